@@ -1,0 +1,96 @@
+//! A deformable object as uploaded: mesh, modes, material and textures, checked once and immutable afterwards.
+//!
+//! Positions are metres times the scene's unit. Behind the constructors of this module no length, index or float is
+//! checked again.
+
+mod material;
+mod mesh;
+mod modes;
+mod tangents;
+mod texture;
+mod transform;
+
+pub use material::{AlphaMode, Material};
+pub use mesh::{Corners, Mesh, smooth_normals};
+pub use modes::{MAX_RANK, Modes};
+pub use texture::Texture;
+pub use transform::Transform;
+
+use std::collections::BTreeMap;
+
+/// A mesh with its modes. Domains that are instances of each other share one shape.
+#[derive(Debug, Clone)]
+pub struct Shape {
+    pub mesh: Mesh,
+    pub modes: Modes,
+    /// Per corner: unit tangent and the sign of the bitangent. Empty unless a normal map needs it.
+    pub(crate) tangents: Vec<[f32; 4]>,
+}
+
+impl Shape {
+    /// A shape whose modes have three rows per vertex of the mesh.
+    ///
+    /// # Errors
+    /// `Invalid` when the rows of the modes are not three times the vertices of the mesh.
+    pub fn new(mesh: Mesh, modes: Modes) -> crate::error::Result<Self> {
+        if modes.rank() > 0 && modes.vertices() != mesh.rest().len() {
+            return Err(crate::error::invalid(
+                "modes.rows",
+                format!("{} (3 x {} vertices)", 3 * mesh.rest().len(), mesh.rest().len()),
+                3 * modes.vertices(),
+            ));
+        }
+        Ok(Self { mesh, modes, tangents: Vec::new() })
+    }
+
+    /// Per corner: unit tangent (xyz) and sign of the bitangent (w); empty when no normal map needs them.
+    pub fn tangents(&self) -> &[[f32; 4]] {
+        &self.tangents
+    }
+
+    /// Makes the tangents (Lengyel's method) if they are not there yet.
+    pub(crate) fn add_tangents(&mut self) {
+        if self.tangents.is_empty() {
+            self.tangents = tangents::lengyel(&self.mesh);
+        }
+    }
+}
+
+/// What the server keeps for a client and hands on, but never uses.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Metadata {
+    /// Eigenvalues of the modes, (rad/s)^2, in the order of the columns of U; empty when unknown.
+    pub eigenvalues: Vec<f64>,
+    /// Anything else, by name.
+    pub notes: BTreeMap<String, String>,
+}
+
+/// How a domain hangs on its parent.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Attachment {
+    /// Index of the parent domain.
+    pub parent: usize,
+    /// Rest pose of the child's frame in the parent's frame: `parent_from_child`.
+    pub frame: Transform,
+    /// Vertices of the parent (rows of its U divided by three) that carry the frame: their displaced positions tell
+    /// how the frame moves. Empty on a rigid parent.
+    pub rows: Vec<u32>,
+}
+
+/// One deformable (or, with rank 0, rigid) object of a scene.
+#[derive(Debug, Clone)]
+pub struct Domain {
+    pub name: String,
+    /// Index into the scene's shapes.
+    pub shape: usize,
+    /// Index into the scene's materials.
+    pub material: usize,
+    /// `world_from_domain` until a step says otherwise.
+    pub placement: Transform,
+    pub attachment: Option<Attachment>,
+    /// The coordinates until a step says otherwise; its length is the rank, or 0 for all zeros.
+    pub rest_q: Vec<f32>,
+    /// A domain with a smaller index and the same rank whose coordinates this one shares (glTF node weights).
+    pub shares_q_with: Option<usize>,
+    pub metadata: Metadata,
+}

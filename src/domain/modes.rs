@@ -1,0 +1,116 @@
+//! The modal matrix U of one shape: 3n x r, column-major f32, so that one mode is one contiguous run.
+
+use crate::error::{Result, invalid};
+
+/// The largest number of modes of one domain.
+pub const MAX_RANK: usize = 512;
+
+/// U, 3n rows and r columns. Row 3i + c is component c of vertex i; every entry is finite.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Modes {
+    vertices: usize,
+    rank: usize,
+    columns: Vec<f32>,
+}
+
+impl Modes {
+    /// No modes: the domain is rigid.
+    pub const fn rigid() -> Self {
+        Self { vertices: 0, rank: 0, columns: Vec::new() }
+    }
+
+    /// U from its entries in column-major order (Vega's order).
+    ///
+    /// # Errors
+    /// `Invalid` when rows are not a multiple of three, columns exceed 512, the count differs from rows x columns, or
+    /// an entry is not finite.
+    pub fn from_columns(rows: usize, rank: usize, columns: Vec<f32>) -> Result<Self> {
+        if !rows.is_multiple_of(3) || rows == 0 {
+            return Err(invalid("modes.rows", "a positive multiple of 3", rows));
+        }
+        if rank > MAX_RANK {
+            return Err(invalid("modes.columns", format!("0 to {MAX_RANK}"), rank));
+        }
+        if rows.checked_mul(rank) != Some(columns.len()) {
+            return Err(invalid("modes.entries", format!("{rows} x {rank}"), columns.len()));
+        }
+        if let Some(at) = columns.iter().position(|entry| !entry.is_finite()) {
+            let place = format!("modes[{}, {}]", at % rows, at / rows);
+            return Err(invalid(place, "a finite number", columns[at]));
+        }
+        if rank == 0 {
+            return Ok(Self::rigid());
+        }
+        Ok(Self { vertices: rows / 3, rank, columns })
+    }
+
+    /// U from its entries in row-major order (NumPy's default order).
+    ///
+    /// # Errors
+    /// As [`Self::from_columns`].
+    pub fn from_rows(rows: usize, rank: usize, entries: &[f32]) -> Result<Self> {
+        if rows.checked_mul(rank) != Some(entries.len()) {
+            return Err(invalid("modes.entries", format!("{rows} x {rank}"), entries.len()));
+        }
+        let columns = (0..rank).flat_map(|mode| (0..rows).map(move |row| entries[row * rank + mode])).collect();
+        Self::from_columns(rows, rank, columns)
+    }
+
+    /// r.
+    pub const fn rank(&self) -> usize {
+        self.rank
+    }
+
+    /// n, or 0 when there are no modes.
+    pub const fn vertices(&self) -> usize {
+        self.vertices
+    }
+
+    /// All entries, column-major.
+    pub fn columns(&self) -> &[f32] {
+        &self.columns
+    }
+
+    /// The 3n entries of one mode.
+    pub fn column(&self, mode: usize) -> &[f32] {
+        &self.columns[3 * self.vertices * mode..][..3 * self.vertices]
+    }
+
+    /// Entry of vertex `vertex`, component `component`, mode `mode`.
+    pub fn at(&self, vertex: usize, component: usize, mode: usize) -> f32 {
+        self.columns[3 * self.vertices * mode + 3 * vertex + component]
+    }
+
+    /// The same without modes if every entry is zero.
+    pub fn without_zero_matrix(self) -> Self {
+        if self.columns.iter().all(|entry| *entry == 0.0) { Self::rigid() } else { self }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn row_major_and_column_major_give_the_same_matrix() {
+        let rows = Modes::from_rows(3, 2, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expect("fits");
+        let columns = Modes::from_columns(3, 2, vec![1.0, 3.0, 5.0, 2.0, 4.0, 6.0]).expect("fits");
+        assert_eq!(rows, columns);
+        assert_eq!(rows.at(0, 2, 1), 6.0);
+        assert_eq!(rows.column(1), [2.0, 4.0, 6.0]);
+    }
+
+    #[test]
+    fn wrong_shapes_and_non_finite_entries_are_refused_by_name() {
+        for (rows, rank, entries, field) in [
+            (4, 1, vec![0.0; 4], "modes.rows"),
+            (0, 0, vec![], "modes.rows"),
+            (3, 513, vec![0.0; 3 * 513], "modes.columns"),
+            (3, 2, vec![0.0; 5], "modes.entries"),
+            (3, 1, vec![0.0, f32::NAN, 0.0], "modes[1, 0]"),
+        ] {
+            let refusal = Modes::from_columns(rows, rank, entries).expect_err("wrong").to_string();
+            assert!(refusal.starts_with(field), "{refusal}");
+        }
+    }
+}

@@ -1,0 +1,71 @@
+//! Decoded images: RGBA8, top row first.
+
+use crate::error::{Result, invalid};
+
+/// The largest width or height of a texture, in pixels.
+pub(super) const MAX_SIDE: u32 = 8192;
+
+/// An image of `width` x `height` RGBA8 pixels, top row first.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Texture {
+    pub name: String,
+    width: u32,
+    height: u32,
+    rgba: Vec<u8>,
+}
+
+impl Texture {
+    /// An image from its pixels.
+    ///
+    /// # Errors
+    /// `Invalid` when a side is 0 or above 8192, or the pixels do not fill it.
+    pub fn new(name: impl Into<String>, width: u32, height: u32, rgba: Vec<u8>) -> Result<Self> {
+        let name = name.into();
+        if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+            let field = format!("texture '{name}': size");
+            return Err(invalid(field, format!("1 to {MAX_SIDE} pixels a side"), format!("{width} x {height}")));
+        }
+        if rgba.len() != 4 * width as usize * height as usize {
+            return Err(invalid(format!("texture '{name}': bytes"), format!("4 x {width} x {height}"), rgba.len()));
+        }
+        Ok(Self { name, width, height, rgba })
+    }
+
+    /// Decodes PNG or JPEG bytes.
+    ///
+    /// # Errors
+    /// `Invalid` when the bytes are no such image, or the image is over the limits.
+    pub fn decode(name: impl Into<String>, bytes: &[u8]) -> Result<Self> {
+        let name = name.into();
+        let refuse = |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
+        let mut reader = image::ImageReader::new(std::io::Cursor::new(bytes));
+        let mut limits = image::Limits::default();
+        limits.max_image_width = Some(MAX_SIDE);
+        limits.max_image_height = Some(MAX_SIDE);
+        reader.limits(limits);
+        let reader = reader.with_guessed_format().map_err(|error| refuse(&error))?;
+        let image = reader.decode().map_err(|error| refuse(&error))?.into_rgba8();
+        let (width, height) = image.dimensions();
+        Self::new(name, width, height, image.into_raw())
+    }
+
+    /// Width in pixels.
+    pub const fn width(&self) -> u32 {
+        self.width
+    }
+
+    /// Height in pixels.
+    pub const fn height(&self) -> u32 {
+        self.height
+    }
+
+    /// The pixels, four bytes each, top row first.
+    pub fn rgba(&self) -> &[u8] {
+        &self.rgba
+    }
+
+    /// Whether a pixel is less than opaque.
+    pub fn has_alpha(&self) -> bool {
+        self.rgba.chunks_exact(4).any(|pixel| pixel[3] < 255)
+    }
+}

@@ -1,0 +1,122 @@
+//! Affine transforms between frames, 3x4 row-major, named by their ends: `world_from_domain`.
+
+use nalgebra::{Matrix3, Matrix4, Vector3};
+
+use crate::error::{Result, invalid};
+
+/// A 3x4 row-major affine transform; the left 3x3 block is the linear part A, the last column the translation.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Transform(pub [f32; 12]);
+
+// The kernels read transforms as three float4 rows.
+const _: () = assert!(size_of::<Transform>() == 48, "Transform differs from kernels/layout.cuh");
+
+impl Default for Transform {
+    fn default() -> Self {
+        Self::IDENTITY
+    }
+}
+
+impl Transform {
+    pub const IDENTITY: Self = Self([1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+
+    /// The twelve numbers, refused when one is not finite.
+    ///
+    /// # Errors
+    /// `Invalid` naming the entry.
+    pub fn new(entries: [f32; 12]) -> Result<Self> {
+        match entries.iter().position(|entry| !entry.is_finite()) {
+            None => Ok(Self(entries)),
+            Some(at) => Err(invalid(format!("transform[{at}]"), "a finite number", entries[at])),
+        }
+    }
+
+    /// Rounds a transform computed in f64.
+    pub fn from_parts(linear: &Matrix3<f64>, translation: &Vector3<f64>) -> Self {
+        let mut entries = [0.0; 12];
+        for row in 0..3 {
+            for column in 0..3 {
+                entries[4 * row + column] = linear[(row, column)] as f32;
+            }
+            entries[4 * row + 3] = translation[row] as f32;
+        }
+        Self(entries)
+    }
+
+    /// The upper three rows of a homogeneous matrix.
+    pub fn from_matrix(matrix: &Matrix4<f64>) -> Self {
+        Self::from_parts(&matrix.fixed_view::<3, 3>(0, 0).into_owned(), &matrix.fixed_view::<3, 1>(0, 3).into_owned())
+    }
+
+    /// The same as a homogeneous 4x4 matrix.
+    pub fn to_matrix(self) -> Matrix4<f64> {
+        let mut matrix = Matrix4::identity();
+        for row in 0..3 {
+            for column in 0..4 {
+                matrix[(row, column)] = f64::from(self.0[4 * row + column]);
+            }
+        }
+        matrix
+    }
+
+    /// The linear part A.
+    pub fn linear(self) -> Matrix3<f64> {
+        self.to_matrix().fixed_view::<3, 3>(0, 0).into_owned()
+    }
+
+    /// The translation.
+    pub fn translation(self) -> Vector3<f64> {
+        self.to_matrix().fixed_view::<3, 1>(0, 3).into_owned()
+    }
+
+    /// `a_from_c = a_from_b * b_from_c`, computed in f64 and rounded once.
+    pub fn then(self, b_from_c: Self) -> Self {
+        Self::from_matrix(&(self.to_matrix() * b_from_c.to_matrix()))
+    }
+
+    /// The inverse, or `None` when the linear part is singular.
+    pub fn inverse(self) -> Option<Self> {
+        self.to_matrix().try_inverse().map(|matrix| Self::from_matrix(&matrix))
+    }
+
+    /// Whether A is a rotation or reflection times one scale, within `1e-4`: then normals turn like positions do.
+    pub fn is_similarity(self) -> bool {
+        let linear = self.linear();
+        let gram = linear.transpose() * linear;
+        let scale = gram.trace() / 3.0;
+        (gram - Matrix3::identity() * scale).abs().max() <= 1e-4 * scale.max(f64::MIN_POSITIVE)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_transform_times_its_inverse_is_the_identity() {
+        let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
+        let transform = Transform::from_parts(&(turn * 2.0), &Vector3::new(1.0, -2.0, 3.0));
+        let unit = transform.then(transform.inverse().expect("regular"));
+        for (got, want) in unit.0.iter().zip(Transform::IDENTITY.0) {
+            assert!((got - want).abs() <= 1e-6, "{got} is not {want}");
+        }
+        assert!(transform.is_similarity());
+    }
+
+    #[test]
+    fn shear_is_no_similarity_and_a_singular_transform_has_no_inverse() {
+        let mut entries = Transform::IDENTITY.0;
+        entries[1] = 0.1;
+        assert!(!Transform(entries).is_similarity());
+        assert!(Transform([0.0; 12]).inverse().is_none());
+    }
+
+    #[test]
+    fn an_infinite_entry_is_named() {
+        let mut entries = Transform::IDENTITY.0;
+        entries[7] = f32::INFINITY;
+        let refusal = Transform::new(entries).expect_err("infinite").to_string();
+        assert!(refusal.starts_with("transform[7]"), "{refusal}");
+    }
+}

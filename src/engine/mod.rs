@@ -1,0 +1,1 @@
+//! The device thread and everything that talks to it.

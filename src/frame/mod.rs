@@ -1,0 +1,33 @@
+//! Pixels to bytes: pure functions, run off the device thread.
+
+use crate::error::Result;
+
+/// PNG of RGBA8 sRGB pixels, top row first.
+///
+/// # Errors
+/// `Fault` when the encoder refuses.
+pub fn png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
+    let fail = crate::error::during::<png::EncodingError>("encode");
+    let mut bytes = Vec::with_capacity(rgba.len() / 3);
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Rgba);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+    encoder.set_compression(png::Compression::Fast);
+    let mut writer = encoder.write_header().map_err(&fail)?;
+    writer.write_image_data(rgba).map_err(&fail)?;
+    writer.finish().map_err(&fail)?;
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_png_decodes_to_the_same_pixels() {
+        let pixels: Vec<u8> = (0..4 * 5 * 3).map(|byte| byte as u8 * 4).collect();
+        let decoded = image::load_from_memory(&png(5, 3, &pixels).expect("encodes")).expect("decodes").into_rgba8();
+        assert_eq!((decoded.dimensions(), decoded.into_raw()), ((5, 3), pixels));
+    }
+}

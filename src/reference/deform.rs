@@ -1,0 +1,26 @@
+//! x = T (x0 + U q), equation 3.9 of the thesis, for every vertex of every domain. Twin of `kernels/deform.cu`.
+
+use crate::scene::{Scene, State};
+
+/// World positions relative to the scene's origin, three f64 per vertex, packed as the layout says.
+pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
+    let mut positions = Vec::with_capacity(scene.layout.vertices);
+    for domain in 0..scene.domains.len() {
+        let shape = scene.shape_of(domain);
+        let q = state.q_of(scene, domain);
+        let world_from_domain = state.transforms[domain].0.map(f64::from);
+        for (vertex, rest) in shape.mesh.rest().iter().enumerate() {
+            let mut bent = rest.map(f64::from);
+            for (component, coordinate) in bent.iter_mut().enumerate() {
+                for (mode, amount) in q.iter().enumerate() {
+                    *coordinate += f64::from(shape.modes.at(vertex, component, mode)) * f64::from(*amount);
+                }
+            }
+            positions.push(std::array::from_fn(|row| {
+                let [x, y, z, offset] = std::array::from_fn(|column| world_from_domain[4 * row + column]);
+                x * bent[0] + y * bent[1] + z * bent[2] + offset
+            }));
+        }
+    }
+    positions
+}

@@ -1,0 +1,53 @@
+//! The definition in f64, plain and without cleverness. Shares no code with the other deformers.
+
+mod deform;
+mod orient;
+
+use std::sync::Arc;
+use std::time::Instant;
+
+pub use deform::deform;
+pub use orient::{orient_normals, orient_tangents};
+
+use crate::deform::{Backend, Deformed, Deformer, Surface};
+use crate::error::Result;
+use crate::scene::{Scene, State};
+
+/// The deformer `reference`: computes in f64 and rounds once.
+#[derive(Debug)]
+pub struct ReferenceDeformer {
+    scene: Arc<Scene>,
+    surface: Surface,
+}
+
+impl ReferenceDeformer {
+    /// A deformer of one scene.
+    pub fn new(scene: &Arc<Scene>) -> Self {
+        Self { scene: Arc::clone(scene), surface: Surface::default() }
+    }
+}
+
+impl Deformer for ReferenceDeformer {
+    fn backend(&self) -> Backend {
+        Backend::Reference
+    }
+
+    fn deform(&mut self, state: &State) -> Result<Deformed> {
+        let begin = Instant::now();
+        let positions = deform(&self.scene, state);
+        let mut bounds = crate::scene::Bounds::EMPTY;
+        positions.iter().for_each(|position| bounds.include(*position));
+        self.surface.positions = positions.into_flattened().into_iter().map(|number| number as f32).collect();
+        self.surface.normals = round(orient_normals(&self.scene, state));
+        self.surface.tangents = round(orient_tangents(&self.scene, state));
+        Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+    }
+
+    fn surface(&mut self) -> Result<&Surface> {
+        Ok(&self.surface)
+    }
+}
+
+fn round<const N: usize>(list: Vec<[f64; N]>) -> Vec<f32> {
+    list.into_flattened().into_iter().map(|number| number as f32).collect()
+}

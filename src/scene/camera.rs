@@ -1,0 +1,201 @@
+//! Cameras and bounds, in f64 until the last matrix.
+
+use nalgebra::{Matrix4, Point3, Vector3};
+
+use super::Scene;
+use crate::domain::Transform;
+use crate::error::{Result, invalid};
+
+/// An axis-aligned box in scene units; empty when `min > max`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    pub min: [f64; 3],
+    pub max: [f64; 3],
+}
+
+impl Bounds {
+    pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
+
+    /// Grows to hold a point. A NaN makes the bounds not finite, so that nobody mistakes them for good.
+    pub fn include(&mut self, point: [f64; 3]) {
+        for axis in 0..3 {
+            self.min[axis] = if point[axis].is_nan() { f64::NAN } else { self.min[axis].min(point[axis]) };
+            self.max[axis] = if point[axis].is_nan() { f64::NAN } else { self.max[axis].max(point[axis]) };
+        }
+    }
+
+    /// The smallest bounds that hold both.
+    pub fn union(mut self, other: Self) -> Self {
+        for axis in 0..3 {
+            self.min[axis] = self.min[axis].min(other.min[axis]);
+            self.max[axis] = self.max[axis].max(other.max[axis]);
+        }
+        self
+    }
+
+    pub fn is_finite(&self) -> bool {
+        self.min.iter().chain(&self.max).all(|number| number.is_finite())
+    }
+
+    pub fn centre(&self) -> Point3<f64> {
+        nalgebra::center(&Point3::from(self.min), &Point3::from(self.max))
+    }
+
+    /// Length of the diagonal: the yardstick of every error in this project.
+    pub fn diagonal(&self) -> f64 {
+        (Point3::from(self.max) - Point3::from(self.min)).norm()
+    }
+
+    /// The eight corners.
+    pub fn corners(&self) -> [Point3<f64>; 8] {
+        std::array::from_fn(|corner| {
+            Point3::from(std::array::from_fn(
+                |axis| {
+                    if corner >> axis & 1 == 0 { self.min[axis] } else { self.max[axis] }
+                },
+            ))
+        })
+    }
+}
+
+/// Where the camera is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum View {
+    LookAt {
+        eye: [f64; 3],
+        target: [f64; 3],
+        up: [f64; 3],
+    },
+    /// `world_from_camera`, OpenGL's axes: x right, y up, looking along -z.
+    Pose(Transform),
+}
+
+/// How the camera projects.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Lens {
+    /// Vertical field of view in degrees.
+    FieldOfView(f64),
+    /// Pinhole intrinsics in pixels; (0, 0) is the top left corner of the image.
+    Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
+}
+
+/// A camera. Near and far are distances in scene units; both 0 means: fit them to the scene.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    pub view: View,
+    pub lens: Lens,
+    pub near: f64,
+    pub far: f64,
+}
+
+impl Camera {
+    /// A camera that frames the rest bounds of a scene from the front, a little above and aside.
+    pub fn framing(scene: &Scene) -> Self {
+        let up = scene.up.vector();
+        let aside = scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
+        let bounds = scene.rest_bounds;
+        let degrees = 32.0_f64;
+        let distance = 0.56 * bounds.diagonal().max(1e-12) / (degrees.to_radians() / 2.0).tan();
+        let eye = bounds.centre() + aside * distance;
+        let view = View::LookAt { eye: eye.coords.into(), target: bounds.centre().coords.into(), up: up.into() };
+        Self { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
+    }
+
+    /// The camera itself if all of its numbers make sense.
+    ///
+    /// # Errors
+    /// `Invalid` naming the field.
+    pub fn checked(self) -> Result<Self> {
+        if let View::LookAt { eye, target, up } = self.view {
+            let ahead = Vector3::from(target) - Vector3::from(eye);
+            let aside = ahead.cross(&Vector3::from(up)).norm();
+            let given = || format!("eye {eye:?}, target {target:?}, up {up:?}");
+            if !(aside.is_finite() && aside > 1e-12 * ahead.norm() * Vector3::from(up).norm()) {
+                return Err(invalid("camera.look_at", "finite eye and target apart, and up not along them", given()));
+            }
+        }
+        if let View::Pose(pose) = self.view
+            && pose.inverse().is_none_or(|inverse| !inverse.0.iter().all(|number| number.is_finite()))
+        {
+            return Err(invalid("camera.pose", "a finite, regular transform", format!("{:?}", pose.0)));
+        }
+        match self.lens {
+            Lens::FieldOfView(degrees) if !(degrees > 0.1 && degrees < 179.0) => {
+                return Err(invalid("camera.field_of_view", "0.1 to 179 degrees", degrees));
+            }
+            Lens::Intrinsics { fx, fy, cx, cy }
+                if !(fx > 0.0 && fy > 0.0 && [fx, fy, cx, cy].iter().all(|number| number.is_finite())) =>
+            {
+                return Err(invalid(
+                    "camera.intrinsics",
+                    "finite numbers, fx and fy above 0",
+                    format!("{:?}", self.lens),
+                ));
+            }
+            _ => {}
+        }
+        let fitted = self.near == 0.0 && self.far == 0.0;
+        if !fitted && !(self.near > 0.0 && self.far > self.near && self.far.is_finite()) {
+            return Err(invalid(
+                "camera.near/far",
+                "0 < near < far, or both 0",
+                format!("{} / {}", self.near, self.far),
+            ));
+        }
+        Ok(self)
+    }
+
+    /// `camera_from_world`, OpenGL's axes.
+    pub fn camera_from_world(&self) -> Matrix4<f64> {
+        match self.view {
+            View::LookAt { eye, target, up } => {
+                Matrix4::look_at_rh(&Point3::from(eye), &Point3::from(target), &Vector3::from(up))
+            }
+            View::Pose(pose) => pose.to_matrix().try_inverse().unwrap_or_else(Matrix4::identity),
+        }
+    }
+
+    /// Position of the camera in the world.
+    pub fn eye(&self) -> Vector3<f64> {
+        match self.view {
+            View::LookAt { eye, .. } => eye.into(),
+            View::Pose(pose) => pose.translation(),
+        }
+    }
+
+    /// `clip_from_camera` for an image of `width` x `height` pixels that shows `bounds`.
+    pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &Bounds) -> Matrix4<f64> {
+        let (near, far) = self.range(bounds);
+        let (width, height) = (f64::from(width), f64::from(height));
+        let (fx, fy, cx, cy) = match self.lens {
+            Lens::FieldOfView(degrees) => {
+                let focal = 0.5 * height / (degrees.to_radians() / 2.0).tan();
+                (focal, focal, width / 2.0, height / 2.0)
+            }
+            Lens::Intrinsics { fx, fy, cx, cy } => (fx, fy, cx, cy),
+        };
+        let mut clip = Matrix4::zeros();
+        clip[(0, 0)] = 2.0 * fx / width;
+        clip[(0, 2)] = 1.0 - 2.0 * cx / width;
+        clip[(1, 1)] = 2.0 * fy / height;
+        clip[(1, 2)] = 2.0 * cy / height - 1.0;
+        clip[(2, 2)] = -(far + near) / (far - near);
+        clip[(2, 3)] = -2.0 * far * near / (far - near);
+        clip[(3, 2)] = -1.0;
+        clip
+    }
+
+    /// Near and far: as given, or fitted so that `bounds` and the ground around them are inside.
+    fn range(&self, bounds: &Bounds) -> (f64, f64) {
+        if self.far > 0.0 {
+            return (self.near, self.far);
+        }
+        let camera = self.camera_from_world();
+        let depth = |corner: &Point3<f64>| -camera.transform_point(corner).z;
+        let depths = bounds.corners().map(|corner| depth(&corner));
+        let farthest = depths.iter().copied().fold(0.0, f64::max);
+        let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
+        let far = (farthest.max(0.0) + 4.0 * bounds.diagonal()).max(1e-6);
+        (nearest.mul_add(0.5, 0.0).clamp(far * 1e-4, far * 0.5), far)
+    }
+}

@@ -1,0 +1,69 @@
+//! Where each domain's vertices, corners, triangles and coordinates lie in the packed buffers of a scene.
+
+use crate::domain::{Domain, Shape};
+use crate::error::{Result, invalid};
+
+/// The packed ranges of one domain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Slot {
+    /// First vertex in the packed positions, and their count n.
+    pub first_vertex: usize,
+    pub vertices: usize,
+    /// First corner in the packed normals, and their count.
+    pub first_corner: usize,
+    pub corners: usize,
+    /// First triangle in the packed index buffer, and their count.
+    pub first_triangle: usize,
+    pub triangles: usize,
+    /// First coordinate in the packed q, and the rank r. Domains that share coordinates share `first_q`.
+    pub first_q: usize,
+    pub rank: usize,
+}
+
+/// Slots of all domains and the totals.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Layout {
+    pub slots: Vec<Slot>,
+    pub vertices: usize,
+    pub corners: usize,
+    pub triangles: usize,
+    /// Length of the packed q.
+    pub coordinates: usize,
+}
+
+impl Layout {
+    pub(super) fn new(shapes: &[Shape], domains: &[Domain]) -> Result<Self> {
+        let mut layout =
+            Self { slots: Vec::with_capacity(domains.len()), vertices: 0, corners: 0, triangles: 0, coordinates: 0 };
+        for domain in domains {
+            let shape = &shapes[domain.shape];
+            let rank = shape.modes.rank();
+            let shared = domain.shares_q_with.map(|twin| layout.slots[twin].first_q);
+            let slot = Slot {
+                first_vertex: layout.vertices,
+                vertices: shape.mesh.rest().len(),
+                first_corner: layout.corners,
+                corners: shape.mesh.corners().vertices.len(),
+                first_triangle: layout.triangles,
+                triangles: shape.mesh.triangles().len(),
+                first_q: shared.unwrap_or(layout.coordinates),
+                rank,
+            };
+            layout.vertices += slot.vertices;
+            layout.corners += slot.corners;
+            layout.triangles += slot.triangles;
+            layout.coordinates += if shared.is_some() { 0 } else { rank };
+            layout.slots.push(slot);
+        }
+        // Device indices are 32 bit and address three numbers per vertex and corner.
+        let largest = layout.vertices.max(layout.corners).max(layout.triangles);
+        if largest > (u32::MAX / 4) as usize {
+            return Err(invalid(
+                "scene.size",
+                format!("at most {} vertices, corners and triangles", u32::MAX / 4),
+                largest,
+            ));
+        }
+        Ok(layout)
+    }
+}

@@ -1,0 +1,128 @@
+//! How a scene is lit: one directional light (the sun), its shadow, the ground and the sky.
+
+use nalgebra::Vector3;
+
+use crate::error::{Result, invalid};
+
+/// The axis that points up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UpAxis {
+    X,
+    #[default]
+    Y,
+    Z,
+}
+
+impl UpAxis {
+    /// Index of the axis.
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// The unit vector up.
+    pub fn vector(self) -> Vector3<f64> {
+        Vector3::ith(self.index(), 1.0)
+    }
+
+    /// A rotation that takes Y-up coordinates to this axis up.
+    pub fn from_y_up(self) -> nalgebra::Rotation3<f64> {
+        let identity = nalgebra::Rotation3::identity();
+        nalgebra::Rotation3::rotation_between(&Vector3::y(), &self.vector()).unwrap_or(identity)
+    }
+}
+
+/// The variance shadow map.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Shadow {
+    /// Side of the square map in texels, 16 to 16384.
+    pub size: u32,
+    /// Standard deviation of the Gaussian blur in texels, 0 (no blur) to 16.
+    pub blur: f32,
+    /// Smallest variance, as a fraction of the squared depth range.
+    pub least_variance: f32,
+    /// Chebyshev values below this count as full shadow, 0 to 0.99 (light-bleeding reduction).
+    pub bleeding: f32,
+    /// Blended materials cast a shadow from this alpha on (the thesis's t_alpha).
+    pub alpha_threshold: f32,
+}
+
+impl Default for Shadow {
+    fn default() -> Self {
+        Self { size: 2048, blur: 2.0, least_variance: 2e-6, bleeding: 0.2, alpha_threshold: 0.5 }
+    }
+}
+
+/// A plane at the lowest rest position along up; it receives the shadow and casts none.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Ground {
+    pub colour: [f32; 3],
+}
+
+impl Default for Ground {
+    fn default() -> Self {
+        Self { colour: [0.50, 0.47, 0.40] }
+    }
+}
+
+/// Light, shadow, ground and sky. Colours are linear.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Look {
+    /// Direction towards the sun for a scene with Y up; other up axes turn it along.
+    pub sun: [f32; 3],
+    /// Colour times intensity of the sun.
+    pub sunlight: [f32; 3],
+    /// Colour times intensity of the ambient light.
+    pub skylight: [f32; 3],
+    /// Sky at the zenith and at the horizon.
+    pub zenith: [f32; 3],
+    pub horizon: [f32; 3],
+    pub shadow: Option<Shadow>,
+    pub ground: Option<Ground>,
+}
+
+impl Default for Look {
+    fn default() -> Self {
+        Self {
+            sun: [0.45, 0.80, 0.55],
+            sunlight: [1.0, 0.95, 0.86],
+            skylight: [0.30, 0.34, 0.40],
+            zenith: [0.25, 0.45, 0.78],
+            horizon: [0.78, 0.85, 0.92],
+            shadow: Some(Shadow::default()),
+            ground: Some(Ground::default()),
+        }
+    }
+}
+
+impl Look {
+    /// Unit vector from the scene towards the sun (v_l of the thesis).
+    pub fn to_sun(&self, up: UpAxis) -> Vector3<f64> {
+        let sun = Vector3::from(self.sun).cast::<f64>();
+        up.from_y_up() * sun.try_normalize(1e-12).unwrap_or_else(Vector3::y)
+    }
+
+    pub(super) fn check(&self) -> Result<()> {
+        let colours = [self.sun, self.sunlight, self.skylight, self.zenith, self.horizon];
+        if !colours.as_flattened().iter().all(|number| number.is_finite()) {
+            return Err(invalid("look", "finite numbers", format!("{self:?}")));
+        }
+        let Some(shadow) = self.shadow else { return Ok(()) };
+        if !(16..=16384).contains(&shadow.size) {
+            return Err(invalid("look.shadow.size", "16 to 16384 texels", shadow.size));
+        }
+        if !(0.0..=16.0).contains(&shadow.blur) {
+            return Err(invalid("look.shadow.blur", "0 to 16 texels", shadow.blur));
+        }
+        if !(0.0..=0.99).contains(&shadow.bleeding) {
+            return Err(invalid("look.shadow.bleeding", "0 to 0.99", shadow.bleeding));
+        }
+        if !(0.0..=1.0).contains(&shadow.alpha_threshold) || !(0.0..=1.0).contains(&shadow.least_variance) {
+            return Err(invalid("look.shadow", "alpha_threshold and least_variance of 0 to 1", format!("{shadow:?}")));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,211 @@
+//! A scene: the immutable set of domains that one physics process drives, and the values of one step.
+//!
+//! All domains are packed: each knows where its vertices, corners, triangles and coordinates begin. Every deformer and
+//! the renderer use the same packing ([`Layout`]).
+
+mod camera;
+mod layout;
+mod look;
+mod needs;
+mod state;
+mod update;
+
+pub use camera::{Bounds, Camera, Lens, View};
+pub use layout::{Layout, Slot};
+pub use look::{Ground, Look, Shadow, UpAxis};
+pub use needs::Needs;
+pub use state::State;
+pub use update::{RawUpdate, Update};
+
+use std::sync::Arc;
+
+use crate::domain::{AlphaMode, Domain, Material, Shape, Texture};
+use crate::error::{Result, invalid};
+
+/// The largest number of domains of one scene.
+pub const MAX_DOMAINS: usize = 1 << 20;
+
+/// What a loader hands to [`Scene::new`].
+#[derive(Debug, Clone, Default)]
+pub struct Parts {
+    pub name: String,
+    pub shapes: Vec<Shape>,
+    pub materials: Vec<Material>,
+    pub textures: Vec<Texture>,
+    pub domains: Vec<Domain>,
+    pub up: UpAxis,
+    /// Metres per unit of length.
+    pub unit: f64,
+    /// World position of the frame in which all transforms are given, metres.
+    pub origin: [f64; 3],
+    pub look: Look,
+    /// The scene's promise that no step will shear or scale a domain unevenly; a step that does is refused.
+    pub rigid_transforms: bool,
+    /// What the loader could not use, in words, for `inspect` and the log.
+    pub remarks: Vec<String>,
+}
+
+/// A checked scene. Immutable; shared by reference count.
+#[derive(Debug)]
+pub struct Scene {
+    pub name: String,
+    pub shapes: Vec<Shape>,
+    pub materials: Vec<Material>,
+    pub textures: Vec<Texture>,
+    pub domains: Vec<Domain>,
+    pub up: UpAxis,
+    pub unit: f64,
+    pub origin: [f64; 3],
+    pub look: Look,
+    pub rigid_transforms: bool,
+    pub remarks: Vec<String>,
+    pub layout: Layout,
+    pub needs: Needs,
+    /// Bounds of the rest state, in scene units.
+    pub rest_bounds: Bounds,
+}
+
+impl Scene {
+    /// Checks all that is between the parts and computes packing, needs, tangents and rest bounds, once.
+    ///
+    /// # Errors
+    /// `Invalid` naming the domain and the field.
+    pub fn new(mut parts: Parts) -> Result<Arc<Self>> {
+        if parts.domains.is_empty() || parts.domains.len() > MAX_DOMAINS {
+            return Err(invalid("scene.domains", format!("1 to {MAX_DOMAINS}"), parts.domains.len()));
+        }
+        if !(parts.unit.is_finite() && parts.unit > 0.0) {
+            return Err(invalid("scene.unit", "a positive number of metres", parts.unit));
+        }
+        if !parts.origin.iter().all(|number| number.is_finite()) {
+            return Err(invalid("scene.origin", "finite numbers", format!("{:?}", parts.origin)));
+        }
+        parts.materials = parts.materials.into_iter().map(Material::checked).collect::<Result<_>>()?;
+        check_textures(&parts)?;
+        for index in 0..parts.domains.len() {
+            check_domain(&parts, index).map_err(|error| error.within(&format!("domain {index}")))?;
+        }
+        parts.look.check()?;
+        add_tangents(&mut parts);
+        let layout = Layout::new(&parts.shapes, &parts.domains)?;
+        let needs = Needs::of(&parts);
+        let mut scene = Self {
+            name: parts.name,
+            shapes: parts.shapes,
+            materials: parts.materials,
+            textures: parts.textures,
+            domains: parts.domains,
+            up: parts.up,
+            unit: parts.unit,
+            origin: parts.origin,
+            look: parts.look,
+            rigid_transforms: parts.rigid_transforms,
+            remarks: parts.remarks,
+            layout,
+            needs,
+            rest_bounds: Bounds::EMPTY,
+        };
+        scene.rest_bounds = scene.bounds_at_rest();
+        Ok(Arc::new(scene))
+    }
+
+    /// The shape of a domain.
+    pub fn shape_of(&self, domain: usize) -> &Shape {
+        &self.shapes[self.domains[domain].shape]
+    }
+
+    /// The number of modes of a domain.
+    pub fn rank_of(&self, domain: usize) -> usize {
+        self.shape_of(domain).modes.rank()
+    }
+
+    /// Index of the domain called `name`.
+    pub fn find(&self, name: &str) -> Option<usize> {
+        self.domains.iter().position(|domain| domain.name == name)
+    }
+
+    fn bounds_at_rest(&self) -> Bounds {
+        let mut bounds = Bounds::EMPTY;
+        for domain in &self.domains {
+            let place = domain.placement.to_matrix();
+            for position in self.shapes[domain.shape].mesh.rest() {
+                let world = place.transform_point(&nalgebra::Point3::from(*position).cast());
+                bounds.include(world.coords.into());
+            }
+        }
+        bounds
+    }
+}
+
+fn check_textures(parts: &Parts) -> Result<()> {
+    for material in &parts.materials {
+        for texture in [material.colour_texture, material.normal_texture].into_iter().flatten() {
+            if texture >= parts.textures.len() {
+                let field = format!("material '{}': texture", material.name);
+                return Err(invalid(field, format!("an index below {}", parts.textures.len()), texture));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn check_domain(parts: &Parts, index: usize) -> Result<()> {
+    let domain = &parts.domains[index];
+    let below = |field: &str, given: usize, limit: usize| match given < limit {
+        true => Ok(()),
+        false => Err(invalid(field, format!("an index below {limit}"), given)),
+    };
+    below("shape", domain.shape, parts.shapes.len())?;
+    below("material", domain.material, parts.materials.len())?;
+    let rank = parts.shapes[domain.shape].modes.rank();
+    crate::domain::Transform::new(domain.placement.0).map_err(|error| error.within("placement"))?;
+    if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
+        return Err(invalid("rest_q", format!("none or {rank} coordinates"), domain.rest_q.len()));
+    }
+    if !domain.rest_q.iter().all(|number| number.is_finite()) {
+        return Err(invalid("rest_q", "finite numbers", format!("{:?}", domain.rest_q)));
+    }
+    if let Some(twin) = domain.shares_q_with {
+        below("shares_q_with", twin, index)?;
+        let theirs = parts.shapes[parts.domains[twin].shape].modes.rank();
+        if theirs != rank {
+            return Err(invalid("shares_q_with", format!("a domain of rank {rank}"), theirs));
+        }
+    }
+    if let Some(attachment) = &domain.attachment {
+        // Parents come first, so the hierarchy has no cycle and one pass in order composes it.
+        below("parent", attachment.parent, index)?;
+        let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest().len();
+        for row in &attachment.rows {
+            below("attachment.rows", *row as usize, vertices)?;
+        }
+    }
+    Ok(())
+}
+
+/// Tangents only where a normal map will read them.
+fn add_tangents(parts: &mut Parts) {
+    for domain in &parts.domains {
+        let shape = &mut parts.shapes[domain.shape];
+        let mapped = parts.materials[domain.material].normal_texture.is_some();
+        if mapped && !shape.mesh.corners().uvs.is_empty() {
+            shape.add_tangents();
+        }
+    }
+}
+
+impl Parts {
+    /// Parts of a scene with the usual conventions: metres, no origin, default look.
+    pub fn named(name: impl Into<String>) -> Self {
+        Self { name: name.into(), unit: 1.0, ..Self::default() }
+    }
+
+    /// Whether any domain's material has this property.
+    pub(crate) fn any_material(&self, has: impl Fn(&Material) -> bool) -> bool {
+        self.domains.iter().any(|domain| has(&self.materials[domain.material]))
+    }
+
+    pub(crate) fn any_mask(&self) -> bool {
+        self.any_material(|material| matches!(material.alpha_mode, AlphaMode::Mask { .. }))
+    }
+}

@@ -1,0 +1,52 @@
+//! What a scene needs, computed once at load; kernels, shaders, passes and buffers follow it and nothing else.
+
+use super::Parts;
+
+/// A feature is compiled, allocated and run only when its flag is set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+pub struct Needs {
+    /// Some domain has modes: u = U q is computed at all.
+    pub modes: bool,
+    /// Some material has a colour texture.
+    pub textures: bool,
+    /// Some material has a normal map on a shape with uvs: tangents exist.
+    pub normal_maps: bool,
+    /// Some material discards by cutoff.
+    pub mask: bool,
+    /// Some material blends: the blended pass exists.
+    pub blend: bool,
+    /// The look asks for shadows: map, moments and blur exist.
+    pub shadows: bool,
+    /// Steps may shear or scale unevenly: normals need the inverse transpose.
+    pub shear: bool,
+}
+
+impl Needs {
+    pub(super) fn of(parts: &Parts) -> Self {
+        Self {
+            modes: parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0),
+            textures: parts.any_material(|material| material.colour_texture.is_some()),
+            normal_maps: parts.domains.iter().any(|domain| {
+                parts.materials[domain.material].normal_texture.is_some()
+                    && !parts.shapes[domain.shape].tangents().is_empty()
+            }),
+            mask: parts.any_mask(),
+            blend: parts.any_material(|material| material.alpha_mode == crate::domain::AlphaMode::Blend),
+            shadows: parts.look.shadow.is_some(),
+            shear: !parts.rigid_transforms || !parts.domains.iter().all(|domain| domain.placement.is_similarity()),
+        }
+    }
+
+    /// Each flag with its name, in a fixed order.
+    pub fn flags(&self) -> [(&'static str, bool); 7] {
+        [
+            ("modes", self.modes),
+            ("textures", self.textures),
+            ("normal_maps", self.normal_maps),
+            ("mask", self.mask),
+            ("blend", self.blend),
+            ("shadows", self.shadows),
+            ("shear", self.shear),
+        ]
+    }
+}

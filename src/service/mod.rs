@@ -1,0 +1,1 @@
+//! gRPC: wire to values and back. The only module that names proto.
