@@ -41,6 +41,7 @@ fn domain(shape: usize, name: String) -> Domain {
         material: 0,
         placement: Transform::IDENTITY,
         attachment: None,
+        runs: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),
