@@ -83,6 +83,8 @@ impl Assembly<'_> {
         let placement = transform(&placed.world)?;
         let attachment = above.map(|above| attach(&above)).transpose()?;
         let first = self.domains.len();
+        // The node's first domain of each rank: its coordinates are those of the others.
+        let mut twins: HashMap<usize, usize> = HashMap::new();
         let name = self.name(node.name.as_ref().or(mesh.name.as_ref()), placed.node);
         for (place, primitive) in mesh.primitives.iter().enumerate() {
             let targets = primitive.targets.len();
@@ -96,10 +98,9 @@ impl Assembly<'_> {
                 return Err(invalid("domains", format!("at most {MAX_DOMAINS}"), "more"));
             }
             let rank = self.shapes[made.shape].modes.rank();
-            let same_rank = |domain: &Domain| self.shapes[domain.shape].modes.rank() == rank;
             let rest_q = weights.filter(|_| rank > 0).cloned().unwrap_or_default();
             self.reader.bytes.spend(4 * rest_q.len() as u64)?;
-            let twin = self.domains[first..].iter().position(same_rank).filter(|_| rank > 0);
+            let twin = *twins.entry(rank).or_insert(self.domains.len());
             self.domains.push(Domain {
                 name: format!("{name}.{place}"),
                 shape: made.shape,
@@ -108,7 +109,7 @@ impl Assembly<'_> {
                 placement,
                 attachment: attachment.clone(),
                 rest_q,
-                shares_q_with: twin.map(|twin| first + twin),
+                shares_q_with: (rank > 0 && twin < self.domains.len()).then_some(twin),
                 metadata: Metadata::default(),
             });
         }

@@ -7,7 +7,7 @@
 //! diffuse   = c (1 - m / 2)            a metal mirrors its surroundings, which are not there; half stays diffuse
 //! ambient   = c
 //! specular  = min(1, f / (4 alpha^2))  the peak of a GGX lobe relative to a white diffuse surface
-//! shininess = (2 / alpha^2 - 2) / 4    the usual exponent of a half-vector lobe; that of a reflected vector is a quarter
+//! shininess = (2 / alpha^2 - 2) / 4    a half-vector lobe's exponent; a reflected vector's is a quarter of it
 //! ```
 //!
 //! `shininess` is kept in 1 to 10,000. The base colour texture multiplies diffuse, ambient and alpha. Normal textures
