@@ -40,7 +40,7 @@ mod tests {
     fn tiles_cover_every_item_once_in_order() {
         let counts = [0, 1, TILE, TILE + 1, 3 * TILE - 1];
         let tiles = cut(counts.into_iter());
-        assert_eq!(tiles.iter().map(|tile| tile.count).sum::<usize>(), counts.iter().sum());
+        assert_eq!(tiles.iter().map(|tile| tile.count).sum::<usize>(), counts.iter().sum::<usize>());
         assert!(tiles.iter().all(|tile| tile.count >= 1 && tile.count <= TILE));
         assert_eq!(tiles.iter().map(|tile| tile.domain).collect::<Vec<_>>(), [1, 2, 3, 3, 4, 4, 4]);
         let mut output = vec![0.0; 3 * counts.iter().sum::<usize>()];

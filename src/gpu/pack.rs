@@ -140,6 +140,7 @@ pub(super) mod tests {
             material,
             placement: Transform::IDENTITY,
             attachment: None::<Attachment>,
+            runs: vec![],
             rest_q: Vec::new(),
             shares_q_with: None,
             metadata: Metadata::default(),
