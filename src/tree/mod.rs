@@ -157,6 +157,7 @@ impl Planter<'_> {
             material,
             placement,
             attachment: None,
+            runs: vec![],
             rest_q: vec![],
             shares_q_with: None,
             metadata: self.metadata[mold].clone(),
