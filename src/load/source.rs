@@ -56,9 +56,11 @@ pub(super) fn model(files: &Files, path: &str, modes: Source) -> Result<Parts> {
             Ok(parts)
         }
         Some(Kind::File) => {
+            let folder = files.within(parent_of(path))?;
             let found = recognised(name_of(path))
                 .ok_or_else(|| invalid(format!("file '{path}'"), "a file ending in .glb, .gltf or .obj", "another"))?;
-            read_model(&files.within(parent_of(path))?, &found, modes)
+            let found = in_company(found, &names_of(&folder));
+            read_model(&folder, &found, modes)
         }
         None => Err(invalid(format!("file '{path}'"), "a model that is there", "nothing of that name")),
     }
@@ -83,22 +85,26 @@ pub(super) fn recognised(name: &str) -> Option<Model> {
 
 /// All models of a folder.
 pub(super) fn models(folder: &Files) -> Vec<Model> {
-    let entries = folder.entries();
-    let names: Vec<&str> =
-        entries.iter().filter(|(_, kind)| *kind == Kind::File).map(|(name, _)| name.as_str()).collect();
-    let is_plant = |stem: &str| {
-        [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")]
-            .iter()
-            .all(|name| names.contains(&name.as_str()))
+    let names = names_of(folder);
+    names.iter().filter_map(|name| recognised(name)).map(|model| in_company(model, &names)).collect()
+}
+
+/// An OBJ file is a plant when the structure of one lies beside it.
+fn in_company(model: Model, names: &[String]) -> Model {
+    let stem = match &model {
+        Model::Obj(name) => name.strip_suffix(".obj"),
+        _ => None,
     };
-    let plant = |model| match model {
-        Model::Obj(name) => match name.strip_suffix(".obj") {
-            Some(stem) if is_plant(stem) => Model::Plant(stem.into()),
-            _ => Model::Obj(name),
-        },
-        other => other,
+    let is_plant = |stem: &&str| {
+        let company = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
+        company.iter().all(|name| names.contains(name))
     };
-    names.iter().filter_map(|name| recognised(name)).map(plant).collect()
+    stem.filter(is_plant).map(|stem| Model::Plant(stem.into())).unwrap_or(model)
+}
+
+/// Names of the files of a folder.
+fn names_of(folder: &Files) -> Vec<String> {
+    folder.entries().into_iter().filter(|(_, kind)| *kind == Kind::File).map(|(name, _)| name).collect()
 }
 
 fn the_one_model(folder: &Files, path: &str) -> Result<Model> {

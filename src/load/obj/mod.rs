@@ -84,12 +84,16 @@ pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Resu
         }
     }
     parts.remarks.extend(obj.remarks.iter().cloned());
+    let mut undefined = Vec::new();
     for name in &obj.materials {
         let made = match known.get(name) {
             Some((statements, folder)) => {
                 material::material(name, statements, folder, &mut images, &mut parts.remarks)?
             }
-            None if obj.libraries.is_empty() || name.is_empty() => white(name, &mut parts.remarks),
+            None if obj.libraries.is_empty() || name.is_empty() => {
+                undefined.push(format!("'{name}'"));
+                white(name)
+            }
             None => {
                 let names = known.keys().take(16).map(String::as_str).collect::<Vec<_>>().join(", ");
                 return Err(invalid("usemtl", format!("a material of the libraries ({names})"), name));
@@ -97,12 +101,16 @@ pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Resu
         };
         parts.materials.push(made);
     }
+    if !undefined.is_empty() {
+        let count = undefined.len();
+        undefined.truncate(8);
+        parts.remarks.push(format!("{count} materials are not defined and white: {}", undefined.join(", ")));
+    }
     parts.textures.append(&mut images.into_list());
     Ok(())
 }
 
-fn white(name: &str, remarks: &mut Vec<String>) -> Material {
-    remarks.push(format!("material '{name}' is not defined: white"));
+fn white(name: &str) -> Material {
     Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
 }
 
@@ -168,6 +176,6 @@ mod tests {
         }
         let white = read(&files, "rows.obj", Source::None).expect("good");
         assert_eq!(white.materials[0].diffuse, [1.0; 3]);
-        assert_eq!(white.remarks, ["material '' is not defined: white"]);
+        assert_eq!(white.remarks, ["1 materials are not defined and white: ''"]);
     }
 }

@@ -73,7 +73,10 @@ impl Statements {
                 "blendu" | "blendv" | "cc" | "clamp" | "bm" | "boost" | "imfchan" | "texres" | "type" => 1,
                 _ => return Err(invalid("option", "an image option of MTL", format!("-{option}"))),
             };
-            self.remarks.push(format!("material '{name}': image option '-{option}' is not used"));
+            let remark = format!("material '{name}': image option '-{option}' is not used");
+            if !self.remarks.contains(&remark) {
+                self.remarks.push(remark);
+            }
             rest = after;
             for argument in 0..most {
                 let (word, after) = next_word(rest);
