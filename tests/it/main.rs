@@ -1,0 +1,5 @@
+//! Claims that need no GPU. One binary.
+
+mod deformers;
+mod layering;
+mod tolerance;
