@@ -1,5 +1,8 @@
 //! Files to scenes.
 
+mod files;
+mod gltf;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -24,13 +24,17 @@ impl Bounds {
         }
     }
 
-    /// The smallest bounds that hold both.
-    pub fn union(mut self, other: Self) -> Self {
-        for axis in 0..3 {
-            self.min[axis] = self.min[axis].min(other.min[axis]);
-            self.max[axis] = self.max[axis].max(other.max[axis]);
+    /// The smallest bounds that hold both; NaN in either stays NaN.
+    pub fn union(self, other: Self) -> Self {
+        let pick = |a: f64, b: f64, least: bool| match (a.is_nan() || b.is_nan(), least) {
+            (true, _) => f64::NAN,
+            (false, true) => a.min(b),
+            (false, false) => a.max(b),
+        };
+        Self {
+            min: std::array::from_fn(|axis| pick(self.min[axis], other.min[axis], true)),
+            max: std::array::from_fn(|axis| pick(self.max[axis], other.max[axis], false)),
         }
-        self
     }
 
     pub fn is_finite(&self) -> bool {

@@ -1,3 +1,6 @@
-//! Integration tests that need no GPU.
+//! Claims that need no GPU. One binary.
 
+mod deformers;
+mod layering;
 mod pixels;
+mod tolerance;
