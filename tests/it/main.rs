@@ -2,4 +2,5 @@
 
 mod deformers;
 mod layering;
+mod pixels;
 mod tolerance;
