@@ -62,6 +62,7 @@ pub(crate) fn domain(shape: usize, material: usize) -> Domain {
         shape,
         material,
         placement: Transform::IDENTITY,
+        runs: vec![],
         attachment: None,
         rest_q: Vec::new(),
         shares_q_with: None,
