@@ -143,7 +143,7 @@ fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, comman
             }
         }
         Command::Deform { id, state, reply } => {
-            reply.send(find(scenes, id).and_then(|staged| staged.deform(&state))).ok();
+            reply.send(find(scenes, id).and_then(|staged| staged.deform_shared(&state))).ok();
         }
         Command::Draw { id, camera, size: (width, height), reply } if !reply.is_closed() => {
             let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));

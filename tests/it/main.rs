@@ -1,8 +1,12 @@
-//! Integration tests through the public door, in one binary.
+//! Claims that need no GPU. One binary.
 
+mod deformers;
 mod frames;
 mod hostile;
+mod layering;
+mod pixels;
 mod restart;
 mod service;
 mod service_harness;
 mod steps;
+mod tolerance;
