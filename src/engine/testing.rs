@@ -15,6 +15,7 @@ pub(super) fn two_strips() -> Arc<Scene> {
         name: name.into(),
         shape: 0,
         material: 0,
+        runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
         rest_q: vec![],

@@ -85,6 +85,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         name: name.into(),
         shape: 0,
         material: 0,
+        runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
         rest_q: vec![],
