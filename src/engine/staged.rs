@@ -57,7 +57,12 @@ impl Staged {
     ///
     /// # Errors
     /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
-    pub fn deform(&mut self, state: &Arc<State>) -> Result<Deformed> {
+    pub fn deform(&mut self, state: &State) -> Result<Deformed> {
+        self.deform_shared(&Arc::new(state.clone()))
+    }
+
+    /// [`Self::deform`] of a state that others hold too, without a copy of it.
+    pub(super) fn deform_shared(&mut self, state: &Arc<State>) -> Result<Deformed> {
         self.filled = false;
         let deformed = match self.deformer.deform(state) {
             Ok(deformed) => deformed,
@@ -147,13 +152,13 @@ mod tests {
         let scene = Arc::clone(staged.scene());
         let mut good = State::rest(&scene);
         good.q[0] = 0.25;
-        staged.deform(&Arc::new(good.clone())).expect("a good step");
+        staged.deform(&good).expect("a good step");
         let before = staged.surface().expect("vertices").clone();
         let last = scene.layout.slots[1].first_q;
         for amount in [f32::MAX, 1e30] {
             let mut bad = good.clone();
             bad.q[last] = amount;
-            let refusal = staged.deform(&Arc::new(bad)).expect_err("overflows").to_string();
+            let refusal = staged.deform(&bad).expect_err("overflows").to_string();
             assert!(refusal.starts_with("step.q of domain 'right'"), "{refusal}");
             assert_eq!(staged.surface().expect("vertices"), &before);
             assert!(staged.bounds().is_finite());

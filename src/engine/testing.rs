@@ -17,6 +17,7 @@ pub(super) fn two_strips() -> Arc<Scene> {
         material: 0,
         placement: Transform::IDENTITY,
         attachment,
+        runs: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),

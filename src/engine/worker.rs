@@ -25,12 +25,31 @@ type Reply<T> = oneshot::Sender<Result<T>>;
 
 /// What the device thread can be asked for.
 pub(super) enum Command {
-    Stage { id: SceneId, scene: Arc<Scene>, reply: Reply<()> },
-    Deform { id: SceneId, state: Arc<State>, reply: Reply<Deformed> },
-    Draw { id: SceneId, camera: Camera, size: (u32, u32), reply: Reply<Image> },
+    Stage {
+        id: SceneId,
+        scene: Arc<Scene>,
+        reply: Reply<()>,
+    },
+    Deform {
+        id: SceneId,
+        state: Arc<State>,
+        reply: Reply<Deformed>,
+    },
+    Draw {
+        id: SceneId,
+        camera: Camera,
+        size: (u32, u32),
+        reply: Reply<Image>,
+    },
     /// Copies positions and normals out; the second value is its milliseconds.
-    Copy { id: SceneId, reply: Reply<(Arc<Surface>, f64)> },
-    Unstage { id: SceneId, reply: Reply<()> },
+    Copy {
+        id: SceneId,
+        reply: Reply<(Arc<Surface>, f64)>,
+    },
+    Unstage {
+        id: SceneId,
+        reply: Reply<()>,
+    },
     /// Ends the thread.
     Quit,
 }
@@ -143,7 +162,7 @@ fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, comman
             }
         }
         Command::Deform { id, state, reply } => {
-            reply.send(find(scenes, id).and_then(|staged| staged.deform(&state))).ok();
+            reply.send(find(scenes, id).and_then(|staged| staged.deform_shared(&state))).ok();
         }
         Command::Draw { id, camera, size: (width, height), reply } if !reply.is_closed() => {
             let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
@@ -167,8 +186,7 @@ fn copy(staged: &mut Staged) -> Result<(Arc<Surface>, f64)> {
     let begin = Instant::now();
     let surface = staged.surface()?;
     // Tangents are for the renderer alone and stay here.
-    let copy =
-        Surface { positions: surface.positions.clone(), normals: surface.normals.clone(), tangents: Vec::new() };
+    let copy = Surface { positions: surface.positions.clone(), normals: surface.normals.clone(), tangents: Vec::new() };
     Ok((Arc::new(copy), ms_since(begin)))
 }
 

@@ -16,21 +16,22 @@ pub struct Bounds {
 impl Bounds {
     pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
 
-    /// Grows to hold a point. A NaN makes the bounds not finite, so that nobody mistakes them for good.
+    /// Grows to hold a point. A NaN stays, so that nobody mistakes the bounds for finite ones.
     pub fn include(&mut self, point: [f64; 3]) {
-        for axis in 0..3 {
-            self.min[axis] = keep_nan(self.min[axis], point[axis], f64::min);
-            self.max[axis] = keep_nan(self.max[axis], point[axis], f64::max);
-        }
+        *self = self.union(Self { min: point, max: point });
     }
 
-    /// The smallest bounds that hold both.
-    pub fn union(mut self, other: Self) -> Self {
-        for axis in 0..3 {
-            self.min[axis] = keep_nan(self.min[axis], other.min[axis], f64::min);
-            self.max[axis] = keep_nan(self.max[axis], other.max[axis], f64::max);
+    /// The smallest bounds that hold both; NaN in either stays NaN.
+    pub fn union(self, other: Self) -> Self {
+        let pick = |a: f64, b: f64, least: bool| match (a.is_nan() || b.is_nan(), least) {
+            (true, _) => f64::NAN,
+            (false, true) => a.min(b),
+            (false, false) => a.max(b),
+        };
+        Self {
+            min: std::array::from_fn(|axis| pick(self.min[axis], other.min[axis], true)),
+            max: std::array::from_fn(|axis| pick(self.max[axis], other.max[axis], false)),
         }
-        self
     }
 
     pub fn is_finite(&self) -> bool {
@@ -56,11 +57,6 @@ impl Bounds {
             ))
         })
     }
-}
-
-/// `f64::min` and `f64::max` drop a NaN; bounds must never forget one.
-fn keep_nan(a: f64, b: f64, choose: fn(f64, f64) -> f64) -> f64 {
-    if a.is_nan() || b.is_nan() { f64::NAN } else { choose(a, b) }
 }
 
 /// Where the camera is.

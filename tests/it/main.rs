@@ -1,4 +1,4 @@
-//! Claims that need no GPU, in one binary.
+//! Claims that need no GPU. One binary.
 
 mod deformers;
 mod frames;
