@@ -80,7 +80,7 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 50551)),
+            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 50051)),
             scenes: None,
             state: default_state(),
             backend: BackendChoice::Auto,

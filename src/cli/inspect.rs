@@ -37,7 +37,8 @@ pub(super) fn run(args: &Args) -> Outcome {
 fn bytes_of(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
-    let per_corner = 4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
+    let per_corner =
+        4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
     12 * shape.mesh.rest().len()
         + per_corner * corners.vertices.len()
         + 12 * shape.mesh.triangles().len()
@@ -99,7 +100,10 @@ fn lines(scene: &Scene) -> Vec<String> {
     for (index, domain) in scene.domains.iter().enumerate().take(LISTED) {
         let slot = scene.layout.slots[index];
         let bytes = bytes_of(scene, index);
-        lines.push(format!("{:<28}{:>10}{:>6}{:>12}{:>14}", domain.name, slot.vertices, slot.rank, slot.triangles, bytes));
+        lines.push(format!(
+            "{:<28}{:>10}{:>6}{:>12}{:>14}",
+            domain.name, slot.vertices, slot.rank, slot.triangles, bytes
+        ));
     }
     if scene.domains.len() > LISTED {
         lines.push(format!("... and {} more (--json lists all)", scene.domains.len() - LISTED));
@@ -124,7 +128,12 @@ fn plans(scene: &Scene) -> Vec<String> {
         deform.kernels.iter().map(|kernel| format!("{} [{}]", kernel.name, kernel.defines.join(" "))).collect();
     let mut lines = vec![
         format!("kernels: {}; {} launches a step", kernels.join(", "), deform.launches()),
-        format!("passes: {}; {} draw calls; shaders [{}]", render.passes.join(", "), render.draws, render.defines.join(" ")),
+        format!(
+            "passes: {}; {} draw calls; shaders [{}]",
+            render.passes.join(", "),
+            render.draws,
+            render.defines.join(" ")
+        ),
         format!("device memory: {} bytes to deform, {} to render", deform.total_bytes(), render.bytes()),
     ];
     for part in &deform.left_out {

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use super::options::Size;
 use super::{Outcome, say};
@@ -53,10 +54,9 @@ pub(super) fn run(args: &Args) -> Outcome {
     if let Some(path) = &args.q {
         state.q = coordinates(&scene, path)?;
     }
-    let mut bench =
-        Workbench::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
+    let mut bench = Workbench::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
     let mut staged = bench.stage(&scene)?;
-    staged.deform(&state)?;
+    staged.deform(&Arc::new(state))?;
     let image = bench.draw(&mut staged, &camera(args, &scene), args.size.width, args.size.height)?;
     let bytes = frame::png(image.width, image.height, &image.rgba)?;
     fs::write(&args.out, bytes).map_err(during("write"))?;
@@ -88,6 +88,8 @@ fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
     }
     match array.iter().position(|number| !number.is_finite()) {
         None => Ok(array.iter().copied().collect()),
-        Some(at) => Err(invalid(format!("q in {place}, entry {at}"), "a finite number", format!("{:?}", array.iter().nth(at)))),
+        Some(at) => {
+            Err(invalid(format!("q in {place}, entry {at}"), "a finite number", format!("{:?}", array.iter().nth(at))))
+        }
     }
 }

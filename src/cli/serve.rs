@@ -2,18 +2,22 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Outcome, say};
 use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::engine::{Engine, Info};
 use crate::error::{Result, during};
+use crate::load::Repository;
+use crate::service;
 
 /// Serves scenes over gRPC until it is told to stop (SIGTERM or Ctrl-C), then drains and ends.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast serve                                   the built-in scenes on loopback
   modalcast serve --scenes ~/scenes                 and those of a folder
-  modalcast serve --listen 0.0.0.0:50551            for other machines too
+  modalcast serve --listen 0.0.0.0:50051            for other machines too
   modalcast serve --backend cpu --renderer software as on a machine without a GPU")]
 pub(super) struct Args {
     /// Where to listen; port 0 is any free one. The address is printed as 'listening on URL'.
@@ -78,5 +82,53 @@ impl Args {
             ..Config::default()
         }
         .checked()
+    }
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let config = args.config()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(during("serve"))?;
+    runtime.block_on(serve(config))?;
+    Ok(true)
+}
+
+async fn serve(config: Config) -> Result<()> {
+    let repository = Arc::new(Repository::new(config.scenes.as_deref())?);
+    // The address is taken before scenes are loaded, so that a second server fails at once.
+    let listener = service::bind(&config).await?;
+    let engine = Engine::start(config, repository).await?;
+    let address = listener.local_addr().map_err(during("serve"))?;
+    if !address.ip().is_loopback() {
+        tracing::warn!("{address} is open to other machines, without authentication");
+    }
+    describe(engine.info());
+    say(format!("listening on http://{address}"));
+    service::serve(engine, listener, told_to_stop()).await
+}
+
+/// Logs what deforms and what draws; a software renderer is said to be one.
+fn describe(info: &Info) {
+    tracing::info!("deforming on {} ({})", info.backend.name(), info.device);
+    match &info.renderer {
+        Ok(found) if found.software => tracing::warn!("drawing on the CPU: {}", found.renderer),
+        Ok(found) => tracing::info!("drawing on {}", found.renderer),
+        Err(error) => tracing::warn!("no frames can be drawn: {error}"),
+    }
+}
+
+/// Ctrl-C or SIGTERM.
+async fn told_to_stop() {
+    let interrupt = tokio::signal::ctrl_c();
+    match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
+        Ok(mut terminate) => {
+            tokio::select! {
+                _ = interrupt => {}
+                _ = terminate.recv() => {}
+            }
+        }
+        Err(error) => {
+            tracing::warn!("SIGTERM will not be heard: {error}");
+            interrupt.await.ok(); // Without a signal there is nothing else to wait for.
+        }
     }
 }

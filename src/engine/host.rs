@@ -62,8 +62,7 @@ impl Host {
         };
         let wake = Arc::new(Notify::new());
         let largest_window = means.config.largest_window;
-        let beginning =
-            Beginning { name: name.clone(), id, scene: Arc::clone(&scene), state, wake: Arc::clone(&wake) };
+        let beginning = Beginning { name: name.clone(), id, scene: Arc::clone(&scene), state, wake: Arc::clone(&wake) };
         let (conductor, last_step) = Conductor::new(beginning, means);
         let (mailbox, inbox) = mpsc::channel(MAILBOX);
         tokio::spawn(conductor.conduct(inbox));

@@ -25,12 +25,31 @@ type Reply<T> = oneshot::Sender<Result<T>>;
 
 /// What the device thread can be asked for.
 pub(super) enum Command {
-    Stage { id: SceneId, scene: Arc<Scene>, reply: Reply<()> },
-    Deform { id: SceneId, state: Arc<State>, reply: Reply<Deformed> },
-    Draw { id: SceneId, camera: Camera, size: (u32, u32), reply: Reply<Image> },
+    Stage {
+        id: SceneId,
+        scene: Arc<Scene>,
+        reply: Reply<()>,
+    },
+    Deform {
+        id: SceneId,
+        state: Arc<State>,
+        reply: Reply<Deformed>,
+    },
+    Draw {
+        id: SceneId,
+        camera: Camera,
+        size: (u32, u32),
+        reply: Reply<Image>,
+    },
     /// Copies positions and normals out; the second value is its milliseconds.
-    Copy { id: SceneId, reply: Reply<(Arc<Surface>, f64)> },
-    Unstage { id: SceneId, reply: Reply<()> },
+    Copy {
+        id: SceneId,
+        reply: Reply<(Arc<Surface>, f64)>,
+    },
+    Unstage {
+        id: SceneId,
+        reply: Reply<()>,
+    },
     /// Ends the thread.
     Quit,
 }
@@ -167,8 +186,7 @@ fn copy(staged: &mut Staged) -> Result<(Arc<Surface>, f64)> {
     let begin = Instant::now();
     let surface = staged.surface()?;
     // Tangents are for the renderer alone and stay here.
-    let copy =
-        Surface { positions: surface.positions.clone(), normals: surface.normals.clone(), tangents: Vec::new() };
+    let copy = Surface { positions: surface.positions.clone(), normals: surface.normals.clone(), tangents: Vec::new() };
     Ok((Arc::new(copy), ms_since(begin)))
 }
 

@@ -52,10 +52,7 @@ impl v1::scene_service_server::SceneService for Scenes {
         .await
     }
 
-    async fn list_scenes(
-        &self,
-        _: Request<v1::ListScenesRequest>,
-    ) -> Result<Response<v1::ListScenesResponse>, Status> {
+    async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
         let engine = self.0.clone();
         guarded(async move {
             let scenes = engine.list().iter().map(|host| scene_info(host, false)).collect();

@@ -104,11 +104,7 @@ impl Deadline {
     }
 
     /// The work's result, or `DEADLINE_EXCEEDED` when it is not there in time; the work is dropped then.
-    pub(super) async fn hold<T>(
-        self,
-        what: &str,
-        work: impl Future<Output = Result<T, Status>>,
-    ) -> Result<T, Status> {
+    pub(super) async fn hold<T>(self, what: &str, work: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
         let Some((at, ms)) = self.at else { return work.await };
         match tokio::time::timeout_at(at.into(), work).await {
             Ok(result) => result,
@@ -143,7 +139,10 @@ mod tests {
     fn pieces_cover_a_reply_once_and_an_empty_reply_is_one_piece() {
         let bytes = Bytes::from((0..=250).collect::<Vec<u8>>());
         let cut: Vec<_> = pieces(bytes.clone(), 100).collect();
-        assert_eq!(cut.iter().map(|(at, piece)| (*at, piece.len())).collect::<Vec<_>>(), [(0, 100), (100, 100), (200, 51)]);
+        assert_eq!(
+            cut.iter().map(|(at, piece)| (*at, piece.len())).collect::<Vec<_>>(),
+            [(0, 100), (100, 100), (200, 51)]
+        );
         assert_eq!(cut.iter().flat_map(|(_, piece)| piece.to_vec()).collect::<Vec<_>>(), bytes);
         assert_eq!(pieces(Bytes::new(), 100).collect::<Vec<_>>(), [(0, Bytes::new())]);
     }

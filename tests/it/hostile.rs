@@ -31,12 +31,24 @@ fn bad_steps() -> Vec<BadStep> {
         ("q of all, too short", step(11, &[], &[0.5; 3]), ["step.q", "16 bytes (4 coordinates)", "12 bytes"]),
         ("q cut within a number", odd, ["step.q of domain 'left'", "8 bytes", "7 bytes"]),
         ("NaN in q", step(11, &[0], &[0.0, f32::NAN]), ["step.q of domain 'left', mode 1", "a finite number", "NaN"]),
-        ("infinity in q", step(11, &[1], &[f32::INFINITY, 0.0]), ["step.q of domain 'right', mode 0", "a finite", "inf"]),
-        ("q that overflows", step(11, &[1], &[f32::MAX, 0.0]), ["step.q of domain 'right'", "q and transform", "vertex"]),
+        (
+            "infinity in q",
+            step(11, &[1], &[f32::INFINITY, 0.0]),
+            ["step.q of domain 'right', mode 0", "a finite", "inf"],
+        ),
+        (
+            "q that overflows",
+            step(11, &[1], &[f32::MAX, 0.0]),
+            ["step.q of domain 'right'", "q and transform", "vertex"],
+        ),
         ("no such domain, q", step(11, &[0, 2], &[0.0; 4]), ["step.q_domains[1]", "an index below 2", "2"]),
         ("no such domain, T", transforms(&[9], &[0.0; 12]), ["step.transform_domains[0]", "an index below 2", "9"]),
         ("T too short", transforms(&[0], &[0.0; 11]), ["step.transforms", "48 bytes", "44 bytes"]),
-        ("infinity in T", transforms(&[1], &infinite), ["step.transforms of domain 'right': transform[7]", "a finite", "inf"]),
+        (
+            "infinity in T",
+            transforms(&[1], &infinite),
+            ["step.transforms of domain 'right': transform[7]", "a finite", "inf"],
+        ),
         ("NaN time", timeless, ["step.time", "a finite number", "NaN"]),
         ("a number that goes back", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
         ("a number that comes again", step(10, &[0], &[0.0; 2]), ["step.number", "a number above 10", "10"]),
@@ -169,7 +181,8 @@ async fn bad_questions_are_refused_with_code_field_expected_and_given() {
 
 /// An upload of one file `scene.txt`, to be spoilt.
 fn upload(contents: &[u8]) -> Vec<Part> {
-    let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
+    let header =
+        v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
     let sha256 = Sha256::digest(contents).to_vec().into();
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: contents.len() as u64, sha256 };
     vec![Part::Header(header), Part::File(file), Part::Chunk(contents.to_vec().into())]
@@ -197,17 +210,29 @@ async fn bad_uploads_are_refused_by_name_and_leave_nothing_behind() {
     let table: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
         ("nothing at all", vec![], ["part", "a header first", "nothing"]),
         ("no header", upload(b"strips").split_off(1), ["part", "a header first", "a file or chunk"]),
-        ("a hash that differs", spoilt(|_, file| file.sha256 = vec![7; 32].into()), ["file.sha256 of 'scene.txt'", "0707", ""]),
+        (
+            "a hash that differs",
+            spoilt(|_, file| file.sha256 = vec![7; 32].into()),
+            ["file.sha256 of 'scene.txt'", "0707", ""],
+        ),
         ("no hash", spoilt(|_, file| file.sha256 = vec![7; 3].into()), ["file.sha256", "32 bytes", "3 bytes"]),
         ("out of the folder", path("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
         ("absolute", path("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
         ("backslashes", path("..\\scene.txt"), ["file.path", "a relative path", ""]),
         ("truncated", upload(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
         ("too few bytes announced", spoilt(|header, _| header.total_bytes = 5), ["header.total_bytes", "5", "6"]),
-        ("more than the limit", spoilt(|header, _| header.total_bytes = 1001), ["header.total_bytes", "at most 1000", "1001"]),
+        (
+            "more than the limit",
+            spoilt(|header, _| header.total_bytes = 1001),
+            ["header.total_bytes", "at most 1000", "1001"],
+        ),
         ("a file too few", spoilt(|header, _| header.files = 2), ["header.files", "2", "1"]),
         ("a bad name", spoilt(|header, _| header.scene = "a/b".into()), ["scene", "1 to 64", "\"a/b\""]),
-        ("a bad entry", spoilt(|header, _| header.entry = "../x".into()), ["header.entry", "a relative path", "\"../x\""]),
+        (
+            "a bad entry",
+            spoilt(|header, _| header.entry = "../x".into()),
+            ["header.entry", "a relative path", "\"../x\""],
+        ),
         ("an entry that is not there", spoilt(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
         ("no scene in it", upload(b"lunch"), ["scene", "a scene", "lunch"]),
     ];

@@ -5,6 +5,7 @@ mod frames;
 mod hostile;
 mod layering;
 mod pixels;
+mod real;
 mod restart;
 mod service;
 mod service_harness;

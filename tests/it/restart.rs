@@ -123,7 +123,8 @@ fn an_upload_comes_back_and_a_closed_scene_does_not() {
         };
         let header =
             v1::UploadHeader { scene: "mine".into(), entry: "deep/scene.txt".into(), files: 1, total_bytes: 6 };
-        let parts = [Part::Header(header), Part::File(file), Part::Chunk(b"str"[..].into()), Part::Chunk(b"ips"[..].into())];
+        let parts =
+            [Part::Header(header), Part::File(file), Part::Chunk(b"str"[..].into()), Part::Chunk(b"ips"[..].into())];
         let requests = parts.map(|part| v1::UploadSceneRequest { part: Some(part) });
         server.scenes().await.upload_scene(tokio_stream::iter(requests)).await.expect("uploads");
         let delete = v1::DeleteSceneRequest { scene: "strips".into() };

@@ -57,8 +57,7 @@ async fn a_client_that_holds_nothing_learns_the_whole_scene() {
     let info = server.open("strips").await;
     assert_eq!((info.domains, info.vertices, info.corners, info.triangles, info.coordinates), (2, 8, 8, 4, 4));
     assert_eq!((info.up.as_str(), info.unit, info.last_step), ("y", 1.0, None));
-    let all =
-        [Array::Indices, Array::CornerVertices, Array::RestPositions, Array::Uvs, Array::RestNormals];
+    let all = [Array::Indices, Array::CornerVertices, Array::RestPositions, Array::Uvs, Array::RestNormals];
     let (domains, contents) = describe(&server, "strips", &all).await;
     let scene = strips();
     let mesh = &scene.shapes[0].mesh;
@@ -73,7 +72,10 @@ async fn a_client_that_holds_nothing_learns_the_whole_scene() {
     let [left, right] = domains.as_slice() else { panic!("{domains:?}") };
     assert_eq!((left.name.as_str(), left.vertices, left.rank, left.parent), ("left", 4, 2, None));
     assert_eq!((left.eigenvalues.as_slice(), left.notes["species"].as_str()), ([1.0, 4.0].as_slice(), "none"));
-    assert_eq!((right.name.as_str(), right.parent, right.attachment_rows.as_slice()), ("right", Some(0), [1, 3].as_slice()));
+    assert_eq!(
+        (right.name.as_str(), right.parent, right.attachment_rows.as_slice()),
+        ("right", Some(0), [1, 3].as_slice())
+    );
     assert_eq!((right.attachment_frame.len(), right.placement.len(), right.shape), (48, 48, 0));
     let columns = &scene.shapes[0].modes;
     let rows = |vertex: usize| (0..3).flat_map(move |part| (0..2).map(move |mode| columns.at(vertex, part, mode)));

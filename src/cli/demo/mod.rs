@@ -9,6 +9,8 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use clap::ValueEnum as _;
+
 use super::options::Size;
 use super::{Outcome, say};
 use crate::config::BackendChoice;
@@ -147,7 +149,8 @@ fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
 fn server_flags<'a>(args: &'a Args, input: &'a Input, scratch: &'a std::path::Path) -> Vec<String> {
     let mut flags = vec!["serve".to_owned(), "--listen".into(), "127.0.0.1:0".into(), "--state".into()];
     flags.push(scratch.join("state").to_string_lossy().into_owned());
-    flags.extend(["--backend".into(), args.backend.name().into()]);
+    let backend = args.backend.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
+    flags.extend(["--backend".into(), backend]);
     if let Some(repository) = &input.repository {
         flags.extend(["--scenes".into(), repository.to_string_lossy().into_owned()]);
     }

@@ -33,7 +33,9 @@ impl Verdict {
     /// Compares every received vertex of every step with the reference.
     pub(super) fn of(scene: &Scene, ran: &Ran, wanted: u32) -> Result<Self> {
         let steps = ran.vertices.shape()[0];
-        if ran.q.shape()[0] != steps || ran.transforms.shape()[0] != steps || ran.vertices.shape()[1] != scene.layout.vertices
+        if ran.q.shape()[0] != steps
+            || ran.transforms.shape()[0] != steps
+            || ran.vertices.shape()[1] != scene.layout.vertices
         {
             let given = format!("{:?}, {:?}, {:?}", ran.q.shape(), ran.transforms.shape(), ran.vertices.shape());
             return Err(invalid("demo", "as many steps of q, transforms and vertices as frames", given));
@@ -88,7 +90,10 @@ impl Verdict {
         rows.extend(self.stages.iter().map(|(stage, ms)| (format!("  {stage}"), format!("{ms:.2} ms"))));
         let share = 100.0 * self.relative_displacement;
         rows.extend([
-            ("error against f64".into(), format!("{:.2e} units, {:.1e} of the diagonal", self.error, self.relative_error)),
+            (
+                "error against f64".into(),
+                format!("{:.2e} units, {:.1e} of the diagonal", self.error, self.relative_error),
+            ),
             ("largest displacement".into(), format!("{:.3} units, {share:.1} % of the diagonal", self.displacement)),
             ("sway at the top".into(), format!("{:.1} % of the height", 100.0 * self.sway)),
         ]);
@@ -141,7 +146,9 @@ impl Crown {
 fn state(scene: &Scene, ran: &Ran, step: usize) -> State {
     let mut state = State::rest(scene);
     state.q = ran.q.index_axis(ndarray::Axis(0), step).to_vec();
-    for (transform, sent) in state.transforms.iter_mut().zip(ran.transforms.index_axis(ndarray::Axis(0), step).outer_iter()) {
+    for (transform, sent) in
+        state.transforms.iter_mut().zip(ran.transforms.index_axis(ndarray::Axis(0), step).outer_iter())
+    {
         *transform = Transform(std::array::from_fn(|entry| sent[entry]));
     }
     state
@@ -163,7 +170,9 @@ fn text(value: &Value, key: &str) -> String {
 /// Median milliseconds per stage, as the fetching client summed them up.
 fn stages(frames: &Value) -> Vec<(String, f64)> {
     let object = frames["stages_ms"].as_object();
-    object.map(|all| all.iter().filter_map(|(name, ms)| Some((name.clone(), ms.as_f64()?))).collect()).unwrap_or_default()
+    object
+        .map(|all| all.iter().filter_map(|(name, ms)| Some((name.clone(), ms.as_f64()?))).collect())
+        .unwrap_or_default()
 }
 
 #[cfg(test)]
