@@ -18,7 +18,6 @@ pub(super) fn two_strips() -> Arc<Scene> {
         runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
-        runs: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),

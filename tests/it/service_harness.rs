@@ -251,6 +251,11 @@ impl Driver {
         while within(replies.message()).await.expect("a clean end").is_some() {}
     }
 
+    /// Its two directions, to be used at the same time.
+    pub(crate) fn split(self) -> (mpsc::Sender<v1::DriveSceneRequest>, Streaming<v1::DriveSceneResponse>) {
+        (self.sender, self.replies)
+    }
+
     /// Goes away without a word.
     pub(crate) fn vanish(self) {}
 }
