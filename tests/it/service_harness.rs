@@ -87,6 +87,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         material: 0,
         placement: Transform::IDENTITY,
         attachment,
+        runs: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),
