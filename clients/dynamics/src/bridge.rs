@@ -134,9 +134,7 @@ fn deflection(part: &Part, q: &DVector<f64>) -> f64 {
 
 /// The strength of a load whose equilibrium deflects as wanted, and that equilibrium. The load grows step by step, each
 /// solved from the last.
-fn calibrate(
-    system: &System, part: &Part, direction: &DVector<f64>, wanted: f64,
-) -> Result<(f64, DVector<f64>)> {
+fn calibrate(system: &System, part: &Part, direction: &DVector<f64>, wanted: f64) -> Result<(f64, DVector<f64>)> {
     let rest = DVector::zeros(system.rank());
     // A thousandth of the way is linear enough to know how strong to begin.
     let tiny = 1e-6 * direction.norm().recip();

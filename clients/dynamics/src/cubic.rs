@@ -79,9 +79,9 @@ impl ReducedForce {
         if body.len() != expected {
             return Err(invalid("cub.size", format!("{} bytes", 16 + expected), bytes.len()));
         }
-        let mut numbers = body.chunks_exact(8).map(|word| {
-            f64::from_le_bytes([word[0], word[1], word[2], word[3], word[4], word[5], word[6], word[7]])
-        });
+        let mut numbers = body
+            .chunks_exact(8)
+            .map(|word| f64::from_le_bytes([word[0], word[1], word[2], word[3], word[4], word[5], word[6], word[7]]));
         let mut block = |count: usize| numbers.by_ref().take(rank * count).collect::<Vec<_>>();
         let (linear, quadratic, cubic) = (block(monomials[0]), block(monomials[1]), block(monomials[2]));
         Self::new(rank, &linear, quadratic, cubic)

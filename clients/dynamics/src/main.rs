@@ -68,8 +68,10 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
         if tokio::signal::ctrl_c().await.is_ok() {
             stopper.send_replace(true);
         }
-        // The receiver must not see its sender go, or it could not tell that from a stop.
-        std::future::pending::<()>().await;
+        // The first interrupt ends the run in order; a second one does not wait for a server that has stalled.
+        if tokio::signal::ctrl_c().await.is_ok() {
+            std::process::exit(130);
+        }
     });
     let options = Options {
         steps: common.count(),

@@ -137,7 +137,8 @@ impl Model {
     }
 
     fn assemble<'a>(
-        description: &SceneDescription, choices: Vec<Choice>,
+        description: &SceneDescription,
+        choices: Vec<Choice>,
         rows: impl Fn(&Domain, &[u32]) -> Option<&'a ModeRows>,
     ) -> Result<Self> {
         let (mut parts, mut coordinates): (Vec<Part>, _) = (vec![], 0);
@@ -189,9 +190,8 @@ impl Model {
     pub fn peak(&self, q: &[f64], world: &[Affine]) -> f64 {
         let parts = self.parts.iter().zip(world);
         let of = |(part, pose): (&Part, &Affine)| {
-            let moved = |sample: &Sample| {
-                (pose.apply(&sample.moved(part.q(q))) - part.placement.apply(&sample.rest)).norm()
-            };
+            let moved =
+                |sample: &Sample| (pose.apply(&sample.moved(part.q(q))) - part.placement.apply(&sample.rest)).norm();
             let origin = (pose.translation - part.placement.translation).norm();
             part.samples[..part.skin].iter().map(moved).fold(origin, f64::max)
         };

@@ -149,8 +149,7 @@ impl System {
 
     fn backward_euler(&self, motion: &Motion, dt: f64, load: &DVector<f64>) -> Motion {
         let ahead = &motion.q + &motion.v * dt;
-        let problem =
-            Problem { inertia: 1.0 / (dt * dt), rate: 1.0 / dt, q: ahead, v: motion.v.clone(), load };
+        let problem = Problem { inertia: 1.0 / (dt * dt), rate: 1.0 / dt, q: ahead, v: motion.v.clone(), load };
         let q = self.minimise(&problem, &motion.q);
         let v = (&q - &motion.q) / dt;
         Motion { q, v, ..motion.clone() }

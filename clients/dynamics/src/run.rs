@@ -80,7 +80,10 @@ struct Tally {
 /// # Errors
 /// `Client` when the scene is taken, the stream ends or a record cannot be written.
 pub async fn run(
-    client: &Client, scenario: &mut dyn Scenario, options: &Options, stop: &watch::Receiver<bool>,
+    client: &Client,
+    scenario: &mut dyn Scenario,
+    options: &Options,
+    stop: &watch::Receiver<bool>,
 ) -> Result<Summary> {
     let scene = scenario.model().scene.clone();
     let mut drive = client.drive(&scene, options.policy, options.window).await?;

@@ -79,8 +79,7 @@ impl Sway {
     pub fn new(model: Model, options: Options) -> Result<Self> {
         let (along, across) = model.ground_axes();
         let along = (along + 0.35 * across).normalize();
-        let wind =
-            Wind { seed: options.seed, along, across: model.up.cross(&along), delay: 0.25 / model.height() };
+        let wind = Wind { seed: options.seed, along, across: model.up.cross(&along), delay: 0.25 / model.height() };
         let modes = oscillators(&model, options.dt)?;
         let loads = model.parts.iter().map(|part| load(&model, part, &wind)).collect();
         let mut sway = Self {
@@ -326,9 +325,8 @@ fn load(model: &Model, part: &Part, wind: &Wind) -> Load {
         let parent = &model.parts[joint.parent];
         let ring = joint.ring.iter().map(|place| &parent.samples[*place]);
         let (count, turn) = (joint.ring.len().max(1) as f64, parent.placement.linear);
-        let mean = |mode: usize| {
-            ring.clone().map(|sample| sample.column(mode, parent.rank)).sum::<Vector3<f64>>() / count
-        };
+        let mean =
+            |mode: usize| ring.clone().map(|sample| sample.column(mode, parent.rank)).sum::<Vector3<f64>>() / count;
         let columns: Vec<Vector3<f64>> = (0..parent.rank).map(|mode| turn * mean(mode)).collect();
         (0..3).flat_map(|component| columns.iter().map(move |column| column[component])).collect()
     });

@@ -72,7 +72,8 @@ mod tests {
             let time = f64::from(step) * 0.01;
             let here = wind.pressure(time, 3, 0.5);
             assert_eq!(here, wind.pressure(time, 3, 0.5));
-            same += usize::from(here == wind.pressure(time, 4, 0.5)) + usize::from(here == other.pressure(time, 3, 0.5));
+            same +=
+                usize::from(here == wind.pressure(time, 4, 0.5)) + usize::from(here == other.pressure(time, 3, 0.5));
             largest = largest.max(here.0.abs()).max(here.1.abs());
         }
         assert!(same == 0 && largest <= 1.2, "{same} {largest}");
