@@ -67,7 +67,8 @@ fn rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     let parts = correlation.svd(true, true);
     let (Some(left), Some(right)) = (parts.u, parts.v_t) else { return Matrix3::identity() };
     let sizes = parts.singular_values;
-    if !(sizes[1] > 1e-9 * sizes[0]) || !sizes[0].is_normal() {
+    let spread = sizes[0].is_normal() && sizes[1] > 1e-9 * sizes[0];
+    if !spread {
         return Matrix3::identity();
     }
     let mirrored = (left * right).determinant() < 0.0;

@@ -164,7 +164,8 @@ impl System {
             let gradient = self.gradient(problem, &q);
             let direction = self.newton(problem, &q, &gradient);
             let slope = gradient.dot(&direction);
-            if !(slope < 0.0) {
+            let descends = slope < 0.0;
+            if !descends {
                 return q;
             }
             // Near the minimum the fall is lost in rounding: there the gradient decides.

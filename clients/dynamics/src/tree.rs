@@ -185,7 +185,8 @@ impl Sway {
         };
         let wanted = self.options.sway * self.options.wind;
         let mut high = self.strongest(bending);
-        if !(wanted > 0.0) || high == 0.0 {
+        let asked = wanted > 0.0 && high > 0.0;
+        if !asked {
             return (vec![0.0; bending.len()], 0.0);
         }
         if reached(high) > wanted {
