@@ -77,6 +77,14 @@ pub struct Attachment {
     pub rows: Vec<u32>,
 }
 
+/// Where a material begins in a domain's triangles; it holds until the next run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Run {
+    pub first_triangle: usize,
+    /// Index into the scene's materials.
+    pub material: usize,
+}
+
 /// One deformable (or, with rank 0, rigid) object of a scene.
 #[derive(Debug, Clone)]
 pub struct Domain {
@@ -85,6 +93,9 @@ pub struct Domain {
     pub shape: usize,
     /// Index into the scene's materials.
     pub material: usize,
+    /// Several materials by runs of triangles, the first at triangle 0, ascending; empty when all triangles have
+    /// `material`.
+    pub runs: Vec<Run>,
     /// `world_from_domain` until a step says otherwise.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
@@ -93,4 +104,12 @@ pub struct Domain {
     /// A domain with a smaller index and the same rank whose coordinates this one shares (glTF node weights).
     pub shares_q_with: Option<usize>,
     pub metadata: Metadata,
+}
+
+impl Domain {
+    /// Indices of the materials that its triangles have, one per run.
+    pub fn materials(&self) -> impl Iterator<Item = usize> + '_ {
+        let only = self.runs.is_empty().then_some(self.material);
+        only.into_iter().chain(self.runs.iter().map(|run| run.material))
+    }
 }

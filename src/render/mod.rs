@@ -1,9 +1,40 @@
 //! Headless OpenGL: a scene's buffers, the passes that draw it, and the pixels back.
+//!
+//! | pass | what it does | runs when |
+//! |---|---|---|
+//! | shadow | depth from the sun; cut-outs leave holes | the look has a shadow |
+//! | blur | depth to moments, blurred in x, then in y (compute) | the look has a shadow |
+//! | opaque | Phong, colour and normal maps; mask discards | some triangle is not blended |
+//! | sky, ground | gradient; plane that receives the shadow and fades into the horizon | always; the look has a ground |
+//! | blended | the same shading over what is there, no depth written | some triangle is blended |
+//! | encode | four samples to one sRGB pixel, top row first (compute) | always |
 
+mod device;
+mod egl;
+mod frame;
+mod geometry;
+mod gl;
+mod light;
+mod passes;
+mod plan;
+mod scene_buffers;
+mod shaders;
+mod target;
+mod textures;
+
+use std::collections::HashMap;
+use std::rc::Rc;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
+pub use self::device::{EglDevice, devices};
+use self::gl::{Gl, Program};
+pub use self::plan::{Allocation, Plan, Saving, plan};
+pub use self::scene_buffers::SceneBuffers;
+use self::shaders::Source;
+use self::target::Target;
 use crate::deform::Surface;
-use crate::error::{Result, during};
+use crate::error::{Result, during, invalid};
 use crate::scene::{Bounds, Camera, Scene};
 
 /// Which EGL device to draw on.
@@ -63,16 +94,35 @@ pub struct SharedBuffers {
     pub tangents: Option<u32>,
 }
 
-/// A scene's buffers, textures and programs on the device.
-#[derive(Debug)]
-pub struct SceneBuffers {
-    pub shared: SharedBuffers,
+/// What the last frame really ran.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Ran {
+    /// Passes, in order.
+    pub passes: Vec<&'static str>,
+    /// Draw calls of the opaque and blended passes.
+    pub draws: usize,
+    /// Samples a pixel.
+    pub samples: u32,
 }
+
+/// The largest side of a frame, whatever the device can do.
+const MAX_SIDE: u32 = 8192;
+/// Frame sizes whose images are kept.
+const TARGETS: usize = 4;
+/// Programs that are kept for scenes to come.
+const PROGRAMS: usize = 128;
+/// How long the device may take for one frame.
+const WATCHDOG: Duration = Duration::from_secs(60);
 
 /// The EGL and OpenGL contexts. Lives and dies on the device thread.
 #[derive(Debug)]
 pub struct Renderer {
     info: Info,
+    gl: Rc<Gl>,
+    programs: HashMap<Source, Rc<Program>>,
+    /// The most recently used last.
+    targets: Vec<Target>,
+    ran: Ran,
 }
 
 impl Renderer {
@@ -81,7 +131,15 @@ impl Renderer {
     /// # Errors
     /// `Unavailable` naming the missing library or vendor file.
     pub fn open(prefer: Prefer) -> Result<Self> {
-        Err(during("render")(format!("not built yet: {prefer:?}")))
+        let (gl, cuda_device) = device::open(prefer)?;
+        let info = Info {
+            renderer: gl.limits.renderer.clone(),
+            version: gl.limits.version.clone(),
+            software: gl.limits.software,
+            cuda_device,
+            max_side: gl.limits.max_side.min(MAX_SIDE),
+        };
+        Ok(Self { info, gl, programs: HashMap::new(), targets: Vec::new(), ran: Ran::default() })
     }
 
     /// What draws.
@@ -89,30 +147,110 @@ impl Renderer {
         &self.info
     }
 
+    /// What the last frame really ran.
+    pub const fn ran(&self) -> &Ran {
+        &self.ran
+    }
+
     /// Loads what never changes of a scene, and makes room for what does.
     ///
     /// # Errors
-    /// `Fault` when a shader or a buffer is refused.
+    /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
-        Err(during("render")(format!("not built yet: {}", scene.name)))
+        let gl = Rc::clone(&self.gl);
+        let samples = target::most_samples(&gl);
+        if self.programs.len() > PROGRAMS {
+            self.programs.clear();
+        }
+        let buffers = SceneBuffers::new(&gl, scene, samples, &mut |source| self.program(source))?;
+        gl.check("load").map(|()| buffers)
     }
 
     /// Frees a scene's buffers.
-    pub fn unload(&mut self, _buffers: SceneBuffers) {}
+    pub fn unload(&mut self, buffers: SceneBuffers) {
+        drop(buffers);
+    }
 
     /// Fills the shared buffers from host memory.
     ///
     /// # Errors
-    /// `Fault` when OpenGL reports one.
-    pub fn upload(&mut self, _buffers: &SceneBuffers, _surface: &Surface) -> Result<()> {
-        Err(during("render")("not built yet"))
+    /// `Fault` when the surface is not the scene's, or OpenGL reports an error.
+    pub fn upload(&mut self, buffers: &SceneBuffers, surface: &Surface) -> Result<()> {
+        for (name, list) in
+            [("positions", &surface.positions), ("normals", &surface.normals), ("tangents", &surface.tangents)]
+        {
+            let Some(buffer) = buffers.buffers.get(name) else { continue };
+            if 4 * list.len() as u64 != buffer.bytes {
+                return Err(during("upload")(format!(
+                    "{} numbers of {name}, {} expected",
+                    list.len(),
+                    buffer.bytes / 4
+                )));
+            }
+            buffer.write(bytemuck::cast_slice(list));
+        }
+        self.gl.check("upload")
     }
 
     /// Draws one frame of what the shared buffers hold.
     ///
     /// # Errors
-    /// `Invalid` for a size above the limit, `Fault` when OpenGL reports one.
-    pub fn draw(&mut self, _buffers: &SceneBuffers, _shot: &Shot) -> Result<Image> {
-        Err(during("render")("not built yet"))
+    /// `Invalid` for a size above the limit or a camera that overflows, `Fault` naming the pass when OpenGL reports an
+    /// error or the device does not finish.
+    pub fn draw(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Image> {
+        let limit = self.info.max_side;
+        if ![shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
+            let given = format!("{} x {}", shot.width, shot.height);
+            return Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given));
+        }
+        let numbers = frame::Frame::new(&buffers.scene, shot)?;
+        self.make_room(shot.width, shot.height)?;
+        let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
+        let gl = &self.gl;
+        let mut ran = Ran { samples: target.samples, ..Ran::default() };
+        buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
+        passes::bind(buffers)?;
+        let shadow = gl.timed(|| passes::shadow(gl, buffers, &mut ran))?;
+        let draw = gl.timed(|| {
+            passes::draw(gl, buffers, target, shot, &mut ran)?;
+            passes::encode(gl, target, &mut ran)
+        })?;
+        let bytes = 4 * shot.width as usize * shot.height as usize;
+        let copy = gl.timed(|| {
+            gl.copy(&target.packed, &target.staging, bytes as u64);
+            Ok(())
+        })?;
+        gl.wait("read", WATCHDOG)?;
+        let begin = Instant::now();
+        let rgba = target.staging.read(bytes)?;
+        let mapped = begin.elapsed().as_secs_f64() * 1e3;
+        let passes = vec![("shadow", shadow.ms()), ("draw", draw.ms()), ("read", copy.ms() + mapped)];
+        gl.check("read")?;
+        self.ran = ran;
+        Ok(Image { width: shot.width, height: shot.height, rgba, passes })
+    }
+
+    /// Puts the images for frames of this size last in the list, made if need be.
+    fn make_room(&mut self, width: u32, height: u32) -> Result<()> {
+        if let Some(at) = self.targets.iter().position(|target| (target.width, target.height) == (width, height)) {
+            self.targets[at..].rotate_left(1);
+            return Ok(());
+        }
+        if self.targets.len() >= TARGETS {
+            self.targets.remove(0);
+        }
+        let encode = self.program(shaders::encode(target::samples(&self.gl, width, height)))?;
+        self.targets.push(Target::new(&self.gl, width, height, encode)?);
+        Ok(())
+    }
+
+    fn program(&mut self, source: Source) -> Result<Rc<Program>> {
+        if let Some(program) = self.programs.get(&source) {
+            return Ok(Rc::clone(program));
+        }
+        let stages: Vec<(u32, &str)> = source.stages.iter().map(|(stage, text)| (*stage, text.as_str())).collect();
+        let program = Rc::new(self.gl.program(&source.label, &stages)?);
+        self.programs.insert(source, Rc::clone(&program));
+        Ok(program)
     }
 }

@@ -157,6 +157,7 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
     };
     below("shape", domain.shape, parts.shapes.len())?;
     below("material", domain.material, parts.materials.len())?;
+    check_runs(parts, domain)?;
     let rank = parts.shapes[domain.shape].modes.rank();
     crate::domain::Transform::new(domain.placement.0).map_err(|error| error.within("placement"))?;
     if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
@@ -183,11 +184,28 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
     Ok(())
 }
 
+fn check_runs(parts: &Parts, domain: &Domain) -> Result<()> {
+    let triangles = parts.shapes[domain.shape].mesh.triangles().len();
+    for (index, run) in domain.runs.iter().enumerate() {
+        let before = index.checked_sub(1).map(|before| domain.runs[before].first_triangle);
+        let in_order = before.map_or(run.first_triangle == 0, |before| run.first_triangle > before);
+        if !in_order || run.first_triangle >= triangles {
+            let expected = format!("0 for the first, then ascending, below {triangles}");
+            return Err(invalid(format!("runs[{index}].first_triangle"), expected, run.first_triangle));
+        }
+        if run.material >= parts.materials.len() {
+            let expected = format!("an index below {}", parts.materials.len());
+            return Err(invalid(format!("runs[{index}].material"), expected, run.material));
+        }
+    }
+    Ok(())
+}
+
 /// Tangents only where a normal map will read them.
 fn add_tangents(parts: &mut Parts) {
     for domain in &parts.domains {
         let shape = &mut parts.shapes[domain.shape];
-        let mapped = parts.materials[domain.material].normal_texture.is_some();
+        let mapped = domain.materials().any(|material| parts.materials[material].normal_texture.is_some());
         if mapped && !shape.mesh.corners().uvs.is_empty() {
             shape.add_tangents();
         }
@@ -202,10 +220,61 @@ impl Parts {
 
     /// Whether any domain's material has this property.
     pub(crate) fn any_material(&self, has: impl Fn(&Material) -> bool) -> bool {
-        self.domains.iter().any(|domain| has(&self.materials[domain.material]))
+        self.domains.iter().flat_map(Domain::materials).any(|material| has(&self.materials[material]))
     }
 
     pub(crate) fn any_mask(&self) -> bool {
         self.any_material(|material| matches!(material.alpha_mode, AlphaMode::Mask { .. }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Mesh, Modes, Run, Transform};
+
+    /// One domain of two triangles, with a plain and a blended material.
+    fn square(runs: Vec<Run>) -> Parts {
+        let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+        let domain = Domain {
+            name: "square".into(),
+            shape: 0,
+            material: 0,
+            runs,
+            placement: Transform::IDENTITY,
+            attachment: None,
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: crate::domain::Metadata::default(),
+        };
+        let mut parts = Parts::named("square");
+        parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
+        parts.materials = vec![Material::default(), Material { alpha_mode: AlphaMode::Blend, ..Material::default() }];
+        parts.domains.push(domain);
+        parts
+    }
+
+    fn run(first_triangle: usize, material: usize) -> Run {
+        Run { first_triangle, material }
+    }
+
+    #[test]
+    fn a_material_of_any_run_counts_for_what_the_scene_needs() {
+        assert!(Scene::new(square(vec![run(0, 0), run(1, 1)])).expect("good").needs.blend);
+        assert!(!Scene::new(square(vec![])).expect("good").needs.blend, "the second material is unused");
+    }
+
+    #[test]
+    fn runs_out_of_order_or_out_of_range_are_refused_by_name() {
+        for (runs, field) in [
+            (vec![run(1, 0)], "domain 0: runs[0].first_triangle"),
+            (vec![run(0, 0), run(0, 1)], "domain 0: runs[1].first_triangle"),
+            (vec![run(0, 0), run(2, 1)], "domain 0: runs[1].first_triangle"),
+            (vec![run(0, 2)], "domain 0: runs[0].material"),
+        ] {
+            let refusal = Scene::new(square(runs)).expect_err(field).to_string();
+            assert!(refusal.starts_with(field), "{refusal}");
+        }
     }
 }

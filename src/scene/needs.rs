@@ -27,7 +27,7 @@ impl Needs {
             modes: parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0),
             textures: parts.any_material(|material| material.colour_texture.is_some()),
             normal_maps: parts.domains.iter().any(|domain| {
-                parts.materials[domain.material].normal_texture.is_some()
+                domain.materials().any(|material| parts.materials[material].normal_texture.is_some())
                     && !parts.shapes[domain.shape].tangents().is_empty()
             }),
             mask: parts.any_mask(),

@@ -1,7 +1,32 @@
-//! The built-in scene `tree`, made in code from a seed.
+//! The built-in scene `tree`, made in code from a seed: beams to modes, modes to skin.
+//!
+//! A trunk of 7 m carries boughs, boughs carry twigs, all carry leaf clusters. Every wooden part is a clamped
+//! Euler-Bernoulli beam along its centreline that carries the masses of its children where they hang; its modes are
+//! lifted to the skin. Modes are mass-orthonormal in kg, so that modal forces are U^T f in newtons.
+//!
+//! The frame of a part: its origin is the centre of its base, +Y runs along its start, +Z looks up as far as that allows.
 
-use crate::error::{Result, during};
-use crate::scene::Parts;
+mod bark;
+mod beam;
+mod centreline;
+mod cluster;
+mod element;
+mod leaf_image;
+mod lift;
+mod mold;
+mod noise;
+mod plan;
+mod random;
+mod sheet;
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
+
+use crate::domain::{AlphaMode, Attachment, Domain, Material, Metadata, Transform};
+use crate::error::Result;
+use crate::scene::{Look, Parts};
+use mold::{Bud, Kind, Mold};
+use random::Random;
 
 /// What the tree is made from.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,10 +40,261 @@ impl Default for Recipe {
     }
 }
 
+/// Index of the bark among the materials; the leaves follow.
+const BARK: usize = 0;
+
+/// Two kinds of leaves: those in the shade and those in the light.
+const LEAVES: [(&str, leaf_image::Palette); 2] = [
+    (
+        "leaf",
+        leaf_image::Palette {
+            blade: [92.0, 133.0, 52.0],
+            edge: [78.0, 118.0, 44.0],
+            vein: [150.0, 176.0, 96.0],
+            stem: [112.0, 112.0, 62.0],
+        },
+    ),
+    (
+        "light leaf",
+        leaf_image::Palette {
+            blade: [124.0, 156.0, 58.0],
+            edge: [106.0, 142.0, 50.0],
+            vein: [176.0, 194.0, 110.0],
+            stem: [130.0, 122.0, 66.0],
+        },
+    ),
+];
+
 /// Grows the tree.
 ///
 /// # Errors
 /// `Fault` when the eigenproblem of a beam does not converge.
 pub fn grow(recipe: &Recipe) -> Result<Parts> {
-    Err(during("tree")(format!("not grown yet: {recipe:?}")))
+    let mut random = Random::new(recipe.seed);
+    let mut parts = Parts::named("tree");
+    parts.rigid_transforms = true;
+    parts.look = Look { sun: [0.52, 0.74, 0.62], ..Look::default() };
+    add_materials(&mut parts, &mut random.fork())?;
+    let molds = plan::plan(&mut random.fork());
+    let cast = molds.par_iter().map(Mold::cast).collect::<Result<Vec<_>>>()?;
+    let (shapes, metadata): (Vec<_>, Vec<_>) = cast.into_iter().unzip();
+    parts.shapes = shapes;
+    let mut planter = Planter { molds: &molds, metadata: &metadata, domains: vec![], random: random.fork() };
+    planter.plant();
+    parts.domains = planter.domains;
+    Ok(parts)
+}
+
+fn add_materials(parts: &mut Parts, random: &mut Random) -> Result<()> {
+    parts.textures.extend(bark::textures(random)?);
+    parts.materials.push(Material {
+        name: "bark".into(),
+        specular: [0.04; 3],
+        shininess: 8.0,
+        colour_texture: Some(0),
+        normal_texture: Some(1),
+        ..Material::default()
+    });
+    for (name, palette) in &LEAVES {
+        parts.materials.push(Material {
+            name: (*name).into(),
+            specular: [0.10, 0.11, 0.08],
+            shininess: 22.0,
+            colour_texture: Some(parts.textures.len()),
+            alpha_mode: AlphaMode::Mask { cutoff: 0.5 },
+            double_sided: true,
+            ..Material::default()
+        });
+        parts.textures.push(leaf_image::texture(name, palette, random)?);
+    }
+    Ok(())
+}
+
+/// Places molds, parents before children.
+struct Planter<'a> {
+    molds: &'a [Mold],
+    metadata: &'a [Metadata],
+    domains: Vec<Domain>,
+    random: Random,
+}
+
+impl Planter<'_> {
+    /// Places the trunk, which is the last mold, and all that hangs on it.
+    fn plant(&mut self) {
+        let trunk = self.molds.len() - 1;
+        self.domains.push(self.domain("trunk".into(), trunk, BARK, Transform::IDENTITY));
+        self.dress(0, trunk, &Isometry3::identity());
+    }
+
+    /// Places the children of a domain.
+    fn dress(&mut self, parent: usize, mold: usize, world_from_parent: &Isometry3<f64>) {
+        let molds = self.molds;
+        for (number, bud) in molds[mold].buds.iter().enumerate() {
+            let parent_from_child = joint(&molds[mold], bud, world_from_parent);
+            let world_from_child = world_from_parent * parent_from_child;
+            let child = &molds[bud.mold];
+            let path = self.domains[parent].name.split_once(' ').map_or(String::new(), |(_, path)| format!("{path}."));
+            let (kind, material) = match child.kind {
+                Kind::Leaf => ("leaf", BARK + 1 + usize::from(self.random.unit() < 0.35)),
+                Kind::Trunk | Kind::Branch => ("branch", BARK),
+            };
+            let placement = Transform::from_matrix(&world_from_child.to_homogeneous());
+            let mut domain = self.domain(format!("{kind} {path}{}", number + 1), bud.mold, material, placement);
+            domain.attachment = Some(Attachment {
+                parent,
+                frame: Transform::from_matrix(&parent_from_child.to_homogeneous()),
+                rows: molds[mold].ring_rows(bud.ring),
+            });
+            self.domains.push(domain);
+            self.dress(self.domains.len() - 1, bud.mold, &world_from_child);
+        }
+    }
+
+    fn domain(&self, name: String, mold: usize, material: usize, placement: Transform) -> Domain {
+        Domain {
+            name,
+            shape: mold,
+            material,
+            placement,
+            attachment: None,
+            runs: vec![],
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: self.metadata[mold].clone(),
+        }
+    }
+}
+
+/// `parent_from_child`: at the ring's centre, along the bud, with +Z towards the sky.
+fn joint(parent: &Mold, bud: &Bud, world_from_parent: &Isometry3<f64>) -> Isometry3<f64> {
+    let turn = world_from_parent.rotation;
+    let child = centreline::frame(&(turn * bud.direction), &Vector3::y());
+    let rotation = turn.inverse() * UnitQuaternion::from_rotation_matrix(&child);
+    Isometry3::from_parts(Translation3::from(parent.line.points[bud.ring]), rotation)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Scene;
+
+    fn grown(seed: u64) -> Parts {
+        grow(&Recipe { seed }).expect("every beam is solved")
+    }
+
+    fn note<'a>(domain: &'a Domain, name: &str) -> &'a str {
+        domain.metadata.notes.get(name).map_or("", String::as_str)
+    }
+
+    #[test]
+    fn a_seed_grows_the_same_tree_twice_and_another_seed_another_tree() {
+        let (one, two, other) = (grown(7), grown(7), grown(8));
+        let rest = |parts: &Parts| parts.shapes.iter().flat_map(|shape| shape.mesh.rest().to_vec()).collect::<Vec<_>>();
+        let modes =
+            |parts: &Parts| parts.shapes.iter().flat_map(|shape| shape.modes.columns().to_vec()).collect::<Vec<_>>();
+        let frames = |parts: &Parts| parts.domains.iter().map(|domain| domain.placement).collect::<Vec<_>>();
+        assert_eq!(rest(&one), rest(&two));
+        assert_eq!(modes(&one), modes(&two));
+        assert_eq!(frames(&one), frames(&two));
+        assert_eq!(one.textures, two.textures);
+        assert!(rest(&one) != rest(&other) && modes(&one) != modes(&other) && frames(&one) != frames(&other));
+        assert_ne!(one.textures, other.textures);
+    }
+
+    #[test]
+    fn every_seed_gives_a_scene_of_the_promised_size_that_needs_what_it_should() {
+        for seed in [0, 7, u64::MAX] {
+            let scene = Scene::new(grown(seed)).expect("a valid scene");
+            let count = |kind: &str| scene.domains.iter().filter(|domain| note(domain, "kind") == kind).count();
+            let corners = |domain: &Domain| scene.shapes[domain.shape].mesh.triangles().len();
+            let triangles: usize = scene.domains.iter().map(corners).sum();
+            assert!(scene.domains.len() >= 300, "{} domains", scene.domains.len());
+            assert!((50_000..=130_000).contains(&triangles), "{triangles} triangles");
+            assert_eq!(count("trunk"), 1);
+            assert!(count("branch") >= 60 && count("leaf") >= 200);
+            assert_eq!(count("trunk") + count("branch") + count("leaf"), scene.domains.len());
+            let needs = scene.needs;
+            assert!(needs.modes && needs.textures && needs.normal_maps && needs.mask && needs.shadows);
+            assert!(!needs.blend && !needs.shear);
+            let height = scene.rest_bounds.max[1];
+            assert!((7.0..9.5).contains(&height), "{height} m high");
+            assert!(scene.rest_bounds.min[1].abs() < 1e-6, "the tree stands on {}", scene.rest_bounds.min[1]);
+        }
+    }
+
+    #[test]
+    fn some_leaves_are_rigid_and_some_bend_with_two_modes() {
+        let parts = grown(7);
+        let rank = |domain: &Domain| parts.shapes[domain.shape].modes.rank();
+        let leaves = parts.domains.iter().filter(|domain| note(domain, "kind") == "leaf");
+        let ranks: std::collections::BTreeSet<usize> = leaves.map(rank).collect();
+        assert_eq!(ranks.into_iter().collect::<Vec<_>>(), [0, 2]);
+        for domain in &parts.domains {
+            assert_eq!(domain.metadata.eigenvalues.len(), rank(domain));
+            assert_eq!(note(domain, "mass_normalised") == "true", rank(domain) > 0);
+        }
+    }
+
+    #[test]
+    fn every_joint_is_the_centre_of_the_ring_that_carries_it() {
+        let parts = grown(7);
+        for domain in &parts.domains[1..] {
+            let attachment = domain.attachment.as_ref().expect("all but the trunk hang on something");
+            let parent = &parts.domains[attachment.parent];
+            let rest = parts.shapes[parent.shape].mesh.rest();
+            let mean = |rows: &[u32]| {
+                let sum: Vector3<f64> = rows.iter().map(|row| Vector3::from(rest[*row as usize]).cast::<f64>()).sum();
+                let centre = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
+                (centre.coords - domain.placement.translation()).norm()
+            };
+            assert!(mean(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, mean(&attachment.rows));
+            // The control: the ring below is elsewhere.
+            let count = attachment.rows.len() as u32;
+            let below: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(count)).collect();
+            assert!(mean(&below) > 1e-3, "{}", domain.name);
+        }
+        assert!(parts.domains[0].attachment.is_none());
+    }
+
+    #[test]
+    fn frames_compose_to_placements_and_are_rotations() {
+        let parts = grown(7);
+        for domain in &parts.domains {
+            let linear = domain.placement.linear();
+            assert!((linear.transpose() * linear - nalgebra::Matrix3::identity()).abs().max() < 1e-5);
+            assert!((linear.determinant() - 1.0).abs() < 1e-5);
+            let Some(attachment) = &domain.attachment else { continue };
+            let composed = parts.domains[attachment.parent].placement.then(attachment.frame);
+            for (got, want) in composed.0.iter().zip(domain.placement.0) {
+                assert!((got - want).abs() <= 1e-5, "{}: {got} is not {want}", domain.name);
+            }
+        }
+    }
+
+    #[test]
+    fn frequencies_are_those_of_a_living_tree() {
+        for domain in &grown(7).domains {
+            let hertz: Vec<f64> =
+                domain.metadata.eigenvalues.iter().map(|value| value.sqrt() / std::f64::consts::TAU).collect();
+            assert!(hertz.windows(2).all(|pair| pair[0] <= pair[1]));
+            let Some(lowest) = hertz.first() else { continue };
+            let range = match note(domain, "level") {
+                "0" if note(domain, "kind") == "trunk" => 0.4..1.5,
+                "1" => 0.6..6.0,
+                _ => 1.5..15.0,
+            };
+            assert!(range.contains(lowest), "{}: {lowest} Hz", domain.name);
+        }
+    }
+
+    #[test]
+    fn the_first_mode_sways_the_top_more_than_the_stem_below_it() {
+        let parts = grown(7);
+        let shape = &parts.shapes[parts.domains[0].shape];
+        let sway = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.at(vertex, axis, 0)).norm();
+        let count = shape.mesh.rest().len();
+        let largest = (0..count).map(sway).fold(0.0, f32::max);
+        assert!(sway(count - 1) > 0.95 * largest);
+        assert!(sway(count / 4) < 0.3 * largest);
+    }
 }

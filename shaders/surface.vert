@@ -1,0 +1,31 @@
+// One corner: its vertex of the deformed positions, its deformed normal and tangent, its texture coordinates.
+layout(location = 0) in uint vertex;
+layout(location = 1) in vec3 normal;
+layout(std430, binding = 0) readonly buffer Positions { float positions[]; };
+
+out vec3 world;
+out vec3 normal_world;
+#ifdef UVS
+layout(location = 2) in vec2 uv;
+out vec2 uv_image;
+#endif
+#ifdef NORMAL_MAPS
+layout(location = 3) in vec4 tangent;
+out vec4 tangent_world;
+#endif
+
+void main() {
+    world = vec3(positions[3u * vertex], positions[3u * vertex + 1u], positions[3u * vertex + 2u]);
+    normal_world = normal;
+#ifdef UVS
+    uv_image = uv;
+#endif
+#ifdef NORMAL_MAPS
+    tangent_world = tangent;
+#endif
+    vec4 clip = frame.clip_from_world * vec4(world, 1.0);
+    // A vertex that overflowed is put behind the camera: no NaN reaches the rasteriser.
+    bool bad = any(isnan(clip)) || any(isinf(clip));
+    gl_Position = bad ? vec4(0.0, 0.0, -2.0, 1.0) : clip;
+    if (bad) world = vec3(0.0);
+}

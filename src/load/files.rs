@@ -1,0 +1,217 @@
+//! Relative paths to bytes: where a loader may read, and how much.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Component, Path, PathBuf};
+
+use crate::error::{Result, invalid};
+
+/// The most bytes of a file that holds a mesh or a matrix.
+pub(super) const MODEL_BYTES: u64 = 2 << 30;
+/// The most bytes of an image.
+pub(super) const IMAGE_BYTES: u64 = 256 << 20;
+/// The most bytes of a description in text.
+pub(super) const TEXT_BYTES: u64 = 64 << 20;
+
+/// The most entries of a folder that are looked at.
+const MOST_ENTRIES: usize = 10_000;
+
+/// A folder whose files a loader may read. With `confine` every path must stay inside that root, symbolic links
+/// resolved; without, paths are taken as they are.
+#[derive(Debug, Clone)]
+pub(super) struct Files {
+    base: PathBuf,
+    confine: Option<PathBuf>,
+}
+
+/// A resolved path that is there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    File,
+    Folder,
+}
+
+impl Files {
+    /// Paths relative to `base`, and absolute ones, without a bound.
+    pub(super) fn anywhere(base: &Path) -> Self {
+        Self { base: base.to_path_buf(), confine: None }
+    }
+
+    /// Paths relative to `root` that stay inside it. `root` is canonical.
+    pub(super) fn confined(root: &Path) -> Self {
+        Self { base: root.to_path_buf(), confine: Some(root.to_path_buf()) }
+    }
+
+    /// The same bound around the sub-folder `relative`.
+    ///
+    /// # Errors
+    /// As [`Self::resolve`].
+    pub(super) fn within(&self, relative: &str) -> Result<Self> {
+        Ok(Self { base: self.resolve(relative)?, confine: self.confine.clone() })
+    }
+
+    /// The last part of the path of `relative`, links resolved; `scene` when it has none.
+    pub(super) fn own_name(&self, relative: &str) -> String {
+        let path = self.resolve(relative).ok();
+        let name = path.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
+        name.unwrap_or("scene").to_owned()
+    }
+
+    /// The bytes of a regular file of at most `limit` bytes.
+    ///
+    /// # Errors
+    /// `Invalid` naming the path as it was given, never the place on disk: outside the root, not there, no regular
+    /// file, over the limit or unreadable.
+    pub(super) fn read(&self, relative: &str, limit: u64) -> Result<Vec<u8>> {
+        let path = self.resolve(relative)?;
+        let refuse = |given: &dyn std::fmt::Display| invalid(field(relative), "a readable file", given);
+        // A pipe or device would block or never end, so its kind is looked at before it is opened.
+        let about = path.metadata().map_err(|error| refuse(&error.kind()))?;
+        if !about.is_file() {
+            return Err(refuse(&"something that is no regular file"));
+        }
+        let too_large = |size: u64| invalid(field(relative), format!("at most {limit} bytes"), size);
+        if about.len() > limit {
+            return Err(too_large(about.len()));
+        }
+        let mut bytes = Vec::new();
+        let file = File::open(&path).map_err(|error| refuse(&error.kind()))?;
+        file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| refuse(&error.kind()))?;
+        // It may have grown since its size was read.
+        if bytes.len() as u64 > limit {
+            return Err(too_large(bytes.len() as u64));
+        }
+        Ok(bytes)
+    }
+
+    /// What lies at `relative`, or `None` when nothing does.
+    ///
+    /// # Errors
+    /// `Invalid` for a path that leaves the root.
+    pub(super) fn kind(&self, relative: &str) -> Result<Option<Kind>> {
+        let path = self.join(relative)?;
+        if !path.exists() {
+            return Ok(None);
+        }
+        let path = self.resolve(relative)?;
+        Ok(match () {
+            () if path.is_dir() => Some(Kind::Folder),
+            () if path.is_file() => Some(Kind::File),
+            () => None,
+        })
+    }
+
+    /// Names and kinds of what lies directly in the folder, sorted; of a huge folder the first ten thousand.
+    pub(super) fn entries(&self) -> Vec<(String, Kind)> {
+        let Ok(listing) = std::fs::read_dir(&self.base) else { return Vec::new() };
+        let names = listing.take(MOST_ENTRIES).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        let mut entries: Vec<_> =
+            names.filter_map(|name| self.kind(&name).ok().flatten().map(|kind| (name, kind))).collect();
+        entries.sort_by(|a, b| a.0.cmp(&b.0));
+        entries
+    }
+
+    /// The canonical path of `relative`.
+    ///
+    /// # Errors
+    /// `Invalid` when it leaves the root or nothing is there.
+    pub(super) fn resolve(&self, relative: &str) -> Result<PathBuf> {
+        let path = self.join(relative)?;
+        let missing = |error: std::io::Error| invalid(field(relative), "a file that is there", error.kind());
+        let canonical = path.canonicalize().map_err(missing)?;
+        match &self.confine {
+            Some(root) if !canonical.starts_with(root) => Err(outside(relative)),
+            _ => Ok(canonical),
+        }
+    }
+
+    /// Joins by the letters of the path alone, so that a refusal tells nothing about what is outside.
+    fn join(&self, relative: &str) -> Result<PathBuf> {
+        if relative.is_empty() || relative.contains('\0') {
+            return Err(invalid(field(relative), "a path", format!("{relative:?}")));
+        }
+        let Some(root) = &self.confine else { return Ok(self.base.join(relative)) };
+        let mut path = self.base.clone();
+        for component in Path::new(relative).components() {
+            match component {
+                Component::Normal(name) => path.push(name),
+                Component::CurDir => {}
+                Component::ParentDir => {
+                    path.pop();
+                    if !path.starts_with(root) {
+                        return Err(outside(relative));
+                    }
+                }
+                Component::RootDir | Component::Prefix(_) => return Err(outside(relative)),
+            }
+        }
+        Ok(path)
+    }
+}
+
+/// The folder of a relative path; `.` when it has none.
+pub(super) fn parent_of(path: &str) -> &str {
+    match path.rsplit_once('/') {
+        Some(("", _)) => "/",
+        Some((folder, _)) => folder,
+        None => ".",
+    }
+}
+
+/// The last part of a relative path.
+pub(super) fn name_of(path: &str) -> &str {
+    path.rsplit_once('/').map_or(path, |(_, name)| name)
+}
+
+fn field(relative: &str) -> String {
+    format!("file '{relative}'")
+}
+
+fn outside(relative: &str) -> crate::error::Error {
+    invalid(field(relative), "a path inside the repository", "one that leaves it")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_confined_reader_refuses_each_way_out_and_tells_nothing_of_what_is_there() {
+        let outer = tempfile::tempdir().expect("a folder");
+        let root = outer.path().join("root");
+        std::fs::create_dir_all(root.join("sub")).expect("made");
+        std::fs::write(outer.path().join("secret.txt"), "secret").expect("written");
+        std::fs::write(root.join("inside.txt"), "inside").expect("written");
+        std::os::unix::fs::symlink(outer.path().join("secret.txt"), root.join("link.txt")).expect("linked");
+        std::os::unix::fs::symlink(outer.path(), root.join("folder")).expect("linked");
+        let files = Files::confined(&root.canonicalize().expect("there")).within("sub").expect("there");
+        assert_eq!(files.read("../inside.txt", 6).expect("inside"), b"inside");
+        let secret = outer.path().join("secret.txt");
+        for path in ["../../secret.txt", "../link.txt", "../folder/secret.txt", secret.to_str().expect("utf-8")] {
+            let refusal = files.read(path, 100).expect_err(path).to_string();
+            let expected = format!("file '{path}': expected a path inside the repository, given one that leaves it");
+            assert_eq!(refusal, expected);
+        }
+        let absent = files.read("../../absent.txt", 100).expect_err("absent").to_string();
+        assert!(absent.ends_with("expected a path inside the repository, given one that leaves it"), "{absent}");
+        assert_eq!(Files::anywhere(&root).read("../secret.txt", 100).expect("unconfined"), b"secret");
+    }
+
+    #[test]
+    fn files_over_the_limit_missing_files_and_folders_are_refused_by_the_path_as_given() {
+        let root = tempfile::tempdir().expect("a folder");
+        std::fs::write(root.path().join("a.bin"), [0; 5]).expect("written");
+        std::fs::create_dir(root.path().join("d")).expect("made");
+        let files = Files::anywhere(root.path());
+        for (path, refusal) in [
+            ("a.bin", "file 'a.bin': expected at most 4 bytes, given 5"),
+            ("b.bin", "file 'b.bin': expected a file that is there, given entity not found"),
+            ("d", "file 'd': expected a readable file, given something that is no regular file"),
+            ("", "file '': expected a path, given \"\""),
+            ("a\0b", "file 'a\0b': expected a path, given \"a\\0b\""),
+        ] {
+            assert_eq!(files.read(path, 4).expect_err(path).to_string(), refusal);
+        }
+        assert_eq!(files.read("a.bin", 5).expect("fits").len(), 5);
+    }
+}

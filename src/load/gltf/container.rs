@@ -1,0 +1,115 @@
+//! The bytes of a `.gltf` or `.glb` file to its JSON document and its binary chunk.
+
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use super::document::Document;
+use crate::error::{Result, invalid};
+
+/// The most JSON objects of one document. Each takes at least two bytes of text but some 300 bytes of memory.
+const MAX_OBJECTS: usize = 1 << 21;
+/// The most commas, which bound the elements of all lists in the same way.
+const MAX_COMMAS: usize = 1 << 24;
+/// The longest text that is parsed a second time to find the place of an error.
+const MAX_SEARCHED: usize = 1 << 22;
+const MAGIC: &[u8] = b"glTF";
+const JSON: u32 = 0x4E4F_534A;
+const BIN: u32 = 0x004E_4942;
+
+/// The two parts of a model file.
+#[derive(Debug)]
+pub(super) struct Container<'a> {
+    pub(super) json: &'a [u8],
+    /// The bytes of the buffer without a URI.
+    pub(super) bin: Option<&'a [u8]>,
+}
+
+/// Splits a GLB into its chunks; anything else is taken for JSON.
+///
+/// # Errors
+/// `Invalid` naming the field of the header or the chunk.
+pub(super) fn split(content: &[u8]) -> Result<Container<'_>> {
+    if !content.starts_with(MAGIC) {
+        return Ok(Container { json: content, bin: None });
+    }
+    let version = word(content, 4, "glb.version")?;
+    if version != 2 {
+        return Err(invalid("glb.version", "2", version));
+    }
+    let length = word(content, 8, "glb.length")?;
+    if u64::from(length) != content.len() as u64 {
+        return Err(invalid("glb.length", format!("{}, the size of the file", content.len()), length));
+    }
+    let (kind, json, rest) = chunk(content, 12)?;
+    if kind != JSON {
+        return Err(invalid("glb.chunk[0].type", format!("{JSON:#x} (JSON)"), format!("{kind:#x}")));
+    }
+    if rest == content.len() {
+        return Ok(Container { json, bin: None });
+    }
+    let (kind, bin, _) = chunk(content, rest)?;
+    // A chunk of an unknown kind has to be passed over; all that may follow the JSON and is known is BIN.
+    Ok(Container { json, bin: (kind == BIN).then_some(bin) })
+}
+
+/// Kind and content of the chunk that begins at `start`, and where the next one begins.
+fn chunk(content: &[u8], start: usize) -> Result<(u32, &[u8], usize)> {
+    let length = word(content, start, "glb.chunk.length")? as usize;
+    let kind = word(content, start + 4, "glb.chunk.type")?;
+    let body = &content[start + 8..];
+    if length > body.len() {
+        return Err(invalid("glb.chunk.length", format!("at most {} bytes, the rest of the file", body.len()), length));
+    }
+    Ok((kind, &body[..length], start + 8 + length))
+}
+
+fn word(content: &[u8], start: usize, field: &str) -> Result<u32> {
+    let bytes = content.get(start..).and_then(|rest| rest.first_chunk::<4>());
+    let cut = || invalid(field, format!("four bytes at {start}"), format!("a file of {} bytes", content.len()));
+    Ok(u32::from_le_bytes(*bytes.ok_or_else(cut)?))
+}
+
+/// Parses the JSON text.
+///
+/// # Errors
+/// `Invalid` naming the list and the element that are not as glTF has them.
+pub(super) fn parse(json: &[u8]) -> Result<Document> {
+    for (sign, what, most) in [(b'{', "objects", MAX_OBJECTS), (b',', "commas", MAX_COMMAS)] {
+        let count = json.iter().filter(|byte| **byte == sign).count();
+        if count > most {
+            return Err(invalid("json", format!("at most {most} {what}"), count));
+        }
+    }
+    serde_json::from_slice(json).map_err(|error| {
+        let (place, given) = locate(json).unwrap_or_else(|| ("json".into(), error.to_string()));
+        invalid(place, "a glTF 2.0 document", given)
+    })
+}
+
+/// The first element of a top-level list that does not parse on its own. The parser itself tells only line and column,
+/// which is of little use in a file of one line.
+fn locate(json: &[u8]) -> Option<(String, String)> {
+    use super::document as doc;
+    let root: Value = serde_json::from_slice(Some(json).filter(|json| json.len() <= MAX_SEARCHED)?).ok()?;
+    let search = [
+        ("scenes", first_bad::<doc::Scene> as fn(&Value) -> Option<(usize, String)>),
+        ("nodes", first_bad::<doc::Node>),
+        ("meshes", first_bad::<doc::Mesh>),
+        ("accessors", first_bad::<doc::Accessor>),
+        ("bufferViews", first_bad::<doc::BufferView>),
+        ("buffers", first_bad::<doc::Buffer>),
+        ("materials", first_bad::<doc::Material>),
+        ("textures", first_bad::<doc::Texture>),
+        ("images", first_bad::<doc::Image>),
+        ("samplers", first_bad::<doc::Sampler>),
+    ];
+    search.into_iter().find_map(|(list, bad)| {
+        let (index, reason) = bad(root.get(list)?)?;
+        Some((format!("{list}[{index}]"), reason))
+    })
+}
+
+fn first_bad<T: DeserializeOwned>(list: &Value) -> Option<(usize, String)> {
+    let reason = |element: &Value| T::deserialize(element).err().map(|error| error.to_string());
+    list.as_array()?.iter().enumerate().find_map(|(index, element)| Some((index, reason(element)?)))
+}

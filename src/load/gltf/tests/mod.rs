@@ -1,0 +1,330 @@
+//! Small models made in code, and what becomes of them.
+
+mod hostile;
+mod looks;
+mod real;
+
+use serde_json::{Value, json};
+
+use crate::error::Result;
+use crate::load::files::Files;
+use crate::scene::{Parts, Scene};
+
+const U8: u64 = 5121;
+const U16: u64 = 5123;
+const U32: u64 = 5125;
+const F32: u64 = 5126;
+
+/// A document and its binary chunk.
+#[derive(Clone)]
+struct Model {
+    json: Value,
+    bin: Vec<u8>,
+}
+
+impl Model {
+    /// Accessor 0: the positions of a right triangle in the plane z = 0; one node, one mesh, one primitive.
+    fn triangle() -> Self {
+        let json = json!({
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"name": "one", "mesh": 0}],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+            "buffers": [{"byteLength": 0}],
+            "bufferViews": [],
+            "accessors": []
+        });
+        let mut model = Self { json, bin: Vec::new() };
+        model.floats("VEC3", 3, &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+        model
+    }
+
+    fn view(&mut self, bytes: &[u8]) -> usize {
+        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
+        let view = json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": bytes.len()});
+        self.bin.extend_from_slice(bytes);
+        self.json["buffers"][0]["byteLength"] = self.bin.len().into();
+        push(&mut self.json["bufferViews"], view)
+    }
+
+    fn accessor(&mut self, bytes: &[u8], component: u64, kind: &str, count: usize) -> usize {
+        let view = self.view(bytes);
+        let accessor = json!({"bufferView": view, "componentType": component, "type": kind, "count": count});
+        push(&mut self.json["accessors"], accessor)
+    }
+
+    fn floats(&mut self, kind: &str, count: usize, numbers: &[f32]) -> usize {
+        self.accessor(bytemuck::cast_slice(numbers), F32, kind, count)
+    }
+
+    fn primitive(&mut self) -> &mut Value {
+        &mut self.json["meshes"][0]["primitives"][0]
+    }
+
+    /// The same with a value put at a JSON pointer.
+    fn with(mut self, pointer: &str, value: Value) -> Self {
+        let (parent, key) = pointer.rsplit_once('/').expect("a pointer");
+        let parent = self.json.pointer_mut(parent).expect("there");
+        match parent.as_array_mut() {
+            Some(list) => list[key.parse::<usize>().expect("an index")] = value,
+            None => parent[key] = value,
+        }
+        self
+    }
+
+    fn glb(&self) -> Vec<u8> {
+        let mut text = self.json.to_string().into_bytes();
+        text.resize(text.len().next_multiple_of(4), b' ');
+        let mut glb = b"glTF\x02\0\0\0\0\0\0\0".to_vec();
+        for (kind, chunk) in [(b"JSON", &text), (b"BIN\0", &self.bin)] {
+            glb.extend((chunk.len() as u32).to_le_bytes());
+            glb.extend(kind);
+            glb.extend(chunk);
+        }
+        let length = glb.len() as u32;
+        glb[8..12].copy_from_slice(&length.to_le_bytes());
+        glb
+    }
+
+    fn read(&self) -> Result<Parts> {
+        super::parse(&Files::anywhere(&std::env::temp_dir()), "model", &self.glb())
+    }
+
+    fn parts(&self) -> Parts {
+        self.read().expect("a sound model")
+    }
+}
+
+fn push(list: &mut Value, value: Value) -> usize {
+    let list = list.as_array_mut().expect("a list");
+    list.push(value);
+    list.len() - 1
+}
+
+/// A triangle with two targets, the second sparse over nothing: it moves vertex 2 alone.
+fn morphed() -> Model {
+    let mut model = Model::triangle();
+    let dense = model.floats("VEC3", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
+    let places = model.view(&[2]);
+    let values = model.view(bytemuck::cast_slice(&[0.5_f32, -0.5, 0.25]));
+    let sparse = json!({
+        "componentType": F32, "type": "VEC3", "count": 3,
+        "sparse": {
+            "count": 1,
+            "indices": {"bufferView": places, "componentType": U8},
+            "values": {"bufferView": values}
+        }
+    });
+    let sparse = push(&mut model.json["accessors"], sparse);
+    model.primitive()["targets"] = json!([{"POSITION": dense, "NORMAL": dense}, {"POSITION": sparse}]);
+    model
+}
+
+#[test]
+fn morph_positions_are_the_columns_of_u_dense_or_sparse_and_normal_targets_are_reported() {
+    let parts = morphed().parts();
+    let modes = &parts.shapes[0].modes;
+    assert_eq!((modes.rank(), modes.vertices()), (2, 3));
+    assert_eq!(modes.column(0), [0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
+    assert_eq!(modes.column(1), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, -0.5, 0.25]);
+    assert_eq!(parts.domains[0].rest_q, [] as [f32; 0]);
+    assert!(parts.remarks.iter().any(|remark| remark.starts_with("NORMAL targets are ignored")), "{:?}", parts.remarks);
+    assert_eq!(Scene::new(parts).expect("a scene").rank_of(0), 2);
+}
+
+#[test]
+fn sparse_values_lie_over_the_dense_ones() {
+    let mut model = morphed();
+    model.json["accessors"][2]["bufferView"] = 0.into();
+    let parts = model.parts();
+    assert_eq!(parts.shapes[0].modes.column(1), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, -0.5, 0.25]);
+}
+
+#[test]
+fn targets_without_motion_make_a_rigid_domain_and_one_that_moves_keeps_them_all() {
+    let mut model = Model::triangle();
+    let zeros = model.floats("VEC3", 3, &[0.0; 9]);
+    let void = json!({"componentType": F32, "type": "VEC3", "count": 3});
+    let void = push(&mut model.json["accessors"], void);
+    model.primitive()["targets"] = json!([{"POSITION": zeros}, {"POSITION": void}, {}]);
+    model.json["nodes"][0]["weights"] = json!([1.0, 2.0, 3.0]);
+    let parts = model.parts();
+    assert_eq!(parts.shapes[0].modes.rank(), 0);
+    assert!(parts.domains[0].rest_q.is_empty());
+    model.primitive()["targets"] = json!([{"POSITION": zeros}, {"POSITION": 0}, {}]);
+    assert_eq!(model.parts().shapes[0].modes.rank(), 3);
+}
+
+#[test]
+fn weights_of_the_node_win_over_those_of_the_mesh_and_primitives_of_one_node_share_them() {
+    let mut model = morphed();
+    let moving = model.primitive().clone();
+    push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}}));
+    push(&mut model.json["meshes"][0]["primitives"], moving);
+    push(&mut model.json["nodes"], json!({"mesh": 0, "weights": [3.0, 4.0]}));
+    let model = model.with("/meshes/0/weights", json!([1.0, 2.0])).with("/scenes/0/nodes", json!([0, 1]));
+    let parts = model.parts();
+    let weights: Vec<&[f32]> = parts.domains.iter().map(|domain| domain.rest_q.as_slice()).collect();
+    assert_eq!(weights, [&[1.0, 2.0][..], &[], &[1.0, 2.0], &[3.0, 4.0], &[], &[3.0, 4.0]]);
+    let shared: Vec<_> = parts.domains.iter().map(|domain| domain.shares_q_with).collect();
+    assert_eq!(shared, [None, None, Some(0), None, None, Some(3)]);
+    let shapes: Vec<_> = parts.domains.iter().map(|domain| domain.shape).collect();
+    assert_eq!((shapes, parts.shapes.len()), (vec![0, 1, 2, 0, 1, 2], 3));
+    Scene::new(parts).expect("a scene");
+}
+
+#[test]
+fn nodes_are_placed_by_the_product_of_their_matrices_and_hang_on_the_nearest_mesh_above() {
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    let nodes = json!([
+        {"name": "leaf", "mesh": 0, "translation": [0, 0, 1]},
+        {"name": "root", "mesh": 0, "children": [2], "translation": [10, 0, 0], "scale": [2, 2, 2]},
+        {"name": "joint", "children": [0], "rotation": [0, 0, half, half]},
+        {"name": "leaf", "mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 5, 0, 1]}
+    ]);
+    let model = Model::triangle().with("/nodes", nodes).with("/scenes/0/nodes", json!([1, 3]));
+    let parts = model.parts();
+    let names: Vec<&str> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();
+    assert_eq!(names, ["root.0", "leaf.0", "leaf #3.0"]);
+    assert_eq!(parts.shapes.len(), 1);
+    close(&parts.domains[1].placement.0, &[0.0, -2.0, 0.0, 10.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0]);
+    close(&parts.domains[2].placement.0, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 5.0, 0.0, 0.0, 1.0, 0.0]);
+    let attachment = parts.domains[1].attachment.as_ref().expect("hangs on root");
+    assert_eq!((attachment.parent, attachment.rows.len()), (0, 0));
+    close(&attachment.frame.0, &[0.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
+    let composed = parts.domains[0].placement.then(attachment.frame);
+    close(&composed.0, &parts.domains[1].placement.0);
+    assert!(parts.domains[0].attachment.is_none() && parts.domains[2].attachment.is_none());
+    Scene::new(parts).expect("a scene");
+}
+
+fn close(got: &[f32; 12], want: &[f32; 12]) {
+    assert!(got.iter().zip(want).all(|(got, want)| (got - want).abs() <= 1e-6), "{got:?} is not {want:?}");
+}
+
+#[test]
+fn a_chain_of_a_hundred_thousand_nodes_is_walked_without_recursion() {
+    let last = 100_000;
+    let mut nodes: Vec<Value> = (0..last).map(|node| json!({"children": [node + 1]})).collect();
+    nodes.push(json!({"mesh": 0, "translation": [0, 2, 0]}));
+    let parts = Model::triangle().with("/nodes", nodes.into()).parts();
+    assert_eq!((parts.domains.len(), parts.domains[0].placement.0[7]), (1, 2.0));
+}
+
+#[test]
+fn indices_of_one_two_and_four_bytes_give_the_same_triangles_and_lists_strips_and_fans_the_right_ones() {
+    let mut model = Model::triangle();
+    model.json["accessors"] = json!([]);
+    model.floats("VEC3", 5, &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 2.0, 0.0]);
+    let order = [0_u32, 1, 2, 3, 3, 4];
+    let bytes = order.map(|index| index as u8);
+    let shorts = order.map(|index| index as u16);
+    let accessors = [
+        model.accessor(&bytes, U8, "SCALAR", 6),
+        model.accessor(bytemuck::cast_slice(&shorts), U16, "SCALAR", 6),
+        model.accessor(bytemuck::cast_slice(&order), U32, "SCALAR", 6),
+    ];
+    let mut triangles = |mode: u64, indices: usize| {
+        *model.primitive() = json!({"attributes": {"POSITION": 0}, "indices": indices, "mode": mode});
+        model.parts().shapes[0].mesh.triangles().to_vec()
+    };
+    for indices in accessors {
+        assert_eq!(triangles(4, indices), [[0, 1, 2], [3, 3, 4]]);
+        assert_eq!(triangles(5, indices), [[0, 1, 2], [1, 3, 2]]);
+        assert_eq!(triangles(6, indices), [[1, 2, 0], [2, 3, 0], [3, 3, 0], [3, 4, 0]]);
+    }
+}
+
+#[test]
+fn points_and_lines_are_left_out_and_said_so() {
+    let mut model = Model::triangle();
+    for mode in 0..4 {
+        push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}, "mode": mode}));
+    }
+    let parts = model.parts();
+    assert_eq!(parts.domains.len(), 1);
+    assert_eq!(parts.remarks, ["primitives of points or lines are left out"]);
+}
+
+#[test]
+fn interleaved_vertices_and_normalised_coordinates_are_read_and_missing_normals_computed() {
+    let mut model = Model::triangle();
+    assert_eq!(model.parts().shapes[0].mesh.corners().normals, [[0.0, 0.0, 1.0]; 3]);
+    // Twelve bytes of position, four of coordinates, and the last stride is cut short, as it may be.
+    let mut bytes = Vec::new();
+    for (x, u) in [(0.0_f32, 0_u16), (4.0, 65535), (8.0, 13107)] {
+        bytes.extend(bytemuck::cast_slice::<f32, u8>(&[x, x * x, 0.0]));
+        bytes.extend(bytemuck::cast_slice::<u16, u8>(&[u, 65535 - u]));
+    }
+    let view = model.view(&bytes);
+    model.json["bufferViews"][view]["byteStride"] = 16.into();
+    model.json["accessors"] = json!([
+        {"bufferView": view, "componentType": F32, "type": "VEC3", "count": 3},
+        {"bufferView": view, "byteOffset": 12, "componentType": U16, "normalized": true, "type": "VEC2", "count": 3}
+    ]);
+    model.primitive()["attributes"] = json!({"POSITION": 0, "TEXCOORD_0": 1});
+    let parts = model.parts();
+    assert_eq!(parts.shapes[0].mesh.rest(), [[0.0, 0.0, 0.0], [4.0, 16.0, 0.0], [8.0, 64.0, 0.0]]);
+    assert_eq!(parts.shapes[0].mesh.corners().uvs, [[0.0, 1.0], [1.0, 0.0], [0.2, 0.8]]);
+}
+
+#[test]
+fn a_gltf_reads_data_uris_and_files_beside_it_and_not_those_of_another_folder() {
+    use base64::Engine;
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut model = Model::triangle();
+    std::fs::create_dir(folder.path().join("sub")).expect("made");
+    std::fs::write(folder.path().join("sub/my buffer.bin"), &model.bin).expect("written");
+    std::fs::write(folder.path().join("secret.bin"), &model.bin).expect("written");
+    let files = Files::anywhere(folder.path());
+    let mut read = |uri: String| {
+        model.json["buffers"][0]["uri"] = uri.into();
+        std::fs::write(folder.path().join("sub/model.gltf"), model.json.to_string()).expect("written");
+        super::read(&files, "sub/model.gltf")
+    };
+    let data = base64::engine::general_purpose::STANDARD.encode(&Model::triangle().bin);
+    let embedded = read(format!("data:application/octet-stream;base64,{data}")).expect("embedded");
+    let beside = read("my%20buffer.bin".into()).expect("beside");
+    assert_eq!(embedded.shapes[0].mesh, beside.shapes[0].mesh);
+    assert_eq!((beside.name.as_str(), beside.domains[0].name.as_str()), ("model", "one.0"));
+    let secret = folder.path().join("secret.bin");
+    for uri in ["../secret.bin", "%2e%2e/secret.bin", "file:///x", "https://host/x", secret.to_str().expect("utf-8")] {
+        let refusal = read(uri.into()).expect_err(uri).to_string();
+        let expected =
+            "file 'sub/model.gltf': buffers[0]: uri: expected a data URI or a path in or below the model's folder";
+        assert!(refusal.starts_with(expected), "{refusal}");
+    }
+    let missing = read("absent.bin".into()).expect_err("absent").to_string();
+    assert!(missing.contains("buffers[0]: file 'absent.bin'"), "{missing}");
+}
+
+#[test]
+fn what_is_left_out_is_said_once_and_required_extensions_that_change_geometry_are_refused_by_name() {
+    let model = Model::triangle()
+        .with("/animations", json!([{"channels": [{"x": 1}]}, {}]))
+        .with("/skins", json!([{}]))
+        .with("/extensionsUsed", json!(["KHR_materials_unlit", "KHR_texture_transform"]))
+        .with("/extensionsRequired", json!(["KHR_texture_transform"]));
+    let remarks = model.parts().remarks;
+    for said in ["KHR_materials_unlit", "KHR_texture_transform", "animations (2)", "skins (1)"] {
+        assert_eq!(remarks.iter().filter(|remark| remark.contains(said)).count(), 1, "{said} in {remarks:?}");
+    }
+    for name in ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"] {
+        let refusal = Model::triangle().with("/extensionsRequired", json!([name])).read().expect_err(name).to_string();
+        assert!(refusal.starts_with("extensionsRequired[0]") && refusal.ends_with(name), "{refusal}");
+    }
+}
+
+#[test]
+fn only_the_scene_of_the_document_is_loaded() {
+    let model = Model::triangle()
+        .with("/nodes", json!([{"name": "a", "mesh": 0}, {"name": "b", "mesh": 0}]))
+        .with("/scenes", json!([{"nodes": [0]}, {"nodes": [1]}]))
+        .with("/scene", json!(1));
+    let parts = model.parts();
+    assert_eq!((parts.domains.len(), parts.domains[0].name.as_str()), (1, "b.0"));
+    assert_eq!(parts.remarks, ["of 2 scenes only number 1 is loaded"]);
+    let bare = model.with("/scenes", json!([])).with("/scene", Value::Null).parts();
+    assert_eq!(bare.domains.len(), 2);
+}

@@ -1,0 +1,95 @@
+//! glTF textures to decoded images, each image once whatever the number of textures and roles that it has.
+
+use std::collections::HashMap;
+
+use super::bytes::Bytes;
+use super::document::{Document, REPEAT, TextureUse};
+use super::remarks::{Remarks, tidy};
+use super::{at, bytes};
+use crate::domain::Texture;
+use crate::error::{Result, invalid};
+
+/// The images that materials use so far.
+#[derive(Debug)]
+pub(super) struct Gallery<'a> {
+    document: &'a Document,
+    bytes: &'a bytes::Bytes<'a>,
+    /// What the scene gets.
+    pub(super) textures: Vec<Texture>,
+    by_image: HashMap<usize, usize>,
+    means: HashMap<usize, [f32; 4]>,
+}
+
+impl<'a> Gallery<'a> {
+    pub(super) fn new(document: &'a Document, bytes: &'a Bytes<'a>) -> Self {
+        Self { document, bytes, textures: Vec::new(), by_image: HashMap::new(), means: HashMap::new() }
+    }
+
+    /// The scene's index of a texture.
+    ///
+    /// # Errors
+    /// `Invalid` when it is not there or no PNG or JPEG image.
+    pub(super) fn hang(&mut self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<usize> {
+        let image = self.image_of(wanted, remarks)?;
+        if let Some(known) = self.by_image.get(&image) {
+            return Ok(*known);
+        }
+        let texture = self.decode(image)?;
+        self.textures.push(texture);
+        self.by_image.insert(image, self.textures.len() - 1);
+        Ok(self.textures.len() - 1)
+    }
+
+    /// The means of the four channels, 0 to 1, of a texture that is not kept.
+    ///
+    /// # Errors
+    /// As [`Self::hang`].
+    pub(super) fn mean(&mut self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<[f32; 4]> {
+        let image = self.image_of(wanted, remarks)?;
+        if let Some(known) = self.means.get(&image) {
+            return Ok(*known);
+        }
+        let texture = self.decode(image)?;
+        let mut sums = [0_u64; 4];
+        for pixel in texture.rgba().as_chunks::<4>().0 {
+            sums.iter_mut().zip(pixel).for_each(|(sum, channel)| *sum += u64::from(*channel));
+        }
+        let pixels = f64::from(texture.width()) * f64::from(texture.height());
+        let means = sums.map(|sum| (sum as f64 / (255.0 * pixels)) as f32);
+        self.means.insert(image, means);
+        Ok(means)
+    }
+
+    /// The image behind a texture; what its sampler asks for and is not done is remarked on.
+    fn image_of(&self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<usize> {
+        let texture = at(&self.document.textures, wanted.index, "index")?;
+        let place = format!("textures[{}]", wanted.index);
+        if let Some(sampler) = texture.sampler {
+            let sampler = at(&self.document.samplers, sampler, &format!("{place}.sampler"))?;
+            if (sampler.wrap_s, sampler.wrap_t) != (REPEAT, REPEAT) {
+                remarks.add("samplers that clamp or mirror are ignored: textures repeat".into());
+            }
+        }
+        if wanted.extensions.transform.is_some() {
+            remarks.add("KHR_texture_transform is not supported: texture coordinates stay as they are".into());
+        }
+        let source = texture.source.ok_or_else(|| invalid(format!("{place}.source"), "an image", "none"))?;
+        at(&self.document.images, source, &format!("{place}.source"))?;
+        Ok(source)
+    }
+
+    fn decode(&self, image: usize) -> Result<Texture> {
+        let within = |error: crate::error::Error| error.within(&format!("images[{image}]"));
+        let encoded = self.bytes.image(image).map_err(within)?;
+        let texture = Texture::decode(self.name(image), &encoded).map_err(within)?;
+        self.bytes.spend(texture.rgba().len() as u64).map_err(within)?;
+        Ok(texture)
+    }
+
+    fn name(&self, index: usize) -> String {
+        let image = &self.document.images[index];
+        let uri = image.uri.as_deref().filter(|uri| !uri.starts_with("data:"));
+        let name = image.name.as_deref().filter(|name| !name.is_empty()).or(uri);
+        name.map_or_else(|| format!("image {index}"), |name| tidy(name, 120))
+    }
+}

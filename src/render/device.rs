@@ -1,0 +1,107 @@
+//! Which EGL device to draw on: all of them described for `doctor`, and the choice of one.
+
+use super::Prefer;
+use super::egl::{Candidate, Context, candidates, none_fits};
+use super::gl::Gl;
+use crate::error::{Error, Result};
+
+/// One place where OpenGL may be had, as EGL describes it.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct EglDevice {
+    /// Index among EGL's devices; none for Mesa's surfaceless platform, which needs no device.
+    pub index: Option<usize>,
+    /// Vendor or driver.
+    pub vendor: String,
+    /// Extensions of the device.
+    pub extensions: Vec<String>,
+    /// The CUDA device that it is, by EGL_CUDA_DEVICE_NV.
+    pub cuda_device: Option<i32>,
+    /// Its DRM node, such as `/dev/dri/card0`.
+    pub drm_node: Option<String>,
+    /// GL_RENDERER and GL_VERSION, when a context could be made.
+    pub renderer: Option<String>,
+    pub version: Option<String>,
+    /// Whether it draws on the CPU; as far as the device says when no context could be made.
+    pub software: bool,
+    /// Why no context could be made.
+    pub problem: Option<String>,
+}
+
+/// All EGL devices, each tried with a context.
+///
+/// # Errors
+/// `Unavailable` naming the package when libEGL cannot be loaded.
+pub fn devices() -> Result<Vec<EglDevice>> {
+    Ok(candidates()?.into_iter().map(describe).collect())
+}
+
+fn describe(candidate: Candidate) -> EglDevice {
+    let tried = Context::open(&candidate).and_then(Gl::new);
+    let (limits, problem) = match tried {
+        Ok(gl) => (Some(gl.limits.clone()), None),
+        Err(error) => (None, Some(error.to_string())),
+    };
+    EglDevice {
+        index: candidate.index,
+        vendor: candidate.vendor,
+        extensions: candidate.extensions,
+        cuda_device: candidate.cuda_device,
+        drm_node: candidate.drm_node,
+        software: limits.as_ref().map_or(candidate.software, |limits| limits.software),
+        version: limits.as_ref().map(|limits| limits.version.clone()),
+        renderer: limits.map(|limits| limits.renderer),
+        problem,
+    }
+}
+
+/// Opens the preferred device. Gives the CUDA device that it is along.
+pub(super) fn open(prefer: Prefer) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
+    let mut tried = Vec::new();
+    for (candidate, software) in order(candidates()?, prefer) {
+        let name = candidate.index.map_or("surfaceless".to_string(), |index| format!("device {index}"));
+        match Context::open(&candidate).and_then(Gl::new) {
+            Ok(gl) if software.is_none_or(|software| software == gl.limits.software) => {
+                return Ok((gl, candidate.cuda_device));
+            }
+            Ok(gl) => tried.push(format!("{name} ({}) draws with {}", candidate.vendor, gl.limits.renderer)),
+            Err(error) => tried.push(format!("{name} ({}): {error}", candidate.vendor)),
+        }
+    }
+    Err(refusal(prefer, &tried))
+}
+
+fn refusal(prefer: Prefer, tried: &[String]) -> Error {
+    match prefer {
+        Prefer::Cuda(ordinal) => none_fits(&format!("the EGL device that is CUDA device {ordinal}"), tried),
+        Prefer::Any => none_fits("any device", tried),
+        Prefer::Software => none_fits("Mesa's software rasteriser", tried),
+    }
+}
+
+/// The candidates worth trying, best first, each with whether it must turn out to be software (or must not).
+fn order(found: Vec<Candidate>, prefer: Prefer) -> Vec<(Candidate, Option<bool>)> {
+    let hardware = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
+        (Some(_), _) => 0,
+        (None, Some(_)) => 1,
+        (None, None) => 2,
+    };
+    let software = |candidate: &Candidate| if candidate.software { 0 } else { 1 };
+    let sorted = |rank: &dyn Fn(&Candidate) -> i32, wanted: Option<bool>| {
+        let mut list = found.clone();
+        list.sort_by_key(rank);
+        list.into_iter().map(|candidate| (candidate, wanted)).collect::<Vec<_>>()
+    };
+    match prefer {
+        Prefer::Cuda(ordinal) => {
+            let is_it = |candidate: &Candidate| candidate.cuda_device == Some(ordinal);
+            found.into_iter().filter(is_it).map(|candidate| (candidate, None)).collect()
+        }
+        Prefer::Software => sorted(&software, Some(true)),
+        Prefer::Any => {
+            let mut list = sorted(&hardware, Some(false));
+            list.retain(|(candidate, _)| !candidate.software);
+            list.extend(sorted(&software, Some(true)));
+            list
+        }
+    }
+}

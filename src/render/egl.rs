@@ -1,0 +1,262 @@
+//! EGL without a window: the devices of this machine, and a surfaceless OpenGL 4.3 core context on one of them.
+//!
+//! Displays are initialised once and never terminated: EGL hands every caller of a process the same display of a device,
+//! so that terminating one would pull it from under the other renderers.
+
+use std::cell::Cell;
+use std::ffi::{CStr, c_char, c_void};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+
+use khronos_egl as egl;
+
+use crate::error::{Error, Result, during};
+
+type Instance = egl::DynamicInstance<egl::EGL1_4>;
+type Raw = *mut c_void;
+type QueryDevices = unsafe extern "system" fn(i32, *mut Raw, *mut i32) -> u32;
+type QueryAttribute = unsafe extern "system" fn(Raw, i32, *mut isize) -> u32;
+type QueryString = unsafe extern "system" fn(Raw, i32) -> *const c_char;
+type PlatformDisplay = unsafe extern "system" fn(u32, *mut c_void, *const i32) -> Raw;
+
+const PLATFORM_DEVICE: u32 = 0x313F;
+const PLATFORM_SURFACELESS: u32 = 0x31DD;
+const CUDA_DEVICE: i32 = 0x323A;
+const DRM_DEVICE_FILE: i32 = 0x3233;
+const DRIVER_NAME: i32 = 0x335E;
+const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasteriser), or the NVIDIA \
+                      driver's libEGL_nvidia.so.0 with its vendor file 10_nvidia.json in /usr/share/glvnd/egl_vendor.d";
+
+/// Guards the calls that make and destroy contexts: drivers are known to race there.
+static DOOR: Mutex<()> = Mutex::new(());
+static NEXT: AtomicU64 = AtomicU64::new(1);
+
+thread_local! {
+    /// Number of the context that is current on this thread, 0 for none.
+    static CURRENT: Cell<u64> = const { Cell::new(0) };
+}
+
+/// A place where a context may be made.
+#[derive(Debug, Clone)]
+pub(super) struct Candidate {
+    /// Index among EGL's devices; `None` for Mesa's surfaceless platform.
+    pub(super) index: Option<usize>,
+    pub(super) vendor: String,
+    pub(super) extensions: Vec<String>,
+    pub(super) cuda_device: Option<i32>,
+    pub(super) drm_node: Option<String>,
+    /// Whether the device itself says that it is software.
+    pub(super) software: bool,
+    display: egl::Display,
+}
+
+/// A surfaceless context, made current where it is used.
+pub(super) struct Context {
+    number: u64,
+    display: egl::Display,
+    context: egl::Context,
+}
+
+struct Api {
+    instance: Instance,
+    query_devices: Option<QueryDevices>,
+    query_attribute: Option<QueryAttribute>,
+    query_string: Option<QueryString>,
+    platform_display: Option<PlatformDisplay>,
+}
+
+fn unavailable(reason: impl Into<String>) -> Error {
+    Error::Unavailable { what: "headless OpenGL (EGL)", reason: reason.into(), remedy: REMEDY.into() }
+}
+
+fn door() -> MutexGuard<'static, ()> {
+    // The lock guards no data, so one that a panicking thread left behind is as good as new.
+    DOOR.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn api() -> Result<&'static Api> {
+    static API: OnceLock<Result<Api>> = OnceLock::new();
+    API.get_or_init(Api::load).as_ref().map_err(Clone::clone)
+}
+
+impl Api {
+    fn load() -> Result<Self> {
+        // SAFETY: loading libEGL runs its initialisers and those of the vendor libraries, which is what it is for.
+        let instance = unsafe { Instance::load_required_from_filename("libEGL.so.1") }
+            .map_err(|error| unavailable(format!("libEGL.so.1 cannot be loaded ({error})")))?;
+        let find = |name: &str| instance.get_proc_address(name);
+        // SAFETY: the types are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base; an
+        // address that EGL gives out for an extension it lacks returns an error when called, and is called only then.
+        let (query_devices, query_attribute, query_string, platform_display) = unsafe {
+            (
+                find("eglQueryDevicesEXT")
+                    .map(|found| std::mem::transmute::<extern "system" fn(), QueryDevices>(found)),
+                find("eglQueryDeviceAttribEXT")
+                    .map(|found| std::mem::transmute::<extern "system" fn(), QueryAttribute>(found)),
+                find("eglQueryDeviceStringEXT")
+                    .map(|found| std::mem::transmute::<extern "system" fn(), QueryString>(found)),
+                find("eglGetPlatformDisplayEXT")
+                    .map(|found| std::mem::transmute::<extern "system" fn(), PlatformDisplay>(found)),
+            )
+        };
+        Ok(Self { instance, query_devices, query_attribute, query_string, platform_display })
+    }
+
+    fn devices(&self) -> Vec<Raw> {
+        let Some(query) = self.query_devices else { return Vec::new() };
+        let mut devices = [std::ptr::null_mut(); 64];
+        let mut count = 0;
+        // SAFETY: the array has room for the 64 handles that the call may write, and the count is ours.
+        let good = unsafe { query(devices.len() as i32, devices.as_mut_ptr(), &raw mut count) };
+        let count = if good == 0 { 0 } else { usize::try_from(count).unwrap_or(0) };
+        devices[..count.min(devices.len())].to_vec()
+    }
+
+    fn text(&self, device: Raw, name: i32) -> Option<String> {
+        let query = self.query_string?;
+        // SAFETY: the device came from eglQueryDevicesEXT; the answer is null or a string that lives as long as EGL.
+        unsafe {
+            let text = query(device, name);
+            (!text.is_null()).then(|| CStr::from_ptr(text).to_string_lossy().into_owned())
+        }
+    }
+
+    fn cuda_device(&self, device: Raw) -> Option<i32> {
+        let mut value = -1_isize;
+        // SAFETY: the device came from eglQueryDevicesEXT and the value outlives the call.
+        let good = unsafe { self.query_attribute?(device, CUDA_DEVICE, &raw mut value) };
+        (good != 0).then(|| i32::try_from(value).ok()).flatten()
+    }
+
+    fn display(&self, platform: u32, native: Raw) -> Option<egl::Display> {
+        let none = [egl::NONE];
+        // SAFETY: `native` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; the list is ended.
+        let display = unsafe { self.platform_display?(platform, native, none.as_ptr()) };
+        // SAFETY: a display that EGL made, and never terminated here.
+        (!display.is_null()).then(|| unsafe { egl::Display::from_ptr(display) })
+    }
+
+    fn candidate(&self, index: usize, device: Raw) -> Option<Candidate> {
+        let extensions: Vec<String> =
+            self.text(device, egl::EXTENSIONS).unwrap_or_default().split_whitespace().map(String::from).collect();
+        let has = |name: &str| extensions.iter().any(|extension| extension == name);
+        let drm = has("EGL_EXT_device_drm").then(|| self.text(device, DRM_DEVICE_FILE)).flatten();
+        let cuda = has("EGL_NV_device_cuda").then(|| self.cuda_device(device)).flatten();
+        let named = has("EGL_EXT_device_query_name").then(|| self.text(device, egl::VENDOR)).flatten();
+        let driver = has("EGL_EXT_device_persistent_id").then(|| self.text(device, DRIVER_NAME)).flatten();
+        let software = has("EGL_MESA_device_software");
+        let display = self.display(PLATFORM_DEVICE, device)?;
+        let vendor =
+            named.or(driver).unwrap_or_else(|| if software { "Mesa software".into() } else { "unnamed".into() });
+        Some(Candidate {
+            index: Some(index),
+            vendor,
+            cuda_device: cuda,
+            drm_node: drm.filter(|node| !node.is_empty()),
+            software,
+            extensions,
+            display,
+        })
+    }
+}
+
+/// All places where a context may be made: EGL's devices in their order, then Mesa's surfaceless platform.
+///
+/// # Errors
+/// `Unavailable` when libEGL cannot be loaded.
+pub(super) fn candidates() -> Result<Vec<Candidate>> {
+    let api = api()?;
+    let _door = door();
+    let mut found: Vec<Candidate> =
+        api.devices().into_iter().enumerate().filter_map(|(index, device)| api.candidate(index, device)).collect();
+    let surfaceless = api.display(PLATFORM_SURFACELESS, std::ptr::null_mut());
+    found.extend(surfaceless.map(|display| Candidate {
+        index: None,
+        vendor: "Mesa surfaceless".into(),
+        extensions: Vec::new(),
+        cuda_device: None,
+        drm_node: None,
+        software: false,
+        display,
+    }));
+    Ok(found)
+}
+
+/// The refusal when no candidate would do.
+pub(super) fn none_fits(wanted: &str, tried: &[String]) -> Error {
+    let tried = if tried.is_empty() { "no EGL device is there".to_string() } else { tried.join("; ") };
+    unavailable(format!("no context on {wanted}: {tried}"))
+}
+
+impl Context {
+    /// Makes a context on a candidate and makes it current on this thread.
+    pub(super) fn open(candidate: &Candidate) -> Result<Self> {
+        let api = api()?;
+        let _door = door();
+        let fail = during::<egl::Error>("EGL context");
+        let display = candidate.display;
+        let instance = &api.instance;
+        instance.initialize(display).map_err(during("EGL initialise"))?;
+        let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&fail)?.to_string_lossy();
+        if !extensions.contains("EGL_KHR_surfaceless_context") {
+            return Err(during("EGL context")("EGL_KHR_surfaceless_context is missing"));
+        }
+        instance.bind_api(egl::OPENGL_API).map_err(&fail)?;
+        let config = config(instance, display)?;
+        let wanted = [
+            egl::CONTEXT_MAJOR_VERSION,
+            4,
+            egl::CONTEXT_MINOR_VERSION,
+            3,
+            egl::CONTEXT_OPENGL_PROFILE_MASK,
+            egl::CONTEXT_OPENGL_CORE_PROFILE_BIT,
+            egl::NONE,
+        ];
+        let context = instance.create_context(display, config, None, &wanted).map_err(&fail)?;
+        let made = Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context };
+        made.make_current()?;
+        Ok(made)
+    }
+
+    /// Makes it current on this thread unless it is so already.
+    pub(super) fn make_current(&self) -> Result<()> {
+        if CURRENT.get() == self.number {
+            return Ok(());
+        }
+        let made = api()?.instance.make_current(self.display, None, None, Some(self.context));
+        made.map_err(during("eglMakeCurrent"))?;
+        CURRENT.set(self.number);
+        Ok(())
+    }
+
+    /// Address of an OpenGL function, or null.
+    pub(super) fn address(&self, name: &str) -> *const c_void {
+        let found = api().ok().and_then(|api| api.instance.get_proc_address(name));
+        found.map_or(std::ptr::null(), |found| found as *const c_void)
+    }
+}
+
+impl Drop for Context {
+    fn drop(&mut self) {
+        let Ok(api) = api() else { return };
+        let _door = door();
+        // A thread that ends may have lost its thread-locals already; then nothing is current on it either.
+        if CURRENT.try_with(Cell::get) == Ok(self.number) {
+            api.instance.make_current(self.display, None, None, None).ok();
+            CURRENT.set(0);
+        }
+        // Destroying fails only for a context that is gone, which is what was asked for.
+        api.instance.destroy_context(self.display, self.context).ok();
+    }
+}
+
+/// A config that asks for no window: the default surface type is WINDOW, which headless devices do not have.
+fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
+    for surface in [egl::PBUFFER_BIT, 0] {
+        let wanted = [egl::SURFACE_TYPE, surface, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
+        if let Ok(Some(config)) = instance.choose_first_config(display, &wanted) {
+            return Ok(config);
+        }
+    }
+    Err(during("EGL config")("no config renders desktop OpenGL, with a pbuffer or without"))
+}

@@ -1,0 +1,155 @@
+//! A shot of a scene to the numbers that its shaders read, computed in f64 and rounded last.
+
+use bytemuck::{Pod, Zeroable};
+use nalgebra::{Matrix4, Vector3};
+
+use super::Shot;
+use super::light::{Fit, LightBox};
+use crate::error::{Result, invalid};
+use crate::scene::{Bounds, Scene};
+
+/// Twin of `FrameBlock` in `shaders/shared/frame.glsl`; columns of matrices follow each other.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(super) struct Frame {
+    clip_from_world: [[f32; 4]; 4],
+    map_from_world: [[f32; 4]; 4],
+    world_from_image: [[f32; 4]; 4],
+    eye: [f32; 4],
+    to_sun: [f32; 4],
+    sunlight: [f32; 4],
+    skylight: [f32; 4],
+    zenith: [f32; 4],
+    horizon: [f32; 4],
+    up: [f32; 4],
+    ground: [f32; 4],
+    ground_centre: [f32; 4],
+    shadow: [f32; 4],
+    ground_depth: [f32; 4],
+}
+
+const _: () = assert!(size_of::<Frame>() == 368, "Frame differs from shaders/shared/frame.glsl");
+
+/// The ground fades by exp(-(d / D)^2) and is drawn to this many D: there it is the horizon to the last bit.
+const EDGE: f64 = 6.0;
+
+impl Frame {
+    /// The numbers of one shot.
+    ///
+    /// # Errors
+    /// `Invalid` when the camera's numbers overflow.
+    pub(super) fn new(scene: &Scene, shot: &Shot) -> Result<Self> {
+        // Bounds that overflowed fit no shadow and no depth range; those at rest are always good.
+        let sound = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
+        let bounds = if sound { shot.bounds } else { scene.rest_bounds };
+        let look = &scene.look;
+        let to_sun = look.to_sun(scene.up);
+        let height = scene.rest_bounds.min[scene.up.index()];
+        let shadow = look.shadow.unwrap_or_default();
+        let light = LightBox::fit(&Fit {
+            to_sun,
+            up: scene.up,
+            bounds,
+            ground: look.ground.map(|_| height),
+            size: f64::from(shadow.size),
+            rim: (3.0 * f64::from(shadow.blur)).ceil() + 1.0,
+        });
+        let camera = shot.camera.camera_from_world();
+        let clip = shot.camera.clip_from_camera(shot.width, shot.height, &around(bounds, scene));
+        let (centre, fade) = ground_disc(scene, shot.camera.eye());
+        let colour = |[r, g, b]: [f32; 3], fourth: f64| [r, g, b, fourth as f32];
+        let frame = Self {
+            clip_from_world: (clip * camera).cast().into(),
+            map_from_world: light.map_from_world.cast().into(),
+            world_from_image: world_from_image(&clip, &camera).cast().into(),
+            eye: wide(shot.camera.eye(), 0.0),
+            to_sun: wide(to_sun, 0.0),
+            sunlight: colour(look.sunlight, 0.0),
+            skylight: colour(look.skylight, 0.0),
+            zenith: colour(look.zenith, 0.0),
+            horizon: colour(look.horizon, 0.0),
+            up: wide(scene.up.vector(), height),
+            ground: colour(look.ground.unwrap_or_default().colour, fade),
+            ground_centre: wide(centre, EDGE * fade),
+            shadow: [shadow.least_variance, shadow.bleeding, shadow.alpha_threshold, shadow.size as f32],
+            ground_depth: wide(light.ground.into(), 0.0),
+        };
+        let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));
+        match numbers.iter().all(|number| number.is_finite()) {
+            true => Ok(frame),
+            false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", shot.camera))),
+        }
+    }
+}
+
+/// Whether the camera stands above the ground; from below it is not drawn.
+pub(super) fn above_ground(scene: &Scene, shot: &Shot) -> bool {
+    let up = scene.up.index();
+    shot.camera.eye()[up] > scene.rest_bounds.min[up]
+}
+
+/// Depth range for the deformed and the rest state: the camera's planes must not jump when a branch bends.
+fn around(bounds: Bounds, scene: &Scene) -> Bounds {
+    bounds.union(scene.rest_bounds)
+}
+
+/// Centre of the ground under the scene, and the distance D over which it fades.
+fn ground_disc(scene: &Scene, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
+    let up = scene.up.index();
+    let mut centre = scene.rest_bounds.centre().coords;
+    centre[up] = scene.rest_bounds.min[up];
+    let mut aside = eye - centre;
+    aside[up] = 0.0;
+    (centre, 2.0 * scene.rest_bounds.diagonal().max(aside.norm()).max(1e-6))
+}
+
+/// Normalised device coordinates (x, y, 1) to a direction in the world.
+fn world_from_image(clip: &Matrix4<f64>, camera: &Matrix4<f64>) -> Matrix4<f64> {
+    let world_from_camera = camera.fixed_view::<3, 3>(0, 0).try_inverse().unwrap_or_else(nalgebra::Matrix3::identity);
+    let mut camera_from_image = nalgebra::Matrix3::zeros();
+    camera_from_image[(0, 0)] = 1.0 / clip[(0, 0)];
+    camera_from_image[(1, 1)] = 1.0 / clip[(1, 1)];
+    camera_from_image[(0, 2)] = clip[(0, 2)] / clip[(0, 0)];
+    camera_from_image[(1, 2)] = clip[(1, 2)] / clip[(1, 1)];
+    camera_from_image[(2, 2)] = -1.0;
+    (world_from_camera * camera_from_image).to_homogeneous()
+}
+
+fn wide(vector: Vector3<f64>, fourth: f64) -> [f32; 4] {
+    [vector.x as f32, vector.y as f32, vector.z as f32, fourth as f32]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::geometry::tests::squares;
+    use super::*;
+    use crate::domain::Material;
+    use crate::scene::{Camera, Lens, View};
+
+    #[test]
+    fn a_direction_through_a_pixel_meets_the_point_that_projects_there() {
+        let view = View::LookAt { eye: [1.0, 2.0, 3.0], target: [0.2, 0.1, -0.4], up: [0.0, 1.0, 0.0] };
+        let lens = Lens::Intrinsics { fx: 300.0, fy: 250.0, cx: 100.0, cy: 130.0 };
+        let camera = Camera { view, lens, near: 0.1, far: 100.0 };
+        let (clip, from_world) = (camera.clip_from_camera(320, 200, &Bounds::EMPTY), camera.camera_from_world());
+        let point = nalgebra::Point3::new(0.3, -0.2, 0.7);
+        let image = (clip * from_world * point.to_homogeneous()).scale(1.0);
+        let image = Vector3::new(image.x / image.w, image.y / image.w, 1.0);
+        let direction = world_from_image(&clip, &from_world).fixed_view::<3, 3>(0, 0) * image;
+        let expected = (point.coords - camera.eye()).normalize();
+        assert!((direction.normalize() - expected).norm() < 1e-12, "{direction} is not {expected}");
+    }
+
+    #[test]
+    fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
+        let scene = Scene::new(squares(vec![Material::default()])).expect("good");
+        let mut shot = Shot { camera: Camera::framing(&scene), width: 64, height: 64, bounds: scene.rest_bounds };
+        let good = Frame::new(&scene, &shot).expect("good");
+        for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
+            assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }).expect("replaced"), good);
+        }
+        shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+        let refusal = Frame::new(&scene, &shot).expect_err("overflows").to_string();
+        assert!(refusal.starts_with("camera:"), "{refusal}");
+    }
+}

@@ -1,0 +1,243 @@
+//! A scene's domains to the arrays that never change: corner indices sorted into draw groups, the vertex and uv of each
+//! corner, and the material of each triangle.
+//!
+//! Triangles are sorted by what the pipeline must be set to, so that the number of draw calls never grows with the
+//! number of domains.
+
+use nalgebra::Vector3;
+
+use crate::domain::{AlphaMode, Domain, Material};
+use crate::scene::{Scene, Slot};
+
+/// Which pass a triangle belongs to, by its material.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Kind {
+    Opaque,
+    Mask,
+    Blend,
+}
+
+/// A contiguous run of triangles that one draw call draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Group {
+    pub(super) kind: Kind,
+    pub(super) double_sided: bool,
+    pub(super) first_triangle: usize,
+    pub(super) triangles: usize,
+}
+
+/// The static arrays, packed as the scene's layout says; triangles in the order of the groups.
+#[derive(Debug, Default)]
+pub(super) struct Geometry {
+    /// Per corner, its vertex in the packed positions.
+    pub(super) vertices: Vec<u32>,
+    /// Per corner; empty when nothing samples a texture.
+    pub(super) uvs: Vec<[f32; 2]>,
+    /// Per triangle, three corners in the packed normals.
+    pub(super) triangles: Vec<[u32; 3]>,
+    /// Per triangle; empty when all have the same material.
+    pub(super) materials: Vec<u32>,
+    pub(super) groups: Vec<Group>,
+}
+
+const GROUPS: usize = 6;
+
+fn group_of(material: &Material) -> usize {
+    let kind = match material.alpha_mode {
+        AlphaMode::Opaque => Kind::Opaque,
+        AlphaMode::Mask { .. } => Kind::Mask,
+        AlphaMode::Blend => Kind::Blend,
+    };
+    2 * kind as usize + usize::from(material.double_sided)
+}
+
+/// The groups of a scene that have triangles: opaque, mask, blend.
+pub(super) fn groups(scene: &Scene) -> Vec<Group> {
+    let mut counts = [0; GROUPS];
+    for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
+        for (material, triangles) in stretches(domain, slot) {
+            counts[group_of(&scene.materials[material])] += triangles.len();
+        }
+    }
+    let mut first_triangle = 0;
+    let mut groups = Vec::new();
+    for (index, triangles) in counts.into_iter().enumerate() {
+        let kind = [Kind::Opaque, Kind::Mask, Kind::Blend][index / 2];
+        let group = Group { kind, double_sided: index % 2 == 1, first_triangle, triangles };
+        groups.extend((triangles > 0).then_some(group));
+        first_triangle += triangles;
+    }
+    groups
+}
+
+/// Indices of the materials that triangles have, ascending.
+pub(super) fn used_materials(scene: &Scene) -> Vec<usize> {
+    let used: std::collections::BTreeSet<usize> = scene.domains.iter().flat_map(Domain::materials).collect();
+    used.into_iter().collect()
+}
+
+impl Geometry {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let groups = groups(scene);
+        let layout = &scene.layout;
+        let several = used_materials(scene).len() > 1;
+        let textured = scene.needs.textures || scene.needs.normal_maps;
+        let mut geometry = Self {
+            vertices: Vec::with_capacity(layout.corners),
+            uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),
+            triangles: vec![[0; 3]; layout.triangles],
+            materials: vec![0; if several { layout.triangles } else { 0 }],
+            groups,
+        };
+        let mut next = [0; GROUPS];
+        for group in &geometry.groups {
+            next[2 * group.kind as usize + usize::from(group.double_sided)] = group.first_triangle;
+        }
+        for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
+            geometry.add_corners(scene, domain, slot, textured);
+            geometry.add_triangles(scene, domain, slot, &mut next);
+        }
+        geometry
+    }
+
+    fn add_corners(&mut self, scene: &Scene, domain: &Domain, slot: &Slot, textured: bool) {
+        let corners = scene.shapes[domain.shape].mesh.corners();
+        self.vertices.extend(corners.vertices.iter().map(|vertex| vertex + slot.first_vertex as u32));
+        if textured {
+            self.uvs.extend_from_slice(&corners.uvs);
+            // A mesh without texture coordinates sees one texel everywhere.
+            self.uvs.resize(self.vertices.len(), [0.0; 2]);
+        }
+    }
+
+    fn add_triangles(&mut self, scene: &Scene, domain: &Domain, slot: &Slot, next: &mut [usize; GROUPS]) {
+        let mesh = &scene.shapes[domain.shape].mesh;
+        // A placement that mirrors turns every winding around.
+        let mirrored = domain.placement.linear().determinant() < 0.0;
+        for (material, range) in stretches(domain, slot) {
+            let kind = &scene.materials[material];
+            let place = &mut next[group_of(kind)];
+            for triangle in &mesh.triangles()[range] {
+                let disagrees = kind.double_sided && winding_disagrees(mesh, *triangle);
+                let [a, b, c] = triangle.map(|corner| corner + slot.first_corner as u32);
+                self.triangles[*place] = if mirrored == disagrees { [a, b, c] } else { [a, c, b] };
+                if let Some(slot) = self.materials.get_mut(*place) {
+                    *slot = material as u32;
+                }
+                *place += 1;
+            }
+        }
+    }
+}
+
+/// The runs of one material, as ranges of the domain's triangles.
+fn stretches<'a>(domain: &'a Domain, slot: &Slot) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
+    let count = slot.triangles;
+    let whole = domain.runs.is_empty().then_some((domain.material, 0..count));
+    let ends = domain.runs.iter().skip(1).map(|run| run.first_triangle).chain([count]);
+    let runs = domain.runs.iter().zip(ends).map(|(run, end)| (run.material, run.first_triangle..end));
+    whole.into_iter().chain(runs)
+}
+
+/// Whether a triangle's winding says the opposite of its normals. Which side of a double-sided triangle is seen is asked
+/// of the winding, so that must agree with the normals; files do not always see to it.
+fn winding_disagrees(mesh: &crate::domain::Mesh, triangle: [u32; 3]) -> bool {
+    let corners = mesh.corners();
+    let at = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
+    let normal = |corner: u32| Vector3::from(corners.normals[corner as usize]).cast::<f64>();
+    let [a, b, c] = triangle;
+    let area = (at(b) - at(a)).cross(&(at(c) - at(a)));
+    area.dot(&(normal(a) + normal(b) + normal(c))) < 0.0
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::domain::{Mesh, Metadata, Modes, Run, Shape, Transform};
+    use crate::scene::Parts;
+
+    /// A scene of one unit square (two triangles) per material.
+    pub(in crate::render) fn squares(materials: Vec<Material>) -> Parts {
+        let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
+        let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+        let mut parts = Parts::named("squares");
+        parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
+        parts.domains = (0..materials.len()).map(|material| domain(material, Transform::IDENTITY)).collect();
+        parts.materials = materials;
+        parts
+    }
+
+    fn domain(material: usize, placement: Transform) -> Domain {
+        Domain {
+            name: format!("square {material}"),
+            shape: 0,
+            material,
+            runs: vec![],
+            placement,
+            attachment: None,
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: Metadata::default(),
+        }
+    }
+
+    fn of(alpha_mode: AlphaMode, double_sided: bool) -> Material {
+        Material { alpha_mode, double_sided, ..Material::default() }
+    }
+
+    #[test]
+    fn draw_groups_do_not_grow_with_domains_and_keep_every_triangle() {
+        let mask = AlphaMode::Mask { cutoff: 0.5 };
+        let pattern = [of(AlphaMode::Blend, false), of(AlphaMode::Opaque, true), of(mask, true)];
+        let materials: Vec<Material> = (0..300).map(|index| pattern[index % 3].clone()).collect();
+        let scene = Scene::new(squares(materials)).expect("good");
+        let geometry = Geometry::new(&scene);
+        let kinds: Vec<Kind> = geometry.groups.iter().map(|group| group.kind).collect();
+        assert_eq!(kinds, [Kind::Opaque, Kind::Mask, Kind::Blend]);
+        assert_eq!(geometry.groups.iter().map(|group| group.triangles).sum::<usize>(), 600);
+        for group in &geometry.groups {
+            for triangle in group.first_triangle..group.first_triangle + group.triangles {
+                let material = &scene.materials[geometry.materials[triangle] as usize];
+                assert_eq!(group_of(material), 2 * group.kind as usize + usize::from(group.double_sided));
+            }
+        }
+        let mut seen = geometry.triangles.as_flattened().to_vec();
+        seen.sort_unstable();
+        seen.dedup();
+        assert_eq!(seen, (0..1200).collect::<Vec<u32>>());
+    }
+
+    #[test]
+    fn runs_split_a_domain_between_groups() {
+        let mut parts = squares(vec![of(AlphaMode::Opaque, false), of(AlphaMode::Blend, false)]);
+        parts.domains.truncate(1);
+        parts.domains[0].runs = vec![Run { first_triangle: 0, material: 1 }, Run { first_triangle: 1, material: 0 }];
+        let geometry = Geometry::new(&Scene::new(parts).expect("good"));
+        assert_eq!(geometry.materials, [0, 1]);
+        assert_eq!(geometry.triangles, [[0, 2, 3], [0, 1, 2]]);
+    }
+
+    #[test]
+    fn a_mirrored_placement_turns_the_winding_and_one_material_needs_no_list() {
+        let mut parts = squares(vec![of(AlphaMode::Opaque, false)]);
+        let mut mirror = Transform::IDENTITY;
+        mirror.0[0] = -1.0;
+        parts.domains[0].placement = mirror;
+        let geometry = Geometry::new(&Scene::new(parts).expect("good"));
+        assert_eq!(geometry.triangles, [[0, 2, 1], [0, 3, 2]]);
+        assert!(geometry.materials.is_empty() && geometry.uvs.is_empty());
+    }
+
+    #[test]
+    fn a_double_sided_triangle_wound_against_its_normals_is_turned_and_a_single_sided_one_is_kept() {
+        for (double_sided, expected) in [(true, [0, 2, 1]), (false, [0, 1, 2])] {
+            let mut parts = squares(vec![of(AlphaMode::Opaque, double_sided)]);
+            let rest = parts.shapes[0].mesh.rest().to_vec();
+            let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]]).expect("good");
+            parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
+            let geometry = Geometry::new(&Scene::new(parts).expect("good"));
+            assert_eq!(geometry.triangles, [expected]);
+        }
+    }
+}

@@ -1,0 +1,400 @@
+//! The only door to OpenGL: typed objects that free themselves (`gl/object.rs`), and the few commands of the passes.
+//!
+//! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
+//! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
+
+mod object;
+
+use std::rc::Rc;
+use std::time::{Duration, Instant};
+
+use glow::HasContext as _;
+
+pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureKind, VertexArray};
+use super::egl::Context;
+use crate::error::{Error, Result, during};
+
+/// The constants that other files name.
+pub(super) use glow::{
+    CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
+    NEAREST, REPEAT, RG32F, RGBA8, RGBA16F, SRGB8_ALPHA8, STATIC_DRAW, STREAM_COPY, STREAM_READ, TEXTURE_2D,
+    TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE, TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T,
+    VERTEX_SHADER,
+};
+
+/// What the context can do.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Limits {
+    pub(super) renderer: String,
+    pub(super) version: String,
+    pub(super) software: bool,
+    pub(super) max_side: u32,
+    pub(super) max_samples: u32,
+    pub(super) max_layers: u32,
+    pub(super) max_storage: u64,
+    /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
+    pub(super) anisotropy: f32,
+}
+
+/// A current context and its functions.
+pub(super) struct Gl {
+    // Declared before the context, so that it is dropped while the context still is.
+    glow: glow::Context,
+    context: Context,
+    pub(super) limits: Limits,
+}
+
+impl std::fmt::Debug for Gl {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.debug_struct("Gl").field("limits", &self.limits).finish_non_exhaustive()
+    }
+}
+
+/// One attribute of a corner: location, buffer, components of 32 bits, and whether it is an integer.
+pub(super) struct Attribute<'a> {
+    pub(super) location: u32,
+    pub(super) buffer: &'a Buffer,
+    pub(super) components: i32,
+    pub(super) integer: bool,
+}
+
+/// The fixed-function state of a pass.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Fixed {
+    pub(super) depth_write: bool,
+    /// Depth outside near and far is clamped rather than clipped.
+    pub(super) depth_clamp: bool,
+    pub(super) cull: bool,
+    pub(super) blend: bool,
+    /// Alpha becomes the share of samples that are covered.
+    pub(super) coverage: bool,
+}
+
+/// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around `glFinish` in software, where
+/// timer queries mean nothing.
+#[derive(Debug)]
+pub(super) enum Stopwatch {
+    Wall(f64),
+    Query(Rc<Gl>, glow::Query),
+}
+
+impl Gl {
+    pub(super) fn new(context: Context) -> Result<Rc<Self>> {
+        context.make_current()?;
+        let address = |name: &std::ffi::CStr| name.to_str().map_or(std::ptr::null(), |name| context.address(name));
+        // SAFETY: the context is current on this thread, and the addresses are those that its EGL gives.
+        let mut glow = unsafe { glow::Context::from_loader_function_cstr(address) };
+        let limits = limits(&glow);
+        listen(&mut glow);
+        Ok(Rc::new(Self { glow, context, limits }))
+    }
+
+    /// The functions, with the context current.
+    fn on(&self) -> &glow::Context {
+        // A context that cannot be made current leaves errors that `check` reports at the end of the pass.
+        self.context.make_current().ok();
+        &self.glow
+    }
+
+    /// Fails when OpenGL reported an error since the last check.
+    pub(super) fn check(&self, stage: &'static str) -> Result<()> {
+        // SAFETY: only asks; the context is current.
+        match unsafe { self.on().get_error() } {
+            glow::NO_ERROR => Ok(()),
+            glow::OUT_OF_MEMORY => Err(during(stage)("OpenGL is out of memory")),
+            error => Err(during(stage)(format!("OpenGL error 0x{error:04X}"))),
+        }
+    }
+
+    /// A buffer of `bytes` (at least 4, since OpenGL has no empty buffers), filled from `data` when given.
+    pub(super) fn buffer(self: &Rc<Self>, bytes: u64, usage: u32, data: Option<&[u8]>) -> Result<Buffer> {
+        let size = i32::try_from(bytes.max(4))
+            .map_err(|_| during("buffer")(format!("{bytes} bytes is over the 2 GiB that one buffer may have")))?;
+        let gl = self.on();
+        // SAFETY: size and data agree, or the data is absent and the store stays unwritten until somebody writes it.
+        let name = unsafe {
+            let name = gl.create_buffer().map_err(during("buffer"))?;
+            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(name));
+            match data {
+                Some(data) if data.len() as u64 == bytes && bytes >= 4 => {
+                    gl.buffer_data_u8_slice(glow::COPY_WRITE_BUFFER, data, usage);
+                }
+                _ => gl.buffer_data_size(glow::COPY_WRITE_BUFFER, size, usage),
+            }
+            name
+        };
+        let buffer = Buffer { gl: Rc::clone(self), name, bytes: bytes.max(4) };
+        self.check("buffer").map(|()| buffer)
+    }
+
+    pub(super) fn texture(self: &Rc<Self>, kind: TextureKind) -> Result<Texture> {
+        let gl = self.on();
+        let [width, height, depth, levels] = [kind.width, kind.height, kind.depth, kind.levels].map(|side| side as i32);
+        // SAFETY: storage of a fresh texture; sizes above the limits are reported as errors.
+        let name = unsafe {
+            let name = gl.create_texture().map_err(during("texture"))?;
+            gl.bind_texture(kind.target, Some(name));
+            match kind.target {
+                glow::TEXTURE_2D_ARRAY => gl.tex_storage_3d(kind.target, levels, kind.format, width, height, depth),
+                glow::TEXTURE_2D_MULTISAMPLE => {
+                    gl.tex_storage_2d_multisample(kind.target, depth, kind.format, width, height, true);
+                }
+                _ => gl.tex_storage_2d(kind.target, levels, kind.format, width, height),
+            }
+            name
+        };
+        let texture = Texture { gl: Rc::clone(self), name, kind };
+        self.check("texture").map(|()| texture)
+    }
+
+    /// Links shaders, each given as stage and source.
+    pub(super) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
+        let gl = self.on();
+        let fail = |log: String| during("shader")(format!("{label}: {log}"));
+        // SAFETY: fresh objects; the shaders are flagged for deletion once the program holds them.
+        unsafe {
+            let name = gl.create_program().map_err(during("shader"))?;
+            let program = Program { gl: Rc::clone(self), name };
+            for (stage, source) in stages {
+                let shader = gl.create_shader(*stage).map_err(during("shader"))?;
+                gl.shader_source(shader, source);
+                gl.compile_shader(shader);
+                gl.attach_shader(name, shader);
+                gl.delete_shader(shader);
+                if !gl.get_shader_compile_status(shader) {
+                    return Err(fail(gl.get_shader_info_log(shader)));
+                }
+            }
+            gl.link_program(name);
+            if gl.get_program_link_status(name) { Ok(program) } else { Err(fail(gl.get_program_info_log(name))) }
+        }
+    }
+
+    pub(super) fn framebuffer(self: &Rc<Self>, colour: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
+        let gl = self.on();
+        // SAFETY: attaches textures of this context; completeness is asked for at once.
+        unsafe {
+            let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
+            let framebuffer = Framebuffer { gl: Rc::clone(self), name };
+            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(name));
+            if let Some(colour) = colour {
+                gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(colour.name), 0);
+            }
+            gl.framebuffer_texture(glow::FRAMEBUFFER, glow::DEPTH_ATTACHMENT, Some(depth.name), 0);
+            gl.draw_buffers(&[if colour.is_some() { glow::COLOR_ATTACHMENT0 } else { glow::NONE }]);
+            match gl.check_framebuffer_status(glow::FRAMEBUFFER) {
+                glow::FRAMEBUFFER_COMPLETE => self.check("framebuffer").map(|()| framebuffer),
+                status => Err(during("framebuffer")(format!("incomplete, 0x{status:04X}"))),
+            }
+        }
+    }
+
+    pub(super) fn vertex_array(self: &Rc<Self>, index: Option<&Buffer>, from: &[Attribute<'_>]) -> Result<VertexArray> {
+        let gl = self.on();
+        // SAFETY: tightly packed attributes of 32-bit components in buffers of this context.
+        unsafe {
+            let name = gl.create_vertex_array().map_err(during("vertex array"))?;
+            let array = VertexArray { gl: Rc::clone(self), name };
+            gl.bind_vertex_array(Some(name));
+            for attribute in from {
+                gl.bind_buffer(glow::ARRAY_BUFFER, Some(attribute.buffer.name));
+                gl.enable_vertex_attrib_array(attribute.location);
+                if attribute.integer {
+                    gl.vertex_attrib_pointer_i32(attribute.location, attribute.components, glow::UNSIGNED_INT, 0, 0);
+                } else {
+                    gl.vertex_attrib_pointer_f32(attribute.location, attribute.components, glow::FLOAT, false, 0, 0);
+                }
+            }
+            gl.bind_buffer(glow::ELEMENT_ARRAY_BUFFER, index.map(|index| index.name));
+            gl.bind_vertex_array(None);
+            self.check("vertex array").map(|()| array)
+        }
+    }
+
+    /// Binds a framebuffer, sets the viewport and clears depth to 1 and colour to zero.
+    pub(super) fn begin(&self, into: &Framebuffer, width: u32, height: u32) {
+        let gl = self.on();
+        // SAFETY: state and a clear of a complete framebuffer.
+        unsafe {
+            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(into.name));
+            gl.viewport(0, 0, width as i32, height as i32);
+            gl.depth_mask(true);
+            gl.clear_color(0.0, 0.0, 0.0, 0.0);
+            gl.clear_depth_f64(1.0);
+            gl.clear(glow::DEPTH_BUFFER_BIT | glow::COLOR_BUFFER_BIT);
+        }
+    }
+
+    pub(super) fn set(&self, fixed: Fixed) {
+        let gl = self.on();
+        let flip = |flag: u32, on: bool| {
+            // SAFETY: flags that every 4.3 core context knows.
+            unsafe { if on { gl.enable(flag) } else { gl.disable(flag) } }
+        };
+        flip(glow::DEPTH_TEST, true);
+        flip(glow::DEPTH_CLAMP, fixed.depth_clamp);
+        flip(glow::CULL_FACE, fixed.cull);
+        flip(glow::BLEND, fixed.blend);
+        flip(glow::SAMPLE_ALPHA_TO_COVERAGE, fixed.coverage);
+        // SAFETY: plain state.
+        unsafe {
+            gl.depth_func(glow::LEQUAL);
+            gl.depth_mask(fixed.depth_write);
+            gl.blend_func(glow::SRC_ALPHA, glow::ONE_MINUS_SRC_ALPHA);
+        }
+    }
+
+    /// Draws `triangles` triangles of an array's index buffer from triangle `first` on.
+    pub(super) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
+        let gl = self.on();
+        // SAFETY: the indices were built from checked meshes and stay below the corners that the attributes hold.
+        unsafe {
+            gl.bind_vertex_array(Some(array.name));
+            gl.draw_elements(glow::TRIANGLES, 3 * triangles as i32, glow::UNSIGNED_INT, 12 * first as i32);
+            gl.bind_vertex_array(None);
+        }
+    }
+
+    /// Draws vertices that the shader makes from their number.
+    pub(super) fn draw_made(&self, array: &VertexArray, vertices: u32) {
+        let gl = self.on();
+        // SAFETY: no attribute is read.
+        unsafe {
+            gl.bind_vertex_array(Some(array.name));
+            gl.draw_arrays(glow::TRIANGLES, 0, vertices as i32);
+            gl.bind_vertex_array(None);
+        }
+    }
+
+    /// Runs the current compute program, then lets everything after it see what it wrote.
+    pub(super) fn dispatch(&self, groups_x: u32, groups_y: u32) {
+        let gl = self.on();
+        // SAFETY: the shaders check their own bounds.
+        unsafe {
+            gl.dispatch_compute(groups_x, groups_y, 1);
+            gl.memory_barrier(glow::ALL_BARRIER_BITS);
+        }
+    }
+
+    pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
+        let gl = self.on();
+        // SAFETY: OpenGL refuses ranges outside either buffer.
+        unsafe {
+            gl.bind_buffer(glow::COPY_READ_BUFFER, Some(from.name));
+            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(to.name));
+            gl.copy_buffer_sub_data(glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER, 0, 0, bytes as i32);
+        }
+    }
+
+    /// Waits until all commands are done.
+    ///
+    /// # Errors
+    /// `Fault` of `stage` when the device did not finish within `limit`.
+    pub(super) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
+        let gl = self.on();
+        let begin = Instant::now();
+        // SAFETY: the fence is made here, waited for in slices that fit glow's 32-bit nanoseconds, and deleted here.
+        unsafe {
+            let fence = gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0).map_err(during(stage))?;
+            let done = loop {
+                match gl.client_wait_sync(fence, glow::SYNC_FLUSH_COMMANDS_BIT, 1_000_000_000) {
+                    glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => break Ok(()),
+                    glow::TIMEOUT_EXPIRED if begin.elapsed() < limit => {}
+                    glow::TIMEOUT_EXPIRED => break Err(format!("the device did not finish within {limit:?}")),
+                    _ => break Err("the device was lost".into()),
+                }
+            };
+            gl.delete_sync(fence);
+            done.map_err(during(stage))
+        }
+    }
+
+    /// Runs commands and tells how long they take; in software this waits for them.
+    pub(super) fn timed(self: &Rc<Self>, commands: impl FnOnce() -> Result<()>) -> Result<Stopwatch> {
+        let gl = self.on();
+        if self.limits.software {
+            // SAFETY: only waits.
+            unsafe { gl.finish() }
+            let begin = Instant::now();
+            commands()?;
+            // SAFETY: only waits.
+            unsafe { gl.finish() }
+            return Ok(Stopwatch::Wall(begin.elapsed().as_secs_f64() * 1e3));
+        }
+        // SAFETY: one query at a time: it is ended before this returns, whatever the commands did.
+        let query = unsafe {
+            let query = gl.create_query().map_err(during("timer"))?;
+            gl.begin_query(glow::TIME_ELAPSED, query);
+            query
+        };
+        let done = commands();
+        // SAFETY: ends the query that was begun above.
+        unsafe { self.on().end_query(glow::TIME_ELAPSED) }
+        let stopwatch = Stopwatch::Query(Rc::clone(self), query);
+        done.map(|()| stopwatch)
+    }
+}
+
+impl Stopwatch {
+    /// Milliseconds; for a stretch that was ended and waited for.
+    pub(super) fn ms(&self) -> f64 {
+        match self {
+            Self::Wall(ms) => *ms,
+            // SAFETY: the query was ended; its result is there or waited for.
+            Self::Query(gl, query) => unsafe {
+                gl.on().get_query_parameter_u64(*query, glow::QUERY_RESULT) as f64 * 1e-6
+            },
+        }
+    }
+}
+
+impl Drop for Stopwatch {
+    fn drop(&mut self) {
+        if let Self::Query(gl, query) = self {
+            // SAFETY: the name is ours alone and is not used after this.
+            unsafe { gl.on().delete_query(*query) }
+        }
+    }
+}
+
+fn limits(gl: &glow::Context) -> Limits {
+    // SAFETY: plain questions that every 4.3 core context answers.
+    unsafe {
+        let number = |name: u32| gl.get_parameter_i32(name).max(0) as u32;
+        let renderer = gl.get_parameter_string(glow::RENDERER);
+        let software = ["llvmpipe", "softpipe", "swrast", "SWR"].iter().any(|name| renderer.contains(name));
+        let anisotropic = gl.supported_extensions().contains("GL_EXT_texture_filter_anisotropic");
+        let mut viewport = [0; 2];
+        gl.get_parameter_i32_slice(glow::MAX_VIEWPORT_DIMS, &mut viewport);
+        let viewport = viewport[0].min(viewport[1]).max(0) as u32;
+        Limits {
+            renderer,
+            version: gl.get_parameter_string(glow::VERSION),
+            software,
+            max_side: number(glow::MAX_TEXTURE_SIZE).min(viewport),
+            max_samples: number(glow::MAX_COLOR_TEXTURE_SAMPLES).min(number(glow::MAX_DEPTH_TEXTURE_SAMPLES)),
+            max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
+            max_storage: gl.get_parameter_i64(glow::MAX_SHADER_STORAGE_BLOCK_SIZE).max(0) as u64,
+            anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
+        }
+    }
+}
+
+/// Lets the driver's messages go to the log.
+fn listen(gl: &mut glow::Context) {
+    if !gl.supports_debug() {
+        return;
+    }
+    // SAFETY: the callback only logs and holds nothing of the context.
+    unsafe {
+        gl.debug_message_callback(|_, kind, _, severity, text| match (kind, severity) {
+            (glow::DEBUG_TYPE_ERROR, _) | (_, glow::DEBUG_SEVERITY_HIGH) => tracing::warn!(target: "opengl", "{text}"),
+            _ => tracing::trace!(target: "opengl", "{text}"),
+        });
+    }
+}
+
+/// A refusal by size that a caller can act on.
+pub(super) fn too_large(what: &str, limit: u64, given: u64) -> Error {
+    crate::error::invalid(what, format!("at most {limit} on this device"), given)
+}

@@ -1,0 +1,128 @@
+//! The passes of one frame, in order: shadow, blur, opaque, sky, ground, blended, encode.
+
+use super::frame::above_ground;
+use super::geometry::Kind;
+use super::gl::{Fixed, Gl, Program};
+use super::scene_buffers::SceneBuffers;
+use super::shaders::{COLOUR_UNIT, NORMAL_UNIT, SHADOW_UNIT};
+use super::target::Target;
+use super::{Ran, Shot};
+use crate::error::Result;
+
+const POSITIONS: u32 = 0;
+const TRIANGLE_MATERIALS: u32 = 1;
+const MATERIALS: u32 = 2;
+const PIXELS: u32 = 3;
+const FRAME: u32 = 0;
+/// Lanes of a compute workgroup, along x.
+const LANES: u32 = 64;
+
+/// Binds what all passes read.
+pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
+    buffers.buffer("positions")?.bind_storage(POSITIONS);
+    buffers.buffer("materials")?.bind_storage(MATERIALS);
+    if let Some(list) = buffers.buffers.get("triangle materials") {
+        list.bind_storage(TRIANGLE_MATERIALS);
+    }
+    buffers.buffer("frame")?.bind_uniform(FRAME);
+    for (unit, texture) in (COLOUR_UNIT..).zip(&buffers.colours) {
+        texture.bind(unit);
+    }
+    for (unit, texture) in (NORMAL_UNIT..).zip(&buffers.normals) {
+        texture.bind(unit);
+    }
+    Ok(())
+}
+
+/// Depth from the sun, then its blurred moments.
+pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
+    let (Some(map), Some([blur_x, blur_y])) = (&buffers.shadow, &buffers.programs.blur) else { return Ok(()) };
+    gl.begin(&map.framebuffer, map.size, map.size);
+    gl.set(Fixed { depth_write: true, ..Fixed::default() });
+    for group in &buffers.groups {
+        if let Some(program) = &buffers.programs.shadow[group.kind as usize] {
+            program.bind(first_triangle(buffers, group.kind != Kind::Opaque, group.first_triangle));
+            gl.draw_indexed(&buffers.casters, group.first_triangle, group.triangles);
+        }
+    }
+    ran.passes.push("shadow");
+    gl.check("shadow")?;
+    for (program, from, to) in [(blur_x, &map.depth, &map.half_blurred), (blur_y, &map.half_blurred, &map.moments)] {
+        program.bind(None);
+        from.bind(0);
+        to.bind_image(0);
+        gl.dispatch(map.size.div_ceil(LANES), map.size);
+    }
+    ran.passes.push("blur");
+    gl.check("blur")
+}
+
+/// The picture, in linear light.
+pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot, ran: &mut Ran) -> Result<()> {
+    let programs = &buffers.programs;
+    gl.begin(&target.framebuffer, target.width, target.height);
+    if let Some(map) = &buffers.shadow {
+        map.moments.bind(SHADOW_UNIT);
+    }
+    if surfaces(gl, buffers, target, &[Kind::Opaque, Kind::Mask], ran) {
+        ran.passes.push("opaque");
+        gl.check("opaque")?;
+    }
+    gl.set(Fixed { depth_clamp: true, ..Fixed::default() });
+    if let Some(program) = &programs.sky {
+        made(gl, buffers, program, 3);
+        ran.passes.push("sky");
+        gl.check("sky")?;
+    }
+    if let Some(program) = programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) {
+        gl.set(Fixed { depth_clamp: true, depth_write: true, ..Fixed::default() });
+        made(gl, buffers, program, 6);
+        ran.passes.push("ground");
+        gl.check("ground")?;
+    }
+    if surfaces(gl, buffers, target, &[Kind::Blend], ran) {
+        ran.passes.push("blended");
+        gl.check("blended")?;
+    }
+    Ok(())
+}
+
+/// Samples to bytes, and the bytes to where the host can read them.
+pub(super) fn encode(gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
+    target.encode.bind(None);
+    target.colour.bind(0);
+    target.packed.bind_storage(PIXELS);
+    gl.dispatch(target.width.div_ceil(LANES), target.height);
+    ran.passes.push("encode");
+    gl.check("encode")
+}
+
+/// Draws the groups of these kinds; whether there were any.
+fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ran: &mut Ran) -> bool {
+    let before = ran.draws;
+    for group in buffers.groups.iter().filter(|group| kinds.contains(&group.kind)) {
+        let single = buffers.programs.mask_single.as_ref().filter(|_| group.kind == Kind::Mask && target.samples == 1);
+        let Some(program) = single.or(buffers.programs.surface[group.kind as usize].as_ref()) else { continue };
+        gl.set(Fixed {
+            depth_write: group.kind != Kind::Blend,
+            cull: !group.double_sided,
+            blend: group.kind == Kind::Blend,
+            coverage: group.kind == Kind::Mask && target.samples > 1,
+            depth_clamp: false,
+        });
+        program.bind(first_triangle(buffers, true, group.first_triangle));
+        gl.draw_indexed(&buffers.corners, group.first_triangle, group.triangles);
+        ran.draws += 1;
+    }
+    ran.draws > before
+}
+
+fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
+    program.bind(None);
+    gl.draw_made(&buffers.nothing, vertices);
+}
+
+/// The number that a program reads the material by, when it does.
+fn first_triangle(buffers: &SceneBuffers, reads_material: bool, first: usize) -> Option<u32> {
+    (reads_material && buffers.buffers.contains_key("triangle materials")).then_some(first as u32)
+}

@@ -1,0 +1,209 @@
+//! What a scene needs of the device, decided once from its [`crate::scene::Needs`]: buffers, textures, passes, shader
+//! branches; and what was left out, with what that saved against a scene that needs everything.
+//!
+//! The renderer allocates and compiles exactly this. Pure: runs without a device.
+
+use super::geometry::{Kind, groups, used_materials};
+use super::textures::{Use, arrays};
+use crate::scene::{Scene, Shadow};
+
+/// A buffer or texture and its size.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Allocation {
+    pub name: String,
+    pub bytes: u64,
+}
+
+/// A feature that the scene does not need, and what leaving it out saved.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Saving {
+    /// The feature.
+    pub feature: &'static str,
+    /// Device memory that is not allocated.
+    pub bytes: u64,
+    /// Passes that do not run.
+    pub passes: Vec<&'static str>,
+    /// What the shaders do without, in words.
+    pub shaders: &'static str,
+}
+
+/// All that the renderer makes for a scene.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Plan {
+    /// Buffers of the scene, by name.
+    pub buffers: Vec<Allocation>,
+    /// Textures of the scene, by name.
+    pub textures: Vec<Allocation>,
+    /// Passes of a frame, in order.
+    pub passes: Vec<&'static str>,
+    /// Draw calls of the opaque and blended passes together; the number of domains does not matter.
+    pub draws: usize,
+    /// Branches that the shaders are compiled with.
+    pub defines: Vec<&'static str>,
+    pub left_out: Vec<Saving>,
+}
+
+impl Plan {
+    /// Whether the shaders are compiled with a branch.
+    pub fn defines(&self, name: &str) -> bool {
+        self.defines.contains(&name)
+    }
+
+    /// Bytes of all buffers and textures.
+    pub fn bytes(&self) -> u64 {
+        self.buffers.iter().chain(&self.textures).map(|allocation| allocation.bytes).sum()
+    }
+}
+
+/// What a scene needs of the device.
+pub fn plan(scene: &Scene) -> Plan {
+    let groups = groups(scene);
+    let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
+    let mut passes = Vec::new();
+    if scene.needs.shadows {
+        passes.extend(["shadow", "blur"]);
+    }
+    if has(Kind::Opaque) || has(Kind::Mask) {
+        passes.push("opaque");
+    }
+    passes.push("sky");
+    passes.extend(scene.look.ground.map(|_| "ground"));
+    passes.extend(scene.needs.blend.then_some("blended"));
+    passes.push("encode");
+    Plan {
+        buffers: buffers(scene),
+        textures: textures(scene),
+        passes,
+        draws: groups.len(),
+        defines: defines(scene),
+        left_out: left_out(scene),
+    }
+}
+
+fn named(name: impl Into<String>, bytes: usize) -> Allocation {
+    Allocation { name: name.into(), bytes: bytes as u64 }
+}
+
+fn buffers(scene: &Scene) -> Vec<Allocation> {
+    let layout = &scene.layout;
+    let mut buffers = vec![
+        named("positions", 12 * layout.vertices),
+        named("normals", 12 * layout.corners),
+        named("corner vertices", 4 * layout.corners),
+        named("triangles", 12 * layout.triangles),
+        named("materials", super::scene_buffers::MATERIAL_BYTES * scene.materials.len()),
+        named("frame", size_of::<super::frame::Frame>()),
+    ];
+    if scene.needs.normal_maps {
+        buffers.push(named("tangents", 16 * layout.corners));
+    }
+    if scene.needs.textures || scene.needs.normal_maps {
+        buffers.push(named("uvs", 8 * layout.corners));
+    }
+    if used_materials(scene).len() > 1 {
+        buffers.push(named("triangle materials", 4 * layout.triangles));
+    }
+    buffers
+}
+
+fn textures(scene: &Scene) -> Vec<Allocation> {
+    let mut textures = Vec::new();
+    for (purpose, word) in [(Use::Colour, "colours"), (Use::Normal, "normals")] {
+        for array in arrays(scene, purpose) {
+            let name = format!("{word} {} x {} x {}", array.width, array.height, array.layers.len());
+            textures.push(Allocation { name, bytes: array.bytes() });
+        }
+    }
+    if let Some(shadow) = scene.look.shadow {
+        textures.extend(shadow_textures(shadow));
+    }
+    textures
+}
+
+fn shadow_textures(shadow: Shadow) -> [Allocation; 3] {
+    let texels = shadow.size as usize * shadow.size as usize;
+    [
+        named("shadow depth", 4 * texels),
+        named("shadow moments, blurred in x", 8 * texels),
+        named("shadow moments", 8 * texels),
+    ]
+}
+
+fn defines(scene: &Scene) -> Vec<&'static str> {
+    let needs = scene.needs;
+    let several = used_materials(scene).len() > 1;
+    let branches = [
+        ("TEXTURES", needs.textures),
+        ("NORMAL_MAPS", needs.normal_maps),
+        ("UVS", needs.textures || needs.normal_maps),
+        ("MATERIALS", several),
+        ("SHADOWS", needs.shadows),
+    ];
+    branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
+}
+
+fn left_out(scene: &Scene) -> Vec<Saving> {
+    let (needs, layout) = (scene.needs, &scene.layout);
+    let map: u64 = shadow_textures(scene.look.shadow.unwrap_or_default()).iter().map(|part| part.bytes).sum();
+    let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
+    let uvs = if needs.textures || needs.normal_maps { 0 } else { per_corner(8) };
+    let several = used_materials(scene).len() > 1;
+    let all = [
+        (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
+        (needs.textures, "textures", uvs, vec![], "no colour lookup"),
+        (needs.mask, "mask", 0, vec![], "no discard; the shadow of opaque triangles needs no fragment shader"),
+        (needs.blend, "blend", 0, vec!["blended"], "no blended variant"),
+        (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
+        (several, "several materials", 4 * layout.triangles as u64, vec![], "no material lookup per triangle"),
+        (scene.look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
+    ];
+    let unneeded = all.into_iter().filter(|row| !row.0);
+    unneeded.map(|(_, feature, bytes, passes, shaders)| Saving { feature, bytes, passes, shaders }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::geometry::tests::squares;
+    use super::*;
+    use crate::domain::{AlphaMode, Material, Texture};
+
+    fn names(allocations: &[Allocation]) -> Vec<&str> {
+        allocations.iter().map(|allocation| allocation.name.as_str()).collect()
+    }
+
+    fn everything() -> crate::scene::Parts {
+        let mut parts = squares(vec![
+            Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
+            Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
+            Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
+        ]);
+        parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
+        parts
+    }
+
+    #[test]
+    fn a_plain_scene_without_shadow_leaves_out_everything_and_says_what_that_saved() {
+        let mut parts = squares(vec![Material::default()]);
+        parts.look.shadow = None;
+        parts.look.ground = None;
+        let scene = Scene::new(parts).expect("good");
+        let plan = plan(&scene);
+        assert_eq!(plan.passes, ["opaque", "sky", "encode"]);
+        let expected = ["positions", "normals", "corner vertices", "triangles", "materials", "frame"];
+        assert_eq!(names(&plan.buffers), expected);
+        assert!(plan.textures.is_empty() && plan.defines.is_empty());
+        let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
+        assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "several materials", "ground"]);
+        assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
+        assert_eq!(plan.left_out[4].bytes, 20 * 2048 * 2048, "map and moments");
+    }
+
+    #[test]
+    fn a_scene_that_needs_all_leaves_out_nothing() {
+        let plan = plan(&Scene::new(everything()).expect("good"));
+        assert_eq!(plan.passes, ["shadow", "blur", "opaque", "sky", "ground", "blended", "encode"]);
+        assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
+        assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
+        assert_eq!(plan.textures[0], Allocation { name: "colours 1 x 1 x 1".into(), bytes: 4 });
+    }
+}

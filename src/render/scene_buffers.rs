@@ -1,0 +1,309 @@
+//! What a scene owns on the device: buffers, texture arrays, shadow map and programs, exactly as its plan says.
+
+use std::collections::BTreeMap;
+use std::rc::Rc;
+use std::sync::Arc;
+
+use bytemuck::{Pod, Zeroable};
+use rayon::prelude::*;
+
+use super::SharedBuffers;
+use super::geometry::{Geometry, Group, Kind, used_materials};
+use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Program, Texture, TextureKind, VertexArray};
+use super::plan::{Allocation, Plan, plan};
+use super::shaders::{Options, Source};
+use super::textures::{Array, Use, arrays, levels, place};
+use crate::domain::AlphaMode;
+use crate::error::{Result, during};
+use crate::scene::Scene;
+
+/// Twin of `Material` in `shaders/shared/material.glsl`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct PackedMaterial {
+    ambient_alpha: [f32; 4],
+    diffuse_cutoff: [f32; 4],
+    specular_exponent: [f32; 4],
+    images: [i32; 4],
+}
+
+pub(super) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
+const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
+
+/// A scene's buffers, textures and programs on the device; freed when dropped.
+#[derive(Debug)]
+pub struct SceneBuffers {
+    /// Names of the buffers that a deformer may write in place of an upload.
+    pub shared: SharedBuffers,
+    pub(super) scene: Arc<Scene>,
+    pub(super) buffers: BTreeMap<String, Buffer>,
+    pub(super) groups: Vec<Group>,
+    pub(super) corners: VertexArray,
+    pub(super) casters: VertexArray,
+    /// No attributes: for triangles that shaders make themselves.
+    pub(super) nothing: VertexArray,
+    pub(super) colours: Vec<Texture>,
+    pub(super) normals: Vec<Texture>,
+    pub(super) shadow: Option<ShadowMap>,
+    pub(super) programs: Programs,
+    plan: Plan,
+}
+
+#[derive(Debug)]
+pub(super) struct ShadowMap {
+    pub(super) size: u32,
+    pub(super) depth: Texture,
+    pub(super) half_blurred: Texture,
+    pub(super) moments: Texture,
+    pub(super) framebuffer: Framebuffer,
+}
+
+/// Programs by kind of triangle; absent where the scene has no such triangles.
+#[derive(Debug, Default)]
+pub(super) struct Programs {
+    pub(super) surface: [Option<Rc<Program>>; 3],
+    /// Cut-outs in a picture of one sample a pixel.
+    pub(super) mask_single: Option<Rc<Program>>,
+    pub(super) shadow: [Option<Rc<Program>>; 3],
+    pub(super) blur: Option<[Rc<Program>; 2]>,
+    pub(super) ground: Option<Rc<Program>>,
+    pub(super) sky: Option<Rc<Program>>,
+}
+
+impl SceneBuffers {
+    /// Allocates and fills what the plan of the scene says; `compile` gives programs that may be shared.
+    pub(super) fn new(
+        gl: &Rc<Gl>,
+        scene: &Arc<Scene>,
+        samples: u32,
+        compile: &mut dyn FnMut(Source) -> Result<Rc<Program>>,
+    ) -> Result<Self> {
+        let plan = plan(scene);
+        let geometry = Geometry::new(scene);
+        let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
+        let materials = pack(scene, &images);
+        let buffers = allocate(gl, &plan, &geometry, &materials)?;
+        let shared = shared(gl, scene, &buffers)?;
+        let (corners, casters) = vertex_arrays(gl, &buffers)?;
+        let options = Options {
+            only_material: used_materials(scene).first().copied().unwrap_or(0),
+            colour_arrays: images[0].len(),
+            normal_arrays: images[1].len(),
+            blur: scene.look.shadow.unwrap_or_default().blur,
+            plan: plan.clone(),
+        };
+        let programs = Programs::compile(&options, &geometry.groups, samples, compile)?;
+        let [colours, normals] = images;
+        Ok(Self {
+            shared,
+            scene: Arc::clone(scene),
+            buffers,
+            groups: geometry.groups,
+            corners,
+            casters,
+            nothing: gl.vertex_array(None, &[])?,
+            colours: upload_arrays(gl, scene, &colours, Use::Colour)?,
+            normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
+            shadow: scene.look.shadow.map(|shadow| ShadowMap::new(gl, shadow.size)).transpose()?,
+            programs,
+            plan,
+        })
+    }
+
+    /// The plan that was followed.
+    pub const fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// The buffers that the device really holds for this scene, by name.
+    pub fn allocated(&self) -> Vec<Allocation> {
+        let buffers = self.buffers.iter().map(|(name, buffer)| Allocation { name: name.clone(), bytes: buffer.bytes });
+        buffers.collect()
+    }
+
+    /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.
+    pub fn texture_count(&self) -> usize {
+        self.colours.len() + self.normals.len() + if self.shadow.is_some() { 3 } else { 0 }
+    }
+
+    pub(super) fn buffer(&self, name: &'static str) -> Result<&Buffer> {
+        named(&self.buffers, name)
+    }
+}
+
+fn named<'a>(buffers: &'a BTreeMap<String, Buffer>, name: &'static str) -> Result<&'a Buffer> {
+    buffers.get(name).ok_or_else(|| during("render")(format!("the plan has no buffer '{name}'")))
+}
+
+fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
+    let wide = |[r, g, b]: [f32; 3], fourth: f32| [r, g, b, fourth];
+    let at = |arrays: &[Array], texture: Option<usize>| {
+        let place = texture.and_then(|texture| place(arrays, texture));
+        place.map_or([-1, -1], |(array, layer)| [array as i32, layer as i32])
+    };
+    let one = |material: &crate::domain::Material| {
+        let cutoff = if let AlphaMode::Mask { cutoff } = material.alpha_mode { cutoff } else { 0.0 };
+        let ([a, b], [c, d]) = (at(&images[0], material.colour_texture), at(&images[1], material.normal_texture));
+        PackedMaterial {
+            ambient_alpha: wide(material.ambient, material.alpha),
+            diffuse_cutoff: wide(material.diffuse, cutoff),
+            specular_exponent: wide(material.specular, material.shininess),
+            images: [a, b, c, d],
+        }
+    };
+    scene.materials.iter().map(one).collect()
+}
+
+fn allocate(
+    gl: &Rc<Gl>,
+    plan: &Plan,
+    geometry: &Geometry,
+    materials: &[PackedMaterial],
+) -> Result<BTreeMap<String, Buffer>> {
+    let mut buffers = BTreeMap::new();
+    for allocation in &plan.buffers {
+        let content: Option<&[u8]> = match allocation.name.as_str() {
+            "corner vertices" => Some(bytemuck::cast_slice(&geometry.vertices)),
+            "triangles" => Some(bytemuck::cast_slice(&geometry.triangles)),
+            "uvs" => Some(bytemuck::cast_slice(&geometry.uvs)),
+            "triangle materials" => Some(bytemuck::cast_slice(&geometry.materials)),
+            "materials" => Some(bytemuck::cast_slice(materials)),
+            _ => None,
+        };
+        let usage = if content.is_some() { gl::STATIC_DRAW } else { gl::DYNAMIC_DRAW };
+        let buffer = gl.buffer(allocation.bytes, usage, content)?;
+        buffers.insert(allocation.name.clone(), buffer);
+    }
+    Ok(buffers)
+}
+
+fn shared(gl: &Gl, scene: &Scene, buffers: &BTreeMap<String, Buffer>) -> Result<SharedBuffers> {
+    let positions = named(buffers, "positions")?;
+    if positions.bytes > gl.limits.max_storage {
+        return Err(gl::too_large("scene.vertices", gl.limits.max_storage / 12, scene.layout.vertices as u64));
+    }
+    let triangles = named(buffers, "triangle materials").map_or(0, |list| list.bytes);
+    if triangles > gl.limits.max_storage {
+        return Err(gl::too_large("scene.triangles", gl.limits.max_storage / 4, scene.layout.triangles as u64));
+    }
+    Ok(SharedBuffers {
+        positions: positions.name(),
+        normals: named(buffers, "normals")?.name(),
+        tangents: buffers.get("tangents").map(Buffer::name),
+    })
+}
+
+/// Attributes for the picture, and the fewer for the shadow map.
+fn vertex_arrays(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<(VertexArray, VertexArray)> {
+    let attribute = |location, buffer, components, integer| Attribute { location, buffer, components, integer };
+    let index = named(buffers, "triangles")?;
+    let vertex = || Ok(attribute(0, named(buffers, "corner vertices")?, 1, true));
+    let uv = || buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false));
+    let mut corners = vec![vertex()?, attribute(1, named(buffers, "normals")?, 3, false)];
+    corners.extend(uv());
+    corners.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
+    let mut casters = vec![vertex()?];
+    casters.extend(uv());
+    Ok((gl.vertex_array(Some(index), &corners)?, gl.vertex_array(Some(index), &casters)?))
+}
+
+fn upload_arrays(gl: &Rc<Gl>, scene: &Scene, arrays: &[Array], purpose: Use) -> Result<Vec<Texture>> {
+    arrays.iter().map(|array| upload_array(gl, scene, array, purpose)).collect()
+}
+
+fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Result<Texture> {
+    let layers = array.layers.len() as u32;
+    if layers > gl.limits.max_layers {
+        let field = format!("textures of {} x {}", array.width, array.height);
+        return Err(gl::too_large(&field, u64::from(gl.limits.max_layers), u64::from(layers)));
+    }
+    let texture = gl.texture(TextureKind {
+        target: gl::TEXTURE_2D_ARRAY,
+        format: if purpose == Use::Colour { gl::SRGB8_ALPHA8 } else { gl::RGBA8 },
+        width: array.width,
+        height: array.height,
+        depth: layers,
+        levels: array.levels(),
+    })?;
+    // A few layers at a time: all chains of a large scene at once would take many times its textures in memory.
+    for (chunk, part) in array.layers.chunks(8).enumerate() {
+        let chains: Vec<Vec<Vec<u8>>> =
+            part.par_iter().map(|layer| levels(&scene.textures[*layer], array, purpose)).collect();
+        for (offset, chain) in chains.iter().enumerate() {
+            for (level, rgba) in chain.iter().enumerate() {
+                let size = [(array.width >> level).max(1), (array.height >> level).max(1)];
+                texture.fill(level as u32, (8 * chunk + offset) as u32, size, rgba)?;
+            }
+        }
+    }
+    let sampling = [
+        (gl::TEXTURE_MIN_FILTER, gl::LINEAR_MIPMAP_LINEAR),
+        (gl::TEXTURE_MAG_FILTER, gl::LINEAR),
+        (gl::TEXTURE_WRAP_S, gl::REPEAT),
+        (gl::TEXTURE_WRAP_T, gl::REPEAT),
+    ];
+    texture.sampling(&sampling, gl.limits.anisotropy);
+    Ok(texture)
+}
+
+impl ShadowMap {
+    fn new(gl: &Rc<Gl>, size: u32) -> Result<Self> {
+        if size > gl.limits.max_side {
+            return Err(gl::too_large("look.shadow.size", u64::from(gl.limits.max_side), u64::from(size)));
+        }
+        let map = |format: u32, filter: u32| {
+            let kind = TextureKind { target: gl::TEXTURE_2D, format, width: size, height: size, depth: 1, levels: 1 };
+            let texture = gl.texture(kind)?;
+            let sampling = [
+                (gl::TEXTURE_MIN_FILTER, filter),
+                (gl::TEXTURE_MAG_FILTER, filter),
+                (gl::TEXTURE_WRAP_S, gl::CLAMP_TO_EDGE),
+                (gl::TEXTURE_WRAP_T, gl::CLAMP_TO_EDGE),
+            ];
+            texture.sampling(&sampling, 1.0);
+            Ok(texture)
+        };
+        let depth = map(gl::DEPTH_COMPONENT32F, gl::NEAREST)?;
+        let framebuffer = gl.framebuffer(None, &depth)?;
+        Ok(Self {
+            size,
+            depth,
+            half_blurred: map(gl::RG32F, gl::NEAREST)?,
+            moments: map(gl::RG32F, gl::LINEAR)?,
+            framebuffer,
+        })
+    }
+}
+
+impl Programs {
+    fn compile(
+        options: &Options,
+        groups: &[Group],
+        samples: u32,
+        compile: &mut dyn FnMut(Source) -> Result<Rc<Program>>,
+    ) -> Result<Self> {
+        let mut programs = Self::default();
+        let plan = &options.plan;
+        let has = |pass: &str| plan.passes.contains(&pass);
+        for kind in [Kind::Opaque, Kind::Mask, Kind::Blend] {
+            if !groups.iter().any(|group| group.kind == kind) {
+                continue;
+            }
+            programs.surface[kind as usize] = Some(compile(options.surface(kind, samples))?);
+            if kind == Kind::Mask {
+                programs.mask_single = Some(compile(options.surface(kind, 1))?);
+            }
+            if has("shadow") {
+                programs.shadow[kind as usize] = Some(compile(options.shadow(kind))?);
+            }
+        }
+        if has("blur") {
+            programs.blur = Some([compile(options.blur(true))?, compile(options.blur(false))?]);
+        }
+        if has("ground") {
+            programs.ground = Some(compile(options.ground())?);
+        }
+        programs.sky = Some(compile(options.sky())?);
+        Ok(programs)
+    }
+}

@@ -1,0 +1,202 @@
+//! Shader sources to programs: the files under `shaders/`, with the branches that a scene needs and no others.
+
+use std::fmt::Write as _;
+
+use super::geometry::Kind;
+use super::gl;
+use super::plan::Plan;
+
+const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
+const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
+const CUT_OUT: &str = include_str!("../../shaders/shared/cut_out.glsl");
+const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
+const SUN: &str = include_str!("../../shaders/shared/sun.glsl");
+const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
+
+/// First texture unit of each use.
+pub(super) const SHADOW_UNIT: u32 = 0;
+pub(super) const COLOUR_UNIT: u32 = 1;
+pub(super) const NORMAL_UNIT: u32 = COLOUR_UNIT + super::textures::MAX_ARRAYS as u32;
+
+/// What the sources depend on besides the plan.
+#[derive(Debug, Clone)]
+pub(super) struct Options {
+    pub(super) plan: Plan,
+    /// Index of the only material, when there is only one.
+    pub(super) only_material: usize,
+    pub(super) colour_arrays: usize,
+    pub(super) normal_arrays: usize,
+    /// Standard deviation of the blur in texels.
+    pub(super) blur: f32,
+}
+
+/// The text of a program's stages.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Source {
+    pub(super) label: String,
+    pub(super) stages: Vec<(u32, String)>,
+}
+
+impl Options {
+    fn head(&self, more: &[&str]) -> String {
+        let mut text = String::from("#version 430 core\n");
+        for define in self.plan.defines.iter().chain(more) {
+            writeln!(text, "#define {define}").ok();
+        }
+        writeln!(text, "#define ONLY_MATERIAL {}u", self.only_material).ok();
+        text
+    }
+
+    /// Draws triangles of one kind into the picture.
+    pub(super) fn surface(&self, kind: Kind, samples: u32) -> Source {
+        let more: &[&str] = match kind {
+            Kind::Opaque => &[],
+            Kind::Mask if samples > 1 => &["MASK", "MULTISAMPLED"],
+            Kind::Mask => &["MASK"],
+            Kind::Blend => &["BLEND"],
+        };
+        let head = self.head(more);
+        let vertex = [&head, FRAME, include_str!("../../shaders/surface.vert")].concat();
+        let cut_out = if kind == Kind::Mask { CUT_OUT } else { "" };
+        let body = include_str!("../../shaders/surface.frag");
+        let fragment = [&head, FRAME, MATERIAL, &self.samplers(), cut_out, SUN, body].concat();
+        Source {
+            label: format!("surface, {kind:?}, {samples} samples"),
+            stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)],
+        }
+    }
+
+    /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
+    pub(super) fn shadow(&self, kind: Kind) -> Source {
+        let more: &[&str] = match kind {
+            Kind::Opaque => &["SOLID"],
+            Kind::Mask => &["MASK"],
+            Kind::Blend => &["BLEND"],
+        };
+        let head = self.head(more);
+        let vertex = [&head, FRAME, include_str!("../../shaders/shadow.vert")].concat();
+        let mut stages = vec![(gl::VERTEX_SHADER, vertex)];
+        if kind != Kind::Opaque {
+            let body = include_str!("../../shaders/shadow.frag");
+            let fragment = [&head, FRAME, MATERIAL, &self.samplers(), CASTER, body].concat();
+            stages.push((gl::FRAGMENT_SHADER, fragment));
+        }
+        Source { label: format!("shadow, {kind:?}"), stages }
+    }
+
+    pub(super) fn ground(&self) -> Source {
+        let head = self.head(&[]);
+        let vertex = [&head, FRAME, include_str!("../../shaders/ground.vert")].concat();
+        let fragment = [&head, FRAME, SUN, SKY, include_str!("../../shaders/ground.frag")].concat();
+        Source { label: "ground".into(), stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
+    }
+
+    pub(super) fn sky(&self) -> Source {
+        let head = self.head(&[]);
+        let vertex = [&head, FRAME, include_str!("../../shaders/sky.vert")].concat();
+        let fragment = [&head, FRAME, SKY, include_str!("../../shaders/sky.frag")].concat();
+        Source { label: "sky".into(), stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
+    }
+
+    /// One direction of the blur; the first also turns depth into moments.
+    pub(super) fn blur(&self, first: bool) -> Source {
+        let mut head = self.head(if first { &["FIRST"] } else { &[] });
+        let weights = weights(self.blur);
+        let list: Vec<String> = weights.iter().map(|weight| format!("{weight:?}")).collect();
+        writeln!(head, "const int REACH = {};", weights.len() - 1).ok();
+        writeln!(head, "const float WEIGHTS[{}] = float[]({});", weights.len(), list.join(", ")).ok();
+        let body = [&head, FRAME, include_str!("../../shaders/blur.comp")].concat();
+        Source { label: format!("blur, {}", if first { "x" } else { "y" }), stages: vec![(gl::COMPUTE_SHADER, body)] }
+    }
+
+    /// The lookup in the texture arrays: sampling must not hang on a number that differs within a quad, so that with
+    /// several arrays the gradients are taken first.
+    fn samplers(&self) -> String {
+        let mut text = String::new();
+        let uses = [("colour", COLOUR_UNIT, self.colour_arrays), ("normal", NORMAL_UNIT, self.normal_arrays)];
+        for (name, unit, count) in uses.into_iter().filter(|(_, _, count)| *count > 0) {
+            for index in 0..count {
+                let unit = unit as usize + index;
+                writeln!(text, "layout(binding = {unit}) uniform sampler2DArray {name}_{index};").ok();
+            }
+            writeln!(text, "vec4 {name}_texel(ivec2 place, vec2 uv) {{").ok();
+            writeln!(text, "    vec3 at = vec3(uv, float(max(place.y, 0)));").ok();
+            if count == 1 {
+                writeln!(text, "    return texture({name}_0, at);\n}}").ok();
+                continue;
+            }
+            writeln!(text, "    vec2 dx = dFdx(uv), dy = dFdy(uv);\n    switch (place.x) {{").ok();
+            for index in 1..count {
+                writeln!(text, "    case {index}: return textureGrad({name}_{index}, at, dx, dy);").ok();
+            }
+            writeln!(text, "    default: return textureGrad({name}_0, at, dx, dy);\n    }}\n}}").ok();
+        }
+        text
+    }
+}
+
+/// Turns the samples of the picture into sRGB bytes.
+pub(super) fn encode(samples: u32) -> Source {
+    let head = format!("#version 430 core\n#define SAMPLES {samples}\n");
+    let body = [&head, include_str!("../../shaders/encode.comp")].concat();
+    Source { label: format!("encode, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
+}
+
+/// Half a normalised Gaussian (equation 3.11 in one dimension), centre first, cut off at three deviations.
+pub(super) fn weights(deviation: f32) -> Vec<f32> {
+    let deviation = f64::from(deviation);
+    let reach = (3.0 * deviation).ceil() as i32;
+    let bell = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / deviation).powi(2)).exp() };
+    let sum: f64 = (-reach..=reach).map(bell).sum();
+    (0..=reach).map(|step| (bell(step) / sum) as f32).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::geometry::tests::squares;
+    use super::*;
+    use crate::domain::{AlphaMode, Material};
+    use crate::scene::Scene;
+
+    fn options(alpha_mode: AlphaMode) -> Options {
+        let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
+        Options {
+            plan: super::super::plan::plan(&scene),
+            only_material: 0,
+            colour_arrays: 0,
+            normal_arrays: 0,
+            blur: 2.0,
+        }
+    }
+
+    #[test]
+    fn only_cut_out_triangles_have_a_discard_in_their_shader() {
+        let text = |source: Source| source.stages.into_iter().map(|(_, text)| text).collect::<String>();
+        let options = options(AlphaMode::Opaque);
+        assert!(!text(options.surface(Kind::Opaque, 4)).contains("discard"));
+        assert!(!text(options.surface(Kind::Blend, 4)).contains("discard"));
+        assert!(text(options.surface(Kind::Mask, 4)).contains("discard"));
+        assert_eq!(options.shadow(Kind::Opaque).stages.len(), 1, "depth alone needs no fragment shader");
+    }
+
+    #[test]
+    fn blur_weights_are_a_normalised_bell() {
+        for deviation in [0.0, 0.3, 2.0, 16.0] {
+            let weights = weights(deviation);
+            let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
+            assert!((sum - 1.0).abs() < 1e-5, "{deviation}: {sum}");
+            assert!(weights.is_sorted_by(|near, far| near >= far));
+        }
+        assert_eq!(weights(0.0), [1.0]);
+    }
+
+    #[test]
+    fn several_arrays_are_chosen_by_a_switch_and_one_is_read_directly() {
+        let mut options = options(AlphaMode::Opaque);
+        assert_eq!(options.samplers(), "");
+        options.colour_arrays = 1;
+        assert!(!options.samplers().contains("switch"));
+        options.colour_arrays = 3;
+        assert!(options.samplers().contains("case 2: return textureGrad(colour_2"));
+    }
+}

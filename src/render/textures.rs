@@ -1,0 +1,296 @@
+//! A scene's images to texture arrays: one layer per distinct use, a bounded number of arrays.
+//!
+//! Images of one size share an array. When there are more sizes than [`MAX_ARRAYS`], the smallest array is merged into
+//! the one where that wastes the fewest texels, and its images are stretched to that size; texture coordinates run from
+//! 0 to 1 either way, so nothing else changes. Colours are stored sRGB, normal maps linear.
+
+use std::sync::OnceLock;
+
+use crate::domain::Texture;
+use crate::scene::Scene;
+
+use super::geometry::used_materials;
+
+/// Arrays per use. Colours, normals and the shadow map together stay below the sixteen units that OpenGL guarantees.
+pub(super) const MAX_ARRAYS: usize = 6;
+
+/// What an image is read as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Use {
+    Colour,
+    Normal,
+}
+
+/// One array: its size and the scene's textures in it, one per layer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Array {
+    pub(super) width: u32,
+    pub(super) height: u32,
+    pub(super) layers: Vec<usize>,
+}
+
+/// Where a material finds its image: array and layer.
+pub(super) type Place = (usize, usize);
+
+impl Array {
+    /// Levels of a full mipmap chain.
+    pub(super) fn levels(&self) -> u32 {
+        self.width.max(self.height).ilog2() + 1
+    }
+
+    /// Bytes of all levels and layers.
+    pub(super) fn bytes(&self) -> u64 {
+        let texels = |level: u32| u64::from((self.width >> level).max(1)) * u64::from((self.height >> level).max(1));
+        4 * self.layers.len() as u64 * (0..self.levels()).map(texels).sum::<u64>()
+    }
+}
+
+/// The arrays that a scene needs for one use; empty when no triangle's material has such an image.
+pub(super) fn arrays(scene: &Scene, purpose: Use) -> Vec<Array> {
+    let wanted = match purpose {
+        Use::Colour => scene.needs.textures,
+        Use::Normal => scene.needs.normal_maps,
+    };
+    if !wanted {
+        return Vec::new();
+    }
+    let image = |material: usize| match purpose {
+        Use::Colour => scene.materials[material].colour_texture,
+        Use::Normal => scene.materials[material].normal_texture,
+    };
+    let used: std::collections::BTreeSet<usize> = used_materials(scene).into_iter().filter_map(image).collect();
+    let sizes =
+        used.into_iter().map(|texture| (texture, scene.textures[texture].width(), scene.textures[texture].height()));
+    merge(by_size(sizes), MAX_ARRAYS)
+}
+
+/// Where a texture lies in its arrays.
+pub(super) fn place(arrays: &[Array], texture: usize) -> Option<Place> {
+    arrays
+        .iter()
+        .enumerate()
+        .find_map(|(index, array)| array.layers.iter().position(|layer| *layer == texture).map(|layer| (index, layer)))
+}
+
+fn by_size(images: impl Iterator<Item = (usize, u32, u32)>) -> Vec<Array> {
+    let mut arrays: Vec<Array> = Vec::new();
+    for (texture, width, height) in images {
+        match arrays.iter_mut().find(|array| (array.width, array.height) == (width, height)) {
+            Some(array) => array.layers.push(texture),
+            None => arrays.push(Array { width, height, layers: vec![texture] }),
+        }
+    }
+    arrays
+}
+
+fn merge(mut arrays: Vec<Array>, limit: usize) -> Vec<Array> {
+    let area = |width: u32, height: u32| u64::from(width) * u64::from(height);
+    while arrays.len() > limit {
+        arrays.sort_by_key(|array| std::cmp::Reverse(area(array.width, array.height)));
+        let Some(small) = arrays.pop() else { break };
+        let joined = |array: &Array| (array.width.max(small.width), array.height.max(small.height));
+        let waste = |array: &Array| {
+            let (width, height) = joined(array);
+            let grown = area(width, height) - area(array.width, array.height);
+            grown * array.layers.len() as u64 + (area(width, height) - area(small.width, small.height))
+        };
+        if let Some(host) = arrays.iter_mut().min_by_key(|array| waste(array)) {
+            (host.width, host.height) = joined(host);
+            host.layers.extend(small.layers);
+        }
+    }
+    arrays
+}
+
+/// All levels of one image at the size of its array, level 0 first, RGBA8.
+pub(super) fn levels(texture: &Texture, array: &Array, purpose: Use) -> Vec<Vec<u8>> {
+    let mut image = Linear::new(texture, purpose);
+    if (texture.width(), texture.height()) != (array.width, array.height) {
+        image = image.stretched(array.width, array.height);
+    }
+    let mut chain = vec![image];
+    while let Some(last) = chain.last().filter(|last| last.width > 1 || last.height > 1) {
+        let half = last.halved();
+        chain.push(half);
+    }
+    if purpose == Use::Colour {
+        bleed(&mut chain);
+    }
+    chain.iter().map(|level| level.bytes(purpose)).collect()
+}
+
+/// RGBA as numbers: linear colour (or a normal), and alpha.
+struct Linear {
+    width: u32,
+    height: u32,
+    texels: Vec<[f32; 4]>,
+}
+
+impl Linear {
+    fn new(texture: &Texture, purpose: Use) -> Self {
+        let decode: [f32; 256] = std::array::from_fn(|byte| match purpose {
+            Use::Colour => linear_from_srgb(byte as f32 / 255.0),
+            Use::Normal => byte as f32 / 255.0,
+        });
+        let texel = |rgba: &[u8]| {
+            let [r, g, b] = [rgba[0], rgba[1], rgba[2]].map(|byte| decode[usize::from(byte)]);
+            [r, g, b, f32::from(rgba[3]) / 255.0]
+        };
+        let texels = texture.rgba().chunks_exact(4).map(texel).collect();
+        Self { width: texture.width(), height: texture.height(), texels }
+    }
+
+    fn at(&self, x: u32, y: u32) -> [f32; 4] {
+        self.texels[(y.min(self.height - 1) * self.width + x.min(self.width - 1)) as usize]
+    }
+
+    /// The next level: each texel averages four, colours weighed by alpha, so that what is cut away tints nothing.
+    fn halved(&self) -> Self {
+        let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
+        let mut texels = Vec::with_capacity((width * height) as usize);
+        for y in 0..height {
+            for x in 0..width {
+                let four = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| self.at(2 * x + dx, 2 * y + dy));
+                texels.push(weighed(&four.map(|texel| (texel, 0.25))));
+            }
+        }
+        Self { width, height, texels }
+    }
+
+    /// Bilinear enlargement (arrays never shrink an image), wrapping around as sampling does.
+    fn stretched(&self, width: u32, height: u32) -> Self {
+        let along = |to: u32, count: u32, from: u32| {
+            let position = (to as f32 + 0.5) * from as f32 / count as f32 - 0.5;
+            let low = position.floor();
+            (
+                (low as i64).rem_euclid(i64::from(from)) as u32,
+                (low as i64 + 1).rem_euclid(i64::from(from)) as u32,
+                position - low,
+            )
+        };
+        let mut texels = Vec::with_capacity((width * height) as usize);
+        for y in 0..height {
+            let (top, bottom, v) = along(y, height, self.height);
+            for x in 0..width {
+                let (left, right, u) = along(x, width, self.width);
+                texels.push(weighed(&[
+                    (self.at(left, top), (1.0 - u) * (1.0 - v)),
+                    (self.at(right, top), u * (1.0 - v)),
+                    (self.at(left, bottom), (1.0 - u) * v),
+                    (self.at(right, bottom), u * v),
+                ]));
+            }
+        }
+        Self { width, height, texels }
+    }
+
+    fn bytes(&self, purpose: Use) -> Vec<u8> {
+        static SRGB: OnceLock<Vec<u8>> = OnceLock::new();
+        // Fine enough that the steepest step of the curve, at black, is a twentieth of a byte.
+        let table =
+            SRGB.get_or_init(|| (0..=65535).map(|step| byte(srgb_from_linear(step as f32 / 65535.0))).collect());
+        let encode = |value: f32| match purpose {
+            Use::Colour => table[(value * 65535.0 + 0.5) as u16 as usize],
+            Use::Normal => byte(value),
+        };
+        self.texels.iter().flat_map(|[r, g, b, a]| [encode(*r), encode(*g), encode(*b), byte(*a)]).collect()
+    }
+}
+
+fn byte(value: f32) -> u8 {
+    (value * 255.0 + 0.5) as u8
+}
+
+fn weighed(parts: &[([f32; 4], f32); 4]) -> [f32; 4] {
+    let alpha: f32 = parts.iter().map(|(texel, weight)| texel[3] * weight).sum();
+    let mut mean = [0.0, 0.0, 0.0, alpha];
+    for (channel, sum) in mean[..3].iter_mut().enumerate() {
+        let opaque = |(texel, weight): &([f32; 4], f32)| weight * if alpha > 0.0 { texel[3] / alpha } else { 1.0 };
+        *sum = parts.iter().map(|part| part.0[channel] * opaque(part)).sum();
+    }
+    mean
+}
+
+/// Gives every wholly transparent texel the colour of the level above it, from the coarsest level down: filtering at the
+/// edge of a cut-out then finds the colour of the leaf and no dark rim.
+fn bleed(chain: &mut [Linear]) {
+    for level in (0..chain.len().saturating_sub(1)).rev() {
+        let (fine, coarse) = chain.split_at_mut(level + 1);
+        let (fine, coarse) = (&mut fine[level], &coarse[0]);
+        for y in 0..fine.height {
+            for x in 0..fine.width {
+                let texel = &mut fine.texels[(y * fine.width + x) as usize];
+                if texel[3] == 0.0 {
+                    let [r, g, b, _] = coarse.at(x / 2, y / 2);
+                    *texel = [r, g, b, 0.0];
+                }
+            }
+        }
+    }
+}
+
+/// IEC 61966-2-1.
+pub(super) fn linear_from_srgb(encoded: f32) -> f32 {
+    if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+}
+
+fn srgb_from_linear(linear: f32) -> f32 {
+    if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(width: u32, height: u32, pixel: impl Fn(u32, u32) -> [u8; 4]) -> Texture {
+        let rgba = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).flat_map(|(x, y)| pixel(x, y)).collect();
+        Texture::new("test", width, height, rgba).expect("fits")
+    }
+
+    #[test]
+    fn many_sizes_end_in_few_arrays_and_no_image_is_lost_or_shrunk() {
+        let sizes: Vec<(usize, u32, u32)> = (0..40).map(|index| (index, 1 + index as u32 * 3, 50)).collect();
+        let merged = merge(by_size(sizes.iter().copied()), MAX_ARRAYS);
+        assert_eq!(merged.len(), MAX_ARRAYS);
+        for (texture, width, height) in sizes {
+            let (array, _) = place(&merged, texture).expect("kept");
+            assert!(merged[array].width >= width && merged[array].height >= height);
+        }
+        let few = by_size([(0, 4, 4), (1, 8, 8), (2, 4, 4)].into_iter());
+        assert_eq!(merge(few.clone(), MAX_ARRAYS), few, "few sizes are left alone");
+    }
+
+    #[test]
+    fn level_zero_keeps_every_byte_of_opaque_and_translucent_texels() {
+        let picture = image(16, 16, |x, y| [(16 * y + x) as u8, (255 - 16 * y) as u8, x as u8, 1 + 15 * y as u8]);
+        let array = Array { width: 16, height: 16, layers: vec![0] };
+        for purpose in [Use::Colour, Use::Normal] {
+            let chain = levels(&picture, &array, purpose);
+            assert_eq!(chain[0], picture.rgba());
+            assert_eq!(chain.iter().map(Vec::len).collect::<Vec<_>>(), [1024, 256, 64, 16, 4]);
+            assert_eq!(chain.iter().map(Vec::len).sum::<usize>() as u64, array.bytes());
+        }
+    }
+
+    #[test]
+    fn transparent_texels_take_the_colour_of_the_leaf_and_darken_no_level() {
+        let leaf = image(4, 4, |x, _| if x == 0 { [0, 200, 0, 255] } else { [255, 0, 255, 0] });
+        let chain = levels(&leaf, &Array { width: 4, height: 4, layers: vec![0] }, Use::Colour);
+        for (level, rgba) in chain.iter().enumerate() {
+            assert!(rgba.chunks_exact(4).all(|texel| texel[..3] == [0, 200, 0]), "level {level}: {rgba:?}");
+        }
+        assert_eq!(chain[2], [0, 200, 0, 64]);
+    }
+
+    #[test]
+    fn an_enlarged_image_keeps_its_corners_and_odd_sizes_reach_one_texel() {
+        let picture = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
+        let array = Array { width: 7, height: 3, layers: vec![0] };
+        let chain = levels(&picture, &array, Use::Normal);
+        assert_eq!((chain[0].len(), chain.len(), chain[2].len()), (84, 3, 4));
+        assert_eq!(array.bytes(), 4 * (21 + 3 + 1));
+        let constant = image(1, 1, |_, _| [9, 99, 199, 255]);
+        let chain = levels(&constant, &array, Use::Colour);
+        assert!(chain[0].chunks_exact(4).all(|texel| texel == [9, 99, 199, 255]));
+    }
+}

@@ -1,0 +1,144 @@
+//! The bark, made from a seed: a tiling sRGB colour image and its tangent-space normal map (+Y up), 512 x 512 each.
+
+use rayon::prelude::*;
+
+use super::noise::{Noise, blend, smooth_step};
+use super::random::Random;
+use crate::domain::Texture;
+use crate::error::Result;
+
+/// Side of both images in pixels.
+const SIDE: usize = 512;
+
+/// Height of the ridges above the furrows, in widths of the tile.
+const RELIEF: f32 = 0.020;
+
+/// sRGB, 0 to 255: bottoms of the furrows, ridges, weathered crests, a breath of lichen.
+const FURROW: [f32; 3] = [70.0, 57.0, 47.0];
+const RIDGE: [f32; 3] = [126.0, 109.0, 92.0];
+const CREST: [f32; 3] = [166.0, 152.0, 135.0];
+const LICHEN: [f32; 3] = [126.0, 126.0, 92.0];
+
+/// Colour image and normal map.
+///
+/// # Errors
+/// None in practice: the sizes are constants.
+pub(super) fn textures(random: &mut Random) -> Result<[Texture; 2]> {
+    let layers = Layers::new(random);
+    let rows = |row: usize| (0..SIDE).map(move |column| (column, row));
+    let heights: Vec<f32> = (0..SIDE * SIDE)
+        .into_par_iter()
+        .with_min_len(SIDE)
+        .map(|pixel| layers.height((pixel % SIDE) as f32 / SIDE as f32, (pixel / SIDE) as f32 / SIDE as f32))
+        .collect();
+    let mut colours = Vec::with_capacity(4 * SIDE * SIDE);
+    let mut normals = Vec::with_capacity(4 * SIDE * SIDE);
+    for (column, row) in (0..SIDE).flat_map(rows) {
+        let (u, v) = (column as f32 / SIDE as f32, row as f32 / SIDE as f32);
+        let colour = layers.colour(u, v, heights[row * SIDE + column]);
+        colours.extend(colour.map(|channel| channel.clamp(0.0, 255.0) as u8));
+        normals.extend(normal(&heights, column, row).map(|axis| ((0.5 * axis + 0.5) * 255.0).round() as u8));
+        colours.push(255);
+        normals.push(255);
+    }
+    let side = SIDE as u32;
+    Ok([Texture::new("bark", side, side, colours)?, Texture::new("bark normals", side, side, normals)?])
+}
+
+struct Layers {
+    warps: [Noise; 2],
+    furrows: [Noise; 2],
+    cracks: Noise,
+    grain: [Noise; 2],
+    tint: Noise,
+}
+
+impl Layers {
+    fn new(random: &mut Random) -> Self {
+        let mut noise = |across, along| Noise { cells: [across, along], seed: random.bits() };
+        Self {
+            warps: [noise(4, 3), noise(9, 7)],
+            furrows: [noise(15, 3), noise(27, 5)],
+            cracks: noise(11, 15),
+            grain: [noise(40, 18), noise(96, 60)],
+            tint: noise(3, 2),
+        }
+    }
+
+    /// 0 in the furrows to about 1 on the crests.
+    fn height(&self, u: f32, v: f32) -> f32 {
+        let bent = u + 0.035 * self.warps[0].at(u, v) + 0.012 * self.warps[1].at(u, v);
+        // Zero lines of the noise are long wavering furrows; the finer ones are shallow.
+        let deep = smooth_step(0.0, 0.34, self.furrows[0].at(bent, v).abs());
+        let fine = smooth_step(0.0, 0.36, self.furrows[1].at(bent, v).abs());
+        let crack = smooth_step(0.0, 0.16, self.cracks.at(bent, v + 0.02 * self.warps[1].at(v, u)).abs());
+        let grain = 0.6 * self.grain[0].at(bent, v) + 0.4 * self.grain[1].at(u, v);
+        let plate = deep.powf(0.7) * (0.58 + 0.42 * fine) * (0.80 + 0.20 * crack);
+        plate * (0.93 + 0.07 * grain) + 0.045 * grain
+    }
+
+    /// sRGB of a place and its height.
+    fn colour(&self, u: f32, v: f32, height: f32) -> [f32; 3] {
+        let grain = self.grain[0].at(u, v);
+        let tint = self.tint.at(u, v);
+        let body = blend(FURROW, RIDGE, smooth_step(0.02, 0.6, height));
+        let crest = blend(body, CREST, 0.75 * smooth_step(0.55, 1.0, height + 0.12 * grain));
+        let mossy = 0.45 * smooth_step(0.05, 0.6, tint) * smooth_step(0.3, 0.9, height);
+        let lichen = blend(crest, LICHEN, mossy);
+        lichen.map(|channel| channel * (1.0 + 0.07 * grain + 0.05 * tint))
+    }
+}
+
+/// The unit normal by central differences over the tile's edges; x to the right, y up in the image.
+fn normal(heights: &[f32], column: usize, row: usize) -> [f32; 3] {
+    let at = |column: usize, row: usize| heights[row % SIDE * SIDE + column % SIDE];
+    let right = at(column + 1, row) - at(column + SIDE - 1, row);
+    let up = at(column, row + SIDE - 1) - at(column, row + 1);
+    let slope = 0.5 * SIDE as f32 * RELIEF;
+    nalgebra::Vector3::new(-slope * right, -slope * up, 1.0).normalize().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mean(texture: &Texture) -> [f64; 3] {
+        let count = texture.rgba().len() as f64 / 4.0;
+        std::array::from_fn(|axis| {
+            texture.rgba().chunks_exact(4).map(|pixel| f64::from(pixel[axis])).sum::<f64>() / count
+        })
+    }
+
+    #[test]
+    fn the_normal_map_looks_up_on_average_and_the_colour_is_a_warm_brown() {
+        let [colour, normals] = textures(&mut Random::new(1)).expect("made");
+        let [x, y, z] = mean(&normals);
+        assert!((x - 127.5).abs() < 2.0 && (y - 127.5).abs() < 2.0 && z > 215.0, "{x} {y} {z}");
+        let [red, green, blue] = mean(&colour);
+        assert!(red > green && green > blue && (70.0..160.0).contains(&red), "{red} {green} {blue}");
+        // The control: it is no flat map.
+        let tilted = normals.rgba().chunks_exact(4).filter(|pixel| pixel[2] < 240).count();
+        assert!(tilted > SIDE * SIDE / 10, "{tilted} tilted pixels");
+    }
+
+    #[test]
+    fn the_images_tile_edges_differ_no_more_than_neighbours_within() {
+        let [colour, _] = textures(&mut Random::new(2)).expect("made");
+        let red = |column: usize, row: usize| f64::from(colour.rgba()[4 * (row * SIDE + column)]);
+        let step = |a: usize, b: usize| (0..SIDE).map(|row| (red(a, row) - red(b, row)).abs()).sum::<f64>();
+        let drop = |a: usize, b: usize| (0..SIDE).map(|column| (red(column, a) - red(column, b)).abs()).sum::<f64>();
+        assert!(step(SIDE - 1, 0) < 3.0 * step(100, 101) + 1.0);
+        assert!(drop(SIDE - 1, 0) < 3.0 * drop(100, 101) + 1.0);
+        assert!(step(0, 101) > 3.0 * step(100, 101));
+    }
+
+    #[test]
+    fn a_bump_tilts_the_normals_away_from_its_top() {
+        let mut heights = vec![0.0; SIDE * SIDE];
+        heights[100 * SIDE + 100] = 0.2;
+        assert!(normal(&heights, 101, 100)[0] > 0.1);
+        assert!(normal(&heights, 99, 100)[0] < -0.1);
+        // The pixel above the bump in the image looks up.
+        assert!(normal(&heights, 100, 99)[1] > 0.1);
+    }
+}

@@ -1,0 +1,157 @@
+//! One Euler-Bernoulli frame element: section, length and direction to 12 x 12 stiffness and consistent mass.
+//!
+//! Degrees of freedom per node: displacement x, y, z (m), rotation about x, y, z (rad). Local x runs along the element.
+//! Bending is cubic, stretch and twist are linear in the element (Przemieniecki, "Theory of Matrix Structural
+//! Analysis", sections 5.6 and 11.3; rotary inertia of the bending is left out, as Euler and Bernoulli did).
+
+use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3};
+
+pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
+
+/// Elastic constants of the wood: pascals and kg/m^3.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Wood {
+    pub(super) youngs_modulus: f64,
+    pub(super) shear_modulus: f64,
+    pub(super) density: f64,
+}
+
+/// A round section: area (m^2) and second moment of area about a diameter (m^4).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Section {
+    pub(super) area: f64,
+    pub(super) moment: f64,
+}
+
+impl Section {
+    /// Means over a cone between two radii.
+    pub(super) fn of_cone(a: f64, b: f64) -> Self {
+        use std::f64::consts::{FRAC_PI_4, PI};
+        let squares = (a * a + a * b + b * b) / 3.0;
+        let fourths = (a.powi(4) + a.powi(3) * b + (a * b).powi(2) + a * b.powi(3) + b.powi(4)) / 5.0;
+        Self { area: PI * squares, moment: FRAC_PI_4 * fourths }
+    }
+}
+
+/// Rows: the local axes of an element between two nodes.
+pub(super) fn axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f64> {
+    let x = (to - from).normalize();
+    let helper = if x.x.abs() < 0.7 { Vector3::x() } else { Vector3::z() };
+    let z = x.cross(&helper).normalize();
+    Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()])
+}
+
+/// Stiffness and consistent mass in the frame of the nodes.
+pub(super) fn matrices(from: &Vector3<f64>, to: &Vector3<f64>, section: &Section, wood: &Wood) -> (Matrix12, Matrix12) {
+    let length = (to - from).norm();
+    let mut turn = Matrix12::zeros();
+    for block in 0..4 {
+        turn.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&axes(from, to));
+    }
+    let (stiffness, mass) = (local_stiffness(length, section, wood), local_mass(length, section, wood));
+    (turn.transpose() * stiffness * turn, turn.transpose() * mass * turn)
+}
+
+fn local_stiffness(l: f64, section: &Section, wood: &Wood) -> Matrix12 {
+    let mut matrix = Matrix12::zeros();
+    let ends = [1.0, -1.0, -1.0, 1.0];
+    add_linear(&mut matrix, 0, ends.map(|end| end * wood.youngs_modulus * section.area / l));
+    add_linear(&mut matrix, 3, ends.map(|end| end * wood.shear_modulus * 2.0 * section.moment / l));
+    #[rustfmt::skip]
+    let bending = Matrix4::new(
+        12.0,    6.0 * l,     -12.0,   6.0 * l,
+        6.0 * l, 4.0 * l * l, -6.0 * l, 2.0 * l * l,
+        -12.0,   -6.0 * l,    12.0,    -6.0 * l,
+        6.0 * l, 2.0 * l * l, -6.0 * l, 4.0 * l * l,
+    );
+    add_bending(&mut matrix, &(bending * (wood.youngs_modulus * section.moment / l.powi(3))));
+    matrix
+}
+
+fn local_mass(l: f64, section: &Section, wood: &Wood) -> Matrix12 {
+    let mut matrix = Matrix12::zeros();
+    let ends = [2.0, 1.0, 1.0, 2.0];
+    add_linear(&mut matrix, 0, ends.map(|end| end * wood.density * section.area * l / 6.0));
+    add_linear(&mut matrix, 3, ends.map(|end| end * wood.density * 2.0 * section.moment * l / 6.0));
+    #[rustfmt::skip]
+    let bending = Matrix4::new(
+        156.0,     22.0 * l,     54.0,      -13.0 * l,
+        22.0 * l,  4.0 * l * l,  13.0 * l,  -3.0 * l * l,
+        54.0,      13.0 * l,     156.0,     -22.0 * l,
+        -13.0 * l, -3.0 * l * l, -22.0 * l, 4.0 * l * l,
+    );
+    add_bending(&mut matrix, &(bending * (wood.density * section.area * l / 420.0)));
+    matrix
+}
+
+/// Adds a 2 x 2 block that couples degree `dof` of both nodes.
+fn add_linear(matrix: &mut Matrix12, dof: usize, block: [f64; 4]) {
+    for (at, value) in block.into_iter().enumerate() {
+        matrix[(dof + 6 * (at / 2), dof + 6 * (at % 2))] += value;
+    }
+}
+
+/// Adds the bending in both planes. A rotation about y lowers the slope dw/dx, hence the sign.
+fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
+    for (places, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
+        for row in 0..4 {
+            for column in 0..4 {
+                let flips = if (row + column) % 2 == 1 { sign } else { 1.0 };
+                matrix[(places[row], places[column])] += flips * block[(row, column)];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WOOD: Wood = Wood { youngs_modulus: 8e9, shear_modulus: 5e8, density: 800.0 };
+
+    fn oblique() -> (Vector3<f64>, Vector3<f64>) {
+        (Vector3::new(0.2, -0.1, 0.4), Vector3::new(0.5, 0.3, 0.1))
+    }
+
+    #[test]
+    fn rigid_motions_cost_no_energy_and_translations_weigh_the_mass() {
+        let (from, to) = oblique();
+        let section = Section::of_cone(0.03, 0.02);
+        let (stiffness, mass) = matrices(&from, &to, &section, &WOOD);
+        let weight = WOOD.density * section.area * (to - from).norm();
+        for axis in 0..3 {
+            let turn = Vector3::ith(axis, 1.0);
+            let mut shift = nalgebra::SVector::<f64, 12>::zeros();
+            let mut spin = shift;
+            for (node, place) in [from, to].iter().enumerate() {
+                shift.fixed_rows_mut::<3>(6 * node).copy_from(&turn);
+                spin.fixed_rows_mut::<3>(6 * node).copy_from(&turn.cross(place));
+                spin.fixed_rows_mut::<3>(6 * node + 3).copy_from(&turn);
+            }
+            assert!((stiffness * shift).norm() <= 1e-9 * stiffness.norm());
+            assert!((stiffness * spin).norm() <= 1e-9 * stiffness.norm());
+            assert!((shift.dot(&(mass * shift)) / weight - 1.0).abs() < 1e-12);
+            // The control: shifting one end only does cost energy.
+            shift.fixed_rows_mut::<3>(0).fill(0.0);
+            assert!((stiffness * shift).norm() > 1e-6 * stiffness.norm());
+        }
+    }
+
+    #[test]
+    fn matrices_are_symmetric_and_the_mass_is_positive() {
+        let (from, to) = oblique();
+        let (stiffness, mass) = matrices(&from, &to, &Section::of_cone(0.01, 0.01), &WOOD);
+        assert!((stiffness - stiffness.transpose()).norm() <= 1e-12 * stiffness.norm());
+        assert!((mass - mass.transpose()).norm() <= 1e-12 * mass.norm());
+        assert!(mass.cholesky().is_some());
+    }
+
+    #[test]
+    fn a_cone_has_its_means_between_those_of_its_ends() {
+        let (thick, thin, cone) = (Section::of_cone(2.0, 2.0), Section::of_cone(1.0, 1.0), Section::of_cone(2.0, 1.0));
+        assert!((thin.area - std::f64::consts::PI).abs() < 1e-12);
+        assert!((thin.moment - std::f64::consts::FRAC_PI_4).abs() < 1e-12);
+        assert!(cone.area < thick.area && cone.area > thin.area);
+        assert!((cone.area - std::f64::consts::PI * 7.0 / 3.0).abs() < 1e-12);
+    }
+}

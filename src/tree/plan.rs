@@ -1,0 +1,219 @@
+//! The species: a seed to the molds of all parts, children before parents, the trunk last. Lengths in metres.
+
+use std::f64::consts::TAU;
+
+use nalgebra::{Rotation3, Unit, Vector3};
+
+use super::centreline::{Centreline, Growth, frame};
+use super::cluster::clusters;
+use super::element::Wood;
+use super::mold::{Bud, Kind, Mold};
+use super::random::Random;
+use super::sheet::{Sheet, Wrap};
+
+/// Green wood.
+const WOOD: Wood = Wood { youngs_modulus: 4.5e9, shear_modulus: 3.5e8, density: 900.0 };
+
+/// The turn from one branch to the next around the trunk.
+const GOLDEN_ANGLE: f64 = 2.399_963;
+
+/// Boughs on the trunk, and where the crown begins and ends on it.
+const BOUGHS: usize = 24;
+const CROWN: [f64; 2] = [0.24, 0.96];
+
+/// Lengths of the twigs, three molds of each.
+const TWIGS: [f64; 12] = [0.45, 0.50, 0.56, 0.66, 0.72, 0.78, 0.90, 0.97, 1.04, 1.18, 1.26, 1.34];
+
+/// The molds of a tree.
+pub(super) fn plan(random: &mut Random) -> Vec<Mold> {
+    let mut molds = clusters(&mut random.fork());
+    let leaves = 0..molds.len();
+    for length in TWIGS {
+        let twig = twig(length, &molds[leaves.clone()], &mut random.fork());
+        molds.push(twig);
+    }
+    let twigs = leaves.end..molds.len();
+    let mut trunk = trunk(&mut random.fork());
+    for number in 0..BOUGHS {
+        let mut random = random.fork();
+        let (ring, direction, length) = place_bough(&trunk, number, &mut random);
+        let thickest = 0.60 * trunk.radii[ring];
+        let bough = bough(&direction, [length, thickest], &molds, &[leaves.clone(), twigs.clone()], &mut random);
+        trunk.hang(Bud { ring, direction, mold: molds.len() }, bough.mass());
+        molds.push(bough);
+    }
+    let last = trunk.line.points.len() - 1;
+    for (ring, lean) in [(last, 0.10), (last - 2, 0.55), (last - 4, 0.65), (last - 6, 0.7)] {
+        let across = around(&trunk.line, ring, GOLDEN_ANGLE * (ring + BOUGHS) as f64);
+        let direction = trunk.line.leaving(ring, lean, &across);
+        let mold = twigs.start + 4 + ring % 5;
+        trunk.hang(Bud { ring, direction, mold }, molds[mold].mass());
+    }
+    molds.push(trunk);
+    molds
+}
+
+fn trunk(random: &mut Random) -> Mold {
+    let growth = Growth {
+        length: 6.8,
+        elements: 16,
+        rings: 3,
+        grading: 1.25,
+        start: Vector3::y(),
+        up: Vector3::y(),
+        sag: 0.0,
+        rise: 0.5,
+        wander: 0.11,
+    };
+    let line = Centreline::grow(&growth, random);
+    let radius = |ring: usize| {
+        let along = line.fraction(ring);
+        0.010 + 0.086 * (1.0 - along).powf(0.92) + 0.075 * (-line.arcs[ring] / 0.22).exp()
+    };
+    let radii = (0..line.points.len()).map(radius).collect();
+    let mut mold = wooden(Kind::Trunk, line, radii, [24, 10]);
+    mold.damping = 0.05;
+    let phases = [random.between(0.0, TAU), random.between(0.0, TAU), random.between(0.0, TAU)];
+    mold.add_skin(Wrap::Bark { repeats: 2 }, |arc, angle| {
+        // Roots run out into the ground; further up the stem is only a little uneven.
+        let root = 0.20 * (5.0 * angle + phases[0]).cos() + 0.10 * (3.0 * angle + phases[1]).cos();
+        let uneven = 0.025 * (2.0 * angle + phases[2] + 1.7 * arc).cos() + 0.018 * (4.0 * angle - 2.3 * arc).cos();
+        1.0 + root * (-arc / 0.30).exp() + uneven
+    });
+    mold
+}
+
+/// Ring, direction and length of a bough: long and level below, short and steep above.
+fn place_bough(trunk: &Mold, number: usize, random: &mut Random) -> (usize, Vector3<f64>, f64) {
+    let height = (number as f64 + random.spread(0.25)) / (BOUGHS - 1) as f64;
+    let ring = trunk.line.ring_at(CROWN[0] + (CROWN[1] - CROWN[0]) * height.clamp(0.0, 1.0).powf(1.06));
+    let across = around(&trunk.line, ring, GOLDEN_ANGLE * (number as f64 + 0.8) + random.spread(0.3));
+    let angle = 1.22 - 0.74 * height + random.spread(0.12);
+    let crown = (1.0 - ((height - 0.28) / 0.75).powi(2)).max(0.0).sqrt();
+    (ring, trunk.line.leaving(ring, angle, &across), (0.40 + 2.32 * crown) * random.between(0.92, 1.08))
+}
+
+/// A bough that starts along `direction` (in the world), with its twigs and leaves. `size`: length, largest radius.
+fn bough(
+    direction: &Vector3<f64>,
+    size: [f64; 2],
+    molds: &[Mold],
+    [leaves, twigs]: &[std::ops::Range<usize>; 2],
+    random: &mut Random,
+) -> Mold {
+    let [length, thickest] = size;
+    let growth = Growth {
+        length,
+        elements: 12,
+        rings: 2,
+        grading: 1.1,
+        start: Vector3::y(),
+        up: frame(direction, &Vector3::y()).inverse() * Vector3::y(),
+        sag: 0.10 + 0.06 * length,
+        rise: 0.55,
+        wander: 0.20,
+    };
+    let line = Centreline::grow(&growth, random);
+    let base = (0.008 + 0.0105 * length).min(thickest);
+    let radii = tapering(&line, base, 0.0045);
+    let mut mold = wooden(Kind::Branch, line, radii, [10, 6]);
+    mold.level = 1;
+    mold.damping = 0.07;
+    mold.add_skin(Wrap::Bark { repeats: 1 }, |_, _| 1.0);
+    let count = (length / 0.42).round().max(3.0) as usize;
+    for number in 0..count {
+        let along = 0.26 + 0.68 * (number as f64 + random.spread(0.25)) / (count as f64 - 1.0);
+        let ring = mold.line.ring_at(along.min(0.95));
+        let wanted = (0.38 + 0.34 * length) * (1.12 - 0.62 * along) * random.between(0.85, 1.15);
+        let across = beside(&mold.line, ring, &growth.up, number, random);
+        let direction = mold.line.leaving(ring, random.between(0.70, 1.0) - 0.2 * along, &across);
+        let child = nearest(wanted, twigs, random);
+        mold.hang(Bud { ring, direction, mold: child }, molds[child].mass());
+    }
+    hang_leaves(&mut mold, &[0.50, 0.66, 0.82, 1.0], &molds[leaves.clone()], &growth.up, random);
+    mold
+}
+
+/// A twig with its leaf clusters.
+fn twig(length: f64, leaves: &[Mold], random: &mut Random) -> Mold {
+    let growth = Growth {
+        length,
+        elements: 10,
+        rings: 1,
+        grading: 1.0,
+        start: Vector3::y(),
+        up: Vector3::new(0.0, 0.35, 0.94).normalize(),
+        sag: 0.16,
+        rise: 0.30,
+        wander: 0.24,
+    };
+    let line = Centreline::grow(&growth, random);
+    let radii = tapering(&line, 0.0040 + 0.0055 * length, 0.0028);
+    let mut mold = wooden(Kind::Branch, line, radii, [5, 4]);
+    mold.level = 2;
+    mold.damping = 0.09;
+    mold.add_skin(Wrap::Bark { repeats: 1 }, |_, _| 1.0);
+    let count = (0.6 + length / 0.33).round() as usize;
+    let along: Vec<f64> = (0..=count).map(|number| 0.24 + 0.76 * number as f64 / count as f64).collect();
+    hang_leaves(&mut mold, &along, leaves, &growth.up, random);
+    mold
+}
+
+/// Hangs leaf clusters at fractions of the length; one at the very end goes straight on.
+fn hang_leaves(mold: &mut Mold, along: &[f64], leaves: &[Mold], up: &Vector3<f64>, random: &mut Random) {
+    for (number, along) in along.iter().enumerate() {
+        let ring = mold.line.ring_at(*along);
+        let end = ring + 1 == mold.line.points.len();
+        let across = beside(&mold.line, ring, up, number, random);
+        let angle = if end { random.between(0.0, 0.2) } else { random.between(0.65, 1.05) };
+        let direction = mold.line.leaving(ring, angle, &across);
+        let child = (random.unit() * leaves.len() as f64) as usize;
+        mold.hang(Bud { ring, direction, mold: child }, leaves[child].mass());
+    }
+}
+
+fn wooden(kind: Kind, line: Centreline, radii: Vec<f64>, [sides, rank]: [usize; 2]) -> Mold {
+    Mold {
+        kind,
+        level: 0,
+        line,
+        radii,
+        sides,
+        sheet: Sheet::default(),
+        wood: WOOD,
+        damping: 0.0,
+        loads: vec![],
+        buds: vec![],
+        rank,
+        leaf_area: 0.0,
+    }
+}
+
+/// Radii from the base to the tip, with a collar where the branch leaves its parent.
+fn tapering(line: &Centreline, base: f64, tip: f64) -> Vec<f64> {
+    let radius = |ring: usize| {
+        let along = line.fraction(ring);
+        (tip + (base - tip) * (1.0 - along).powf(0.9)) * (1.0 + 0.45 * (-line.arcs[ring] / (2.6 * base)).exp())
+    };
+    (0..line.points.len()).map(radius).collect()
+}
+
+/// A unit vector across the line at `azimuth` around it.
+fn around(line: &Centreline, ring: usize, azimuth: f64) -> Vector3<f64> {
+    Rotation3::from_axis_angle(&Unit::new_unchecked(line.tangents[ring]), azimuth) * line.sides[ring]
+}
+
+/// A vector across the line, left and right by turns, somewhat above the level more often than below.
+fn beside(line: &Centreline, ring: usize, up: &Vector3<f64>, number: usize, random: &mut Random) -> Vector3<f64> {
+    let basis = frame(&line.tangents[ring], up);
+    let tilt = random.between(-0.6, 0.8);
+    let side = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
+    basis * Vector3::new(side * tilt.cos(), 0.0, tilt.sin())
+}
+
+/// A twig of about the wanted length.
+fn nearest(wanted: f64, twigs: &std::ops::Range<usize>, random: &mut Random) -> usize {
+    let wanted = wanted * random.between(0.93, 1.07);
+    let gap = |twig: &usize| (TWIGS[twig - twigs.start] - wanted).abs();
+    twigs.clone().min_by(|a, b| gap(a).total_cmp(&gap(b))).unwrap_or(twigs.start)
+}

@@ -1,0 +1,280 @@
+//! A mesh in the making, with the beam station of every vertex: tubes around centrelines, and leaf blades.
+
+use nalgebra::Vector3;
+
+use super::centreline::Centreline;
+use super::lift::Station;
+use crate::domain::{Corners, Mesh, smooth_normals};
+use crate::error::Result;
+
+/// Positions in the part's own frame, metres; one station per vertex.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Sheet {
+    pub(super) rest: Vec<[f32; 3]>,
+    pub(super) stations: Vec<Station>,
+    corners: Vec<u32>,
+    uvs: Vec<[f32; 2]>,
+    triangles: Vec<[u32; 3]>,
+}
+
+/// The skin of a branch.
+#[derive(Debug)]
+pub(super) struct Tube<'a> {
+    pub(super) line: &'a Centreline,
+    /// One radius per ring.
+    pub(super) radii: &'a [f64],
+    pub(super) sides: usize,
+    pub(super) wrap: Wrap,
+}
+
+/// How the image lies on a tube.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Wrap {
+    /// A whole number of repeats around, and as many along as keep the texels square.
+    Bark { repeats: u32 },
+    /// One column of the image, top to bottom.
+    Strip { u: f32 },
+}
+
+/// A leaf blade: a card folded along its midrib and curled along its length.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Blade {
+    pub(super) base: Vector3<f64>,
+    /// Unit vector from the base along the midrib.
+    pub(super) forward: Vector3<f64>,
+    /// Unit vector out of the upper face.
+    pub(super) normal: Vector3<f64>,
+    pub(super) length: f64,
+    pub(super) width: f64,
+    /// Radians by which the tip points below the base.
+    pub(super) curl: f64,
+    /// Radians by which each half is raised.
+    pub(super) fold: f64,
+    /// The image's part: left, right.
+    pub(super) span: [f32; 2],
+}
+
+/// Quads along a blade; across it has two.
+const BLADE_ROWS: usize = 2;
+
+/// The bark's image shrinks with the branch down to this radius, metres.
+const LEAST_RADIUS: f64 = 0.012;
+
+impl Sheet {
+    /// The finished mesh with smooth normals.
+    ///
+    /// # Errors
+    /// `Invalid` when a position is not finite.
+    pub(super) fn mesh(&self) -> Result<Mesh> {
+        let normals = smooth_normals(&self.rest, &self.corners, &self.triangles);
+        let corners = Corners { vertices: self.corners.clone(), normals, uvs: self.uvs.clone() };
+        Mesh::new(self.rest.clone(), corners, self.triangles.clone())
+    }
+
+    /// Adds a tube with one ring per sample of its centreline and a closed tip. `swell` gives a factor on the radius
+    /// for an arc length and an angle; rings are centred on the line whatever it does.
+    pub(super) fn add_tube(&mut self, tube: &Tube, swell: impl Fn(f64, f64) -> f64) {
+        let (line, sides) = (tube.line, tube.sides);
+        let last = line.points.len() - 1;
+        let first_vertex = self.rest.len() as u32;
+        let first_corner = self.corners.len() as u32;
+        let mut along = 0.0;
+        for ring in 0..=last {
+            if ring > 0 {
+                let radius = (0.5 * (tube.radii[ring] + tube.radii[ring - 1])).max(LEAST_RADIUS);
+                along += (line.arcs[ring] - line.arcs[ring - 1]) / (std::f64::consts::TAU * radius);
+            }
+            self.add_ring(tube, ring, &swell);
+            for side in 0..=sides {
+                self.corners.push(first_vertex + (ring * sides + side % sides) as u32);
+                self.uvs.push(tube.wrap.at(side as f64 / sides as f64, along, line.fraction(ring)));
+            }
+        }
+        let tip = line.points[last] + line.tangents[last] * tube.radii[last];
+        self.add_vertex(&tip, station(line, last));
+        for ring in 0..last {
+            for side in 0..sides {
+                let corner = |ring: usize, side: usize| first_corner + (ring * (sides + 1) + side) as u32;
+                let [a, b] = [corner(ring, side), corner(ring, side + 1)];
+                let [d, c] = [corner(ring + 1, side), corner(ring + 1, side + 1)];
+                self.triangles.extend([[a, b, c], [a, c, d]]);
+            }
+        }
+        let edge = first_corner + (last * (sides + 1)) as u32;
+        let along = along + tube.radii[last] / (std::f64::consts::TAU * LEAST_RADIUS);
+        for side in 0..sides {
+            let tip = self.corners.len() as u32;
+            self.corners.push(self.rest.len() as u32 - 1);
+            self.uvs.push(tube.wrap.at((side as f64 + 0.5) / sides as f64, along, 1.0));
+            self.triangles.push([edge + side as u32, edge + side as u32 + 1, tip]);
+        }
+    }
+
+    /// Adds a leaf blade that is fixed to one section of its stem.
+    pub(super) fn add_blade(&mut self, blade: &Blade, station: Station) {
+        let side = blade.forward.cross(&blade.normal);
+        let step = blade.length / BLADE_ROWS as f64;
+        let mut place = blade.base;
+        let first = self.corners.len() as u32;
+        for row in 0..=BLADE_ROWS {
+            let along = row as f64 / BLADE_ROWS as f64;
+            let (sin, cos) = (blade.curl * along).sin_cos();
+            let normal = blade.normal * cos + blade.forward * sin;
+            for column in [-1.0, 0.0, 1.0] {
+                let half = 0.5 * blade.width * column;
+                let lifted = normal * (half.abs() * blade.fold.sin());
+                self.corners.push(self.rest.len() as u32);
+                self.add_vertex(&(place + side * (half * blade.fold.cos()) + lifted), station);
+                let u = blade.span[0] + (blade.span[1] - blade.span[0]) * (0.5 + 0.5 * column as f32);
+                self.uvs.push([u, 1.0 - along as f32]);
+            }
+            let (sin, cos) = (blade.curl * (along + 0.5 / BLADE_ROWS as f64)).sin_cos();
+            place += (blade.forward * cos - blade.normal * sin) * step;
+        }
+        for row in 0..BLADE_ROWS as u32 {
+            for column in 0..2 {
+                let a = first + 3 * row + column;
+                self.triangles.extend([[a, a + 1, a + 4], [a, a + 4, a + 3]]);
+            }
+        }
+    }
+
+    fn add_ring(&mut self, tube: &Tube, ring: usize, swell: &impl Fn(f64, f64) -> f64) {
+        let (line, sides) = (tube.line, tube.sides);
+        let (across, over) = (line.sides[ring], line.tangents[ring].cross(&line.sides[ring]));
+        let offset = |side: usize| {
+            let angle = std::f64::consts::TAU * side as f64 / sides as f64;
+            (across * angle.cos() + over * angle.sin()) * (tube.radii[ring] * swell(line.arcs[ring], angle))
+        };
+        let offsets: Vec<_> = (0..sides).map(offset).collect();
+        // A joint finds the section's centre as the mean of its ring, so the mean is made to lie there.
+        let mean = offsets.iter().sum::<Vector3<f64>>() / sides as f64;
+        for offset in offsets {
+            self.add_vertex(&(line.points[ring] + offset - mean), station(line, ring));
+        }
+    }
+
+    fn add_vertex(&mut self, place: &Vector3<f64>, station: Station) {
+        self.rest.push(place.cast::<f32>().into());
+        self.stations.push(station);
+    }
+}
+
+/// The beam station of a ring.
+pub(super) fn station(line: &Centreline, ring: usize) -> Station {
+    if ring + 1 == line.points.len() {
+        return Station { element: ring / line.rings - 1, fraction: 1.0 };
+    }
+    Station { element: ring / line.rings, fraction: (ring % line.rings) as f64 / line.rings as f64 }
+}
+
+/// The beam station, the place and the unit tangent at a fraction of the length.
+pub(super) fn between(line: &Centreline, along: f64) -> (Station, Vector3<f64>, Vector3<f64>) {
+    let arc = along * line.length();
+    let after = line.arcs.partition_point(|at| *at < arc).clamp(1, line.arcs.len() - 1);
+    let part = (arc - line.arcs[after - 1]) / (line.arcs[after] - line.arcs[after - 1]);
+    let mut station = station(line, after - 1);
+    station.fraction += part / line.rings as f64;
+    let place = line.points[after - 1].lerp(&line.points[after], part);
+    (station, place, line.tangents[after - 1].lerp(&line.tangents[after], part).normalize())
+}
+
+impl Wrap {
+    /// Texture coordinates for a fraction around, an arc length in circumferences, and a fraction of the length.
+    fn at(self, around: f64, along: f64, fraction: f64) -> [f32; 2] {
+        match self {
+            Self::Bark { repeats } => {
+                let repeats = f64::from(repeats);
+                [(around * repeats) as f32, (-along * repeats) as f32]
+            }
+            Self::Strip { u } => [u, 0.95 - 0.9 * fraction as f32],
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::centreline::{Growth, tests::straight};
+    use super::super::random::Random;
+    use super::*;
+
+    fn winding() -> Centreline {
+        Centreline::grow(&Growth { wander: 0.3, rise: 0.5, ..straight(1.5, 6, 2) }, &mut Random::new(4))
+    }
+
+    #[test]
+    fn a_tube_is_centred_on_its_line_and_its_normals_point_outwards() {
+        let line = winding();
+        let radii: Vec<f64> = (0..13).map(|ring| 0.06 - 0.004 * f64::from(ring)).collect();
+        let mut sheet = Sheet::default();
+        let tube = Tube { line: &line, radii: &radii, sides: 9, wrap: Wrap::Bark { repeats: 2 } };
+        sheet.add_tube(&tube, |_, angle| 1.0 + 0.3 * angle.cos());
+        let mesh = sheet.mesh().expect("finite");
+        assert_eq!(mesh.rest().len(), 13 * 9 + 1);
+        assert_eq!(mesh.triangles().len(), 12 * 9 * 2 + 9);
+        for ring in 0..13 {
+            let places = mesh.rest()[9 * ring..][..9].iter().map(|place| Vector3::from(*place).cast::<f64>());
+            let mean = places.sum::<Vector3<f64>>() / 9.0;
+            assert!((mean - line.points[ring]).norm() < 1e-6);
+        }
+        for (corner, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
+            let (place, ring) = (Vector3::from(mesh.rest()[*corner as usize]).cast::<f64>(), *corner as usize / 9);
+            let centre = if ring > 12 { line.points[12] } else { line.points[ring] };
+            let outwards = (place - centre).normalize().dot(&Vector3::from(*normal).cast());
+            assert!(outwards > 0.3, "normal {normal:?} looks inwards: {outwards}");
+        }
+    }
+
+    #[test]
+    fn bark_repeats_a_whole_number_of_times_around_with_square_texels() {
+        let line = Centreline::grow(&straight(1.0, 4, 2), &mut Random::new(1));
+        let mut sheet = Sheet::default();
+        let tube = Tube { line: &line, radii: &[0.05; 9], sides: 8, wrap: Wrap::Bark { repeats: 3 } };
+        sheet.add_tube(&tube, |_, _| 1.0);
+        let seam = |ring: usize| (sheet.uvs[9 * ring], sheet.uvs[9 * ring + 8]);
+        for ring in 0..9 {
+            let (left, right) = seam(ring);
+            assert_eq!((left[0], right[0], left[1]), (0.0, 3.0, right[1]));
+        }
+        let texels_along = f64::from(seam(0).0[1] - seam(8).0[1]);
+        let texels_around = 3.0 / (std::f64::consts::TAU * 0.05);
+        assert!((texels_along / texels_around - 1.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn places_between_rings_lie_on_the_line_at_their_station() {
+        let line = winding();
+        let (at_ring, place, _) = between(&line, line.fraction(5));
+        assert!((place - line.points[5]).norm() < 1e-12);
+        assert!((at_ring.element, at_ring.fraction) == (2, 0.5));
+        let (end, place, tangent) = between(&line, 1.0);
+        assert!((end.element, end.fraction) == (5, 1.0));
+        assert!((place - line.points[12]).norm() < 1e-12);
+        assert!((tangent - line.tangents[12]).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_blade_after_a_tube_uses_its_own_corners_and_faces_its_normal() {
+        let line = winding();
+        let mut sheet = Sheet::default();
+        sheet.add_tube(&Tube { line: &line, radii: &[0.01; 13], sides: 4, wrap: Wrap::Strip { u: 0.97 } }, |_, _| 1.0);
+        let (before, corners) = (sheet.triangles.len(), sheet.corners.len() as u32);
+        let blade = Blade {
+            base: Vector3::new(1.0, 0.0, 0.0),
+            forward: Vector3::y(),
+            normal: Vector3::z(),
+            length: 0.2,
+            width: 0.1,
+            curl: 0.5,
+            fold: 0.3,
+            span: [0.0, 0.9],
+        };
+        sheet.add_blade(&blade, station(&line, 6));
+        assert!(sheet.triangles[before..].as_flattened().iter().all(|corner| *corner >= corners));
+        let mesh = sheet.mesh().expect("finite");
+        for corner in corners as usize..mesh.corners().vertices.len() {
+            assert!(mesh.corners().normals[corner][2] > 0.5);
+            assert!(mesh.rest()[mesh.corners().vertices[corner] as usize][0] > 0.9);
+        }
+    }
+}

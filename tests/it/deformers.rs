@@ -1,0 +1,201 @@
+//! The cpu deformer equals its f64 twin, and the twin equals algebra.
+
+use std::sync::Arc;
+
+use modalcast::cpu::CpuDeformer;
+use modalcast::deform::Deformer;
+use modalcast::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast::reference;
+use modalcast::scene::{Parts, Scene, State};
+
+use crate::tolerance::{Tolerance, first_wrong, largest_error};
+
+/// Deterministic numbers in -1 to 1.
+pub(crate) struct Noise(pub(crate) u64);
+
+impl Noise {
+    pub(crate) fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
+    }
+}
+
+fn strip(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
+    let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
+    let normals = rest.iter().map(|_| [noise.next(), noise.next(), noise.next() + 2.0]).collect();
+    let uvs = rest.iter().map(|_| [noise.next(), noise.next()]).collect();
+    let corners = Corners { vertices: (0..vertices as u32).collect(), normals, uvs };
+    let last = vertices as u32 - 1;
+    let triangles = (0..vertices as u32).map(|at| [at, (at + 1).min(last), (at + 2).min(last)]).collect();
+    let mesh = Mesh::new(rest, corners, triangles).expect("a strip");
+    let entries = (0..3 * vertices * rank).map(|_| noise.next()).collect();
+    let modes =
+        if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, entries).expect("modes") };
+    Shape::new(mesh, modes).expect("a shape")
+}
+
+fn domain(shape: usize, name: String) -> Domain {
+    Domain {
+        name,
+        shape,
+        material: 0,
+        placement: Transform::IDENTITY,
+        attachment: None,
+        runs: vec![],
+        rest_q: vec![],
+        shares_q_with: None,
+        metadata: Metadata::default(),
+    }
+}
+
+/// A scene of strips with a normal map, one per (n, r).
+fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
+    let mut noise = Noise(42);
+    let mut parts = Parts::named("strips");
+    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
+    parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
+    for (at, (vertices, rank)) in sizes.iter().enumerate() {
+        parts.shapes.push(strip(*vertices, *rank, &mut noise));
+        parts.domains.push(domain(at, format!("strip {at}")));
+    }
+    Scene::new(parts).expect("a scene")
+}
+
+/// Coordinates and sheared, mirrored transforms.
+fn shaken(scene: &Scene) -> State {
+    let mut noise = Noise(7);
+    let mut state = State::rest(scene);
+    state.q.iter_mut().for_each(|number| *number = noise.next());
+    for transform in &mut state.transforms {
+        transform.0.iter_mut().for_each(|number| *number += 0.7 * noise.next());
+    }
+    state
+}
+
+const SIZES: [(usize, usize); 10] =
+    [(1, 1), (3, 0), (31, 3), (32, 4), (33, 5), (257, 20), (256, 31), (1000, 33), (7, 512), (5000, 7)];
+
+#[test]
+fn cpu_equals_its_twin_for_all_sizes_ranks_shears_and_mirrors() {
+    let scene = strips(&SIZES);
+    let state = shaken(&scene);
+    let mut cpu = CpuDeformer::new(&scene);
+    let told = cpu.deform(&state).expect("deforms");
+    let want = reference::deform(&scene, &state);
+    let surface = cpu.surface().expect("a surface");
+    let diagonal = told.bounds.diagonal();
+    let error = largest_error(&surface.positions, &want) / diagonal;
+    assert!(error <= 1e-6, "positions are off by {error} of the diagonal");
+    let loose = Tolerance { abs: 2e-5, rel: 0.0 };
+    let normals = reference::orient_normals(&scene, &state).into_flattened();
+    assert_eq!(first_wrong(&surface.normals, &normals, loose), None);
+    let tangents = reference::orient_tangents(&scene, &state).into_flattened();
+    assert_eq!(first_wrong(&surface.tangents, &tangents, loose), None);
+    for point in &want {
+        for axis in 0..3 {
+            let slack = 1e-6 * diagonal;
+            assert!(point[axis] >= told.bounds.min[axis] - slack && point[axis] <= told.bounds.max[axis] + slack);
+        }
+    }
+}
+
+#[test]
+fn a_wrong_coordinate_a_wrong_transform_and_a_missing_mode_are_seen() {
+    let scene = strips(&SIZES);
+    let state = shaken(&scene);
+    let want = reference::deform(&scene, &state);
+    let mut cpu = CpuDeformer::new(&scene);
+    let mut spoil = |change: &dyn Fn(&mut State)| {
+        let mut wrong = state.clone();
+        change(&mut wrong);
+        cpu.deform(&wrong).expect("deforms");
+        largest_error(&cpu.surface().expect("a surface").positions, &want)
+    };
+    assert!(spoil(&|state| state.q[30] += 0.01) > 1e-3);
+    assert!(spoil(&|state| *state.q.last_mut().expect("some") = 0.0) > 1e-3);
+    assert!(spoil(&|state| state.transforms.swap(4, 5)) > 1e-3);
+}
+
+#[test]
+fn the_twin_gives_rest_at_zero_a_column_at_one_and_is_linear() {
+    let scene = strips(&[(50, 6)]);
+    let modes = &scene.shape_of(0).modes;
+    let rest = scene.shape_of(0).mesh.rest();
+    let mut state = State::rest(&scene);
+    let still = reference::deform(&scene, &state);
+    state.q[4] = 1.0;
+    let one = reference::deform(&scene, &state);
+    state.q[4] = -2.5;
+    let more = reference::deform(&scene, &state);
+    for vertex in 0..50 {
+        for axis in 0..3 {
+            assert_eq!(still[vertex][axis], f64::from(rest[vertex][axis]));
+            let column = f64::from(modes.at(vertex, axis, 4));
+            assert!((one[vertex][axis] - still[vertex][axis] - column).abs() < 1e-12);
+            assert!((more[vertex][axis] - still[vertex][axis] + 2.5 * column).abs() < 1e-12);
+        }
+    }
+}
+
+#[test]
+fn normals_stay_orthogonal_to_a_sheared_plane_where_the_plain_matrix_fails() {
+    let mut parts = Parts::named("plane");
+    let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a plane");
+    parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
+    parts.materials = vec![Material::default()];
+    parts.domains = vec![domain(0, "plane".into())];
+    let scene = Scene::new(parts).expect("a scene");
+    let mut state = State::rest(&scene);
+    // z += x: the plane tilts about y; A itself would leave the normal upright.
+    state.transforms[0].0[8] = 1.0;
+    let mut cpu = CpuDeformer::new(&scene);
+    cpu.deform(&state).expect("deforms");
+    let surface = cpu.surface().expect("a surface");
+    let edge = [surface.positions[3], surface.positions[4], surface.positions[5]];
+    let dot = |normal: &[f32]| -> f32 { normal.iter().zip(edge).map(|(a, b)| a * b).sum() };
+    assert!(dot(&surface.normals[..3]).abs() < 1e-6);
+    assert!(dot(&[0.0, 0.0, 1.0]).abs() > 0.5, "the control is not orthogonal");
+}
+
+#[test]
+fn overflow_makes_the_bounds_not_finite_and_large_but_finite_numbers_do_not() {
+    let scene = strips(&[(40, 3), (9, 0)]);
+    let mut cpu = CpuDeformer::new(&scene);
+    let mut bounds = |amount: f32| {
+        let mut state = State::rest(&scene);
+        state.q.fill(amount);
+        cpu.deform(&state).expect("deforms").bounds
+    };
+    assert!(bounds(1e30).is_finite());
+    assert!(!bounds(3e38).is_finite());
+    assert!(bounds(1e-42).is_finite(), "denormals");
+    assert!(bounds(0.0).is_finite());
+}
+
+#[test]
+fn runs_are_bit_identical_and_rows_of_zeros_stay_where_q_zero_puts_them() {
+    let mut parts = Parts::named("clamped");
+    let mut shape = strip(300, 8, &mut Noise(3));
+    let mut columns = shape.modes.columns().to_vec();
+    for mode in 0..8 {
+        columns[900 * mode..][..30].fill(0.0);
+    }
+    shape.modes = Modes::from_columns(900, 8, columns).expect("modes");
+    parts.shapes = vec![shape];
+    parts.materials = vec![Material::default()];
+    parts.domains = vec![domain(0, "clamped".into())];
+    let scene = Scene::new(parts).expect("a scene");
+    let mut cpu = CpuDeformer::new(&scene);
+    let mut run = |state: &State| {
+        cpu.deform(state).expect("deforms");
+        cpu.surface().expect("a surface").positions.clone()
+    };
+    let still = run(&State::rest(&scene));
+    let mut state = shaken(&scene);
+    state.transforms = State::rest(&scene).transforms;
+    let moved = run(&state);
+    assert_eq!(moved, run(&state));
+    assert_eq!(moved[..30], still[..30]);
+    assert_ne!(moved[30..33], still[30..33]);
+}

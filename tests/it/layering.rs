@@ -1,0 +1,165 @@
+//! The table in `src/lib.rs` holds: modules use only what their row names, files stay small, kernels have their twins.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const LARGEST_FILE: usize = 500;
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Module to what it may use, from the page's table.
+fn table(page: &str) -> BTreeMap<String, BTreeSet<String>> {
+    let names = |cell: &str| -> BTreeSet<String> { cell.split('`').skip(1).step_by(2).map(str::to_owned).collect() };
+    let row = |line: &str| {
+        let cells: Vec<&str> = line.strip_prefix("//! | `")?.split('|').collect();
+        let module = cells.first()?.trim().trim_end_matches('`').to_owned();
+        Some((module, names(cells.get(2)?)))
+    };
+    page.lines().filter_map(row).collect()
+}
+
+fn files(folder: &Path, endings: &[&str]) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let Ok(entries) = fs::read_dir(folder) else { return found };
+    for entry in entries {
+        let path = entry.expect("an entry").path();
+        if path.is_dir() {
+            found.extend(files(&path, endings));
+        } else if endings.iter().any(|ending| path.extension().is_some_and(|own| own == *ending)) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The top-level module that a file of `src` belongs to.
+fn module_of(path: &Path) -> String {
+    let inside = path.strip_prefix(root().join("src")).expect("inside src");
+    let first = inside.components().next().expect("a name").as_os_str().to_string_lossy();
+    first.trim_end_matches(".rs").to_owned()
+}
+
+/// Every `crate::name` of a text outside its comments.
+fn uses(text: &str) -> BTreeSet<String> {
+    let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
+    let words = code.flat_map(|line| line.split("crate::").skip(1).map(str::to_owned).collect::<Vec<_>>());
+    let name = |rest: String| rest.chars().take_while(|letter| letter.is_alphanumeric() || *letter == '_').collect();
+    words.map(name).filter(|name: &String| !name.is_empty()).collect()
+}
+
+/// What a module uses without leave.
+fn illegal(module: &str, text: &str, table: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+    let Some(allowed) = table.get(module) else { return vec![format!("{module} is not in the table")] };
+    let mut wrong: Vec<String> = uses(text)
+        .into_iter()
+        .filter(|name| name != module && table.contains_key(name) && !allowed.contains(name))
+        .map(|name| format!("{module} uses {name}"))
+        .collect();
+    if text.contains("modalcast_proto") && module != "service" {
+        wrong.push(format!("{module} names proto"));
+    }
+    wrong
+}
+
+#[test]
+fn modules_use_only_what_their_row_names() {
+    let table = table(&fs::read_to_string(root().join("src/lib.rs")).expect("the page"));
+    assert!(table.len() >= 10, "the table was read: {table:?}");
+    for path in files(&root().join("src"), &["rs"]) {
+        let module = module_of(&path);
+        if module == "lib" || module == "main" {
+            continue;
+        }
+        let wrong = illegal(&module, &fs::read_to_string(&path).expect("a file"), &table);
+        assert_eq!(wrong, Vec::<String>::new(), "{}", path.display());
+    }
+}
+
+#[test]
+fn no_arrow_points_up() {
+    let table = table(&fs::read_to_string(root().join("src/lib.rs")).expect("the page"));
+    // Peeling modules that use nothing left over empties the table unless there is a cycle.
+    let mut left = table;
+    while !left.is_empty() {
+        let leaf = left.iter().find(|(_, uses)| uses.iter().all(|name| !left.contains_key(name)));
+        let leaf = leaf.map(|(name, _)| name.clone()).unwrap_or_else(|| panic!("a cycle among {:?}", left.keys()));
+        left.remove(&leaf);
+    }
+}
+
+#[test]
+fn provoked_faults_are_seen() {
+    let table = table("//! | `low` | x | |\n//! | `high` | x | `low` |\n");
+    assert_eq!(illegal("high", "use crate::low::Thing;", &table), Vec::<String>::new());
+    assert_eq!(illegal("low", "use crate::high::Thing;", &table), ["low uses high"]);
+    assert_eq!(illegal("stray", "", &table), ["stray is not in the table"]);
+    assert_eq!(illegal("low", "use modalcast_proto::v1;", &table), ["low names proto"]);
+}
+
+#[test]
+fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
+    let kernels = files(&root().join("kernels"), &["cu"]);
+    assert!(!kernels.is_empty());
+    for kernel in kernels {
+        let name = kernel.file_stem().expect("a name").to_string_lossy().into_owned();
+        for folder in ["src/gpu", "src/reference", "src/cpu"] {
+            let twin = root().join(folder).join(format!("{name}.rs"));
+            assert!(twin.exists(), "{} is missing", twin.display());
+        }
+    }
+}
+
+#[test]
+fn files_have_at_most_five_hundred_lines() {
+    let endings = ["rs", "cu", "cuh", "proto", "vert", "frag", "comp", "glsl", "sh", "toml"];
+    for folder in ["src", "proto", "clients", "tests", "kernels", "shaders", "deploy"] {
+        for path in files(&root().join(folder), &endings) {
+            let lines = fs::read_to_string(&path).expect("a file").lines().count();
+            assert!(lines <= LARGEST_FILE, "{} has {lines} lines", path.display());
+        }
+    }
+}
+
+#[test]
+fn unsafe_has_its_addresses() {
+    for path in files(&root().join("src"), &["rs"]) {
+        let inside = path.strip_prefix(root()).expect("inside").to_string_lossy().into_owned();
+        let text = fs::read_to_string(&path).expect("a file");
+        let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
+        let has = code.into_iter().any(|line| line.contains("unsafe {") || line.contains("unsafe fn"));
+        let may = inside.starts_with("src/gpu/") || inside.starts_with("src/render/");
+        assert!(!has || may, "{inside} has unsafe code");
+    }
+}
+
+/// Version floors below which a dependency has a known fault.
+#[test]
+fn locked_versions_are_above_their_known_faults() {
+    let lock = fs::read_to_string(root().join("Cargo.lock")).expect("the lock file");
+    let floors = [
+        ("h2", "0.4.16"),
+        ("tonic", "0.14.6"),
+        ("bytes", "1.11.1"),
+        ("tokio", "1.44.2"),
+        ("slab", "0.4.11"),
+        ("tracing-subscriber", "0.3.20"),
+        ("prost", "0.6.1"),
+    ];
+    let number =
+        |version: &str| -> Vec<u64> { version.split(['.', '-', '+']).map_while(|part| part.parse().ok()).collect() };
+    for (name, floor) in floors {
+        let versions: Vec<&str> = lock
+            .split("[[package]]")
+            .filter(|entry| entry.contains(&format!("name = \"{name}\"\n")))
+            .filter_map(|entry| entry.split("version = \"").nth(1)?.split('"').next())
+            .collect();
+        assert!(!versions.is_empty(), "{name} is not locked");
+        for version in versions {
+            assert!(number(version) >= number(floor), "{name} {version} is below {floor}");
+        }
+    }
+}

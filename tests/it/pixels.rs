@@ -1,0 +1,6 @@
+//! Pictures against arithmetic, each with a negative control. Runs on whatever EGL gives, Mesa's llvmpipe included.
+
+mod build;
+mod limits;
+mod shading;
+mod shadow;

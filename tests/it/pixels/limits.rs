@@ -1,0 +1,189 @@
+//! What a scene does not need is not made; extreme sizes, cameras and vertices; the same input gives the same bytes.
+
+use modalcast::deform::{Deformer as _, Surface};
+use modalcast::domain::{AlphaMode, Material, Mesh, Transform};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Prefer, Renderer, Shot, devices, plan};
+use modalcast::scene::{Bounds, Camera, Look, State, View};
+
+use super::build::{Stage, camera, draw, facing, lying, open, picture};
+
+fn full() -> Stage {
+    let mut stage = Stage::new();
+    stage.0.look = Look::default();
+    stage
+}
+
+#[test]
+fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_no_blended_pass() {
+    let plain = picture(&full().add(lying(1.0, -0.5), Material::default()).scene());
+    let names = |list: &[modalcast::render::Allocation]| {
+        list.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
+    };
+    for absent in ["tangents", "uvs", "triangle materials"] {
+        assert!(!names(&plain.allocated).contains(&absent.to_string()), "{absent}");
+    }
+    assert_eq!(plain.ran.passes, ["shadow", "blur", "opaque", "sky", "ground", "encode"]);
+
+    let mut stage = full();
+    let image = stage.texture(1, 1, |_, _| [128, 128, 255, 255]);
+    let mapped = Material { normal_texture: Some(image), ..Material::default() };
+    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
+    let scene = stage.add(lying(1.0, -0.5), mapped).add(lying(1.0, -0.3), glass).scene();
+    let rich = picture(&scene);
+    for present in ["tangents", "uvs", "triangle materials"] {
+        assert!(names(&rich.allocated).contains(&present.to_string()), "{present}");
+    }
+    assert_eq!(rich.ran.passes, ["shadow", "blur", "opaque", "sky", "ground", "blended", "encode"]);
+    let mut planned = plan(&scene).buffers;
+    planned.sort_by(|a, b| a.name.cmp(&b.name));
+    assert_eq!(rich.allocated, planned, "what is planned is what is allocated");
+    assert_eq!(rich.ran.passes, plan(&scene).passes, "what is planned is what runs");
+}
+
+#[test]
+fn the_draw_calls_do_not_grow_with_the_domains() {
+    let draws = |domains: usize| {
+        let mut stage = Stage::new();
+        for index in 0..domains {
+            let double_sided = index % 2 == 1;
+            stage = stage.add(
+                facing(-1.0, -1.0, 1.0, 1.0, index as f32 * -0.01),
+                Material { double_sided, ..Material::default() },
+            );
+        }
+        picture(&stage.scene()).ran.draws
+    };
+    assert_eq!((draws(2), draws(40)), (2, 2));
+}
+
+#[test]
+fn frames_of_no_size_and_above_the_limit_are_refused_with_the_numbers() {
+    let scene = Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
+    let mut renderer = open();
+    let buffers = renderer.load(&scene).expect("loads");
+    let limit = renderer.info().max_side;
+    for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
+        let shot = Shot { camera: camera(64), width, height, bounds: scene.rest_bounds };
+        let refusal = renderer.draw(&buffers, &shot).expect_err("refused").to_string();
+        let expected = format!("frame.size: expected 1 to {limit} pixels a side, given {width} x {height}");
+        assert_eq!(refusal, expected);
+    }
+    let shot = Shot { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds };
+    assert_eq!(renderer.draw(&buffers, &shot).expect("one pixel is a frame").rgba.len(), 4);
+}
+
+#[test]
+fn a_frame_too_large_for_four_samples_is_drawn_with_one_and_keeps_its_cut_outs() {
+    let mut stage = Stage::new();
+    let image = stage.texture(2, 1, |x, _| [255, 255, 255, 255 * x as u8]);
+    let alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
+    let leaf = Material { colour_texture: Some(image), alpha_mode, ..Material::default() };
+    let scene = stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), leaf).scene();
+    let mut renderer = open();
+    let side = 3400;
+    let mut wide = camera(side);
+    wide.lens = modalcast::scene::Lens::FieldOfView(12.0);
+    let shown = draw(&mut renderer, &scene, wide, side);
+    assert_eq!(shown.ran.samples, 1);
+    assert!(shown.at(side / 2 - 700, side / 2) == [0; 3] && shown.at(side / 2 + 700, side / 2) != [0; 3]);
+}
+
+#[test]
+fn the_same_input_gives_the_same_bytes_and_another_does_not() {
+    let scene = full().add(lying(1.0, 0.5), Material::default()).add(lying(0.5, 1.0), Material::default()).scene();
+    let mut renderer = open();
+    let first = draw(&mut renderer, &scene, Camera::framing(&scene), 96);
+    assert!(first.image.rgba == draw(&mut renderer, &scene, Camera::framing(&scene), 96).image.rgba);
+    assert!(first.image.rgba == draw(&mut open(), &scene, Camera::framing(&scene), 96).image.rgba, "another context");
+    let mut moved = Camera::framing(&scene);
+    moved.lens = modalcast::scene::Lens::FieldOfView(33.0);
+    assert!(first.image.rgba != draw(&mut renderer, &scene, moved, 96).image.rgba, "control");
+}
+
+#[test]
+fn degenerate_triangles_light_from_straight_up_and_a_camera_inside_the_mesh_are_drawn() {
+    let line = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
+    let triangles = vec![[0, 1, 2], [0, 0, 0], [0, 3, 1]];
+    let flat = Mesh::indexed(line, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("degenerate, yet a mesh");
+    let mut stage = full();
+    stage.0.look.sun = [0.0, 1.0, 0.0];
+    let scene = stage.add(flat, Material::default()).add(lying(2.0, 0.5), Material::default()).scene();
+    let shown = picture(&scene);
+    assert!(shown.count(|pixel| pixel != shown.at(0, 0)) > 100);
+    let view = View::LookAt { eye: [0.1, 0.3, 0.1], target: [1.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let inside = draw(&mut open(), &scene, Camera { view, ..Camera::framing(&scene) }, 64);
+    assert_eq!(inside.image.rgba.len(), 4 * 64 * 64);
+}
+
+#[test]
+fn vertices_that_overflowed_spoil_no_other_pixel_and_blacken_none() {
+    let mut stage = full();
+    stage.0.look.horizon = [0.5; 3];
+    let scene = stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).scene();
+    let mut renderer = open();
+    let buffers = renderer.load(&scene).expect("loads");
+    for bad in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
+        let mut positions: Vec<f32> = scene.shapes[0].mesh.rest().as_flattened().to_vec();
+        positions[6..9].fill(bad);
+        let surface = Surface { positions, normals: [0.0, 0.0, 1.0].repeat(4), tangents: vec![] };
+        renderer.upload(&buffers, &surface).expect("uploads");
+        let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
+        let shot = Shot { camera: camera(64), width: 64, height: 64, bounds };
+        let image = renderer.draw(&buffers, &shot).expect("draws");
+        assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{bad}");
+    }
+    let short = Surface { positions: vec![0.0; 3], ..Surface::default() };
+    let refusal = renderer.upload(&buffers, &short).expect_err("three numbers of twelve").to_string();
+    assert!(refusal.contains("3 numbers of positions, 12 expected"), "{refusal}");
+}
+
+#[test]
+fn a_scene_far_from_the_origin_still_shows() {
+    let mut parts = full().add(lying(1.0, 1.0), Material::default()).add(lying(0.5, 0.0), Material::default()).0;
+    for domain in &mut parts.domains {
+        let mut place = Transform::IDENTITY;
+        (place.0[3], place.0[7], place.0[11]) = (1e7, 1e7, -1e7);
+        domain.placement = place;
+    }
+    let scene = Stage(parts).scene();
+    let shown = draw(&mut open(), &scene, Camera::framing(&scene), 64);
+    assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
+}
+
+#[test]
+fn renderers_come_and_go_on_many_threads_and_on_one() {
+    let draw_one = || {
+        let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
+        draw(&mut open(), &scene, Camera::framing(&scene), 32).image.rgba
+    };
+    let first = draw_one();
+    let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_one(), draw_one()])).collect();
+    for thread in threads {
+        assert!(thread.join().expect("lives").iter().all(|bytes| *bytes == first));
+    }
+    let (mut left, mut right) = (open(), open());
+    let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
+    let buffers = left.load(&scene).expect("loads");
+    assert!(draw(&mut right, &scene, Camera::framing(&scene), 32).image.rgba == first);
+    drop(right);
+    let mut deformer = ReferenceDeformer::new(&scene);
+    let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+    left.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let shot = Shot { camera: Camera::framing(&scene), width: 32, height: 32, bounds };
+    assert!(left.draw(&buffers, &shot).expect("draws").rgba == first, "two contexts on one thread keep apart");
+}
+
+#[test]
+fn every_device_says_what_it_is_and_a_missing_one_is_refused_by_name() {
+    let found = devices().expect("EGL");
+    assert!(found.iter().any(|device| device.renderer.is_some()), "{found:?}");
+    for device in &found {
+        assert_eq!(device.renderer.is_none(), device.problem.is_some(), "{device:?}");
+    }
+    let refusal = Renderer::open(Prefer::Cuda(4711)).expect_err("no such device").to_string();
+    assert!(refusal.contains("CUDA device 4711") && refusal.contains("10_nvidia.json"), "{refusal}");
+    if found.iter().any(|device| device.software && device.renderer.is_some()) {
+        assert!(Renderer::open(Prefer::Software).expect("software").info().software);
+    }
+}

@@ -1,0 +1,162 @@
+//! The variance shadow map, seen on the ground.
+
+use modalcast::domain::{AlphaMode, Material};
+use modalcast::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
+
+use super::build::{Picture, Stage, close, draw, facing, lying, open};
+
+/// Looking down on the ground from a height of 20, ten pixels a unit there; the sun straight up unless it is moved.
+fn stage() -> Stage {
+    let mut stage = Stage::new();
+    stage.0.look.sun = [0.0, 1.0, 0.0];
+    stage.0.look.ground = Some(Ground { colour: [0.8; 3] });
+    stage.0.look.shadow = Some(Shadow { size: 512, bleeding: 0.0, ..Shadow::default() });
+    // Two pegs hold the ground at height 0 and the bounds wide, out of the picture.
+    stage
+        .add(facing(5.0, 0.0, 5.1, 0.1, 5.0), Material::default())
+        .add(facing(-5.1, 0.0, -5.0, 0.1, -5.0), Material::default())
+}
+
+fn from_above(stage: Stage) -> Picture {
+    let camera = Camera {
+        view: View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] },
+        lens: Lens::Intrinsics { fx: 200.0, fy: 200.0, cx: 32.0, cy: 32.0 },
+        near: 0.0,
+        far: 0.0,
+    };
+    draw(&mut open(), &stage.scene(), camera, 64)
+}
+
+/// A square of two units that floats where the camera does not see it cover its shadow: the sun comes from the side.
+fn aside(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
+    stage.0.look.sun = [3.0, 4.0, 0.0];
+    let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
+    let image = stage.texture(64, 64, |x, y| [255, 255, 255, if hole(x, y) { 0 } else { 255 }]);
+    let material =
+        Material { alpha_mode, alpha, colour_texture: Some(image), double_sided: true, ..Material::default() };
+    let mut square = lying(1.0, 4.0).rest().to_vec();
+    square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
+    let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
+    let mesh = modalcast::domain::Mesh::indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
+    from_above(stage.add(mesh.expect("a square"), material))
+}
+
+/// The ground near the middle, where the haze has hardly begun: the horizon is black here.
+fn ground(sun: f64, facing: f64) -> [f64; 3] {
+    [0.8 * (0.25 + 0.5 * sun * facing); 3]
+}
+
+#[test]
+fn the_shadow_of_a_floating_square_is_ambient_only_and_goes_with_caster_or_shadows() {
+    let shaded = aside(stage(), AlphaMode::Opaque, 1.0);
+    assert!(close(shaded.at(32, 32), ground(0.0, 0.8), 2.0), "umbra: {:?}", shaded.at(32, 32));
+    assert!(close(shaded.at(32, 12), ground(1.0, 0.8), 2.0), "beside it: {:?}", shaded.at(32, 12));
+    assert!(close(shaded.at(12, 32), ground(1.0, 0.8), 2.0), "beside it: {:?}", shaded.at(12, 32));
+    let dark = shaded.count(|[r, ..]| f64::from(r) < 150.0);
+    assert!((330..=470).contains(&dark), "a shadow of 20 x 20 pixels has {dark}");
+
+    let mut off = stage();
+    off.0.look.shadow = None;
+    let unshaded = aside(off, AlphaMode::Opaque, 1.0);
+    assert!(close(unshaded.at(32, 32), ground(1.0, 0.8), 2.0), "control: shadows off");
+    assert!(!unshaded.ran.passes.contains(&"shadow") && shaded.ran.passes.contains(&"shadow"));
+    let mut empty = stage();
+    empty.0.look.sun = [3.0, 4.0, 0.0];
+    assert!(close(from_above(empty).at(32, 32), ground(1.0, 0.8), 2.0), "control: no caster");
+}
+
+#[test]
+fn the_shadow_of_a_cut_out_has_the_hole_too_and_an_opaque_one_has_not() {
+    let cut = aside(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
+    assert!(close(cut.at(32, 32), ground(1.0, 0.8), 4.0), "the hole: {:?}", cut.at(32, 32));
+    assert!(close(cut.at(24, 32), ground(0.0, 0.8), 4.0), "the rim: {:?}", cut.at(24, 32));
+    let solid = aside(stage(), AlphaMode::Opaque, 1.0);
+    assert!(close(solid.at(32, 32), ground(0.0, 0.8), 4.0), "control: opaque fills it");
+}
+
+#[test]
+fn a_blended_square_casts_from_the_threshold_on() {
+    let dense = aside(stage(), AlphaMode::Blend, 0.6);
+    assert!(close(dense.at(24, 32), ground(0.0, 0.8), 4.0) && close(dense.at(32, 32), ground(1.0, 0.8), 4.0));
+    let thin = aside(stage(), AlphaMode::Blend, 0.4);
+    assert!(close(thin.at(24, 32), ground(1.0, 0.8), 4.0), "{:?}", thin.at(24, 32));
+}
+
+#[test]
+fn one_texel_without_blur_gives_chebyshevs_bound_and_bleeding_is_taken_off() {
+    // A square at height 4 that covers the whole map: near = 4.00 + 1 % and far = 0 - 1 % of the diagonal.
+    let shown = |least_variance: f32, bleeding: f32| {
+        let mut stage = stage();
+        stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, alpha_threshold: 0.5 });
+        let cover = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };
+        stage.0.look.shadow = stage.0.look.shadow.map(|shadow| Shadow { alpha_threshold: 0.0, ..shadow });
+        from_above(stage.add(lying(5.1, 4.0), cover)).at(32, 32)
+    };
+    let diagonal = (2.0 * 10.2_f64.powi(2) + 16.0).sqrt();
+    let behind = 4.0 / (4.0 + 0.02 * diagonal);
+    for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
+        let variance = f64::from(least_variance);
+        let bound = variance / (variance + behind * behind);
+        let bleeding_share = f64::from(bleeding);
+        let share = ((bound - bleeding_share) / (1.0 - bleeding_share)).max(0.0);
+        let seen = shown(least_variance, bleeding);
+        assert!(close(seen, ground(share, 1.0), 2.0), "{least_variance} {bleeding}: {seen:?}, share {share}");
+        assert!(!close(seen, ground(share + 0.05, 1.0), 2.0), "control: the judge sees five parts in a hundred");
+    }
+}
+
+#[test]
+fn the_edge_of_a_shadow_is_soft_by_the_blur_and_half_dark_where_the_caster_ends() {
+    let penumbra = |blur: f32| {
+        let mut stage = stage();
+        stage.0.look.shadow = Some(Shadow { size: 256, blur, bleeding: 0.0, ..Shadow::default() });
+        let shown = aside(stage, AlphaMode::Opaque, 1.0);
+        let row: Vec<f64> = (8..56).map(|y| f64::from(shown.at(32, y)[0])).collect();
+        let (dark, light) = (row[24], row[0]);
+        let between = row.iter().filter(|byte| **byte > dark + 4.0 && **byte < light - 4.0).count();
+        assert!(row[..20].windows(2).all(|pair| pair[0] >= pair[1] - 1.0), "falls towards the middle: {row:?}");
+        between
+    };
+    let (hard, soft) = (penumbra(0.0), penumbra(4.0));
+    assert!(soft >= hard + 6, "blur widens the edge: {hard} and {soft} pixels");
+}
+
+#[test]
+fn a_lit_surface_does_not_shadow_itself() {
+    for sun in [[0.0, 1.0, 0.0], [3.0, 4.0, 0.0], [1.0, 0.4, 0.6]] {
+        let mut stage = stage();
+        stage.0.look.sun = sun;
+        let shown = from_above(stage.add(lying(1.5, 2.0), Material::default()));
+        let lit = nalgebra::Vector3::from(sun).cast::<f64>().normalize().y;
+        for (x, y) in [(32, 32), (22, 24), (40, 42)] {
+            let seen = shown.at(x, y);
+            assert!(close(seen, [0.25 + 0.5 * lit; 3], 2.0), "{sun:?} ({x}, {y}): {seen:?}");
+        }
+    }
+}
+
+#[test]
+fn every_up_axis_gives_the_same_picture() {
+    let shown = |up: UpAxis| {
+        let turn = up.from_y_up();
+        let mut stage = Stage::new();
+        stage.0.up = up;
+        stage.0.look = modalcast::scene::Look::default();
+        let mesh = lying(1.0, 1.0);
+        let rotate = |vector: &[f32; 3]| (turn * nalgebra::Vector3::from(*vector).cast::<f64>()).cast::<f32>().into();
+        let rest: Vec<[f32; 3]> = mesh.rest().iter().chain(lying(0.4, 0.0).rest()).map(rotate).collect();
+        let normals = vec![rotate(&[0.0, 1.0, 0.0]); 8];
+        let triangles = vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
+        let mesh = modalcast::domain::Mesh::indexed(rest, normals, vec![], triangles).expect("two squares");
+        let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
+        draw(&mut open(), &scene, Camera::framing(&scene), 64)
+    };
+    let upright = shown(UpAxis::Y);
+    for up in [UpAxis::X, UpAxis::Z] {
+        let other = shown(up);
+        let differ = upright.image.rgba.iter().zip(&other.image.rgba).filter(|(a, b)| a.abs_diff(**b) > 4).count();
+        assert!(differ < 60, "{up:?}: {differ} bytes differ");
+    }
+    let flat = upright.at(32, 60);
+    assert!(upright.count(|pixel| pixel == flat) < 4000, "there is something to see");
+}
