@@ -72,7 +72,7 @@ pub(crate) enum Command {
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Common {
     /// The server.
-    #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50551")]
+    #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// Seconds to keep trying until the server answers.
     #[arg(long, default_value_t = 0.0, value_parser = number)]
