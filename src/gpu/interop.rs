@@ -56,8 +56,7 @@ impl Interop {
             names.push(buffers.tangents.ok_or_else(|| fail("the renderer gave no buffer for tangents".into()))?);
         }
         let sizes = sizes[..names.len()].to_vec();
-        let mut interop =
-            Self { resources: Vec::new(), sizes, access: None, context: Arc::clone(device.context()) };
+        let mut interop = Self { resources: Vec::new(), sizes, access: None, context: Arc::clone(device.context()) };
         for name in names {
             let mut resource = std::ptr::null_mut();
             // SAFETY: `resource` is a live pointer; an unknown buffer name is refused by the driver.

@@ -106,8 +106,7 @@ pub fn agreements() -> Vec<Agreement> {
 }
 
 /// The start of a source that states agreements: NVRTC has no `offsetof`, so this is what that macro expands to.
-pub(super) const PRELUDE: &str =
-    "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
+pub(super) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
 
 /// A kernel `report` that writes the device's value of every agreement, in order, into its only argument.
 pub(super) fn report_source() -> String {

@@ -214,7 +214,8 @@ pub(super) mod tests {
     fn the_first_domain_of_each_block_brackets_the_domains_of_all_its_vertices() {
         let sizes: [&[u32]; 5] = [&[1], &[256], &[255, 1, 1], &[7; 1000], &[1000, 3, 256, 512, 1, 700]];
         for sizes in sizes {
-            let firsts: Vec<u32> = sizes.iter().scan(0, |sum, size| Some(std::mem::replace(sum, *sum + size))).collect();
+            let firsts: Vec<u32> =
+                sizes.iter().scan(0, |sum, size| Some(std::mem::replace(sum, *sum + size))).collect();
             let items: u32 = sizes.iter().sum();
             let blocks = first_domains(firsts.iter().copied(), items as usize);
             assert_eq!(blocks.len(), items.div_ceil(BLOCK) as usize + 1);

@@ -128,7 +128,11 @@ fn kernels(scene: &Scene) -> Vec<Kernel> {
     let flags = [("MODES", needs.modes), ("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear)];
     let compiled = |kernel: KernelSource, items: usize| Kernel {
         name: kernel.name,
-        defines: flags.iter().filter(|(name, on)| *on && kernel.features.contains(name)).map(|(name, _)| *name).collect(),
+        defines: flags
+            .iter()
+            .filter(|(name, on)| *on && kernel.features.contains(name))
+            .map(|(name, _)| *name)
+            .collect(),
         blocks: blocks(items),
         threads: BLOCK,
         source: kernel.source,
@@ -143,7 +147,11 @@ fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
         (needs.modes, LeftOut { feature: "modes", what: "the sum U q in `deform`", bytes: 0 }),
         (
             needs.normal_maps,
-            LeftOut { feature: "normal_maps", what: "tangents in `orient` and their two buffers", bytes: tangent_bytes },
+            LeftOut {
+                feature: "normal_maps",
+                what: "tangents in `orient` and their two buffers",
+                bytes: tangent_bytes,
+            },
         ),
         (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose in `orient`", bytes: 0 }),
     ];

@@ -250,10 +250,7 @@ mod tests {
         };
         let mut parts = Parts::named("square");
         parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
-        parts.materials = vec![
-            Material::default(),
-            Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
-        ];
+        parts.materials = vec![Material::default(), Material { alpha_mode: AlphaMode::Blend, ..Material::default() }];
         parts.domains.push(domain);
         parts
     }

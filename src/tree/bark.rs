@@ -104,7 +104,9 @@ mod tests {
 
     fn mean(texture: &Texture) -> [f64; 3] {
         let count = texture.rgba().len() as f64 / 4.0;
-        std::array::from_fn(|axis| texture.rgba().chunks_exact(4).map(|pixel| f64::from(pixel[axis])).sum::<f64>() / count)
+        std::array::from_fn(|axis| {
+            texture.rgba().chunks_exact(4).map(|pixel| f64::from(pixel[axis])).sum::<f64>() / count
+        })
     }
 
     #[test]

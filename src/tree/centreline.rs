@@ -111,7 +111,8 @@ fn ring_arcs(growth: &Growth) -> Vec<f64> {
         let fraction = ring as f64 / growth.rings as f64;
         node(element) * (1.0 - fraction) + node(element + 1) * fraction
     };
-    let mut arcs: Vec<f64> = (0..growth.elements).flat_map(|e| (0..growth.rings).map(move |r| (e, r))).map(|(e, r)| within(e, r)).collect();
+    let mut arcs: Vec<f64> =
+        (0..growth.elements).flat_map(|e| (0..growth.rings).map(move |r| (e, r))).map(|(e, r)| within(e, r)).collect();
     arcs.push(growth.length);
     arcs
 }
@@ -134,7 +135,11 @@ impl Wander {
         let basis = frame(&growth.start, &growth.up);
         let mut wave = |number: usize| {
             let waves = number as f64 + random.between(0.6, 1.3);
-            (growth.wander * std::f64::consts::TAU * waves * 0.5 / (1.0 + number as f64), waves, random.between(0.0, 6.2832))
+            (
+                growth.wander * std::f64::consts::TAU * waves * 0.5 / (1.0 + number as f64),
+                waves,
+                random.between(0.0, 6.2832),
+            )
         };
         let waves = std::array::from_fn(|_| std::array::from_fn(&mut wave));
         Self { axes: [basis * Vector3::x(), basis * Vector3::z()], waves }

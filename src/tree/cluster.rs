@@ -69,7 +69,8 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Ran
     };
     mold.add_skin(Wrap::Strip { u: STEM_U }, |_, _| 1.0);
     for leaf in 0..leaves {
-        let along = if leaf + 1 == leaves { 1.0 } else { 0.16 + 0.84 * (leaf as f64 + random.unit() * 0.6) / leaves as f64 };
+        let along =
+            if leaf + 1 == leaves { 1.0 } else { 0.16 + 0.84 * (leaf as f64 + random.unit() * 0.6) / leaves as f64 };
         let azimuth = if bends { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
         add_leaf(&mut mold, along, azimuth + random.spread(0.45), size * random.between(0.78, 1.12), random);
     }

@@ -45,7 +45,8 @@ pub(super) fn texture(name: &str, palette: &Palette, random: &mut Random) -> Res
         let u = ((pixel % SIDE) as f32 + 0.5) / SIDE as f32;
         let v = ((pixel / SIDE) as f32 + 0.5) / SIDE as f32;
         let shade = 1.0 + 0.08 * mottle[0].at(u, v) + 0.05 * mottle[1].at(u, v);
-        let (colour, cover) = if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, u / LEAF_SPAN[1] - 0.5, 1.0 - v) };
+        let (colour, cover) =
+            if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, u / LEAF_SPAN[1] - 0.5, 1.0 - v) };
         rgba.extend(colour.map(|channel| (shade * channel).clamp(0.0, 255.0) as u8));
         rgba.push((255.0 * cover).round() as u8);
     }

@@ -37,7 +37,8 @@ pub(super) fn motion(nodes: &[Vector3<f64>], dofs: &[f64], station: Station) -> 
     let part = |node: usize, first: usize| local * Vector3::from_column_slice(&dofs[6 * node + first..][..3]);
     let (shift_a, turn_a) = (part(element, 0), part(element, 3));
     let (shift_b, turn_b) = (part(element + 1, 0), part(element + 1, 3));
-    let value = [1.0 - 3.0 * x * x + 2.0 * x.powi(3), x * (1.0 - x).powi(2), x * x * (3.0 - 2.0 * x), x * x * (x - 1.0)];
+    let value =
+        [1.0 - 3.0 * x * x + 2.0 * x.powi(3), x * (1.0 - x).powi(2), x * x * (3.0 - 2.0 * x), x * x * (x - 1.0)];
     let slope = [6.0 * x * (x - 1.0), (1.0 - x) * (1.0 - 3.0 * x), 6.0 * x * (1.0 - x), x * (3.0 * x - 2.0)];
     let bend = |basis: &[f64; 4], [a, da, b, db]: [f64; 4]| {
         basis[0] * a + basis[1] * length * da + basis[2] * b + basis[3] * length * db

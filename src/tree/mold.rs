@@ -96,7 +96,8 @@ impl Mold {
 
     pub(super) fn beam(&self) -> Beam {
         let element = |first: usize| {
-            let cones = self.radii[first..=first + self.line.rings].windows(2).map(|ends| Section::of_cone(ends[0], ends[1]));
+            let cones =
+                self.radii[first..=first + self.line.rings].windows(2).map(|ends| Section::of_cone(ends[0], ends[1]));
             let count = self.line.rings as f64;
             cones.fold(Section { area: 0.0, moment: 0.0 }, |sum, cone| Section {
                 area: sum.area + cone.area / count,

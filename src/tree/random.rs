@@ -49,7 +49,8 @@ mod tests {
 
     #[test]
     fn a_seed_repeats_its_numbers_and_another_seed_differs() {
-        let draw = |seed| (0..4).map(|_| 0).scan(Random::new(seed), |random, _| Some(random.bits())).collect::<Vec<_>>();
+        let draw =
+            |seed| (0..4).map(|_| 0).scan(Random::new(seed), |random, _| Some(random.bits())).collect::<Vec<_>>();
         assert_eq!(draw(1), draw(1));
         assert_ne!(draw(1), draw(2));
         // The published first output for seed 0.
