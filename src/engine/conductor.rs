@@ -120,6 +120,9 @@ impl Conductor {
             self.tend().await;
             let stall = self.next_stall();
             tokio::select! {
+                // In this order: a request that came before a step is in place when the step is done. Every turn of
+                // the loop tends, so messages do not starve steps.
+                biased;
                 message = mailbox.recv() => match message {
                     Some(Message::Stop { error, done }) => break (error, Some(done)),
                     Some(message) => self.receive(message),

@@ -133,6 +133,7 @@ pub(super) fn own_name(source: &str) -> Result<String> {
     let last = source.trim_end_matches('/').rsplit('/').next().unwrap_or_default();
     let stem = last.rsplit_once('.').map_or(last, |(stem, _)| if stem.is_empty() { last } else { stem });
     let fit = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '-' };
+    let stem = if source.trim_end_matches('/') == "." { "scene" } else { stem };
     let name: String = stem.trim_start_matches('.').chars().map(fit).take(64).collect();
     checked_name(&name).map_err(|_| invalid("source", "a built-in name or a path in the repository", source))?;
     Ok(name)
@@ -152,9 +153,14 @@ mod tests {
 
     #[test]
     fn a_source_gives_its_last_part_as_name() {
-        for (source, name) in
-            [("tree", "tree"), ("vega/simpleBridge/", "simpleBridge"), ("a b/c d.glb", "c-d"), ("x.y.obj", "x.y")]
-        {
+        for (source, name) in [
+            ("tree", "tree"),
+            ("vega/simpleBridge/", "simpleBridge"),
+            ("a b/c d.glb", "c-d"),
+            ("x.y.obj", "x.y"),
+            (".", "scene"),
+            ("./tree", "tree"),
+        ] {
             assert_eq!(own_name(source).as_deref(), Ok(name));
         }
         for source in ["", "/", "..", "a/.."] {

@@ -52,6 +52,9 @@ use crate::scene::Scene;
 /// How many scenes are read from disk at a time.
 const LOADS: usize = 2;
 
+/// How many uploads may be under way.
+const UPLOADS: usize = 8;
+
 /// The engine. Clones share everything.
 #[derive(Clone)]
 pub struct Engine {
@@ -65,6 +68,7 @@ struct Shared {
     means: Means,
     registry: Registry,
     loads: Semaphore,
+    uploads: Arc<Semaphore>,
     next_id: AtomicU64,
     stopping: AtomicBool,
     device: Mutex<Option<JoinHandle<()>>>,
@@ -94,6 +98,7 @@ impl Engine {
             source,
             info,
             loads: Semaphore::new(LOADS),
+            uploads: Arc::new(Semaphore::new(UPLOADS)),
             next_id: AtomicU64::new(1),
             stopping: AtomicBool::new(false),
             device: Mutex::new(Some(device)),
@@ -158,7 +163,8 @@ impl Engine {
     /// Begins an upload.
     ///
     /// # Errors
-    /// `Invalid` for a name, entry or size that cannot be; `Taken` when the name is in use.
+    /// `Invalid` for a name, entry or size that cannot be; `Taken` when the name is in use; `Busy` when too many are under
+    /// way.
     pub async fn begin_upload(&self, announced: Announcement) -> Result<Upload> {
         checked_name(&announced.scene)?;
         let config = &self.shared.config;
@@ -170,8 +176,10 @@ impl Engine {
             return Err(invalid("header.total_bytes", expected, announced.total_bytes));
         }
         self.shared.registry.check_free(&announced.scene)?;
+        let full = |_| Error::Busy { queue: "uploads under way", limit: UPLOADS };
+        let place = Arc::clone(&self.shared.uploads).try_acquire_owned().map_err(full)?;
         let uploads = config.state.join("uploads");
-        aside("upload", move || Upload::begin(&uploads, announced)).await
+        aside("upload", move || Upload::begin(&uploads, announced, place)).await
     }
 
     /// Opens a finished upload. A failure leaves nothing of it behind.

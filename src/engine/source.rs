@@ -31,7 +31,8 @@ impl SceneSource for Repository {
     }
 
     fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>> {
-        Self::new(Some(folder))?.open(if entry.is_empty() { "." } else { entry })
+        // The dot in front keeps an upload's file from being taken for a built-in name.
+        Self::new(Some(folder))?.open(&format!("./{entry}"))
     }
 
     fn list(&self) -> Vec<String> {

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use sha2::{Digest as _, Sha256};
+use tokio::sync::OwnedSemaphorePermit;
 
 use crate::error::{Result, during, invalid};
 
@@ -37,6 +38,8 @@ pub struct Upload {
     /// Bytes announced by the files so far.
     claimed: u64,
     open: Option<Open>,
+    /// Its place among the uploads under way.
+    _place: OwnedSemaphorePermit,
 }
 
 #[derive(Debug)]
@@ -51,14 +54,14 @@ struct Open {
 
 impl Upload {
     /// A fresh folder beside the finished uploads.
-    pub(super) fn begin(uploads: &Path, announced: Announcement) -> Result<Self> {
+    pub(super) fn begin(uploads: &Path, announced: Announcement, place: OwnedSemaphorePermit) -> Result<Self> {
         if !announced.entry.is_empty() {
             checked_path("header.entry", &announced.entry)?;
         }
         let count = COUNTER.fetch_add(1, Ordering::Relaxed);
         let folder = uploads.join(format!(".{}-{count}", announced.scene));
         fs::create_dir_all(&folder).map_err(during("upload"))?;
-        Ok(Self { announced, folder, paths: BTreeSet::new(), claimed: 0, open: None })
+        Ok(Self { announced, folder, paths: BTreeSet::new(), claimed: 0, open: None, _place: place })
     }
 
     /// Begins the next file.
@@ -182,7 +185,8 @@ mod tests {
 
     fn begin(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let announced = Announcement { scene: "s".into(), entry: String::new(), files, total_bytes };
-        Upload::begin(folder, announced).expect("begins")
+        let places = std::sync::Arc::new(tokio::sync::Semaphore::new(1));
+        Upload::begin(folder, announced, places.try_acquire_owned().expect("free")).expect("begins")
     }
 
     fn sha(bytes: &[u8]) -> Vec<u8> {

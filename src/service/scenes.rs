@@ -37,9 +37,13 @@ impl v1::scene_service_server::SceneService for Scenes {
         request: Request<Streaming<v1::UploadSceneRequest>>,
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
         let mut parts = request.into_inner();
-        let limit = self.0.config().message_bytes;
+        let (limit, patience) = (self.0.config().message_bytes, self.0.config().stall);
         let mut upload = None;
-        while let Some(request) = parts.message().await.map_err(|fault| transport(fault, limit))? {
+        loop {
+            // A client that falls silent must not keep its place and its disk space.
+            let silent = |_| Error::Deadline { what: "the next part".into(), ms: patience.as_millis() as u64 };
+            let next = tokio::time::timeout(patience, parts.message()).await.map_err(|late| status(silent(late)))?;
+            let Some(request) = next.map_err(|fault| transport(fault, limit))? else { break };
             let part = request.part.ok_or_else(|| status(invalid("part", "header, file or chunk", "none")))?;
             upload = Some(receive(&self.0, upload, part).await.map_err(status)?);
         }

@@ -7,6 +7,16 @@ use tonic::{Code, Status};
 
 use crate::error::Error;
 
+/// The most letters of one text of a refusal: it travels in headers or between steps, whatever a client has sent.
+const LONGEST: usize = 512;
+
+fn short(text: String) -> String {
+    match text.char_indices().nth(LONGEST) {
+        None => text,
+        Some((end, _)) => format!("{}...", &text[..end]),
+    }
+}
+
 /// The refusal as a message: field, expected, given.
 pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
     let (field, expected, given) = match error.clone() {
@@ -19,7 +29,7 @@ pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
         Error::Unavailable { what, reason, remedy } => (what.into(), remedy, reason),
         Error::Fault { stage, reason } => (stage.into(), "success".into(), reason),
     };
-    Rejection { step, field, expected, given }
+    Rejection { step, field: short(field), expected: short(expected), given: short(given) }
 }
 
 /// The status of an error.
@@ -34,15 +44,7 @@ pub(super) fn status(error: Error) -> Status {
         Error::Unavailable { .. } => Code::Unavailable,
         Error::Fault { .. } => Code::Internal,
     };
-    // A status travels in the headers, so its text must stay small whatever a client has sent.
-    let short = |text: String| match text.char_indices().nth(512) {
-        None => text,
-        Some((end, _)) => format!("{}...", &text[..end]),
-    };
-    let mut details = rejection(None, &error);
-    details.field = short(details.field);
-    details.expected = short(details.expected);
-    details.given = short(details.given);
+    let details = rejection(None, &error);
     Status::with_details(code, short(error.to_string()), details.encode_to_vec().into())
 }
 

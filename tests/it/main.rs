@@ -8,6 +8,8 @@ mod pixels;
 mod real;
 mod restart;
 mod service;
+mod service_faults;
+mod service_files;
 mod service_harness;
 mod steps;
 mod tolerance;

@@ -85,6 +85,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         name: name.into(),
         shape: 0,
         material: 0,
+        runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
         runs: vec![],
@@ -249,6 +250,11 @@ impl Driver {
         let Self { sender, mut replies } = self;
         drop(sender);
         while within(replies.message()).await.expect("a clean end").is_some() {}
+    }
+
+    /// Its two directions, to be used at the same time.
+    pub(crate) fn split(self) -> (mpsc::Sender<v1::DriveSceneRequest>, Streaming<v1::DriveSceneResponse>) {
+        (self.sender, self.replies)
     }
 
     /// Goes away without a word.
