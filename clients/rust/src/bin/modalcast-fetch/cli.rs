@@ -10,7 +10,7 @@ Examples:
   modalcast-fetch frames --scene tree --open tree --count 60 --size 1280x720 --out out
   modalcast-fetch frame --scene tree --min-step 10 --out frame.png
   modalcast-fetch vertices --scene tree --count 60 --out vertices.npy --json
-  modalcast-fetch --server http://10.0.0.2:50551 info
+  modalcast-fetch --server http://10.0.0.2:50051 info
 
 `frames`, and `vertices` with --count, print a line `ready` on standard output once the server has accepted the
 subscription: a physics process started after that line loses no step.
@@ -23,7 +23,7 @@ Exit codes: 0 done; 1 the server refused; 2 bad command line; 3 no connection, o
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
 pub(crate) struct Arguments {
     /// The server.
-    #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50551")]
+    #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// Seconds to keep trying until the server answers.
     #[arg(long, global = true, default_value_t = 0.0, value_parser = seconds)]
