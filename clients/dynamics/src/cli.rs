@@ -132,6 +132,10 @@ pub(crate) struct Wind {
     /// The crown's peak displacement at wind 1, as a share of the height.
     #[arg(long, default_value_t = 0.05, value_parser = share)]
     pub(crate) sway: f64,
+    /// Where the wind blows to, in degrees about up from the first horizontal axis; at 25 the default camera sees the
+    /// sway from the side.
+    #[arg(long, default_value_t = 25.0, value_parser = angle, allow_hyphen_values = true)]
+    pub(crate) direction: f64,
     /// Seed of the turbulence.
     #[arg(long, default_value_t = 7)]
     pub(crate) seed: u64,
@@ -183,6 +187,11 @@ impl Command {
 fn number(text: &str) -> Result<f64, String> {
     let parsed = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
     parsed.ok_or_else(|| "expected a number from 0 to 1000000".into())
+}
+
+fn angle(text: &str) -> Result<f64, String> {
+    let parsed = text.parse().ok().filter(|number: &f64| number.abs() <= 360.0);
+    parsed.ok_or_else(|| "expected degrees, -360 to 360".into())
 }
 
 fn positive(text: &str) -> Result<f64, String> {

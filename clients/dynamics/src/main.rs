@@ -90,8 +90,9 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
     match command {
         Command::Tree { wind, .. } => {
             let model = Model::learn(client, scene, WATCHED_TREE).await?;
-            let (wind, sway, seed) = (wind.wind, wind.sway, wind.seed);
-            Ok(Box::new(Sway::new(model, TreeOptions { dt, steps, sway, wind, seed })?))
+            let (strength, direction) = (wind.wind, wind.direction.to_radians());
+            let options = TreeOptions { dt, steps, sway: wind.sway, wind: strength, direction, seed: wind.seed };
+            Ok(Box::new(Sway::new(model, options)?))
         }
         Command::Bridge { files, load, .. } => {
             let model = Model::learn(client, scene, WATCHED).await?;

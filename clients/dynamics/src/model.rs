@@ -178,10 +178,15 @@ impl Model {
         (self.high - self.low).dot(&self.up).max(f64::MIN_POSITIVE)
     }
 
+    /// The horizontal direction at an angle about up, in radians, from the first horizontal axis (x, or y when x is up).
+    pub fn horizontal(&self, angle: f64) -> Vector3<f64> {
+        let first = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
+        first * angle.cos() + self.up.cross(&first) * angle.sin()
+    }
+
     /// The longer horizontal axis, and the other one, so that the three are right-handed with up.
     pub fn ground_axes(&self) -> (Vector3<f64>, Vector3<f64>) {
-        let first = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
-        let second = self.up.cross(&first);
+        let (first, second) = (self.horizontal(0.0), self.horizontal(std::f64::consts::FRAC_PI_2));
         let size = |axis: &Vector3<f64>| (self.high - self.low).dot(&axis.abs());
         if size(&second) > size(&first) { (second, -first) } else { (first, second) }
     }

@@ -129,7 +129,7 @@ pub async fn run(
         ("rejected".to_owned(), json!(end.refused)),
         ("skipped".to_owned(), json!(end.skipped)),
         ("elapsed_s".to_owned(), json!(elapsed)),
-        ("steps_per_s".to_owned(), json!(end.sent as f64 / elapsed.max(1e-9))),
+        ("steps_per_second".to_owned(), json!(end.sent as f64 / elapsed.max(1e-9))),
     ]));
     Ok(Summary { sent: end.sent, refused: end.refused, value: Value::Object(value) })
 }

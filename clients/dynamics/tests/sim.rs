@@ -103,7 +103,7 @@ async fn the_tree_sways_and_its_subscribers_see_every_joint_closed() {
     assert_eq!((summary["steps_sent"].as_u64(), summary["rejected"].as_u64()), (Some(90), Some(0)));
     let sway = summary["crown_sway_of_height"].as_f64().expect("a number");
     assert!((0.03..0.1).contains(&sway), "{sway}");
-    assert!(summary["joint_gap_max"].as_f64().expect("a number") <= 1e-3);
+    assert!(summary["joint_gap_of_diagonal"].as_f64().expect("a number") <= 1e-3);
     assert_eq!(summary["stages_ms"]["deform"].as_f64(), Some(1.5));
     // Each beam has 54 vertices; a child's first section begins where its parent's last section is.
     let (q, poses) = (numbers(&folder.path().join("q.npy")), numbers(&folder.path().join("transforms.npy")));
