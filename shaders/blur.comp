@@ -1,7 +1,7 @@
 // One direction of the Gaussian blur (equation 3.11). The first direction reads depth and makes the moments (m, m m) of
-// m = depth - 1/2; the second reads those. One invocation a texel; lanes run along x in both directions, so that their
-// reads are neighbours in memory.
-layout(local_size_x = 64) in;
+// m = depth - 1/2; the second reads those. One invocation makes RUN texels in a row along its direction, so that a texel is
+// read once for all of them.
+layout(local_size_x = LANES) in;
 layout(binding = 0) uniform sampler2D from;
 layout(rg32f, binding = 0) uniform writeonly image2D to;
 
@@ -26,15 +26,17 @@ vec2 moments(ivec2 at, int side) {
 void main() {
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     int side = int(frame.shadow.w);
-    if (at.x >= side) return;
 #ifdef FIRST
     const ivec2 along = ivec2(1, 0);
 #else
     const ivec2 along = ivec2(0, 1);
 #endif
-    vec2 sum = WEIGHTS[0] * moments(at, side);
-    for (int step = 1; step <= REACH; step++) {
-        sum += WEIGHTS[step] * (moments(at + step * along, side) + moments(at - step * along, side));
+    at += (RUN - 1) * at * along;
+    if (at.x >= side) return;
+    vec2 sums[RUN];
+    blur(at, along, side, sums);
+    // Stores beyond the edge of the map are dropped.
+    for (int index = 0; index < RUN; index++) {
+        imageStore(to, at + index * along, vec4(sums[index], 0.0, 0.0));
     }
-    imageStore(to, at, vec4(sum, 0.0, 0.0));
 }

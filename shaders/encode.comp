@@ -1,13 +1,13 @@
 // Linear samples to sRGB bytes, opaque, top row first: averages the samples of each pixel, encodes, packs.
 //   picture   [height][width][SAMPLES]  RGBA16F, bottom row first (in)
 //   pixels    [height][width]           RGBA8 in one word         (out)
-layout(local_size_x = 64) in;
+layout(local_size_x = LANES) in;
 #if SAMPLES > 1
 layout(binding = 0) uniform sampler2DMS picture;
 #else
 layout(binding = 0) uniform sampler2D picture;
 #endif
-layout(std430, binding = 3) writeonly buffer Pixels { uint pixels[]; };
+layout(std430, binding = 0) writeonly buffer Pixels { uint pixels[]; };
 
 void main() {
 #if SAMPLES > 1

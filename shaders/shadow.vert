@@ -1,13 +1,13 @@
 // One corner seen from the sun.
 layout(location = 0) in uint vertex;
-layout(std430, binding = 0) readonly buffer Positions { float positions[]; };
+layout(binding = 13) uniform samplerBuffer positions;
 #if defined(UVS) && !defined(SOLID)
 layout(location = 2) in vec2 uv;
 out vec2 uv_image;
 #endif
 
 void main() {
-    vec3 world = vec3(positions[3u * vertex], positions[3u * vertex + 1u], positions[3u * vertex + 2u]);
+    vec3 world = texelFetch(positions, int(vertex)).xyz;
     vec3 at = (frame.map_from_world * vec4(world, 1.0)).xyz;
     bool bad = any(isnan(at)) || any(isinf(at));
     gl_Position = bad ? vec4(0.0, 0.0, -2.0, 1.0) : vec4(2.0 * at - 1.0, 1.0);

@@ -1,7 +1,7 @@
 // One corner: its vertex of the deformed positions, its deformed normal and tangent, its texture coordinates.
 layout(location = 0) in uint vertex;
 layout(location = 1) in vec3 normal;
-layout(std430, binding = 0) readonly buffer Positions { float positions[]; };
+layout(binding = 13) uniform samplerBuffer positions;
 
 out vec3 world;
 out vec3 normal_world;
@@ -15,7 +15,7 @@ out vec4 tangent_world;
 #endif
 
 void main() {
-    world = vec3(positions[3u * vertex], positions[3u * vertex + 1u], positions[3u * vertex + 2u]);
+    world = texelFetch(positions, int(vertex)).xyz;
     normal_world = normal;
 #ifdef UVS
     uv_image = uv;

@@ -17,11 +17,17 @@ pub(super) enum Kind {
     Blend,
 }
 
+/// The most materials that get a draw call each. With more, triangles of one pipeline state are drawn together and each
+/// looks its material up.
+pub(super) const DRAWN_APART: usize = 8;
+
 /// A contiguous run of triangles that one draw call draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Group {
     pub(super) kind: Kind,
     pub(super) double_sided: bool,
+    /// The material of all of them; none when each triangle has its own.
+    pub(super) material: Option<usize>,
     pub(super) first_triangle: usize,
     pub(super) triangles: usize,
 }
@@ -35,39 +41,56 @@ pub(super) struct Geometry {
     pub(super) uvs: Vec<[f32; 2]>,
     /// Per triangle, three corners in the packed normals.
     pub(super) triangles: Vec<[u32; 3]>,
-    /// Per triangle; empty when all have the same material.
+    /// Per triangle; empty when every group has one material.
     pub(super) materials: Vec<u32>,
     pub(super) groups: Vec<Group>,
+    /// Group of each material.
+    group_of: Vec<usize>,
 }
 
-const GROUPS: usize = 6;
+/// Whether triangles look their materials up one by one.
+pub(super) fn looks_up(scene: &Scene) -> bool {
+    used_materials(scene).len() > DRAWN_APART
+}
 
-fn group_of(material: &Material) -> usize {
+/// The groups of a scene: opaque, then mask, then blend; and the group of each material.
+pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
+    let together = looks_up(scene);
+    let mut groups: Vec<Group> = Vec::new();
+    let mut of_material = vec![0; scene.materials.len()];
+    let mut used = used_materials(scene);
+    used.sort_by_key(|material| state(&scene.materials[*material]));
+    for material in used {
+        let (kind, double_sided) = state(&scene.materials[material]);
+        let joins =
+            groups.last().is_some_and(|last| together && (last.kind, last.double_sided) == (kind, double_sided));
+        if !joins {
+            let material = (!together).then_some(material);
+            groups.push(Group { kind, double_sided, material, first_triangle: 0, triangles: 0 });
+        }
+        of_material[material] = groups.len() - 1;
+    }
+    for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
+        for (material, triangles) in stretches(domain, slot) {
+            groups[of_material[material]].triangles += triangles.len();
+        }
+    }
+    let mut first_triangle = 0;
+    for group in &mut groups {
+        group.first_triangle = first_triangle;
+        first_triangle += group.triangles;
+    }
+    (groups, of_material)
+}
+
+/// What the pipeline must be set to for a material.
+fn state(material: &Material) -> (Kind, bool) {
     let kind = match material.alpha_mode {
         AlphaMode::Opaque => Kind::Opaque,
         AlphaMode::Mask { .. } => Kind::Mask,
         AlphaMode::Blend => Kind::Blend,
     };
-    2 * kind as usize + usize::from(material.double_sided)
-}
-
-/// The groups of a scene that have triangles: opaque, mask, blend.
-pub(super) fn groups(scene: &Scene) -> Vec<Group> {
-    let mut counts = [0; GROUPS];
-    for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
-        for (material, triangles) in stretches(domain, slot) {
-            counts[group_of(&scene.materials[material])] += triangles.len();
-        }
-    }
-    let mut first_triangle = 0;
-    let mut groups = Vec::new();
-    for (index, triangles) in counts.into_iter().enumerate() {
-        let kind = [Kind::Opaque, Kind::Mask, Kind::Blend][index / 2];
-        let group = Group { kind, double_sided: index % 2 == 1, first_triangle, triangles };
-        groups.extend((triangles > 0).then_some(group));
-        first_triangle += triangles;
-    }
-    groups
+    (kind, material.double_sided)
 }
 
 /// Indices of the materials that triangles have, ascending.
@@ -78,21 +101,18 @@ pub(super) fn used_materials(scene: &Scene) -> Vec<usize> {
 
 impl Geometry {
     pub(super) fn new(scene: &Scene) -> Self {
-        let groups = groups(scene);
+        let (groups, group_of) = groups(scene);
         let layout = &scene.layout;
-        let several = used_materials(scene).len() > 1;
         let textured = scene.needs.textures || scene.needs.normal_maps;
         let mut geometry = Self {
             vertices: Vec::with_capacity(layout.corners),
             uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),
             triangles: vec![[0; 3]; layout.triangles],
-            materials: vec![0; if several { layout.triangles } else { 0 }],
+            materials: vec![0; if looks_up(scene) { layout.triangles } else { 0 }],
             groups,
+            group_of,
         };
-        let mut next = [0; GROUPS];
-        for group in &geometry.groups {
-            next[2 * group.kind as usize + usize::from(group.double_sided)] = group.first_triangle;
-        }
+        let mut next: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
         for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
             geometry.add_corners(scene, domain, slot, textured);
             geometry.add_triangles(scene, domain, slot, &mut next);
@@ -110,13 +130,13 @@ impl Geometry {
         }
     }
 
-    fn add_triangles(&mut self, scene: &Scene, domain: &Domain, slot: &Slot, next: &mut [usize; GROUPS]) {
+    fn add_triangles(&mut self, scene: &Scene, domain: &Domain, slot: &Slot, next: &mut [usize]) {
         let mesh = &scene.shapes[domain.shape].mesh;
         // A placement that mirrors turns every winding around.
         let mirrored = domain.placement.linear().determinant() < 0.0;
         for (material, range) in stretches(domain, slot) {
             let kind = &scene.materials[material];
-            let place = &mut next[group_of(kind)];
+            let place = &mut next[self.group_of[material]];
             for triangle in &mesh.triangles()[range] {
                 let disagrees = kind.double_sided && winding_disagrees(mesh, *triangle);
                 let [a, b, c] = triangle.map(|corner| corner + slot.first_corner as u32);
@@ -187,7 +207,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn draw_groups_do_not_grow_with_domains_and_keep_every_triangle() {
+    fn draw_groups_do_not_grow_with_domains_or_materials_and_keep_every_triangle() {
         let mask = AlphaMode::Mask { cutoff: 0.5 };
         let pattern = [of(AlphaMode::Blend, false), of(AlphaMode::Opaque, true), of(mask, true)];
         let materials: Vec<Material> = (0..300).map(|index| pattern[index % 3].clone()).collect();
@@ -195,11 +215,12 @@ pub(super) mod tests {
         let geometry = Geometry::new(&scene);
         let kinds: Vec<Kind> = geometry.groups.iter().map(|group| group.kind).collect();
         assert_eq!(kinds, [Kind::Opaque, Kind::Mask, Kind::Blend]);
+        assert!(geometry.groups.iter().all(|group| group.material.is_none()), "three hundred materials are looked up");
         assert_eq!(geometry.groups.iter().map(|group| group.triangles).sum::<usize>(), 600);
         for group in &geometry.groups {
             for triangle in group.first_triangle..group.first_triangle + group.triangles {
                 let material = &scene.materials[geometry.materials[triangle] as usize];
-                assert_eq!(group_of(material), 2 * group.kind as usize + usize::from(group.double_sided));
+                assert_eq!(state(material), (group.kind, group.double_sided));
             }
         }
         let mut seen = geometry.triangles.as_flattened().to_vec();
@@ -214,7 +235,8 @@ pub(super) mod tests {
         parts.domains.truncate(1);
         parts.domains[0].runs = vec![Run { first_triangle: 0, material: 1 }, Run { first_triangle: 1, material: 0 }];
         let geometry = Geometry::new(&Scene::new(parts).expect("good"));
-        assert_eq!(geometry.materials, [0, 1]);
+        let materials: Vec<_> = geometry.groups.iter().map(|group| group.material).collect();
+        assert_eq!(materials, [Some(0), Some(1)], "few materials are drawn apart");
         assert_eq!(geometry.triangles, [[0, 2, 3], [0, 1, 2]]);
     }
 

@@ -17,9 +17,9 @@ use crate::error::{Error, Result, during};
 /// The constants that other files name.
 pub(super) use glow::{
     CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
-    NEAREST, REPEAT, RG32F, RGBA8, RGBA16F, SRGB8_ALPHA8, STATIC_DRAW, STREAM_COPY, STREAM_READ, TEXTURE_2D,
-    TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE, TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T,
-    VERTEX_SHADER,
+    NEAREST, R32UI, REPEAT, RG32F, RGB32F, RGBA8, RGBA16F, RGBA32F, SRGB8_ALPHA8, STATIC_DRAW, STREAM_COPY,
+    STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE, TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER,
+    TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
 };
 
 /// What the context can do.
@@ -31,7 +31,8 @@ pub(super) struct Limits {
     pub(super) max_side: u32,
     pub(super) max_samples: u32,
     pub(super) max_layers: u32,
-    pub(super) max_storage: u64,
+    /// Largest buffer texture.
+    pub(super) max_texels: u64,
     /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
     pub(super) anisotropy: f32,
 }
@@ -143,6 +144,22 @@ impl Gl {
             }
             name
         };
+        let texture = Texture { gl: Rc::clone(self), name, kind };
+        self.check("texture").map(|()| texture)
+    }
+
+    /// A view of a whole buffer as a texture of one row. The buffer must outlive it.
+    pub(super) fn view(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
+        let gl = self.on();
+        let target = glow::TEXTURE_BUFFER;
+        // SAFETY: fresh texture over a buffer of this context.
+        let name = unsafe {
+            let name = gl.create_texture().map_err(during("texture"))?;
+            gl.bind_texture(target, Some(name));
+            gl.tex_buffer(target, format, Some(buffer.name));
+            name
+        };
+        let kind = TextureKind { target, format, width: 0, height: 1, depth: 1, levels: 1 };
         let texture = Texture { gl: Rc::clone(self), name, kind };
         self.check("texture").map(|()| texture)
     }
@@ -374,7 +391,7 @@ fn limits(gl: &glow::Context) -> Limits {
             max_side: number(glow::MAX_TEXTURE_SIZE).min(viewport),
             max_samples: number(glow::MAX_COLOR_TEXTURE_SAMPLES).min(number(glow::MAX_DEPTH_TEXTURE_SAMPLES)),
             max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
-            max_storage: gl.get_parameter_i64(glow::MAX_SHADER_STORAGE_BLOCK_SIZE).max(0) as u64,
+            max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
             anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
         }
     }

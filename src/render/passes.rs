@@ -1,30 +1,28 @@
 //! The passes of one frame, in order: shadow, blur, opaque, sky, ground, blended, encode.
 
-use super::frame::above_ground;
-use super::geometry::Kind;
+use super::frame::{Frame, above_ground};
+use super::geometry::{Group, Kind};
 use super::gl::{Fixed, Gl, Program};
-use super::scene_buffers::SceneBuffers;
-use super::shaders::{COLOUR_UNIT, NORMAL_UNIT, SHADOW_UNIT};
+use super::scene_buffers::{MATERIAL_BYTES, SceneBuffers};
+use super::shaders::{
+    COLOUR_UNIT, LANES, MATERIAL_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TRIANGLE_MATERIAL_UNIT,
+};
 use super::target::Target;
 use super::{Ran, Shot};
 use crate::error::Result;
 
-const POSITIONS: u32 = 0;
-const TRIANGLE_MATERIALS: u32 = 1;
-const MATERIALS: u32 = 2;
-const PIXELS: u32 = 3;
+const PIXELS: u32 = 0;
 const FRAME: u32 = 0;
-/// Lanes of a compute workgroup, along x.
-const LANES: u32 = 64;
+const MATERIAL: u32 = 1;
 
 /// Binds what all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
-    buffers.buffer("positions")?.bind_storage(POSITIONS);
-    buffers.buffer("materials")?.bind_storage(MATERIALS);
-    if let Some(list) = buffers.buffers.get("triangle materials") {
-        list.bind_storage(TRIANGLE_MATERIALS);
+    buffers.views.positions.bind(POSITION_UNIT);
+    buffers.views.materials.bind(MATERIAL_UNIT);
+    if let Some(view) = &buffers.views.triangle_materials {
+        view.bind(TRIANGLE_MATERIAL_UNIT);
     }
-    buffers.buffer("frame")?.bind_uniform(FRAME);
+    buffers.buffer("frame")?.bind_uniform(FRAME, 0, size_of::<Frame>());
     for (unit, texture) in (COLOUR_UNIT..).zip(&buffers.colours) {
         texture.bind(unit);
     }
@@ -41,17 +39,20 @@ pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<(
     gl.set(Fixed { depth_write: true, ..Fixed::default() });
     for group in &buffers.groups {
         if let Some(program) = &buffers.programs.shadow[group.kind as usize] {
-            program.bind(first_triangle(buffers, group.kind != Kind::Opaque, group.first_triangle));
+            bind_material(buffers, group, program, group.kind != Kind::Opaque)?;
             gl.draw_indexed(&buffers.casters, group.first_triangle, group.triangles);
         }
     }
     ran.passes.push("shadow");
     gl.check("shadow")?;
-    for (program, from, to) in [(blur_x, &map.depth, &map.half_blurred), (blur_y, &map.half_blurred, &map.moments)] {
+    let runs = map.size.div_ceil(RUN);
+    let along_x = (blur_x, &map.depth, &map.half_blurred, [runs.div_ceil(LANES), map.size]);
+    let along_y = (blur_y, &map.half_blurred, &map.moments, [map.size.div_ceil(LANES), runs]);
+    for (program, from, to, groups) in [along_x, along_y] {
         program.bind(None);
         from.bind(0);
         to.bind_image(0);
-        gl.dispatch(map.size.div_ceil(LANES), map.size);
+        gl.dispatch(groups[0], groups[1]);
     }
     ran.passes.push("blur");
     gl.check("blur")
@@ -64,7 +65,7 @@ pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot
     if let Some(map) = &buffers.shadow {
         map.moments.bind(SHADOW_UNIT);
     }
-    if surfaces(gl, buffers, target, &[Kind::Opaque, Kind::Mask], ran) {
+    if surfaces(gl, buffers, target, &[Kind::Opaque, Kind::Mask], ran)? {
         ran.passes.push("opaque");
         gl.check("opaque")?;
     }
@@ -80,7 +81,7 @@ pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot
         ran.passes.push("ground");
         gl.check("ground")?;
     }
-    if surfaces(gl, buffers, target, &[Kind::Blend], ran) {
+    if surfaces(gl, buffers, target, &[Kind::Blend], ran)? {
         ran.passes.push("blended");
         gl.check("blended")?;
     }
@@ -98,7 +99,7 @@ pub(super) fn encode(gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
 }
 
 /// Draws the groups of these kinds; whether there were any.
-fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ran: &mut Ran) -> bool {
+fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ran: &mut Ran) -> Result<bool> {
     let before = ran.draws;
     for group in buffers.groups.iter().filter(|group| kinds.contains(&group.kind)) {
         let single = buffers.programs.mask_single.as_ref().filter(|_| group.kind == Kind::Mask && target.samples == 1);
@@ -110,11 +111,11 @@ fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ra
             coverage: group.kind == Kind::Mask && target.samples > 1,
             depth_clamp: false,
         });
-        program.bind(first_triangle(buffers, true, group.first_triangle));
+        bind_material(buffers, group, program, true)?;
         gl.draw_indexed(&buffers.corners, group.first_triangle, group.triangles);
         ran.draws += 1;
     }
-    ran.draws > before
+    Ok(ran.draws > before)
 }
 
 fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
@@ -122,7 +123,12 @@ fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
     gl.draw_made(&buffers.nothing, vertices);
 }
 
-/// The number that a program reads the material by, when it does.
-fn first_triangle(buffers: &SceneBuffers, reads_material: bool, first: usize) -> Option<u32> {
-    (reads_material && buffers.buffers.contains_key("triangle materials")).then_some(first as u32)
+/// Uses a program, with the one material of the group, or with the place where its triangles begin.
+fn bind_material(buffers: &SceneBuffers, group: &Group, program: &Program, reads_it: bool) -> Result<()> {
+    if let Some(material) = group.material {
+        buffers.buffer("materials")?.bind_uniform(MATERIAL, MATERIAL_BYTES * material, MATERIAL_BYTES);
+    }
+    let looks_up = reads_it && group.material.is_none();
+    program.bind(looks_up.then_some(group.first_triangle as u32));
+    Ok(())
 }

@@ -3,7 +3,7 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
-use super::geometry::{Kind, groups, used_materials};
+use super::geometry::{Kind, groups, looks_up};
 use super::textures::{Use, arrays};
 use crate::scene::{Scene, Shadow};
 
@@ -57,7 +57,7 @@ impl Plan {
 
 /// What a scene needs of the device.
 pub fn plan(scene: &Scene) -> Plan {
-    let groups = groups(scene);
+    let (groups, _) = groups(scene);
     let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
     let mut passes = Vec::new();
     if scene.needs.shadows {
@@ -100,7 +100,7 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     if scene.needs.textures || scene.needs.normal_maps {
         buffers.push(named("uvs", 8 * layout.corners));
     }
-    if used_materials(scene).len() > 1 {
+    if looks_up(scene) {
         buffers.push(named("triangle materials", 4 * layout.triangles));
     }
     buffers
@@ -131,12 +131,11 @@ fn shadow_textures(shadow: Shadow) -> [Allocation; 3] {
 
 fn defines(scene: &Scene) -> Vec<&'static str> {
     let needs = scene.needs;
-    let several = used_materials(scene).len() > 1;
     let branches = [
         ("TEXTURES", needs.textures),
         ("NORMAL_MAPS", needs.normal_maps),
         ("UVS", needs.textures || needs.normal_maps),
-        ("MATERIALS", several),
+        ("LOOK_UP", looks_up(scene)),
         ("SHADOWS", needs.shadows),
     ];
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
@@ -147,14 +146,19 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
     let map: u64 = shadow_textures(scene.look.shadow.unwrap_or_default()).iter().map(|part| part.bytes).sum();
     let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
     let uvs = if needs.textures || needs.normal_maps { 0 } else { per_corner(8) };
-    let several = used_materials(scene).len() > 1;
     let all = [
         (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
         (needs.textures, "textures", uvs, vec![], "no colour lookup"),
         (needs.mask, "mask", 0, vec![], "no discard; the shadow of opaque triangles needs no fragment shader"),
         (needs.blend, "blend", 0, vec!["blended"], "no blended variant"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
-        (several, "several materials", 4 * layout.triangles as u64, vec![], "no material lookup per triangle"),
+        (
+            looks_up(scene),
+            "many materials",
+            4 * layout.triangles as u64,
+            vec![],
+            "a draw call for each material, no lookup per triangle",
+        ),
         (scene.look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
     ];
     let unneeded = all.into_iter().filter(|row| !row.0);
@@ -163,6 +167,7 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::geometry::DRAWN_APART;
     use super::super::geometry::tests::squares;
     use super::*;
     use crate::domain::{AlphaMode, Material, Texture};
@@ -172,11 +177,13 @@ mod tests {
     }
 
     fn everything() -> crate::scene::Parts {
-        let mut parts = squares(vec![
+        let mut materials = vec![
             Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
             Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
-        ]);
+        ];
+        materials.resize(DRAWN_APART + 1, Material::default());
+        let mut parts = squares(materials);
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
         parts
     }
@@ -193,7 +200,7 @@ mod tests {
         assert_eq!(names(&plan.buffers), expected);
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
-        assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "several materials", "ground"]);
+        assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"]);
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
         assert_eq!(plan.left_out[4].bytes, 20 * 2048 * 2048, "map and moments");
     }

@@ -8,7 +8,7 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::SharedBuffers;
-use super::geometry::{Geometry, Group, Kind, used_materials};
+use super::geometry::{Geometry, Group, Kind};
 use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Program, Texture, TextureKind, VertexArray};
 use super::plan::{Allocation, Plan, plan};
 use super::shaders::{Options, Source};
@@ -24,11 +24,13 @@ struct PackedMaterial {
     ambient_alpha: [f32; 4],
     diffuse_cutoff: [f32; 4],
     specular_exponent: [f32; 4],
-    images: [i32; 4],
+    images: [f32; 4],
+    /// A uniform block may begin at any multiple of 256 bytes.
+    gap: [f32; 48],
 }
 
 pub(super) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
-const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
+const _: () = assert!(MATERIAL_BYTES == 256, "PackedMaterial differs from shaders/shared/material.glsl");
 
 /// A scene's buffers, textures and programs on the device; freed when dropped.
 #[derive(Debug)]
@@ -37,6 +39,7 @@ pub struct SceneBuffers {
     pub shared: SharedBuffers,
     pub(super) scene: Arc<Scene>,
     pub(super) buffers: BTreeMap<String, Buffer>,
+    pub(super) views: Views,
     pub(super) groups: Vec<Group>,
     pub(super) corners: VertexArray,
     pub(super) casters: VertexArray,
@@ -47,6 +50,14 @@ pub struct SceneBuffers {
     pub(super) shadow: Option<ShadowMap>,
     pub(super) programs: Programs,
     plan: Plan,
+}
+
+/// Buffers that shaders read like textures.
+#[derive(Debug)]
+pub(super) struct Views {
+    pub(super) positions: Texture,
+    pub(super) materials: Texture,
+    pub(super) triangle_materials: Option<Texture>,
 }
 
 #[derive(Debug)]
@@ -83,10 +94,9 @@ impl SceneBuffers {
         let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
         let materials = pack(scene, &images);
         let buffers = allocate(gl, &plan, &geometry, &materials)?;
-        let shared = shared(gl, scene, &buffers)?;
+        let (views, shared) = (views(gl, scene, &buffers)?, shared(&buffers)?);
         let (corners, casters) = vertex_arrays(gl, &buffers)?;
         let options = Options {
-            only_material: used_materials(scene).first().copied().unwrap_or(0),
             colour_arrays: images[0].len(),
             normal_arrays: images[1].len(),
             blur: scene.look.shadow.unwrap_or_default().blur,
@@ -98,6 +108,7 @@ impl SceneBuffers {
             shared,
             scene: Arc::clone(scene),
             buffers,
+            views,
             groups: geometry.groups,
             corners,
             casters,
@@ -139,7 +150,7 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
     let wide = |[r, g, b]: [f32; 3], fourth: f32| [r, g, b, fourth];
     let at = |arrays: &[Array], texture: Option<usize>| {
         let place = texture.and_then(|texture| place(arrays, texture));
-        place.map_or([-1, -1], |(array, layer)| [array as i32, layer as i32])
+        place.map_or([-1.0; 2], |(array, layer)| [array as f32, layer as f32])
     };
     let one = |material: &crate::domain::Material| {
         let cutoff = if let AlphaMode::Mask { cutoff } = material.alpha_mode { cutoff } else { 0.0 };
@@ -149,6 +160,7 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
             diffuse_cutoff: wide(material.diffuse, cutoff),
             specular_exponent: wide(material.specular, material.shininess),
             images: [a, b, c, d],
+            gap: [0.0; 48],
         }
     };
     scene.materials.iter().map(one).collect()
@@ -177,19 +189,26 @@ fn allocate(
     Ok(buffers)
 }
 
-fn shared(gl: &Gl, scene: &Scene, buffers: &BTreeMap<String, Buffer>) -> Result<SharedBuffers> {
-    let positions = named(buffers, "positions")?;
-    if positions.bytes > gl.limits.max_storage {
-        return Err(gl::too_large("scene.vertices", gl.limits.max_storage / 12, scene.layout.vertices as u64));
-    }
-    let triangles = named(buffers, "triangle materials").map_or(0, |list| list.bytes);
-    if triangles > gl.limits.max_storage {
-        return Err(gl::too_large("scene.triangles", gl.limits.max_storage / 4, scene.layout.triangles as u64));
-    }
+fn shared(buffers: &BTreeMap<String, Buffer>) -> Result<SharedBuffers> {
     Ok(SharedBuffers {
-        positions: positions.name(),
+        positions: named(buffers, "positions")?.name(),
         normals: named(buffers, "normals")?.name(),
         tangents: buffers.get("tangents").map(Buffer::name),
+    })
+}
+
+fn views(gl: &Rc<Gl>, scene: &Scene, buffers: &BTreeMap<String, Buffer>) -> Result<Views> {
+    let limit = gl.limits.max_texels;
+    for (field, count) in [("scene.vertices", scene.layout.vertices), ("scene.triangles", scene.layout.triangles)] {
+        if count as u64 > limit {
+            return Err(gl::too_large(field, limit, count as u64));
+        }
+    }
+    let of_triangles = buffers.get("triangle materials");
+    Ok(Views {
+        positions: gl.view(named(buffers, "positions")?, gl::RGB32F)?,
+        materials: gl.view(named(buffers, "materials")?, gl::RGBA32F)?,
+        triangle_materials: of_triangles.map(|list| gl.view(list, gl::R32UI)).transpose()?,
     })
 }
 

@@ -17,13 +17,21 @@ const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
 pub(super) const SHADOW_UNIT: u32 = 0;
 pub(super) const COLOUR_UNIT: u32 = 1;
 pub(super) const NORMAL_UNIT: u32 = COLOUR_UNIT + super::textures::MAX_ARRAYS as u32;
+/// Units of the buffer textures, as the shaders name them.
+pub(super) const POSITION_UNIT: u32 = 13;
+pub(super) const MATERIAL_UNIT: u32 = 14;
+pub(super) const TRIANGLE_MATERIAL_UNIT: u32 = 15;
+const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
+
+/// Lanes of a compute workgroup, along x.
+pub(super) const LANES: u32 = 64;
+/// Texels that one invocation of the blur makes, along its direction.
+pub(super) const RUN: u32 = 8;
 
 /// What the sources depend on besides the plan.
 #[derive(Debug, Clone)]
 pub(super) struct Options {
     pub(super) plan: Plan,
-    /// Index of the only material, when there is only one.
-    pub(super) only_material: usize,
     pub(super) colour_arrays: usize,
     pub(super) normal_arrays: usize,
     /// Standard deviation of the blur in texels.
@@ -43,7 +51,7 @@ impl Options {
         for define in self.plan.defines.iter().chain(more) {
             writeln!(text, "#define {define}").ok();
         }
-        writeln!(text, "#define ONLY_MATERIAL {}u", self.only_material).ok();
+        writeln!(text, "#define STRIDE {}", super::scene_buffers::MATERIAL_BYTES / 16).ok();
         text
     }
 
@@ -101,11 +109,8 @@ impl Options {
     /// One direction of the blur; the first also turns depth into moments.
     pub(super) fn blur(&self, first: bool) -> Source {
         let mut head = self.head(if first { &["FIRST"] } else { &[] });
-        let weights = weights(self.blur);
-        let list: Vec<String> = weights.iter().map(|weight| format!("{weight:?}")).collect();
-        writeln!(head, "const int REACH = {};", weights.len() - 1).ok();
-        writeln!(head, "const float WEIGHTS[{}] = float[]({});", weights.len(), list.join(", ")).ok();
-        let body = [&head, FRAME, include_str!("../../shaders/blur.comp")].concat();
+        writeln!(head, "#define LANES {LANES}\n#define RUN {RUN}\nvec2 moments(ivec2 at, int side);").ok();
+        let body = [&head, FRAME, &taps(&weights(self.blur)), include_str!("../../shaders/blur.comp")].concat();
         Source { label: format!("blur, {}", if first { "x" } else { "y" }), stages: vec![(gl::COMPUTE_SHADER, body)] }
     }
 
@@ -137,9 +142,27 @@ impl Options {
 
 /// Turns the samples of the picture into sRGB bytes.
 pub(super) fn encode(samples: u32) -> Source {
-    let head = format!("#version 430 core\n#define SAMPLES {samples}\n");
+    let head = format!("#version 430 core\n#define SAMPLES {samples}\n#define LANES {LANES}\n");
     let body = [&head, include_str!("../../shaders/encode.comp")].concat();
     Source { label: format!("encode, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
+}
+
+/// The weighted sums of one invocation of the blur, written out: each texel is read once for all the sums it is part of.
+fn taps(weights: &[f32]) -> String {
+    let reach = weights.len() as i32 - 1;
+    let mut text = String::from("void blur(ivec2 at, ivec2 along, int side, out vec2 sums[RUN]) {\n    vec2 texel;\n");
+    for index in 0..RUN {
+        writeln!(text, "    sums[{index}] = vec2(0.0);").ok();
+    }
+    for tap in -reach..RUN as i32 + reach {
+        writeln!(text, "    texel = moments(at + {tap} * along, side);").ok();
+        for index in 0..RUN as i32 {
+            if let Some(weight) = weights.get((tap - index).unsigned_abs() as usize) {
+                writeln!(text, "    sums[{index}] += {weight:?} * texel;").ok();
+            }
+        }
+    }
+    text + "}\n"
 }
 
 /// Half a normalised Gaussian (equation 3.11 in one dimension), centre first, cut off at three deviations.
@@ -160,13 +183,7 @@ mod tests {
 
     fn options(alpha_mode: AlphaMode) -> Options {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
-        Options {
-            plan: super::super::plan::plan(&scene),
-            only_material: 0,
-            colour_arrays: 0,
-            normal_arrays: 0,
-            blur: 2.0,
-        }
+        Options { plan: super::super::plan::plan(&scene), colour_arrays: 0, normal_arrays: 0, blur: 2.0 }
     }
 
     #[test]

@@ -72,7 +72,7 @@ pub struct Picture {
 
 /// Which step a single reply shows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) enum At {
+pub(crate) enum Wanted {
     #[default]
     Newest,
     Exactly(u64),
@@ -84,7 +84,7 @@ pub(crate) enum At {
 pub struct FrameRequest {
     pub scene: String,
     pub picture: Picture,
-    at: At,
+    at: Wanted,
     deadline_ms: u32,
 }
 
@@ -104,14 +104,14 @@ impl FrameRequest {
     /// Exactly this step of the current run; refused when it is gone.
     #[must_use]
     pub const fn exactly(mut self, step: u64) -> Self {
-        self.at = At::Exactly(step);
+        self.at = Wanted::Exactly(step);
         self
     }
 
     /// This step of the current run or a later one.
     #[must_use]
     pub const fn at_least(mut self, step: u64) -> Self {
-        self.at = At::AtLeast(step);
+        self.at = Wanted::AtLeast(step);
         self
     }
 
@@ -158,9 +158,9 @@ impl Client {
             scene: request.scene.clone(),
             picture: Some(request.picture.into()),
             step: match request.at {
-                At::Newest => None,
-                At::Exactly(step) => Some(Step::ExactStep(step)),
-                At::AtLeast(step) => Some(Step::MinimumStep(step)),
+                Wanted::Newest => None,
+                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
+                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
             },
             deadline_ms: request.deadline_ms,
         };

@@ -12,7 +12,7 @@ use v1::vertex_service_client::VertexServiceClient;
 use crate::assemble::{Part, Piece, Replies, floats};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed};
-use crate::frames::{At, Delivery, Stages, stages};
+use crate::frames::{Delivery, Stages, Wanted, stages};
 
 /// A request for one step's vertices.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -21,7 +21,7 @@ pub struct VertexRequest {
     /// Domains by index; empty means all.
     pub domains: Vec<u32>,
     pub positions_only: bool,
-    at: At,
+    at: Wanted,
     deadline_ms: u32,
 }
 
@@ -34,14 +34,14 @@ impl VertexRequest {
     /// Exactly this step of the current run; refused when it is gone.
     #[must_use]
     pub const fn exactly(mut self, step: u64) -> Self {
-        self.at = At::Exactly(step);
+        self.at = Wanted::Exactly(step);
         self
     }
 
     /// This step of the current run or a later one.
     #[must_use]
     pub const fn at_least(mut self, step: u64) -> Self {
-        self.at = At::AtLeast(step);
+        self.at = Wanted::AtLeast(step);
         self
     }
 
@@ -98,9 +98,9 @@ impl Client {
             scene: request.scene.clone(),
             selection: Some(selection(&request.domains, request.positions_only)),
             step: match request.at {
-                At::Newest => None,
-                At::Exactly(step) => Some(Step::ExactStep(step)),
-                At::AtLeast(step) => Some(Step::MinimumStep(step)),
+                Wanted::Newest => None,
+                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
+                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
             },
             deadline_ms: request.deadline_ms,
         };

@@ -183,3 +183,57 @@ fn the_library_needs_neither_cuda_nor_opengl() {
     assert!(tree("modalcast-client").iter().any(|name| name == "tonic"), "the walk finds what is there");
     assert_eq!(of("modalcast"), drawing.len(), "the walk finds what the server needs");
 }
+
+/// Runs `modalcast-fetch`; its exit code and what it printed.
+async fn fetch(url: &str, arguments: &[&str]) -> (i32, String, String) {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalcast-fetch"));
+    command.args(arguments).args(["--server", url]);
+    let output = tokio::task::spawn_blocking(move || command.output().expect("starts")).await.expect("ends");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code().unwrap_or(-1), text(&output.stdout), text(&output.stderr))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_program_saves_frames_and_vertices_and_its_exit_code_says_what_went_wrong() {
+    let world = Arc::new(world(4));
+    let url = serve(Arc::clone(&world)).await;
+    let client = Client::connect(&url).await.expect("connects");
+    let folder = tempfile::tempdir().expect("folder");
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    // Steps flow until the program has what it wants: it subscribes at a time of its own.
+    let flow = tokio::spawn(async move {
+        for number in 0.. {
+            drive.step(&Step::new(number, 0.0).q(0, &[number as f32, 0.0])).await.expect("sent");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    });
+    let (frames, vertices) = (path("frames"), path("vertices.npy"));
+    let size = ["--scene", "toy", "--size", "20x10", "--format", "raw"];
+    let all = [&["frames", "--json", "--count", "3", "--open", "toy", "--out", &frames], &size[..]].concat();
+    let (code, out, fault) = fetch(&url, &all).await;
+    assert_eq!(code, 0, "{fault}");
+    let (ready, json) = out.trim().split_once('\n').expect("two lines");
+    let summary: serde_json::Value = serde_json::from_str(json).expect("JSON");
+    assert_eq!((ready, &summary["frames"], summary["stages_ms"]["draw"].as_f64()), ("ready", &3.into(), Some(2.0)));
+    for (index, step) in summary["steps"].as_array().expect("steps").iter().enumerate() {
+        let bytes = std::fs::read(format!("{frames}/frame_{index:05}.rgba")).expect("a frame");
+        assert_eq!((bytes.len(), u64::from(bytes[0])), (800, step.as_u64().expect("a number") % 256));
+    }
+    let (code, _, fault) = fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;
+    assert_eq!(code, 0, "{fault}");
+    assert_eq!(std::fs::read(&vertices).expect("a file").len(), 128 + 2 * 48);
+    flow.abort();
+    let single = path("one.rgba");
+    let one = [&["frame", "--out", &single], &size[..]].concat();
+    assert_eq!(fetch(&url, &one).await.0, 0);
+    assert_eq!(fetch(&url, &["info"]).await.0, 0);
+    assert!(fetch(&url, &["list", "--json"]).await.1.contains("\"scene\":\"toy\""));
+    assert_eq!(fetch(&url, &["frame", "--scene", "none", "--out", &path("x.png")]).await.0, 1);
+    assert_eq!(fetch(&url, &["frame", "--out", &path("x.png")]).await.0, 2);
+    assert_eq!(fetch("http://127.0.0.1:1", &["info"]).await.0, 3);
+    let nowhere = [&["frame", "--out", "/nowhere/x.png"], &size[..]].concat();
+    assert_eq!(fetch(&url, &nowhere).await.0, 4);
+    let late = ["frames", "--scene", "toy", "--out", &frames, "--timeout", "0.2"];
+    assert_eq!(fetch(&url, &late).await.0, 5);
+}

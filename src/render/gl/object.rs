@@ -91,9 +91,11 @@ impl Buffer {
         unsafe { self.gl.on().bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.name)) }
     }
 
-    pub(in crate::render) fn bind_uniform(&self, binding: u32) {
-        // SAFETY: as for storage.
-        unsafe { self.gl.on().bind_buffer_base(glow::UNIFORM_BUFFER, binding, Some(self.name)) }
+    /// Binds `bytes` bytes from `offset` on, a multiple of 256.
+    pub(in crate::render) fn bind_uniform(&self, binding: u32, offset: usize, bytes: usize) {
+        let (offset, bytes) = (offset as i32, bytes as i32);
+        // SAFETY: as for storage; OpenGL refuses ranges outside the buffer.
+        unsafe { self.gl.on().bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.name), offset, bytes) }
     }
 }
 
@@ -159,7 +161,7 @@ impl Program {
         unsafe {
             gl.use_program(Some(self.name));
             if let Some(first) = first_triangle {
-                gl.uniform_1_u32(Some(&glow::NativeUniformLocation(0)), first);
+                gl.uniform_1_i32(Some(&glow::NativeUniformLocation(0)), first as i32);
             }
         }
     }
