@@ -12,6 +12,9 @@ pub enum Error {
     /// The caller wants what somebody else holds; it may be free later.
     #[error("{what} is taken: {holder}")]
     Taken { what: &'static str, holder: String },
+    /// The caller asked for what has passed.
+    #[error("{what}: expected {expected}, given {given}")]
+    Gone { what: &'static str, expected: String, given: String },
     /// The caller came too fast; a later try may pass.
     #[error("{queue} is full ({limit})")]
     Busy { queue: &'static str, limit: usize },

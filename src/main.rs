@@ -1,1 +1,7 @@
-fn main() {}
+//! The server's binary: see `modalcast --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    ExitCode::from(modalcast::cli::run())
+}

@@ -15,6 +15,24 @@ pub enum Stage {
 }
 
 impl Stage {
+    /// All stages, in the order in which a step passes through them.
+    pub const ALL: [Self; 9] = [
+        Self::Parse,
+        Self::Queue,
+        Self::Deform,
+        Self::Upload,
+        Self::Shadow,
+        Self::Draw,
+        Self::Read,
+        Self::Encode,
+        Self::Copy,
+    ];
+
+    /// The stage of that name.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|stage| stage.name() == name)
+    }
+
     /// The stage's name.
     pub const fn name(self) -> &'static str {
         match self {
@@ -33,3 +51,30 @@ impl Stage {
 
 /// Milliseconds per stage, in the order in which they were run.
 pub type StageTimes = Vec<(Stage, f64)>;
+
+/// Milliseconds since `begin`.
+pub fn ms_since(begin: std::time::Instant) -> f64 {
+    begin.elapsed().as_secs_f64() * 1e3
+}
+
+/// Sends the log to stderr; `RUST_LOG` chooses what is in it, else everything from `info` on.
+///
+/// A second call changes nothing.
+pub fn log_to_stderr() {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).try_init().ok();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_stage_is_found_by_its_name_and_nothing_else_is() {
+        for stage in Stage::ALL {
+            assert_eq!(Stage::named(stage.name()), Some(stage));
+        }
+        assert_eq!(Stage::named("lunch"), None);
+    }
+}

@@ -1,1 +1,97 @@
-//! The command line: one file per command.
+//! The command line: one file per command, and the exit codes.
+
+mod demo;
+mod doctor;
+mod inspect;
+mod options;
+mod render;
+mod serve;
+
+use clap::{Parser, Subcommand};
+
+use crate::error::Error;
+
+/// A GPU server for modal deformable objects: x = T (x0 + U q), rendered headless, streamed over gRPC.
+#[derive(Debug, Parser)]
+#[command(version, arg_required_else_help = true, after_help = EXIT_CODES)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Serve(serve::Args),
+    Demo(demo::Args),
+    Render(render::Args),
+    Inspect(inspect::Args),
+    Doctor(doctor::Args),
+}
+
+const EXIT_CODES: &str = "\
+Exit codes:
+  0  done
+  1  the check that the command makes did not pass (doctor: no frame can be drawn; demo: a promise was not kept)
+  2  the command line is wrong
+  3  the input is wrong: the message names field, expected and given
+  4  not found
+  5  something must be installed or freed: the message says what
+  6  a fault of the server or the device";
+
+/// What a command ends with: whether its own check passed.
+type Outcome = crate::error::Result<bool>;
+
+/// Runs the command line and returns the process's exit code.
+pub fn run() -> u8 {
+    let cli = Cli::parse();
+    crate::telemetry::log_to_stderr();
+    let outcome = match cli.command {
+        Command::Serve(args) => serve::run(&args),
+        Command::Demo(args) => demo::run(&args),
+        Command::Render(args) => render::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
+    };
+    match outcome {
+        Ok(true) => 0,
+        Ok(false) => 1,
+        Err(error) => {
+            eprintln!("modalcast: {error}");
+            exit_code(&error)
+        }
+    }
+}
+
+fn exit_code(error: &Error) -> u8 {
+    match error {
+        Error::Invalid { .. } => 3,
+        Error::NotFound { .. } | Error::Gone { .. } => 4,
+        Error::Taken { .. } | Error::Busy { .. } | Error::Unavailable { .. } => 5,
+        Error::Deadline { .. } | Error::Fault { .. } => 6,
+    }
+}
+
+/// Prints a line of a command's result. The only way to standard output, so that logs never mix with results.
+#[expect(clippy::print_stdout, reason = "results of commands go to standard output")]
+fn say(line: impl std::fmt::Display) {
+    println!("{line}");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_well_formed_and_every_command_has_examples() {
+        use clap::CommandFactory as _;
+        let mut command = Cli::command();
+        command.clone().debug_assert();
+        for sub in command.get_subcommands_mut() {
+            let name = sub.get_name().to_owned();
+            if name != "help" {
+                let help = sub.render_long_help().to_string();
+                assert!(help.contains("Examples:"), "{name} shows no examples");
+            }
+        }
+    }
+}

@@ -1,1 +1,350 @@
-//! The device thread and everything that talks to it.
+//! The engine: one device thread, one task per open scene, and what survives a restart. Sources in, steps in, pictures
+//! and vertices out.
+//!
+//! A scene's task orders everything that happens to it (`conductor`); a writer reaches it through a bounded lane
+//! (`lane`), a subscriber through a bounded feed (`viewer`), and both are told when they are too fast or too slow.
+
+mod conductor;
+mod encode;
+mod host;
+mod keep;
+mod lane;
+mod ledger;
+mod registry;
+mod show;
+mod source;
+mod staged;
+#[cfg(test)]
+mod testing;
+mod upload;
+mod viewer;
+mod workbench;
+mod worker;
+
+pub use conductor::Which;
+pub use encode::{Encoded, Format, Selection, checked_domains, encode_frame, pack_vertices};
+pub use host::{Drive, Host};
+pub use lane::{Policy, Report};
+pub use ledger::{Origin, checked_name};
+pub use source::SceneSource;
+pub use staged::Staged;
+pub use upload::{Announcement, Upload};
+pub use viewer::{Body, Delivery, Feed, Shown, StepName, View};
+pub use workbench::{Info, Workbench};
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+
+use tokio::sync::Semaphore;
+
+use self::conductor::Means;
+use self::encode::aside;
+use self::host::Opening;
+use self::keep::Keeper;
+use self::ledger::Ledger;
+use self::registry::Registry;
+use self::worker::Worker;
+use crate::config::Config;
+use crate::error::{Error, Result, invalid};
+use crate::scene::Scene;
+
+/// How many scenes are read from disk at a time.
+const LOADS: usize = 2;
+
+/// How many uploads may be under way.
+const UPLOADS: usize = 8;
+
+/// The engine. Clones share everything.
+#[derive(Clone)]
+pub struct Engine {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    config: Arc<Config>,
+    source: Arc<dyn SceneSource>,
+    info: Info,
+    means: Means,
+    registry: Registry,
+    loads: Semaphore,
+    uploads: Arc<Semaphore>,
+    next_id: AtomicU64,
+    stopping: AtomicBool,
+    device: Mutex<Option<JoinHandle<()>>>,
+    // Last: the state folder is free for another server only when nobody here writes to it any more.
+    ledger: Ledger,
+}
+
+impl Engine {
+    /// Opens the devices and the state folder, then every scene that was open when the last server stopped.
+    ///
+    /// # Errors
+    /// `Unavailable` when a device asked for by name is not there, or another server uses the state folder.
+    pub async fn start(config: Config, source: Arc<dyn SceneSource>) -> Result<Self> {
+        let config = Arc::new(config);
+        let state = config.state.clone();
+        let (ledger, keeper) = aside("state folder", move || {
+            let ledger = Ledger::open(&state)?;
+            let keeper = Keeper::start(ledger.steps())?;
+            Ok((ledger, Arc::new(keeper)))
+        })
+        .await?;
+        let (worker, info, device) = Worker::start(&config).await?;
+        let shared = Shared {
+            means: Means { worker, keeper, config: Arc::clone(&config) },
+            registry: Registry::new(config.open_scenes),
+            config,
+            source,
+            info,
+            loads: Semaphore::new(LOADS),
+            uploads: Arc::new(Semaphore::new(UPLOADS)),
+            next_id: AtomicU64::new(1),
+            stopping: AtomicBool::new(false),
+            device: Mutex::new(Some(device)),
+            ledger,
+        };
+        let engine = Self { shared: Arc::new(shared) };
+        engine.restore().await;
+        Ok(engine)
+    }
+
+    /// What deforms and what draws.
+    pub fn info(&self) -> &Info {
+        &self.shared.info
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &Config {
+        &self.shared.config
+    }
+
+    /// The largest image side that the settings and the renderer allow.
+    pub fn frame_side(&self) -> u32 {
+        let renderer = self.shared.info.renderer.as_ref().map_or(u32::MAX, |info| info.max_side);
+        self.shared.config.frame_side.min(renderer)
+    }
+
+    /// Opens a source of the repository under a name (its own when empty). What is open already is answered as it is.
+    ///
+    /// # Errors
+    /// `Taken` when the name belongs to another source, `Busy` when too many scenes are open, and whatever is wrong
+    /// with the source.
+    pub async fn open(&self, source: &str, name: &str) -> Result<Arc<Host>> {
+        let name = if name.is_empty() { ledger::own_name(source)? } else { checked_name(name)?.to_owned() };
+        self.admit(name, Origin::Repository { source: source.into() }, None).await
+    }
+
+    /// An open scene.
+    ///
+    /// # Errors
+    /// `NotFound` when none of that name is open, `Unavailable` when the server stops.
+    pub fn find(&self, name: &str) -> Result<Arc<Host>> {
+        if self.is_stopping() {
+            return Err(stopping());
+        }
+        self.shared.registry.find(name)
+    }
+
+    /// All open scenes, by name.
+    pub fn list(&self) -> Vec<Arc<Host>> {
+        self.shared.registry.list()
+    }
+
+    /// What [`Self::open`] accepts.
+    ///
+    /// # Errors
+    /// `Fault` when the repository could not be read.
+    pub async fn sources(&self) -> Result<Vec<String>> {
+        let source = Arc::clone(&self.shared.source);
+        aside("repository", move || Ok(source.list())).await
+    }
+
+    /// Begins an upload.
+    ///
+    /// # Errors
+    /// `Invalid` for a name, entry or size that cannot be; `Taken` when the name is in use; `Busy` when too many are under
+    /// way.
+    pub async fn begin_upload(&self, announced: Announcement) -> Result<Upload> {
+        checked_name(&announced.scene)?;
+        let config = &self.shared.config;
+        if announced.files == 0 || announced.files > config.upload_files {
+            return Err(invalid("header.files", format!("1 to {}", config.upload_files), announced.files));
+        }
+        if announced.total_bytes > config.upload_bytes {
+            let expected = format!("at most {}", config.upload_bytes);
+            return Err(invalid("header.total_bytes", expected, announced.total_bytes));
+        }
+        self.shared.registry.check_free(&announced.scene)?;
+        let full = |_| Error::Busy { queue: "uploads under way", limit: UPLOADS };
+        let place = Arc::clone(&self.shared.uploads).try_acquire_owned().map_err(full)?;
+        let uploads = config.state.join("uploads");
+        aside("upload", move || Upload::begin(&uploads, announced, place)).await
+    }
+
+    /// Opens a finished upload. A failure leaves nothing of it behind.
+    ///
+    /// # Errors
+    /// `Invalid` naming what is missing or wrong in the files; `Taken` when the name has been used meanwhile.
+    pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<Host>> {
+        upload.finish()?;
+        let (name, entry) = (upload.announced.scene.clone(), upload.announced.entry.clone());
+        self.admit(name, Origin::Upload { entry }, Some(upload)).await
+    }
+
+    /// Closes a scene and ends its streams; an upload's files and the kept step are removed.
+    ///
+    /// # Errors
+    /// `NotFound` when none of that name is open or kept.
+    pub async fn close(&self, name: &str) -> Result<()> {
+        let engine = self.clone();
+        let name = checked_name(name)?.to_owned();
+        // A task of its own: the work must be whole even when the caller goes away.
+        let work = async move { engine.close_whole(&name).await };
+        tokio::spawn(work).await.map_err(crate::error::during("close"))?
+    }
+
+    /// Ends every stream with `Unavailable`, writes what is to be kept and lets the devices go.
+    pub async fn shutdown(&self) {
+        if self.shared.stopping.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        for host in self.list() {
+            host.stop(stopping()).await;
+        }
+        let engine = self.clone();
+        let finish = move || {
+            engine.shared.means.keeper.finish();
+            let device = engine.shared.device.lock().unwrap_or_else(PoisonError::into_inner).take();
+            engine.shared.means.worker.quit();
+            device.map(JoinHandle::join);
+            engine.shared.ledger.release();
+            Ok(())
+        };
+        if let Err(error) = aside("shutdown", finish).await {
+            tracing::error!(%error, "the engine did not stop cleanly");
+        }
+    }
+
+    /// Whether [`Self::shutdown`] was called.
+    pub fn is_stopping(&self) -> bool {
+        self.shared.stopping.load(Ordering::Acquire)
+    }
+
+    async fn restore(&self) {
+        let mut openings = tokio::task::JoinSet::new();
+        for (name, origin) in self.shared.ledger.entries() {
+            let engine = self.clone();
+            openings.spawn(async move {
+                if let Err(error) = engine.admit(name.clone(), origin, None).await {
+                    // It stays in the list: the next start may find its files again.
+                    tracing::warn!(scene = name, %error, "a kept scene could not be opened");
+                }
+            });
+        }
+        openings.join_all().await;
+    }
+
+    /// Opens a scene once, however many ask for it, in a task of its own that no caller's end breaks off.
+    async fn admit(&self, name: String, origin: Origin, upload: Option<Upload>) -> Result<Arc<Host>> {
+        if self.is_stopping() {
+            return Err(stopping());
+        }
+        let engine = self.clone();
+        let work = async move {
+            let seat = engine.shared.registry.seat(&name, &origin, upload.is_some())?;
+            let opened = seat.open(|| engine.host(name.clone(), origin, upload)).await;
+            if opened.is_err() {
+                engine.shared.registry.remove(&name, &seat);
+            }
+            opened
+        };
+        tokio::spawn(work).await.map_err(crate::error::during("open"))?
+    }
+
+    async fn host(&self, name: String, origin: Origin, upload: Option<Upload>) -> Result<Arc<Host>> {
+        let is_new_upload = upload.is_some();
+        let hosted = self.load_and_stage(&name, &origin, upload).await;
+        if hosted.is_err() && is_new_upload {
+            let place = self.shared.ledger.upload(&name);
+            aside("upload", move || Ok(std::fs::remove_dir_all(place).ok())).await?;
+        }
+        hosted.map(Arc::new)
+    }
+
+    async fn load_and_stage(&self, name: &str, origin: &Origin, upload: Option<Upload>) -> Result<Host> {
+        let scene = self.load(name, origin, upload).await?;
+        let (engine, key, kept) = (self.clone(), name.to_owned(), Arc::clone(&scene));
+        let state = aside("kept step", move || Ok(engine.shared.means.keeper.load(&key, &kept))).await?;
+        let state = state.unwrap_or_else(|error| {
+            tracing::warn!(scene = name, %error, "the scene begins at rest");
+            None
+        });
+        let opening = Opening {
+            name: name.into(),
+            origin: origin.clone(),
+            scene,
+            id: self.shared.next_id.fetch_add(1, Ordering::Relaxed),
+            state,
+            no_frames: self.shared.info.renderer.as_ref().err().cloned(),
+        };
+        let host = Host::open(opening, self.shared.means.clone()).await?;
+        let (engine, key, origin) = (self.clone(), name.to_owned(), origin.clone());
+        if let Err(error) = aside("scenes.json", move || engine.shared.ledger.add(&key, &origin)).await {
+            host.stop(error.clone()).await;
+            return Err(error);
+        }
+        Ok(host)
+    }
+
+    /// Reads a scene's files. A panic of a loader is a fault of this call alone.
+    async fn load(&self, name: &str, origin: &Origin, upload: Option<Upload>) -> Result<Arc<Scene>> {
+        let stopped = |_| stopping();
+        let _permit = self.shared.loads.acquire().await.map_err(stopped)?;
+        let source = Arc::clone(&self.shared.source);
+        let place = self.shared.ledger.upload(name);
+        let (engine, key, origin) = (self.clone(), name.to_owned(), origin.clone());
+        let read = move || match origin {
+            Origin::Repository { source: path } => source.open(&path),
+            Origin::Upload { entry } => {
+                if let Some(upload) = upload {
+                    // A step kept for an older scene of this name means nothing to the new one.
+                    engine.shared.means.keeper.forget(&key);
+                    upload.settle(&place)?;
+                }
+                source.open_within(&place, &entry)
+            }
+        };
+        aside("load", read).await
+    }
+
+    async fn close_whole(&self, name: &str) -> Result<()> {
+        let seat = self.shared.registry.seat_of(name);
+        match seat.as_ref().map(|seat| seat.host()) {
+            Some(Some(host)) if host.is_closing() => return Err(not_open(name)),
+            Some(Some(host)) => host.stop(not_open(name)).await,
+            Some(None) => return Err(Error::Busy { queue: "the name of a scene that is being opened", limit: 1 }),
+            None => {}
+        }
+        let (engine, key) = (self.clone(), name.to_owned());
+        let was_kept = aside("close", move || {
+            engine.shared.means.keeper.forget(&key);
+            std::fs::remove_dir_all(engine.shared.ledger.upload(&key)).ok(); // Only uploads have a folder.
+            engine.shared.ledger.remove(&key)
+        })
+        .await?;
+        // The name is free only now, so that nobody's new files are removed with the old ones.
+        if let Some(seat) = &seat {
+            self.shared.registry.remove(name, seat);
+        }
+        if seat.is_some() || was_kept { Ok(()) } else { Err(not_open(name)) }
+    }
+}
+
+fn not_open(name: &str) -> Error {
+    Error::NotFound { what: "scene", given: format!("'{name}'") }
+}
+
+fn stopping() -> Error {
+    Error::Unavailable { what: "server", reason: "it stops".into(), remedy: "Try again when it is back".into() }
+}

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use cudarc::driver::sys::CUdevice_attribute as Attribute;
 use cudarc::driver::{CudaContext, CudaFunction, CudaStream, DriverError, result, sys};
 use cudarc::nvrtc::Ptx;
 
@@ -74,6 +73,14 @@ impl Device {
         self.context.mem_get_info().map_err(during("device"))
     }
 
+    /// Whether kernels can be compiled for this device, so that a server can choose another backend before any scene.
+    ///
+    /// # Errors
+    /// `Unavailable` when NVRTC is missing or does not fit the driver, with what brings it.
+    pub fn check_compiler(&self) -> Result<()> {
+        fits_driver(nvrtc()?.version, driver_version()?)
+    }
+
     pub(super) const fn context(&self) -> &Arc<CudaContext> {
         &self.context
     }
@@ -87,8 +94,8 @@ impl Device {
     /// # Errors
     /// `Unavailable` when NVRTC is missing or does not fit the driver; `Fault` when compiling or loading fails.
     pub(super) fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
+        self.check_compiler()?;
         let nvrtc = nvrtc()?;
-        fits_driver(nvrtc.version, driver_version()?)?;
         let job = Job::new(name, source, defines, self.capability);
         let version = format!("{}.{}", nvrtc.version.0, nvrtc.version.1);
         let mut ingredients = job.ingredients();
@@ -144,18 +151,6 @@ fn fits_driver(nvrtc: (i32, i32), driver: i32) -> Result<()> {
     let reason = format!("NVRTC is {}.{}, the driver only knows CUDA {}.x", nvrtc.0, nvrtc.1, driver / 1000);
     let remedy = format!("{UPDATE}, or set MODALCAST_NVRTC to the libnvrtc.so of CUDA {}", driver / 1000);
     Err(Error::Unavailable { what: "NVRTC for this driver", reason, remedy })
-}
-
-/// Name, capability and memory of a device, without opening a context.
-pub(super) fn describe(ordinal: i32) -> Result<(String, (i32, i32), usize), DriverError> {
-    let device = result::device::get(ordinal)?;
-    let name = result::device::get_name(device)?;
-    // SAFETY: `device` came from the driver just now.
-    unsafe {
-        let major = result::device::get_attribute(device, Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR)?;
-        let minor = result::device::get_attribute(device, Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR)?;
-        Ok((name, (major, minor), result::device::total_mem(device)?))
-    }
 }
 
 #[cfg(test)]

@@ -298,7 +298,7 @@ mod tests {
     #[ignore = "needs NVRTC: deploy/check installs it"]
     fn nvrtc_compiles_every_kernel_with_every_combination_of_defines_without_spilling() {
         let nvrtc = nvrtc().expect("NVRTC");
-        for capability in [(8, 0), (9, 0)] {
+        for capability in [(7, 5), (8, 0), (9, 0), (12, 0)] {
             for kernel in plan::KERNELS {
                 let mut sizes = Vec::new();
                 for defines in all_subsets(kernel.features) {

@@ -1,10 +1,11 @@
 //! What CUDA finds on this machine, for `doctor`: driver, devices, NVRTC, cache. Never fails, never panics.
 
-use cudarc::driver::CudaContext;
+use cudarc::driver::sys::CUdevice_attribute as Attribute;
+use cudarc::driver::{CudaContext, DriverError, result};
 use serde::Serialize;
 
 use super::cache::Cache;
-use super::device::{describe, driver_version};
+use super::device::driver_version;
 use super::nvrtc::nvrtc;
 
 /// One CUDA device.
@@ -67,27 +68,38 @@ pub fn probe() -> Probe {
 
 impl Probe {
     fn add_devices(&mut self) {
-        let count = CudaContext::device_count();
-        let devices = count.and_then(|count| (0..count).map(|ordinal| Ok((ordinal, describe(ordinal)?))).collect());
-        match devices {
-            Ok(list) => {
-                let list: Vec<(i32, (String, (i32, i32), usize))> = list;
-                let info = |(ordinal, (name, (major, minor), memory))| DeviceInfo {
-                    ordinal,
-                    name,
-                    capability: format!("{major}.{minor}"),
-                    memory_bytes: memory as u64,
-                };
-                self.devices = list.into_iter().map(info).collect();
-            }
+        let list = CudaContext::device_count().and_then(|count| (0..count).map(describe).collect());
+        match list {
+            Ok(list) => self.devices = list,
             Err(error) => self.cuda_problem = Some(error.to_string()),
         }
     }
 }
 
+/// Name, capability and memory of a device, without a context on it.
+fn describe(ordinal: i32) -> Result<DeviceInfo, DriverError> {
+    let device = result::device::get(ordinal)?;
+    // SAFETY: `device` came from the driver just now.
+    let (major, minor, memory) = unsafe {
+        let major = result::device::get_attribute(device, Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR)?;
+        let minor = result::device::get_attribute(device, Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR)?;
+        (major, minor, result::device::total_mem(device)?)
+    };
+    let (name, capability) = (result::device::get_name(device)?, format!("{major}.{minor}"));
+    Ok(DeviceInfo { ordinal, name, capability, memory_bytes: memory as u64 })
+}
+
 /// The version that the kernel module gives itself; none without an NVIDIA driver.
 fn kernel_driver() -> Option<String> {
-    std::fs::read_to_string("/sys/module/nvidia/version").ok().map(|version| version.trim().to_owned())
+    let read = |path: &str| std::fs::read_to_string(path).ok();
+    let text = read("/sys/module/nvidia/version").or_else(|| read("/proc/driver/nvidia/version"))?;
+    version_in(&text)
+}
+
+/// The first word that is made of digits and dots.
+fn version_in(text: &str) -> Option<String> {
+    let is_version = |word: &&str| word.contains('.') && word.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
+    text.split_whitespace().find(is_version).map(String::from)
 }
 
 #[cfg(test)]
@@ -102,5 +114,13 @@ mod tests {
         if let Some(problem) = probe.nvrtc_problem {
             assert!(problem.contains("nvidia-cuda-nvrtc"), "{problem}");
         }
+    }
+
+    #[test]
+    fn the_driver_version_is_read_from_either_file() {
+        let module = "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.159.04  Release Build";
+        assert_eq!(version_in(module).as_deref(), Some("580.159.04"));
+        assert_eq!(version_in("580.159.04\n").as_deref(), Some("580.159.04"));
+        assert_eq!(version_in("no driver here."), None);
     }
 }

@@ -6,6 +6,16 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::error::{Result, invalid};
 
+/// The most bytes of a file that holds a mesh or a matrix.
+pub(super) const MODEL_BYTES: u64 = 2 << 30;
+/// The most bytes of an image.
+pub(super) const IMAGE_BYTES: u64 = 256 << 20;
+/// The most bytes of a description in text.
+pub(super) const TEXT_BYTES: u64 = 64 << 20;
+
+/// The most entries of a folder that are looked at.
+const MOST_ENTRIES: usize = 10_000;
+
 /// A folder whose files a loader may read. With `confine` every path must stay inside that root, symbolic links
 /// resolved; without, paths are taken as they are.
 #[derive(Debug, Clone)]
@@ -38,6 +48,13 @@ impl Files {
     /// As [`Self::resolve`].
     pub(super) fn within(&self, relative: &str) -> Result<Self> {
         Ok(Self { base: self.resolve(relative)?, confine: self.confine.clone() })
+    }
+
+    /// The last part of the path of `relative`, links resolved; `scene` when it has none.
+    pub(super) fn own_name(&self, relative: &str) -> String {
+        let path = self.resolve(relative).ok();
+        let name = path.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
+        name.unwrap_or("scene").to_owned()
     }
 
     /// The bytes of a regular file of at most `limit` bytes.
@@ -84,10 +101,10 @@ impl Files {
         })
     }
 
-    /// Names and kinds of what lies directly in the folder, sorted, at most `limit`.
-    pub(super) fn entries(&self, limit: usize) -> Vec<(String, Kind)> {
+    /// Names and kinds of what lies directly in the folder, sorted; of a huge folder the first ten thousand.
+    pub(super) fn entries(&self) -> Vec<(String, Kind)> {
         let Ok(listing) = std::fs::read_dir(&self.base) else { return Vec::new() };
-        let names = listing.take(limit).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        let names = listing.take(MOST_ENTRIES).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
         let mut entries: Vec<_> =
             names.filter_map(|name| self.kind(&name).ok().flatten().map(|kind| (name, kind))).collect();
         entries.sort_by(|a, b| a.0.cmp(&b.0));
@@ -130,6 +147,20 @@ impl Files {
         }
         Ok(path)
     }
+}
+
+/// The folder of a relative path; `.` when it has none.
+pub(super) fn parent_of(path: &str) -> &str {
+    match path.rsplit_once('/') {
+        Some(("", _)) => "/",
+        Some((folder, _)) => folder,
+        None => ".",
+    }
+}
+
+/// The last part of a relative path.
+pub(super) fn name_of(path: &str) -> &str {
+    path.rsplit_once('/').map_or(path, |(_, name)| name)
 }
 
 fn field(relative: &str) -> String {

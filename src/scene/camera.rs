@@ -16,12 +16,9 @@ pub struct Bounds {
 impl Bounds {
     pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
 
-    /// Grows to hold a point. A NaN makes the bounds not finite, so that nobody mistakes them for good.
+    /// Grows to hold a point. A NaN stays, so that nobody mistakes the bounds for finite ones.
     pub fn include(&mut self, point: [f64; 3]) {
-        for axis in 0..3 {
-            self.min[axis] = if point[axis].is_nan() { f64::NAN } else { self.min[axis].min(point[axis]) };
-            self.max[axis] = if point[axis].is_nan() { f64::NAN } else { self.max[axis].max(point[axis]) };
-        }
+        *self = self.union(Self { min: point, max: point });
     }
 
     /// The smallest bounds that hold both; NaN in either stays NaN.
@@ -201,5 +198,22 @@ impl Camera {
         let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
         let far = (farthest.max(0.0) + 4.0 * bounds.diagonal()).max(1e-6);
         (nearest.mul_add(0.5, 0.0).clamp(far * 1e-4, far * 0.5), far)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bounds_never_forget_a_nan() {
+        let mut bounds = Bounds::EMPTY;
+        bounds.include([0.0; 3]);
+        assert!(bounds.is_finite());
+        bounds.include([0.0, f64::NAN, 0.0]);
+        bounds.include([1.0; 3]);
+        assert!(!bounds.is_finite());
+        let other = Bounds { min: [0.0; 3], max: [1.0; 3] };
+        assert!(!other.union(bounds).is_finite() && !bounds.union(other).is_finite());
     }
 }

@@ -1,1 +1,136 @@
-//! gRPC: wire to values and back. The only module that names proto.
+//! gRPC: wire to values and back. The only module that names proto; one file per group of calls.
+
+mod convert;
+mod describe;
+mod frames;
+mod info;
+mod listen;
+mod routes;
+mod scenes;
+mod status;
+mod steps;
+mod stream;
+mod vertices;
+
+use modalcast_proto::v1;
+use tokio::net::TcpListener;
+use tokio::sync::oneshot;
+use tokio::time::Instant;
+use tonic::transport::Server;
+use tonic_health::server::HealthReporter;
+
+use self::routes::Routes;
+use crate::config::Config;
+use crate::engine::Engine;
+use crate::error::{Error, Result, during};
+
+/// The largest message that the server sends: a chunk and its envelope.
+const LARGEST_REPLY: usize = 3 << 20;
+
+/// Binds the configured address.
+///
+/// # Errors
+/// `Unavailable` when the address is taken or not ours.
+pub async fn bind(config: &Config) -> Result<TcpListener> {
+    TcpListener::bind(config.listen).await.map_err(|error| Error::Unavailable {
+        what: "listening address",
+        reason: format!("{}: {error}", config.listen),
+        remedy: "Name another one with --listen".into(),
+    })
+}
+
+/// Serves until `shutdown` is there, then says so to health checks, ends every stream, and stops within the configured
+/// drain time whatever clients do.
+///
+/// # Errors
+/// `Fault` when the transport fails.
+pub async fn serve(
+    engine: Engine,
+    listener: TcpListener,
+    shutdown: impl Future<Output = ()> + Send + 'static,
+) -> Result<()> {
+    let config = engine.config().clone();
+    let (health, health_server) = tonic_health::server::health_reporter();
+    set_health(&health, true).await;
+    let routes = routes(&engine, &config)?.with(health_server);
+    let connections = listen::connections(listener, config.connections, config.first_byte);
+    let (stop, stopped) = oneshot::channel();
+    let draining = engine.clone();
+    let drain = async move {
+        shutdown.await;
+        tracing::info!("the server stops");
+        let end = Instant::now() + draining.config().drain;
+        set_health(&health, false).await;
+        if tokio::time::timeout_at(end, draining.shutdown()).await.is_err() {
+            tracing::warn!("the device did not stop in time");
+        }
+        stop.send(()).ok(); // The transport has failed, and the receiver went with it.
+        end
+    };
+    let told = async {
+        stopped.await.ok(); // A drain that is dropped means stop, too.
+    };
+    let mut transport = std::pin::pin!(transport(&config).serve_with_incoming_shutdown(routes, connections, told));
+    let end = tokio::select! {
+        ended = &mut transport => return ended.map_err(during("transport")),
+        end = drain => end,
+    };
+    match tokio::time::timeout_at(end, transport).await {
+        Ok(ended) => ended.map_err(during("transport")),
+        Err(_) => {
+            tracing::warn!("some clients did not close their connections and are left behind");
+            Ok(())
+        }
+    }
+}
+
+async fn set_health(health: &HealthReporter, serving: bool) {
+    use tonic_health::ServingStatus::{NotServing, Serving};
+    let status = if serving { Serving } else { NotServing };
+    let services = ["SceneService", "StepService", "FrameService", "VertexService", "ServerService"];
+    for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
+        health.set_service_status(name, status).await;
+    }
+}
+
+/// Every limit of the transport, because the library's defaults leave some of them off.
+fn transport(config: &Config) -> Server {
+    Server::builder()
+        .max_concurrent_streams(128)
+        .concurrency_limit_per_connection(64)
+        .http2_max_local_error_reset_streams(Some(1024))
+        .http2_max_pending_accept_reset_streams(Some(100))
+        .http2_max_header_list_size(16 << 10)
+        .initial_stream_window_size(64 << 10)
+        .initial_connection_window_size(16 << 20)
+        .max_frame_size(64 << 10)
+        .http2_keepalive_interval(Some(config.keepalive))
+        .http2_keepalive_timeout(Some(config.keepalive_timeout))
+}
+
+fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
+    use v1::frame_service_server::FrameServiceServer;
+    use v1::scene_service_server::SceneServiceServer;
+    use v1::server_service_server::ServerServiceServer;
+    use v1::step_service_server::StepServiceServer;
+    use v1::vertex_service_server::VertexServiceServer;
+    // Every server has the same limits, but their builder has no common trait.
+    macro_rules! limited {
+        ($server:expr) => {
+            $server.max_decoding_message_size(config.message_bytes).max_encoding_message_size(LARGEST_REPLY)
+        };
+    }
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(v1::DESCRIPTORS)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    Ok(Routes::default()
+        .with(reflection().build_v1().map_err(during("reflection"))?)
+        .with(reflection().build_v1alpha().map_err(during("reflection"))?)
+        .with(limited!(ServerServiceServer::new(info::Info(engine.clone()))))
+        .with(limited!(SceneServiceServer::new(scenes::Scenes(engine.clone()))))
+        .with(limited!(StepServiceServer::new(steps::Steps(engine.clone()))))
+        .with(limited!(FrameServiceServer::new(frames::Frames(engine.clone()))))
+        .with(limited!(VertexServiceServer::new(vertices::Vertices(engine.clone())))))
+}

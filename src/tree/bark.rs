@@ -11,12 +11,12 @@ use crate::error::Result;
 const SIDE: usize = 512;
 
 /// Height of the ridges above the furrows, in widths of the tile.
-const RELIEF: f32 = 0.028;
+const RELIEF: f32 = 0.020;
 
 /// sRGB, 0 to 255: bottoms of the furrows, ridges, weathered crests, a breath of lichen.
-const FURROW: [f32; 3] = [62.0, 47.0, 38.0];
-const RIDGE: [f32; 3] = [128.0, 106.0, 86.0];
-const CREST: [f32; 3] = [168.0, 150.0, 130.0];
+const FURROW: [f32; 3] = [70.0, 57.0, 47.0];
+const RIDGE: [f32; 3] = [126.0, 109.0, 92.0];
+const CREST: [f32; 3] = [166.0, 152.0, 135.0];
 const LICHEN: [f32; 3] = [126.0, 126.0, 92.0];
 
 /// Colour image and normal map.
@@ -58,8 +58,8 @@ impl Layers {
         let mut noise = |across, along| Noise { cells: [across, along], seed: random.bits() };
         Self {
             warps: [noise(4, 3), noise(9, 7)],
-            furrows: [noise(9, 2), noise(15, 4)],
-            cracks: noise(6, 13),
+            furrows: [noise(15, 3), noise(27, 5)],
+            cracks: noise(11, 15),
             grain: [noise(40, 18), noise(96, 60)],
             tint: noise(3, 2),
         }
@@ -69,11 +69,11 @@ impl Layers {
     fn height(&self, u: f32, v: f32) -> f32 {
         let bent = u + 0.035 * self.warps[0].at(u, v) + 0.012 * self.warps[1].at(u, v);
         // Zero lines of the noise are long wavering furrows; the finer ones are shallow.
-        let deep = smooth_step(0.0, 0.42, self.furrows[0].at(bent, v).abs());
-        let fine = smooth_step(0.0, 0.5, self.furrows[1].at(bent, v).abs());
+        let deep = smooth_step(0.0, 0.34, self.furrows[0].at(bent, v).abs());
+        let fine = smooth_step(0.0, 0.36, self.furrows[1].at(bent, v).abs());
         let crack = smooth_step(0.0, 0.16, self.cracks.at(bent, v + 0.02 * self.warps[1].at(v, u)).abs());
         let grain = 0.6 * self.grain[0].at(bent, v) + 0.4 * self.grain[1].at(u, v);
-        let plate = deep.powf(0.8) * (0.62 + 0.38 * fine) * (0.80 + 0.20 * crack);
+        let plate = deep.powf(0.7) * (0.58 + 0.42 * fine) * (0.80 + 0.20 * crack);
         plate * (0.93 + 0.07 * grain) + 0.045 * grain
     }
 

@@ -138,7 +138,7 @@ impl Wander {
             (
                 growth.wander * std::f64::consts::TAU * waves * 0.5 / (1.0 + number as f64),
                 waves,
-                random.between(0.0, 6.2832),
+                random.between(0.0, std::f64::consts::TAU),
             )
         };
         let waves = std::array::from_fn(|_| std::array::from_fn(&mut wave));

@@ -7,30 +7,30 @@ use super::element::Wood;
 use super::leaf_image::{LEAF_SPAN, STEM_U};
 use super::mold::{Kind, Mold};
 use super::random::Random;
-use super::sheet::{Blade, Sheet, Wrap, station};
+use super::sheet::{Blade, Sheet, Wrap, between};
 
 /// Green shoots are softer than wood.
 const SHOOT: Wood = Wood { youngs_modulus: 3.0e9, shear_modulus: 2.0e8, density: 850.0 };
 
 /// Fresh mass of a leaf, kg per m^2 of one side.
-const LEAF_MASS: f64 = 0.16;
+const LEAF_MASS: f64 = 0.17;
 
 /// The part of a card that the outline covers.
 const COVER: f64 = 0.55;
 
 /// Width of a leaf's card over its length.
-const SLIMNESS: f64 = 0.66;
+const SLIMNESS: f64 = 0.62;
 
 /// Which clusters there are: bending or not, length of the shoot (m), leaves, length of a leaf (m).
 const CLUSTERS: [(bool, f64, usize, f64); 8] = [
-    (true, 0.46, 11, 0.180),
-    (true, 0.42, 10, 0.190),
-    (true, 0.38, 10, 0.175),
-    (true, 0.34, 9, 0.185),
-    (true, 0.30, 8, 0.170),
-    (false, 0.22, 8, 0.185),
-    (false, 0.18, 7, 0.175),
-    (false, 0.20, 8, 0.165),
+    (true, 0.50, 13, 0.235),
+    (true, 0.46, 12, 0.240),
+    (true, 0.42, 12, 0.225),
+    (true, 0.38, 11, 0.235),
+    (true, 0.34, 10, 0.225),
+    (false, 0.28, 11, 0.230),
+    (false, 0.24, 10, 0.220),
+    (false, 0.26, 10, 0.225),
 ];
 
 /// All kinds of clusters.
@@ -41,7 +41,7 @@ pub(super) fn clusters(random: &mut Random) -> Vec<Mold> {
 fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Random) -> Mold {
     let growth = Growth {
         length,
-        elements: 5,
+        elements: 4,
         rings: 1,
         grading: 1.0,
         start: Vector3::y(),
@@ -58,7 +58,7 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Ran
         level: 0,
         line,
         radii,
-        sides: 4,
+        sides: 3,
         sheet: Sheet::default(),
         wood: SHOOT,
         damping: 0.12,
@@ -72,21 +72,19 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Ran
         let along =
             if leaf + 1 == leaves { 1.0 } else { 0.16 + 0.84 * (leaf as f64 + random.unit() * 0.6) / leaves as f64 };
         let azimuth = if bends { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
-        add_leaf(&mut mold, along, azimuth + random.spread(0.45), size * random.between(0.78, 1.12), random);
+        add_leaf(&mut mold, along, azimuth + random.spread(0.7), size * random.between(0.78, 1.12), random);
     }
     mold
 }
 
 /// Adds a leaf at a fraction of the shoot. Azimuth 0 is to the right of the shoot, the light comes from +Z.
 fn add_leaf(mold: &mut Mold, along: f64, azimuth: f64, length: f64, random: &mut Random) {
-    let line = &mold.line;
-    let ring = line.ring_at(along);
-    let tangent = line.tangents[ring];
+    let (station, base, tangent) = between(&mold.line, along);
     let right = tangent.cross(&Vector3::z()).normalize();
     let over = right.cross(&tangent);
     // Leaves stand off to the sides rather than up or down, the last one goes on where the shoot ends.
-    let across = right * azimuth.cos() + over * (0.45 * azimuth.sin() + 0.12);
-    let angle = if along >= 1.0 { random.between(0.05, 0.25) } else { random.between(0.75, 1.15) };
+    let across = right * azimuth.cos() + over * (0.60 * azimuth.sin() + 0.15);
+    let angle = if along >= 1.0 { random.between(0.05, 0.25) } else { random.between(0.70, 1.20) };
     let droop = random.between(0.05, 0.50);
     let forward = (tangent * angle.cos() + across * angle.sin() - Vector3::z() * droop).normalize();
     // The blade turns its face to the light, but never wholly.
@@ -94,7 +92,7 @@ fn add_leaf(mold: &mut Mold, along: f64, azimuth: f64, length: f64, random: &mut
     let normal = (face - forward * forward.dot(&face)).normalize();
     let twist = Rotation3::from_axis_angle(&Unit::new_unchecked(forward), random.spread(0.35));
     let blade = Blade {
-        base: line.points[ring],
+        base,
         forward,
         normal: twist * normal,
         length,
@@ -103,10 +101,9 @@ fn add_leaf(mold: &mut Mold, along: f64, azimuth: f64, length: f64, random: &mut
         fold: random.between(0.12, 0.42),
         span: LEAF_SPAN,
     };
-    let place = station(line, ring);
     let area = COVER * blade.length * blade.width;
-    mold.sheet.add_blade(&blade, place);
-    mold.loads.push((place, LEAF_MASS * area));
+    mold.sheet.add_blade(&blade, station);
+    mold.loads.push((station, LEAF_MASS * area));
     mold.leaf_area += area;
 }
 
@@ -135,7 +132,7 @@ mod tests {
     fn upper_faces_look_to_the_light_on_the_whole() {
         for mold in clusters(&mut Random::new(9)) {
             let mesh = mold.sheet.mesh().expect("finite");
-            let blades = &mesh.corners().normals[6 * 5 + 4..];
+            let blades = &mesh.corners().normals[5 * 4 + 3..];
             let mean = blades.iter().map(|normal| normal[2]).sum::<f32>() / blades.len() as f32;
             assert!(mean > 0.5, "{mean}");
         }

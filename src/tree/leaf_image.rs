@@ -23,7 +23,7 @@ const PETIOLE: f32 = 0.13;
 /// Widest half of the blade, in widths of its part of the image.
 const HALF_WIDTH: f32 = 0.46;
 
-const TEETH: f32 = 17.0;
+const TEETH: f32 = 19.0;
 
 /// sRGB colours, 0 to 255.
 #[derive(Debug, Clone, Copy)]
@@ -58,8 +58,8 @@ fn leaf(palette: &Palette, x: f32, y: f32) -> ([f32; 3], f32) {
     let along = (y - PETIOLE) / (0.985 - PETIOLE);
     let off = x.abs();
     let pixel = 1.2 / SIDE as f32;
-    let stalk = if along < 0.9 { 0.016 * (1.0 - 0.7 * along.max(0.0)) } else { 0.0 };
-    let on_stalk = ((stalk - off) / pixel + 0.5).clamp(0.0, 1.0);
+    let stalk = 0.016 * (1.0 - 0.85 * along.max(0.0));
+    let on_stalk = if along < 0.9 { ((stalk - off) / pixel + 0.5).clamp(0.0, 1.0) } else { 0.0 };
     if along <= 0.0 {
         return (palette.stem, on_stalk);
     }
@@ -77,10 +77,10 @@ fn leaf(palette: &Palette, x: f32, y: f32) -> ([f32; 3], f32) {
 /// Half of the blade's width: egg-shaped with a drawn-out tip, and teeth that point forwards.
 fn half_width(along: f32) -> f32 {
     let t = along.clamp(0.0, 1.0);
-    let egg = (std::f32::consts::PI * t.powf(0.70)).sin().max(0.0).powf(0.80);
-    let tip = 1.0 - 0.35 * smooth_step(0.62, 0.95, t);
+    let egg = (std::f32::consts::PI * t.powf(0.74)).sin().max(0.0).powf(0.72);
+    let tip = 1.0 - 0.42 * smooth_step(0.70, 0.96, t);
     let tooth = (t * TEETH).fract();
-    HALF_WIDTH * egg * tip * (0.90 + 0.10 * tooth * tooth.sqrt())
+    HALF_WIDTH * egg * tip * (0.93 + 0.07 * tooth * tooth.sqrt())
 }
 
 /// How much of a side vein is here, and how far between two of them.

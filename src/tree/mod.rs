@@ -172,3 +172,129 @@ fn joint(parent: &Mold, bud: &Bud, world_from_parent: &Isometry3<f64>) -> Isomet
     let rotation = turn.inverse() * UnitQuaternion::from_rotation_matrix(&child);
     Isometry3::from_parts(Translation3::from(parent.line.points[bud.ring]), rotation)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Scene;
+
+    fn grown(seed: u64) -> Parts {
+        grow(&Recipe { seed }).expect("every beam is solved")
+    }
+
+    fn note<'a>(domain: &'a Domain, name: &str) -> &'a str {
+        domain.metadata.notes.get(name).map_or("", String::as_str)
+    }
+
+    #[test]
+    fn a_seed_grows_the_same_tree_twice_and_another_seed_another_tree() {
+        let (one, two, other) = (grown(7), grown(7), grown(8));
+        let rest = |parts: &Parts| parts.shapes.iter().flat_map(|shape| shape.mesh.rest().to_vec()).collect::<Vec<_>>();
+        let modes =
+            |parts: &Parts| parts.shapes.iter().flat_map(|shape| shape.modes.columns().to_vec()).collect::<Vec<_>>();
+        let frames = |parts: &Parts| parts.domains.iter().map(|domain| domain.placement).collect::<Vec<_>>();
+        assert_eq!(rest(&one), rest(&two));
+        assert_eq!(modes(&one), modes(&two));
+        assert_eq!(frames(&one), frames(&two));
+        assert_eq!(one.textures, two.textures);
+        assert!(rest(&one) != rest(&other) && modes(&one) != modes(&other) && frames(&one) != frames(&other));
+        assert_ne!(one.textures, other.textures);
+    }
+
+    #[test]
+    fn every_seed_gives_a_scene_of_the_promised_size_that_needs_what_it_should() {
+        for seed in [0, 7, u64::MAX] {
+            let scene = Scene::new(grown(seed)).expect("a valid scene");
+            let count = |kind: &str| scene.domains.iter().filter(|domain| note(domain, "kind") == kind).count();
+            let corners = |domain: &Domain| scene.shapes[domain.shape].mesh.triangles().len();
+            let triangles: usize = scene.domains.iter().map(corners).sum();
+            assert!(scene.domains.len() >= 300, "{} domains", scene.domains.len());
+            assert!((50_000..=130_000).contains(&triangles), "{triangles} triangles");
+            assert_eq!(count("trunk"), 1);
+            assert!(count("branch") >= 60 && count("leaf") >= 200);
+            assert_eq!(count("trunk") + count("branch") + count("leaf"), scene.domains.len());
+            let needs = scene.needs;
+            assert!(needs.modes && needs.textures && needs.normal_maps && needs.mask && needs.shadows);
+            assert!(!needs.blend && !needs.shear);
+            let height = scene.rest_bounds.max[1];
+            assert!((7.0..9.5).contains(&height), "{height} m high");
+            assert!(scene.rest_bounds.min[1].abs() < 1e-6, "the tree stands on {}", scene.rest_bounds.min[1]);
+        }
+    }
+
+    #[test]
+    fn some_leaves_are_rigid_and_some_bend_with_two_modes() {
+        let parts = grown(7);
+        let rank = |domain: &Domain| parts.shapes[domain.shape].modes.rank();
+        let leaves = parts.domains.iter().filter(|domain| note(domain, "kind") == "leaf");
+        let ranks: std::collections::BTreeSet<usize> = leaves.map(rank).collect();
+        assert_eq!(ranks.into_iter().collect::<Vec<_>>(), [0, 2]);
+        for domain in &parts.domains {
+            assert_eq!(domain.metadata.eigenvalues.len(), rank(domain));
+            assert_eq!(note(domain, "mass_normalised") == "true", rank(domain) > 0);
+        }
+    }
+
+    #[test]
+    fn every_joint_is_the_centre_of_the_ring_that_carries_it() {
+        let parts = grown(7);
+        for domain in &parts.domains[1..] {
+            let attachment = domain.attachment.as_ref().expect("all but the trunk hang on something");
+            let parent = &parts.domains[attachment.parent];
+            let rest = parts.shapes[parent.shape].mesh.rest();
+            let mean = |rows: &[u32]| {
+                let sum: Vector3<f64> = rows.iter().map(|row| Vector3::from(rest[*row as usize]).cast::<f64>()).sum();
+                let centre = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
+                (centre.coords - domain.placement.translation()).norm()
+            };
+            assert!(mean(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, mean(&attachment.rows));
+            // The control: the ring below is elsewhere.
+            let count = attachment.rows.len() as u32;
+            let below: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(count)).collect();
+            assert!(mean(&below) > 1e-3, "{}", domain.name);
+        }
+        assert!(parts.domains[0].attachment.is_none());
+    }
+
+    #[test]
+    fn frames_compose_to_placements_and_are_rotations() {
+        let parts = grown(7);
+        for domain in &parts.domains {
+            let linear = domain.placement.linear();
+            assert!((linear.transpose() * linear - nalgebra::Matrix3::identity()).abs().max() < 1e-5);
+            assert!((linear.determinant() - 1.0).abs() < 1e-5);
+            let Some(attachment) = &domain.attachment else { continue };
+            let composed = parts.domains[attachment.parent].placement.then(attachment.frame);
+            for (got, want) in composed.0.iter().zip(domain.placement.0) {
+                assert!((got - want).abs() <= 1e-5, "{}: {got} is not {want}", domain.name);
+            }
+        }
+    }
+
+    #[test]
+    fn frequencies_are_those_of_a_living_tree() {
+        for domain in &grown(7).domains {
+            let hertz: Vec<f64> =
+                domain.metadata.eigenvalues.iter().map(|value| value.sqrt() / std::f64::consts::TAU).collect();
+            assert!(hertz.windows(2).all(|pair| pair[0] <= pair[1]));
+            let Some(lowest) = hertz.first() else { continue };
+            let range = match note(domain, "level") {
+                "0" if note(domain, "kind") == "trunk" => 0.4..1.5,
+                "1" => 0.6..6.0,
+                _ => 1.5..15.0,
+            };
+            assert!(range.contains(lowest), "{}: {lowest} Hz", domain.name);
+        }
+    }
+
+    #[test]
+    fn the_first_mode_sways_the_top_more_than_the_stem_below_it() {
+        let parts = grown(7);
+        let shape = &parts.shapes[parts.domains[0].shape];
+        let sway = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.at(vertex, axis, 0)).norm();
+        let count = shape.mesh.rest().len();
+        let largest = (0..count).map(sway).fold(0.0, f32::max);
+        assert!(sway(count - 1) > 0.95 * largest);
+        assert!(sway(count / 4) < 0.3 * largest);
+    }
+}

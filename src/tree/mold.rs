@@ -137,3 +137,80 @@ impl Mold {
         notes
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::beam::tests::faults;
+    use super::super::lift::motion;
+    use super::super::plan::plan;
+    use super::super::random::Random;
+    use super::*;
+
+    #[test]
+    fn the_modes_of_every_part_solve_its_eigenproblem() {
+        for mold in plan(&mut Random::new(7)).iter().filter(|mold| mold.rank > 0) {
+            let beam = mold.beam();
+            let modes = beam.modes(mold.rank).expect("converges");
+            let (residual, skew) = faults(&beam, &modes);
+            assert!(residual <= 1e-6, "level {}: residual {residual}", mold.level);
+            assert!(skew <= 1e-6, "level {}: departure from mass-orthonormality {skew}", mold.level);
+        }
+    }
+
+    #[test]
+    fn the_base_rests_and_the_mean_of_a_ring_moves_as_its_section_does() {
+        for mold in plan(&mut Random::new(7)).iter().filter(|mold| mold.rank > 0) {
+            let (shape, _) = mold.cast().expect("solved");
+            let beam = mold.beam();
+            let solved = beam.modes(mold.rank).expect("converges");
+            let mean = |ring: usize, mode: usize| {
+                let rows = mold.ring_rows(ring);
+                let count = rows.len() as f64;
+                let row = |row: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.at(row as usize, axis, mode)));
+                rows.into_iter().map(row).sum::<Vector3<f64>>() / count
+            };
+            for mode in 0..mold.rank {
+                let base = mold.ring_rows(0);
+                let at_rest = |row: &u32| (0..3).all(|axis| shape.modes.at(*row as usize, axis, mode).to_bits() == 0);
+                assert!(base.iter().all(at_rest), "the base moves");
+                let dofs: Vec<f64> = solved.shapes.column(mode).iter().copied().collect();
+                let largest = solved.shapes.column(mode).amax();
+                for ring in 1..mold.line.points.len() {
+                    let section = motion(&beam.nodes, &dofs, station(&mold.line, ring));
+                    let want = section.of(&mold.line.points[ring]);
+                    assert!((mean(ring, mode) - want).norm() <= 1e-6 * largest, "ring {ring}");
+                }
+                // The control: neighbouring rings move differently.
+                let last = mold.line.points.len() - 1;
+                assert!((mean(last, mode) - mean(last - 1, mode)).norm() > 1e-4 * largest);
+            }
+        }
+    }
+
+    #[test]
+    fn all_bark_looks_outwards() {
+        for mold in plan(&mut Random::new(7)).iter().filter(|mold| mold.kind != Kind::Leaf) {
+            let mesh = mold.sheet.mesh().expect("finite");
+            let last = mold.line.points.len() - 1;
+            for (vertex, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
+                let place = Vector3::from(mesh.rest()[*vertex as usize]).cast::<f64>();
+                let centre = mold.line.points[(*vertex as usize / mold.sides).min(last)];
+                let outwards = (place - centre).normalize().dot(&Vector3::from(*normal).cast());
+                assert!(outwards > 0.2, "level {}: {outwards}", mold.level);
+                assert!((Vector3::from(*normal).norm() - 1.0).abs() < 1e-5);
+            }
+            assert!(mesh.corners().uvs.as_flattened().iter().all(|number| number.is_finite()));
+        }
+    }
+
+    #[test]
+    fn masses_add_up_from_the_leaves_to_the_trunk() {
+        let molds = plan(&mut Random::new(7));
+        for mold in molds.iter().filter(|mold| mold.kind != Kind::Leaf) {
+            let children: f64 = mold.buds.iter().map(|bud| molds[bud.mold].mass()).sum();
+            assert!((mold.mass() - mold.beam().own_mass() - children).abs() <= 1e-9 * mold.mass());
+        }
+        let whole = molds.last().expect("a trunk").mass();
+        assert!((80.0..400.0).contains(&whole), "the tree weighs {whole} kg");
+    }
+}

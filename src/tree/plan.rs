@@ -12,14 +12,14 @@ use super::random::Random;
 use super::sheet::{Sheet, Wrap};
 
 /// Green wood.
-const WOOD: Wood = Wood { youngs_modulus: 8.0e9, shear_modulus: 5.0e8, density: 800.0 };
+const WOOD: Wood = Wood { youngs_modulus: 4.5e9, shear_modulus: 3.5e8, density: 900.0 };
 
 /// The turn from one branch to the next around the trunk.
 const GOLDEN_ANGLE: f64 = 2.399_963;
 
 /// Boughs on the trunk, and where the crown begins and ends on it.
-const BOUGHS: usize = 17;
-const CROWN: [f64; 2] = [0.25, 0.93];
+const BOUGHS: usize = 24;
+const CROWN: [f64; 2] = [0.24, 0.96];
 
 /// Lengths of the twigs, three molds of each.
 const TWIGS: [f64; 12] = [0.45, 0.50, 0.56, 0.66, 0.72, 0.78, 0.90, 0.97, 1.04, 1.18, 1.26, 1.34];
@@ -55,7 +55,7 @@ pub(super) fn plan(random: &mut Random) -> Vec<Mold> {
 
 fn trunk(random: &mut Random) -> Mold {
     let growth = Growth {
-        length: 7.0,
+        length: 6.8,
         elements: 16,
         rings: 3,
         grading: 1.25,
@@ -68,15 +68,15 @@ fn trunk(random: &mut Random) -> Mold {
     let line = Centreline::grow(&growth, random);
     let radius = |ring: usize| {
         let along = line.fraction(ring);
-        0.010 + 0.130 * (1.0 - along).powf(1.05) + 0.085 * (-line.arcs[ring] / 0.24).exp()
+        0.010 + 0.086 * (1.0 - along).powf(0.92) + 0.075 * (-line.arcs[ring] / 0.22).exp()
     };
     let radii = (0..line.points.len()).map(radius).collect();
-    let mut mold = wooden(Kind::Trunk, line, radii, [20, 10]);
+    let mut mold = wooden(Kind::Trunk, line, radii, [24, 10]);
     mold.damping = 0.05;
     let phases = [random.between(0.0, TAU), random.between(0.0, TAU), random.between(0.0, TAU)];
     mold.add_skin(Wrap::Bark { repeats: 2 }, |arc, angle| {
         // Roots run out into the ground; further up the stem is only a little uneven.
-        let root = 0.26 * (5.0 * angle + phases[0]).cos() + 0.13 * (3.0 * angle + phases[1]).cos();
+        let root = 0.20 * (5.0 * angle + phases[0]).cos() + 0.10 * (3.0 * angle + phases[1]).cos();
         let uneven = 0.025 * (2.0 * angle + phases[2] + 1.7 * arc).cos() + 0.018 * (4.0 * angle - 2.3 * arc).cos();
         1.0 + root * (-arc / 0.30).exp() + uneven
     });
@@ -86,11 +86,11 @@ fn trunk(random: &mut Random) -> Mold {
 /// Ring, direction and length of a bough: long and level below, short and steep above.
 fn place_bough(trunk: &Mold, number: usize, random: &mut Random) -> (usize, Vector3<f64>, f64) {
     let height = (number as f64 + random.spread(0.25)) / (BOUGHS - 1) as f64;
-    let ring = trunk.line.ring_at(CROWN[0] + (CROWN[1] - CROWN[0]) * height.clamp(0.0, 1.0).powf(0.9));
-    let across = around(&trunk.line, ring, GOLDEN_ANGLE * number as f64 + random.spread(0.3));
-    let angle = 1.22 - 0.62 * height + random.spread(0.12);
-    let crown = (1.0 - height.clamp(0.0, 1.0)).powf(0.62) * (0.84 + 0.16 * (height / 0.2).clamp(0.0, 1.0));
-    (ring, trunk.line.leaving(ring, angle, &across), (0.75 + 2.15 * crown) * random.between(0.9, 1.08))
+    let ring = trunk.line.ring_at(CROWN[0] + (CROWN[1] - CROWN[0]) * height.clamp(0.0, 1.0).powf(1.06));
+    let across = around(&trunk.line, ring, GOLDEN_ANGLE * (number as f64 + 0.8) + random.spread(0.3));
+    let angle = 1.22 - 0.74 * height + random.spread(0.12);
+    let crown = (1.0 - ((height - 0.28) / 0.75).powi(2)).max(0.0).sqrt();
+    (ring, trunk.line.leaving(ring, angle, &across), (0.40 + 2.32 * crown) * random.between(0.92, 1.08))
 }
 
 /// A bough that starts along `direction` (in the world), with its twigs and leaves. `size`: length, largest radius.
@@ -114,13 +114,13 @@ fn bough(
         wander: 0.20,
     };
     let line = Centreline::grow(&growth, random);
-    let base = (0.010 + 0.0135 * length).min(thickest);
-    let radii = tapering(&line, base, 0.0055);
-    let mut mold = wooden(Kind::Branch, line, radii, [12, 6]);
+    let base = (0.008 + 0.0105 * length).min(thickest);
+    let radii = tapering(&line, base, 0.0045);
+    let mut mold = wooden(Kind::Branch, line, radii, [10, 6]);
     mold.level = 1;
     mold.damping = 0.07;
     mold.add_skin(Wrap::Bark { repeats: 1 }, |_, _| 1.0);
-    let count = (length / 0.36).round().max(3.0) as usize;
+    let count = (length / 0.42).round().max(3.0) as usize;
     for number in 0..count {
         let along = 0.26 + 0.68 * (number as f64 + random.spread(0.25)) / (count as f64 - 1.0);
         let ring = mold.line.ring_at(along.min(0.95));
@@ -130,7 +130,7 @@ fn bough(
         let child = nearest(wanted, twigs, random);
         mold.hang(Bud { ring, direction, mold: child }, molds[child].mass());
     }
-    hang_leaves(&mut mold, &[0.62, 0.74, 0.86, 1.0], &molds[leaves.clone()], &growth.up, random);
+    hang_leaves(&mut mold, &[0.50, 0.66, 0.82, 1.0], &molds[leaves.clone()], &growth.up, random);
     mold
 }
 
@@ -144,16 +144,16 @@ fn twig(length: f64, leaves: &[Mold], random: &mut Random) -> Mold {
         start: Vector3::y(),
         up: Vector3::new(0.0, 0.35, 0.94).normalize(),
         sag: 0.16,
-        rise: 0.40,
+        rise: 0.30,
         wander: 0.24,
     };
     let line = Centreline::grow(&growth, random);
-    let radii = tapering(&line, 0.0045 + 0.0075 * length, 0.0034);
-    let mut mold = wooden(Kind::Branch, line, radii, [7, 4]);
+    let radii = tapering(&line, 0.0040 + 0.0055 * length, 0.0028);
+    let mut mold = wooden(Kind::Branch, line, radii, [5, 4]);
     mold.level = 2;
     mold.damping = 0.09;
     mold.add_skin(Wrap::Bark { repeats: 1 }, |_, _| 1.0);
-    let count = (1.0 + length / 0.21).round() as usize;
+    let count = (0.6 + length / 0.33).round() as usize;
     let along: Vec<f64> = (0..=count).map(|number| 0.24 + 0.76 * number as f64 / count as f64).collect();
     hang_leaves(&mut mold, &along, leaves, &growth.up, random);
     mold
@@ -193,7 +193,7 @@ fn wooden(kind: Kind, line: Centreline, radii: Vec<f64>, [sides, rank]: [usize; 
 fn tapering(line: &Centreline, base: f64, tip: f64) -> Vec<f64> {
     let radius = |ring: usize| {
         let along = line.fraction(ring);
-        (tip + (base - tip) * (1.0 - along).powf(0.9)) * (1.0 + 0.22 * (-line.arcs[ring] / (2.5 * base)).exp())
+        (tip + (base - tip) * (1.0 - along).powf(0.9)) * (1.0 + 0.45 * (-line.arcs[ring] / (2.6 * base)).exp())
     };
     (0..line.points.len()).map(radius).collect()
 }
@@ -206,7 +206,7 @@ fn around(line: &Centreline, ring: usize, azimuth: f64) -> Vector3<f64> {
 /// A vector across the line, left and right by turns, somewhat above the level more often than below.
 fn beside(line: &Centreline, ring: usize, up: &Vector3<f64>, number: usize, random: &mut Random) -> Vector3<f64> {
     let basis = frame(&line.tangents[ring], up);
-    let tilt = random.between(-0.55, 0.95);
+    let tilt = random.between(-0.6, 0.8);
     let side = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
     basis * Vector3::new(side * tilt.cos(), 0.0, tilt.sin())
 }

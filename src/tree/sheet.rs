@@ -55,7 +55,7 @@ pub(super) struct Blade {
 }
 
 /// Quads along a blade; across it has two.
-const BLADE_ROWS: usize = 4;
+const BLADE_ROWS: usize = 2;
 
 /// The bark's image shrinks with the branch down to this radius, metres.
 const LEAST_RADIUS: f64 = 0.012;
@@ -168,6 +168,17 @@ pub(super) fn station(line: &Centreline, ring: usize) -> Station {
     Station { element: ring / line.rings, fraction: (ring % line.rings) as f64 / line.rings as f64 }
 }
 
+/// The beam station, the place and the unit tangent at a fraction of the length.
+pub(super) fn between(line: &Centreline, along: f64) -> (Station, Vector3<f64>, Vector3<f64>) {
+    let arc = along * line.length();
+    let after = line.arcs.partition_point(|at| *at < arc).clamp(1, line.arcs.len() - 1);
+    let part = (arc - line.arcs[after - 1]) / (line.arcs[after] - line.arcs[after - 1]);
+    let mut station = station(line, after - 1);
+    station.fraction += part / line.rings as f64;
+    let place = line.points[after - 1].lerp(&line.points[after], part);
+    (station, place, line.tangents[after - 1].lerp(&line.tangents[after], part).normalize())
+}
+
 impl Wrap {
     /// Texture coordinates for a fraction around, an arc length in circumferences, and a fraction of the length.
     fn at(self, around: f64, along: f64, fraction: f64) -> [f32; 2] {
@@ -228,6 +239,18 @@ mod tests {
         let texels_along = f64::from(seam(0).0[1] - seam(8).0[1]);
         let texels_around = 3.0 / (std::f64::consts::TAU * 0.05);
         assert!((texels_along / texels_around - 1.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn places_between_rings_lie_on_the_line_at_their_station() {
+        let line = winding();
+        let (at_ring, place, _) = between(&line, line.fraction(5));
+        assert!((place - line.points[5]).norm() < 1e-12);
+        assert!((at_ring.element, at_ring.fraction) == (2, 0.5));
+        let (end, place, tangent) = between(&line, 1.0);
+        assert!((end.element, end.fraction) == (5, 1.0));
+        assert!((place - line.points[12]).norm() < 1e-12);
+        assert!((tangent - line.tangents[12]).norm() < 1e-12);
     }
 
     #[test]

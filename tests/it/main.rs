@@ -1,6 +1,15 @@
 //! Claims that need no GPU. One binary.
 
 mod deformers;
+mod frames;
+mod hostile;
 mod layering;
 mod pixels;
+mod real;
+mod restart;
+mod service;
+mod service_faults;
+mod service_files;
+mod service_harness;
+mod steps;
 mod tolerance;

@@ -26,9 +26,8 @@ fn bent(scene: &Scene, fraction: f64) -> State {
     }
     let largest = |state: &State| {
         let moved = reference::deform(scene, state);
-        let distance = |(a, b): (&[f64; 3], &[f64; 3])| {
-            a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
-        };
+        let distance =
+            |(a, b): (&[f64; 3], &[f64; 3])| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         moved.iter().zip(&rest).map(distance).fold(0.0, f64::max)
     };
     let scale = fraction * scene.rest_bounds.diagonal() / largest(&state);

@@ -1,1 +1,169 @@
-fn main() {}
+//! `modalcast-sim`: the physics process. It learns a scene from its server, moves it, and says what came of it.
+
+mod cli;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser as _;
+use modalcast_client::{Client, Error as ClientError};
+use modalcast_dynamics::bridge::{Bridge, Options as BridgeOptions};
+use modalcast_dynamics::cubic::ReducedForce;
+use modalcast_dynamics::model::Model;
+use modalcast_dynamics::run::{Options, Scenario, Summary, run};
+use modalcast_dynamics::sweep::{Options as SweepOptions, Sweep};
+use modalcast_dynamics::tree::{Options as TreeOptions, Sway};
+use modalcast_dynamics::vega::Settings;
+use modalcast_dynamics::{Error, Result, invalid};
+use tokio::sync::watch;
+
+use cli::{Arguments, Command, Common, Files};
+
+/// Vertices that are watched of each part of a tree, and of any other scene.
+const WATCHED_TREE: usize = 24;
+const WATCHED: usize = 1 << 16;
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(fault) => {
+            eprintln!("modalcast-sim: no runtime: {fault}");
+            return ExitCode::from(4);
+        }
+    };
+    match runtime.block_on(drive(&arguments)) {
+        Ok(summary) => {
+            print(&summary, arguments.command.common().json);
+            ExitCode::from(if summary.refused > 0 { 6 } else { 0 })
+        }
+        Err(error) => {
+            eprintln!("modalcast-sim: {error}");
+            ExitCode::from(code(&error))
+        }
+    }
+}
+
+/// The documented exit code of an error.
+const fn code(error: &Error) -> u8 {
+    match error {
+        Error::Client(ClientError::Refused { .. } | ClientError::Rejected(_)) => 1,
+        Error::Client(ClientError::Connect { .. }) => 3,
+        Error::Client(ClientError::File { .. }) => 4,
+        Error::Client(_) | Error::Invalid { .. } => 5,
+    }
+}
+
+async fn drive(arguments: &Arguments) -> Result<Summary> {
+    let common = arguments.command.common();
+    let client = Client::connect_within(&common.server, Duration::from_secs_f64(common.wait)).await?;
+    let scene = match &common.open {
+        Some(source) => client.open_scene(source, &common.scene).await?.scene,
+        None => common.scene.clone(),
+    };
+    let mut scenario = scenario(&client, &scene, &arguments.command).await?;
+    let (stopper, stop) = watch::channel(false);
+    tokio::spawn(async move {
+        if tokio::signal::ctrl_c().await.is_ok() {
+            stopper.send_replace(true);
+        }
+        // The first interrupt ends the run in order; a second one does not wait for a server that has stalled.
+        if tokio::signal::ctrl_c().await.is_ok() {
+            std::process::exit(130);
+        }
+    });
+    let options = Options {
+        steps: common.count(),
+        dt: common.dt,
+        policy: common.policy.into(),
+        window: common.window,
+        realtime: common.realtime,
+        record: common.record.clone(),
+    };
+    run(&client, scenario.as_mut(), &options, &stop).await
+}
+
+async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box<dyn Scenario>> {
+    let common = command.common();
+    let (dt, steps) = (common.dt, common.count());
+    match command {
+        Command::Tree { wind, .. } => {
+            let model = Model::learn(client, scene, WATCHED_TREE).await?;
+            let (strength, direction) = (wind.wind, wind.direction.to_radians());
+            let options = TreeOptions { dt, steps, sway: wind.sway, wind: strength, direction, seed: wind.seed };
+            Ok(Box::new(Sway::new(model, options)?))
+        }
+        Command::Bridge { files, load, .. } => {
+            let model = Model::learn(client, scene, WATCHED).await?;
+            let options = BridgeOptions { dt, deflection: load.deflection, period: load.period };
+            bridge(model, files, options)
+        }
+        Command::Sweep { share, .. } => {
+            let model = Model::learn(client, scene, WATCHED).await?;
+            Ok(Box::new(Sweep::new(model, SweepOptions { dt, steps, share: *share })))
+        }
+        Command::Auto { files, load, wind, share, .. } => {
+            // A first look at few vertices tells which physics is known.
+            let model = Model::learn(client, scene, WATCHED_TREE).await?;
+            let command = if cubic(&model, files).is_some() {
+                Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
+            } else if model.parts.iter().any(|part| !part.eigenvalues.is_empty()) {
+                Command::Tree { common: common.clone(), wind: *wind }
+            } else {
+                Command::Sweep { common: common.clone(), share: *share }
+            };
+            eprintln!("modalcast-sim: {scene} is driven as `{}`", command.name());
+            Box::pin(scenario(client, scene, &command)).await
+        }
+    }
+}
+
+fn bridge(model: Model, files: &Files, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
+    let missing = || invalid("cubic", "--cubic FILE.cub, or --files DIR with the file that the scene names", "none");
+    let cubic = cubic(&model, files).ok_or_else(missing)?;
+    let beside = cubic.with_extension("config");
+    let config = files.config.clone().or_else(|| beside.is_file().then_some(beside));
+    let settings = config.map_or_else(|| Ok(Settings::default()), |path| Settings::read(&path))?;
+    Ok(Box::new(Bridge::new(model, ReducedForce::read(&cubic)?, &settings, options)?))
+}
+
+/// The file of cubic forces: as the command line says, or the one in `--files` that the scene's note names, or the only
+/// one there.
+fn cubic(model: &Model, files: &Files) -> Option<PathBuf> {
+    if let Some(path) = &files.cubic {
+        return Some(path.clone());
+    }
+    let folder = files.files.as_deref()?;
+    let named = model.parts.iter().filter_map(|part| part.notes.get("vega.cubic"));
+    let named = named.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
+    let mut found: Vec<PathBuf> = named.filter(|path| path.is_file()).collect();
+    if found.is_empty() {
+        let items = folder.read_dir().ok()?.filter_map(|item| Some(item.ok()?.path()));
+        found = items.filter(|path| path.extension().is_some_and(|end| end == "cub")).collect();
+    }
+    if found.len() == 1 { found.pop() } else { None }
+}
+
+/// The summary: one line of JSON, or a line per fact.
+fn print(summary: &Summary, json: bool) {
+    if json {
+        println!("{}", summary.value);
+        return;
+    }
+    for (name, value) in summary.value.as_object().into_iter().flatten() {
+        println!("{name:24} {value}");
+    }
+}
+
+impl Common {
+    /// How many steps; none without end.
+    fn count(&self) -> Option<u64> {
+        match (self.steps, self.seconds) {
+            (Some(0), _) => None,
+            (Some(steps), _) => Some(steps),
+            (None, seconds) if seconds > 0.0 => Some((seconds / self.dt).ceil().max(1.0) as u64),
+            (None, _) => None,
+        }
+    }
+}

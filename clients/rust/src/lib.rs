@@ -1,1 +1,23 @@
+#![doc = include_str!("../README.md")]
+#![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
+mod assemble;
+mod client;
+mod drive;
+mod error;
+mod frames;
+pub mod npy;
+mod scene;
+mod step;
+mod upload;
+mod vertices;
+
+pub use client::{Client, REPLY_LIMIT};
+pub use drive::{Ack, Drive, Finished, Policy};
+pub use error::{Error, Refusal, Result};
+pub use frames::{Camera, Delivery, Format, Frame, FrameRequest, Frames, FramesRequest, Lens, Picture, Stages, View};
+pub use modalcast_proto::v1;
+pub use modalcast_proto::v1::{SceneInfo, StepId};
+pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
+pub use step::Step;
+pub use vertices::{VertexRequest, VertexSet, VertexSets, VertexStreamRequest};

@@ -1,0 +1,194 @@
+//! A span under a pulsating load to its coordinates: reduced StVK forces under implicit Newmark.
+//!
+//! The load pulls the middle of the span down, spread evenly over the vertices there; its strength is calibrated so
+//! that the equilibrium under it deflects by a wanted share of the diagonal. The run begins in that equilibrium and the
+//! load then goes up and down as (1 + cos) / 2.
+
+use std::f64::consts::TAU;
+
+use nalgebra::DVector;
+use serde_json::json;
+
+use crate::affine::Affine;
+use crate::cubic::ReducedForce;
+use crate::error::{Result, invalid};
+use crate::model::{Model, Part};
+use crate::newmark::{Motion as Reduced, System};
+use crate::run::{Motion, Report, Scenario};
+use crate::vega::Settings;
+
+/// What the load does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Options {
+    /// Seconds per step.
+    pub dt: f64,
+    /// Deflection in equilibrium as a share of the diagonal.
+    pub deflection: f64,
+    /// Seconds per pulse.
+    pub period: f64,
+}
+
+/// The span.
+pub struct Bridge {
+    model: Model,
+    system: System,
+    options: Options,
+    /// Which part bends.
+    part: usize,
+    /// The full load, and the coordinates that it holds.
+    load: DVector<f64>,
+    motion: Reduced,
+    next: u64,
+    strength: f64,
+    still: f64,
+    peak: f64,
+}
+
+impl Bridge {
+    /// Calibrates the load to the span.
+    ///
+    /// # Errors
+    /// `Invalid` when no part has the rank of the forces, or the load cannot move it.
+    pub fn new(model: Model, force: ReducedForce, settings: &Settings, options: Options) -> Result<Self> {
+        let rank = force.rank();
+        let part = model.parts.iter().position(|part| part.owner && part.rank == rank);
+        let ranks = || format!("{:?}", model.parts.iter().map(|part| part.rank).collect::<Vec<_>>());
+        let part = part.ok_or_else(|| invalid("scene", format!("a domain of rank {rank}"), ranks()))?;
+        let system = System::new(force, settings)?;
+        let direction = pull(&model, &model.parts[part])?;
+        let wanted = options.deflection * model.diagonal();
+        let (strength, q) = calibrate(&system, &model.parts[part], &direction, wanted)?;
+        let load = direction * strength;
+        let still = deflection(&model.parts[part], &q) / model.diagonal();
+        let motion = system.still(q);
+        Ok(Self { model, system, options, part, load, motion, next: 0, strength, still, peak: 0.0 })
+    }
+
+    /// The load at a step.
+    fn load(&self, step: u64) -> DVector<f64> {
+        let time = step as f64 * self.options.dt;
+        &self.load * (0.5 + 0.5 * (TAU * time / self.options.period).cos())
+    }
+}
+
+impl Scenario for Bridge {
+    fn model(&self) -> &Model {
+        &self.model
+    }
+
+    fn at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
+        while self.next < number {
+            let (before, after) = (self.load(self.next), self.load(self.next + 1));
+            self.motion = self.system.step(&self.motion, self.options.dt, (&before, &after));
+            self.next += 1;
+        }
+        let part = &self.model.parts[self.part];
+        motion.q = vec![0.0; self.model.coordinates];
+        for (place, number) in motion.q[part.first..].iter_mut().zip(self.motion.q.iter()) {
+            *place = *number as f32;
+        }
+        motion.transforms = self.model.parts.iter().map(|part| part.placement.entries()).collect();
+        let q: Vec<f64> = motion.q.iter().map(|number| f64::from(*number)).collect();
+        let world: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
+        self.peak = self.peak.max(self.model.peak(&q, &world));
+        Ok(())
+    }
+
+    fn report(&self) -> Report {
+        let load = format!(
+            "a force of {:.4} (reduced mass 1) on the middle tenth of the span, downwards, pulsating every {} s; it holds \
+             the span at {:.4} of the diagonal, where the run begins",
+            self.strength, self.options.period, self.still,
+        );
+        Report::from_iter([
+            ("load".to_owned(), json!(load)),
+            ("deflection_of_diagonal".to_owned(), json!(self.still)),
+            ("peak_of_diagonal".to_owned(), json!(self.peak / self.model.diagonal())),
+            ("frequencies_hz".to_owned(), json!(self.system.frequencies())),
+        ])
+    }
+}
+
+/// U^T of a unit force that pulls down, spread over the middle tenth of the longer horizontal axis (or over the whole
+/// part, when nothing there can move).
+fn pull(model: &Model, part: &Part) -> Result<DVector<f64>> {
+    let (axis, _) = model.ground_axes();
+    let along = |rest: &nalgebra::Vector3<f64>| part.placement.apply(rest).dot(&axis);
+    let places = || part.samples.iter().map(|sample| along(&sample.rest));
+    let (low, high) = places().fold((f64::MAX, f64::MIN), |(low, high), at| (low.min(at), high.max(at)));
+    let down = -(part.placement.linear.transpose() * model.up);
+    let of = |near: f64| {
+        let near = |at: f64| (at - 0.5 * (low + high)).abs() <= near * (high - low);
+        let chosen: Vec<_> = part.samples.iter().filter(|sample| near(along(&sample.rest))).collect();
+        let sum = |mode| chosen.iter().map(|sample| sample.column(mode, part.rank).dot(&down)).sum::<f64>();
+        DVector::from_fn(part.rank, |mode, _| sum(mode) / chosen.len().max(1) as f64)
+    };
+    let force = Some(of(0.05)).filter(|force| force.norm() > 0.0).unwrap_or_else(|| of(1.0));
+    if force.norm() > 0.0 { Ok(force) } else { Err(invalid("scene", "a part that a load can bend", &part.name)) }
+}
+
+/// The largest displacement of a part's watched vertices.
+fn deflection(part: &Part, q: &DVector<f64>) -> f64 {
+    part.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
+}
+
+/// The strength of a load whose equilibrium deflects as wanted, and that equilibrium. The load grows step by step, each
+/// solved from the last.
+fn calibrate(system: &System, part: &Part, direction: &DVector<f64>, wanted: f64) -> Result<(f64, DVector<f64>)> {
+    let rest = DVector::zeros(system.rank());
+    // A thousandth of the way is linear enough to know how strong to begin.
+    let tiny = 1e-6 * direction.norm().recip();
+    let answer = deflection(part, &system.equilibrium(&(direction * tiny), &rest));
+    if !(answer > 0.0 && answer.is_finite()) {
+        return Err(invalid("load", "a deflection", answer));
+    }
+    let (mut low, mut high) = (0.0, 0.1 * wanted / answer * tiny);
+    let (mut below, mut above) = (rest.clone(), rest);
+    for _ in 0..60 {
+        above = system.equilibrium(&(direction * high), &below);
+        if deflection(part, &above) >= wanted {
+            break;
+        }
+        (low, below) = (high, above.clone());
+        high *= 1.3;
+    }
+    for _ in 0..40 {
+        let middle = 0.5 * (low + high);
+        let q = system.equilibrium(&(direction * middle), &below);
+        if deflection(part, &q) >= wanted { (high, above) = (middle, q) } else { (low, below) = (middle, q) }
+    }
+    Ok((high, above))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cubic::tests::chain;
+    use crate::hierarchy::tests::plant;
+
+    /// A part of two modes and a force of two coordinates.
+    fn span(options: Options) -> Bridge {
+        Bridge::new(plant(), chain(&[40.0, 90.0], 30.0, 4.0), &Settings::default(), options).expect("valid")
+    }
+
+    const OPTIONS: Options = Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0 };
+
+    #[test]
+    fn the_run_begins_at_the_wanted_deflection_and_moves() {
+        let mut bridge = span(OPTIONS);
+        assert!((bridge.still - 0.03).abs() <= 1e-6, "{}", bridge.still);
+        let (mut first, mut later) = (Motion::default(), Motion::default());
+        bridge.at(0, &mut first).expect("moves");
+        assert!(bridge.peak / bridge.model.diagonal() >= 0.0299);
+        bridge.at(40, &mut later).expect("moves");
+        assert!(first.q != later.q && first.transforms == later.transforms);
+        assert!(bridge.peak / bridge.model.diagonal() < 0.2);
+    }
+
+    #[test]
+    fn a_force_of_another_rank_is_refused_with_the_ranks_that_are_there() {
+        let force = chain(&[1.0, 2.0, 3.0], 0.0, 0.0);
+        let refusal = Bridge::new(plant(), force, &Settings::default(), OPTIONS).err().expect("refused").to_string();
+        assert!(refusal.contains("rank 3") && refusal.contains("[2, 2, 2, 0]"), "{refusal}");
+    }
+}

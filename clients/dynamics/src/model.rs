@@ -1,0 +1,305 @@
+//! A described scene to what the dynamics needs: per part rank, joint, chosen vertices with their rows of U, and area.
+//!
+//! Points and rows are in the part's own frame, lengths in scene units. Parents come before their children.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use modalcast_client::{Array, Client, Domain, ModeRows, SceneDescription};
+use nalgebra::Vector3;
+
+use crate::affine::Affine;
+use crate::error::{Result, invalid};
+
+/// How many numbers of U are read at most, over all parts.
+const BUDGET: usize = 8 << 20;
+
+/// A vertex that the dynamics watches or loads.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    pub rest: Vector3<f64>,
+    /// Three rows of r entries, row-major.
+    pub rows: Vec<f64>,
+}
+
+/// How a part hangs on its parent.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Joint {
+    pub parent: usize,
+    /// `parent_from_child` at rest.
+    pub frame: Affine,
+    /// Which samples of the parent carry the frame; none on a rigid parent.
+    pub ring: Vec<usize>,
+}
+
+/// One domain.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    pub name: String,
+    pub rank: usize,
+    /// Where its coordinates are among all. Parts that share coordinates have the same.
+    pub first: usize,
+    /// Whether steps carry its coordinates, not those of the part that it shares them with.
+    pub owner: bool,
+    /// `world_from_domain` at rest.
+    pub placement: Affine,
+    pub joint: Option<Joint>,
+    /// (rad/s)^2; empty when unknown.
+    pub eigenvalues: Vec<f64>,
+    pub notes: BTreeMap<String, String>,
+    /// Surface, and diagonal of the bounds; 0 when the mesh was not asked for.
+    pub area: f64,
+    pub extent: f64,
+    /// The first `skin` are spread evenly over the vertices; then come joints' rings.
+    pub samples: Vec<Sample>,
+    pub skin: usize,
+    /// The sample nearest to the part's origin, where it hangs on its parent.
+    pub base: Option<usize>,
+}
+
+/// A scene.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model {
+    pub scene: String,
+    pub parts: Vec<Part>,
+    /// Coordinates of all parts together.
+    pub coordinates: usize,
+    pub up: Vector3<f64>,
+    pub low: Vector3<f64>,
+    pub high: Vector3<f64>,
+}
+
+impl Sample {
+    /// U q at this vertex.
+    pub fn displacement(&self, q: &[f64]) -> Vector3<f64> {
+        Vector3::from_fn(|row, _| self.row(row, q.len()).iter().zip(q).map(|(entry, q)| entry * q).sum())
+    }
+
+    /// One row of U.
+    pub fn row(&self, component: usize, rank: usize) -> &[f64] {
+        &self.rows[component * rank..][..rank]
+    }
+
+    /// One column of the three rows.
+    pub fn column(&self, mode: usize, rank: usize) -> Vector3<f64> {
+        Vector3::from_fn(|component, _| self.rows[component * rank + mode])
+    }
+
+    /// Where the vertex is, in the part's frame.
+    pub fn moved(&self, q: &[f64]) -> Vector3<f64> {
+        self.rest + self.displacement(q)
+    }
+}
+
+impl Part {
+    /// This part's coordinates among all.
+    pub fn q<'a>(&self, all: &'a [f64]) -> &'a [f64] {
+        &all[self.first..][..self.rank]
+    }
+
+    /// A number that a note states.
+    pub fn note(&self, name: &str) -> Option<f64> {
+        self.notes.get(name).and_then(|text| text.trim().parse().ok()).filter(|number: &f64| number.is_finite())
+    }
+}
+
+impl Model {
+    /// Learns a scene from its server. `watched` is the most vertices that are watched of one part; the whole stays
+    /// within 8 Mi numbers of U.
+    ///
+    /// # Errors
+    /// `Client` as the calls; `Invalid` when the description contradicts itself.
+    pub async fn learn(client: &Client, scene: &str, watched: usize) -> Result<Self> {
+        let bare = client.describe(scene, &[]).await?;
+        let bends = bare.domains.iter().any(|domain| domain.rank > 0);
+        let swings = bare.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
+        let description = match (bends, swings) {
+            (false, _) => bare,
+            (true, false) => client.describe(scene, &[Array::RestPositions]).await?,
+            (true, true) => {
+                client.describe(scene, &[Array::RestPositions, Array::Indices, Array::CornerVertices]).await?
+            }
+        };
+        let numbers: usize = description.domains.iter().map(|domain| 3 * domain.rank).sum();
+        let watched = watched.min(BUDGET / numbers.max(1)).max(8);
+        let choices = choose(&description, watched)?;
+        let mut modes = BTreeMap::new();
+        for (domain, choice) in description.domains.iter().zip(&choices) {
+            let key = (domain.shape, choice.vertices.clone());
+            if domain.rank > 0 && !modes.contains_key(&key) {
+                let rows = client.modes(scene, domain.index, &choice.vertices).await?;
+                if rows.rank != domain.rank {
+                    return Err(invalid(format!("rank of '{}'", domain.name), domain.rank, rows.rank));
+                }
+                modes.insert(key, rows);
+            }
+        }
+        Self::assemble(&description, choices, |domain, vertices| modes.get(&(domain.shape, vertices.to_vec())))
+    }
+
+    fn assemble<'a>(
+        description: &SceneDescription,
+        choices: Vec<Choice>,
+        rows: impl Fn(&Domain, &[u32]) -> Option<&'a ModeRows>,
+    ) -> Result<Self> {
+        let (mut parts, mut coordinates): (Vec<Part>, _) = (vec![], 0);
+        for (domain, choice) in description.domains.iter().zip(&choices) {
+            let twin = domain.shares_q_with.map(|twin| parts.get(twin).map(|part| (part.first, part.rank)));
+            let first = match twin {
+                None => coordinates,
+                Some(Some((first, rank))) if rank == domain.rank => first,
+                Some(_) => return Err(invalid(format!("'{}' shares q", domain.name), "an earlier twin", "another")),
+            };
+            coordinates += if twin.is_none() { domain.rank } else { 0 };
+            let read = rows(domain, &choice.vertices);
+            let mut part = part(domain, choice, read);
+            (part.first, part.owner) = (first, twin.is_none());
+            part.joint = joint(domain, &choices)?;
+            parts.push(part);
+        }
+        let info = &description.info;
+        let bounds = <[f64; 6]>::try_from(info.bounds.as_slice());
+        let bounds = bounds.map_err(|_| invalid("scene.bounds", "6 numbers", info.bounds.len()))?;
+        let up = match info.up.as_str() {
+            "x" => Vector3::x(),
+            "z" => Vector3::z(),
+            _ => Vector3::y(),
+        };
+        let (low, high) = (Vector3::from_column_slice(&bounds[..3]), Vector3::from_column_slice(&bounds[3..]));
+        Ok(Self { scene: info.scene.clone(), parts, coordinates, up, low, high })
+    }
+
+    /// Diagonal of the bounds at rest.
+    pub fn diagonal(&self) -> f64 {
+        (self.high - self.low).norm().max(f64::MIN_POSITIVE)
+    }
+
+    /// Extent along up at rest.
+    pub fn height(&self) -> f64 {
+        (self.high - self.low).dot(&self.up).max(f64::MIN_POSITIVE)
+    }
+
+    /// The horizontal direction at an angle about up, in radians, from the first horizontal axis (x, or y when x is up).
+    pub fn horizontal(&self, angle: f64) -> Vector3<f64> {
+        let first = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
+        first * angle.cos() + self.up.cross(&first) * angle.sin()
+    }
+
+    /// The longer horizontal axis, and the other one, so that the three are right-handed with up.
+    pub fn ground_axes(&self) -> (Vector3<f64>, Vector3<f64>) {
+        let (first, second) = (self.horizontal(0.0), self.horizontal(std::f64::consts::FRAC_PI_2));
+        let size = |axis: &Vector3<f64>| (self.high - self.low).dot(&axis.abs());
+        if size(&second) > size(&first) { (second, -first) } else { (first, second) }
+    }
+
+    /// The largest displacement of a watched vertex from its place at rest, in scene units.
+    pub fn peak(&self, q: &[f64], world: &[Affine]) -> f64 {
+        let parts = self.parts.iter().zip(world);
+        let of = |(part, pose): (&Part, &Affine)| {
+            let moved =
+                |sample: &Sample| (pose.apply(&sample.moved(part.q(q))) - part.placement.apply(&sample.rest)).norm();
+            let origin = (pose.translation - part.placement.translation).norm();
+            part.samples[..part.skin].iter().map(moved).fold(origin, f64::max)
+        };
+        parts.map(of).fold(0.0, f64::max)
+    }
+}
+
+/// Which vertices of a domain are read: first `skin` evenly spread ones, then the others that joints need.
+struct Choice {
+    vertices: Vec<u32>,
+    skin: usize,
+}
+
+fn choose(description: &SceneDescription, watched: usize) -> Result<Vec<Choice>> {
+    let domains = &description.domains;
+    let mut rings: Vec<BTreeSet<u32>> = vec![BTreeSet::new(); domains.len()];
+    for (index, domain) in domains.iter().enumerate() {
+        let Some(attachment) = &domain.attachment else { continue };
+        if attachment.parent >= index {
+            let field = format!("parent of '{}'", domain.name);
+            return Err(invalid(field, format!("an index below {index}"), attachment.parent));
+        }
+        let limit = domains[attachment.parent].vertices;
+        if let Some(row) = attachment.rows.iter().find(|row| **row as usize >= limit) {
+            return Err(invalid(format!("ring of '{}'", domain.name), format!("vertices below {limit}"), row));
+        }
+        rings[attachment.parent].extend(&attachment.rows);
+    }
+    let choice = |(domain, ring): (&Domain, BTreeSet<u32>)| {
+        if domain.rest_positions.is_empty() {
+            return Choice { vertices: vec![], skin: 0 };
+        }
+        let skin = domain.vertices.min(watched);
+        let mut vertices: Vec<u32> = (0..skin).map(|at| (at * domain.vertices / skin) as u32).collect();
+        let spread: BTreeSet<u32> = vertices.iter().copied().collect();
+        let others = ring.into_iter().chain([base(domain)]).collect::<BTreeSet<_>>();
+        vertices.extend(others.difference(&spread));
+        Choice { vertices, skin }
+    };
+    Ok(domains.iter().zip(rings).map(choice).collect())
+}
+
+/// The vertex nearest to the domain's origin.
+fn base(domain: &Domain) -> u32 {
+    let size = |at: u32| domain.rest_positions[3 * at as usize..][..3].iter().map(|x| x * x).sum::<f32>();
+    (0..domain.vertices as u32).min_by(|a, b| size(*a).total_cmp(&size(*b))).unwrap_or(0)
+}
+
+fn point(domain: &Domain, vertex: u32) -> Vector3<f64> {
+    Vector3::from_fn(|row, _| f64::from(domain.rest_positions[3 * vertex as usize + row]))
+}
+
+fn part(domain: &Domain, choice: &Choice, read: Option<&ModeRows>) -> Part {
+    let sample = |(place, vertex): (usize, &u32)| {
+        let rows = read.map_or(&[][..], |rows| rows.of(place));
+        Sample { rest: point(domain, *vertex), rows: rows.iter().map(|entry| f64::from(*entry)).collect() }
+    };
+    let samples: Vec<Sample> = choice.vertices.iter().enumerate().map(sample).collect();
+    let base = if samples.is_empty() { None } else { Some(base(domain)) };
+    Part {
+        name: domain.name.clone(),
+        rank: domain.rank,
+        first: 0,
+        owner: true,
+        placement: Affine::from_entries(&domain.placement),
+        joint: None,
+        eigenvalues: domain.eigenvalues.clone(),
+        notes: domain.notes.clone(),
+        area: area(domain),
+        extent: extent(domain),
+        base: base.and_then(|base| choice.vertices.iter().position(|vertex| *vertex == base)),
+        samples,
+        skin: choice.skin,
+    }
+}
+
+fn joint(domain: &Domain, choices: &[Choice]) -> Result<Option<Joint>> {
+    let Some(attachment) = &domain.attachment else { return Ok(None) };
+    let places: BTreeMap<u32, usize> =
+        choices[attachment.parent].vertices.iter().enumerate().map(|(place, vertex)| (*vertex, place)).collect();
+    let ring = attachment.rows.iter().filter_map(|row| places.get(row).copied()).collect();
+    let frame = Affine::from_entries(&attachment.frame);
+    Ok(Some(Joint { parent: attachment.parent, frame, ring }))
+}
+
+/// The surface of a domain's mesh.
+fn area(domain: &Domain) -> f64 {
+    if domain.corner_vertices.is_empty() {
+        return 0.0;
+    }
+    let corner = |index: &u32| point(domain, domain.corner_vertices[*index as usize]);
+    let triangle = |three: &[u32]| {
+        let [a, b, c] = [corner(&three[0]), corner(&three[1]), corner(&three[2])];
+        0.5 * (b - a).cross(&(c - a)).norm()
+    };
+    domain.indices.chunks_exact(3).map(triangle).sum()
+}
+
+/// The diagonal of a domain's bounds.
+fn extent(domain: &Domain) -> f64 {
+    let points = (0..(domain.rest_positions.len() / 3) as u32).map(|vertex| point(domain, vertex));
+    let bounds = points.fold(None, |bounds: Option<(Vector3<f64>, Vector3<f64>)>, point| {
+        Some(bounds.map_or((point, point), |(low, high)| (low.inf(&point), high.sup(&point))))
+    });
+    bounds.map_or(0.0, |(low, high)| (high - low).norm())
+}

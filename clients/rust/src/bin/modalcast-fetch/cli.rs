@@ -1,0 +1,233 @@
+//! The command line of `modalcast-fetch`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use modalcast_client::{Camera, Delivery, Format, Lens, Picture, View};
+
+const EXAMPLES: &str = "\
+Examples:
+  modalcast-fetch frames --scene tree --open tree --count 60 --size 1280x720 --out out
+  modalcast-fetch frame --scene tree --min-step 10 --out frame.png
+  modalcast-fetch vertices --scene tree --count 60 --out vertices.npy --json
+  modalcast-fetch --server http://10.0.0.2:50051 info
+
+`frames`, and `vertices` with --count, print a line `ready` on standard output once the server has accepted the
+subscription: a physics process started after that line loses no step.
+
+Exit codes: 0 done; 1 the server refused; 2 bad command line; 3 no connection, or lost; 4 a local file;
+5 the reply was malformed, ended early or did not come in time.";
+
+/// Saves frames or vertices of a modalcast server.
+#[derive(Debug, Parser)]
+#[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
+pub(crate) struct Arguments {
+    /// The server.
+    #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
+    pub(crate) server: String,
+    /// Seconds to keep trying until the server answers.
+    #[arg(long, global = true, default_value_t = 0.0, value_parser = seconds)]
+    pub(crate) wait: f64,
+    /// Print a machine-readable summary on standard output.
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Save a frame per step.
+    #[command(after_help = EXAMPLES)]
+    Frames(FramesOptions),
+    /// Save one frame.
+    #[command(after_help = EXAMPLES)]
+    Frame(FrameOptions),
+    /// Save deformed vertices as a NumPy file: steps x vertices x 3.
+    #[command(after_help = EXAMPLES)]
+    Vertices(VerticesOptions),
+    /// What the server is: backend, renderer, limits.
+    Info,
+    /// Open scenes, and what could be opened.
+    List,
+}
+
+/// Which scene.
+#[derive(Debug, Args)]
+pub(crate) struct SceneOptions {
+    /// The scene's name on the server.
+    #[arg(long)]
+    pub(crate) scene: String,
+    /// Open this source of the server's repository under that name first.
+    #[arg(long, value_name = "SOURCE")]
+    pub(crate) open: Option<String>,
+}
+
+/// What the picture looks like.
+#[derive(Debug, Args)]
+pub(crate) struct PictureOptions {
+    /// Size in pixels.
+    #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = size)]
+    size: (u32, u32),
+    /// How the bytes are encoded: PNG, or raw RGBA8 (top row first, sRGB).
+    #[arg(long, value_enum, default_value = "png")]
+    pub(crate) format: FormatOption,
+    /// Where the camera is; without it the server frames the scene.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, requires = "target", allow_hyphen_values = true)]
+    camera_eye: Option<[f64; 3]>,
+    /// What the camera looks at.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, requires = "camera_eye", allow_hyphen_values = true)]
+    target: Option<[f64; 3]>,
+    /// Which way is up for the camera.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple, default_value = "0,1,0", allow_hyphen_values = true)]
+    up: [f64; 3],
+    /// Vertical field of view in degrees.
+    #[arg(long, default_value_t = 40.0)]
+    fov: f64,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(crate) enum FormatOption {
+    Png,
+    Raw,
+}
+
+impl PictureOptions {
+    pub(crate) fn picture(&self) -> Picture {
+        let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
+        let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov), clip: None });
+        let format = match self.format {
+            FormatOption::Png => Format::Png,
+            FormatOption::Raw => Format::Rgba,
+        };
+        Picture { width: self.size.0, height: self.size.1, format, camera }
+    }
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(crate) enum DeliveryOption {
+    Lossless,
+    Latest,
+}
+
+impl From<DeliveryOption> for Delivery {
+    fn from(option: DeliveryOption) -> Self {
+        match option {
+            DeliveryOption::Lossless => Self::Lossless,
+            DeliveryOption::Latest => Self::Latest,
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct FramesOptions {
+    #[command(flatten)]
+    pub(crate) scene: SceneOptions,
+    #[command(flatten)]
+    pub(crate) picture: PictureOptions,
+    /// How many frames.
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(crate) count: u64,
+    /// The folder for frame_00000.png and so on; it is made if missing.
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Every step, or the newest.
+    #[arg(long, value_enum, default_value = "lossless")]
+    pub(crate) delivery: DeliveryOption,
+    /// Seconds to wait for the next frame before giving up.
+    #[arg(long, default_value_t = 120.0, value_parser = seconds)]
+    pub(crate) timeout: f64,
+}
+
+/// Which step.
+#[derive(Debug, Args)]
+pub(crate) struct StepOptions {
+    /// Exactly this step of the current run.
+    #[arg(long, conflicts_with = "min_step")]
+    pub(crate) step: Option<u64>,
+    /// This step of the current run or a later one.
+    #[arg(long)]
+    pub(crate) min_step: Option<u64>,
+    /// Milliseconds that the server may wait for it; 0 is its own default.
+    #[arg(long, default_value_t = 0)]
+    pub(crate) deadline_ms: u32,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct FrameOptions {
+    #[command(flatten)]
+    pub(crate) scene: SceneOptions,
+    #[command(flatten)]
+    pub(crate) picture: PictureOptions,
+    #[command(flatten)]
+    pub(crate) step: StepOptions,
+    /// The file to write.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct VerticesOptions {
+    #[command(flatten)]
+    pub(crate) scene: SceneOptions,
+    #[command(flatten)]
+    pub(crate) step: StepOptions,
+    /// The NumPy file for positions, float32, steps x vertices x 3.
+    #[arg(long, value_name = "FILE.npy")]
+    pub(crate) out: PathBuf,
+    /// A NumPy file for the normals, float32, steps x corners x 3.
+    #[arg(long, value_name = "FILE.npy")]
+    pub(crate) normals: Option<PathBuf>,
+    /// Domains by index, separated by commas; all without it.
+    #[arg(long, value_delimiter = ',')]
+    pub(crate) domains: Vec<u32>,
+    /// Subscribe, and save so many steps.
+    #[arg(long, conflicts_with_all = ["step", "min_step"], value_parser = clap::value_parser!(u64).range(1..))]
+    pub(crate) count: Option<u64>,
+    /// Every step, or the newest.
+    #[arg(long, value_enum, default_value = "lossless")]
+    pub(crate) delivery: DeliveryOption,
+    /// Seconds to wait for the next step before giving up.
+    #[arg(long, default_value_t = 120.0, value_parser = seconds)]
+    pub(crate) timeout: f64,
+}
+
+fn size(text: &str) -> Result<(u32, u32), String> {
+    let parsed = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    parsed.filter(|(width, height)| *width > 0 && *height > 0).ok_or_else(|| "expected WIDTHxHEIGHT".into())
+}
+
+fn triple(text: &str) -> Result<[f64; 3], String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
+    let triple = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+    triple.filter(|numbers| numbers.iter().all(|number| number.is_finite())).ok_or_else(|| "expected X,Y,Z".into())
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let parsed = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
+    parsed.ok_or_else(|| "expected seconds, 0 to 1000000".into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_sound() {
+        use clap::CommandFactory as _;
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn sizes_and_triples_are_read_and_nonsense_is_refused() {
+        assert_eq!(size("1280x720"), Ok((1280, 720)));
+        assert_eq!(triple("1, -2,.5"), Ok([1.0, -2.0, 0.5]));
+        for wrong in ["", "1280", "0x5", "-1x5", "axb", "5x5x5"] {
+            assert!(size(wrong).is_err(), "{wrong}");
+        }
+        for wrong in ["", "1,2", "1,2,3,4", "1,2,nan", "inf,0,0"] {
+            assert!(triple(wrong).is_err(), "{wrong}");
+        }
+        assert!(seconds("-1").is_err() && seconds("nan").is_err());
+    }
+}

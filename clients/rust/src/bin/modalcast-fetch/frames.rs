@@ -1,0 +1,61 @@
+//! Frames to files: frame_00000.png (or .rgba) in the order in which they came.
+
+use std::path::Path;
+use std::time::Duration;
+
+use modalcast_client::{Client, Error, Format, Frame, FrameRequest, FramesRequest, Result};
+
+use crate::cli::{FrameOptions, FramesOptions, StepOptions};
+use crate::output::{Summary, bar, scene};
+
+pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool) -> Result<()> {
+    let name = scene(client, &options.scene).await?;
+    std::fs::create_dir_all(&options.out).map_err(|fault| Error::file(&options.out, fault))?;
+    let request = FramesRequest {
+        scene: name,
+        picture: options.picture.picture(),
+        delivery: options.delivery.into(),
+        frames: options.count,
+    };
+    let mut frames = client.frames(&request).await?;
+    println!("ready");
+    let patience = Duration::from_secs_f64(options.timeout);
+    let (mut summary, bar) = (Summary::new(), bar(options.count, "frames"));
+    for index in 0..options.count {
+        let late = Error::Deadline { what: "the next frame", ms: patience.as_millis() as u64 };
+        let next = tokio::time::timeout(patience, frames.next()).await.map_err(|_| late)?;
+        let frame = next.unwrap_or(Err(Error::Ended { what: "the last frame" }))?;
+        write(&options.out.join(format!("frame_{index:05}.{}", extension(frame.format))), &frame)?;
+        summary.add((frame.step.run, frame.step.number), frame.bytes.len() as u64, frame.skipped, &frame.stages);
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    summary.print("frames", &options.out, json);
+    Ok(())
+}
+
+pub(crate) async fn single(client: &Client, options: &FrameOptions, json: bool) -> Result<()> {
+    let name = scene(client, &options.scene).await?;
+    let mut request = FrameRequest::of(&name).within_ms(options.step.deadline_ms);
+    request.picture = options.picture.picture();
+    let StepOptions { step, min_step, .. } = options.step;
+    request = step.map_or(request.clone(), |step| request.exactly(step));
+    request = min_step.map_or(request.clone(), |step| request.at_least(step));
+    let mut summary = Summary::new();
+    let frame = client.frame(&request).await?;
+    write(&options.out, &frame)?;
+    summary.add((frame.step.run, frame.step.number), frame.bytes.len() as u64, frame.skipped, &frame.stages);
+    summary.print("frames", &options.out, json);
+    Ok(())
+}
+
+fn write(path: &Path, frame: &Frame) -> Result<()> {
+    std::fs::write(path, &frame.bytes).map_err(|fault| Error::file(path, fault))
+}
+
+const fn extension(format: Format) -> &'static str {
+    match format {
+        Format::Png => "png",
+        Format::Rgba => "rgba",
+    }
+}

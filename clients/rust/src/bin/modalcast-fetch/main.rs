@@ -1,0 +1,55 @@
+//! `modalcast-fetch`: frames and vertices of a server to files. Progress goes to standard error, results to standard
+//! output.
+
+mod cli;
+mod frames;
+mod output;
+mod vertices;
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Parser as _;
+use modalcast_client::{Client, Error, Result};
+
+use cli::{Arguments, Command};
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(fault) => {
+            eprintln!("modalcast-fetch: no runtime: {fault}");
+            return ExitCode::from(4);
+        }
+    };
+    match runtime.block_on(run(&arguments)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("modalcast-fetch: {error}");
+            ExitCode::from(code(&error))
+        }
+    }
+}
+
+/// The documented exit code of an error.
+const fn code(error: &Error) -> u8 {
+    match error {
+        Error::Refused { .. } | Error::Rejected(_) => 1,
+        Error::Connect { .. } => 3,
+        Error::File { .. } => 4,
+        Error::Malformed { .. } | Error::Ended { .. } | Error::Deadline { .. } => 5,
+    }
+}
+
+async fn run(arguments: &Arguments) -> Result<()> {
+    let client = Client::connect_within(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
+    let json = arguments.json;
+    match &arguments.command {
+        Command::Frames(options) => frames::stream(&client, options, json).await,
+        Command::Frame(options) => frames::single(&client, options, json).await,
+        Command::Vertices(options) => vertices::fetch(&client, options, json).await,
+        Command::Info => output::info(&client, json).await,
+        Command::List => output::list(&client, json).await,
+    }
+}

@@ -1,0 +1,147 @@
+//! Summaries on standard output: for people, or one line of JSON.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use modalcast_client::{Client, Result, SceneInfo, Stages};
+use serde_json::{Value, json};
+
+use crate::cli::SceneOptions;
+
+/// What a run of frames or vertices came to.
+pub(crate) struct Summary {
+    start: Instant,
+    steps: Vec<u64>,
+    runs: Vec<u64>,
+    bytes: u64,
+    skipped: u64,
+    stages: BTreeMap<String, Vec<f32>>,
+}
+
+impl Summary {
+    pub(crate) fn new() -> Self {
+        Self { start: Instant::now(), steps: vec![], runs: vec![], bytes: 0, skipped: 0, stages: BTreeMap::new() }
+    }
+
+    /// Counts one reply.
+    pub(crate) fn add(&mut self, step: (u64, u64), bytes: u64, skipped: u64, stages: &Stages) {
+        self.runs.push(step.0);
+        self.steps.push(step.1);
+        self.bytes += bytes;
+        self.skipped += skipped;
+        for (stage, milliseconds) in stages {
+            self.stages.entry(stage.clone()).or_default().push(*milliseconds);
+        }
+    }
+
+    /// Prints `what` (frames, steps) and where they went.
+    pub(crate) fn print(mut self, what: &str, out: &std::path::Path, json: bool) {
+        let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
+        let elapsed = self.start.elapsed().as_secs_f64();
+        let count = self.steps.len();
+        if json {
+            let summary = json!({
+                what: count, "out": out.display().to_string(), "steps": self.steps, "runs": self.runs,
+                "bytes": self.bytes, "skipped": self.skipped, "elapsed_s": elapsed,
+                "per_second": count as f64 / elapsed.max(1e-9), "stages_ms": medians,
+            });
+            println!("{summary}");
+            return;
+        }
+        println!("{count} {what}, {} bytes, {elapsed:.2} s, {} skipped: {}", self.bytes, self.skipped, out.display());
+        for (stage, milliseconds) in medians {
+            println!("  {stage:8} {milliseconds:8.3} ms (median)");
+        }
+    }
+}
+
+/// The middle of some times; 0 of none.
+fn median(times: &mut [f32]) -> f32 {
+    times.sort_by(f32::total_cmp);
+    times.get(times.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// A bar on standard error; hidden when that is no terminal.
+pub(crate) fn bar(count: u64, what: &'static str) -> ProgressBar {
+    let style = ProgressStyle::with_template("{msg} [{bar:32}] {pos}/{len} {per_sec} eta {eta}");
+    ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(what)
+}
+
+/// Opens the scene first when the command line says so; the name that other calls use.
+pub(crate) async fn scene(client: &Client, options: &SceneOptions) -> Result<String> {
+    match &options.open {
+        None => Ok(options.scene.clone()),
+        Some(source) => Ok(client.open_scene(source, &options.scene).await?.scene),
+    }
+}
+
+pub(crate) async fn info(client: &Client, json: bool) -> Result<()> {
+    let info = client.server_info().await?;
+    let limits = &info.limits;
+    if json {
+        let limits = json!({
+            "message_bytes": limits.message_bytes, "frame_side": limits.frame_side, "scenes": limits.scenes,
+            "window": limits.window, "upload_bytes": limits.upload_bytes, "deadline_ms": limits.deadline_ms,
+        });
+        let value = json!({
+            "version": info.version, "backend": info.backend, "device": info.device, "renderer": info.renderer,
+            "software": info.software, "limits": limits,
+        });
+        println!("{value}");
+        return Ok(());
+    }
+    let how = if info.software { "software" } else { "hardware" };
+    println!("modalcast {}\nbackend   {} ({})", info.version, info.backend, info.device);
+    println!("renderer  {} ({how})", info.renderer);
+    println!("message   at most {} bytes", limits.message_bytes);
+    println!("frame     at most {} pixels a side", limits.frame_side);
+    println!("scenes    at most {}", limits.scenes);
+    println!("window    at most {} steps", limits.window);
+    println!("upload    at most {} bytes", limits.upload_bytes);
+    println!("deadline  {} ms unless a request says otherwise", limits.deadline_ms);
+    Ok(())
+}
+
+pub(crate) async fn list(client: &Client, json: bool) -> Result<()> {
+    let (scenes, sources) = client.list_scenes().await?;
+    if json {
+        let scenes: Vec<_> = scenes.iter().map(scene_json).collect();
+        println!("{}", json!({ "scenes": scenes, "sources": sources }));
+        return Ok(());
+    }
+    for scene in scenes {
+        let last =
+            scene.last_step.map_or("no step yet".into(), |step| format!("step {} of run {}", step.number, step.run));
+        let counts = (scene.domains, scene.vertices, scene.triangles, scene.coordinates);
+        println!(
+            "{} ({}): {} domains, {} vertices, {} triangles, {} coordinates, {last}",
+            scene.scene, scene.source, counts.0, counts.1, counts.2, counts.3
+        );
+    }
+    for source in sources {
+        println!("could open: {source}");
+    }
+    Ok(())
+}
+
+fn scene_json(scene: &SceneInfo) -> Value {
+    let last = scene.last_step.map(|step| json!({ "run": step.run, "number": step.number, "time": step.time }));
+    json!({
+        "scene": scene.scene, "source": scene.source, "domains": scene.domains, "vertices": scene.vertices,
+        "corners": scene.corners, "triangles": scene.triangles, "coordinates": scene.coordinates, "up": scene.up,
+        "unit": scene.unit, "origin": scene.origin, "bounds": scene.bounds, "last_step": last,
+        "remarks": scene.remarks,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_median_is_the_middle_and_none_is_zero() {
+        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(&mut []), 0.0);
+    }
+}

@@ -1,0 +1,116 @@
+//! One connection to a server: unary calls to values, streams to handles. Cloning shares the connection.
+
+use std::time::{Duration, Instant};
+
+use modalcast_proto::v1;
+use tonic::transport::{Channel, Endpoint};
+
+use crate::error::{Error, Result, malformed};
+use crate::scene::ServerInfo;
+
+/// The largest reply that is put together from chunks, in bytes, unless the caller says otherwise.
+pub const REPLY_LIMIT: u64 = 1 << 30;
+
+/// A connection to a modalcast server.
+#[derive(Debug, Clone)]
+pub struct Client {
+    pub(crate) channel: Channel,
+    pub(crate) reply_limit: u64,
+}
+
+impl Client {
+    /// Connects, or says why not within five seconds. `url` is `http://host:port`.
+    ///
+    /// # Errors
+    /// `Connect` when the URL is none or nobody answers.
+    pub async fn connect(url: &str) -> Result<Self> {
+        let refused = |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: chain(&fault) };
+        // An unread stream may fill its own window but never the connection's, or every other call would wait too.
+        let endpoint = Endpoint::from_shared(url.to_owned())
+            .map_err(refused)?
+            .connect_timeout(Duration::from_secs(5))
+            .initial_stream_window_size(1 << 20)
+            .initial_connection_window_size(16 << 20)
+            .http2_keep_alive_interval(Duration::from_secs(20))
+            .keep_alive_timeout(Duration::from_secs(20));
+        let channel = endpoint.connect().await.map_err(refused)?;
+        Ok(Self { channel, reply_limit: REPLY_LIMIT })
+    }
+
+    /// Connects, trying again until a server answers or `patience` is over.
+    ///
+    /// # Errors
+    /// `Connect` with the reason of the last try.
+    pub async fn connect_within(url: &str, patience: Duration) -> Result<Self> {
+        let start = Instant::now();
+        loop {
+            match Self::connect(url).await {
+                Err(_) if start.elapsed() < patience => tokio::time::sleep(Duration::from_millis(100)).await,
+                answer => return answer,
+            }
+        }
+    }
+
+    /// The same connection with another bound on one reply, in bytes.
+    #[must_use]
+    pub fn with_reply_limit(mut self, bytes: u64) -> Self {
+        self.reply_limit = bytes;
+        self
+    }
+
+    /// Backend, renderer and limits of the server.
+    ///
+    /// # Errors
+    /// As every call: `Refused`, `Connect` or `Malformed`.
+    pub async fn server_info(&self) -> Result<ServerInfo> {
+        let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
+        let wire = service.get_server_info(v1::GetServerInfoRequest {}).await?.into_inner();
+        Ok(ServerInfo {
+            version: wire.version,
+            backend: wire.backend,
+            device: wire.device,
+            renderer: wire.renderer,
+            software: wire.software,
+            limits: wire.limits.unwrap_or_default(),
+        })
+    }
+
+    /// Opens a scene of the server's repository, or answers with what is open under that name already. An empty `name`
+    /// takes the source's own.
+    ///
+    /// # Errors
+    /// `Refused` when there is no such source; `Connect`; `Malformed`.
+    pub async fn open_scene(&self, source: &str, name: &str) -> Result<v1::SceneInfo> {
+        let request = v1::OpenSceneRequest { source: source.to_owned(), scene: name.to_owned() };
+        let reply = self.scenes().open_scene(request).await?.into_inner();
+        reply.scene.ok_or_else(|| malformed("open_scene.scene", "a scene", "none"))
+    }
+
+    /// The open scenes, and what [`Self::open_scene`] would accept as a source.
+    ///
+    /// # Errors
+    /// `Refused` or `Connect`.
+    pub async fn list_scenes(&self) -> Result<(Vec<v1::SceneInfo>, Vec<String>)> {
+        let reply = self.scenes().list_scenes(v1::ListScenesRequest {}).await?.into_inner();
+        Ok((reply.scenes, reply.sources))
+    }
+
+    /// Closes a scene; an uploaded one's files are removed.
+    ///
+    /// # Errors
+    /// `Refused` when there is no such scene; `Connect`.
+    pub async fn delete_scene(&self, scene: &str) -> Result<()> {
+        self.scenes().delete_scene(v1::DeleteSceneRequest { scene: scene.to_owned() }).await?;
+        Ok(())
+    }
+
+    pub(crate) fn scenes(&self) -> v1::scene_service_client::SceneServiceClient<Channel> {
+        v1::scene_service_client::SceneServiceClient::new(self.channel.clone())
+    }
+}
+
+/// An error with its causes in one line; tonic's own says only "transport error".
+fn chain(fault: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(Some(fault), |error| error.source());
+    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
+}

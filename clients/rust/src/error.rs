@@ -1,0 +1,110 @@
+//! What can go wrong in a client, sorted by who can act on it; a server's refusal keeps its field, expected and given.
+
+use modalcast_proto::v1;
+use prost::Message as _;
+
+/// Shorthand of every fallible function in the crate.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Why the server refused a request or a step.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refusal {
+    /// The step that was refused, when it was a step.
+    pub step: Option<u64>,
+    pub field: String,
+    pub expected: String,
+    pub given: String,
+}
+
+impl From<v1::Rejection> for Refusal {
+    fn from(wire: v1::Rejection) -> Self {
+        Self { step: wire.step, field: wire.field, expected: wire.expected, given: wire.given }
+    }
+}
+
+impl std::fmt::Display for Refusal {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if let Some(step) = self.step {
+            write!(out, "step {step}: ")?;
+        }
+        write!(out, "{}: expected {}, given {}", self.field, self.expected, self.given)
+    }
+}
+
+/// The one error of the client.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum Error {
+    /// No connection, or the connection was lost.
+    #[error("{url}: no connection: {reason}")]
+    Connect { url: String, reason: String },
+    /// The server refused a call. The refusal is there when the server sent details.
+    #[error("refused ({code:?}): {message}")]
+    Refused { code: tonic::Code, message: String, refusal: Option<Box<Refusal>> },
+    /// The server refused a step, or the opening of a step stream; a refused step does not end its stream.
+    #[error("rejected: {0}")]
+    Rejected(Box<Refusal>),
+    /// The server's reply contradicts itself or the contract.
+    #[error("malformed reply: {field}: expected {expected}, given {given}")]
+    Malformed { field: String, expected: String, given: String },
+    /// A stream ended too early.
+    #[error("the stream ended before {what}")]
+    Ended { what: &'static str },
+    /// Something did not come in time.
+    #[error("{what} did not come within {ms} ms")]
+    Deadline { what: &'static str, ms: u64 },
+    /// A local file could not be read or written.
+    #[error("{path}: {reason}")]
+    File { path: String, reason: String },
+}
+
+impl Error {
+    /// A fault of a local file.
+    pub fn file(path: impl AsRef<std::path::Path>, fault: impl std::fmt::Display) -> Self {
+        Self::File { path: path.as_ref().display().to_string(), reason: fault.to_string() }
+    }
+
+    /// The server's own words about what was wrong, if it sent them.
+    pub fn refusal(&self) -> Option<&Refusal> {
+        match self {
+            Self::Rejected(refusal) => Some(refusal),
+            Self::Refused { refusal, .. } => refusal.as_deref(),
+            _ => None,
+        }
+    }
+}
+
+/// A reply that breaks the contract.
+pub(crate) fn malformed(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
+    Error::Malformed { field: field.into(), expected: expected.to_string(), given: given.to_string() }
+}
+
+impl From<tonic::Status> for Error {
+    fn from(status: tonic::Status) -> Self {
+        // A transport fault has a source and no details; a refusal of the server has neither or has details.
+        let lost = status.code() == tonic::Code::Unavailable && status.details().is_empty();
+        if lost {
+            return Self::Connect { url: "server".into(), reason: status.message().to_owned() };
+        }
+        let decoded = (!status.details().is_empty()).then(|| v1::Rejection::decode(status.details()).ok()).flatten();
+        Self::Refused {
+            code: status.code(),
+            message: status.message().to_owned(),
+            refusal: decoded.map(|wire| Box::new(wire.into())),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_details_of_a_status_become_the_refusal_and_garbage_does_not() {
+        let wire = v1::Rejection { step: Some(4), field: "q".into(), expected: "80".into(), given: "79".into() };
+        let with = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
+        let error = Error::from(with(wire.encode_to_vec()));
+        assert_eq!(error.refusal().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, given 79"));
+        assert_eq!(Error::from(with(vec![0xff, 0xff, 0xff])).refusal(), None);
+        assert_eq!(Error::from(tonic::Status::not_found("scene")).refusal(), None);
+    }
+}

@@ -1,0 +1,293 @@
+//! Pictures: a request with camera and size in, whole PNG or RGBA8 frames with their step and stage times out.
+
+use std::pin::Pin;
+use std::task::{Context, Poll};
+
+use bytes::Bytes;
+use modalcast_proto::v1;
+use v1::frame_service_client::FrameServiceClient;
+
+use crate::assemble::{Part, Piece, Replies};
+use crate::client::Client;
+use crate::error::{Error, Result, malformed};
+
+/// Milliseconds per stage of the work, by the server's stage names, in its order.
+pub type Stages = Vec<(String, f32)>;
+
+/// How the bytes of a frame are encoded: 8-bit sRGB, top row first.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Format {
+    #[default]
+    Png,
+    Rgba,
+}
+
+/// Which steps a subscriber gets.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Delivery {
+    /// Every step, in order; a slow reader holds back the writer.
+    #[default]
+    Lossless,
+    /// The newest; what was passed over is counted.
+    Latest,
+}
+
+/// Where the camera is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum View {
+    LookAt {
+        eye: [f64; 3],
+        target: [f64; 3],
+        up: [f64; 3],
+    },
+    /// `world_from_camera`, row-major 3x4; x right, y up, looking along -z.
+    Pose([f64; 12]),
+}
+
+/// How the camera sees.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Lens {
+    /// Vertical field of view in degrees.
+    FieldOfView(f64),
+    /// Pinhole in pixels; (0, 0) is the top left corner.
+    Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
+}
+
+/// A camera. `clip` is near and far in scene units; `None` is fitted to the scene.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    pub view: View,
+    pub lens: Lens,
+    pub clip: Option<(f64, f64)>,
+}
+
+/// What a picture looks like. Without a camera the server frames the scene; 0 x 0 is 1280 x 720.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Picture {
+    pub width: u32,
+    pub height: u32,
+    pub format: Format,
+    pub camera: Option<Camera>,
+}
+
+/// Which step a single reply shows.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) enum Wanted {
+    #[default]
+    Newest,
+    Exactly(u64),
+    AtLeast(u64),
+}
+
+/// A request for one frame.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FrameRequest {
+    pub scene: String,
+    pub picture: Picture,
+    at: Wanted,
+    deadline_ms: u32,
+}
+
+impl FrameRequest {
+    /// The newest state of a scene, 1280 x 720, PNG.
+    pub fn of(scene: &str) -> Self {
+        Self { scene: scene.to_owned(), ..Self::default() }
+    }
+
+    /// Another size in pixels.
+    #[must_use]
+    pub const fn size(mut self, width: u32, height: u32) -> Self {
+        (self.picture.width, self.picture.height) = (width, height);
+        self
+    }
+
+    /// Exactly this step of the current run; refused when it is gone.
+    #[must_use]
+    pub const fn exactly(mut self, step: u64) -> Self {
+        self.at = Wanted::Exactly(step);
+        self
+    }
+
+    /// This step of the current run or a later one.
+    #[must_use]
+    pub const fn at_least(mut self, step: u64) -> Self {
+        self.at = Wanted::AtLeast(step);
+        self
+    }
+
+    /// How long the server may wait for the step and the picture; 0 is its own default.
+    #[must_use]
+    pub const fn within_ms(mut self, milliseconds: u32) -> Self {
+        self.deadline_ms = milliseconds;
+        self
+    }
+}
+
+/// A subscription to frames; `frames` of 0 never ends.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FramesRequest {
+    pub scene: String,
+    pub picture: Picture,
+    pub delivery: Delivery,
+    pub frames: u64,
+}
+
+/// One frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// The step that it shows.
+    pub step: v1::StepId,
+    pub width: u32,
+    pub height: u32,
+    pub format: Format,
+    /// The file (PNG) or width x height x 4 bytes (RGBA).
+    pub bytes: Bytes,
+    /// Steps passed over since the last frame of the stream.
+    pub skipped: u64,
+    pub stages: Stages,
+}
+
+impl Client {
+    /// Renders one frame.
+    ///
+    /// # Errors
+    /// `Refused` when scene or step do not exist or the deadline passed; `Malformed`; `Connect`.
+    pub async fn frame(&self, request: &FrameRequest) -> Result<Frame> {
+        use v1::render_frame_request::Step;
+        let wire = v1::RenderFrameRequest {
+            scene: request.scene.clone(),
+            picture: Some(request.picture.into()),
+            step: match request.at {
+                Wanted::Newest => None,
+                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
+                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
+            },
+            deadline_ms: request.deadline_ms,
+        };
+        let stream = FrameServiceClient::new(self.channel.clone()).render_frame(wire).await?.into_inner();
+        let frame = Replies::new(stream, self.reply_limit).next().await;
+        frame.unwrap_or(Err(Error::Ended { what: "the frame" }))
+    }
+
+    /// Subscribes to frames. When this returns, the server has accepted: no later step is missed.
+    ///
+    /// # Errors
+    /// `Refused` when there is no such scene; `Connect`.
+    pub async fn frames(&self, request: &FramesRequest) -> Result<Frames> {
+        let wire = v1::StreamFramesRequest {
+            scene: request.scene.clone(),
+            picture: Some(request.picture.into()),
+            delivery: v1::Delivery::from(request.delivery).into(),
+            frames: request.frames,
+        };
+        let stream = FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await?.into_inner();
+        Ok(Frames(Replies::new(stream, self.reply_limit)))
+    }
+}
+
+/// A stream of frames; dropping it unsubscribes.
+pub struct Frames(Replies<v1::StreamFramesResponse>);
+
+impl Frames {
+    /// The next frame, or `None` when the server has sent as many as asked for.
+    pub async fn next(&mut self) -> Option<Result<Frame>> {
+        self.0.next().await
+    }
+}
+
+impl tokio_stream::Stream for Frames {
+    type Item = Result<Frame>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.0.poll(context)
+    }
+}
+
+impl Part for v1::RenderFrameResponse {
+    type Head = v1::FrameHead;
+    type Whole = Frame;
+    const WHAT: &'static str = "frame";
+
+    fn piece(self) -> Result<Piece<Self::Head>> {
+        piece(self.chunk)
+    }
+
+    fn whole(head: Self::Head, bytes: Bytes) -> Result<Frame> {
+        frame(head, bytes)
+    }
+}
+
+impl Part for v1::StreamFramesResponse {
+    type Head = v1::FrameHead;
+    type Whole = Frame;
+    const WHAT: &'static str = "frame";
+
+    fn piece(self) -> Result<Piece<Self::Head>> {
+        piece(self.chunk)
+    }
+
+    fn whole(head: Self::Head, bytes: Bytes) -> Result<Frame> {
+        frame(head, bytes)
+    }
+}
+
+fn piece(chunk: Option<v1::FrameChunk>) -> Result<Piece<v1::FrameHead>> {
+    let chunk = chunk.ok_or_else(|| malformed("frame.chunk", "a chunk", "none"))?;
+    let head = chunk.head.map(|head| (head.total, head)).map(|(total, head)| (head, total));
+    Ok(Piece { head, offset: chunk.offset, data: chunk.data })
+}
+
+fn frame(head: v1::FrameHead, bytes: Bytes) -> Result<Frame> {
+    let pixels = 4 * u64::from(head.width) * u64::from(head.height);
+    let format = match head.format() {
+        v1::Format::Png => Format::Png,
+        v1::Format::Rgba if bytes.len() as u64 == pixels => Format::Rgba,
+        v1::Format::Rgba => return Err(malformed("frame.total", format!("{pixels} bytes"), bytes.len())),
+        v1::Format::Unspecified => return Err(malformed("frame.format", "PNG or RGBA", head.format)),
+    };
+    let step = head.step.ok_or_else(|| malformed("frame.step", "a step", "none"))?;
+    let stages = stages(head.stages);
+    Ok(Frame { step, width: head.width, height: head.height, format, bytes, skipped: head.skipped, stages })
+}
+
+pub(crate) fn stages(wire: Vec<v1::StageTime>) -> Stages {
+    wire.into_iter().map(|time| (time.stage, time.milliseconds)).collect()
+}
+
+impl From<Delivery> for v1::Delivery {
+    fn from(delivery: Delivery) -> Self {
+        match delivery {
+            Delivery::Lossless => Self::Lossless,
+            Delivery::Latest => Self::Latest,
+        }
+    }
+}
+
+impl From<Picture> for v1::Picture {
+    fn from(picture: Picture) -> Self {
+        let format = match picture.format {
+            Format::Png => v1::Format::Png,
+            Format::Rgba => v1::Format::Rgba,
+        };
+        let camera = picture.camera.map(Into::into);
+        Self { width: picture.width, height: picture.height, format: format.into(), camera }
+    }
+}
+
+impl From<Camera> for v1::Camera {
+    fn from(camera: Camera) -> Self {
+        use v1::camera::{Lens as WireLens, View as WireView};
+        let view = match camera.view {
+            View::LookAt { eye, target, up } => {
+                WireView::LookAt(v1::LookAt { eye: eye.into(), target: target.into(), up: up.into() })
+            }
+            View::Pose(pose) => WireView::Pose(v1::Pose { world_from_camera: pose.into() }),
+        };
+        let lens = match camera.lens {
+            Lens::FieldOfView(degrees) => WireLens::FieldOfView(degrees),
+            Lens::Intrinsics { fx, fy, cx, cy } => WireLens::Intrinsics(v1::Intrinsics { fx, fy, cx, cy }),
+        };
+        let (near, far) = camera.clip.unwrap_or_default();
+        Self { view: Some(view), lens: Some(lens), near, far }
+    }
+}

@@ -1,0 +1,294 @@
+//! Descriptions of scenes and rows of U as owned values: arrays put together from chunks and checked against counts.
+
+use std::collections::BTreeMap;
+
+use bytes::Bytes;
+use modalcast_proto::v1;
+
+use crate::assemble::{Assembler, Piece, floats, words};
+use crate::client::Client;
+use crate::error::{Error, Result, malformed};
+
+/// What to know of a server before sending anything.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ServerInfo {
+    pub version: String,
+    /// The deformer in use: `cpu`, `cuda` or `reference`.
+    pub backend: String,
+    /// The CUDA device, or why there is none.
+    pub device: String,
+    /// The OpenGL renderer's own name.
+    pub renderer: String,
+    /// Whether that renderer runs on the CPU.
+    pub software: bool,
+    pub limits: v1::Limits,
+}
+
+/// The arrays that [`Client::describe`] can fetch.
+pub use modalcast_proto::v1::Array;
+
+/// How a domain hangs on its parent.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Attachment {
+    pub parent: usize,
+    /// `parent_from_child` at rest, row-major 3x4.
+    pub frame: [f32; 12],
+    /// Vertices of the parent that carry the frame; empty on a rigid parent.
+    pub rows: Vec<u32>,
+}
+
+/// One domain: n vertices, r modes, and the arrays that were asked for (the others are empty).
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Domain {
+    pub index: usize,
+    pub name: String,
+    /// n: U has 3n rows.
+    pub vertices: usize,
+    /// r: U has r columns.
+    pub rank: usize,
+    pub corners: usize,
+    pub triangles: usize,
+    pub attachment: Option<Attachment>,
+    /// `world_from_domain` at rest, row-major 3x4.
+    pub placement: [f32; 12],
+    /// A domain with a smaller index whose coordinates this one shares.
+    pub shares_q_with: Option<usize>,
+    /// Instances of each other have the same.
+    pub shape: usize,
+    /// (rad/s)^2, one per mode; empty when unknown.
+    pub eigenvalues: Vec<f64>,
+    pub notes: BTreeMap<String, String>,
+    /// Corner indices, three per triangle.
+    pub indices: Vec<u32>,
+    /// Vertex of each corner: rows 3v, 3v + 1, 3v + 2 of U.
+    pub corner_vertices: Vec<u32>,
+    /// Three per vertex.
+    pub rest_positions: Vec<f32>,
+    /// Two per corner.
+    pub uvs: Vec<f32>,
+    /// Three per corner.
+    pub rest_normals: Vec<f32>,
+}
+
+/// A scene and its domains.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneDescription {
+    pub info: v1::SceneInfo,
+    pub domains: Vec<Domain>,
+}
+
+/// Chosen rows of U: for each vertex asked for, three rows of r entries.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModeRows {
+    pub rank: usize,
+    pub rows: Vec<f32>,
+}
+
+impl ModeRows {
+    /// The 3 x r rows of the `place`-th vertex asked for, row-major.
+    pub fn of(&self, place: usize) -> &[f32] {
+        &self.rows[3 * self.rank * place..][..3 * self.rank]
+    }
+}
+
+impl Client {
+    /// Describes all domains of a scene, with the arrays asked for.
+    ///
+    /// # Errors
+    /// `Refused` when there is no such scene; `Malformed` when lengths and counts contradict each other.
+    pub async fn describe(&self, scene: &str, arrays: &[Array]) -> Result<SceneDescription> {
+        self.describe_domains(scene, &[], arrays).await
+    }
+
+    /// As [`Self::describe`], for the domains named; none means all.
+    ///
+    /// # Errors
+    /// As [`Self::describe`].
+    pub async fn describe_domains(&self, scene: &str, domains: &[u32], arrays: &[Array]) -> Result<SceneDescription> {
+        let request = v1::DescribeSceneRequest {
+            scene: scene.to_owned(),
+            domains: domains.to_vec(),
+            arrays: arrays.iter().map(|array| *array as i32).collect(),
+        };
+        let mut stream = self.scenes().describe_scene(request).await?.into_inner();
+        let mut collected = Collected::new(self.reply_limit);
+        while let Some(message) = stream.message().await? {
+            collected.add(message)?;
+        }
+        collected.finish(arrays)
+    }
+
+    /// The rows of U of chosen vertices of a domain; none chosen means all.
+    ///
+    /// # Errors
+    /// `Refused` when scene, domain or vertex do not exist; `Malformed` when the reply has not 3 r numbers per vertex.
+    pub async fn modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
+        let domain = u32::try_from(domain).map_err(|_| malformed("modes.domain", "a 32-bit index", domain))?;
+        let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
+        let mut stream = self.scenes().read_modes(request).await?.into_inner();
+        let mut assembler = Assembler::new("modes", self.reply_limit);
+        let mut whole = None;
+        while let Some(message) = stream.message().await? {
+            let head = (!assembler.is_open()).then_some((message.rank, message.total));
+            let done = assembler.push(Piece { head, offset: message.offset, data: message.data })?;
+            whole = done.or(whole);
+        }
+        if assembler.is_open() {
+            return Err(Error::Ended { what: "the last chunk of the modes" });
+        }
+        // A rigid domain has no rows; a server may answer that with no message at all.
+        let (rank, bytes) = whole.unwrap_or((0, Bytes::new()));
+        let rows = ModeRows { rank: rank as usize, rows: floats(&bytes) };
+        let expected = 12_u64.saturating_mul(u64::from(rank)).saturating_mul(vertices.len() as u64);
+        if !vertices.is_empty() && bytes.len() as u64 != expected {
+            return Err(malformed("modes.total", format!("{expected} bytes"), bytes.len()));
+        }
+        Ok(rows)
+    }
+}
+
+/// The parts of a description as they come in.
+struct Collected {
+    limit: u64,
+    kept: u64,
+    info: Option<v1::SceneInfo>,
+    domains: Vec<Domain>,
+    places: BTreeMap<u32, usize>,
+    open: Option<((u32, i32), Assembler<()>)>,
+}
+
+impl Collected {
+    const fn new(limit: u64) -> Self {
+        Self { limit, kept: 0, info: None, domains: vec![], places: BTreeMap::new(), open: None }
+    }
+
+    fn add(&mut self, message: v1::DescribeSceneResponse) -> Result<()> {
+        use v1::describe_scene_response::Part;
+        match message.part {
+            Some(Part::Scene(info)) => self.info = Some(info),
+            Some(Part::Domains(list)) => {
+                for wire in list.domains {
+                    self.places.insert(wire.domain, self.domains.len());
+                    self.domains.push(domain(wire)?);
+                }
+            }
+            Some(Part::Chunk(chunk)) => self.chunk(chunk)?,
+            None => return Err(malformed("describe.part", "a part", "none")),
+        }
+        Ok(())
+    }
+
+    /// Adds a chunk of an array; chunks of one array follow each other.
+    fn chunk(&mut self, chunk: v1::ArrayChunk) -> Result<()> {
+        let key = (chunk.domain, chunk.array);
+        let mut assembler = match self.open.take() {
+            Some((open, assembler)) if open == key => assembler,
+            Some((open, _)) => {
+                return Err(malformed("describe.chunk", format!("the rest of {open:?}"), format!("{key:?}")));
+            }
+            None => Assembler::new("describe.chunk", self.limit),
+        };
+        let head = (!assembler.is_open()).then_some(((), chunk.total));
+        match assembler.push(Piece { head, offset: chunk.offset, data: chunk.data })? {
+            None => self.open = Some((key, assembler)),
+            Some(((), bytes)) => self.store(key, &bytes)?,
+        }
+        Ok(())
+    }
+
+    fn store(&mut self, (index, array): (u32, i32), bytes: &[u8]) -> Result<()> {
+        self.kept = self.kept.saturating_add(bytes.len() as u64);
+        if self.kept > self.limit {
+            return Err(malformed("describe.chunk", format!("at most {} bytes in all", self.limit), self.kept));
+        }
+        let place = self.places.get(&index).and_then(|place| self.domains.get_mut(*place));
+        let Some(domain) = place else {
+            return Err(malformed("describe.chunk.domain", "a domain described before", index));
+        };
+        match Array::try_from(array) {
+            Ok(Array::Indices) => domain.indices = words(bytes),
+            Ok(Array::CornerVertices) => domain.corner_vertices = words(bytes),
+            Ok(Array::RestPositions) => domain.rest_positions = floats(bytes),
+            Ok(Array::Uvs) => domain.uvs = floats(bytes),
+            Ok(Array::RestNormals) => domain.rest_normals = floats(bytes),
+            _ => return Err(malformed("describe.chunk.array", "a known array", array)),
+        }
+        Ok(())
+    }
+
+    fn finish(self, arrays: &[Array]) -> Result<SceneDescription> {
+        if self.open.is_some() {
+            return Err(Error::Ended { what: "the last chunk of an array" });
+        }
+        let info = self.info.ok_or_else(|| malformed("describe.scene", "a scene", "none"))?;
+        for domain in &self.domains {
+            for array in arrays {
+                domain.check(*array)?;
+            }
+        }
+        Ok(SceneDescription { info, domains: self.domains })
+    }
+}
+
+impl Domain {
+    /// Whether an array that was asked for has the length that the counts say, and indices within them.
+    fn check(&self, array: Array) -> Result<()> {
+        let (got, wanted) = match array {
+            Array::Indices => (self.indices.len(), 3 * self.triangles),
+            Array::CornerVertices => (self.corner_vertices.len(), self.corners),
+            Array::RestPositions => (self.rest_positions.len(), 3 * self.vertices),
+            Array::RestNormals => (self.rest_normals.len(), 3 * self.corners),
+            // A mesh without texture coordinates has none.
+            Array::Uvs if self.uvs.is_empty() => (0, 0),
+            Array::Uvs => (self.uvs.len(), 2 * self.corners),
+            Array::Unspecified => (0, 0),
+        };
+        let field = |what: &str| format!("domain '{}': {what}", self.name);
+        if got != wanted {
+            return Err(malformed(field(array.as_str_name()), format!("{wanted} numbers"), got));
+        }
+        let below = |list: &[u32], limit: usize| list.iter().all(|index| (*index as usize) < limit);
+        if !below(&self.indices, self.corners) {
+            return Err(malformed(field("indices"), format!("below {}", self.corners), "a larger one"));
+        }
+        if !below(&self.corner_vertices, self.vertices) {
+            return Err(malformed(field("corner_vertices"), format!("below {}", self.vertices), "a larger one"));
+        }
+        Ok(())
+    }
+}
+
+/// A domain off the wire.
+fn domain(wire: v1::DomainDescription) -> Result<Domain> {
+    let place = |field: &str, bytes: &[u8]| match <[f32; 12]>::try_from(floats(bytes)) {
+        Ok(entries) if bytes.len() == 48 => Ok(entries),
+        _ => Err(malformed(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len())),
+    };
+    let attachment = match wire.parent {
+        None => None,
+        Some(parent) => Some(Attachment {
+            parent: parent as usize,
+            frame: place("attachment_frame", &wire.attachment_frame)?,
+            rows: wire.attachment_rows.clone(),
+        }),
+    };
+    if !wire.eigenvalues.is_empty() && wire.eigenvalues.len() != wire.rank as usize {
+        let field = format!("domain '{}': eigenvalues", wire.name);
+        return Err(malformed(field, format!("none or {}", wire.rank), wire.eigenvalues.len()));
+    }
+    Ok(Domain {
+        index: wire.domain as usize,
+        placement: place("placement", &wire.placement)?,
+        attachment,
+        vertices: wire.vertices as usize,
+        rank: wire.rank as usize,
+        corners: wire.corners as usize,
+        triangles: wire.triangles as usize,
+        shares_q_with: wire.shares_q_with.map(|twin| twin as usize),
+        shape: wire.shape as usize,
+        name: wire.name,
+        eigenvalues: wire.eigenvalues,
+        notes: wire.notes.into_iter().collect(),
+        ..Domain::default()
+    })
+}

@@ -1,0 +1,209 @@
+//! Deformed vertices: positions per row of U and normals per corner, world relative to the scene's origin, one set per
+//! step.
+
+use std::ops::Range;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+
+use bytes::Bytes;
+use modalcast_proto::v1;
+use v1::vertex_service_client::VertexServiceClient;
+
+use crate::assemble::{Part, Piece, Replies, floats};
+use crate::client::Client;
+use crate::error::{Error, Result, malformed};
+use crate::frames::{Delivery, Stages, Wanted, stages};
+
+/// A request for one step's vertices.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct VertexRequest {
+    pub scene: String,
+    /// Domains by index; empty means all.
+    pub domains: Vec<u32>,
+    pub positions_only: bool,
+    at: Wanted,
+    deadline_ms: u32,
+}
+
+impl VertexRequest {
+    /// All vertices of a scene's newest state, with normals.
+    pub fn of(scene: &str) -> Self {
+        Self { scene: scene.to_owned(), ..Self::default() }
+    }
+
+    /// Exactly this step of the current run; refused when it is gone.
+    #[must_use]
+    pub const fn exactly(mut self, step: u64) -> Self {
+        self.at = Wanted::Exactly(step);
+        self
+    }
+
+    /// This step of the current run or a later one.
+    #[must_use]
+    pub const fn at_least(mut self, step: u64) -> Self {
+        self.at = Wanted::AtLeast(step);
+        self
+    }
+
+    /// How long the server may wait for the step; 0 is its own default.
+    #[must_use]
+    pub const fn within_ms(mut self, milliseconds: u32) -> Self {
+        self.deadline_ms = milliseconds;
+        self
+    }
+}
+
+/// A subscription to vertices; `steps` of 0 never ends.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct VertexStreamRequest {
+    pub scene: String,
+    pub domains: Vec<u32>,
+    pub positions_only: bool,
+    pub delivery: Delivery,
+    pub steps: u64,
+}
+
+/// The vertices of one step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VertexSet {
+    pub step: v1::StepId,
+    /// The origin of all positions, metres.
+    pub origin: Vec<f64>,
+    /// Per chosen domain: its index, its vertices and its corners.
+    pub domains: Vec<(u32, u32, u32)>,
+    /// Three per vertex, all chosen domains after each other.
+    pub positions: Vec<f32>,
+    /// Three per corner; empty when they were left out.
+    pub normals: Vec<f32>,
+    pub skipped: u64,
+    pub stages: Stages,
+}
+
+impl VertexSet {
+    /// Where the positions of the `place`-th chosen domain are.
+    pub fn range(&self, place: usize) -> Range<usize> {
+        let before: usize = self.domains[..place].iter().map(|(_, vertices, _)| 3 * *vertices as usize).sum();
+        before..before + 3 * self.domains[place].1 as usize
+    }
+}
+
+impl Client {
+    /// The vertices of one step.
+    ///
+    /// # Errors
+    /// `Refused` when scene, domain or step do not exist or the deadline passed; `Malformed`; `Connect`.
+    pub async fn vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
+        use v1::get_vertices_request::Step;
+        let wire = v1::GetVerticesRequest {
+            scene: request.scene.clone(),
+            selection: Some(selection(&request.domains, request.positions_only)),
+            step: match request.at {
+                Wanted::Newest => None,
+                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
+                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
+            },
+            deadline_ms: request.deadline_ms,
+        };
+        let stream = VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await?.into_inner();
+        let set = Replies::new(stream, self.reply_limit).next().await;
+        set.unwrap_or(Err(Error::Ended { what: "the vertices" }))
+    }
+
+    /// Subscribes to the vertices of every step. When this returns, the server has accepted.
+    ///
+    /// # Errors
+    /// `Refused` when scene or domain do not exist; `Connect`.
+    pub async fn vertex_sets(&self, request: &VertexStreamRequest) -> Result<VertexSets> {
+        let wire = v1::StreamVerticesRequest {
+            scene: request.scene.clone(),
+            selection: Some(selection(&request.domains, request.positions_only)),
+            delivery: v1::Delivery::from(request.delivery).into(),
+            steps: request.steps,
+        };
+        let stream = VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await?.into_inner();
+        Ok(VertexSets(Replies::new(stream, self.reply_limit)))
+    }
+}
+
+/// A stream of vertex sets; dropping it unsubscribes.
+pub struct VertexSets(Replies<v1::StreamVerticesResponse>);
+
+impl VertexSets {
+    /// The next step's vertices, or `None` when the server has sent as many as asked for.
+    pub async fn next(&mut self) -> Option<Result<VertexSet>> {
+        self.0.next().await
+    }
+}
+
+impl tokio_stream::Stream for VertexSets {
+    type Item = Result<VertexSet>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.0.poll(context)
+    }
+}
+
+impl Part for v1::GetVerticesResponse {
+    type Head = v1::VertexHead;
+    type Whole = VertexSet;
+    const WHAT: &'static str = "vertices";
+
+    fn piece(self) -> Result<Piece<Self::Head>> {
+        piece(self.chunk)
+    }
+
+    fn whole(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
+        set(head, &bytes)
+    }
+}
+
+impl Part for v1::StreamVerticesResponse {
+    type Head = v1::VertexHead;
+    type Whole = VertexSet;
+    const WHAT: &'static str = "vertices";
+
+    fn piece(self) -> Result<Piece<Self::Head>> {
+        piece(self.chunk)
+    }
+
+    fn whole(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
+        set(head, &bytes)
+    }
+}
+
+fn selection(domains: &[u32], positions_only: bool) -> v1::VertexSelection {
+    v1::VertexSelection { domains: domains.to_vec(), positions_only }
+}
+
+fn piece(chunk: Option<v1::VertexChunk>) -> Result<Piece<v1::VertexHead>> {
+    let chunk = chunk.ok_or_else(|| malformed("vertices.chunk", "a chunk", "none"))?;
+    let head = chunk.head.map(|head| (head.total, head)).map(|(total, head)| (head, total));
+    Ok(Piece { head, offset: chunk.offset, data: chunk.data })
+}
+
+fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
+    let counts = (head.domains.len(), head.vertices.len(), head.corners.len());
+    if counts.0 != counts.1 || counts.0 != counts.2 {
+        return Err(malformed("vertices.domains", "one count of vertices and corners each", format!("{counts:?}")));
+    }
+    let sum = |list: &[u32]| 12 * list.iter().map(|count| u64::from(*count)).sum::<u64>();
+    if sum(&head.vertices) != head.position_bytes {
+        return Err(malformed("vertices.position_bytes", sum(&head.vertices), head.position_bytes));
+    }
+    let total = bytes.len() as u64;
+    if total != head.position_bytes && total != head.position_bytes + sum(&head.corners) {
+        let expected = format!("{} or {}", head.position_bytes, head.position_bytes + sum(&head.corners));
+        return Err(malformed("vertices.total", expected, total));
+    }
+    let (positions, normals) = bytes.split_at(head.position_bytes as usize);
+    let domains = head.domains.iter().zip(&head.vertices).zip(&head.corners);
+    Ok(VertexSet {
+        step: head.step.ok_or_else(|| malformed("vertices.step", "a step", "none"))?,
+        origin: head.origin,
+        domains: domains.map(|((domain, vertices), corners)| (*domain, *vertices, *corners)).collect(),
+        positions: floats(positions),
+        normals: floats(normals),
+        skipped: head.skipped,
+        stages: stages(head.stages),
+    })
+}

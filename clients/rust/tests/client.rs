@@ -1,0 +1,239 @@
+//! The client against a small server of its own, over a real socket, with the default limits of gRPC.
+
+mod fake;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fake::{FakeDomain, World, serve};
+use modalcast_client::{Array, Client, Error, Format, FrameRequest, FramesRequest, Picture, Policy, Step};
+use modalcast_client::{VertexRequest, VertexStreamRequest};
+use tokio::sync::Semaphore;
+
+/// One domain of n vertices and two modes whose entries say where they are.
+fn world(vertices: usize) -> World {
+    let rest = (0..3 * vertices).map(|at| at as f32).collect();
+    let modes = (0..6 * vertices).map(|at| (at % 1000) as f32).collect();
+    World::new(vec![FakeDomain::new(0, rest, 2, modes)])
+}
+
+async fn connected(world: World) -> (Arc<World>, Client) {
+    let world = Arc::new(world);
+    let url = serve(Arc::clone(&world)).await;
+    (world, Client::connect(&url).await.expect("connects"))
+}
+
+#[tokio::test]
+async fn arrays_and_modes_above_four_mebibytes_come_whole() {
+    let (world, client) = connected(world(300_000)).await;
+    let described =
+        client.describe("toy", &[Array::RestPositions, Array::Indices, Array::Uvs]).await.expect("describes");
+    assert_eq!(described.domains[0].rest_positions, world.domains[0].rest);
+    assert_eq!(described.domains[0].indices.len(), 3 * described.domains[0].triangles);
+    assert!(described.domains[0].uvs.is_empty());
+    let rows = client.modes("toy", 0, &[]).await.expect("reads");
+    assert_eq!((rows.rank, &rows.rows), (2, &world.domains[0].modes));
+    let chosen = client.modes("toy", 0, &[7, 2]).await.expect("reads");
+    assert_eq!((chosen.of(0), chosen.of(1)), (&rows.rows[42..48], &rows.rows[12..18]));
+    let refusal = client.with_reply_limit(1000).modes("toy", 0, &[]).await.expect_err("too much").to_string();
+    assert!(refusal.contains("modes.total") && refusal.contains("1000"), "{refusal}");
+}
+
+#[tokio::test]
+async fn a_frame_above_four_mebibytes_comes_whole_and_names_its_step() {
+    let (_, client) = connected(world(4)).await;
+    let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    drive.step(&Step::new(5, 0.1).q(0, &[1.0, 2.0])).await.expect("sent");
+    drive.settle().await.expect("acknowledged");
+    let mut request = FrameRequest::of("toy").size(1920, 1080).at_least(5);
+    request.picture.format = Format::Rgba;
+    let frame = client.frame(&request).await.expect("comes");
+    assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
+    assert!(frame.bytes.iter().all(|byte| *byte == 5));
+    assert_eq!(frame.stages, [("draw".to_owned(), 2.0)]);
+}
+
+#[tokio::test]
+async fn a_subscription_made_before_the_first_step_gets_every_step() {
+    let (world, client) = connected(world(4)).await;
+    let picture = Picture { width: 600, height: 600, format: Format::Rgba, camera: None };
+    let request = FramesRequest { scene: "toy".into(), picture, frames: 20, ..FramesRequest::default() };
+    let mut frames = client.frames(&request).await.expect("accepted");
+    let request = VertexStreamRequest { scene: "toy".into(), steps: 20, ..VertexStreamRequest::default() };
+    let mut sets = client.vertex_sets(&request).await.expect("accepted");
+    let mut drive = client.drive("toy", Policy::Lossless, 3).await.expect("opens");
+    assert_eq!((drive.run, drive.window), (1, 3));
+    for number in 0..20 {
+        drive.step(&Step::new(number, 0.0).q(0, &[number as f32, 0.0])).await.expect("sent");
+    }
+    assert_eq!(drive.take_acks().first().map(|ack| ack.step), Some(0));
+    let end = drive.finish().await.expect("all acknowledged");
+    assert_eq!((end.sent, end.acknowledged, end.refused), (20, Some(19), 0));
+    for number in 0..20 {
+        assert_eq!(frames.next().await.expect("a frame").expect("whole").step.number, number);
+        let set = sets.next().await.expect("a set").expect("whole");
+        assert_eq!((set.step.number, set.range(0)), (number, 0..12));
+        assert_eq!(set.positions[3], 3.0 + 6.0 * number as f32);
+    }
+    assert!(frames.next().await.is_none() && sets.next().await.is_none());
+    assert_eq!(world.steps.lock().expect("lock").len(), 20);
+}
+
+#[tokio::test]
+async fn a_step_beyond_the_window_waits_for_an_acknowledgement() {
+    let mut slow = world(4);
+    (slow.window, slow.permits) = (2, Semaphore::new(0));
+    let (world, client) = connected(slow).await;
+    let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    let step = |number| Step::new(number, 0.0).q(0, &[0.0, 0.0]);
+    drive.step(&step(0)).await.expect("room");
+    drive.step(&step(1)).await.expect("room");
+    let third = step(2);
+    let waited = tokio::time::timeout(Duration::from_millis(200), drive.step(&third)).await;
+    assert!(waited.is_err(), "the window of two let a third step pass");
+    world.permits.add_permits(100);
+    drive.step(&third).await.expect("room again");
+    assert_eq!(drive.finish().await.expect("acknowledged").acknowledged, Some(2));
+}
+
+#[tokio::test]
+async fn a_refused_step_is_a_typed_error_and_the_stream_goes_on() {
+    let (world, client) = connected(world(4)).await;
+    let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    drive.step(&Step::new(0, 0.0).q(0, &[1.0])).await.ok();
+    let refusal = drive.settle().await.expect_err("one of two coordinates");
+    let words = refusal.refusal().expect("typed").clone();
+    assert_eq!((words.step, words.field.as_str()), (Some(0), "step.q"));
+    assert_eq!((words.expected.as_str(), words.given.as_str()), ("8 bytes", "4 bytes"));
+    drive.step(&Step::new(1, 0.0).q(0, &[1.0, 2.0])).await.expect("goes on");
+    let end = drive.finish().await.expect("goes on");
+    assert_eq!((end.sent, end.refused, end.acknowledged), (2, 1, Some(1)));
+    assert_eq!(world.steps.lock().expect("lock").len(), 1);
+}
+
+#[tokio::test]
+async fn a_second_writer_is_refused_until_the_first_has_gone() {
+    let (_, client) = connected(world(4)).await;
+    let first = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    let refusal = client.drive("toy", Policy::Latest, 0).await.err().expect("taken");
+    assert!(refusal.to_string().contains("another run"), "{refusal}");
+    drop(first);
+    let start = std::time::Instant::now();
+    while let Err(error) = client.drive("toy", Policy::Latest, 0).await {
+        assert!(start.elapsed() < Duration::from_secs(5), "{error}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+#[tokio::test]
+async fn refusals_of_calls_carry_what_the_server_said() {
+    let (_, client) = connected(world(4)).await;
+    for error in [
+        client.describe("none", &[]).await.expect_err("unknown"),
+        client.modes("none", 0, &[]).await.expect_err("unknown"),
+        client.frame(&FrameRequest::of("none")).await.expect_err("unknown"),
+        client.vertices(&VertexRequest::of("none")).await.expect_err("unknown"),
+        client.open_scene("none", "").await.expect_err("unknown"),
+    ] {
+        let Error::Refused { code, .. } = &error else { panic!("{error}") };
+        let refusal = error.refusal().expect("details");
+        assert_eq!((*code, refusal.field.as_str(), refusal.given.as_str()), (tonic::Code::NotFound, "scene", "none"));
+    }
+    assert!(matches!(Client::connect("http://127.0.0.1:1").await, Err(Error::Connect { .. })));
+    assert!(matches!(Client::connect("not a url").await, Err(Error::Connect { .. })));
+}
+
+#[tokio::test]
+async fn an_upload_sends_every_file_of_a_folder_under_its_relative_path() {
+    let (world, client) = connected(world(4)).await;
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::create_dir(folder.path().join("maps")).expect("folder");
+    let big: Vec<u8> = (0..3_000_000_u32).map(|at| (at % 251) as u8).collect();
+    std::fs::write(folder.path().join("scene.toml"), "x").expect("file");
+    std::fs::write(folder.path().join("maps/bark.png"), &big).expect("file");
+    std::fs::write(folder.path().join("empty"), "").expect("file");
+    client.upload_scene(folder.path(), "mine", "").await.expect("uploads");
+    let expected = [("empty".into(), vec![]), ("maps/bark.png".into(), big), ("scene.toml".into(), b"x".to_vec())];
+    assert_eq!(*world.uploads.lock().expect("lock"), expected);
+    assert!(matches!(client.upload_scene("/none".as_ref(), "mine", "").await, Err(Error::File { .. })));
+}
+
+/// Every package that `package` needs, by the lock file of the workspace.
+fn tree(package: &str) -> Vec<String> {
+    let lock = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../Cargo.lock")).expect("a lock file");
+    let mut found = vec![package.to_owned()];
+    for at in 0.. {
+        let Some(name) = found.get(at).cloned() else { break };
+        let entries = lock.split("[[package]]").filter(|entry| entry.contains(&format!("\nname = \"{name}\"\n")));
+        for line in entries.flat_map(str::lines).filter(|line| line.starts_with(" \"")) {
+            let needed = line.trim().trim_matches([' ', '"', ',']).split(' ').next().unwrap_or("").to_owned();
+            if !found.contains(&needed) {
+                found.push(needed);
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn the_library_needs_neither_cuda_nor_opengl() {
+    let drawing = ["cudarc", "glow", "khronos-egl", "modalcast"];
+    let of = |package| tree(package).into_iter().filter(|name| drawing.contains(&name.as_str())).count();
+    assert_eq!(of("modalcast-client"), 0);
+    assert!(tree("modalcast-client").iter().any(|name| name == "tonic"), "the walk finds what is there");
+    assert_eq!(of("modalcast"), drawing.len(), "the walk finds what the server needs");
+}
+
+/// Runs `modalcast-fetch`; its exit code and what it printed.
+async fn fetch(url: &str, arguments: &[&str]) -> (i32, String, String) {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalcast-fetch"));
+    command.args(arguments).args(["--server", url]);
+    let output = tokio::task::spawn_blocking(move || command.output().expect("starts")).await.expect("ends");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code().unwrap_or(-1), text(&output.stdout), text(&output.stderr))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_program_saves_frames_and_vertices_and_its_exit_code_says_what_went_wrong() {
+    let world = Arc::new(world(4));
+    let url = serve(Arc::clone(&world)).await;
+    let client = Client::connect(&url).await.expect("connects");
+    let folder = tempfile::tempdir().expect("folder");
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    // Steps flow until the program has what it wants: it subscribes at a time of its own.
+    let flow = tokio::spawn(async move {
+        for number in 0.. {
+            drive.step(&Step::new(number, 0.0).q(0, &[number as f32, 0.0])).await.expect("sent");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    });
+    let (frames, vertices) = (path("frames"), path("vertices.npy"));
+    let size = ["--scene", "toy", "--size", "20x10", "--format", "raw"];
+    let all = [&["frames", "--json", "--count", "3", "--open", "toy", "--out", &frames], &size[..]].concat();
+    let (code, out, fault) = fetch(&url, &all).await;
+    assert_eq!(code, 0, "{fault}");
+    let (ready, json) = out.trim().split_once('\n').expect("two lines");
+    let summary: serde_json::Value = serde_json::from_str(json).expect("JSON");
+    assert_eq!((ready, &summary["frames"], summary["stages_ms"]["draw"].as_f64()), ("ready", &3.into(), Some(2.0)));
+    for (index, step) in summary["steps"].as_array().expect("steps").iter().enumerate() {
+        let bytes = std::fs::read(format!("{frames}/frame_{index:05}.rgba")).expect("a frame");
+        assert_eq!((bytes.len(), u64::from(bytes[0])), (800, step.as_u64().expect("a number") % 256));
+    }
+    let (code, _, fault) = fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;
+    assert_eq!(code, 0, "{fault}");
+    assert_eq!(std::fs::read(&vertices).expect("a file").len(), 128 + 2 * 48);
+    flow.abort();
+    let single = path("one.rgba");
+    let one = [&["frame", "--out", &single], &size[..]].concat();
+    assert_eq!(fetch(&url, &one).await.0, 0);
+    assert_eq!(fetch(&url, &["info"]).await.0, 0);
+    assert!(fetch(&url, &["list", "--json"]).await.1.contains("\"scene\":\"toy\""));
+    assert_eq!(fetch(&url, &["frame", "--scene", "none", "--out", &path("x.png")]).await.0, 1);
+    assert_eq!(fetch(&url, &["frame", "--out", &path("x.png")]).await.0, 2);
+    assert_eq!(fetch("http://127.0.0.1:1", &["info"]).await.0, 3);
+    let nowhere = [&["frame", "--out", "/nowhere/x.png"], &size[..]].concat();
+    assert_eq!(fetch(&url, &nowhere).await.0, 4);
+    let late = ["frames", "--scene", "toy", "--out", &frames, "--timeout", "0.2"];
+    assert_eq!(fetch(&url, &late).await.0, 5);
+}

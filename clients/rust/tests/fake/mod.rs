@@ -1,0 +1,216 @@
+//! A small server for the tests of the clients: the wire contract in memory, x = T (x0 + U q) in f64, no engine.
+
+mod serve;
+
+use std::sync::Mutex;
+
+use modalcast_proto::v1;
+use tokio::sync::{Semaphore, broadcast};
+use tonic::Status;
+
+pub(crate) use serve::serve;
+
+/// One domain: its description, rest positions (3 per vertex) and U (3n x r, row-major).
+#[derive(Debug, Clone, Default)]
+pub(crate) struct FakeDomain {
+    pub(crate) wire: v1::DomainDescription,
+    pub(crate) rest: Vec<f32>,
+    pub(crate) modes: Vec<f32>,
+    pub(crate) indices: Vec<u32>,
+}
+
+/// Row-major 3x4 identity.
+pub(crate) const IDENTITY: [f32; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+
+impl FakeDomain {
+    /// A domain at the origin whose corners are its vertices.
+    pub(crate) fn new(index: u32, rest: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
+        let vertices = (rest.len() / 3) as u32;
+        assert_eq!(modes.len(), rest.len() * rank as usize, "U has 3n rows");
+        let indices: Vec<u32> = (0..vertices.saturating_sub(2)).flat_map(|first| first..first + 3).collect();
+        let wire = v1::DomainDescription {
+            domain: index,
+            name: format!("domain {index}"),
+            vertices,
+            rank,
+            corners: vertices,
+            triangles: (indices.len() / 3) as u32,
+            placement: pack(&IDENTITY).into(),
+            shape: index,
+            ..Default::default()
+        };
+        Self { wire, rest, modes, indices }
+    }
+
+    /// World positions at coordinates `q` and transform `pose`.
+    fn positions(&self, q: &[f32], pose: &[f32]) -> Vec<f32> {
+        let mut local: Vec<f64> = self.rest.iter().map(|number| f64::from(*number)).collect();
+        for (row, entry) in local.iter_mut().enumerate() {
+            let modes = &self.modes[row * q.len()..][..q.len()];
+            *entry += modes.iter().zip(q).map(|(mode, q)| f64::from(*mode) * f64::from(*q)).sum::<f64>();
+        }
+        let at = |row: usize, column: usize| f64::from(pose[4 * row + column]);
+        let world = |x: &[f64], row| at(row, 0) * x[0] + at(row, 1) * x[1] + at(row, 2) * x[2] + at(row, 3);
+        local.chunks(3).flat_map(|x| (0..3).map(move |row| world(x, row) as f32)).collect()
+    }
+}
+
+/// The state after a step, as subscribers get it.
+#[derive(Debug, Clone)]
+pub(crate) struct Shown {
+    pub(crate) step: v1::StepId,
+    pub(crate) positions: Vec<f32>,
+}
+
+/// A server's only scene, `toy`, and what it has seen.
+pub(crate) struct World {
+    pub(crate) domains: Vec<FakeDomain>,
+    pub(crate) bounds: [f64; 6],
+    pub(crate) window: u32,
+    /// Acknowledgements that may still be given; many unless a test holds them back.
+    pub(crate) permits: Semaphore,
+    pub(crate) steps: Mutex<Vec<v1::Step>>,
+    pub(crate) uploads: Mutex<Vec<(String, Vec<u8>)>>,
+    pub(crate) shown: broadcast::Sender<Shown>,
+    state: Mutex<State>,
+}
+
+struct State {
+    run: u64,
+    taken: bool,
+    q: Vec<Vec<f32>>,
+    transforms: Vec<Vec<f32>>,
+    last: Option<v1::StepId>,
+}
+
+impl World {
+    pub(crate) fn new(domains: Vec<FakeDomain>) -> Self {
+        let q = domains.iter().map(|domain| vec![0.0; domain.wire.rank as usize]).collect();
+        let transforms = domains.iter().map(|domain| floats(&domain.wire.placement)).collect();
+        let positions: Vec<f32> = domains
+            .iter()
+            .flat_map(|domain| domain.positions(&vec![0.0; domain.wire.rank as usize], &floats(&domain.wire.placement)))
+            .collect();
+        let mut bounds = [f64::MAX, f64::MAX, f64::MAX, f64::MIN, f64::MIN, f64::MIN];
+        for (at, number) in positions.iter().enumerate() {
+            bounds[at % 3] = bounds[at % 3].min(f64::from(*number));
+            bounds[at % 3 + 3] = bounds[at % 3 + 3].max(f64::from(*number));
+        }
+        Self {
+            domains,
+            bounds,
+            window: 8,
+            permits: Semaphore::new(Semaphore::MAX_PERMITS),
+            steps: Mutex::default(),
+            uploads: Mutex::default(),
+            shown: broadcast::channel(1 << 14).0,
+            state: Mutex::new(State { run: 0, taken: false, q, transforms, last: None }),
+        }
+    }
+
+    pub(crate) fn info(&self) -> v1::SceneInfo {
+        let sum = |count: fn(&v1::DomainDescription) -> u32| {
+            self.domains.iter().map(|domain| u64::from(count(&domain.wire))).sum::<u64>()
+        };
+        v1::SceneInfo {
+            scene: "toy".into(),
+            source: "toy".into(),
+            domains: self.domains.len() as u32,
+            vertices: sum(|wire| wire.vertices),
+            corners: sum(|wire| wire.corners),
+            triangles: sum(|wire| wire.triangles),
+            coordinates: sum(|wire| if wire.shares_q_with.is_some() { 0 } else { wire.rank }),
+            up: "y".into(),
+            unit: 1.0,
+            origin: vec![0.0; 3],
+            bounds: self.bounds.to_vec(),
+            last_step: self.state.lock().unwrap().last,
+            ..Default::default()
+        }
+    }
+
+    /// Takes the writer's place, or says who has it.
+    fn take(&self) -> Result<u64, v1::Rejection> {
+        let mut state = self.state.lock().unwrap();
+        if std::mem::replace(&mut state.taken, true) {
+            return Err(rejection(None, "scene", "a scene without a writer", "the writer of another run"));
+        }
+        state.run += 1;
+        Ok(state.run)
+    }
+
+    fn release(&self) {
+        self.state.lock().unwrap().taken = false;
+    }
+
+    /// Applies a step as a whole, or says what is wrong with it.
+    fn apply(&self, step: &v1::Step) -> Result<(), v1::Rejection> {
+        let wrong = |field, expected: String, given| Err(rejection(Some(step.number), field, expected, given));
+        let expected: usize = step.q_domains.iter().map(|index| self.rank(*index)).sum();
+        if step.q.len() != 4 * expected {
+            return wrong("step.q", format!("{} bytes", 4 * expected), format!("{} bytes", step.q.len()));
+        }
+        if step.transforms.len() != 48 * step.transform_domains.len() {
+            return wrong("step.transforms", "48 bytes each".into(), format!("{} bytes", step.transforms.len()));
+        }
+        let (q, transforms) = (floats(&step.q), floats(&step.transforms));
+        if !q.iter().chain(&transforms).all(|number| number.is_finite()) {
+            return wrong("step", "finite numbers".into(), "others".into());
+        }
+        let mut state = self.state.lock().unwrap();
+        let mut first = 0;
+        for index in &step.q_domains {
+            let rank = self.rank(*index);
+            state.q[*index as usize] = q[first..][..rank].to_vec();
+            first += rank;
+        }
+        for (index, pose) in step.transform_domains.iter().zip(transforms.chunks(12)) {
+            state.transforms[*index as usize] = pose.to_vec();
+        }
+        let id = v1::StepId { run: state.run, number: step.number, time: step.time };
+        state.last = Some(id);
+        drop(state);
+        self.steps.lock().unwrap().push(step.clone());
+        self.shown.send(self.now()).ok();
+        Ok(())
+    }
+
+    fn rank(&self, domain: u32) -> usize {
+        self.domains[domain as usize].wire.rank as usize
+    }
+
+    /// The state after the last step.
+    pub(crate) fn now(&self) -> Shown {
+        let state = self.state.lock().unwrap();
+        let q = |index: usize| {
+            let owner = self.domains[index].wire.shares_q_with.map_or(index, |twin| twin as usize);
+            &state.q[owner]
+        };
+        let domains = self.domains.iter().enumerate();
+        let positions = domains.flat_map(|(index, domain)| domain.positions(q(index), &state.transforms[index]));
+        Shown { step: state.last.unwrap_or_default(), positions: positions.collect() }
+    }
+}
+
+pub(crate) fn rejection(
+    step: Option<u64>,
+    field: &str,
+    expected: impl ToString,
+    given: impl ToString,
+) -> v1::Rejection {
+    v1::Rejection { step, field: field.into(), expected: expected.to_string(), given: given.to_string() }
+}
+
+/// A status with a rejection in its details.
+fn refuse(code: tonic::Code, rejection: &v1::Rejection) -> Status {
+    let details = prost::Message::encode_to_vec(rejection);
+    Status::with_details(code, format!("{}: {}", rejection.field, rejection.given), details.into())
+}
+
+pub(crate) fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytes.chunks_exact(4).map(|word| f32::from_le_bytes(word.try_into().unwrap())).collect()
+}
+
+pub(crate) fn pack(numbers: &[f32]) -> Vec<u8> {
+    numbers.iter().flat_map(|number| number.to_le_bytes()).collect()
+}

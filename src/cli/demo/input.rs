@@ -1,0 +1,48 @@
+//! What a demo shows: the scene, where the server finds it, and the physics that lies beside it.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::error::Result;
+use crate::load;
+use crate::scene::Scene;
+
+pub(super) struct Input {
+    pub(super) scene: Arc<Scene>,
+    /// The name by which the server opens it.
+    pub(super) source: String,
+    /// The server's repository; none for a built-in scene.
+    pub(super) repository: Option<PathBuf>,
+    /// Vega's cubic polynomial and configuration, if they lie beside the model.
+    pub(super) cubic: Option<PathBuf>,
+    pub(super) vega_config: Option<PathBuf>,
+}
+
+impl Input {
+    /// Finds a scene by built-in name or path.
+    pub(super) fn find(source: &str) -> Result<Self> {
+        let scene = load::open(source)?;
+        let path = Path::new(source);
+        let Some(path) = path.canonicalize().ok().filter(|_| path.exists()) else {
+            return Ok(Self { scene, source: source.into(), repository: None, cubic: None, vega_config: None });
+        };
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let folder = if path.is_dir() { path.clone() } else { path.parent().unwrap_or(&path).to_path_buf() };
+        Ok(Self {
+            scene,
+            source: name,
+            repository: path.parent().map(Path::to_path_buf),
+            cubic: only_file(&folder, "cub"),
+            vega_config: only_file(&folder, "config"),
+        })
+    }
+}
+
+/// The file of a folder with this ending, if there is exactly one.
+fn only_file(folder: &Path, ending: &str) -> Option<PathBuf> {
+    let entries = std::fs::read_dir(folder).ok()?;
+    let mut found = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    let matches = |path: &PathBuf| path.extension().is_some_and(|own| own == ending);
+    let first = found.by_ref().find(matches)?;
+    found.all(|path| !matches(&path)).then_some(first)
+}

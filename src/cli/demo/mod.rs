@@ -1,0 +1,183 @@
+//! `modalcast demo`: the server, a physics process and two fetching clients as separate processes on this machine; then
+//! a table of what came out, and whether it kept its promises.
+
+mod input;
+mod processes;
+mod verdict;
+
+use std::fs;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::ValueEnum as _;
+
+use super::options::Size;
+use super::{Outcome, say};
+use crate::config::BackendChoice;
+use crate::error::{Result, during};
+use input::Input;
+use processes::{Process, program};
+
+/// Drives a scene with a physics process, fetches its frames and vertices over the network, and checks them.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  modalcast demo                                the built-in tree in the wind: 60 frames into out/
+  modalcast demo --scene path/to/simpleBridge   a Vega folder under its own cubic forces
+  modalcast demo --frames 10 --size 640x360")]
+pub(super) struct Args {
+    /// What to show: a built-in name, or a path to a model or a scene folder.
+    #[arg(long, default_value = "tree")]
+    scene: String,
+    /// How many steps to drive, and frames to save.
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(2..=100_000))]
+    frames: u32,
+    /// The size of the frames in pixels.
+    #[arg(long, default_value = "1280x720")]
+    size: Size,
+    /// Simulated seconds from one frame to the next.
+    #[arg(long, default_value_t = 1.0 / 24.0)]
+    dt: f64,
+    /// The folder for the frames; frames of an earlier demo there are replaced.
+    #[arg(long, default_value = "out")]
+    out: PathBuf,
+    /// Which deformer the server uses.
+    #[arg(long, value_enum, default_value_t = BackendChoice::Auto)]
+    backend: BackendChoice,
+    /// Where to write the table as JSON too.
+    #[arg(long)]
+    report: Option<PathBuf>,
+    /// How long the whole run may take, in seconds.
+    #[arg(long, default_value_t = 600)]
+    timeout: u64,
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let input = Input::find(&args.scene)?;
+    let scratch = tempfile_folder()?;
+    let outcome = drive(args, &input, scratch.as_path());
+    // What the processes left behind is worthless once they have ended.
+    fs::remove_dir_all(&scratch).ok();
+    let ran = outcome?;
+    let verdict = verdict::Verdict::of(&input.scene, &ran, args.frames)?;
+    for line in verdict.table() {
+        say(line);
+    }
+    if let Some(path) = &args.report {
+        let text = serde_json::to_string_pretty(&record(&verdict)).map_err(during("demo"))?;
+        fs::write(path, text + "\n").map_err(during("demo"))?;
+    }
+    say(format!("frames in {}", args.out.display()));
+    Ok(verdict.passed())
+}
+
+/// The verdict with what it was measured on and how, to be kept.
+fn record(verdict: &verdict::Verdict) -> serde_json::Value {
+    let command: Vec<String> = std::env::args().skip(1).collect();
+    serde_json::json!({
+        "command": format!("modalcast {}", command.join(" ")),
+        "commit": std::env::var("MODALCAST_COMMIT").ok(),
+        "version": env!("CARGO_PKG_VERSION"),
+        "machine": super::doctor::examine(),
+        "result": verdict.json(),
+    })
+}
+
+/// What the processes told and left.
+struct Ran {
+    frames: serde_json::Value,
+    sim: serde_json::Value,
+    server: serde_json::Value,
+    /// steps x coordinates, as the physics process sent them.
+    q: ndarray::Array2<f32>,
+    /// steps x domains x 12.
+    transforms: ndarray::Array3<f32>,
+    /// steps x vertices x 3, as they came over the network.
+    vertices: ndarray::Array3<f32>,
+    frames_on_disk: usize,
+}
+
+fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
+    let patience = Duration::from_secs(args.timeout);
+    let (count, dt) = (args.frames.to_string(), args.dt.to_string());
+    clear_frames(&args.out)?;
+    let mut server = Process::start("server", &program("modalcast")?, &server_flags(args, input, scratch))?;
+    let url = server.wait_for("listening on ", patience)?;
+    let common = ["--server", url.as_str(), "--scene", "demo"];
+
+    let out = args.out.to_string_lossy();
+    let size = args.size.to_string();
+    let mut flags = vec!["frames", "--open", input.source.as_str(), "--count", &count, "--size", &size, "--json"];
+    flags.extend(["--delivery", "lossless", "--out", &out]);
+    let mut frames = Process::start("fetch", &program("modalcast-fetch")?, &[&flags[..], &common].concat())?;
+    frames.wait_for("ready", patience)?;
+
+    let vertices_file = scratch.join("vertices.npy").to_string_lossy().into_owned();
+    let flags = ["vertices", "--count", &count, "--delivery", "lossless", "--out", &vertices_file, "--json"];
+    let mut vertices = Process::start("vertices", &program("modalcast-fetch")?, &[&flags[..], &common].concat())?;
+    vertices.wait_for("ready", patience)?;
+
+    let record = scratch.join("record").to_string_lossy().into_owned();
+    let mut flags = vec!["auto", "--steps", &count, "--dt", &dt, "--policy", "lossless", "--record", &record, "--json"];
+    let cubic = input.cubic.as_ref().map(|path| path.to_string_lossy().into_owned());
+    let config = input.vega_config.as_ref().map(|path| path.to_string_lossy().into_owned());
+    if let Some(path) = &cubic {
+        flags.extend(["--cubic", path.as_str()]);
+    }
+    if let Some(path) = &config {
+        flags.extend(["--config", path.as_str()]);
+    }
+    let sim = Process::start("physics", &program("modalcast-sim")?, &[&flags[..], &common].concat())?;
+
+    let sim = sim.finish(patience)?;
+    let frames = frames.finish(patience)?;
+    vertices.finish(patience)?;
+    let told = Process::start("info", &program("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
+    let told = told.finish(patience)?;
+    server.stop();
+    let record = scratch.join("record");
+    Ok(Ran {
+        frames,
+        sim,
+        server: told,
+        q: read(&record.join("q.npy"))?,
+        transforms: read(&record.join("transforms.npy"))?,
+        vertices: read(&scratch.join("vertices.npy"))?,
+        frames_on_disk: frame_files(&args.out)?.len(),
+    })
+}
+
+fn server_flags<'a>(args: &'a Args, input: &'a Input, scratch: &'a std::path::Path) -> Vec<String> {
+    let mut flags = vec!["serve".to_owned(), "--listen".into(), "127.0.0.1:0".into(), "--state".into()];
+    flags.push(scratch.join("state").to_string_lossy().into_owned());
+    let backend = args.backend.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
+    flags.extend(["--backend".into(), backend]);
+    if let Some(repository) = &input.repository {
+        flags.extend(["--scenes".into(), repository.to_string_lossy().into_owned()]);
+    }
+    flags
+}
+
+fn read<D: ndarray::Dimension>(path: &std::path::Path) -> Result<ndarray::Array<f32, D>> {
+    ndarray_npy::read_npy(path).map_err(|error| during("demo")(format!("{}: {error}", path.display())))
+}
+
+/// A fresh folder for what the processes exchange.
+fn tempfile_folder() -> Result<PathBuf> {
+    let folder = std::env::temp_dir().join(format!("modalcast-demo-{}", std::process::id()));
+    fs::create_dir_all(&folder).map_err(during("demo"))?;
+    Ok(folder)
+}
+
+/// PNG files in the output folder, sorted.
+fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(folder).map_err(during("demo"))?;
+    let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    files.retain(|path| path.extension().is_some_and(|ending| ending == "png"));
+    files.sort();
+    Ok(files)
+}
+
+fn clear_frames(folder: &std::path::Path) -> Result<()> {
+    fs::create_dir_all(folder).map_err(during("demo"))?;
+    frame_files(folder)?.iter().try_for_each(fs::remove_file).map_err(during("demo"))
+}

@@ -1,0 +1,115 @@
+//! Child processes of the demo: started, listened to, and never left behind.
+
+use std::io::{BufRead as _, BufReader};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::time::{Duration, Instant};
+
+use crate::error::{Error, Result, during};
+
+/// Lines that a child may be ahead of us. A child that prints more waits, which harms nobody here.
+const LINES: usize = 1024;
+
+/// A program of this project beside this executable.
+pub(super) fn program(name: &str) -> Result<PathBuf> {
+    let here = std::env::current_exe().map_err(during("demo"))?;
+    let path = here.with_file_name(name);
+    if path.exists() {
+        return Ok(path);
+    }
+    Err(Error::Unavailable {
+        what: "a program of the demo",
+        reason: format!("{} is not there", path.display()),
+        remedy: "Build it with: cargo build --release --workspace --bins".into(),
+    })
+}
+
+/// A running child. Dropping it ends it.
+pub(super) struct Process {
+    name: &'static str,
+    child: Child,
+    lines: Receiver<String>,
+}
+
+impl Process {
+    /// Starts a program; its errors and logs go where ours go.
+    pub(super) fn start(name: &'static str, program: &PathBuf, flags: &[impl AsRef<std::ffi::OsStr>]) -> Result<Self> {
+        let mut child = Command::new(program)
+            .args(flags)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(|error| during("demo")(format!("{}: {error}", program.display())))?;
+        let (send, lines) = sync_channel(LINES);
+        let output = child.stdout.take().ok_or_else(|| during("demo")("no output"))?;
+        std::thread::spawn(move || {
+            for line in BufReader::new(output).lines().map_while(std::io::Result::ok) {
+                if send.send(line).is_err() {
+                    break;
+                }
+            }
+        });
+        Ok(Self { name, child, lines })
+    }
+
+    /// Waits for a line with this beginning and returns the rest of it.
+    pub(super) fn wait_for(&mut self, beginning: &str, patience: Duration) -> Result<String> {
+        let end = Instant::now() + patience;
+        loop {
+            let line = self.next_line(end, beginning)?;
+            if let Some(rest) = line.strip_prefix(beginning) {
+                return Ok(rest.trim().to_owned());
+            }
+        }
+    }
+
+    /// Waits for the end and returns the last line, which is JSON.
+    pub(super) fn finish(mut self, patience: Duration) -> Result<serde_json::Value> {
+        let end = Instant::now() + patience;
+        let mut last = String::new();
+        while let Some(line) = self.line_or_end(end, "its end")? {
+            last = line;
+        }
+        let status = self.child.wait().map_err(during("demo"))?;
+        if !status.success() {
+            return Err(during("demo")(format!("{} ended with {status}", self.name)));
+        }
+        serde_json::from_str(&last).map_err(|error| during("demo")(format!("{} said '{last}': {error}", self.name)))
+    }
+
+    /// Asks the child to end, as Ctrl-C would, and waits a little before insisting.
+    pub(super) fn stop(&mut self) {
+        let pid = self.child.id().to_string();
+        Command::new("kill").args(["-TERM", &pid]).status().ok();
+        let end = Instant::now() + Duration::from_secs(15);
+        while Instant::now() < end && matches!(self.child.try_wait(), Ok(None)) {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    fn next_line(&mut self, end: Instant, what: &str) -> Result<String> {
+        self.line_or_end(end, what)?.ok_or_else(|| {
+            let status = self.child.wait().map(|status| status.to_string()).unwrap_or_default();
+            during("demo")(format!("{} ended with {status} before it said '{what}'", self.name))
+        })
+    }
+
+    fn line_or_end(&self, end: Instant, what: &str) -> Result<Option<String>> {
+        match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
+            Ok(line) => Ok(Some(line)),
+            Err(RecvTimeoutError::Disconnected) => Ok(None),
+            Err(RecvTimeoutError::Timeout) => {
+                Err(Error::Deadline { what: format!("'{what}' of {}", self.name), ms: 0 })
+            }
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // Already gone is as good as killed.
+        self.child.kill().ok();
+        self.child.wait().ok();
+    }
+}

@@ -1,0 +1,188 @@
+//! What came out of a demo, against the f64 reference and the demo's promises.
+
+use serde_json::{Value, json};
+
+use super::Ran;
+use crate::domain::Transform;
+use crate::error::{Result, invalid};
+use crate::reference;
+use crate::scene::{Scene, State};
+
+/// The largest error of received vertices, as a fraction of the scene's diagonal.
+const LARGEST_ERROR: f64 = 1e-5;
+
+pub(super) struct Verdict {
+    backend: String,
+    renderer: String,
+    steps: usize,
+    steps_per_second: f64,
+    stages: Vec<(String, f64)>,
+    /// Largest distance to the reference, and it as a fraction of the diagonal.
+    error: f64,
+    relative_error: f64,
+    /// Largest distance from rest, in scene units, and where the scene is highest as a fraction of its height.
+    displacement: f64,
+    relative_displacement: f64,
+    sway: f64,
+    joint_gap: Option<f64>,
+    frames: usize,
+    frames_wanted: usize,
+}
+
+impl Verdict {
+    /// Compares every received vertex of every step with the reference.
+    pub(super) fn of(scene: &Scene, ran: &Ran, wanted: u32) -> Result<Self> {
+        let steps = ran.vertices.shape()[0];
+        if ran.q.shape()[0] != steps
+            || ran.transforms.shape()[0] != steps
+            || ran.vertices.shape()[1] != scene.layout.vertices
+        {
+            let given = format!("{:?}, {:?}, {:?}", ran.q.shape(), ran.transforms.shape(), ran.vertices.shape());
+            return Err(invalid("demo", "as many steps of q, transforms and vertices as frames", given));
+        }
+        let rest = reference::deform(scene, &State::rest(scene));
+        let crown = Crown::of(scene, &rest);
+        let (mut error, mut displacement, mut sway) = (0.0_f64, 0.0_f64, 0.0_f64);
+        for step in 0..steps {
+            let want = reference::deform(scene, &state(scene, ran, step));
+            let got = ran.vertices.index_axis(ndarray::Axis(0), step);
+            for (vertex, got) in got.outer_iter().enumerate() {
+                let got = [got[0], got[1], got[2]].map(f64::from);
+                error = worse(error, distance(got, want[vertex]));
+                let moved = distance(got, rest[vertex]);
+                displacement = worse(displacement, moved);
+                if crown.holds(rest[vertex]) {
+                    sway = worse(sway, moved);
+                }
+            }
+        }
+        let diagonal = scene.rest_bounds.diagonal();
+        Ok(Self {
+            backend: text(&ran.server, "backend"),
+            renderer: text(&ran.server, "renderer"),
+            steps,
+            steps_per_second: ran.sim["steps_per_s"].as_f64().unwrap_or(f64::NAN),
+            stages: stages(&ran.frames),
+            error,
+            relative_error: error / diagonal,
+            displacement,
+            relative_displacement: displacement / diagonal,
+            sway: sway / crown.height,
+            joint_gap: ran.sim["joint_gap_max"].as_f64(),
+            frames: ran.frames_on_disk,
+            frames_wanted: wanted as usize,
+        })
+    }
+
+    /// Whether all frames came and all vertices agree.
+    pub(super) fn passed(&self) -> bool {
+        let close = self.relative_error <= LARGEST_ERROR;
+        let joined = self.joint_gap.is_none_or(|gap| gap <= 1e-3);
+        close && joined && self.frames == self.frames_wanted && self.displacement > 0.0
+    }
+
+    pub(super) fn table(&self) -> Vec<String> {
+        let mut rows = vec![
+            ("backend".into(), self.backend.clone()),
+            ("renderer".into(), self.renderer.clone()),
+            ("steps".into(), format!("{} at {:.1} steps/s", self.steps, self.steps_per_second)),
+        ];
+        rows.extend(self.stages.iter().map(|(stage, ms)| (format!("  {stage}"), format!("{ms:.2} ms"))));
+        let share = 100.0 * self.relative_displacement;
+        rows.extend([
+            (
+                "error against f64".into(),
+                format!("{:.2e} units, {:.1e} of the diagonal", self.error, self.relative_error),
+            ),
+            ("largest displacement".into(), format!("{:.3} units, {share:.1} % of the diagonal", self.displacement)),
+            ("sway at the top".into(), format!("{:.1} % of the height", 100.0 * self.sway)),
+        ]);
+        rows.extend(self.joint_gap.map(|gap| ("largest joint gap".into(), format!("{gap:.1e} of the diagonal"))));
+        rows.push(("frames written".into(), format!("{} of {}", self.frames, self.frames_wanted)));
+        rows.into_iter().map(|(name, value): (String, String)| format!("{name:<22}{value}")).collect()
+    }
+
+    pub(super) fn json(&self) -> Value {
+        let stages: serde_json::Map<String, Value> =
+            self.stages.iter().map(|(stage, ms)| (stage.clone(), json!(ms))).collect();
+        json!({
+            "backend": self.backend,
+            "renderer": self.renderer,
+            "steps": self.steps,
+            "steps_per_second": self.steps_per_second,
+            "stage_ms_median": stages,
+            "error_units": self.error,
+            "error_of_diagonal": self.relative_error,
+            "displacement_of_diagonal": self.relative_displacement,
+            "sway_of_height": self.sway,
+            "joint_gap_of_diagonal": self.joint_gap,
+            "frames": self.frames,
+            "passed": self.passed(),
+        })
+    }
+}
+
+/// The top tenth of a scene along its up axis.
+struct Crown {
+    axis: usize,
+    from: f64,
+    height: f64,
+}
+
+impl Crown {
+    fn of(scene: &Scene, rest: &[[f64; 3]]) -> Self {
+        let axis = scene.up.index();
+        let heights = || rest.iter().map(|point| point[axis]);
+        let (low, high) = (heights().fold(f64::INFINITY, f64::min), heights().fold(f64::NEG_INFINITY, f64::max));
+        Self { axis, from: high - 0.1 * (high - low), height: (high - low).max(f64::MIN_POSITIVE) }
+    }
+
+    fn holds(&self, point: [f64; 3]) -> bool {
+        point[self.axis] >= self.from
+    }
+}
+
+/// The state that the physics process sent at one step.
+fn state(scene: &Scene, ran: &Ran, step: usize) -> State {
+    let mut state = State::rest(scene);
+    state.q = ran.q.index_axis(ndarray::Axis(0), step).to_vec();
+    for (transform, sent) in
+        state.transforms.iter_mut().zip(ran.transforms.index_axis(ndarray::Axis(0), step).outer_iter())
+    {
+        *transform = Transform(std::array::from_fn(|entry| sent[entry]));
+    }
+    state
+}
+
+fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+/// The larger of two, where NaN is the worst.
+fn worse(a: f64, b: f64) -> f64 {
+    if b.is_nan() { f64::INFINITY } else { a.max(b) }
+}
+
+fn text(value: &Value, key: &str) -> String {
+    value[key].as_str().unwrap_or("unknown").to_owned()
+}
+
+/// Median milliseconds per stage, as the fetching client summed them up.
+fn stages(frames: &Value) -> Vec<(String, f64)> {
+    let object = frames["stages_ms"].as_object();
+    object
+        .map(|all| all.iter().filter_map(|(name, ms)| Some((name.clone(), ms.as_f64()?))).collect())
+        .unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_distance_that_is_not_a_number_is_the_worst() {
+        assert_eq!(worse(1.0, f64::NAN), f64::INFINITY);
+        assert_eq!(worse(f64::INFINITY, 1.0), f64::INFINITY);
+        assert_eq!(worse(1.0, 2.0), 2.0);
+    }
+}

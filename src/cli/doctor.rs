@@ -1,0 +1,86 @@
+//! `modalcast doctor`: what this machine has for deforming and drawing, and what it lacks, by file or package.
+
+use serde_json::{Value, json};
+
+use super::{Outcome, say};
+use crate::error::during;
+use crate::render::{Prefer, Renderer};
+use crate::{gpu, render};
+
+/// Looks at driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 when no frame can be drawn.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  modalcast doctor
+  modalcast doctor --json")]
+pub(super) struct Args {
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let report = examine();
+    if args.json {
+        say(serde_json::to_string_pretty(&report).map_err(during("doctor"))?);
+    } else {
+        lines(&report).into_iter().for_each(say);
+    }
+    Ok(report["can_draw"] == true)
+}
+
+/// All that the command knows of this machine.
+pub(super) fn examine() -> Value {
+    let renderer = Renderer::open(Prefer::Any).map(|renderer| renderer.info().clone());
+    let devices = render::devices();
+    let cuda = gpu::probe();
+    json!({
+        "can_draw": renderer.is_ok(),
+        "deforms_on": if cuda.devices.is_empty() || cuda.nvrtc_problem.is_some() { "cpu" } else { "cuda" },
+        "cpu_threads": std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+        "cuda": cuda,
+        "renderer": renderer.as_ref().ok(),
+        "renderer_problem": renderer.as_ref().err().map(ToString::to_string),
+        "egl_devices": devices.as_ref().ok(),
+        "egl_problem": devices.as_ref().err().map(ToString::to_string),
+    })
+}
+
+fn lines(report: &Value) -> Vec<String> {
+    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    let mut lines = Vec::new();
+    let mut line = |name: &str, value: &Value, missing: &str| {
+        let shown = if value.is_null() { missing.to_owned() } else { text(value) };
+        lines.push(format!("{name:<18}{shown}"));
+    };
+    let cuda = &report["cuda"];
+    line("driver", &cuda["driver"], "no NVIDIA kernel driver");
+    line("CUDA", &cuda["cuda"], &text(&cuda["cuda_problem"]));
+    for device in cuda["devices"].as_array().into_iter().flatten() {
+        let gib = device["memory_bytes"].as_f64().unwrap_or(0.0) / f64::from(1 << 30);
+        let what = format!("{}, capability {}, {gib:.1} GiB", text(&device["name"]), text(&device["capability"]));
+        line(&format!("CUDA device {}", device["ordinal"]), &what.into(), "");
+    }
+    line("NVRTC", &cuda["nvrtc"], &text(&cuda["nvrtc_problem"]));
+    line("NVRTC version", &cuda["nvrtc_version"], "unknown");
+    for (index, device) in report["egl_devices"].as_array().into_iter().flatten().enumerate() {
+        let what = format!("{}, CUDA device {}", text(&device["vendor"]), text(&device["cuda_device"]));
+        line(&format!("EGL device {index}"), &what.into(), "");
+    }
+    if !report["egl_problem"].is_null() {
+        line("EGL", &report["egl_problem"], "");
+    }
+    let renderer = &report["renderer"];
+    line("renderer", &renderer["renderer"], &text(&report["renderer_problem"]));
+    line("OpenGL", &renderer["version"], "none");
+    let how = match renderer["software"].as_bool() {
+        Some(true) => "software: frames are drawn on the CPU",
+        Some(false) => "hardware",
+        None => "none",
+    };
+    line("drawn in", &how.into(), "");
+    line("largest frame", &renderer["max_side"], "none");
+    line("deforms on", &report["deforms_on"], "cpu");
+    let verdict = if report["can_draw"] == true { "frames can be drawn" } else { "no frame can be drawn" };
+    line("verdict", &verdict.into(), "");
+    lines
+}

@@ -1,0 +1,150 @@
+//! `modalcast inspect`: what a scene holds, what it needs, and what leaving out the rest saved.
+
+use serde_json::{Value, json};
+
+use super::{Outcome, say};
+use crate::error::during;
+use crate::scene::Scene;
+use crate::{gpu, load, render};
+
+/// Domains that the table for people lists before it sums up the rest; `--json` lists all.
+const LISTED: usize = 24;
+
+/// Shows a scene: per domain its size; totals; which features it does without, and what that saved.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  modalcast inspect tree
+  modalcast inspect path/to/model.glb --json")]
+pub(super) struct Args {
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
+    scene: String,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let scene = load::open(&args.scene)?;
+    if args.json {
+        say(serde_json::to_string_pretty(&json(&scene)).map_err(during("inspect"))?);
+    } else {
+        lines(&scene).into_iter().for_each(say);
+    }
+    Ok(true)
+}
+
+/// Bytes of a shape as it is kept: rest positions, corners, triangles and U.
+fn bytes_of(scene: &Scene, domain: usize) -> usize {
+    let shape = scene.shape_of(domain);
+    let corners = shape.mesh.corners();
+    let per_corner =
+        4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
+    12 * shape.mesh.rest().len()
+        + per_corner * corners.vertices.len()
+        + 12 * shape.mesh.triangles().len()
+        + 4 * shape.modes.columns().len()
+}
+
+fn json(scene: &Scene) -> Value {
+    let domain = |index: usize| {
+        let (domain, slot) = (&scene.domains[index], scene.layout.slots[index]);
+        json!({
+            "name": domain.name,
+            "vertices": slot.vertices,
+            "rank": slot.rank,
+            "triangles": slot.triangles,
+            "corners": slot.corners,
+            "bytes": bytes_of(scene, index),
+            "shape": domain.shape,
+            "parent": domain.attachment.as_ref().map(|attachment| attachment.parent),
+            "material": scene.materials[domain.material].name,
+        })
+    };
+    let domains: Vec<Value> = (0..scene.domains.len()).map(domain).collect();
+    json!({
+        "scene": scene.name,
+        "up": scene.up,
+        "unit_metres": scene.unit,
+        "origin": scene.origin,
+        "totals": totals(scene),
+        "needs": scene.needs,
+        "look": scene.look,
+        "remarks": scene.remarks,
+        "deform": gpu::plan(scene),
+        "render": render::plan(scene),
+        "domains": domains,
+    })
+}
+
+fn totals(scene: &Scene) -> Value {
+    // Instances share a shape, so shapes are counted once.
+    let mut seen = vec![false; scene.shapes.len()];
+    let mut bytes = 0;
+    for (index, domain) in scene.domains.iter().enumerate() {
+        bytes += if std::mem::replace(&mut seen[domain.shape], true) { 0 } else { bytes_of(scene, index) };
+    }
+    json!({
+        "domains": scene.domains.len(),
+        "shapes": scene.shapes.len(),
+        "vertices": scene.layout.vertices,
+        "corners": scene.layout.corners,
+        "triangles": scene.layout.triangles,
+        "coordinates": scene.layout.coordinates,
+        "textures": scene.textures.len(),
+        "shape_bytes": bytes,
+    })
+}
+
+fn lines(scene: &Scene) -> Vec<String> {
+    let mut lines = vec![format!("{:<28}{:>10}{:>6}{:>12}{:>14}", "domain", "vertices", "r", "triangles", "bytes")];
+    for (index, domain) in scene.domains.iter().enumerate().take(LISTED) {
+        let slot = scene.layout.slots[index];
+        let bytes = bytes_of(scene, index);
+        lines.push(format!(
+            "{:<28}{:>10}{:>6}{:>12}{:>14}",
+            domain.name, slot.vertices, slot.rank, slot.triangles, bytes
+        ));
+    }
+    if scene.domains.len() > LISTED {
+        lines.push(format!("... and {} more (--json lists all)", scene.domains.len() - LISTED));
+    }
+    let totals = totals(scene);
+    let numbers = totals.as_object().into_iter().flatten();
+    lines.extend(numbers.map(|(name, value)| format!("{:<28}{value:>16}", format!("total {name}"))));
+    let extent = scene.rest_bounds.diagonal();
+    lines.push(format!("up {:?}, unit {} m, diagonal {extent:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
+    lines.extend(scene.remarks.iter().map(|remark| format!("remark: {remark}")));
+    let flags = scene.needs.flags().into_iter();
+    let needed: Vec<&str> = flags.filter_map(|(name, needed)| needed.then_some(name)).collect();
+    lines.push(format!("needs: {}", needed.join(", ")));
+    lines.extend(plans(scene));
+    lines
+}
+
+/// What the deformer and the renderer make for the scene, and what they leave out.
+fn plans(scene: &Scene) -> Vec<String> {
+    let (deform, render) = (gpu::plan(scene), render::plan(scene));
+    let kernels: Vec<String> =
+        deform.kernels.iter().map(|kernel| format!("{} [{}]", kernel.name, kernel.defines.join(" "))).collect();
+    let mut lines = vec![
+        format!("kernels: {}; {} launches a step", kernels.join(", "), deform.launches()),
+        format!(
+            "passes: {}; {} draw calls; shaders [{}]",
+            render.passes.join(", "),
+            render.draws,
+            render.defines.join(" ")
+        ),
+        format!("device memory: {} bytes to deform, {} to render", deform.total_bytes(), render.bytes()),
+    ];
+    for part in &deform.left_out {
+        lines.push(format!("left out of deforming, {}: {}; saved {} bytes", part.feature, part.what, part.bytes));
+    }
+    for part in &render.left_out {
+        let passes = if part.passes.is_empty() { "no pass".into() } else { part.passes.join(" and ") };
+        lines.push(format!(
+            "left out of rendering, {}: {}; saved {} bytes and {passes}",
+            part.feature, part.shaders, part.bytes
+        ));
+    }
+    lines
+}

@@ -1,0 +1,95 @@
+//! `modalcast render`: one frame, no network.
+
+use std::fs;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use super::options::Size;
+use super::{Outcome, say};
+use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::engine::Workbench;
+use crate::error::{Result, during, invalid};
+use crate::frame;
+use crate::load;
+use crate::scene::{Camera, Lens, Scene, State, View};
+
+/// Renders one frame of a scene to a PNG file.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  modalcast render tree --out tree.png
+  modalcast render path/to/simpleBridge --q bent.npy --out bridge.png --size 1920x1080
+  modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0")]
+pub(super) struct Args {
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
+    scene: String,
+    /// Coordinates of all domains in order, concatenated: one-dimensional .npy of f32 or f64.
+    #[arg(long)]
+    q: Option<PathBuf>,
+    /// The PNG file to write.
+    #[arg(long)]
+    out: PathBuf,
+    /// The size in pixels.
+    #[arg(long, default_value = "1280x720")]
+    size: Size,
+    /// Where the camera is, in scene units; without it the camera frames the scene.
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 3, requires = "target")]
+    eye: Vec<f64>,
+    /// What the camera looks at.
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 3, requires = "eye")]
+    target: Vec<f64>,
+    /// Vertical field of view in degrees.
+    #[arg(long, default_value_t = 35.0)]
+    field_of_view: f64,
+    /// Which deformer to use.
+    #[arg(long, value_enum, default_value_t)]
+    backend: BackendChoice,
+    /// Which OpenGL renderer to use.
+    #[arg(long, value_enum, default_value_t)]
+    renderer: RendererChoice,
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let scene = load::open(&args.scene)?;
+    let mut state = State::rest(&scene);
+    if let Some(path) = &args.q {
+        state.q = coordinates(&scene, path)?;
+    }
+    let mut bench = Workbench::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
+    let mut staged = bench.stage(&scene)?;
+    staged.deform(&Arc::new(state))?;
+    let image = bench.draw(&mut staged, &camera(args, &scene), args.size.width, args.size.height)?;
+    let bytes = frame::png(image.width, image.height, &image.rgba)?;
+    fs::write(&args.out, bytes).map_err(during("write"))?;
+    bench.unstage(staged);
+    say(format!("{} ({}, {})", args.out.display(), args.size, bench.backend().name()));
+    Ok(true)
+}
+
+fn camera(args: &Args, scene: &Scene) -> Camera {
+    let (Ok(eye), Ok(target)) = (args.eye.clone().try_into(), args.target.clone().try_into()) else {
+        return Camera::framing(scene);
+    };
+    let view = View::LookAt { eye, target, up: scene.up.vector().into() };
+    Camera { view, lens: Lens::FieldOfView(args.field_of_view), near: 0.0, far: 0.0 }
+}
+
+/// Reads q and checks its shape against the scene.
+fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
+    let place = path.display().to_string();
+    let wanted = format!("{} coordinates, all domains in order", scene.layout.coordinates);
+    let single = ndarray_npy::read_npy::<_, ndarray::ArrayD<f32>>(path);
+    let array = single.or_else(|_| {
+        ndarray_npy::read_npy::<_, ndarray::ArrayD<f64>>(path).map(|array| array.mapv(|number| number as f32))
+    });
+    let array = array.map_err(|error| invalid(format!("q in {place}"), "a .npy file of f32 or f64", error))?;
+    // A leading axis of one is what saving a single step of a trajectory leaves.
+    if array.len() != scene.layout.coordinates || array.shape().iter().filter(|side| **side != 1).count() > 1 {
+        return Err(invalid(format!("q in {place}: shape"), wanted, format!("{:?}", array.shape())));
+    }
+    match array.iter().position(|number| !number.is_finite()) {
+        None => Ok(array.iter().copied().collect()),
+        Some(at) => {
+            Err(invalid(format!("q in {place}, entry {at}"), "a finite number", format!("{:?}", array.iter().nth(at))))
+        }
+    }
+}

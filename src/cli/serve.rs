@@ -1,0 +1,134 @@
+//! `modalcast serve`: the server, until it is told to stop.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::{Outcome, say};
+use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::engine::{Engine, Info};
+use crate::error::{Result, during};
+use crate::load::Repository;
+use crate::service;
+
+/// Serves scenes over gRPC until it is told to stop (SIGTERM or Ctrl-C), then drains and ends.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  modalcast serve                                   the built-in scenes on loopback
+  modalcast serve --scenes ~/scenes                 and those of a folder
+  modalcast serve --listen 0.0.0.0:50051            for other machines too
+  modalcast serve --backend cpu --renderer software as on a machine without a GPU")]
+pub(super) struct Args {
+    /// Where to listen; port 0 is any free one. The address is printed as 'listening on URL'.
+    #[arg(long, env = "MODALCAST_LISTEN", default_value_t = Config::default().listen)]
+    listen: SocketAddr,
+    /// The folder of scenes that clients may open. Nothing outside it is ever read.
+    #[arg(long, env = "MODALCAST_SCENES")]
+    scenes: Option<PathBuf>,
+    /// Where uploads, the list of open scenes and their last steps are kept.
+    #[arg(long, env = "MODALCAST_STATE")]
+    state: Option<PathBuf>,
+    /// Which deformer to use.
+    #[arg(long, value_enum, default_value_t)]
+    backend: BackendChoice,
+    /// CUDA's number of the device.
+    #[arg(long, default_value_t = 0)]
+    cuda_device: usize,
+    /// Which OpenGL renderer to use.
+    #[arg(long, value_enum, default_value_t)]
+    renderer: RendererChoice,
+    /// Refuse to draw on the CPU.
+    #[arg(long)]
+    hardware_only: bool,
+    /// The largest message that is read, in bytes.
+    #[arg(long, default_value_t = Config::default().message_bytes)]
+    message_bytes: usize,
+    /// The largest side of a frame, in pixels.
+    #[arg(long, default_value_t = Config::default().frame_side)]
+    frame_side: u32,
+    /// How many scenes may be open.
+    #[arg(long, default_value_t = Config::default().open_scenes)]
+    open_scenes: usize,
+    /// How many steps of a lossless stream may wait for their acknowledgement unless it asks otherwise.
+    #[arg(long, default_value_t = Config::default().window)]
+    window: u32,
+    /// The largest upload of one scene, in bytes.
+    #[arg(long, default_value_t = Config::default().upload_bytes)]
+    upload_bytes: u64,
+    /// How long a request waits that names no deadline, in milliseconds.
+    #[arg(long, default_value_t = 30_000)]
+    deadline_ms: u64,
+}
+
+impl Args {
+    fn config(&self) -> Result<Config> {
+        let defaults = Config::default();
+        Config {
+            listen: self.listen,
+            scenes: self.scenes.clone(),
+            state: self.state.clone().unwrap_or(defaults.state),
+            backend: self.backend,
+            cuda_device: self.cuda_device,
+            renderer: self.renderer,
+            allow_software: !self.hardware_only,
+            message_bytes: self.message_bytes,
+            frame_side: self.frame_side,
+            open_scenes: self.open_scenes,
+            window: self.window,
+            largest_window: defaults.largest_window.max(self.window),
+            upload_bytes: self.upload_bytes,
+            deadline: Duration::from_millis(self.deadline_ms),
+            ..Config::default()
+        }
+        .checked()
+    }
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let config = args.config()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(during("serve"))?;
+    runtime.block_on(serve(config))?;
+    Ok(true)
+}
+
+async fn serve(config: Config) -> Result<()> {
+    let repository = Arc::new(Repository::new(config.scenes.as_deref())?);
+    // The address is taken before scenes are loaded, so that a second server fails at once.
+    let listener = service::bind(&config).await?;
+    let engine = Engine::start(config, repository).await?;
+    let address = listener.local_addr().map_err(during("serve"))?;
+    if !address.ip().is_loopback() {
+        tracing::warn!("{address} is open to other machines, without authentication");
+    }
+    describe(engine.info());
+    say(format!("listening on http://{address}"));
+    service::serve(engine, listener, told_to_stop()).await
+}
+
+/// Logs what deforms and what draws; a software renderer is said to be one.
+fn describe(info: &Info) {
+    tracing::info!("deforming on {} ({})", info.backend.name(), info.device);
+    match &info.renderer {
+        Ok(found) if found.software => tracing::warn!("drawing on the CPU: {}", found.renderer),
+        Ok(found) => tracing::info!("drawing on {}", found.renderer),
+        Err(error) => tracing::warn!("no frames can be drawn: {error}"),
+    }
+}
+
+/// Ctrl-C or SIGTERM.
+async fn told_to_stop() {
+    let interrupt = tokio::signal::ctrl_c();
+    match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
+        Ok(mut terminate) => {
+            tokio::select! {
+                _ = interrupt => {}
+                _ = terminate.recv() => {}
+            }
+        }
+        Err(error) => {
+            tracing::warn!("SIGTERM will not be heard: {error}");
+            interrupt.await.ok(); // Without a signal there is nothing else to wait for.
+        }
+    }
+}

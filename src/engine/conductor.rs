@@ -1,0 +1,295 @@
+//! One task per scene. It alone orders what happens to the scene: a step is deformed, shown to whoever waits for it,
+//! then acknowledged, and only then comes the next. It waits for the device, never for a client.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::sync::{Notify, mpsc, oneshot, watch};
+
+use super::keep::Keeper;
+use super::lane::{Lane, Policy, Waiting};
+use super::viewer::{Delivery, Shown, StepName, View, Viewer};
+use super::worker::{SceneId, Worker};
+use crate::config::Config;
+use crate::deform::Surface;
+use crate::error::{Error, Result};
+use crate::scene::{Scene, State};
+use crate::telemetry::{Stage, StageTimes};
+
+/// Which step a single request wants. Numbers are those of the current run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Which {
+    Current,
+    Exact(u64),
+    Minimum(u64),
+}
+
+/// A single request that waits for its step.
+#[derive(Debug)]
+pub(super) struct Ask {
+    pub which: Which,
+    pub view: View,
+    pub reply: oneshot::Sender<Result<Shown>>,
+}
+
+/// What a scene can be told. The queue is bounded; whoever finds it full hears `Busy`.
+pub(super) enum Message {
+    Drive { who: String, policy: Policy, window: u32, reply: oneshot::Sender<Result<(Arc<Lane>, u64)>> },
+    Watch { viewer: Viewer, reply: oneshot::Sender<Result<()>> },
+    Ask(Ask),
+    Stop { error: Error, done: oneshot::Sender<()> },
+}
+
+/// What all scenes share.
+#[derive(Debug, Clone)]
+pub(super) struct Means {
+    pub worker: Worker,
+    pub keeper: Arc<Keeper>,
+    pub config: Arc<Config>,
+}
+
+/// The one writer of a scene.
+struct Writer {
+    lane: Arc<Lane>,
+    who: String,
+    since: Instant,
+}
+
+/// A scene in play.
+pub(super) struct Conductor {
+    pub(super) name: String,
+    pub(super) id: SceneId,
+    pub(super) scene: Arc<Scene>,
+    pub(super) means: Means,
+    pub(super) state: Arc<State>,
+    /// The last run given to a writer; 0 before the first.
+    run: u64,
+    /// How many steps the scene has seen, merged ones included.
+    pub(super) count: u64,
+    writer: Option<Writer>,
+    pub(super) viewers: Vec<Viewer>,
+    pub(super) asks: Vec<Ask>,
+    /// A step that is done but not yet shown to every lossless viewer.
+    pending: Option<(Arc<Lane>, u64)>,
+    /// Times of the current step until its vertices were there.
+    pub(super) stages: StageTimes,
+    /// The current vertices, once somebody has asked for them, and the milliseconds of copying them.
+    pub(super) surface: Option<(Arc<Surface>, f64)>,
+    last_step: watch::Sender<Option<StepName>>,
+    wake: Arc<Notify>,
+}
+
+/// How a scene begins.
+pub(super) struct Beginning {
+    pub name: String,
+    pub id: SceneId,
+    pub scene: Arc<Scene>,
+    pub state: Arc<State>,
+    pub wake: Arc<Notify>,
+}
+
+impl Conductor {
+    /// A staged scene that shows `beginning.state`.
+    pub(super) fn new(beginning: Beginning, means: Means) -> (Self, watch::Receiver<Option<StepName>>) {
+        let Beginning { name, id, scene, state, wake } = beginning;
+        let has_step = state.run > 0;
+        let (last_step, told) = watch::channel(has_step.then(|| StepName::of(&state)));
+        let conductor = Self {
+            name,
+            id,
+            scene,
+            means,
+            run: state.run,
+            state,
+            count: u64::from(has_step),
+            writer: None,
+            viewers: Vec::new(),
+            asks: Vec::new(),
+            pending: None,
+            stages: Vec::new(),
+            surface: None,
+            last_step,
+            wake,
+        };
+        (conductor, told)
+    }
+
+    /// Runs until it is told to stop or nobody can reach it any more.
+    pub(super) async fn conduct(mut self, mut mailbox: mpsc::Receiver<Message>) {
+        let (error, done) = loop {
+            self.tend().await;
+            let stall = self.next_stall();
+            tokio::select! {
+                // In this order: a request that came before a step is in place when the step is done. Every turn of
+                // the loop tends, so messages do not starve steps.
+                biased;
+                message = mailbox.recv() => match message {
+                    Some(Message::Stop { error, done }) => break (error, Some(done)),
+                    Some(message) => self.receive(message),
+                    None => break (stopped(), None),
+                },
+                () = self.wake.notified() => {}
+                () = sleep_until(stall) => {}
+            }
+        };
+        self.end(error).await;
+        drop(mailbox);
+        if let Some(done) = done {
+            done.send(()).ok(); // Whoever stopped the scene need not wait for it.
+        }
+    }
+
+    /// Does all that can be done now, and at most one step.
+    async fn tend(&mut self) {
+        self.answer_asks().await;
+        let holds_back = self.holds_back();
+        self.serve_viewers(holds_back).await;
+        if self.is_held() {
+            return;
+        }
+        if let Some((lane, step)) = self.pending.take() {
+            lane.report(step, Ok(self.stages.clone()));
+        }
+        if self.writer.as_ref().is_some_and(|writer| writer.lane.is_closed()) {
+            self.writer = None;
+        }
+        let next = self.writer.as_ref().and_then(|writer| Some((Arc::clone(&writer.lane), writer.lane.take()?)));
+        if let Some((lane, waiting)) = next {
+            self.step(lane, waiting).await;
+            // There may be more to do; messages get their turn first.
+            self.wake.notify_one();
+        }
+    }
+
+    async fn step(&mut self, lane: Arc<Lane>, waiting: Waiting) {
+        let mut stages = waiting.stages();
+        let number = waiting.update.number;
+        let mut next = State::clone(&self.state);
+        next.run = self.run;
+        next.apply(&self.scene, &waiting.update);
+        let next = Arc::new(next);
+        match self.means.worker.deform(self.id, &next).await {
+            Ok(deformed) => {
+                stages.push((Stage::Deform, deformed.ms));
+                self.stages = stages;
+                self.means.keeper.note(&self.name, &next);
+                self.last_step.send_replace(Some(StepName::of(&next)));
+                self.state = next;
+                self.surface = None;
+                self.count += 1 + waiting.merged;
+                self.pending = Some((lane, number));
+            }
+            Err(error) => lane.report(number, Err(error)),
+        }
+    }
+
+    fn receive(&mut self, message: Message) {
+        // An ignored result below means: the asker has gone, and its answer goes with it.
+        match message {
+            Message::Drive { who, policy, window, reply } => {
+                if let Err(Ok((lane, _))) = reply.send(self.admit(who, policy, window)) {
+                    lane.close();
+                }
+            }
+            Message::Watch { viewer, reply } => {
+                reply.send(self.seat(viewer)).ok();
+            }
+            Message::Ask(ask) => {
+                self.asks.retain(|ask| !ask.reply.is_closed());
+                let limit = self.means.config.waiting;
+                if self.asks.len() < limit {
+                    self.asks.push(ask);
+                } else {
+                    ask.reply.send(Err(Error::Busy { queue: "requests that wait for a step", limit })).ok();
+                }
+            }
+            // Taken by the caller.
+            Message::Stop { .. } => {}
+        }
+    }
+
+    /// One writer at a time; a dead one makes room.
+    fn admit(&mut self, who: String, policy: Policy, window: u32) -> Result<(Arc<Lane>, u64)> {
+        if let Some(writer) = self.writer.as_ref().filter(|writer| !writer.lane.is_closed()) {
+            let seconds = writer.since.elapsed().as_secs();
+            let holder = format!("{} has driven run {} for {seconds} s", writer.who, self.run);
+            return Err(Error::Taken { what: "the writer's place of the scene", holder });
+        }
+        self.run += 1;
+        let lane = Arc::new(Lane::new(policy, window, Arc::clone(&self.wake)));
+        self.writer = Some(Writer { lane: Arc::clone(&lane), who, since: Instant::now() });
+        Ok((lane, self.run))
+    }
+
+    fn seat(&mut self, mut viewer: Viewer) -> Result<()> {
+        self.viewers.retain(|viewer| !viewer.is_gone());
+        let limit = self.means.config.subscribers;
+        if self.viewers.len() >= limit {
+            return Err(Error::Busy { queue: "subscribers of the scene", limit });
+        }
+        let shows_current = viewer.delivery == Delivery::Latest && self.state.run > 0;
+        viewer.seen = if shows_current { self.count.saturating_sub(1) } else { self.count };
+        self.viewers.push(viewer);
+        Ok(())
+    }
+
+    /// Whether lossless viewers hold the step back: only under a lossless writer that still lives.
+    fn holds_back(&self) -> bool {
+        self.pending.as_ref().is_some_and(|(lane, _)| lane.policy() == Policy::Lossless && !lane.is_closed())
+    }
+
+    fn is_held(&self) -> bool {
+        let owes = |viewer: &Viewer| viewer.delivery == Delivery::Lossless && viewer.seen < self.count;
+        self.holds_back() && self.viewers.iter().any(owes)
+    }
+
+    /// When the first viewer that holds back the writer is to be cut off.
+    fn next_stall(&self) -> Option<Instant> {
+        let first = self.viewers.iter().filter_map(|viewer| viewer.stalled).min()?;
+        Some(first + self.means.config.stall)
+    }
+
+    /// Whether a request can be answered now; an error when it never will be.
+    pub(super) fn is_ready(&self, which: Which) -> Result<bool> {
+        let of_this_run = self.state.run == self.run && self.run > 0;
+        let here = of_this_run.then_some(self.state.step);
+        match (which, here) {
+            (Which::Current, _) => Ok(true),
+            (Which::Exact(want), Some(here)) if here > want => Err(Error::Gone {
+                what: "exact_step",
+                expected: format!("{here}, the step that scene '{}' shows, or a later one", self.name),
+                given: want.to_string(),
+            }),
+            (Which::Exact(want), Some(here)) => Ok(here == want),
+            (Which::Minimum(want), Some(here)) => Ok(here >= want),
+            (Which::Exact(_) | Which::Minimum(_), None) => Ok(false),
+        }
+    }
+
+    async fn end(mut self, error: Error) {
+        if let Some(writer) = &self.writer {
+            if let Some((lane, step)) = self.pending.take() {
+                lane.report(step, Ok(self.stages.clone()));
+            }
+            writer.lane.end(error.clone());
+        }
+        self.viewers.iter().for_each(|viewer| viewer.end(error.clone()));
+        self.viewers.clear();
+        for ask in self.asks.drain(..) {
+            ask.reply.send(Err(error.clone())).ok(); // The asker has gone.
+        }
+        // The device thread may be gone already; then so is the scene.
+        self.means.worker.unstage(self.id).await.ok();
+    }
+}
+
+fn stopped() -> Error {
+    Error::Unavailable { what: "scene", reason: "the server stops".into(), remedy: "Try again later".into() }
+}
+
+async fn sleep_until(when: Option<Instant>) {
+    match when {
+        Some(when) => tokio::time::sleep_until(when.into()).await,
+        None => std::future::pending().await,
+    }
+}

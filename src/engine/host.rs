@@ -1,0 +1,194 @@
+//! The way to one open scene: what everybody may know of it, and its bounded mailbox.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use tokio::sync::mpsc::error::TrySendError;
+use tokio::sync::{Notify, mpsc, oneshot, watch};
+
+use super::conductor::{Ask, Beginning, Conductor, Means, Message, Which};
+use super::lane::{Lane, Policy, Report, Waiting};
+use super::ledger::Origin;
+use super::viewer::{Delivery, Feed, Shown, StepName, View};
+use super::worker::SceneId;
+use crate::error::{Error, Result, invalid};
+use crate::scene::{RawUpdate, Scene, State, Update};
+use crate::telemetry::ms_since;
+
+/// How many messages may wait for one scene.
+const MAILBOX: usize = 128;
+
+/// An open scene.
+#[derive(Debug)]
+pub struct Host {
+    pub name: String,
+    pub origin: Origin,
+    pub scene: Arc<Scene>,
+    /// Why no frame can be drawn, if so.
+    no_frames: Option<Error>,
+    largest_window: u32,
+    mailbox: mpsc::Sender<Message>,
+    last_step: watch::Receiver<Option<StepName>>,
+    wake: Arc<Notify>,
+    closing: AtomicBool,
+}
+
+/// What a scene begins with.
+pub(super) struct Opening {
+    pub name: String,
+    pub origin: Origin,
+    pub scene: Arc<Scene>,
+    pub id: SceneId,
+    /// The state that survived a restart, if one did.
+    pub state: Option<State>,
+    pub no_frames: Option<Error>,
+}
+
+impl Host {
+    /// Stages a scene on the device, brings back its state and starts its task.
+    pub(super) async fn open(opening: Opening, means: Means) -> Result<Self> {
+        let Opening { name, origin, scene, id, state, no_frames } = opening;
+        means.worker.stage(id, &scene).await?;
+        let state = match state.map(Arc::new) {
+            Some(state) => match means.worker.deform(id, &state).await {
+                Ok(_) => state,
+                Err(error) => {
+                    tracing::warn!(scene = name, %error, "the kept step is not usable; the scene begins at rest");
+                    Arc::new(State::rest(&scene))
+                }
+            },
+            None => Arc::new(State::rest(&scene)),
+        };
+        let wake = Arc::new(Notify::new());
+        let largest_window = means.config.largest_window;
+        let beginning = Beginning { name: name.clone(), id, scene: Arc::clone(&scene), state, wake: Arc::clone(&wake) };
+        let (conductor, last_step) = Conductor::new(beginning, means);
+        let (mailbox, inbox) = mpsc::channel(MAILBOX);
+        tokio::spawn(conductor.conduct(inbox));
+        let closing = AtomicBool::new(false);
+        Ok(Self { name, origin, scene, no_frames, largest_window, mailbox, last_step, wake, closing })
+    }
+
+    /// The last step that was done, if there was any.
+    pub fn last_step(&self) -> Option<StepName> {
+        *self.last_step.borrow()
+    }
+
+    /// Becomes the writer. The window is what is asked for, within the limit.
+    ///
+    /// # Errors
+    /// `Taken` with who holds the place and since when; `NotFound` when the scene has been closed.
+    pub async fn drive(&self, who: String, policy: Policy, window: u32) -> Result<Drive> {
+        let window = window.clamp(1, self.largest_window);
+        let (lane, run) = self.tell(|reply| Message::Drive { who, policy, window, reply }).await?;
+        Ok(Drive { lane, scene: Arc::clone(&self.scene), run, window, policy, last: None })
+    }
+
+    /// Subscribes to the scene's steps. When this returns, the subscription holds.
+    ///
+    /// # Errors
+    /// `Unavailable` when frames are wanted and nothing draws, `Busy` when there are too many subscribers.
+    pub async fn watch(&self, view: View, delivery: Delivery) -> Result<Feed> {
+        self.check_view(&view)?;
+        let (viewer, feed) = Feed::new(view, delivery, Arc::clone(&self.wake));
+        self.tell(|reply| Message::Watch { viewer, reply }).await?;
+        Ok(feed)
+    }
+
+    /// Waits for a step and shows it. Dropping the future gives up; nothing is drawn then.
+    ///
+    /// # Errors
+    /// `Gone` when an exact step has passed, `Unavailable` when nothing draws, `Busy` when too many wait.
+    pub async fn show(&self, which: Which, view: View) -> Result<Shown> {
+        self.check_view(&view)?;
+        self.tell(|reply| Message::Ask(Ask { which, view, reply })).await
+    }
+
+    /// Ends every stream of the scene and frees it. Returns when it is freed.
+    pub(super) async fn stop(&self, error: Error) {
+        self.closing.store(true, Ordering::Release);
+        let (done, stopped) = oneshot::channel();
+        // A closed mailbox means that the scene has stopped already.
+        if self.mailbox.send(Message::Stop { error, done }).await.is_ok() {
+            stopped.await.ok();
+        }
+    }
+
+    /// Whether [`Self::stop`] was called.
+    pub(super) fn is_closing(&self) -> bool {
+        self.closing.load(Ordering::Acquire)
+    }
+
+    fn check_view(&self, view: &View) -> Result<()> {
+        match (view, &self.no_frames) {
+            (View::Frame { .. }, Some(error)) => Err(error.clone()),
+            _ => Ok(()),
+        }
+    }
+
+    async fn tell<T>(&self, make: impl FnOnce(oneshot::Sender<Result<T>>) -> Message) -> Result<T> {
+        let gone = || Error::NotFound { what: "scene", given: format!("'{}', which was closed", self.name) };
+        let (reply, answer) = oneshot::channel();
+        match self.mailbox.try_send(make(reply)) {
+            Ok(()) => answer.await.map_err(|_| gone())?,
+            Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "requests to the scene", limit: MAILBOX }),
+            Err(TrySendError::Closed(_)) => Err(gone()),
+        }
+    }
+}
+
+/// The writer's place of a scene; dropping it makes room for the next writer.
+#[derive(Debug)]
+pub struct Drive {
+    lane: Arc<Lane>,
+    scene: Arc<Scene>,
+    /// Counts the writers of the scene.
+    pub run: u64,
+    /// How many steps may be without acknowledgement.
+    pub window: u32,
+    pub policy: Policy,
+    last: Option<u64>,
+}
+
+impl Drive {
+    /// Takes a step in. What is refused leaves no trace.
+    ///
+    /// # Errors
+    /// `Invalid` with field, expected and given for whatever is wrong with the step, the window included; or whatever
+    /// ended the drive.
+    pub fn step(&mut self, raw: &RawUpdate) -> Result<()> {
+        let begin = Instant::now();
+        if let Some(last) = self.last.filter(|last| raw.number <= *last) {
+            return Err(invalid("step.number", format!("a number above {last}"), raw.number));
+        }
+        let update = Update::parse(&self.scene, raw)?;
+        self.lane.offer(Waiting::new(update, ms_since(begin)))?;
+        self.last = Some(raw.number);
+        Ok(())
+    }
+
+    /// Waits for what became of a step. Safe to drop while it waits.
+    ///
+    /// # Errors
+    /// Why the drive was ended by the server.
+    pub async fn next_report(&self) -> Result<Report> {
+        self.lane.next_report().await
+    }
+
+    /// Whether there is nothing left to hear of.
+    pub fn is_drained(&self) -> bool {
+        self.lane.is_drained()
+    }
+
+    /// Whether the server has ended it.
+    pub fn is_ended(&self) -> bool {
+        self.lane.is_closed()
+    }
+}
+
+impl Drop for Drive {
+    fn drop(&mut self) {
+        self.lane.close();
+    }
+}

@@ -1,0 +1,232 @@
+//! Keeps the last step of every scene on disk: one file per scene, written by a thread of its own at most ten times a
+//! second and put in place by a rename, so that a killed server loses at most the last tenth of a second and never
+//! half a step.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use sha2::{Digest as _, Sha256};
+
+use crate::domain::Transform;
+use crate::error::{Result, during, invalid};
+use crate::scene::{Scene, State};
+
+/// Time between two writings.
+const REST: Duration = Duration::from_millis(100);
+
+/// A step file: this, then run and number (u64), time (f64), the counts of q and of transforms (u64), q (f32), the
+/// transforms (12 f32 each), and the SHA-256 of all before it. Little-endian.
+const MAGIC: &[u8; 8] = b"MCSTEP01";
+const HEAD: usize = 8 + 5 * 8;
+const HASH: usize = 32;
+
+/// Writes steps behind the scenes' backs.
+#[derive(Debug)]
+pub(super) struct Keeper {
+    folder: PathBuf,
+    shared: Arc<Shared>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    notes: Mutex<Notes>,
+    changed: Condvar,
+    /// Held while files are written or removed; taken before `notes`.
+    files: Mutex<()>,
+}
+
+#[derive(Debug, Default)]
+struct Notes {
+    /// The newest state of each scene that is not on disk yet: one entry per scene at most.
+    fresh: BTreeMap<String, Arc<State>>,
+    stopping: bool,
+}
+
+impl Keeper {
+    /// Starts the thread that writes into `folder`.
+    pub(super) fn start(folder: PathBuf) -> Result<Self> {
+        fs::create_dir_all(&folder).map_err(during("state folder"))?;
+        let shared = Arc::new(Shared::default());
+        let (theirs, place) = (Arc::clone(&shared), folder.clone());
+        let thread = std::thread::Builder::new()
+            .name("keeper".into())
+            .spawn(move || keep(&theirs, &place))
+            .map_err(during("keeper thread"))?;
+        Ok(Self { folder, shared, thread: Mutex::new(Some(thread)) })
+    }
+
+    /// Notes the newest state of a scene. Never waits for the disk.
+    pub(super) fn note(&self, name: &str, state: &Arc<State>) {
+        lock(&self.shared.notes).fresh.insert(name.to_owned(), Arc::clone(state));
+        self.shared.changed.notify_one();
+    }
+
+    /// The kept state of a scene, if there is one that fits it. Reads from disk.
+    ///
+    /// # Errors
+    /// `Invalid` when the file is damaged or was written for another scene.
+    pub(super) fn load(&self, name: &str, scene: &Scene) -> Result<Option<State>> {
+        match fs::read(path_of(&self.folder, name)) {
+            Ok(bytes) => decode(&bytes, scene).map(Some),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(during("reading the kept step")(error)),
+        }
+    }
+
+    /// Removes a scene's file. Waits for the disk.
+    pub(super) fn forget(&self, name: &str) {
+        let _files = lock(&self.shared.files);
+        lock(&self.shared.notes).fresh.remove(name);
+        // Most often there was no step, and so no file.
+        fs::remove_file(path_of(&self.folder, name)).ok();
+    }
+
+    /// Writes what is left and ends the thread. Waits for the disk.
+    pub(super) fn finish(&self) {
+        lock(&self.shared.notes).stopping = true;
+        self.shared.changed.notify_one();
+        if let Some(thread) = lock(&self.thread).take() {
+            thread.join().ok(); // A panic of the thread was logged by the panic hook.
+        }
+    }
+}
+
+impl Drop for Keeper {
+    fn drop(&mut self) {
+        self.finish();
+    }
+}
+
+fn keep(shared: &Shared, folder: &Path) {
+    loop {
+        let waits = |notes: &mut Notes| notes.fresh.is_empty() && !notes.stopping;
+        drop(shared.changed.wait_while(lock(&shared.notes), waits).unwrap_or_else(PoisonError::into_inner));
+        {
+            let _files = lock(&shared.files);
+            let fresh = std::mem::take(&mut lock(&shared.notes).fresh);
+            for (name, state) in fresh {
+                if let Err(error) = replace(&path_of(folder, &name), &encode(&state)) {
+                    tracing::warn!(scene = name, %error, "the last step could not be kept");
+                }
+            }
+        }
+        let notes = lock(&shared.notes);
+        if notes.stopping && notes.fresh.is_empty() {
+            return;
+        }
+        let runs = |notes: &mut Notes| !notes.stopping;
+        drop(shared.changed.wait_timeout_while(notes, REST, runs).unwrap_or_else(PoisonError::into_inner));
+    }
+}
+
+/// Writes beside the file, then renames: a reader sees the old or the new, never a half.
+pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let beside = path.with_extension("new");
+    fs::write(&beside, bytes)?;
+    fs::rename(&beside, path)
+}
+
+fn path_of(folder: &Path, name: &str) -> PathBuf {
+    folder.join(format!("{name}.step"))
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every change under these locks is a single assignment, so a poisoned lock is still sound.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn encode(state: &State) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(HEAD + 4 * state.q.len() + 48 * state.transforms.len() + HASH);
+    bytes.extend_from_slice(MAGIC);
+    bytes.extend_from_slice(&state.run.to_le_bytes());
+    bytes.extend_from_slice(&state.step.to_le_bytes());
+    bytes.extend_from_slice(&state.time.to_le_bytes());
+    bytes.extend_from_slice(&(state.q.len() as u64).to_le_bytes());
+    bytes.extend_from_slice(&(state.transforms.len() as u64).to_le_bytes());
+    let transforms = state.transforms.iter().flat_map(|transform| transform.0);
+    bytes.extend(state.q.iter().copied().chain(transforms).flat_map(f32::to_le_bytes));
+    let hash = Sha256::digest(&bytes);
+    bytes.extend_from_slice(&hash);
+    bytes
+}
+
+fn decode(bytes: &[u8], scene: &Scene) -> Result<State> {
+    let rest = State::rest(scene);
+    let size = HEAD + 4 * rest.q.len() + 48 * rest.transforms.len() + HASH;
+    if bytes.len() != size {
+        return Err(invalid("kept step", format!("{size} bytes for this scene"), format!("{} bytes", bytes.len())));
+    }
+    let (body, hash) = bytes.split_at(size - HASH);
+    if Sha256::digest(body).as_slice() != hash || !body.starts_with(MAGIC) {
+        return Err(invalid("kept step", "bytes that match their SHA-256", "a damaged file"));
+    }
+    let word = |at: usize| {
+        let mut word = [0; 8];
+        word.copy_from_slice(&body[8 * at..8 * at + 8]);
+        word
+    };
+    let counts = [u64::from_le_bytes(word(4)), u64::from_le_bytes(word(5))];
+    if counts != [rest.q.len() as u64, rest.transforms.len() as u64] {
+        let expected = format!("{} coordinates and {} transforms", rest.q.len(), rest.transforms.len());
+        return Err(invalid("kept step", expected, format!("{counts:?}")));
+    }
+    let (q, transforms) = body[HEAD..].split_at(4 * rest.q.len());
+    let number = |word: &[u8]| f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
+    let transform = |bytes: &[u8]| Transform(std::array::from_fn(|entry| number(&bytes[4 * entry..])));
+    Ok(State {
+        run: u64::from_le_bytes(word(1)),
+        step: u64::from_le_bytes(word(2)),
+        time: f64::from_le_bytes(word(3)),
+        q: q.chunks_exact(4).map(number).collect(),
+        transforms: transforms.chunks_exact(48).map(transform).collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing;
+    use super::*;
+
+    fn moved(scene: &Scene) -> State {
+        let mut state = State { run: 3, step: 41, time: 0.25, ..State::rest(scene) };
+        state.q[1] = -0.5;
+        state.transforms[1].0[3] = 7.0;
+        state
+    }
+
+    #[test]
+    fn a_kept_step_comes_back_bit_for_bit_and_a_damaged_one_is_refused() {
+        let scene = testing::two_strips();
+        let state = moved(&scene);
+        let bytes = encode(&state);
+        assert_eq!(decode(&bytes, &scene).expect("whole"), state);
+        for at in [0, 9, HEAD + 2, bytes.len() - 1] {
+            let mut damaged = bytes.clone();
+            damaged[at] ^= 1;
+            assert!(decode(&damaged, &scene).is_err(), "byte {at}");
+        }
+        assert!(decode(&bytes[..bytes.len() - 1], &scene).is_err());
+        assert!(decode(&[], &scene).is_err());
+    }
+
+    #[test]
+    fn a_finished_keeper_has_written_the_newest_note_and_forgets_on_demand() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let scene = testing::two_strips();
+        let keeper = Keeper::start(folder.path().to_owned()).expect("starts");
+        for step in 0..50 {
+            keeper.note("strips", &Arc::new(State { step, ..moved(&scene) }));
+        }
+        keeper.finish();
+        let kept = keeper.load("strips", &scene).expect("fits").expect("is there");
+        assert_eq!(kept, State { step: 49, ..moved(&scene) });
+        keeper.forget("strips");
+        assert_eq!(keeper.load("strips", &scene), Ok(None));
+    }
+}

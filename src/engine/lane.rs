@@ -1,0 +1,277 @@
+//! The steps of one writer on their way to its scene, and the reports on their way back. Both are bounded by the
+//! window: `lossless` refuses a step beyond it, `latest` merges the step into the one that waits.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use tokio::sync::Notify;
+
+use crate::error::{Error, Result, invalid};
+use crate::scene::Update;
+use crate::telemetry::{Stage, StageTimes, ms_since};
+
+/// What happens to steps that come faster than they are done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Policy {
+    /// Each is deformed, in order.
+    Lossless,
+    /// They are merged, so that the state equals having applied all.
+    Latest,
+}
+
+/// A step that was accepted and waits.
+#[derive(Debug)]
+pub(super) struct Waiting {
+    pub update: Update,
+    /// Steps that were merged into this one.
+    pub merged: u64,
+    parse_ms: f64,
+    since: Instant,
+}
+
+impl Waiting {
+    pub(super) fn new(update: Update, parse_ms: f64) -> Self {
+        Self { update, merged: 0, parse_ms, since: Instant::now() }
+    }
+
+    /// Parse and queue times until now.
+    pub(super) fn stages(&self) -> StageTimes {
+        vec![(Stage::Parse, self.parse_ms), (Stage::Queue, ms_since(self.since))]
+    }
+}
+
+/// What became of a step.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Report {
+    /// All steps up to this one are done or superseded. `skipped` counts the merged ones since the stream began.
+    Done { step: u64, skipped: u64, stages: StageTimes },
+    /// The step was taken back; the scene is as before it.
+    Refused { step: u64, error: Error },
+}
+
+/// Shared by a writer's handle and its scene. No lock is held across an await.
+#[derive(Debug)]
+pub(super) struct Lane {
+    policy: Policy,
+    window: usize,
+    inner: Mutex<Inner>,
+    /// Wakes the scene.
+    scene: Arc<Notify>,
+    /// Wakes the writer.
+    writer: Notify,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    waiting: VecDeque<Waiting>,
+    in_work: bool,
+    reports: VecDeque<Report>,
+    skipped: u64,
+    /// The writer has gone.
+    closed: bool,
+    /// The scene has ended it, and why.
+    ended: Option<Error>,
+}
+
+impl Lane {
+    pub(super) fn new(policy: Policy, window: u32, scene: Arc<Notify>) -> Self {
+        Self { policy, window: window.max(1) as usize, inner: Mutex::default(), scene, writer: Notify::new() }
+    }
+
+    pub(super) const fn policy(&self) -> Policy {
+        self.policy
+    }
+
+    /// Takes a step in.
+    ///
+    /// # Errors
+    /// `Invalid` naming the window when the step is beyond it; whatever ended the lane.
+    pub(super) fn offer(&self, step: Waiting) -> Result<()> {
+        let mut inner = self.lock();
+        if let Some(error) = &inner.ended {
+            return Err(error.clone());
+        }
+        match (self.policy, inner.waiting.pop_back()) {
+            (Policy::Latest, Some(older)) => {
+                inner.skipped += 1;
+                let merged = older.merged + 1;
+                inner.waiting.push_back(Waiting { update: step.update.over(&older.update), merged, ..step });
+            }
+            (_, last) => {
+                inner.waiting.extend(last);
+                self.check_window(&inner, step.update.number)?;
+                inner.waiting.push_back(step);
+            }
+        }
+        self.scene.notify_one();
+        Ok(())
+    }
+
+    /// The next step to work on. It counts against the window until its report is taken.
+    pub(super) fn take(&self) -> Option<Waiting> {
+        let mut inner = self.lock();
+        let step = inner.waiting.pop_front()?;
+        inner.in_work = true;
+        Some(step)
+    }
+
+    /// Tells what became of the step in work.
+    pub(super) fn report(&self, step: u64, outcome: Result<StageTimes>) {
+        let mut inner = self.lock();
+        inner.in_work = false;
+        let skipped = inner.skipped;
+        let report = match outcome {
+            Ok(stages) => Report::Done { step, skipped, stages },
+            Err(error) => Report::Refused { step, error },
+        };
+        // Under `latest` a writer may be slow to read. A newer "done" says all that the older one said; refusals are
+        // never dropped, so a writer that reads none of them is cut off in the end.
+        let supersedes = matches!((inner.reports.back(), &report), (Some(Report::Done { .. }), Report::Done { .. }));
+        if inner.reports.len() >= self.window && supersedes {
+            inner.reports.pop_back();
+        }
+        if inner.reports.len() > self.window {
+            inner.ended.get_or_insert(Error::Busy { queue: "replies not read by the writer", limit: self.window });
+        } else {
+            inner.reports.push_back(report);
+        }
+        self.writer.notify_one();
+    }
+
+    /// Waits for the next report. Safe to drop while it waits.
+    ///
+    /// # Errors
+    /// Whatever ended the lane, after all reports were taken.
+    pub(super) async fn next_report(&self) -> Result<Report> {
+        loop {
+            {
+                let mut inner = self.lock();
+                if let Some(report) = inner.reports.pop_front() {
+                    return Ok(report);
+                }
+                if let Some(error) = &inner.ended {
+                    return Err(error.clone());
+                }
+            }
+            self.writer.notified().await;
+        }
+    }
+
+    /// Whether every accepted step has been reported and the report been taken.
+    pub(super) fn is_drained(&self) -> bool {
+        let inner = self.lock();
+        !inner.in_work && inner.waiting.is_empty() && inner.reports.is_empty()
+    }
+
+    /// The writer has gone: steps that still wait are dropped.
+    pub(super) fn close(&self) {
+        let mut inner = self.lock();
+        inner.closed = true;
+        inner.waiting.clear();
+        self.scene.notify_one();
+    }
+
+    pub(super) fn is_closed(&self) -> bool {
+        let inner = self.lock();
+        inner.closed || inner.ended.is_some()
+    }
+
+    /// The scene takes no more steps.
+    pub(super) fn end(&self, error: Error) {
+        let mut inner = self.lock();
+        inner.ended.get_or_insert(error);
+        inner.waiting.clear();
+        self.writer.notify_one();
+    }
+
+    fn check_window(&self, inner: &Inner, number: u64) -> Result<()> {
+        let open = inner.waiting.len() + usize::from(inner.in_work) + inner.reports.len();
+        if self.policy == Policy::Lossless && open >= self.window {
+            let expected = format!("at most {} steps without acknowledgement", self.window);
+            return Err(invalid("window", expected, format!("step {number} as number {}", open + 1)));
+        }
+        Ok(())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // Every change under the lock is complete before anything can panic, so a poisoned lock is still sound.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing;
+    use super::*;
+    use crate::scene::{RawUpdate, State};
+
+    fn step(number: u64, domain: u32, q: [f32; 2]) -> Waiting {
+        let scene = testing::two_strips();
+        let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&q));
+        let raw = RawUpdate { number, q_domains: vec![domain], q, ..RawUpdate::default() };
+        Waiting::new(Update::parse(&scene, &raw).expect("a step"), 0.0)
+    }
+
+    #[test]
+    fn a_lossless_lane_refuses_the_step_beyond_the_window_until_a_report_is_taken() {
+        let lane = Lane::new(Policy::Lossless, 2, Arc::default());
+        lane.offer(step(1, 0, [0.0; 2])).expect("first");
+        lane.offer(step(2, 0, [0.0; 2])).expect("second");
+        let refusal = lane.offer(step(3, 0, [0.0; 2])).expect_err("beyond").to_string();
+        assert!(refusal.starts_with("window: expected at most 2"), "{refusal}");
+        assert_eq!(lane.take().map(|step| step.update.number), Some(1));
+        lane.report(1, Ok(vec![]));
+        assert!(lane.offer(step(3, 0, [0.0; 2])).is_err(), "the report was not taken yet");
+        lane.inner.lock().expect("sound").reports.clear();
+        lane.offer(step(3, 0, [0.0; 2])).expect("room again");
+    }
+
+    #[test]
+    fn a_latest_lane_merges_to_the_state_that_all_steps_would_have_left() {
+        let scene = testing::two_strips();
+        let lane = Lane::new(Policy::Latest, 1, Arc::default());
+        let steps = || [step(1, 0, [1.0, 2.0]), step(2, 1, [3.0, 4.0]), step(5, 0, [5.0, 6.0])];
+        let mut want = State::rest(&scene);
+        for step in steps() {
+            want.apply(&scene, &step.update);
+            lane.offer(step).expect("never refused");
+        }
+        let merged = lane.take().expect("one step");
+        let mut got = State::rest(&scene);
+        got.apply(&scene, &merged.update);
+        assert_eq!((got, merged.merged), (want, 2));
+        assert!(lane.take().is_none());
+    }
+
+    #[tokio::test]
+    async fn a_latest_writer_that_reads_late_hears_of_the_newest_step() {
+        let lane = Lane::new(Policy::Latest, 2, Arc::default());
+        for number in 1..=9 {
+            lane.offer(step(number, 0, [0.0; 2])).expect("taken");
+            lane.take().expect("in work");
+            lane.report(number, Ok(vec![]));
+        }
+        let mut heard = Vec::new();
+        while !lane.is_drained() {
+            heard.push(lane.next_report().await.expect("a report"));
+        }
+        let steps: Vec<u64> = heard.iter().map(|r| if let Report::Done { step, .. } = r { *step } else { 0 }).collect();
+        assert_eq!(steps, [1, 9]);
+    }
+
+    #[tokio::test]
+    async fn a_writer_that_reads_no_refusal_is_cut_off_and_an_ended_lane_says_why() {
+        let lane = Lane::new(Policy::Latest, 1, Arc::default());
+        for number in 1..=3 {
+            if lane.offer(step(number, 0, [0.0; 2])).is_ok() {
+                lane.take();
+                lane.report(number, Err(invalid("step.q", "less", "more")));
+            }
+        }
+        assert!(matches!(lane.next_report().await, Ok(Report::Refused { step: 1, .. })));
+        assert!(matches!(lane.next_report().await, Ok(Report::Refused { step: 2, .. })));
+        assert!(matches!(lane.next_report().await, Err(Error::Busy { limit: 1, .. })));
+        assert!(matches!(lane.offer(step(4, 0, [0.0; 2])), Err(Error::Busy { .. })));
+    }
+}

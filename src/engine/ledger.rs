@@ -1,0 +1,184 @@
+//! The state folder: a lock so that one server uses it, and `scenes.json`, the list of scenes that are open.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use super::keep::replace;
+use crate::error::{Error, Result, during, invalid};
+
+/// Where a scene came from.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum Origin {
+    /// A built-in name, or a path inside the repository.
+    Repository { source: String },
+    /// Files that a client sent; `entry` names the one to open, or is empty.
+    Upload { entry: String },
+}
+
+impl Origin {
+    /// In words, for lists.
+    pub fn source(&self) -> String {
+        match self {
+            Self::Repository { source } => source.clone(),
+            Self::Upload { entry } if entry.is_empty() => "uploaded".into(),
+            Self::Upload { entry } => format!("uploaded: {entry}"),
+        }
+    }
+}
+
+/// The names and origins of open scenes, on disk at all times.
+#[derive(Debug)]
+pub(super) struct Ledger {
+    folder: PathBuf,
+    entries: Mutex<BTreeMap<String, Origin>>,
+    /// Held by the server that uses the folder; the operating system frees it when the process dies.
+    lock: Mutex<Option<File>>,
+}
+
+impl Ledger {
+    /// Takes the folder and reads its list.
+    ///
+    /// # Errors
+    /// `Unavailable` when another server uses the folder or it cannot be made; `Invalid` when the list is damaged.
+    pub(super) fn open(folder: &Path) -> Result<Self> {
+        let unusable = |reason: String| Error::Unavailable {
+            what: "state folder",
+            reason,
+            remedy: "Name another one with --state".into(),
+        };
+        let refuse = |error: std::io::Error| unusable(format!("{}: {error}", folder.display()));
+        fs::create_dir_all(folder.join("uploads")).map_err(refuse)?;
+        let lock = File::create(folder.join("lock")).map_err(refuse)?;
+        lock.try_lock().map_err(|_| unusable(format!("{} is in use by another server", folder.display())))?;
+        let entries = match fs::read(folder.join("scenes.json")) {
+            Ok(bytes) => serde_json::from_slice(&bytes)
+                .map_err(|error| invalid("scenes.json of the state folder", "a map of scenes", error))?,
+            Err(_) => BTreeMap::new(),
+        };
+        remove_leftovers(&folder.join("uploads"));
+        Ok(Self { folder: folder.to_owned(), entries: Mutex::new(entries), lock: Mutex::new(Some(lock)) })
+    }
+
+    pub(super) fn entries(&self) -> BTreeMap<String, Origin> {
+        self.guard().clone()
+    }
+
+    /// Adds a scene. Writes to disk.
+    pub(super) fn add(&self, name: &str, origin: &Origin) -> Result<()> {
+        let mut entries = self.guard();
+        entries.insert(name.to_owned(), origin.clone());
+        self.write(&entries)
+    }
+
+    /// Removes a scene; whether it was there. Writes to disk.
+    pub(super) fn remove(&self, name: &str) -> Result<bool> {
+        let mut entries = self.guard();
+        let was_there = entries.remove(name).is_some();
+        self.write(&entries).map(|()| was_there)
+    }
+
+    /// Where steps are kept.
+    pub(super) fn steps(&self) -> PathBuf {
+        self.folder.join("steps")
+    }
+
+    /// Where an upload's files lie.
+    pub(super) fn upload(&self, name: &str) -> PathBuf {
+        self.folder.join("uploads").join(name)
+    }
+
+    /// Lets another server use the folder.
+    pub(super) fn release(&self) {
+        self.lock.lock().unwrap_or_else(PoisonError::into_inner).take();
+    }
+
+    fn write(&self, entries: &BTreeMap<String, Origin>) -> Result<()> {
+        let text = serde_json::to_vec_pretty(entries).map_err(during("writing scenes.json"))?;
+        replace(&self.folder.join("scenes.json"), &text).map_err(during("writing scenes.json"))
+    }
+
+    fn guard(&self) -> MutexGuard<'_, BTreeMap<String, Origin>> {
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Uploads that a killed server never finished.
+fn remove_leftovers(uploads: &Path) {
+    let Ok(folders) = fs::read_dir(uploads) else { return };
+    for folder in folders.flatten() {
+        if folder.file_name().to_string_lossy().starts_with('.') {
+            fs::remove_dir_all(folder.path()).ok(); // It is tried again at the next start.
+        }
+    }
+}
+
+/// The name itself if it may name a scene, and so a file.
+///
+/// # Errors
+/// `Invalid` for anything but 1 to 64 letters, digits, dots, dashes and underscores that begin with no dot.
+pub fn checked_name(name: &str) -> Result<&str> {
+    let fits = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
+    if name.is_empty() || name.len() > 64 || name.starts_with('.') || !name.chars().all(fits) {
+        let expected = "1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-', no dot first";
+        return Err(invalid("scene", expected, format!("{name:?}")));
+    }
+    Ok(name)
+}
+
+/// The name of a scene that was opened without one: the last part of its source.
+pub(super) fn own_name(source: &str) -> Result<String> {
+    let last = source.trim_end_matches('/').rsplit('/').next().unwrap_or_default();
+    let stem = last.rsplit_once('.').map_or(last, |(stem, _)| if stem.is_empty() { last } else { stem });
+    let fit = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '-' };
+    let stem = if source.trim_end_matches('/') == "." { "scene" } else { stem };
+    let name: String = stem.trim_start_matches('.').chars().map(fit).take(64).collect();
+    checked_name(&name).map_err(|_| invalid("source", "a built-in name or a path in the repository", source))?;
+    Ok(name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_could_leave_a_folder_are_refused() {
+        for name in ["", ".", "..", ".hidden", "a/b", "a\\b", "a\0", "ü", &"x".repeat(65)] {
+            assert!(checked_name(name).is_err(), "{name:?} passed");
+        }
+        assert_eq!(checked_name("tree_2.v-1"), Ok("tree_2.v-1"));
+    }
+
+    #[test]
+    fn a_source_gives_its_last_part_as_name() {
+        for (source, name) in [
+            ("tree", "tree"),
+            ("vega/simpleBridge/", "simpleBridge"),
+            ("a b/c d.glb", "c-d"),
+            ("x.y.obj", "x.y"),
+            (".", "scene"),
+            ("./tree", "tree"),
+        ] {
+            assert_eq!(own_name(source).as_deref(), Ok(name));
+        }
+        for source in ["", "/", "..", "a/.."] {
+            assert!(own_name(source).is_err(), "{source:?} passed");
+        }
+    }
+
+    #[test]
+    fn the_list_survives_and_a_second_server_is_refused_while_the_first_lives() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let first = Ledger::open(folder.path()).expect("free");
+        let origin = Origin::Upload { entry: String::new() };
+        first.add("a", &origin).expect("written");
+        first.add("b", &origin).expect("written");
+        assert_eq!(first.remove("b"), Ok(true));
+        assert!(matches!(Ledger::open(folder.path()), Err(Error::Unavailable { .. })));
+        first.release();
+        let second = Ledger::open(folder.path()).expect("free again");
+        assert_eq!(second.entries().into_iter().collect::<Vec<_>>(), [("a".to_owned(), origin)]);
+    }
+}

@@ -1,0 +1,102 @@
+//! Scenes by name. A name is claimed before its scene is loaded, so that two openings of one name share one loading.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::OnceCell;
+
+use super::host::Host;
+use super::ledger::Origin;
+use super::not_open;
+use crate::error::{Error, Result};
+
+/// A claimed name, and its scene once that is loaded.
+pub(super) struct Seat {
+    origin: Origin,
+    cell: OnceCell<Arc<Host>>,
+}
+
+impl Seat {
+    /// The scene, loaded by the first who asks; the others wait.
+    pub(super) async fn open<F>(&self, load: impl FnOnce() -> F) -> Result<Arc<Host>>
+    where
+        F: Future<Output = Result<Arc<Host>>>,
+    {
+        let host = self.cell.get_or_try_init(load).await?;
+        match host.is_closing() {
+            false => Ok(Arc::clone(host)),
+            true => Err(Error::Busy { queue: "the name of a scene that is being closed", limit: 1 }),
+        }
+    }
+
+    /// The scene, if it is loaded.
+    pub(super) fn host(&self) -> Option<&Arc<Host>> {
+        self.cell.get()
+    }
+}
+
+/// All claimed names.
+pub(super) struct Registry {
+    limit: usize,
+    seats: Mutex<BTreeMap<String, Arc<Seat>>>,
+}
+
+impl Registry {
+    pub(super) const fn new(limit: usize) -> Self {
+        Self { limit, seats: Mutex::new(BTreeMap::new()) }
+    }
+
+    /// Claims a name, or joins whoever claimed it for the same source. A `fresh` claim joins nobody.
+    pub(super) fn seat(&self, name: &str, origin: &Origin, fresh: bool) -> Result<Arc<Seat>> {
+        let mut seats = self.lock();
+        if let Some(seat) = seats.get(name) {
+            return match !fresh && seat.origin == *origin {
+                true => Ok(Arc::clone(seat)),
+                false => Err(taken(name, seat)),
+            };
+        }
+        if seats.len() >= self.limit {
+            return Err(Error::Busy { queue: "list of open scenes", limit: self.limit });
+        }
+        let seat = Arc::new(Seat { origin: origin.clone(), cell: OnceCell::new() });
+        seats.insert(name.to_owned(), Arc::clone(&seat));
+        Ok(seat)
+    }
+
+    pub(super) fn check_free(&self, name: &str) -> Result<()> {
+        self.lock().get(name).map_or(Ok(()), |seat| Err(taken(name, seat)))
+    }
+
+    pub(super) fn seat_of(&self, name: &str) -> Option<Arc<Seat>> {
+        self.lock().get(name).cloned()
+    }
+
+    pub(super) fn find(&self, name: &str) -> Result<Arc<Host>> {
+        let seats = self.lock();
+        let host = seats.get(name).and_then(|seat| seat.host()).filter(|host| !host.is_closing());
+        host.cloned().ok_or_else(|| not_open(name))
+    }
+
+    pub(super) fn list(&self) -> Vec<Arc<Host>> {
+        self.lock().values().filter_map(|seat| seat.host().cloned()).filter(|host| !host.is_closing()).collect()
+    }
+
+    /// Gives a name back, unless somebody else has claimed it since.
+    pub(super) fn remove(&self, name: &str, seat: &Arc<Seat>) {
+        let mut seats = self.lock();
+        let is_ours = seats.get(name).is_some_and(|held| Arc::ptr_eq(held, seat));
+        let is_usable = seat.host().is_some_and(|host| !host.is_closing());
+        if is_ours && !is_usable {
+            seats.remove(name);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Seat>>> {
+        // Every change under the lock is one insertion or removal, so a poisoned lock is still sound.
+        self.seats.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn taken(name: &str, seat: &Seat) -> Error {
+    Error::Taken { what: "the name of the scene", holder: format!("'{name}' is {}", seat.origin.source()) }
+}

@@ -1,0 +1,168 @@
+//! One scene on the device thread: its deformer, its OpenGL buffers once they are needed, and the last good state.
+
+use std::sync::Arc;
+
+use crate::deform::{Deformed, Deformer, Surface};
+use crate::error::{Error, Result, invalid};
+use crate::render::{Renderer, SceneBuffers};
+use crate::scene::{Bounds, Scene, State};
+
+/// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
+const FARTHEST: f64 = 1e18;
+
+/// A scene that can be deformed and drawn.
+pub struct Staged {
+    scene: Arc<Scene>,
+    deformer: Box<dyn Deformer>,
+    buffers: Option<SceneBuffers>,
+    /// Whether the buffers hold the vertices of the last deformation.
+    filled: bool,
+    bounds: Bounds,
+    /// What the deformer's output shows.
+    shown: Arc<State>,
+}
+
+impl Staged {
+    /// Deforms the rest state. On failure the buffers come back, so that their owner can free them.
+    pub(super) fn new(
+        scene: &Arc<Scene>,
+        mut deformer: Box<dyn Deformer>,
+        buffers: Option<SceneBuffers>,
+    ) -> Result<Self, (Error, Option<SceneBuffers>)> {
+        let shown = Arc::new(State::rest(scene));
+        let deformed = match deformer.deform(&shown) {
+            Ok(deformed) => deformed,
+            Err(error) => return Err((error, buffers)),
+        };
+        if !is_near(&deformed.bounds) {
+            let refusal = invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds));
+            return Err((refusal, buffers));
+        }
+        let scene = Arc::clone(scene);
+        Ok(Self { scene, deformer, buffers, filled: false, bounds: deformed.bounds, shown })
+    }
+
+    /// The scene.
+    pub const fn scene(&self) -> &Arc<Scene> {
+        &self.scene
+    }
+
+    /// Bounds of the last deformation; finite.
+    pub const fn bounds(&self) -> Bounds {
+        self.bounds
+    }
+
+    /// Deforms a state. A state whose vertices are not finite is refused; the previous one stays and is deformed again,
+    /// so that nobody ever sees the refused one.
+    ///
+    /// # Errors
+    /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
+    pub fn deform(&mut self, state: &State) -> Result<Deformed> {
+        self.deform_shared(&Arc::new(state.clone()))
+    }
+
+    /// [`Self::deform`] of a state that others hold too, without a copy of it.
+    pub(super) fn deform_shared(&mut self, state: &Arc<State>) -> Result<Deformed> {
+        self.filled = false;
+        let deformed = match self.deformer.deform(state) {
+            Ok(deformed) => deformed,
+            Err(error) => {
+                // The output may be half written. If this fails too, the first error tells more.
+                self.deformer.deform(&self.shown).ok();
+                return Err(error);
+            }
+        };
+        if is_near(&deformed.bounds) {
+            self.bounds = deformed.bounds;
+            self.shown = Arc::clone(state);
+            return Ok(deformed);
+        }
+        let refusal = self.overflow(state)?;
+        self.deformer.deform(&self.shown)?;
+        Err(refusal)
+    }
+
+    /// The vertices of the last deformation, in host memory.
+    ///
+    /// # Errors
+    /// `Fault` when copying from the device failed.
+    pub fn surface(&mut self) -> Result<&Surface> {
+        self.deformer.surface()
+    }
+
+    /// Makes the buffers if need be and brings the last deformation into them. True when an upload was needed.
+    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer) -> Result<bool> {
+        let shares = self.deformer.shares_buffers();
+        let buffers = match self.buffers.take() {
+            Some(buffers) => buffers,
+            None => renderer.load(&self.scene)?,
+        };
+        let buffers = self.buffers.insert(buffers);
+        if self.filled || shares {
+            return Ok(false);
+        }
+        renderer.upload(buffers, self.deformer.surface()?)?;
+        self.filled = true;
+        Ok(true)
+    }
+
+    pub(super) fn buffers(&self) -> Result<&SceneBuffers> {
+        self.buffers.as_ref().ok_or_else(|| crate::error::during("draw")("the scene has no buffers"))
+    }
+
+    /// Drops the deformer first: it may have the buffers mapped.
+    pub(super) fn into_buffers(self) -> Option<SceneBuffers> {
+        drop(self.deformer);
+        self.buffers
+    }
+
+    /// Names the first domain with a vertex out of range.
+    fn overflow(&mut self, state: &State) -> Result<Error> {
+        let scene = Arc::clone(&self.scene);
+        let surface = self.deformer.surface()?;
+        let is_far = |number: &f32| !(f64::from(*number).abs() <= FARTHEST);
+        let at = surface.positions.iter().position(is_far).unwrap_or(0);
+        let domain = scene.layout.slots.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
+        let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));
+        let given = format!("vertex {} out of range, largest |q| {largest:e}", at / 3);
+        let field = format!("step.q of domain '{}'", scene.domains[domain].name);
+        Ok(invalid(field, format!("q and transform that keep every vertex within {FARTHEST:e}"), given))
+    }
+}
+
+fn is_near(bounds: &Bounds) -> bool {
+    bounds.min.iter().chain(&bounds.max).all(|number| number.abs() <= FARTHEST)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing;
+    use super::*;
+    use crate::reference::ReferenceDeformer;
+
+    fn staged() -> Staged {
+        let scene = testing::two_strips();
+        let deformer = Box::new(ReferenceDeformer::new(&scene));
+        Staged::new(&scene, deformer, None).map_err(|(error, _)| error).expect("a scene at rest")
+    }
+
+    #[test]
+    fn an_overflowing_step_is_refused_by_name_and_the_previous_vertices_stay() {
+        let mut staged = staged();
+        let scene = Arc::clone(staged.scene());
+        let mut good = State::rest(&scene);
+        good.q[0] = 0.25;
+        staged.deform(&good).expect("a good step");
+        let before = staged.surface().expect("vertices").clone();
+        let last = scene.layout.slots[1].first_q;
+        for amount in [f32::MAX, 1e30] {
+            let mut bad = good.clone();
+            bad.q[last] = amount;
+            let refusal = staged.deform(&bad).expect_err("overflows").to_string();
+            assert!(refusal.starts_with("step.q of domain 'right'"), "{refusal}");
+            assert_eq!(staged.surface().expect("vertices"), &before);
+            assert!(staged.bounds().is_finite());
+        }
+        assert_ne!(before, Surface::default());
+    }
+}

@@ -1,0 +1,29 @@
+//! Scenes for the unit tests of this module.
+
+use std::sync::Arc;
+
+use crate::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use crate::scene::{Parts, Scene};
+
+/// Two strips of two triangles with two modes each; the second hangs on the first.
+pub(super) fn two_strips() -> Arc<Scene> {
+    let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+    let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.0 }).collect();
+    let shape = Shape::new(mesh, Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
+    let domain = |name: &str, attachment| Domain {
+        name: name.into(),
+        shape: 0,
+        material: 0,
+        runs: vec![],
+        placement: Transform::IDENTITY,
+        attachment,
+        rest_q: vec![],
+        shares_q_with: None,
+        metadata: Metadata::default(),
+    };
+    let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 2] };
+    let domains = vec![domain("left", None), domain("right", Some(joint))];
+    let parts = Parts { shapes: vec![shape], materials: vec![Material::default()], domains, ..Parts::named("strips") };
+    Scene::new(parts).expect("a scene")
+}

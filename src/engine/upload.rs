@@ -1,0 +1,242 @@
+//! Uploaded files on their way to disk: paths stay inside a fresh folder, sizes and SHA-256 are those declared. A folder
+//! that is not finished disappears with its [`Upload`].
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use sha2::{Digest as _, Sha256};
+use tokio::sync::OwnedSemaphorePermit;
+
+use crate::error::{Result, during, invalid};
+
+/// The longest path, in bytes, and its most folders.
+const LONGEST_PATH: usize = 240;
+const DEEPEST: usize = 16;
+
+static COUNTER: AtomicU64 = AtomicU64::new(0);
+
+/// What a client says it will send.
+#[derive(Debug, Clone, Default)]
+pub struct Announcement {
+    /// The name to open the scene under.
+    pub scene: String,
+    /// Which of the paths to open; empty: the folder.
+    pub entry: String,
+    pub files: u32,
+    pub total_bytes: u64,
+}
+
+/// One upload under way. Its functions wait for the disk.
+#[derive(Debug)]
+pub struct Upload {
+    pub(super) announced: Announcement,
+    folder: PathBuf,
+    paths: BTreeSet<String>,
+    /// Bytes announced by the files so far.
+    claimed: u64,
+    open: Option<Open>,
+    /// Its place among the uploads under way.
+    _place: OwnedSemaphorePermit,
+}
+
+#[derive(Debug)]
+struct Open {
+    path: String,
+    file: File,
+    bytes: u64,
+    left: u64,
+    hasher: Sha256,
+    sha256: [u8; 32],
+}
+
+impl Upload {
+    /// A fresh folder beside the finished uploads.
+    pub(super) fn begin(uploads: &Path, announced: Announcement, place: OwnedSemaphorePermit) -> Result<Self> {
+        if !announced.entry.is_empty() {
+            checked_path("header.entry", &announced.entry)?;
+        }
+        let count = COUNTER.fetch_add(1, Ordering::Relaxed);
+        let folder = uploads.join(format!(".{}-{count}", announced.scene));
+        fs::create_dir_all(&folder).map_err(during("upload"))?;
+        Ok(Self { announced, folder, paths: BTreeSet::new(), claimed: 0, open: None, _place: place })
+    }
+
+    /// Begins the next file.
+    ///
+    /// # Errors
+    /// `Invalid` for a path that leaves the folder or comes twice, for more files or bytes than announced, for a hash
+    /// that is none, and when the file before it is not whole.
+    pub fn file(&mut self, path: &str, bytes: u64, sha256: &[u8]) -> Result<()> {
+        self.check_whole()?;
+        checked_path("file.path", path)?;
+        let sha256: [u8; 32] = sha256
+            .try_into()
+            .map_err(|_| invalid(format!("file.sha256 of '{path}'"), "32 bytes", format!("{} bytes", sha256.len())))?;
+        if !self.paths.insert(path.to_owned()) {
+            return Err(invalid("file.path", "a path that was not sent yet", path));
+        }
+        if self.paths.len() > self.announced.files as usize {
+            return Err(invalid("header.files", self.announced.files.to_string(), self.paths.len()));
+        }
+        self.claimed = self.claimed.saturating_add(bytes);
+        if self.claimed > self.announced.total_bytes {
+            return Err(invalid("header.total_bytes", self.announced.total_bytes.to_string(), self.claimed));
+        }
+        let place = self.folder.join(path);
+        let clash = |_| invalid("file.path", "a path whose folders are no files", path);
+        if let Some(parent) = place.parent() {
+            fs::create_dir_all(parent).map_err(clash)?;
+        }
+        let file = File::create_new(&place).map_err(clash)?;
+        self.open = Some(Open { path: path.into(), file, bytes, left: bytes, hasher: Sha256::new(), sha256 });
+        self.finish_file()
+    }
+
+    /// The next bytes of the file begun last.
+    ///
+    /// # Errors
+    /// `Invalid` when they are more than announced or the finished file's hash differs; `Fault` of the disk.
+    pub fn chunk(&mut self, bytes: &[u8]) -> Result<()> {
+        let count = bytes.len() as u64;
+        let Some(open) = self.open.as_mut().filter(|open| count <= open.left) else {
+            let left = self.open.as_ref().map_or(0, |open| open.left);
+            return Err(invalid("chunk", format!("at most the {left} bytes that are left of the file"), count));
+        };
+        open.file.write_all(bytes).map_err(during("upload"))?;
+        open.hasher.update(bytes);
+        open.left -= count;
+        self.finish_file()
+    }
+
+    /// Checks that everything announced is there.
+    ///
+    /// # Errors
+    /// `Invalid` naming what is missing.
+    pub(super) fn finish(&mut self) -> Result<()> {
+        self.check_whole()?;
+        if self.paths.len() != self.announced.files as usize {
+            return Err(invalid("header.files", self.announced.files.to_string(), self.paths.len()));
+        }
+        if self.claimed != self.announced.total_bytes {
+            return Err(invalid("header.total_bytes", self.announced.total_bytes.to_string(), self.claimed));
+        }
+        Ok(())
+    }
+
+    /// Moves the folder to its place, over whatever an earlier upload of that name left there.
+    pub(super) fn settle(mut self, place: &Path) -> Result<()> {
+        if place.exists() {
+            fs::remove_dir_all(place).map_err(during("upload"))?;
+        }
+        fs::rename(&self.folder, place).map_err(during("upload"))?;
+        self.folder = PathBuf::new();
+        Ok(())
+    }
+
+    fn finish_file(&mut self) -> Result<()> {
+        let Some(open) = self.open.take_if(|open| open.left == 0) else { return Ok(()) };
+        let given: [u8; 32] = open.hasher.finalize().into();
+        if given != open.sha256 {
+            return Err(invalid(format!("file.sha256 of '{}'", open.path), hex(&open.sha256), hex(&given)));
+        }
+        Ok(())
+    }
+
+    fn check_whole(&self) -> Result<()> {
+        match &self.open {
+            None => Ok(()),
+            Some(open) => {
+                let given = format!("{} bytes", open.bytes - open.left);
+                Err(invalid(format!("file.bytes of '{}'", open.path), format!("{} bytes", open.bytes), given))
+            }
+        }
+    }
+}
+
+impl Drop for Upload {
+    fn drop(&mut self) {
+        if !self.folder.as_os_str().is_empty() {
+            fs::remove_dir_all(&self.folder).ok(); // What stays is removed at the next start.
+        }
+    }
+}
+
+/// Relative, forward slashes, every part a plain name.
+fn checked_path(field: &str, path: &str) -> Result<()> {
+    let is_plain = |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0', ':']);
+    let parts = path.split('/').count();
+    if path.len() > LONGEST_PATH || parts > DEEPEST || !path.split('/').all(is_plain) {
+        let expected = format!("a relative path of plain names, at most {LONGEST_PATH} bytes and {DEEPEST} parts");
+        return Err(invalid(field, expected, format!("{path:?}")));
+    }
+    Ok(())
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn begin(folder: &Path, files: u32, total_bytes: u64) -> Upload {
+        let announced = Announcement { scene: "s".into(), entry: String::new(), files, total_bytes };
+        let places = std::sync::Arc::new(tokio::sync::Semaphore::new(1));
+        Upload::begin(folder, announced, places.try_acquire_owned().expect("free")).expect("begins")
+    }
+
+    fn sha(bytes: &[u8]) -> Vec<u8> {
+        Sha256::digest(bytes).to_vec()
+    }
+
+    #[test]
+    fn files_arrive_in_chunks_and_settle_whole() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut upload = begin(folder.path(), 2, 5);
+        upload.file("a/b.txt", 5, &sha(b"hello")).expect("a file");
+        upload.chunk(b"he").expect("fits");
+        upload.chunk(b"llo").expect("fits");
+        upload.file("empty", 0, &sha(b"")).expect("an empty file");
+        upload.finish().expect("whole");
+        upload.settle(&folder.path().join("done")).expect("settles");
+        assert_eq!(fs::read(folder.path().join("done/a/b.txt")).expect("is there"), b"hello");
+        assert_eq!(fs::read_dir(folder.path()).expect("a folder").count(), 1);
+    }
+
+    #[test]
+    fn bad_paths_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut upload = begin(folder.path(), 99, 0);
+        let long = "x".repeat(300);
+        let deep = ["d"; 20].join("/");
+        for path in ["", "/etc/x", "../x", "a/../x", "a//b", "./a", "a/", "a\\b", "a\0b", "C:x", &long, &deep] {
+            let refusal = upload.file(path, 0, &sha(b"")).expect_err(path).to_string();
+            assert!(refusal.starts_with("file.path"), "{refusal}");
+        }
+        upload.file("a", 0, &sha(b"")).expect("plain");
+        for path in ["a", "a/b"] {
+            assert!(upload.file(path, 0, &sha(b"")).is_err(), "{path} passed");
+        }
+    }
+
+    #[test]
+    fn sizes_and_hashes_are_held_to_and_nothing_is_left_of_a_failure() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let refusal = |act: fn(&mut Upload) -> Result<()>| {
+            let mut upload = begin(folder.path(), 1, 4);
+            act(&mut upload).expect_err("refused").to_string()
+        };
+        assert!(refusal(|up| up.file("a", 5, &sha(b""))).starts_with("header.total_bytes"));
+        assert!(refusal(|up| up.file("a", 4, b"short")).starts_with("file.sha256"));
+        assert!(refusal(|up| up.chunk(b"x")).starts_with("chunk"));
+        assert!(refusal(|up| up.file("a", 1, &sha(b"x")).and_then(|()| up.chunk(b"xy"))).starts_with("chunk"));
+        assert!(refusal(|up| up.file("a", 1, &sha(b"x")).and_then(|()| up.chunk(b"y"))).starts_with("file.sha256"));
+        assert!(refusal(|up| up.file("a", 1, &sha(b"x")).and_then(|()| up.finish())).starts_with("file.bytes"));
+        assert!(refusal(Upload::finish).starts_with("header.files"));
+        assert_eq!(fs::read_dir(folder.path()).expect("a folder").count(), 0);
+    }
+}

@@ -1,0 +1,174 @@
+//! The tools of the device thread: a backend that deforms and, where there is one, a renderer. Scenes become [`Staged`].
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::staged::Staged;
+use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::cpu::CpuDeformer;
+use crate::deform::{Backend, Deformer};
+use crate::error::{Error, Result};
+use crate::gpu::{self, CudaDeformer, GlBuffers};
+use crate::reference::ReferenceDeformer;
+use crate::render::{self, Image, Prefer, Renderer, SceneBuffers, Shot};
+use crate::scene::{Camera, Scene};
+use crate::telemetry::{Stage, ms_since};
+
+/// What deforms and what draws, for people to read.
+#[derive(Debug, Clone)]
+pub struct Info {
+    pub backend: Backend,
+    /// The CUDA device's name, or the reason why there is none.
+    pub device: String,
+    /// What draws, or why nothing does.
+    pub renderer: Result<render::Info>,
+}
+
+/// Owns the device and the renderer. Lives on one thread; the command line's `render` uses it directly.
+#[derive(Debug)]
+pub struct Workbench {
+    // Scenes are put away by `unstage` before either is dropped; OpenGL goes before the CUDA context that it maps.
+    renderer: Result<Renderer>,
+    device: Option<Arc<gpu::Device>>,
+    info: Info,
+}
+
+impl Workbench {
+    /// Opens what the settings ask for and the machine has.
+    ///
+    /// # Errors
+    /// `Unavailable` when CUDA is asked for by name and is not there. A missing renderer is no error until a frame is
+    /// asked for.
+    pub fn open(config: &Config) -> Result<Self> {
+        let (backend, device, note) = open_backend(config)?;
+        let renderer = open_renderer(config, device.is_some());
+        let info = Info {
+            backend,
+            device: note,
+            renderer: renderer.as_ref().map(|renderer| renderer.info().clone()).map_err(Clone::clone),
+        };
+        Ok(Self { renderer, device, info })
+    }
+
+    /// The backend in use.
+    pub const fn backend(&self) -> Backend {
+        self.info.backend
+    }
+
+    /// What deforms and what draws.
+    pub const fn info(&self) -> &Info {
+        &self.info
+    }
+
+    /// Prepares a scene and deforms it at rest. OpenGL buffers are made now only when the deformer writes into them.
+    ///
+    /// # Errors
+    /// `Fault` when the device refuses; `Invalid` when the rest state itself overflows.
+    pub fn stage(&mut self, scene: &Arc<Scene>) -> Result<Staged> {
+        let mut buffers = None;
+        let deformer: Box<dyn Deformer> = match (self.device.clone(), self.info.backend) {
+            (Some(device), Backend::Cuda) => {
+                buffers = self.shareable_buffers(scene)?;
+                let gl = buffers.as_ref().map(gl_buffers);
+                match CudaDeformer::new(&device, scene, gl) {
+                    Ok(deformer) => Box::new(deformer),
+                    Err(error) => {
+                        self.unload(buffers);
+                        return Err(error);
+                    }
+                }
+            }
+            (_, Backend::Reference) => Box::new(ReferenceDeformer::new(scene)),
+            _ => Box::new(CpuDeformer::new(scene)),
+        };
+        Staged::new(scene, deformer, buffers).map_err(|(error, buffers)| {
+            self.unload(buffers);
+            error
+        })
+    }
+
+    /// Frees what a staged scene holds.
+    pub fn unstage(&mut self, staged: Staged) {
+        let buffers = staged.into_buffers();
+        self.unload(buffers);
+    }
+
+    /// Draws the vertices of the last deformation. The image's passes name "upload" too when there was one.
+    ///
+    /// # Errors
+    /// `Unavailable` without a renderer, `Invalid` for a camera or size that makes no sense, `Fault` of OpenGL.
+    pub fn draw(&mut self, staged: &mut Staged, camera: &Camera, width: u32, height: u32) -> Result<Image> {
+        let camera = camera.checked()?;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let begin = Instant::now();
+        let uploaded = staged.fill_buffers(renderer)?;
+        let upload_ms = ms_since(begin);
+        let shot = Shot { camera, width, height, bounds: staged.bounds() };
+        let mut image = renderer.draw(staged.buffers()?, &shot)?;
+        if uploaded {
+            image.passes.insert(0, (Stage::Upload.name(), upload_ms));
+        }
+        Ok(image)
+    }
+
+    /// Buffers that CUDA may map: only when the renderer is that very device.
+    fn shareable_buffers(&mut self, scene: &Arc<Scene>) -> Result<Option<SceneBuffers>> {
+        match &mut self.renderer {
+            Ok(renderer) if renderer.info().cuda_device.is_some() => renderer.load(scene).map(Some),
+            _ => Ok(None),
+        }
+    }
+
+    fn unload(&mut self, buffers: Option<SceneBuffers>) {
+        if let (Some(buffers), Ok(renderer)) = (buffers, &mut self.renderer) {
+            renderer.unload(buffers);
+        }
+    }
+}
+
+fn gl_buffers(buffers: &SceneBuffers) -> GlBuffers {
+    let shared = buffers.shared;
+    GlBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents }
+}
+
+fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
+    match config.backend {
+        BackendChoice::Cpu => Ok((Backend::Cpu, None, "not asked for".into())),
+        BackendChoice::Reference => Ok((Backend::Reference, None, "not asked for".into())),
+        BackendChoice::Cuda => {
+            let device = gpu::Device::open(config.cuda_device)?;
+            let name = device.name().to_owned();
+            Ok((Backend::Cuda, Some(device), name))
+        }
+        BackendChoice::Auto => Ok(match gpu::Device::open(config.cuda_device) {
+            Ok(device) => {
+                let name = device.name().to_owned();
+                (Backend::Cuda, Some(device), name)
+            }
+            Err(error) => (Backend::Cpu, None, error.to_string()),
+        }),
+    }
+}
+
+fn open_renderer(config: &Config, cuda: bool) -> Result<Renderer> {
+    let refusal = |reason: &str, remedy: &str| Error::Unavailable {
+        what: "renderer",
+        reason: reason.into(),
+        remedy: remedy.into(),
+    };
+    let renderer = match config.renderer {
+        RendererChoice::Off => return Err(refusal("it was switched off", "Start the server with a renderer")),
+        RendererChoice::Software => Renderer::open(Prefer::Software),
+        RendererChoice::Auto if cuda => {
+            let ordinal = i32::try_from(config.cuda_device).unwrap_or(i32::MAX);
+            // A driver without its EGL half still deforms; frames then come from whatever else draws.
+            Renderer::open(Prefer::Cuda(ordinal)).or_else(|_| Renderer::open(Prefer::Any))
+        }
+        RendererChoice::Auto => Renderer::open(Prefer::Any),
+    }?;
+    if renderer.info().software && !config.allow_software {
+        let reason = format!("only {} is there and software renderers are not allowed", renderer.info().renderer);
+        return Err(refusal(&reason, "Install the GPU's EGL driver or allow software"));
+    }
+    Ok(renderer)
+}

@@ -1,0 +1,343 @@
+//! Entries of a manifest to the parts of one scene: models read once, placed, joined and painted.
+
+use std::collections::{HashMap, HashSet};
+use std::path::PathBuf;
+
+use super::patch::{Gallery, Patch};
+use super::{Entry, Manifest, Transforms};
+use crate::domain::{Attachment, Domain, Material, Modes, Shape, Texture, Transform};
+use crate::error::{Result, invalid};
+use crate::load::files::Files;
+use crate::load::obj::Source;
+use crate::load::{images, modes, source};
+use crate::scene::{MAX_DOMAINS, Parts, UpAxis};
+
+/// Vertices of a deformable parent that carry a child whose entry names none.
+const CARRIERS: usize = 8;
+
+/// The scene of all entries.
+///
+/// # Errors
+/// `Invalid` naming the entry.
+pub(super) fn assemble(files: &Files, manifest: &Manifest, entries: &[Entry], own_name: &str) -> Result<Parts> {
+    let name = manifest.name.clone().unwrap_or_else(|| own_name.to_owned());
+    let mut assembly = Assembly {
+        files,
+        manifest,
+        parts: Parts::named(name),
+        pictures: HashMap::new(),
+        models: HashMap::new(),
+        by_name: HashMap::new(),
+        patched: HashSet::new(),
+    };
+    for (index, entry) in entries.iter().enumerate() {
+        assembly.add(index, entry).map_err(|error| error.within(&format!("domain {} ('{}')", index, entry.model)))?;
+    }
+    assembly.check_patches()?;
+    let mut parts = assembly.parts;
+    parts.up = manifest.up.unwrap_or(parts.up);
+    parts.unit = manifest.unit.unwrap_or(parts.unit);
+    parts.origin = manifest.origin;
+    parts.look = manifest.look.unwrap_or(parts.look);
+    match manifest.shadows {
+        Some(false) => parts.look.shadow = None,
+        Some(true) => parts.look.shadow = Some(parts.look.shadow.unwrap_or_default()),
+        None => {}
+    }
+    match manifest.ground {
+        Some(false) => parts.look.ground = None,
+        Some(true) => parts.look.ground = Some(parts.look.ground.unwrap_or_default()),
+        None => {}
+    }
+    parts.rigid_transforms = manifest.transforms == Transforms::Rigid;
+    drop_unused(&mut parts);
+    Ok(parts)
+}
+
+/// A model that was read: its domains, indices already those of the whole scene, but domains counted from 0.
+struct Loaded {
+    domains: Vec<Domain>,
+}
+
+struct Assembly<'a> {
+    files: &'a Files,
+    manifest: &'a Manifest,
+    parts: Parts,
+    pictures: HashMap<String, usize>,
+    models: HashMap<(PathBuf, Option<String>), Loaded>,
+    by_name: HashMap<String, usize>,
+    /// Names of materials that a patch was looked up for.
+    patched: HashSet<String>,
+}
+
+impl Gallery for Assembly<'_> {
+    fn index(&mut self, path: &str) -> Result<usize> {
+        if let Some(index) = self.pictures.get(path) {
+            return Ok(*index);
+        }
+        self.parts.textures.push(images::decode(self.files, path)?);
+        self.pictures.insert(path.to_owned(), self.parts.textures.len() - 1);
+        Ok(self.parts.textures.len() - 1)
+    }
+
+    fn at(&self, index: usize) -> Option<&Texture> {
+        self.parts.textures.get(index)
+    }
+}
+
+impl Assembly<'_> {
+    fn add(&mut self, index: usize, entry: &Entry) -> Result<()> {
+        let path = self.files.resolve(&entry.model)?;
+        let key = (path, entry.modes.clone());
+        if !self.models.contains_key(&key) {
+            let loaded = self.load(index, entry)?;
+            self.models.insert(key.clone(), loaded);
+        }
+        let Some(loaded) = self.models.get(&key) else { return Ok(()) };
+        let mut domains = loaded.domains.clone();
+        let first = self.parts.domains.len();
+        if first + domains.len() > MAX_DOMAINS {
+            return Err(invalid("domains", format!("at most {MAX_DOMAINS} in a scene"), first + domains.len()));
+        }
+        self.place(entry, &mut domains)?;
+        self.paint(entry, &mut domains)?;
+        self.annotate(entry, &mut domains)?;
+        for domain in &mut domains {
+            domain.shares_q_with = domain.shares_q_with.map(|twin| twin + first);
+        }
+        self.name(entry, &mut domains)?;
+        self.parts.domains.append(&mut domains);
+        Ok(())
+    }
+
+    /// Reads a model and puts what is not a domain of it behind what is there.
+    fn load(&mut self, index: usize, entry: &Entry) -> Result<Loaded> {
+        let source = if entry.modes.is_some() { Source::None } else { Source::Beside };
+        let mut model = source::model(self.files, &entry.model, source)?;
+        if let Some(file) = &entry.modes {
+            replace_modes(self.files, file, &mut model)?;
+        }
+        if index == 0 {
+            (self.parts.up, self.parts.unit, self.parts.look) = (model.up, model.unit, model.look);
+        }
+        let up = self.manifest.up.unwrap_or(self.parts.up);
+        if entry.up.is_none() && model.up != up {
+            let remark = format!("{:?} is up in it and {up:?} in the scene; its entry can say so with `up`", model.up);
+            model.remarks.push(remark);
+        }
+        let (shapes, materials) = (self.parts.shapes.len(), self.parts.materials.len());
+        let textures = self.parts.textures.len();
+        for domain in &mut model.domains {
+            domain.shape += shapes;
+            domain.material += materials;
+            domain.runs.iter_mut().for_each(|run| run.material += materials);
+        }
+        self.parts.shapes.append(&mut model.shapes);
+        self.parts.textures.append(&mut model.textures);
+        for mut material in model.materials {
+            for texture in [&mut material.colour_texture, &mut material.normal_texture] {
+                *texture = texture.map(|texture| texture + textures);
+            }
+            let manifest = self.manifest;
+            self.patched.insert(material.name.clone());
+            for name in ["*", material.name.clone().as_str()] {
+                if let Some(patch) = manifest.material.get(name) {
+                    patch.apply(&mut material, self)?;
+                }
+            }
+            self.parts.materials.push(material);
+        }
+        let remarks = model.remarks.into_iter().map(|remark| format!("model '{}': {remark}", entry.model));
+        self.parts.remarks.extend(remarks);
+        Ok(Loaded { domains: model.domains })
+    }
+
+    fn check_patches(&self) -> Result<()> {
+        let known = |name: &&String| name.as_str() == "*" || self.patched.contains(*name);
+        let Some(stray) = self.manifest.material.keys().find(|name| !known(name)) else { return Ok(()) };
+        let mut names: Vec<&str> = self.patched.iter().map(String::as_str).collect();
+        names.sort_unstable();
+        names.truncate(16);
+        Err(invalid("material", format!("* or one of {}", names.join(", ")), stray))
+    }
+
+    /// Moves the domains to their place and hangs those without a parent on the entry's.
+    fn place(&self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+        let first = self.parts.domains.len();
+        let said = |placement: &Option<super::Placement>, key: &str| match placement {
+            Some(placement) => placement.transform().map_err(|error| error.within(key)),
+            None => Ok(Transform::IDENTITY),
+        };
+        let parent = self.parent(entry)?;
+        let world_from_entry = match parent {
+            Some(parent) if entry.frame.is_some() => {
+                self.parts.domains[parent].placement.then(said(&entry.frame, "frame")?)
+            }
+            _ => said(&entry.placement, "placement")?,
+        };
+        let world_from_model = world_from_entry.then(turned(entry.up, self.manifest.up.unwrap_or(self.parts.up)));
+        for domain in domains {
+            domain.placement = world_from_model.then(domain.placement);
+            match (&mut domain.attachment, parent) {
+                (Some(attachment), _) => attachment.parent += first,
+                (None, Some(parent)) => domain.attachment = Some(self.attach(entry, parent, domain.placement)?),
+                (None, None) => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn parent(&self, entry: &Entry) -> Result<Option<usize>> {
+        let Some(name) = &entry.parent else {
+            return match (&entry.frame, &entry.rows) {
+                (None, None) => Ok(None),
+                _ => Err(invalid("frame, rows", "none without a parent", "some")),
+            };
+        };
+        if entry.frame.is_some() && entry.placement.is_some() {
+            return Err(invalid("frame", "either a frame in the parent or a placement in the world", "both"));
+        }
+        let found = self.by_name.get(name).copied();
+        found.map(Some).ok_or_else(|| invalid("parent", "the name of a domain of an earlier entry", name))
+    }
+
+    fn attach(&self, entry: &Entry, parent: usize, world_from_child: Transform) -> Result<Attachment> {
+        let carrier = &self.parts.domains[parent];
+        let parent_from_world = carrier.placement.inverse();
+        let singular = || invalid("parent", "a parent whose placement has an inverse", &carrier.name);
+        let frame = parent_from_world.ok_or_else(singular)?.then(world_from_child);
+        let rows = match &entry.rows {
+            Some(rows) => rows.clone(),
+            None => nearest(&self.parts.shapes[carrier.shape], frame),
+        };
+        Ok(Attachment { parent, frame, rows })
+    }
+
+    /// Gives the entry its own copies of the materials that it changes.
+    fn paint(&mut self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+        let Some(patch) = &entry.material else { return Ok(()) };
+        let mut copies = HashMap::new();
+        let mut used: Vec<usize> = domains.iter().flat_map(Domain::materials).collect();
+        used.sort_unstable();
+        used.dedup();
+        for index in used {
+            let mut copy: Material = self.parts.materials[index].clone();
+            Patch::apply(patch, &mut copy, self)?;
+            self.parts.materials.push(copy);
+            copies.insert(index, self.parts.materials.len() - 1);
+        }
+        let copied = |index: &mut usize| *index = copies.get(index).copied().unwrap_or(*index);
+        for domain in domains {
+            copied(&mut domain.material);
+            domain.runs.iter_mut().for_each(|run| copied(&mut run.material));
+        }
+        Ok(())
+    }
+
+    fn annotate(&self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+        if let Some(eigenvalues) = &entry.eigenvalues {
+            let ranks: Vec<_> = domains.iter().map(|domain| self.parts.shapes[domain.shape].modes.rank()).collect();
+            if ranks[..] != [eigenvalues.len()] || !eigenvalues.iter().all(|value| value.is_finite()) {
+                let expected = format!("finite numbers for one domain of as many modes (there: {ranks:?})");
+                return Err(invalid("eigenvalues", expected, format!("{} numbers", eigenvalues.len())));
+            }
+            domains[0].metadata.eigenvalues.clone_from(eigenvalues);
+        }
+        for domain in domains {
+            domain.metadata.notes.extend(entry.notes.clone());
+        }
+        Ok(())
+    }
+
+    /// Names every domain apart: the entry's name, in front of the model's own where that has several domains.
+    fn name(&mut self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+        let single = domains.len() == 1;
+        for (offset, domain) in domains.iter_mut().enumerate() {
+            let index = self.parts.domains.len() + offset;
+            match &entry.name {
+                Some(name) if single => domain.name.clone_from(name),
+                Some(name) => domain.name = format!("{name}/{}", domain.name),
+                None => {}
+            }
+            let wanted = domain.name.clone();
+            let mut count = 1;
+            while self.by_name.contains_key(&domain.name) {
+                if entry.name.is_some() && single {
+                    return Err(invalid("name", "a name that no earlier domain has", wanted));
+                }
+                count += 1;
+                domain.name = format!("{wanted} {count}");
+            }
+            self.by_name.insert(domain.name.clone(), index);
+        }
+        if let (Some(name), false) = (&entry.name, single) {
+            // The entry's name stands for its first domain when a later one wants it as its parent.
+            self.by_name.entry(name.clone()).or_insert(self.parts.domains.len());
+        }
+        Ok(())
+    }
+}
+
+/// Exchanges U of a model of one shape; coordinates at rest go with it.
+fn replace_modes(files: &Files, file: &str, model: &mut Parts) -> Result<()> {
+    let [shape] = &mut model.shapes[..] else {
+        return Err(invalid("modes", "a model of one domain", format!("one of {}", model.shapes.len())));
+    };
+    let found = if file.is_empty() { Modes::rigid() } else { modes::read(files, file)? };
+    *shape = Shape::new(shape.mesh.clone(), found).map_err(|error| error.within(&format!("file '{file}'")))?;
+    model.domains.iter_mut().for_each(|domain| domain.rest_q.clear());
+    Ok(())
+}
+
+/// Turns `from` up to `to` up; the identity when `from` is not said.
+fn turned(from: Option<UpAxis>, to: UpAxis) -> Transform {
+    let Some(from) = from.filter(|from| *from != to) else { return Transform::IDENTITY };
+    let turn = to.from_y_up() * from.from_y_up().inverse();
+    Transform::from_parts(turn.matrix(), &nalgebra::Vector3::zeros())
+}
+
+/// The vertices of a deformable shape that are nearest to the origin of `frame`, ascending.
+fn nearest(shape: &Shape, frame: Transform) -> Vec<u32> {
+    if shape.modes.rank() == 0 {
+        return Vec::new();
+    }
+    let origin = frame.translation();
+    let rest = shape.mesh.rest();
+    let distance = |vertex: u32| (nalgebra::Vector3::from(rest[vertex as usize]).cast::<f64>() - origin).norm_squared();
+    let mut vertices: Vec<u32> = (0..rest.len() as u32).collect();
+    vertices.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));
+    vertices.truncate(CARRIERS);
+    vertices.sort_unstable();
+    vertices
+}
+
+/// Drops materials that no triangle has and textures that no material has, such as one that was replaced.
+fn drop_unused(parts: &mut Parts) {
+    let mut used = vec![false; parts.materials.len()];
+    for domain in &parts.domains {
+        used[domain.material] = true;
+        domain.runs.iter().for_each(|run| used[run.material] = true);
+    }
+    let new = keep(&mut parts.materials, &used);
+    for domain in &mut parts.domains {
+        domain.material = new[domain.material];
+        domain.runs.iter_mut().for_each(|run| run.material = new[run.material]);
+    }
+    let mut used = vec![false; parts.textures.len()];
+    let textures = |material: &Material| [material.colour_texture, material.normal_texture];
+    parts.materials.iter().flat_map(textures).flatten().for_each(|texture| used[texture] = true);
+    let new = keep(&mut parts.textures, &used);
+    for material in &mut parts.materials {
+        material.colour_texture = material.colour_texture.map(|texture| new[texture]);
+        material.normal_texture = material.normal_texture.map(|texture| new[texture]);
+    }
+}
+
+/// Keeps what is used and tells where each kept one lies now.
+fn keep<T>(list: &mut Vec<T>, used: &[bool]) -> Vec<usize> {
+    let before: Vec<usize> =
+        used.iter().scan(0, |kept, used| Some(std::mem::replace(kept, *kept + usize::from(*used)))).collect();
+    let mut flags = used.iter();
+    list.retain(|_| *flags.next().unwrap_or(&false));
+    before
+}

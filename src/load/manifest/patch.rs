@@ -1,0 +1,147 @@
+//! What `scene.toml` says about a material, laid over what the model's file says.
+
+use crate::domain::{AlphaMode, Material, Texture};
+use crate::error::{Result, invalid};
+use crate::load::obj::CUTOFF;
+
+/// Overrides; what is missing stays. A texture of no name takes the texture away.
+#[derive(Debug, Clone, Default, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Patch {
+    ambient: Option<[f32; 3]>,
+    diffuse: Option<[f32; 3]>,
+    specular: Option<[f32; 3]>,
+    shininess: Option<f32>,
+    alpha: Option<f32>,
+    colour_texture: Option<String>,
+    normal_texture: Option<String>,
+    alpha_mode: Option<Mode>,
+    cutoff: Option<f32>,
+    double_sided: Option<bool>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Mode {
+    Opaque,
+    Mask,
+    Blend,
+}
+
+/// Where the patched scene keeps its textures.
+pub(super) trait Gallery {
+    /// Index of the texture in a file.
+    fn index(&mut self, path: &str) -> Result<usize>;
+    /// The texture at an index.
+    fn at(&self, index: usize) -> Option<&Texture>;
+}
+
+impl Patch {
+    /// Changes `material`.
+    ///
+    /// Without an `alpha_mode`, an opaque material whose new colour texture has alpha becomes a mask, and one whose new
+    /// alpha is below 1 blends.
+    ///
+    /// # Errors
+    /// `Invalid` naming the material and the key: a texture that cannot be read, a cutoff for what is no mask.
+    pub(super) fn apply(&self, material: &mut Material, gallery: &mut impl Gallery) -> Result<()> {
+        let place = |key: &str| format!("material '{}': {key}", material.name);
+        let mut texture = |path: &str, key: &str| match path {
+            "" => Ok(None),
+            path => gallery.index(path).map(Some).map_err(|error| error.within(&place(key))),
+        };
+        let colour = self.colour_texture.as_deref().map(|path| texture(path, "colour_texture")).transpose()?;
+        let normal = self.normal_texture.as_deref().map(|path| texture(path, "normal_texture")).transpose()?;
+        let cut_out = colour.flatten().and_then(|index| gallery.at(index)).is_some_and(Texture::has_alpha);
+        let mode = match (self.alpha_mode, material.alpha_mode) {
+            (Some(Mode::Opaque), _) => AlphaMode::Opaque,
+            (Some(Mode::Blend), _) => AlphaMode::Blend,
+            (Some(Mode::Mask), AlphaMode::Mask { cutoff }) => AlphaMode::Mask { cutoff },
+            (Some(Mode::Mask), _) => AlphaMode::Mask { cutoff: CUTOFF },
+            (None, AlphaMode::Opaque) if self.alpha.is_some_and(|alpha| alpha < 1.0) => AlphaMode::Blend,
+            (None, AlphaMode::Opaque) if cut_out => AlphaMode::Mask { cutoff: CUTOFF },
+            (None, kept) => kept,
+        };
+        let mode = match (mode, self.cutoff) {
+            (mode, None) => mode,
+            (AlphaMode::Mask { .. }, Some(cutoff)) => AlphaMode::Mask { cutoff },
+            (_, Some(cutoff)) => return Err(invalid(place("cutoff"), "the alpha_mode mask with it", cutoff)),
+        };
+        material.ambient = self.ambient.unwrap_or(material.ambient);
+        material.diffuse = self.diffuse.unwrap_or(material.diffuse);
+        material.specular = self.specular.unwrap_or(material.specular);
+        material.shininess = self.shininess.unwrap_or(material.shininess);
+        material.alpha = self.alpha.unwrap_or(material.alpha);
+        material.colour_texture = colour.unwrap_or(material.colour_texture);
+        material.normal_texture = normal.unwrap_or(material.normal_texture);
+        material.double_sided = self.double_sided.unwrap_or(material.double_sided);
+        material.alpha_mode = mode;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Two(Vec<Texture>);
+
+    impl Gallery for Two {
+        fn index(&mut self, path: &str) -> Result<usize> {
+            let found = self.0.iter().position(|texture| texture.name == path);
+            found.ok_or_else(|| invalid(format!("file '{path}'"), "a file that is there", "none"))
+        }
+        fn at(&self, index: usize) -> Option<&Texture> {
+            self.0.get(index)
+        }
+    }
+
+    fn patched(text: &str, before: Material) -> Result<Material> {
+        let texture = |name: &str, alpha: u8| Texture::new(name, 1, 1, vec![1, 2, 3, alpha]).expect("a texel");
+        let mut material = before;
+        let patch: Patch = toml::from_str(text).map_err(|error| invalid("toml", "a patch", error.message()))?;
+        patch.apply(&mut material, &mut Two(vec![texture("solid", 255), texture("leaf", 0)]))?;
+        Ok(material)
+    }
+
+    #[test]
+    fn what_is_said_changes_and_what_is_not_stays() {
+        let before = || Material { colour_texture: Some(9), specular: [0.5; 3], ..Material::default() };
+        assert_eq!(patched("", before()).expect("nothing"), before());
+        let after =
+            patched("alpha = 0.5\ncolour_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'", before());
+        let after = after.expect("good");
+        assert_eq!((after.colour_texture, after.normal_texture, after.alpha_mode), (None, Some(0), AlphaMode::Blend));
+        assert_eq!((after.diffuse, after.specular), ([1.0, 0.0, 0.0], [0.5; 3]));
+    }
+
+    #[test]
+    fn alpha_modes_follow_the_texture_unless_they_are_stated() {
+        let mask = |cutoff| AlphaMode::Mask { cutoff };
+        let masked = || Material { alpha_mode: mask(0.3), ..Material::default() };
+        for (text, before, after) in [
+            ("colour_texture = 'leaf'", Material::default(), mask(0.5)),
+            ("colour_texture = 'solid'", Material::default(), AlphaMode::Opaque),
+            ("colour_texture = 'leaf'", masked(), mask(0.3)),
+            ("alpha_mode = 'mask'", masked(), mask(0.3)),
+            ("cutoff = 0.7", masked(), mask(0.7)),
+            ("colour_texture = 'leaf'\nalpha_mode = 'blend'", masked(), AlphaMode::Blend),
+            ("alpha_mode = 'opaque'", masked(), AlphaMode::Opaque),
+        ] {
+            assert_eq!(patched(text, before).expect(text).alpha_mode, after, "{text}");
+        }
+    }
+
+    #[test]
+    fn missing_textures_unknown_keys_and_stray_cutoffs_are_refused() {
+        for (text, start) in [
+            ("colour_texture = 'no'", "material 'white': colour_texture: file 'no': expected a file that is there"),
+            ("cutoff = 0.5", "material 'white': cutoff: expected the alpha_mode mask with it"),
+            ("color_texture = 'leaf'", "toml: expected a patch, given unknown field `color_texture`"),
+            ("alpha_mode = 'cut'", "toml: expected a patch, given unknown variant `cut`"),
+        ] {
+            let refusal = patched(text, Material::default()).expect_err(text).to_string();
+            assert!(refusal.starts_with(start), "{refusal}");
+        }
+    }
+}

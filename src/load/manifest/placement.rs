@@ -1,0 +1,118 @@
+//! A placement in words (translation, turn, scale; or twelve numbers) to a transform.
+
+use nalgebra::{Matrix3, Quaternion, Rotation3, Unit, UnitQuaternion, Vector3};
+
+use crate::domain::Transform;
+use crate::error::{Result, invalid};
+
+/// Scale, then turn, then translation; or the twelve numbers of a row-major 3x4 matrix.
+#[derive(Debug, Clone, Default, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Placement {
+    translation: Option<[f64; 3]>,
+    /// With `degrees`: the turn about an axis through the origin.
+    axis: Option<[f64; 3]>,
+    degrees: Option<f64>,
+    /// The turn as x, y, z, w (glTF's order).
+    quaternion: Option<[f64; 4]>,
+    scale: Option<Scale>,
+    matrix: Option<[f64; 12]>,
+}
+
+#[derive(Debug, Clone, Copy, serde::Deserialize)]
+#[serde(untagged, expecting = "a number or three")]
+enum Scale {
+    Even(f64),
+    Each([f64; 3]),
+}
+
+impl Placement {
+    /// The transform.
+    ///
+    /// # Errors
+    /// `Invalid` naming the key when two say the same thing, one needs another, or a number is not finite.
+    pub(super) fn transform(&self) -> Result<Transform> {
+        let parts = [self.translation.is_some(), self.axis.is_some(), self.quaternion.is_some(), self.scale.is_some()];
+        let transform = match self.matrix {
+            Some(_) if parts.contains(&true) || self.degrees.is_some() => {
+                return Err(invalid("matrix", "either a matrix or its parts", "both"));
+            }
+            Some(entries) => Transform(entries.map(|entry| entry as f32)),
+            None => {
+                let scale = match self.scale {
+                    None => [1.0; 3],
+                    Some(Scale::Even(factor)) => [factor; 3],
+                    Some(Scale::Each(factors)) => factors,
+                };
+                let linear = self.turn()?.into_inner() * Matrix3::from_diagonal(&scale.into());
+                Transform::from_parts(&linear, &self.translation.unwrap_or_default().into())
+            }
+        };
+        Transform::new(transform.0)
+    }
+
+    fn turn(&self) -> Result<Rotation3<f64>> {
+        let length = |field: &str, squared: f64| match squared.is_finite() && squared > 1e-24 {
+            true => Ok(()),
+            false => Err(invalid(field, "finite numbers that are not all zero", format!("length {}", squared.sqrt()))),
+        };
+        match (self.axis, self.degrees, self.quaternion) {
+            (None, None, None) => Ok(Rotation3::identity()),
+            (Some(axis), Some(degrees), None) => {
+                let axis = Vector3::from(axis);
+                length("axis", axis.norm_squared())?;
+                Ok(Rotation3::from_axis_angle(&Unit::new_normalize(axis), degrees.to_radians()))
+            }
+            (None, None, Some([x, y, z, w])) => {
+                let quaternion = Quaternion::new(w, x, y, z);
+                length("quaternion", quaternion.norm_squared())?;
+                Ok(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix())
+            }
+            _ => Err(invalid("turn", "axis and degrees together, or quaternion alone", "another mixture")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<Transform> {
+        toml::from_str::<Placement>(text).map_err(|error| invalid("toml", "a placement", error.message()))?.transform()
+    }
+
+    fn close(a: Transform, b: [f32; 12]) -> bool {
+        a.0.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6)
+    }
+
+    #[test]
+    fn the_same_placement_can_be_said_in_three_ways() {
+        let expected = [0.0, -2.0, 0.0, 1.0, 2.0, 0.0, 0.0, 2.0, 0.0, 0.0, 2.0, 3.0];
+        for text in [
+            "translation = [1, 2, 3]\naxis = [0, 0, 5]\ndegrees = 90\nscale = 2",
+            "translation = [1.0, 2.0, 3.0]\nquaternion = [0.0, 0.0, 1.0, 1.0]\nscale = [2.0, 2.0, 2.0]",
+            "matrix = [0, -2, 0, 1, 2, 0, 0, 2, 0, 0, 2, 3]",
+        ] {
+            assert!(close(read(text).expect(text), expected), "{text}");
+        }
+        assert!(close(read("").expect("nothing said"), Transform::IDENTITY.0));
+    }
+
+    #[test]
+    fn contradictions_and_numbers_that_are_none_are_refused() {
+        for (text, start) in [
+            ("matrix = [1,0,0,0, 0,1,0,0, 0,0,1,0]\nscale = 1", "matrix: expected either"),
+            ("axis = [0,0,1]", "turn: expected axis and degrees together"),
+            ("axis = [0,0,0]\ndegrees = 1", "axis: expected finite numbers that are not all zero"),
+            ("quaternion = [0,0,0,nan]", "quaternion: expected"),
+            ("translation = [inf,0,0]", "transform[3]: expected a finite number"),
+            ("scale = 1e300", "transform[0]: expected a finite number"),
+            ("scale = 'big'", "toml: expected a placement, given a number or three"),
+            ("matrix = [1]", "toml:"),
+            ("rotation = 1", "toml:"),
+        ] {
+            let refusal = read(text).expect_err(text).to_string();
+            assert!(refusal.starts_with(start), "{refusal}");
+        }
+    }
+}

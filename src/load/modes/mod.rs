@@ -1,0 +1,124 @@
+//! Files to the modal matrix U: 3n rows, r columns, f32.
+
+mod numpy;
+mod sofa;
+mod tensors;
+mod vega;
+
+pub use numpy::{Array, parse as parse_numpy};
+
+use super::files::{Files, Kind, MODEL_BYTES};
+use crate::domain::Modes;
+use crate::error::{Result, invalid};
+
+/// Endings of files with modes, in the order in which they are preferred: binary ones hold all digits, text does not.
+const ENDINGS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
+
+/// The modes in `name`; its ending tells the format.
+///
+/// # Errors
+/// `Invalid` naming the file, what was expected and what was given.
+pub(super) fn read(files: &Files, name: &str) -> Result<Modes> {
+    let parse = match name.rsplit_once('.').map(|(_, ending)| ending) {
+        Some("float" | "double" | "U") => vega::parse,
+        Some("npy") => matrix,
+        Some("safetensors") => tensors::parse,
+        Some("txt") => sofa::parse,
+        _ => return Err(invalid("modes", "a file ending in .float, .double, .U, .npy, .safetensors or .txt", name)),
+    };
+    parse(&files.read(name, MODEL_BYTES)?).map_err(|error| error.within(&format!("file '{name}'")))
+}
+
+fn matrix(bytes: &[u8]) -> Result<Modes> {
+    let array = numpy::parse(bytes)?;
+    let [rows, rank] = array.shape[..] else {
+        return Err(invalid("shape", "two dimensions, 3n x r", format!("{:?}", array.shape)));
+    };
+    match array.fortran {
+        true => Modes::from_columns(rows, rank, array.entries),
+        false => Modes::from_rows(rows, rank, &array.entries),
+    }
+}
+
+/// The modes that belong to the OBJ file `name` in its folder, if any.
+///
+/// They have its name (without `.obj` and `.derived`) before one of [`ENDINGS`], in that order; `.U` may stand between.
+/// When no other OBJ file lies there, any file with such an ending is taken, in that order too.
+///
+/// # Errors
+/// `Invalid` naming the candidates when two files have the same ending.
+pub(super) fn beside(files: &Files, name: &str) -> Result<Option<String>> {
+    let stem = name.strip_suffix(".obj").unwrap_or(name);
+    let stem = stem.strip_suffix(".derived").unwrap_or(stem);
+    for ending in &ENDINGS[..4] {
+        for middle in ["", ".U"] {
+            let candidate = format!("{stem}{middle}{ending}");
+            if files.kind(&candidate)? == Some(Kind::File) {
+                return Ok(Some(candidate));
+            }
+        }
+    }
+    let names: Vec<_> =
+        files.entries().into_iter().filter(|(_, kind)| *kind == Kind::File).map(|(name, _)| name).collect();
+    if names.iter().filter(|name| name.ends_with(".obj")).count() != 1 {
+        return Ok(None);
+    }
+    for ending in ENDINGS {
+        // `q.npy` and the like hold coordinates, not modes.
+        let fits = |name: &&String| name.ends_with(ending) && *name != "q.npy" && !name.ends_with(".q.npy");
+        let found: Vec<&String> = names.iter().filter(fits).collect();
+        match found[..] {
+            [] => {}
+            [one] => return Ok(Some(one.clone())),
+            _ => {
+                let given = found.iter().map(|name| name.as_str()).collect::<Vec<_>>().join(", ");
+                return Err(invalid("modes", format!("one file ending in {ending}"), given));
+            }
+        }
+    }
+    Ok(None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn found(names: &[&str], obj: &str) -> Result<Option<String>> {
+        let folder = tempfile::tempdir().expect("a folder");
+        for name in names {
+            std::fs::write(folder.path().join(name), "").expect("written");
+        }
+        beside(&Files::anywhere(folder.path()), obj)
+    }
+
+    #[test]
+    fn modes_of_a_files_own_name_come_first_and_binary_before_text() {
+        for (names, expected) in [
+            (&["a.obj", "a.URendering.float", "a.U.float", "modes.txt"][..], Some("a.URendering.float")),
+            (&["a.obj", "a.U.float", "modes.txt"], Some("a.U.float")),
+            (&["a.obj", "b.obj", "a.U.npy", "b.npy"], Some("a.U.npy")),
+            (&["a.obj", "modes.txt", "q.npy", "a.q.npy"], Some("modes.txt")),
+            (&["a.obj", "other.safetensors", "modes.txt"], Some("other.safetensors")),
+            (&["a.obj", "b.obj", "modes.txt"], None),
+            (&["a.obj", "a.mtl"], None),
+        ] {
+            assert_eq!(found(names, "a.obj").expect("clear").as_deref(), expected, "{names:?}");
+        }
+        assert_eq!(
+            found(&["a.derived.obj", "a.U.float"], "a.derived.obj").expect("clear").as_deref(),
+            Some("a.U.float")
+        );
+    }
+
+    #[test]
+    fn two_candidates_of_one_ending_are_refused_by_name() {
+        let refusal = found(&["a.obj", "x.npy", "y.npy"], "a.obj").expect_err("ambiguous").to_string();
+        assert_eq!(refusal, "modes: expected one file ending in .npy, given x.npy, y.npy");
+    }
+
+    #[test]
+    fn an_unknown_ending_is_refused_before_anything_is_read() {
+        let refusal = read(&Files::anywhere(std::path::Path::new(".")), "u.mat").expect_err("unknown").to_string();
+        assert!(refusal.ends_with(".npy, .safetensors or .txt, given u.mat"), "{refusal}");
+    }
+}

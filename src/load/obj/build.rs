@@ -1,0 +1,181 @@
+//! Polygons to a mesh of triangles in runs of one material.
+
+use std::collections::HashMap;
+
+use super::parse::{Corner, NONE, Obj};
+use super::triangulate::triangulate;
+use crate::domain::{Corners, Mesh, Run, smooth_normals};
+use crate::error::Result;
+
+/// A mesh and where its materials (indices into [`Obj::materials`]) begin.
+#[derive(Debug)]
+pub(in crate::load) struct Piece {
+    pub(in crate::load) mesh: Mesh,
+    pub(in crate::load) material: usize,
+    /// Empty when there is one material only.
+    pub(in crate::load) runs: Vec<Run>,
+}
+
+/// All faces. The vertices are the file's `v` lines, all of them and in their order, whether a face names them or not.
+///
+/// # Errors
+/// `Invalid` as [`Mesh::new`].
+pub(in crate::load) fn whole(obj: &Obj) -> Result<Piece> {
+    let faces: Vec<usize> = (0..obj.faces.len()).collect();
+    let mut builder = Builder { rest: obj.positions.clone(), ..Builder::new(obj) };
+    builder.add(&faces);
+    builder.finish()
+}
+
+/// Chosen faces with the vertices that they use, relative to `base`.
+///
+/// # Errors
+/// `Invalid` as [`Mesh::new`].
+pub(in crate::load) fn part(obj: &Obj, faces: &[usize], base: [f64; 3]) -> Result<Piece> {
+    let mut builder = Builder { local: Some((HashMap::new(), base)), ..Builder::new(obj) };
+    builder.add(faces);
+    builder.finish()
+}
+
+struct Builder<'a> {
+    obj: &'a Obj,
+    /// With a part: its own number of each of the file's vertices, and its base.
+    local: Option<(HashMap<u32, u32>, [f64; 3])>,
+    rest: Vec<[f32; 3]>,
+    corner_of: HashMap<Corner, u32>,
+    corners: Vec<Corner>,
+    vertices: Vec<u32>,
+    triangles: Vec<[u32; 3]>,
+    runs: Vec<Run>,
+}
+
+impl<'a> Builder<'a> {
+    fn new(obj: &'a Obj) -> Self {
+        Self {
+            obj,
+            local: None,
+            rest: Vec::new(),
+            corner_of: HashMap::new(),
+            corners: Vec::new(),
+            vertices: Vec::new(),
+            triangles: Vec::new(),
+            runs: Vec::new(),
+        }
+    }
+
+    fn add(&mut self, faces: &[usize]) {
+        // Sorted by material, so that there are no more runs than materials; stable, so that nothing else moves.
+        let mut faces = faces.to_vec();
+        faces.sort_by_key(|face| self.obj.faces[*face].material);
+        for face in faces {
+            let material = self.obj.faces[face].material;
+            if self.runs.last().is_none_or(|run| run.material != material) {
+                self.runs.push(Run { first_triangle: self.triangles.len(), material });
+            }
+            self.face(face);
+        }
+    }
+
+    fn face(&mut self, face: usize) {
+        let corners = self.obj.corners_of(face);
+        let points: Vec<_> = corners.iter().map(|corner| self.obj.positions[corner.v as usize]).collect();
+        let numbers: Vec<u32> = corners.iter().map(|corner| self.corner(*corner)).collect();
+        self.triangles.extend(triangulate(&points).into_iter().map(|triangle| triangle.map(|index| numbers[index])));
+    }
+
+    /// The rendered corner of a (v, vt, vn), made at its first use.
+    fn corner(&mut self, corner: Corner) -> u32 {
+        if let Some(known) = self.corner_of.get(&corner) {
+            return *known;
+        }
+        let number = self.corners.len() as u32;
+        let vertex = self.vertex(corner.v);
+        self.vertices.push(vertex);
+        self.corners.push(corner);
+        self.corner_of.insert(corner, number);
+        number
+    }
+
+    fn vertex(&mut self, v: u32) -> u32 {
+        let Some((numbers, base)) = &mut self.local else { return v };
+        *numbers.entry(v).or_insert_with(|| {
+            let position = self.obj.positions[v as usize];
+            self.rest.push([0, 1, 2].map(|axis| (f64::from(position[axis]) - base[axis]) as f32));
+            self.rest.len() as u32 - 1
+        })
+    }
+
+    fn finish(self) -> Result<Piece> {
+        let normals = self.normals();
+        let uvs = if self.corners.iter().all(|corner| corner.vt == NONE) { Vec::new() } else { self.uvs() };
+        let material = self.runs.first().map_or(0, |run| run.material);
+        let runs = if self.runs.len() > 1 { self.runs } else { Vec::new() };
+        let mesh = Mesh::new(self.rest, Corners { vertices: self.vertices, normals, uvs }, self.triangles)?;
+        Ok(Piece { mesh, material, runs })
+    }
+
+    /// The file's normals; where it has none, or a zero, the smooth normal of the vertex.
+    fn normals(&self) -> Vec<[f32; 3]> {
+        let given = |corner: &Corner| self.obj.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
+        if let Some(all) = self.corners.iter().map(|corner| given(corner).copied()).collect() {
+            return all;
+        }
+        let smooth = smooth_normals(&self.rest, &self.vertices, &self.triangles);
+        self.corners.iter().zip(smooth).map(|(corner, smooth)| given(corner).copied().unwrap_or(smooth)).collect()
+    }
+
+    fn uvs(&self) -> Vec<[f32; 2]> {
+        let uv = |corner: &Corner| self.obj.uvs.get(corner.vt as usize).copied().unwrap_or_default();
+        self.corners.iter().map(uv).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two squares in one plane; the middle edge is doubled, one vertex is unused, materials alternate.
+    const SQUARES: &str = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\n\
+        vt 0 0\nvt 1 1\nusemtl b\nf 2/1 3/1 4/1 5/1\nusemtl a\nf 6 7 8 9\nusemtl b\nf 2/2 3/2 4/2\n";
+
+    fn parsed() -> Obj {
+        Obj::parse(SQUARES.as_bytes()).expect("good")
+    }
+
+    #[test]
+    fn rows_follow_the_v_lines_with_unreferenced_and_coincident_vertices_kept() {
+        let obj = parsed();
+        let mesh = whole(&obj).expect("good").mesh;
+        assert_eq!(mesh.rest(), obj.positions);
+        assert_eq!(mesh.corners().vertices, [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8], "v/1 and v/2 are corners of one vertex");
+        assert_eq!(mesh.corners().uvs[4], [1.0, 0.0]);
+        assert_eq!(mesh.corners().uvs[7], [0.0, 0.0], "a corner without vt among others with");
+        assert_eq!(mesh.corners().normals, [[0.0, 0.0, 1.0]; 11]);
+    }
+
+    #[test]
+    fn faces_of_one_material_make_one_run_and_one_material_makes_none() {
+        let obj = parsed();
+        let piece = whole(&obj).expect("good");
+        assert_eq!(obj.materials, ["b", "a"]);
+        assert_eq!(piece.runs, [Run { first_triangle: 0, material: 0 }, Run { first_triangle: 3, material: 1 }]);
+        assert_eq!(piece.mesh.triangles().len(), 5);
+        let only = part(&obj, &[1], [0.0; 3]).expect("good");
+        assert_eq!((only.material, only.runs.len()), (1, 0));
+    }
+
+    #[test]
+    fn a_part_has_its_own_vertices_relative_to_its_base() {
+        let piece = part(&parsed(), &[1], [1.0, 0.0, 0.5]).expect("good");
+        let rest = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
+        assert_eq!(piece.mesh.rest(), rest);
+        assert!(piece.mesh.corners().uvs.is_empty());
+    }
+
+    #[test]
+    fn missing_and_zero_normals_are_computed_and_given_ones_kept() {
+        let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\nvn 0 0 0\nf 1//1 2//2 3\n";
+        let mesh = whole(&Obj::parse(text.as_bytes()).expect("good")).expect("good").mesh;
+        assert_eq!(mesh.corners().normals, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]);
+    }
+}

@@ -1,0 +1,153 @@
+//! Bytes of an MTL file to its statements, by material name.
+//!
+//! Colours are linear factors, like glTF's; images are sRGB where they hold colour.
+
+use std::collections::BTreeMap;
+
+use super::parse::{number, rest_of, words};
+use crate::error::{Result, invalid};
+
+/// One `newmtl` as it is written; what is missing is `None`.
+#[derive(Debug, Default, Clone, PartialEq)]
+pub(super) struct Statements {
+    pub(super) ambient: Option<[f32; 3]>,
+    pub(super) diffuse: Option<[f32; 3]>,
+    pub(super) specular: Option<[f32; 3]>,
+    pub(super) exponent: Option<f32>,
+    /// Opacity: `d`, or 1 - `Tr`.
+    pub(super) opacity: Option<f32>,
+    pub(super) colour_map: Option<String>,
+    pub(super) alpha_map: Option<String>,
+    /// From `norm`, `map_Bump`, `map_bump` or `bump`.
+    pub(super) normal_map: Option<String>,
+    /// What was left out, in words.
+    pub(super) remarks: Vec<String>,
+}
+
+/// Parses a whole file; a name that comes twice holds its last definition.
+///
+/// # Errors
+/// `Invalid` naming the line and the statement.
+pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, Statements>> {
+    let mut all = BTreeMap::new();
+    let mut current: Option<(String, Statements)> = None;
+    for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
+        let Some(key) = words(line).next() else { continue };
+        if key == b"newmtl" {
+            all.extend(current.replace((rest_of(line), Statements::default())));
+        } else if let Some((name, statements)) = &mut current {
+            let place = || format!("line {}: {}", index + 1, String::from_utf8_lossy(key));
+            statements.read(key, line, name).map_err(|error| error.within(&place()))?;
+        }
+    }
+    all.extend(current);
+    Ok(all)
+}
+
+impl Statements {
+    fn read(&mut self, key: &[u8], line: &[u8], name: &str) -> Result<()> {
+        match key.to_ascii_lowercase().as_slice() {
+            b"ka" => self.ambient = Some(colour(line)?),
+            b"kd" => self.diffuse = Some(colour(line)?),
+            b"ks" => self.specular = Some(colour(line)?),
+            b"ns" => self.exponent = Some(last_number(line)?),
+            b"d" => self.opacity = Some(last_number(line)?),
+            b"tr" => self.opacity = Some(1.0 - last_number(line)?),
+            b"map_kd" => self.colour_map = self.image(line, name)?,
+            b"map_d" => self.alpha_map = self.image(line, name)?,
+            b"norm" | b"map_bump" | b"bump" => self.normal_map = self.image(line, name)?,
+            // Ambient maps repeat the colour map; illumination models and the rest have no counterpart here.
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// The path after the options of an image statement.
+    fn image(&mut self, line: &[u8], name: &str) -> Result<Option<String>> {
+        let text = rest_of(line);
+        let mut rest = text.as_str();
+        while let Some((option, after)) = rest.strip_prefix('-').map(next_word) {
+            let most = match option {
+                "s" | "o" | "t" => 3,
+                "mm" => 2,
+                "blendu" | "blendv" | "cc" | "clamp" | "bm" | "boost" | "imfchan" | "texres" | "type" => 1,
+                _ => return Err(invalid("option", "an image option of MTL", format!("-{option}"))),
+            };
+            let remark = format!("material '{name}': image option '-{option}' is not used");
+            if !self.remarks.contains(&remark) {
+                self.remarks.push(remark);
+            }
+            rest = after;
+            for argument in 0..most {
+                let (word, after) = next_word(rest);
+                // -s, -o and -t take one to three numbers.
+                if argument > 0 && word.parse::<f32>().is_err() {
+                    break;
+                }
+                rest = after;
+            }
+        }
+        if rest.is_empty() {
+            return Err(invalid("path", "the name of an image file", "none"));
+        }
+        Ok(Some(rest.replace('\\', "/")))
+    }
+}
+
+fn next_word(text: &str) -> (&str, &str) {
+    text.split_once(|letter: char| letter.is_ascii_whitespace())
+        .map_or((text, ""), |(word, rest)| (word, rest.trim_start()))
+}
+
+/// Three numbers, or one for all three.
+fn colour(line: &[u8]) -> Result<[f32; 3]> {
+    let found: Option<Vec<f32>> = words(line).skip(1).map(number).collect();
+    match found.as_deref() {
+        Some([grey]) => Ok([*grey; 3]),
+        Some([red, green, blue]) => Ok([*red, *green, *blue]),
+        _ => Err(invalid("colour", "one or three finite numbers", rest_of(line))),
+    }
+}
+
+/// The last word, so that `d -halo 0.5` is read too.
+fn last_number(line: &[u8]) -> Result<f32> {
+    let value = words(line).skip(1).last().and_then(number);
+    value.ok_or_else(|| invalid("value", "a finite number", rest_of(line)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn statements_are_read_in_any_case_and_with_image_options() {
+        let text = b"# head\nKd 1 0 0\nnewmtl old bark\nKa 0.1 0.2 0.3\nKd 0.5\nNs 7\r\nTr 0.25\n\
+            map_Kd -s 2 2 -clamp on my bark.png\nmap_Bump -bm 0.5 maps\\n.png\nnewmtl black\nKd 0 0 0\nd -halo 0.5\n";
+        let all = parse(text).expect("good");
+        let bark = &all["old bark"];
+        assert_eq!(bark.ambient, Some([0.1, 0.2, 0.3]));
+        assert_eq!(bark.diffuse, Some([0.5; 3]));
+        assert_eq!((bark.exponent, bark.opacity), (Some(7.0), Some(0.75)));
+        assert_eq!(bark.colour_map.as_deref(), Some("my bark.png"));
+        assert_eq!(bark.normal_map.as_deref(), Some("maps/n.png"));
+        assert_eq!(bark.remarks.len(), 3);
+        assert_eq!((all["black"].diffuse, all["black"].opacity), (Some([0.0; 3]), Some(0.5)));
+    }
+
+    #[test]
+    fn bad_statements_are_refused_with_their_line() {
+        for (statement, refusal) in [
+            ("Kd 1 2", "line 2: Kd: colour: expected one or three finite numbers, given 1 2"),
+            ("Kd spectral a.rfl", "line 2: Kd: colour: expected one or three finite numbers, given spectral a.rfl"),
+            ("Ns", "line 2: Ns: value: expected a finite number, given "),
+            ("d inf", "line 2: d: value: expected a finite number, given inf"),
+            ("map_Kd", "line 2: map_Kd: path: expected the name of an image file, given none"),
+            ("map_Kd -clamp on", "line 2: map_Kd: path: expected the name of an image file, given none"),
+            ("map_Kd -zoom a.png", "line 2: map_Kd: option: expected an image option of MTL, given -zoom"),
+        ] {
+            let text = format!("newmtl a\n{statement}\n");
+            assert_eq!(parse(text.as_bytes()).expect_err(statement).to_string(), refusal);
+        }
+        assert!(parse(b"\xff\nnewmtl \xff\nmap_Kd \xff").is_ok());
+    }
+}

@@ -1,0 +1,142 @@
+//! Objects of a plant to its members: each shoot and each leaf is one; everything else joins one of them.
+
+use std::collections::{BTreeMap, HashMap};
+
+use nalgebra::Vector3;
+
+use super::structure::Structure;
+use crate::error::{Result, invalid};
+
+/// A part of the plant that moves by itself: index of a shoot or of a leaf.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(super) enum Member {
+    Shoot(usize),
+    Leaf(usize),
+}
+
+/// Points per object that are compared with the shoots.
+const MOST_POINTS: usize = 32;
+
+/// The member that each object belongs to. `points` holds the corners of each object that has faces.
+///
+/// Shoots have no object of their own in the structure: sorted ids of internodes are in shoot order. A petiole joins the
+/// leaf whose petiole line has its centre nearest to its own; anything else joins the nearest shoot.
+///
+/// # Errors
+/// `Invalid` when internodes and shoots differ in number, or an object is unknown.
+pub(super) fn members(structure: &Structure, points: &BTreeMap<u64, Vec<[f32; 3]>>) -> Result<HashMap<u64, Member>> {
+    let mut members = HashMap::new();
+    let internodes = structure.objects.iter().filter(|(_, kind)| *kind == "internode");
+    let internodes: Vec<u64> = internodes.map(|(id, _)| *id).collect();
+    if internodes.len() != structure.shoots.len() {
+        let expected = format!("{} internodes, one per shoot", structure.shoots.len());
+        return Err(invalid("objects", expected, internodes.len()));
+    }
+    members.extend(internodes.into_iter().enumerate().map(|(shoot, id)| (id, Member::Shoot(shoot))));
+    members.extend(structure.leaves.iter().enumerate().map(|(leaf, about)| (about.object_id, Member::Leaf(leaf))));
+    let centres = petiole_centres(structure);
+    for (id, points) in points {
+        let kind = structure.objects.get(id).ok_or_else(|| invalid("object", "one of the structure", id))?;
+        let member = match kind.as_str() {
+            "internode" => continue,
+            "leaf" if members.contains_key(id) => continue,
+            "leaf" => return Err(invalid(format!("leaf {id}"), "an entry in leaves", "none")),
+            "petiole" => nearest_leaf(&centres, centre(points.iter().map(|point| Vector3::from(*point).cast()))),
+            _ => None,
+        };
+        let member = member.or_else(|| nearest_shoot(structure, points));
+        members.insert(*id, member.ok_or_else(|| invalid(format!("{kind} {id}"), "a shoot to join", "none"))?);
+    }
+    Ok(members)
+}
+
+/// Centre of the petiole line, or else the base, of each leaf that may carry a petiole.
+fn petiole_centres(structure: &Structure) -> Vec<(usize, Vector3<f64>)> {
+    let with_line: Vec<_> = structure
+        .leaves
+        .iter()
+        .enumerate()
+        .filter_map(|(leaf, about)| {
+            Some((leaf, centre(about.petiole_vertices.as_ref()?.iter().map(|point| (*point).into()))))
+        })
+        .collect();
+    if !with_line.is_empty() {
+        return with_line;
+    }
+    structure.leaves.iter().enumerate().map(|(leaf, about)| (leaf, about.base.into())).collect()
+}
+
+fn centre(points: impl Iterator<Item = Vector3<f64>>) -> Vector3<f64> {
+    let (sum, count) = points.fold((Vector3::zeros(), 0.0), |(sum, count), point| (sum + point, count + 1.0));
+    sum / f64::max(count, 1.0)
+}
+
+fn nearest_leaf(centres: &[(usize, Vector3<f64>)], petiole: Vector3<f64>) -> Option<Member> {
+    let distance = |(_, centre): &&(usize, Vector3<f64>)| (centre - petiole).norm_squared();
+    centres.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).map(|(leaf, _)| Member::Leaf(*leaf))
+}
+
+/// The shoot whose line comes nearest to any of the points.
+fn nearest_shoot(structure: &Structure, points: &[[f32; 3]]) -> Option<Member> {
+    let step = points.len().div_ceil(MOST_POINTS).max(1);
+    let points: Vec<Vector3<f64>> = points.iter().step_by(step).map(|point| Vector3::from(*point).cast()).collect();
+    let distance = |shoot: &usize| {
+        let line = &structure.shoots[*shoot].vertices;
+        points.iter().map(|point| to_line(line, point)).fold(f64::INFINITY, f64::min)
+    };
+    let by_distance = (0..structure.shoots.len()).map(|shoot| (distance(&shoot), shoot));
+    by_distance.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, shoot)| Member::Shoot(shoot))
+}
+
+/// Squared distance of a point to a line of segments.
+fn to_line(line: &[[f64; 3]], point: &Vector3<f64>) -> f64 {
+    let to_segment = |ends: &[[f64; 3]]| {
+        let start = Vector3::from(ends[0]);
+        let along = Vector3::from(ends[ends.len() - 1]) - start;
+        let length = along.norm_squared();
+        let share = if length > 0.0 { ((point - start).dot(&along) / length).clamp(0.0, 1.0) } else { 0.0 };
+        (start + along * share - point).norm_squared()
+    };
+    line.windows(2.min(line.len())).map(to_segment).fold(f64::INFINITY, f64::min)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STRUCTURE: &str = r#"{
+        "objects": {"5": "internode", "9": "internode", "3": "leaf", "4": "leaf", "10": "petiole", "11": "fruit"},
+        "shoots": [{"id": 0, "parent": -1, "vertices": [[0,0,0],[0,0,9]]}, {"id": 1, "parent": 0, "vertices": [[5,0,0],[9,0,0]]}],
+        "leaves": [
+            {"object_id": 3, "shoot": 0, "node": 0, "petiole": 0, "base": [1,0,0], "petiole_vertices": [[0,0,0],[1,0,0]]},
+            {"object_id": 4, "shoot": 0, "node": 1, "petiole": 0, "base": [0,3,3], "petiole_vertices": [[0,0,3],[0,3,3]]}
+        ]
+    }"#;
+
+    #[test]
+    fn petioles_join_their_leaf_fruit_the_nearest_shoot_and_internodes_follow_shoot_order() {
+        let structure = Structure::parse(STRUCTURE.as_bytes()).expect("good");
+        let points = BTreeMap::from([
+            (5, vec![[0.0; 3]]),
+            (10, vec![[0.0, 0.0, 3.0], [0.0, 3.0, 3.0]]),
+            (11, vec![[9.5, 0.0, 0.0], [20.0, 0.0, 0.0]]),
+        ]);
+        let members = members(&structure, &points).expect("good");
+        assert_eq!(members[&5], Member::Shoot(0));
+        assert_eq!(members[&9], Member::Shoot(1));
+        assert_eq!(members[&3], Member::Leaf(0));
+        assert_eq!(members[&10], Member::Leaf(1));
+        assert_eq!(members[&11], Member::Shoot(1));
+    }
+
+    #[test]
+    fn unknown_objects_and_missing_internodes_are_refused() {
+        let structure = Structure::parse(STRUCTURE.as_bytes()).expect("good");
+        let refusal = members(&structure, &BTreeMap::from([(77, vec![])])).expect_err("unknown").to_string();
+        assert_eq!(refusal, "object: expected one of the structure, given 77");
+        let text = STRUCTURE.replace(r#""9": "internode", "#, "");
+        let structure = Structure::parse(text.as_bytes()).expect("good");
+        let refusal = members(&structure, &BTreeMap::new()).expect_err("one internode").to_string();
+        assert_eq!(refusal, "objects: expected 2 internodes, one per shoot, given 1");
+    }
+}

@@ -1,0 +1,174 @@
+//! The server's folder of scenes: names to scenes, and the list of names.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use super::files::{Files, Kind};
+use super::{manifest, source};
+use crate::error::{Error, Result};
+use crate::scene::Scene;
+
+/// How deep below the root scenes are listed; deeper ones can be opened by their path.
+const DEPTH: usize = 4;
+/// The most names of a list.
+const MOST: usize = 4096;
+
+/// The server's folder of scenes; every path stays inside it, symbolic links resolved.
+#[derive(Debug, Clone)]
+pub struct Repository {
+    root: Option<PathBuf>,
+}
+
+impl Repository {
+    /// A repository of the built-in scenes and of what lies in `root`.
+    ///
+    /// # Errors
+    /// `Unavailable` when the folder is not there.
+    pub fn new(root: Option<&Path>) -> Result<Self> {
+        let Some(root) = root else { return Ok(Self { root: None }) };
+        let unavailable = |reason: String| Error::Unavailable {
+            what: "scene repository",
+            reason: format!("{}: {reason}", root.display()),
+            remedy: "Name a folder that is there".into(),
+        };
+        let canonical = root.canonicalize().map_err(|error| unavailable(error.to_string()))?;
+        if !canonical.is_dir() {
+            return Err(unavailable("not a folder".into()));
+        }
+        Ok(Self { root: Some(canonical) })
+    }
+
+    /// Opens a built-in name or a path inside the repository; `.` is the repository's folder itself.
+    ///
+    /// # Errors
+    /// As [`super::open`], and `Invalid` for a path that leaves the repository.
+    pub fn open(&self, source: &str) -> Result<Arc<Scene>> {
+        match &self.root {
+            Some(root) => Scene::new(source::read(&Files::confined(root), source)?),
+            None if source::BUILT_IN.contains(&source) => super::open(source),
+            None => Err(Error::NotFound { what: "scene", given: source.into() }),
+        }
+    }
+
+    /// Names that [`Self::open`] takes, sorted: built-in ones, then folders and model files down to a small depth.
+    pub fn list(&self) -> Vec<String> {
+        let mut names: Vec<String> = source::BUILT_IN.map(str::to_owned).to_vec();
+        if let Some(root) = &self.root {
+            let mut found = Vec::new();
+            collect(&Files::confined(root), "", DEPTH, &mut found);
+            found.sort();
+            names.append(&mut found);
+        }
+        names
+    }
+}
+
+fn collect(folder: &Files, prefix: &str, depth: usize, found: &mut Vec<String>) {
+    let entries = folder.entries();
+    let is_manifest = entries.contains(&(manifest::FILE.to_owned(), Kind::File));
+    if is_manifest || source::models(folder).len() == 1 {
+        found.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
+    }
+    for (name, kind) in entries {
+        // Names with a dot in front are not for readers: uploads on their way, version control.
+        if found.len() >= MOST || name.starts_with('.') {
+            continue;
+        }
+        let path = format!("{prefix}{name}");
+        match kind {
+            Kind::File if source::recognised(&name).is_some() => found.push(path),
+            Kind::Folder if depth > 0 => {
+                if let Ok(sub) = folder.within(&name) {
+                    collect(&sub, &format!("{path}/"), depth - 1, found);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+
+    fn repository(files: &[(&str, &str)]) -> (tempfile::TempDir, Repository) {
+        let outer = tempfile::tempdir().expect("a folder");
+        for (name, text) in files {
+            let path = outer.path().join("root").join(name);
+            std::fs::create_dir_all(path.parent().expect("a parent")).expect("made");
+            std::fs::write(path, text).expect("written");
+        }
+        let repository = Repository::new(Some(&outer.path().join("root"))).expect("there");
+        (outer, repository)
+    }
+
+    #[test]
+    fn what_is_listed_can_be_opened() {
+        let (_keep, repository) = repository(&[
+            ("one/a.obj", TRIANGLE),
+            ("two/b.obj", TRIANGLE),
+            ("two/c.obj", TRIANGLE),
+            ("deep/er/scene/scene.toml", "model = '../../../one/a.obj'\n"),
+            ("a/b/c/d/e/f/far.obj", TRIANGLE),
+            (".hidden/x.obj", TRIANGLE),
+            ("notes.txt", ""),
+        ]);
+        let names = repository.list();
+        assert_eq!(names, ["tree", "deep/er/scene", "one", "one/a.obj", "two/b.obj", "two/c.obj"]);
+        for name in &names[1..] {
+            let scene = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
+            assert_eq!(scene.domains.len(), 1);
+        }
+        assert_eq!(repository.open("deep/er/scene").expect("there").name, "scene");
+        assert!(repository.open("a/b/c/d/e/f/far.obj").is_ok(), "too deep for the list, not for its path");
+    }
+
+    #[test]
+    fn paths_that_leave_the_repository_are_refused_alike_whether_something_is_there_or_not() {
+        let (outer, repository) = repository(&[
+            ("one/a.obj", TRIANGLE),
+            ("out/scene.toml", "model = '../../secret.obj'\n"),
+            ("far/scene.toml", "model = '/etc/hostname'\n"),
+            ("map/a.obj", "mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+            ("patch/scene.toml", "model = '../one/a.obj'\nmaterial.'*'.colour_texture = '../../x.png'\n"),
+        ]);
+        std::fs::write(outer.path().join("secret.obj"), TRIANGLE).expect("written");
+        std::os::unix::fs::symlink(outer.path(), outer.path().join("root/link")).expect("linked");
+        for source in [
+            "../secret.obj",
+            "../absent.obj",
+            "/etc/passwd",
+            "/absent",
+            "one/../../secret.obj",
+            "link/secret.obj",
+            "link",
+            "out",
+            "far",
+            "map",
+            "patch",
+        ] {
+            let refusal = repository.open(source).expect_err(source).to_string();
+            assert!(refusal.contains("expected a path inside the repository"), "{source}: {refusal}");
+            let outside = outer.path().to_str().expect("utf-8");
+            assert!(!refusal.contains(outside), "{source}: {refusal}");
+        }
+        assert!(!repository.list().iter().any(|name| name.starts_with("link")));
+    }
+
+    #[test]
+    fn unknown_names_and_folders_are_told_apart() {
+        let (outer, repository) = repository(&[("two/b.obj", TRIANGLE), ("two/c.obj", TRIANGLE), ("none/x.txt", "")]);
+        let absent = repository.open("absent").expect_err("absent");
+        assert_eq!(absent, Error::NotFound { what: "scene", given: "absent".into() });
+        let ambiguous = repository.open("two").expect_err("two models").to_string();
+        assert_eq!(ambiguous, "folder 'two': expected scene.toml, or one model to choose, given 2: b.obj, c.obj");
+        let empty = repository.open("none").expect_err("no model").to_string();
+        assert!(empty.ends_with("given none among: x.txt"), "{empty}");
+        assert!(matches!(Repository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
+        let built_in = Repository::new(None).expect("built-in scenes only");
+        assert_eq!(built_in.list(), ["tree"]);
+        assert!(matches!(built_in.open("two"), Err(Error::NotFound { .. })));
+    }
+}

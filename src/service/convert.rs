@@ -1,0 +1,163 @@
+//! Wire to values and back: scenes, steps, pictures, stage times. Numbers off the wire are believed only behind the
+//! constructors of `scene`.
+
+use modalcast_proto::v1;
+
+use crate::engine::{self, Delivery, Engine, Format, Host, Policy, StepName, View, Which};
+use crate::error::{Result, invalid};
+use crate::scene::{Camera, RawUpdate, Scene};
+use crate::telemetry::StageTimes;
+
+mod camera;
+
+/// The most bytes of remarks that a description carries.
+const MOST_REMARKS: usize = 64 << 10;
+
+/// What everybody may know of an open scene.
+pub(super) fn scene_info(host: &Host, with_remarks: bool) -> v1::SceneInfo {
+    let scene = &host.scene;
+    let layout = &scene.layout;
+    let bounds = scene.rest_bounds;
+    v1::SceneInfo {
+        scene: host.name.clone(),
+        source: host.origin.source(),
+        domains: scene.domains.len() as u32,
+        vertices: layout.vertices as u64,
+        corners: layout.corners as u64,
+        triangles: layout.triangles as u64,
+        coordinates: layout.coordinates as u64,
+        up: ["x", "y", "z"][scene.up.index()].into(),
+        unit: scene.unit,
+        origin: scene.origin.to_vec(),
+        bounds: [bounds.min, bounds.max].concat(),
+        affine: scene.needs.shear,
+        last_step: host.last_step().map(step_id),
+        remarks: if with_remarks { remarks(scene) } else { Vec::new() },
+    }
+}
+
+fn remarks(scene: &Scene) -> Vec<String> {
+    let mut left = MOST_REMARKS;
+    let fits = |remark: &&String| {
+        left = left.saturating_sub(remark.len() + 8);
+        left > 0
+    };
+    let mut kept: Vec<String> = scene.remarks.iter().take_while(fits).cloned().collect();
+    if kept.len() < scene.remarks.len() {
+        kept.push(format!("and {} more", scene.remarks.len() - kept.len()));
+    }
+    kept
+}
+
+pub(super) const fn step_id(step: StepName) -> v1::StepId {
+    v1::StepId { run: step.run, number: step.number, time: step.time }
+}
+
+pub(super) fn stages(times: &StageTimes) -> Vec<v1::StageTime> {
+    let wire = |(stage, ms): &(crate::telemetry::Stage, f64)| v1::StageTime {
+        stage: stage.name().into(),
+        milliseconds: *ms as f32,
+    };
+    times.iter().map(wire).collect()
+}
+
+pub(super) fn raw_update(step: v1::Step) -> RawUpdate {
+    RawUpdate {
+        number: step.number,
+        time: step.time,
+        q_domains: step.q_domains,
+        q: step.q,
+        transform_domains: step.transform_domains,
+        transforms: step.transforms,
+    }
+}
+
+/// Unspecified means lossless.
+pub(super) fn policy(number: i32) -> Result<Policy> {
+    match v1::Policy::try_from(number) {
+        Ok(v1::Policy::Unspecified | v1::Policy::Lossless) => Ok(Policy::Lossless),
+        Ok(v1::Policy::Latest) => Ok(Policy::Latest),
+        Err(_) => Err(invalid("open.policy", "a policy of this version", number)),
+    }
+}
+
+pub(super) const fn wire_policy(policy: Policy) -> v1::Policy {
+    match policy {
+        Policy::Lossless => v1::Policy::Lossless,
+        Policy::Latest => v1::Policy::Latest,
+    }
+}
+
+/// Unspecified means the newest.
+pub(super) fn delivery(number: i32) -> Result<Delivery> {
+    match v1::Delivery::try_from(number) {
+        Ok(v1::Delivery::Lossless) => Ok(Delivery::Lossless),
+        Ok(v1::Delivery::Unspecified | v1::Delivery::Latest) => Ok(Delivery::Latest),
+        Err(_) => Err(invalid("delivery", "a delivery of this version", number)),
+    }
+}
+
+/// A picture that can be drawn: what to show, and as what to send it.
+pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Picture>) -> Result<(View, Format)> {
+    let picture = picture.unwrap_or_default();
+    let format = match v1::Format::try_from(picture.format) {
+        Ok(v1::Format::Unspecified | v1::Format::Png) => Format::Png,
+        Ok(v1::Format::Rgba) => Format::Rgba,
+        Err(_) => return Err(invalid("picture.format", "a format of this version", picture.format)),
+    };
+    let (width, height) = match (picture.width, picture.height) {
+        (0, 0) => (1280, 720),
+        size => size,
+    };
+    let most = engine.frame_side();
+    if !(1..=most).contains(&width) || !(1..=most).contains(&height) {
+        let expected = format!("1 to {most} pixels a side, or 0 x 0 for 1280 x 720");
+        return Err(invalid("picture.size", expected, format!("{width} x {height}")));
+    }
+    let camera = match picture.camera {
+        None => Camera::framing(scene),
+        Some(camera) => camera::parse(scene, camera).map_err(|error| error.within("picture"))?,
+    };
+    Ok((View::Frame { camera, width, height }, format))
+}
+
+pub(super) const fn wire_format(format: Format) -> v1::Format {
+    match format {
+        Format::Png => v1::Format::Png,
+        Format::Rgba => v1::Format::Rgba,
+    }
+}
+
+pub(super) const fn which_of_frame(step: Option<&v1::render_frame_request::Step>) -> Which {
+    match step {
+        None => Which::Current,
+        Some(v1::render_frame_request::Step::ExactStep(number)) => Which::Exact(*number),
+        Some(v1::render_frame_request::Step::MinimumStep(number)) => Which::Minimum(*number),
+    }
+}
+
+pub(super) const fn which_of_vertices(step: Option<&v1::get_vertices_request::Step>) -> Which {
+    match step {
+        None => Which::Current,
+        Some(v1::get_vertices_request::Step::ExactStep(number)) => Which::Exact(*number),
+        Some(v1::get_vertices_request::Step::MinimumStep(number)) => Which::Minimum(*number),
+    }
+}
+
+/// A step as people say it, for errors.
+pub(super) fn said(which: Which, scene: &str) -> String {
+    match which {
+        Which::Current => format!("the step that scene '{scene}' shows"),
+        Which::Exact(number) => format!("step {number} of scene '{scene}'"),
+        Which::Minimum(number) => format!("step {number} or later of scene '{scene}'"),
+    }
+}
+
+pub(super) fn announcement(header: v1::UploadHeader) -> engine::Announcement {
+    engine::Announcement {
+        scene: header.scene,
+        entry: header.entry,
+        files: header.files,
+        total_bytes: header.total_bytes,
+    }
+}

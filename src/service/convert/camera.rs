@@ -1,0 +1,34 @@
+//! A camera off the wire. What it leaves out is as in the camera that frames the scene.
+
+use modalcast_proto::v1;
+
+use crate::domain::Transform;
+use crate::error::{Result, invalid};
+use crate::scene::{Camera, Lens, Scene, View};
+
+/// The checked camera.
+pub(super) fn parse(scene: &Scene, camera: v1::Camera) -> Result<Camera> {
+    let framing = Camera::framing(scene);
+    let view = match camera.view {
+        None => framing.view,
+        Some(v1::camera::View::LookAt(look)) => View::LookAt {
+            eye: exactly("camera.look_at.eye", &look.eye)?,
+            target: exactly("camera.look_at.target", &look.target)?,
+            up: exactly("camera.look_at.up", &look.up)?,
+        },
+        Some(v1::camera::View::Pose(pose)) => {
+            let numbers: [f64; 12] = exactly("camera.pose", &pose.world_from_camera)?;
+            View::Pose(Transform(numbers.map(|number| number as f32)))
+        }
+    };
+    let lens = match camera.lens {
+        None => framing.lens,
+        Some(v1::camera::Lens::FieldOfView(degrees)) => Lens::FieldOfView(degrees),
+        Some(v1::camera::Lens::Intrinsics(v1::Intrinsics { fx, fy, cx, cy })) => Lens::Intrinsics { fx, fy, cx, cy },
+    };
+    Camera { view, lens, near: camera.near, far: camera.far }.checked()
+}
+
+fn exactly<const N: usize>(field: &str, list: &[f64]) -> Result<[f64; N]> {
+    list.try_into().map_err(|_| invalid(field, format!("{N} numbers"), list.len()))
+}

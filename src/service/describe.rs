@@ -1,0 +1,154 @@
+//! A scene described so that a client needs nothing else: domains, arrays, and rows of U, in chunks of at most 1 MiB.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use modalcast_proto::v1;
+use modalcast_proto::v1::describe_scene_response::Part;
+use prost::Message as _;
+use tonic::{Response, Status};
+
+use super::convert::scene_info;
+use super::stream::{Outlet, Replies, pieces, respond};
+use crate::engine::{Host, checked_domains};
+use crate::error::{Result, invalid};
+use crate::scene::Scene;
+
+/// Describes the chosen domains and sends the arrays asked for.
+pub(super) fn scene(
+    host: Arc<Host>,
+    request: v1::DescribeSceneRequest,
+    most: usize,
+) -> Result<Response<Replies<v1::DescribeSceneResponse>>> {
+    let domains = checked_domains("domains", &host.scene, request.domains)?;
+    let arrays = request.arrays.into_iter().map(array).collect::<Result<Vec<_>>>()?;
+    if arrays.len() > 5 {
+        return Err(invalid("arrays", "at most 5", arrays.len()));
+    }
+    Ok(respond(move |outlet| async move {
+        outlet.send(part(Part::Scene(scene_info(&host, true)))).await?;
+        send_descriptions(&host.scene, &domains, most, &outlet).await?;
+        for domain in domains {
+            for array in &arrays {
+                let bytes = contents(&host.scene, domain as usize, *array);
+                let total = bytes.len() as u64;
+                for (offset, data) in pieces(bytes, most) {
+                    let chunk = v1::ArrayChunk { domain, array: (*array).into(), offset, total, data };
+                    outlet.send(part(Part::Chunk(chunk))).await?;
+                }
+            }
+        }
+        Ok(())
+    }))
+}
+
+/// Rows of one domain's U: three per vertex asked for.
+pub(super) fn modes(
+    host: Arc<Host>,
+    request: v1::ReadModesRequest,
+    most: usize,
+) -> Result<Response<Replies<v1::ReadModesResponse>>> {
+    let count = host.scene.domains.len();
+    if request.domain as usize >= count {
+        return Err(invalid("domain", format!("an index below {count}"), request.domain));
+    }
+    let shape = host.scene.shape_of(request.domain as usize);
+    let (vertices, rank) = (shape.mesh.rest().len(), shape.modes.rank());
+    let chosen = match request.vertices {
+        all if all.is_empty() => (0..vertices as u32).collect(),
+        some => some,
+    };
+    if chosen.len() > vertices {
+        return Err(invalid("vertices", format!("at most {vertices} indices"), chosen.len()));
+    }
+    if let Some(at) = chosen.iter().position(|vertex| *vertex as usize >= vertices) {
+        return Err(invalid(format!("vertices[{at}]"), format!("an index below {vertices}"), chosen[at]));
+    }
+    // Rows are cut between vertices, so that no more than one chunk of them is ever made.
+    let row_bytes = 12 * rank;
+    let per_chunk = (most / row_bytes.max(1)).max(1);
+    let total = (row_bytes * chosen.len()) as u64;
+    Ok(respond(move |outlet: Outlet<v1::ReadModesResponse>| async move {
+        let modes = &host.scene.shape_of(request.domain as usize).modes;
+        for (index, group) in chosen.chunks(if rank == 0 { chosen.len() } else { per_chunk }).enumerate() {
+            let row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
+            let rows = group.iter().flat_map(|vertex| (0..3).map(move |component| 3 * *vertex as usize + component));
+            let data: Vec<u8> = rows.flat_map(row).flat_map(f32::to_le_bytes).collect();
+            let offset = (index * per_chunk * row_bytes) as u64;
+            outlet.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() }).await?;
+        }
+        Ok(())
+    }))
+}
+
+const fn part(part: Part) -> v1::DescribeSceneResponse {
+    v1::DescribeSceneResponse { part: Some(part) }
+}
+
+fn array(number: i32) -> Result<v1::Array> {
+    match v1::Array::try_from(number) {
+        Ok(v1::Array::Unspecified) | Err(_) => Err(invalid("arrays", "arrays of this version", number)),
+        Ok(array) => Ok(array),
+    }
+}
+
+/// As many descriptions per message as fit a chunk.
+async fn send_descriptions(
+    scene: &Scene,
+    domains: &[u32],
+    most: usize,
+    outlet: &Outlet<v1::DescribeSceneResponse>,
+) -> Result<(), Status> {
+    let mut group = v1::DomainDescriptions::default();
+    let mut size = 0;
+    for domain in domains {
+        let description = describe(scene, *domain);
+        let more = description.encoded_len() + 8;
+        if size + more > most && !group.domains.is_empty() {
+            outlet.send(part(Part::Domains(std::mem::take(&mut group)))).await?;
+            size = 0;
+        }
+        size += more;
+        group.domains.push(description);
+    }
+    outlet.send(part(Part::Domains(group))).await
+}
+
+fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
+    let domain = &scene.domains[index as usize];
+    let slot = scene.layout.slots[index as usize];
+    let numbers = |transform: &crate::domain::Transform| -> Bytes {
+        transform.0.into_iter().flat_map(f32::to_le_bytes).collect::<Vec<u8>>().into()
+    };
+    let attachment = domain.attachment.as_ref();
+    v1::DomainDescription {
+        domain: index,
+        name: domain.name.clone(),
+        vertices: slot.vertices as u32,
+        rank: slot.rank as u32,
+        corners: slot.corners as u32,
+        triangles: slot.triangles as u32,
+        parent: attachment.map(|attachment| attachment.parent as u32),
+        attachment_frame: attachment.map(|attachment| numbers(&attachment.frame)).unwrap_or_default(),
+        attachment_rows: attachment.map(|attachment| attachment.rows.clone()).unwrap_or_default(),
+        placement: numbers(&domain.placement),
+        shares_q_with: domain.shares_q_with.map(|twin| twin as u32),
+        shape: domain.shape as u32,
+        eigenvalues: domain.metadata.eigenvalues.clone(),
+        notes: domain.metadata.notes.clone().into_iter().collect(),
+    }
+}
+
+fn contents(scene: &Scene, domain: usize, array: v1::Array) -> Bytes {
+    let mesh = &scene.shape_of(domain).mesh;
+    let corners = mesh.corners();
+    let bytes: &[u8] = match array {
+        v1::Array::Unspecified => &[],
+        v1::Array::Indices => bytemuck::cast_slice(mesh.triangles()),
+        v1::Array::CornerVertices => bytemuck::cast_slice(&corners.vertices),
+        v1::Array::RestPositions => bytemuck::cast_slice(mesh.rest()),
+        v1::Array::Uvs => bytemuck::cast_slice(&corners.uvs),
+        v1::Array::RestNormals => bytemuck::cast_slice(&corners.normals),
+    };
+    Bytes::copy_from_slice(bytes)
+}

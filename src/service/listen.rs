@@ -1,0 +1,113 @@
+//! Connections, one by one: a place is taken before one is accepted, one that stays silent is closed, and running out of
+//! file descriptors makes the listener wait instead of spin.
+
+use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::server::{Connected, TcpConnectInfo};
+
+/// How many connections that have spoken may wait for the server.
+const AHEAD: usize = 16;
+
+/// How long the listener rests after it could not accept.
+const REST: Duration = Duration::from_millis(50);
+
+/// An accepted connection and its place.
+#[derive(Debug)]
+pub(super) struct Connection {
+    stream: TcpStream,
+    remote: SocketAddr,
+    _place: OwnedSemaphorePermit,
+}
+
+/// Accepts at most `most` connections at a time; each must send its first byte within `silence`. Ends with its reader.
+pub(super) fn connections(
+    listener: TcpListener,
+    most: usize,
+    silence: Duration,
+) -> ReceiverStream<io::Result<Connection>> {
+    let (ready, connections) = mpsc::channel(AHEAD);
+    tokio::spawn(async move {
+        let places = Arc::new(Semaphore::new(most));
+        loop {
+            let accepted = tokio::select! {
+                accepted = accept(&listener, &places) => accepted,
+                () = ready.closed() => return,
+            };
+            match accepted {
+                Ok(connection) => {
+                    tokio::spawn(hear(connection, silence, ready.clone()));
+                }
+                Err(error) => {
+                    tracing::warn!(%error, "a connection could not be accepted");
+                    tokio::time::sleep(REST).await;
+                }
+            }
+        }
+    });
+    ReceiverStream::new(connections)
+}
+
+async fn accept(listener: &TcpListener, places: &Arc<Semaphore>) -> io::Result<Connection> {
+    let place = Arc::clone(places).acquire_owned().await.map_err(io::Error::other)?;
+    let (stream, remote) = listener.accept().await?;
+    stream.set_nodelay(true)?;
+    Ok(Connection { stream, remote, _place: place })
+}
+
+/// Hands a connection on once it has spoken; drops it when it does not.
+async fn hear(connection: Connection, silence: Duration, ready: mpsc::Sender<io::Result<Connection>>) {
+    let mut first = [0];
+    let spoke = tokio::time::timeout(silence, connection.stream.peek(&mut first)).await;
+    if matches!(spoke, Ok(Ok(1))) {
+        ready.send(Ok(connection)).await.ok(); // The server has stopped, and the connection goes with it.
+    }
+}
+
+impl Connected for Connection {
+    type ConnectInfo = TcpConnectInfo;
+
+    fn connect_info(&self) -> TcpConnectInfo {
+        TcpConnectInfo { local_addr: self.stream.local_addr().ok(), remote_addr: Some(self.remote) }
+    }
+}
+
+impl AsyncRead for Connection {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_read(cx, into)
+    }
+}
+
+impl AsyncWrite for Connection {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(cx, bytes)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        parts: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(cx, parts)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(cx)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(cx)
+    }
+}

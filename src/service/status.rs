@@ -1,0 +1,79 @@
+//! Errors of the server as gRPC statuses and as rejections. The code is chosen in one match without a wildcard; the
+//! status's details are the bytes of the same `Rejection` that a step stream would send.
+
+use modalcast_proto::v1::Rejection;
+use prost::Message as _;
+use tonic::{Code, Status};
+
+use crate::error::Error;
+
+/// The most letters of one text of a refusal: it travels in headers or between steps, whatever a client has sent.
+const LONGEST: usize = 512;
+
+fn short(text: String) -> String {
+    match text.char_indices().nth(LONGEST) {
+        None => text,
+        Some((end, _)) => format!("{}...", &text[..end]),
+    }
+}
+
+/// The refusal as a message: field, expected, given.
+pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
+    let (field, expected, given) = match error.clone() {
+        Error::Invalid { field, expected, given } => (field, expected, given),
+        Error::NotFound { what, given } => (what.into(), format!("a {what} that is there"), given),
+        Error::Taken { what, holder } => (what.into(), "nobody there".into(), holder),
+        Error::Gone { what, expected, given } => (what.into(), expected, given),
+        Error::Busy { queue, limit } => (queue.into(), format!("at most {limit}"), "more".into()),
+        Error::Deadline { what, ms } => (what, format!("within {ms} ms"), "later".into()),
+        Error::Unavailable { what, reason, remedy } => (what.into(), remedy, reason),
+        Error::Fault { stage, reason } => (stage.into(), "success".into(), reason),
+    };
+    Rejection { step, field: short(field), expected: short(expected), given: short(given) }
+}
+
+/// The status of an error.
+pub(super) fn status(error: Error) -> Status {
+    let code = match error {
+        Error::Invalid { .. } => Code::InvalidArgument,
+        Error::NotFound { .. } => Code::NotFound,
+        Error::Taken { .. } => Code::AlreadyExists,
+        Error::Gone { .. } => Code::FailedPrecondition,
+        Error::Busy { .. } => Code::ResourceExhausted,
+        Error::Deadline { .. } => Code::DeadlineExceeded,
+        Error::Unavailable { .. } => Code::Unavailable,
+        Error::Fault { .. } => Code::Internal,
+    };
+    let details = rejection(None, &error);
+    Status::with_details(code, short(error.to_string()), details.encode_to_vec().into())
+}
+
+/// What a fault of transport under a client's stream is called: a message over the limit is `RESOURCE_EXHAUSTED` as
+/// everywhere else in gRPC.
+pub(super) fn transport(fault: Status, limit: usize) -> Status {
+    if fault.code() != Code::OutOfRange {
+        return fault;
+    }
+    let details = Rejection {
+        step: None,
+        field: "message".into(),
+        expected: format!("at most {limit} bytes"),
+        given: fault.message().into(),
+    };
+    Status::with_details(Code::ResourceExhausted, fault.message(), details.encode_to_vec().into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_status_carries_the_rejection_and_stays_small() {
+        let error = crate::error::invalid("step.q", "8 bytes", "x".repeat(100_000));
+        let status = status(error);
+        assert_eq!(status.code(), Code::InvalidArgument);
+        let details = Rejection::decode(status.details()).expect("a rejection");
+        assert_eq!((details.field.as_str(), details.expected.as_str()), ("step.q", "8 bytes"));
+        assert!(status.message().len() + status.details().len() < 4096);
+    }
+}

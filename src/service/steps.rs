@@ -1,0 +1,166 @@
+//! Steps: one bidirectional stream per physics process. The stream's task always reads, so that a slow scene never
+//! blocks the connection; what it cannot take it refuses, and the stream goes on.
+
+use std::collections::VecDeque;
+
+use modalcast_proto::v1;
+use modalcast_proto::v1::drive_scene_request::Kind as Asked;
+use modalcast_proto::v1::drive_scene_response::Kind as Told;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::convert::{policy, raw_update, scene_info, stages, wire_policy};
+use super::status::{rejection, status, transport};
+use super::stream::{Deadline, Outlet, Replies, respond};
+use crate::engine::{Drive, Engine, Report};
+use crate::error::{Error, Result, invalid};
+
+/// How many replies may wait for a client that does not read; beyond, the stream ends.
+const MOST_REPLIES: usize = 256;
+
+/// `StepService`.
+pub(super) struct Steps(pub(super) Engine);
+
+#[tonic::async_trait]
+impl v1::step_service_server::StepService for Steps {
+    type DriveSceneStream = Replies<v1::DriveSceneResponse>;
+
+    async fn drive_scene(
+        &self,
+        request: Request<Streaming<v1::DriveSceneRequest>>,
+    ) -> Result<Response<Self::DriveSceneStream>, Status> {
+        let who = request.remote_addr().map_or_else(|| "a local client".into(), |address| address.to_string());
+        let deadline = Deadline::of(request.metadata(), 0, None);
+        let session = Session {
+            engine: self.0.clone(),
+            who,
+            inbound: request.into_inner(),
+            drive: None,
+            replies: VecDeque::new(),
+        };
+        Ok(respond(move |outlet| deadline.hold("the end of the step stream", session.run(outlet))))
+    }
+}
+
+/// One stream.
+struct Session {
+    engine: Engine,
+    who: String,
+    inbound: Streaming<v1::DriveSceneRequest>,
+    /// The writer's place, once it was given.
+    drive: Option<Drive>,
+    replies: VecDeque<v1::DriveSceneResponse>,
+}
+
+impl Session {
+    /// Reads, and sends what there is to tell, until the client has said all and has been told all.
+    async fn run(mut self, outlet: Outlet<v1::DriveSceneResponse>) -> Result<(), Status> {
+        let mut listens = true;
+        loop {
+            let is_drained = self.drive.as_ref().is_none_or(Drive::is_drained);
+            if !listens && is_drained && self.replies.is_empty() {
+                return Ok(());
+            }
+            let has_room = self.replies.len() < MOST_REPLIES;
+            tokio::select! {
+                message = self.inbound.message(), if listens => match message {
+                    Ok(Some(message)) => self.receive(message).await?,
+                    Ok(None) => listens = false,
+                    Err(fault) => return Err(transport(fault, self.engine.config().message_bytes)),
+                },
+                report = next_report(self.drive.as_ref()), if has_room => match report {
+                    Ok(report) => self.replies.push_back(told(report)),
+                    Err(error) => return self.say_farewell(&outlet, error).await,
+                },
+                permit = outlet.ready(), if !self.replies.is_empty() => {
+                    let permit = permit?;
+                    if let Some(reply) = self.replies.pop_front() {
+                        permit.send(Ok(reply));
+                    }
+                }
+                () = outlet.closed() => return Ok(()),
+            }
+        }
+    }
+
+    /// Answers one message. Only a client that reads no answers is an error.
+    async fn receive(&mut self, message: v1::DriveSceneRequest) -> Result<(), Status> {
+        let refused = match message.kind {
+            Some(Asked::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
+            Some(Asked::Step(step)) => {
+                let number = step.number;
+                self.step(step).err().map(|error| (Some(number), error))
+            }
+            None => Some((None, invalid("kind", "open or step", "neither"))),
+        };
+        if let Some((step, error)) = refused {
+            self.push(Told::Rejection(rejection(step, &error)))?;
+        }
+        Ok(())
+    }
+
+    async fn open(&mut self, open: v1::OpenDrive) -> Result<()> {
+        if self.drive.is_some() {
+            return Err(invalid("open", "one open per stream", "a second"));
+        }
+        let policy = policy(open.policy)?;
+        let host = self.engine.find(&open.scene)?;
+        let window = if open.window == 0 { self.engine.config().window } else { open.window };
+        let drive = host.drive(self.who.clone(), policy, window).await?;
+        let opened = v1::Opened {
+            run: drive.run,
+            policy: wire_policy(drive.policy).into(),
+            window: drive.window,
+            scene: Some(scene_info(&host, true)),
+        };
+        self.drive = Some(drive);
+        self.replies.push_back(v1::DriveSceneResponse { kind: Some(Told::Opened(opened)) });
+        Ok(())
+    }
+
+    fn step(&mut self, step: v1::Step) -> Result<()> {
+        match &mut self.drive {
+            Some(drive) => drive.step(&raw_update(step)),
+            None => Err(invalid("kind", "open, before any step", "a step")),
+        }
+    }
+
+    fn push(&mut self, kind: Told) -> Result<(), Status> {
+        if self.replies.len() >= MOST_REPLIES {
+            return Err(status(Error::Busy { queue: "replies not read by the client", limit: MOST_REPLIES }));
+        }
+        self.replies.push_back(v1::DriveSceneResponse { kind: Some(kind) });
+        Ok(())
+    }
+
+    /// The server ends the stream: what was done is still told, as far as the client reads.
+    async fn say_farewell(mut self, outlet: &Outlet<v1::DriveSceneResponse>, error: Error) -> Result<(), Status> {
+        let patience = self.engine.config().drain / 2;
+        let tell = async {
+            while let Some(reply) = self.replies.pop_front() {
+                outlet.send(reply).await?;
+            }
+            Ok::<(), Status>(())
+        };
+        // Whether or not it read them: the reason comes last.
+        tokio::time::timeout(patience, tell).await.ok();
+        Err(status(error))
+    }
+}
+
+/// Waits for the drive's next report; for ever while there is no drive.
+async fn next_report(drive: Option<&Drive>) -> Result<Report> {
+    match drive {
+        Some(drive) => drive.next_report().await,
+        None => std::future::pending().await,
+    }
+}
+
+fn told(report: Report) -> v1::DriveSceneResponse {
+    let kind = match report {
+        Report::Done { step, skipped, stages: times } => {
+            Told::Ack(v1::Acknowledgement { step, skipped, stages: stages(&times) })
+        }
+        Report::Refused { step, error } => Told::Rejection(rejection(Some(step), &error)),
+    };
+    v1::DriveSceneResponse { kind: Some(kind) }
+}

@@ -1,0 +1,175 @@
+//! Reply streams: a task feeds a bounded channel, replies are cut into chunks of at most 1 MiB, deadlines hold to the
+//! last chunk, and a panic costs its own call only.
+
+use std::pin::Pin;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use tokio::sync::mpsc;
+use tokio_stream::Stream;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::metadata::MetadataMap;
+use tonic::{Response, Status};
+
+use super::status::status;
+use crate::error::{Error, Result};
+
+/// A reply stream.
+pub(super) type Replies<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// How many messages of a reply may wait for the connection.
+const AHEAD: usize = 2;
+
+/// Where a task puts its replies; waits while the client is slow.
+#[derive(Debug)]
+pub(super) struct Outlet<T>(mpsc::Sender<Result<T, Status>>);
+
+impl<T> Outlet<T> {
+    /// Sends one message.
+    ///
+    /// # Errors
+    /// When the client has gone.
+    pub(super) async fn send(&self, message: T) -> Result<(), Status> {
+        self.0.send(Ok(message)).await.map_err(|_| gone())
+    }
+
+    /// Waits until there is room for a message; dropping the future loses nothing.
+    pub(super) async fn ready(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
+        self.0.reserve().await.map_err(|_| gone())
+    }
+
+    /// Waits until the client has gone.
+    pub(super) async fn closed(&self) {
+        self.0.closed().await;
+    }
+}
+
+fn gone() -> Status {
+    Status::cancelled("the client has gone")
+}
+
+/// A stream that `work` fills. How `work` ends is how the stream ends; there is always room to say so.
+pub(super) fn respond<T, W, F>(work: W) -> Response<Replies<T>>
+where
+    T: Send + 'static,
+    W: FnOnce(Outlet<T>) -> F,
+    F: Future<Output = Result<(), Status>> + Send + 'static,
+{
+    let (sender, replies) = mpsc::channel(AHEAD + 1);
+    let last_word = sender.clone().try_reserve_owned();
+    let work = tokio::spawn(work(Outlet(sender)));
+    tokio::spawn(async move {
+        let end = work.await.unwrap_or_else(|_| Err(Status::internal("the call failed on our side")));
+        if let (Err(status), Ok(last_word)) = (end, last_word) {
+            last_word.send(Err(status));
+        }
+    });
+    Response::new(Box::pin(ReceiverStream::new(replies)))
+}
+
+/// Runs a single call's work so that a panic costs that call only.
+pub(super) async fn guarded<T: Send + 'static>(
+    work: impl Future<Output = Result<T>> + Send + 'static,
+) -> Result<Response<T>, Status> {
+    match tokio::spawn(work).await {
+        Ok(result) => result.map(Response::new).map_err(status),
+        Err(_) => Err(Status::internal("the call failed on our side")),
+    }
+}
+
+/// Cuts a reply into pieces, each with its offset; an empty reply is one empty piece.
+pub(super) fn pieces(bytes: Bytes, most: usize) -> impl Iterator<Item = (u64, Bytes)> {
+    let starts = (0..bytes.len().max(1)).step_by(most.max(1));
+    starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + most))))
+}
+
+/// When a call must be over.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Deadline {
+    /// `None`: never.
+    at: Option<(Instant, u64)>,
+}
+
+impl Deadline {
+    /// The smaller of what the request says (0: nothing) and what its `grpc-timeout` header says; `default` if neither.
+    pub(super) fn of(metadata: &MetadataMap, ms: u32, default: Option<Duration>) -> Self {
+        let asked = (ms > 0).then(|| Duration::from_millis(ms.into()));
+        let header = metadata.get("grpc-timeout").and_then(|text| parse_timeout(text.to_str().ok()?));
+        let time = match (asked, header) {
+            (Some(asked), Some(header)) => Some(asked.min(header)),
+            (asked, header) => asked.or(header).or(default),
+        };
+        let at = time.and_then(|time| Some((Instant::now().checked_add(time)?, time.as_millis() as u64)));
+        Self { at }
+    }
+
+    /// The work's result, or `DEADLINE_EXCEEDED` when it is not there in time; the work is dropped then.
+    pub(super) async fn hold<T>(self, what: &str, work: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
+        let Some((at, ms)) = self.at else { return work.await };
+        match tokio::time::timeout_at(at.into(), work).await {
+            Ok(result) => result,
+            Err(_) => Err(status(Error::Deadline { what: what.into(), ms })),
+        }
+    }
+}
+
+/// The header's at most eight digits and its unit.
+fn parse_timeout(text: &str) -> Option<Duration> {
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|digit| digit.is_ascii_digit()) {
+        return None;
+    }
+    let count: u64 = digits.parse().ok()?;
+    match unit {
+        "H" => Some(Duration::from_secs(count * 3600)),
+        "M" => Some(Duration::from_secs(count * 60)),
+        "S" => Some(Duration::from_secs(count)),
+        "m" => Some(Duration::from_millis(count)),
+        "u" => Some(Duration::from_micros(count)),
+        "n" => Some(Duration::from_nanos(count)),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_cover_a_reply_once_and_an_empty_reply_is_one_piece() {
+        let bytes = Bytes::from((0..=250).collect::<Vec<u8>>());
+        let cut: Vec<_> = pieces(bytes.clone(), 100).collect();
+        assert_eq!(
+            cut.iter().map(|(at, piece)| (*at, piece.len())).collect::<Vec<_>>(),
+            [(0, 100), (100, 100), (200, 51)]
+        );
+        assert_eq!(cut.iter().flat_map(|(_, piece)| piece.to_vec()).collect::<Vec<_>>(), bytes);
+        assert_eq!(pieces(Bytes::new(), 100).collect::<Vec<_>>(), [(0, Bytes::new())]);
+    }
+
+    #[test]
+    fn a_timeout_header_is_digits_and_a_unit_and_anything_else_is_none() {
+        assert_eq!(parse_timeout("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(parse_timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
+        for text in ["", "S", "123456789S", "-1S", "1s", "1 S", "1é", "é"] {
+            assert_eq!(parse_timeout(text), None, "{text}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_panicking_task_ends_its_stream_with_internal_even_when_nobody_reads() {
+        let respond = respond(|outlet: Outlet<u32>| async move {
+            outlet.send(1).await?;
+            outlet.send(2).await?;
+            let nothing: Option<u32> = None;
+            outlet.send(nothing.expect("a planted panic")).await
+        });
+        let mut replies = respond.into_inner();
+        use tokio_stream::StreamExt as _;
+        assert_eq!(replies.next().await.expect("a message").expect("fine"), 1);
+        assert_eq!(replies.next().await.expect("a message").expect("fine"), 2);
+        let end = replies.next().await.expect("an end").expect_err("an error");
+        assert_eq!(end.code(), tonic::Code::Internal);
+        assert!(replies.next().await.is_none());
+    }
+}

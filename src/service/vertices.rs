@@ -1,0 +1,118 @@
+//! Deformed vertices: those of one step with a deadline, or of every step. Positions in row order of U, then normals.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use modalcast_proto::v1;
+use tonic::{Request, Response, Status};
+
+use super::convert::{delivery, said, stages, step_id, which_of_vertices};
+use super::status::status;
+use super::stream::{Deadline, Outlet, Replies, pieces, respond};
+use crate::engine::{Encoded, Engine, Feed, Host, Selection, View, pack_vertices};
+
+/// `VertexService`.
+pub(super) struct Vertices(pub(super) Engine);
+
+#[tonic::async_trait]
+impl v1::vertex_service_server::VertexService for Vertices {
+    type GetVerticesStream = Replies<v1::GetVerticesResponse>;
+
+    async fn get_vertices(
+        &self,
+        request: Request<v1::GetVerticesRequest>,
+    ) -> Result<Response<Self::GetVerticesStream>, Status> {
+        let config = self.0.config();
+        let deadline = Deadline::of(request.metadata(), request.get_ref().deadline_ms, Some(config.deadline));
+        let request = request.into_inner();
+        let host = self.0.find(&request.scene).map_err(status)?;
+        let selection = select(&host, request.selection)?;
+        let which = which_of_vertices(request.step.as_ref());
+        let most = config.chunk_bytes;
+        Ok(respond(move |outlet| async move {
+            let work = async {
+                let shown = host.show(which, View::Vertices).await.map_err(status)?;
+                let vertices = pack_vertices(shown, &selection).await.map_err(status)?;
+                for chunk in chunks(&host, &vertices, &selection, most) {
+                    outlet.send(v1::GetVerticesResponse { chunk: Some(chunk) }).await?;
+                }
+                Ok(())
+            };
+            deadline.hold(&said(which, &host.name), work).await
+        }))
+    }
+
+    type StreamVerticesStream = Replies<v1::StreamVerticesResponse>;
+
+    async fn stream_vertices(
+        &self,
+        request: Request<v1::StreamVerticesRequest>,
+    ) -> Result<Response<Self::StreamVerticesStream>, Status> {
+        let deadline = Deadline::of(request.metadata(), 0, None);
+        let request = request.into_inner();
+        let host = self.0.find(&request.scene).map_err(status)?;
+        let selection = select(&host, request.selection)?;
+        let delivery = delivery(request.delivery).map_err(status)?;
+        // The subscription holds before the reply's head is sent, so that a client may count on the next step.
+        let feed = host.watch(View::Vertices, delivery).await.map_err(status)?;
+        let show = Show { host, selection, most: self.0.config().chunk_bytes, steps: request.steps };
+        Ok(respond(move |outlet| deadline.hold("the end of the vertex stream", show.run(feed, outlet))))
+    }
+}
+
+/// How a stream of vertices is sent.
+struct Show {
+    host: Arc<Host>,
+    selection: Arc<Selection>,
+    most: usize,
+    /// 0: without end.
+    steps: u64,
+}
+
+impl Show {
+    async fn run(self, mut feed: Feed, outlet: Outlet<v1::StreamVerticesResponse>) -> Result<(), Status> {
+        let mut sent = 0;
+        while self.steps == 0 || sent < self.steps {
+            let shown = tokio::select! {
+                shown = feed.next() => shown.map_err(status)?,
+                () = outlet.closed() => return Ok(()),
+            };
+            let vertices = pack_vertices(shown, &self.selection).await.map_err(status)?;
+            for chunk in chunks(&self.host, &vertices, &self.selection, self.most) {
+                tokio::select! {
+                    sent = outlet.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent?,
+                    error = feed.cut_off() => return Err(status(error)),
+                }
+            }
+            sent += 1;
+        }
+        Ok(())
+    }
+}
+
+fn select(host: &Host, selection: Option<v1::VertexSelection>) -> Result<Arc<Selection>, Status> {
+    let v1::VertexSelection { domains, positions_only } = selection.unwrap_or_default();
+    Selection::new(&host.scene, domains, positions_only).map(Arc::new).map_err(status)
+}
+
+fn chunks(
+    host: &Host,
+    vertices: &Encoded,
+    selection: &Selection,
+    most: usize,
+) -> impl Iterator<Item = v1::VertexChunk> + use<> {
+    let head = v1::VertexHead {
+        step: Some(step_id(vertices.step)),
+        origin: host.scene.origin.to_vec(),
+        domains: selection.domains.clone(),
+        vertices: selection.vertices().collect(),
+        corners: selection.corners().collect(),
+        position_bytes: selection.position_bytes(),
+        total: vertices.bytes.len() as u64,
+        skipped: vertices.skipped,
+        stages: stages(&vertices.stages),
+    };
+    let mut head = Some(head);
+    let cut = move |(offset, data): (u64, Bytes)| v1::VertexChunk { head: head.take(), offset, data };
+    pieces(vertices.bytes.clone(), most).map(cut)
+}

@@ -1,0 +1,58 @@
+//! The device itself: what it agrees on with the host, what it refuses, what it gives back.
+
+use modalcast::deform::Deformer;
+use modalcast::error::Error;
+use modalcast::gpu::{CudaDeformer, Device, agreements, device_values, probe};
+
+use crate::scenes;
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_host_and_device_agree_on_every_size_and_offset() {
+    let device = Device::open(0).expect("a CUDA device");
+    let values = device_values(&device).expect("reports");
+    for (agreement, device) in agreements().iter().zip(&values) {
+        assert_eq!(agreement.host, *device, "{}", agreement.expression);
+    }
+    assert_eq!(values.len(), agreements().len());
+    assert!(values.iter().any(|value| *value > 0), "the report was written");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_probe_names_the_device_that_opens() {
+    let (probe, device) = (probe(), Device::open(0).expect("a CUDA device"));
+    assert_eq!(probe.devices[0].name, device.name());
+    assert_eq!(probe.devices[0].capability, format!("{}.{}", device.capability().0, device.capability().1));
+    assert_eq!((probe.cuda_problem, probe.nvrtc_problem), (None, None));
+    device.check_compiler().expect("NVRTC fits the driver");
+    assert!(probe.driver.is_some() && probe.cuda.is_some() && probe.nvrtc.is_some());
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_an_ordinal_beyond_the_last_device_is_refused() {
+    let refusal = Device::open(probe().devices.len()).expect_err("beyond the last");
+    assert!(matches!(&refusal, Error::Unavailable { what: "CUDA device", .. }), "{refusal}");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_memory_returns_when_deformers_go() {
+    let device = Device::open(0).expect("a CUDA device");
+    let scene = scenes::scene(&[(20_000, 30)], 2, true, false);
+    let state = scenes::state(&scene, 1);
+    let once = || {
+        let mut deformer = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+        deformer.deform(&state).expect("deforms");
+        deformer.surface().expect("copies");
+        deformer.plan().total_bytes()
+    };
+    let bytes = once();
+    let (before, _) = device.memory().expect("memory");
+    for _ in 0..200 {
+        once();
+    }
+    let (after, _) = device.memory().expect("memory");
+    assert!((before as u64) < after as u64 + 8 * bytes, "{before} bytes free before, {after} after 200 scenes");
+}

@@ -1,0 +1,111 @@
+//! Zero rows, overflow, singular and tiny transforms: what a step may hold at the edge of f32.
+
+use modalcast::deform::Deformer;
+use modalcast::domain::{Modes, Shape, Transform};
+use modalcast::reference::orient_normals;
+use modalcast::scene::{Scene, State};
+
+use crate::judge::{DIRECTION, check, largest_error, same_bits};
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::twins::deformer;
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_vertices_whose_rows_of_u_are_zero_stay_bit_equal_to_q_of_zero() {
+    let mut random = Random(1);
+    let shape = scenes::shape(&mut random, 700, 9);
+    let mut entries = shape.modes.columns().to_vec();
+    for (row, entry) in entries.iter_mut().enumerate() {
+        // Zeros of both signs.
+        if (row % 2100 / 3).is_multiple_of(3) {
+            *entry = if row % 2 == 0 { 0.0 } else { -0.0 };
+        }
+    }
+    let modes = Modes::from_columns(2100, 9, entries).expect("modes");
+    let mut parts = scenes::parts(vec![Shape::new(shape.mesh, modes).expect("a shape")]);
+    parts.domains = vec![scenes::domain(0, 0), scenes::domain(0, 0)];
+    let scene = Scene::new(parts).expect("a scene");
+    let mut deformer = deformer(&scene);
+    let mut state = scenes::state(&scene, 2);
+    state.transforms[1] = Transform::IDENTITY;
+    check("zero rows", &scene, &state, &mut deformer);
+    let bent = deformer.surface().expect("copies").positions.clone();
+    state.q.fill(0.0);
+    deformer.deform(&state).expect("deforms");
+    let still = &deformer.surface().expect("copies").positions;
+    for vertex in 0..1400 {
+        let of = |positions: &[f32]| positions[3 * vertex..][..3].to_vec();
+        assert_eq!(same_bits(&of(&bent), &of(still)), (vertex % 700).is_multiple_of(3), "vertex {vertex}");
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_overflow_makes_the_bounds_not_finite_and_the_next_step_is_good_again() {
+    let scene = scenes::scene(&[(300, 2), (300, 0)], 2, false, false);
+    let mut deformer = deformer(&scene);
+    let good = scenes::state(&scene, 3);
+    assert!(check("before", &scene, &good, &mut deformer).bounds.is_finite());
+    for q in [f32::MAX, -f32::MAX] {
+        let mut bad = good.clone();
+        bad.q[0] = q;
+        bad.q[1] = q;
+        // Large enough that f32 overflows in the transform if it did not in the sum.
+        bad.transforms[0] = Transform([1e3, -2e3, 1e3, 0.0, 1e3, 1e3, -3e3, 0.0, -1e3, 1e3, 1e3, 0.0]);
+        assert!(!deformer.deform(&bad).expect("deforms").bounds.is_finite(), "q {q}");
+    }
+    assert!(check("after", &scene, &good, &mut deformer).bounds.is_finite());
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_nan_shows_in_both_bounds_of_its_axis_and_an_infinity_in_one() {
+    let mut random = Random(4);
+    let shape = scenes::shape(&mut random, 1000, 1);
+    let mut column = vec![0.0; 3000];
+    column[3 * 517] = 2.0;
+    column[3 * 517 + 1] = 2.0;
+    let modes = Modes::from_columns(3000, 1, column).expect("modes");
+    let mut parts = scenes::parts(vec![Shape::new(shape.mesh, modes).expect("a shape")]);
+    parts.domains = vec![scenes::domain(0, 0)];
+    let scene = Scene::new(parts).expect("a scene");
+    let mut state = State::rest(&scene);
+    state.q[0] = f32::MAX;
+    // Infinity minus infinity in the first row alone.
+    state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
+    let bounds = deformer(&scene).deform(&state).expect("deforms").bounds;
+    assert!(bounds.min[0].is_nan() && bounds.max[0].is_nan(), "{bounds:?}");
+    assert!(bounds.min[1].is_finite() && bounds.max[1] == f64::INFINITY, "{bounds:?}");
+    assert!(bounds.min[2] == f64::NEG_INFINITY && bounds.max[2].is_finite(), "{bounds:?}");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_normals_and_tangents_of_singular_tiny_and_huge_transforms_equal_the_twin() {
+    let linear: [[f32; 9]; 10] = [
+        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+        [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+        [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0; 9],
+        [1.0, 2.0, 3.0, 2.0, 4.0, 6.0, 0.0, 0.0, 1.0],
+        [1e-30, 0.0, 0.0, 0.0, 3e-30, 1e-30, 0.0, 0.0, 2e-30],
+        [1e30, 2e29, 0.0, 0.0, 3e30, 1e30, 0.0, 0.0, -2e30],
+        [1e-40, 0.0, 0.0, 0.0, 2e-40, 0.0, 1e-41, 0.0, 1e-40],
+        [1.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1.0],
+        [0.3, 0.5, -0.2, 0.300_000_03, 0.5, -0.2, 0.1, -0.7, 0.4],
+    ];
+    let mut random = Random(6);
+    let mut parts = scenes::parts(vec![scenes::shape(&mut random, 40, 0)]);
+    parts.domains = vec![scenes::domain(0, NORMAL_MAPPED); linear.len()];
+    let scene = Scene::new(parts).expect("a scene");
+    let mut state = State::rest(&scene);
+    for (transform, [a, b, c, d, e, f, g, h, i]) in state.transforms.iter_mut().zip(linear) {
+        *transform = Transform([a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0]);
+    }
+    let mut deformer = deformer(&scene);
+    check("edge transforms", &scene, &state, &mut deformer);
+    // The twin of other transforms is no twin.
+    let normals = &deformer.surface().expect("copies").normals;
+    let other = orient_normals(&scene, &State::rest(&scene));
+    assert!(largest_error(normals, &other, DIRECTION).is_err(), "the judge can fail");
+}

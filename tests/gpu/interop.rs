@@ -1,0 +1,86 @@
+//! CUDA writes into OpenGL's buffers: the same vertices and the same picture as with a copy.
+
+use std::sync::Arc;
+
+use modalcast::deform::Deformer;
+use modalcast::gpu::{CudaDeformer, Device, GlBuffers};
+use modalcast::render::{Prefer, Renderer, SceneBuffers, Shot};
+use modalcast::scene::{Camera, Scene};
+
+use crate::judge::{check, same_bits};
+use crate::scenes;
+
+fn shared(buffers: &SceneBuffers) -> GlBuffers {
+    let modalcast::render::SharedBuffers { positions, normals, tangents } = buffers.shared;
+    GlBuffers { positions, normals, tangents }
+}
+
+fn stage() -> (Renderer, Arc<Device>, Arc<Scene>) {
+    let renderer = Renderer::open(Prefer::Cuda(0)).expect("OpenGL on the CUDA device");
+    let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
+    (renderer, Device::open(0).expect("a CUDA device"), scene)
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_vertices_in_shared_buffers_equal_the_twin_and_the_copied_ones_bit_by_bit() {
+    let (mut renderer, device, scene) = stage();
+    let buffers = renderer.load(&scene).expect("loads");
+    let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&buffers))).expect("a deformer");
+    let mut copied = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    assert!(direct.shares_buffers(), "interop was refused");
+    assert!(!copied.shares_buffers());
+    for seed in 0..3 {
+        let state = scenes::state(&scene, seed);
+        let shown = check("shared buffers", &scene, &state, &mut direct);
+        let bounds = copied.deform(&state).expect("deforms").bounds;
+        assert_eq!(shown.bounds, bounds);
+        let (direct, copied) = (direct.surface().expect("copies"), copied.surface().expect("copies"));
+        assert!(same_bits(&direct.positions, &copied.positions));
+        assert!(same_bits(&direct.normals, &copied.normals));
+        assert!(same_bits(&direct.tangents, &copied.tangents));
+    }
+    drop(direct);
+    renderer.unload(buffers);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
+    let (mut renderer, device, scene) = stage();
+    let (state, other) = (scenes::state(&scene, 1), scenes::state(&scene, 2));
+    let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
+    let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&to_share))).expect("a deformer");
+    let bounds = direct.deform(&state).expect("deforms").bounds;
+    let shot = Shot { camera: Camera::framing(&scene), width: 320, height: 240, bounds };
+    let shown = renderer.draw(&to_share, &shot).expect("draws");
+    renderer.upload(&to_fill, direct.surface().expect("copies")).expect("uploads");
+    let uploaded = renderer.draw(&to_fill, &shot).expect("draws");
+    assert_eq!(shown.rgba, uploaded.rgba, "reading the surface leaves the picture");
+    let again = renderer.draw(&to_share, &shot).expect("draws");
+    assert_eq!(shown.rgba, again.rgba, "a copy of the surface does not disturb the shared buffers");
+    direct.deform(&other).expect("deforms");
+    let moved = renderer.draw(&to_share, &shot).expect("draws");
+    assert_ne!(shown.rgba, moved.rgba, "the judge can fail");
+    drop(direct);
+    renderer.unload(to_share);
+    renderer.unload(to_fill);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_fall_back_to_copies() {
+    let (mut renderer, device, scene) = stage();
+    let small = renderer.load(&scenes::scene(&[(4, 0)], 1, true, false)).expect("loads");
+    let good = renderer.load(&scene).expect("loads");
+    let unknown = GlBuffers { positions: 999_999, normals: 999_998, tangents: Some(999_997) };
+    let without_tangents = GlBuffers { tangents: None, ..shared(&good) };
+    for buffers in [shared(&small), unknown, without_tangents] {
+        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers)).expect("a deformer");
+        assert!(!deformer.shares_buffers(), "{buffers:?}");
+        check("fallen back", &scene, &scenes::state(&scene, 3), &mut deformer);
+    }
+    let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&good))).expect("a deformer");
+    assert!(direct.shares_buffers(), "refusals leave nothing behind");
+    check("after refusals", &scene, &scenes::state(&scene, 3), &mut direct);
+}

@@ -1,0 +1,113 @@
+//! Random scenes: shapes of n vertices and r modes, placed by rotations, mirrors and shears.
+
+use std::sync::Arc;
+
+use modalcast::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast::scene::{Parts, Scene, State};
+use nalgebra::{Matrix3, Rotation3, Vector3};
+
+/// A small generator of repeatable numbers (splitmix64).
+pub(crate) struct Random(pub(crate) u64);
+
+impl Random {
+    /// Even in -1 to 1.
+    pub(crate) fn number(&mut self) -> f32 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ z >> 31) >> 40) as f32 / (1 << 23) as f32 - 1.0
+    }
+
+    pub(crate) fn triple(&mut self) -> [f32; 3] {
+        std::array::from_fn(|_| self.number())
+    }
+
+    fn vector(&mut self) -> Vector3<f64> {
+        Vector3::from(self.triple()).cast()
+    }
+
+    /// A rotation times a scale, mirrored if asked.
+    pub(crate) fn similarity(&mut self, mirror: bool) -> Transform {
+        let turn = Rotation3::from_scaled_axis(self.vector() * 3.0).into_inner();
+        let scale = f64::from(1.0 + 0.5 * self.number()) * if mirror { -1.0 } else { 1.0 };
+        Transform::from_parts(&(turn * scale), &(self.vector() * 2.0))
+    }
+
+    /// Any regular matrix.
+    pub(crate) fn shear(&mut self) -> Transform {
+        let linear = Matrix3::from_columns(&[self.vector(), self.vector(), self.vector()]) + Matrix3::identity();
+        Transform::from_parts(&linear, &(self.vector() * 2.0))
+    }
+}
+
+/// A shape in the unit cube whose modes bend it by about its own size at q of 1. It has more corners than vertices.
+pub(crate) fn shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
+    let rest = (0..vertices).map(|_| random.triple()).collect();
+    let count = vertices + 3;
+    let corners = Corners {
+        vertices: (0..count).map(|corner| (corner * 7 % vertices) as u32).collect(),
+        normals: (0..count).map(|_| random.triple()).collect(),
+        uvs: (0..count).map(|_| [random.number(), random.number()]).collect(),
+    };
+    let triangles = (0..count as u32 - 2).map(|first| [first, first + 1, first + 2]).collect();
+    let mesh = Mesh::new(rest, corners, triangles).expect("a mesh");
+    let size = 1.0 / (rank.max(1) as f32).sqrt();
+    let entries = (0..3 * vertices * rank).map(|_| size * random.number()).collect();
+    Shape::new(mesh, Modes::from_columns(3 * vertices, rank, entries).expect("modes")).expect("a shape")
+}
+
+pub(crate) fn domain(shape: usize, material: usize) -> Domain {
+    Domain {
+        name: format!("shape {shape}"),
+        shape,
+        material,
+        placement: Transform::IDENTITY,
+        runs: vec![],
+        attachment: None,
+        rest_q: Vec::new(),
+        shares_q_with: None,
+        metadata: Metadata::default(),
+    }
+}
+
+/// The index of [`parts`]'s material with a normal map; 0 is plain.
+pub(crate) const NORMAL_MAPPED: usize = 1;
+
+/// Parts with the shapes, two materials and no domains.
+pub(crate) fn parts(shapes: Vec<Shape>) -> Parts {
+    let mut parts = Parts::named("random");
+    parts.shapes = shapes;
+    let mapped = Material { normal_texture: Some(0), ..Material::default() };
+    parts.materials = vec![Material::default(), mapped];
+    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
+    parts
+}
+
+/// A scene of shapes (n, r), each used by `instances` domains; every other shape has a normal map if asked.
+pub(crate) fn scene(shapes: &[(usize, usize)], instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
+    let mut random = Random(shapes.len() as u64);
+    let mut parts = parts(shapes.iter().map(|(vertices, rank)| shape(&mut random, *vertices, *rank)).collect());
+    parts.rigid_transforms = rigid;
+    for _ in 0..instances {
+        for index in 0..shapes.len() {
+            let mapped = normal_maps && index % 2 == 0;
+            parts.domains.push(domain(index, if mapped { NORMAL_MAPPED } else { 0 }));
+        }
+    }
+    Scene::new(parts).expect("a scene")
+}
+
+/// A random state; sheared where the scene allows it, every third domain mirrored.
+pub(crate) fn state(scene: &Scene, seed: u64) -> State {
+    let mut random = Random(seed);
+    let mut state = State::rest(scene);
+    state.q.iter_mut().for_each(|coordinate| *coordinate = random.number());
+    for (index, transform) in state.transforms.iter_mut().enumerate() {
+        *transform = match index % 3 {
+            0 => random.similarity(false),
+            1 if scene.needs.shear => random.shear(),
+            _ => random.similarity(true),
+        };
+    }
+    state
+}

@@ -1,0 +1,183 @@
+//! Frames over the wire: the right step, size and bytes, with a deadline, single or streamed. Needs an EGL that draws.
+
+use modalcast::config::{Config, RendererChoice};
+use modalcast_proto::v1;
+use prost::Message as _;
+use tonic::{Code, Status, Streaming};
+use v1::render_frame_request::Step as Which;
+
+use crate::service_harness::{Server, details, step, within};
+
+async fn server() -> Server {
+    let server = Server::with(|config| Config { renderer: RendererChoice::Software, ..config }).await;
+    server.open("strips").await;
+    server
+}
+
+fn picture(width: u32, height: u32, format: v1::Format) -> Option<v1::Picture> {
+    Some(v1::Picture { width, height, format: format.into(), camera: None })
+}
+
+fn request() -> v1::RenderFrameRequest {
+    let picture = picture(64, 48, v1::Format::Rgba);
+    v1::RenderFrameRequest { scene: "strips".into(), picture, ..v1::RenderFrameRequest::default() }
+}
+
+struct Frame {
+    head: v1::FrameHead,
+    bytes: Vec<u8>,
+}
+
+async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Frame, Status> {
+    let mut stream = within(server.frames().await.render_frame(request)).await?.into_inner();
+    let mut head = None;
+    let mut bytes = Vec::new();
+    while let Some(response) = within(stream.message()).await? {
+        assert!(response.encoded_len() <= (1 << 20) + 4096);
+        let chunk = response.chunk.expect("a chunk");
+        assert_eq!(chunk.offset, bytes.len() as u64);
+        head = head.or(chunk.head);
+        bytes.extend_from_slice(&chunk.data);
+    }
+    let head = head.expect("a head");
+    assert_eq!(head.total, bytes.len() as u64);
+    Ok(Frame { head, bytes })
+}
+
+async fn next(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::FrameHead> {
+    let mut head: Option<v1::FrameHead> = None;
+    let mut got = 0;
+    while let Some(response) = within(stream.message()).await.expect("goes on") {
+        let chunk = response.chunk.expect("a chunk");
+        got += chunk.data.len() as u64;
+        head = head.or(chunk.head);
+        if head.as_ref().is_some_and(|head| head.total == got) {
+            return head;
+        }
+    }
+    None
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frame_names_its_step_and_png_and_rgba_hold_the_same_pixels() {
+    let server = server().await;
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let rest = render(&server, request()).await.expect("the rest state can be drawn");
+    assert_eq!(rest.head.step.map(|step| step.run), Some(0));
+    driver.acked(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
+    let raw = render(&server, v1::RenderFrameRequest { step: Some(Which::ExactStep(5)), ..request() }).await;
+    let raw = raw.expect("a frame");
+    assert_eq!(raw.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
+    assert_eq!((raw.head.width, raw.head.height, raw.bytes.len()), (64, 48, 64 * 48 * 4));
+    assert_ne!(raw.bytes, rest.bytes, "the step is to be seen");
+    let png = v1::RenderFrameRequest { picture: picture(64, 48, v1::Format::Png), ..request() };
+    let png = render(&server, png).await.expect("a frame");
+    let decoded = image::load_from_memory(&png.bytes).expect("a PNG").into_rgba8();
+    assert_eq!(decoded.into_raw(), raw.bytes);
+    let stages: Vec<&str> = png.head.stages.iter().map(|stage| stage.stage.as_str()).collect();
+    for stage in ["deform", "draw", "read", "encode"] {
+        assert!(stages.contains(&stage), "{stage} is not in {stages:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_large_raw_frame_travels_in_chunks_to_a_client_with_default_limits() {
+    let server = server().await;
+    let large = v1::RenderFrameRequest { picture: picture(1600, 1000, v1::Format::Rgba), ..request() };
+    let frame = render(&server, large).await.expect("a frame");
+    assert_eq!(frame.bytes.len(), 1600 * 1000 * 4);
+    let unsized_picture = v1::RenderFrameRequest { picture: None, ..request() };
+    let frame = render(&server, unsized_picture).await.expect("a frame");
+    assert_eq!((frame.head.width, frame.head.height, frame.head.format()), (1280, 720, v1::Format::Png));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_lossless_frame_stream_shows_every_step_and_a_latest_one_only_goes_forward() {
+    let server = server().await;
+    let subscribe = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
+        scene: "strips".into(),
+        picture: picture(32, 32, v1::Format::Png),
+        delivery: delivery.into(),
+        frames,
+    };
+    let mut client = server.frames().await;
+    let lossless = client.stream_frames(subscribe(v1::Delivery::Lossless, 12)).await.expect("subscribes");
+    let latest = client.stream_frames(subscribe(v1::Delivery::Latest, 0)).await.expect("subscribes");
+    let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 3).await;
+    let write = async {
+        for number in 1..=12 {
+            driver.acked(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
+        }
+    };
+    let read = async {
+        for number in 1..=12 {
+            let head = next(&mut lossless).await.expect("a frame");
+            assert_eq!((head.step.map(|step| step.number), head.skipped), (Some(number), 0));
+        }
+        assert!(next(&mut lossless).await.is_none(), "it ends after its count");
+    };
+    let follow = async {
+        let mut last = 0;
+        let mut counted = 0;
+        while last < 12 {
+            let head = next(&mut latest).await.expect("a frame");
+            let number = head.step.expect("a step").number;
+            assert!(number > last);
+            counted += 1 + head.skipped;
+            assert_eq!(counted, number, "every step is shown or counted");
+            last = number;
+        }
+    };
+    tokio::join!(write, read, follow);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bad_pictures_are_refused_by_name_and_deadlines_hold() {
+    let server = server().await;
+    let eye = |eye: Vec<f64>, up: Vec<f64>| v1::Camera {
+        view: Some(v1::camera::View::LookAt(v1::LookAt { eye, target: vec![0.0; 3], up })),
+        ..v1::Camera::default()
+    };
+    let lens = |lens| v1::Camera { lens: Some(lens), ..v1::Camera::default() };
+    let up = || vec![0.0, 1.0, 0.0];
+    let cameras: Vec<(v1::Camera, &str)> = vec![
+        (eye(vec![0.0; 2], up()), "picture: camera.look_at.eye"),
+        (eye(vec![f64::NAN, 0.0, 1.0], up()), "picture: camera.look_at"),
+        (eye(vec![0.0; 3], up()), "picture: camera.look_at"),
+        (eye(vec![0.0, 2.0, 0.0], up()), "picture: camera.look_at"),
+        (lens(v1::camera::Lens::FieldOfView(180.0)), "picture: camera.field_of_view"),
+        (lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture: camera.intrinsics"),
+        (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture: camera.near/far"),
+        (v1::Camera { near: f64::NAN, ..v1::Camera::default() }, "picture: camera.near/far"),
+        (
+            v1::Camera {
+                view: Some(v1::camera::View::Pose(v1::Pose { world_from_camera: vec![0.0; 12] })),
+                ..v1::Camera::default()
+            },
+            "picture: camera.pose",
+        ),
+    ];
+    for (camera, field) in cameras {
+        let mut bad = request();
+        bad.picture.as_mut().expect("a picture").camera = Some(camera);
+        let status = render(&server, bad).await.err().expect(field);
+        assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
+        assert!(details(&status).field.starts_with(field), "{:?} is not {field}", details(&status));
+    }
+    for (width, height) in [(0, 48), (48, 0), (1_000_000, 48), (48, u32::MAX)] {
+        let bad = v1::RenderFrameRequest { picture: picture(width, height, v1::Format::Png), ..request() };
+        let status = render(&server, bad).await.err().expect("a size");
+        assert_eq!((status.code(), details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
+        assert_eq!(details(&status).given, format!("{width} x {height}"));
+    }
+    let late = v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), deadline_ms: 60, ..request() };
+    assert_eq!(render(&server, late).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
+    let mut hasty = tonic::Request::new(v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), ..request() });
+    hasty.metadata_mut().insert("grpc-timeout", "60m".parse().expect("a header"));
+    let ended = async {
+        let mut stream = server.frames().await.render_frame(hasty).await?.into_inner();
+        stream.message().await
+    };
+    assert_eq!(within(ended).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
+}

@@ -1,0 +1,141 @@
+//! What survives a restart: open scenes, uploads and the last step, whether the server stopped or was killed.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use modalcast_proto::v1;
+use sha2::{Digest as _, Sha256};
+use v1::upload_scene_request::Part;
+
+use crate::service_harness::{PATIENCE, Server, config, expected, get_vertices, step, strips};
+
+fn ask(scene: &str) -> v1::GetVerticesRequest {
+    v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
+}
+
+fn runtime() -> tokio::runtime::Runtime {
+    tokio::runtime::Builder::new_multi_thread().enable_all().worker_threads(2).build().expect("a runtime")
+}
+
+fn steps() -> [v1::Step; 2] {
+    [step(4, &[], &[0.1, 0.2, 0.3, 0.4]), step(9, &[1], &[0.5, -0.5])]
+}
+
+/// Opens `strips`, drives it and returns the vertices of the last step.
+async fn play(server: &Server) -> Vec<f32> {
+    server.open("strips").await;
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    for step in steps() {
+        driver.acked(step).await;
+    }
+    driver.finish().await;
+    get_vertices(server, ask("strips")).await.expect("vertices").positions
+}
+
+/// What a server on this folder shows of `strips`.
+fn shown_by_the_next_server(state: &Path) -> (v1::StepId, Vec<f32>) {
+    runtime().block_on(async {
+        let begin = Instant::now();
+        let server = Server::start(config(state)).await;
+        assert!(begin.elapsed() < Duration::from_secs(2), "{:?}", begin.elapsed());
+        let got = get_vertices(&server, ask("strips")).await.expect("it is open again");
+        let shown = (got.step(), got.positions);
+        // A writer begins a new run at any number.
+        let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+        driver.acked(step(0, &[0], &[0.0, 0.0])).await;
+        let got = get_vertices(&server, ask("strips")).await.expect("vertices");
+        assert_eq!((got.step().run, got.step().number), (shown.0.run + 1, 0));
+        shown
+    })
+}
+
+#[test]
+fn a_stopped_server_comes_back_with_its_scenes_and_their_last_step() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let before = runtime().block_on(async {
+        let server = Server::start(config(folder.path())).await;
+        let before = play(&server).await;
+        server.stop().await.expect("a clean stop");
+        before
+    });
+    assert_eq!(before, expected(&strips(), &steps()).0);
+    let (step, after) = shown_by_the_next_server(folder.path());
+    assert_eq!((step.run, step.number, step.time), (1, 9, 4.5));
+    assert_eq!(after, before);
+}
+
+#[test]
+fn a_server_that_dies_loses_nothing_that_is_a_moment_old() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let copy = tempfile::tempdir().expect("a folder");
+    let doomed = runtime();
+    let before = doomed.block_on(async {
+        let server = Server::start(config(folder.path())).await;
+        let before = play(&server).await;
+        // What a kill leaves is what is on disk at that moment: the files are copied while the server runs.
+        let begin = Instant::now();
+        let is_kept = |bytes: Vec<u8>| bytes.get(16..24) == Some(9_u64.to_le_bytes().as_slice());
+        while !std::fs::read(folder.path().join("steps/strips.step")).is_ok_and(is_kept) {
+            assert!(begin.elapsed() < PATIENCE, "the step was never kept");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        std::fs::create_dir(copy.path().join("steps")).expect("a folder");
+        for file in ["scenes.json", "steps/strips.step"] {
+            std::fs::copy(folder.path().join(file), copy.path().join(file)).expect("copies");
+        }
+        before
+    });
+    drop(doomed);
+    for state in [copy.path(), folder.path()] {
+        let (step, after) = shown_by_the_next_server(state);
+        assert_eq!((step.run, step.number), (1, 9));
+        assert_eq!(after, before);
+    }
+}
+
+#[test]
+fn a_damaged_step_is_left_out_and_its_scene_begins_at_rest() {
+    let folder = tempfile::tempdir().expect("a folder");
+    runtime().block_on(async {
+        let server = Server::start(config(folder.path())).await;
+        play(&server).await;
+        server.stop().await.expect("a clean stop");
+    });
+    let path = folder.path().join("steps/strips.step");
+    let mut bytes = std::fs::read(&path).expect("it was kept");
+    bytes[60] ^= 0x40;
+    std::fs::write(&path, bytes).expect("damages it");
+    let (step, after) = shown_by_the_next_server(folder.path());
+    assert_eq!(step.run, 0);
+    assert_eq!(after, expected(&strips(), &[]).0);
+}
+
+#[test]
+fn an_upload_comes_back_and_a_closed_scene_does_not() {
+    let folder = tempfile::tempdir().expect("a folder");
+    runtime().block_on(async {
+        let server = Server::start(config(folder.path())).await;
+        play(&server).await;
+        let file = v1::UploadFile {
+            path: "deep/scene.txt".into(),
+            bytes: 6,
+            sha256: Sha256::digest(b"strips").to_vec().into(),
+        };
+        let header =
+            v1::UploadHeader { scene: "mine".into(), entry: "deep/scene.txt".into(), files: 1, total_bytes: 6 };
+        let parts =
+            [Part::Header(header), Part::File(file), Part::Chunk(b"str"[..].into()), Part::Chunk(b"ips"[..].into())];
+        let requests = parts.map(|part| v1::UploadSceneRequest { part: Some(part) });
+        server.scenes().await.upload_scene(tokio_stream::iter(requests)).await.expect("uploads");
+        let delete = v1::DeleteSceneRequest { scene: "strips".into() };
+        server.scenes().await.delete_scene(delete).await.expect("deletes");
+        server.stop().await.expect("a clean stop");
+    });
+    runtime().block_on(async {
+        let server = Server::start(config(folder.path())).await;
+        let names: Vec<_> = server.engine.list().iter().map(|host| host.name.clone()).collect();
+        assert_eq!(names, ["mine"]);
+        assert!(!folder.path().join("steps/strips.step").exists());
+        get_vertices(&server, ask("mine")).await.expect("vertices");
+    });
+}

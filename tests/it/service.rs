@@ -1,0 +1,190 @@
+//! Scenes over the wire: open, describe, list, upload, delete; health, reflection and limits.
+
+use modalcast_proto::v1;
+use prost::Message as _;
+use tokio_stream::StreamExt as _;
+use v1::Array;
+use v1::describe_scene_response::Part;
+
+use crate::service_harness::{Server, details, expected, get_vertices, sheet, strips, within};
+
+/// The largest message: a chunk of 1 MiB and its envelope.
+const LARGEST: usize = (1 << 20) + 4096;
+
+async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
+    let arrays = arrays.iter().map(|array| (*array).into()).collect();
+    let request = v1::DescribeSceneRequest { scene: scene.into(), domains: vec![], arrays };
+    let mut stream = server.scenes().await.describe_scene(request).await.expect("describes").into_inner();
+    let mut domains = Vec::new();
+    let mut contents: Vec<Vec<u8>> = Vec::new();
+    while let Some(response) = within(stream.message()).await.expect("goes on") {
+        assert!(response.encoded_len() <= LARGEST);
+        match response.part.expect("a part") {
+            Part::Scene(info) => assert_eq!(info.scene, scene),
+            Part::Domains(part) => domains.extend(part.domains),
+            Part::Chunk(chunk) => {
+                if chunk.offset == 0 {
+                    contents.push(Vec::new());
+                }
+                let whole = contents.last_mut().expect("begun");
+                assert_eq!(chunk.offset, whole.len() as u64);
+                whole.extend_from_slice(&chunk.data);
+                assert!(whole.len() as u64 <= chunk.total);
+            }
+        }
+    }
+    (domains, contents)
+}
+
+async fn modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> Vec<f32> {
+    let request = v1::ReadModesRequest { scene: scene.into(), domain, vertices: vertices.to_vec() };
+    let mut stream = server.scenes().await.read_modes(request).await.expect("reads").into_inner();
+    let mut bytes = Vec::new();
+    let mut total = 0;
+    while let Some(response) = within(stream.message()).await.expect("goes on") {
+        assert!(response.encoded_len() <= LARGEST);
+        assert_eq!(response.offset, bytes.len() as u64);
+        bytes.extend_from_slice(&response.data);
+        total = response.total;
+    }
+    assert_eq!(total, bytes.len() as u64);
+    bytemuck::pod_collect_to_vec(&bytes)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_that_holds_nothing_learns_the_whole_scene() {
+    let server = Server::fresh().await;
+    let info = server.open("strips").await;
+    assert_eq!((info.domains, info.vertices, info.corners, info.triangles, info.coordinates), (2, 8, 8, 4, 4));
+    assert_eq!((info.up.as_str(), info.unit, info.last_step), ("y", 1.0, None));
+    let all = [Array::Indices, Array::CornerVertices, Array::RestPositions, Array::Uvs, Array::RestNormals];
+    let (domains, contents) = describe(&server, "strips", &all).await;
+    let scene = strips();
+    let mesh = &scene.shapes[0].mesh;
+    let want: [Vec<u8>; 5] = [
+        bytemuck::cast_slice(mesh.triangles()).to_vec(),
+        bytemuck::cast_slice(&mesh.corners().vertices).to_vec(),
+        bytemuck::cast_slice(mesh.rest()).to_vec(),
+        bytemuck::cast_slice(&mesh.corners().uvs).to_vec(),
+        bytemuck::cast_slice(&mesh.corners().normals).to_vec(),
+    ];
+    assert_eq!(contents, [want.clone(), want].concat());
+    let [left, right] = domains.as_slice() else { panic!("{domains:?}") };
+    assert_eq!((left.name.as_str(), left.vertices, left.rank, left.parent), ("left", 4, 2, None));
+    assert_eq!((left.eigenvalues.as_slice(), left.notes["species"].as_str()), ([1.0, 4.0].as_slice(), "none"));
+    assert_eq!(
+        (right.name.as_str(), right.parent, right.attachment_rows.as_slice()),
+        ("right", Some(0), [1, 3].as_slice())
+    );
+    assert_eq!((right.attachment_frame.len(), right.placement.len(), right.shape), (48, 48, 0));
+    let columns = &scene.shapes[0].modes;
+    let rows = |vertex: usize| (0..3).flat_map(move |part| (0..2).map(move |mode| columns.at(vertex, part, mode)));
+    assert_eq!(modes(&server, "strips", 1, &[3, 0]).await, rows(3).chain(rows(0)).collect::<Vec<_>>());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn replies_of_many_megabytes_pass_a_client_with_default_limits() {
+    let server = Server::fresh().await;
+    server.open("sheet").await;
+    let scene = sheet();
+    let (_, contents) = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
+    let mesh = &scene.shapes[0].mesh;
+    assert_eq!(contents[0], bytemuck::cast_slice::<_, u8>(mesh.triangles()));
+    assert_eq!(contents[1], bytemuck::cast_slice::<_, u8>(mesh.rest()));
+    let rows = modes(&server, "sheet", 0, &[]).await;
+    let columns = &scene.shapes[0].modes;
+    assert_eq!(rows.len(), columns.columns().len());
+    assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == columns.at(vertex, 1, 3)));
+    let ask = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
+    let got = get_vertices(&server, ask).await.expect("vertices");
+    assert_eq!(got.step().run, 0, "no step was made yet");
+    assert_eq!((got.positions, got.normals), expected(&scene, &[]));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn openings_at_the_same_time_share_one_scene_and_a_closed_one_is_gone_from_every_stream() {
+    let server = Server::fresh().await;
+    let (a, b, c) = tokio::join!(server.open("strips"), server.open("strips"), server.open("strips"));
+    assert!(a == b && b == c);
+    let list = server.scenes().await.list_scenes(v1::ListScenesRequest {}).await.expect("lists").into_inner();
+    assert_eq!(list.scenes.iter().map(|scene| scene.scene.as_str()).collect::<Vec<_>>(), ["strips"]);
+    assert_eq!(list.sources, ["panic", "sheet", "strips"]);
+    let request = v1::StreamVerticesRequest { scene: "strips".into(), ..v1::StreamVerticesRequest::default() };
+    let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let delete = v1::DeleteSceneRequest { scene: "strips".into() };
+    server.scenes().await.delete_scene(delete).await.expect("deletes");
+    let end = within(stream.message()).await.expect_err("the scene is gone");
+    assert_eq!((end.code(), details(&end).given.as_str()), (tonic::Code::NotFound, "'strips'"));
+    let end = within(driver.replies.message()).await.expect_err("the scene is gone");
+    assert_eq!(end.code(), tonic::Code::NotFound);
+    server.open("strips").await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_number_of_scenes_is_limited_and_a_closed_one_makes_room() {
+    let server = Server::with(|config| modalcast::config::Config { open_scenes: 1, ..config }).await;
+    server.open("strips").await;
+    let more = v1::OpenSceneRequest { source: "sheet".into(), scene: String::new() };
+    let status = server.scenes().await.open_scene(more).await.expect_err("full");
+    assert_eq!((status.code(), details(&status).expected.as_str()), (tonic::Code::ResourceExhausted, "at most 1"));
+    server.scenes().await.delete_scene(v1::DeleteSceneRequest { scene: "strips".into() }).await.expect("deletes");
+    server.open("sheet").await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_without_a_renderer_says_so_and_refuses_frames_only() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut client = v1::server_service_client::ServerServiceClient::new(server.channel().await);
+    let info = client.get_server_info(v1::GetServerInfoRequest {}).await.expect("an info").into_inner();
+    assert_eq!((info.backend.as_str(), info.software), ("reference", false));
+    assert!(info.renderer.contains("switched off"), "{}", info.renderer);
+    let limits = info.limits.expect("limits");
+    assert_eq!((limits.message_bytes, limits.window, limits.scenes), (1 << 20, 256, 16));
+    let request = v1::StreamFramesRequest { scene: "strips".into(), ..v1::StreamFramesRequest::default() };
+    let status = server.frames().await.stream_frames(request).await.expect_err("no renderer");
+    assert_eq!(status.code(), tonic::Code::Unavailable);
+    assert!(details(&status).given.contains("switched off"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn health_and_reflection_answer_and_a_stopped_server_has_ended_its_streams() {
+    use tonic_reflection::pb::v1::ServerReflectionRequest;
+    use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
+    use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+    use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut health = tonic_health::pb::health_client::HealthClient::new(server.channel().await);
+    for service in ["", "modalcast.v1.StepService"] {
+        let request = tonic_health::pb::HealthCheckRequest { service: service.into() };
+        let status = health.check(request).await.expect("an answer").into_inner();
+        assert_eq!(status.status(), tonic_health::pb::health_check_response::ServingStatus::Serving);
+    }
+    let ask = ServerReflectionRequest {
+        host: String::new(),
+        message_request: Some(MessageRequest::ListServices(String::new())),
+    };
+    let mut client = ServerReflectionClient::new(server.channel().await);
+    let mut answers = client.server_reflection_info(tokio_stream::iter([ask])).await.expect("an answer").into_inner();
+    let answer = answers.next().await.expect("one").expect("fine").message_response;
+    let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("{answer:?}") };
+    let names: Vec<_> = list.service.into_iter().map(|service| service.name).collect();
+    for service in ["modalcast.v1.SceneService", "modalcast.v1.FrameService", "grpc.health.v1.Health"] {
+        assert!(names.iter().any(|name| name == service), "{service} is not in {names:?}");
+    }
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    driver.acked(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
+    let watched = health.watch(tonic_health::pb::HealthCheckRequest { service: String::new() }).await;
+    let mut watched = watched.expect("a watch").into_inner();
+    assert_eq!(watched.message().await.expect("fine").expect("one").status, 1);
+    let read = async {
+        assert_eq!(within(watched.message()).await.expect("fine").expect("one").status, 2, "not serving");
+        let end = within(driver.replies.message()).await.expect_err("the server stops");
+        assert_eq!(end.code(), tonic::Code::Unavailable);
+        drop((watched, driver, health, client, answers));
+    };
+    let (stopped, ()) = tokio::join!(server.stop(), read);
+    stopped.expect("a clean stop");
+}

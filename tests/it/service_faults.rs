@@ -1,0 +1,190 @@
+//! Faults of transport and of patience: floods, silence, frozen peers, clients that do not read. Only the one who fails
+//! is cut off.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use modalcast::config::Config;
+use modalcast_proto::v1;
+use tokio::io::AsyncReadExt as _;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tonic::Code;
+use tonic::transport::Channel;
+use v1::Policy;
+use v1::drive_scene_response::Kind as Told;
+
+use crate::service_harness::{Driver, PATIENCE, Server, step, within};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_of_tiny_steps_is_merged_and_another_stream_of_the_connection_lives() {
+    let server = Server::fresh().await;
+    server.open("sheet").await;
+    server.open("strips").await;
+    let channel = server.channel().await;
+    let mut flood = Driver::connect(channel.clone()).await;
+    assert!(matches!(flood.open("sheet", Policy::Latest, 0).await, Told::Opened(_)));
+    let mut other = Driver::connect(channel).await;
+    assert!(matches!(other.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
+    const COUNT: u64 = 20_000;
+    let (sender, mut replies) = flood.split();
+    let send = async {
+        for number in 1..=COUNT {
+            let kind = Some(v1::drive_scene_request::Kind::Step(step(number, &[], &[])));
+            sender.send(v1::DriveSceneRequest { kind }).await.expect("the stream lives");
+        }
+    };
+    let read = async {
+        loop {
+            match within(replies.message()).await.expect("goes on").expect("a reply").kind {
+                Some(Told::Ack(ack)) if ack.step == COUNT => return ack.skipped,
+                Some(Told::Ack(_)) => {}
+                other => panic!("{other:?}"),
+            }
+        }
+    };
+    let live = async {
+        for number in 0..50 {
+            other.acked(step(number, &[0], &[0.1, 0.2])).await;
+        }
+    };
+    let ((), skipped, ()) = tokio::join!(send, read, live);
+    assert!(skipped > 0 && skipped < COUNT);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_writer_that_reads_no_refusals_is_cut_off_and_its_connection_lives() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let channel = server.channel().await;
+    let driver = Driver::connect(channel.clone()).await;
+    // So many long refusals that no buffer on the way holds them.
+    let open = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
+    let (sender, mut replies) = driver.split();
+    let send = async {
+        for _ in 0..20_000 {
+            let kind = Some(v1::drive_scene_request::Kind::Open(open.clone()));
+            if sender.send(v1::DriveSceneRequest { kind }).await.is_err() {
+                return;
+            }
+        }
+    };
+    within(send).await;
+    let mut refusals = 0;
+    let end = loop {
+        match within(replies.message()).await {
+            Ok(Some(_)) => refusals += 1,
+            Ok(None) => panic!("the stream ended as if nothing was wrong"),
+            Err(status) => break status,
+        }
+    };
+    assert!(refusals < 20_000, "{refusals}");
+    assert_eq!(end.code(), Code::ResourceExhausted, "{end:?}");
+    let mut next = Driver::connect(channel).await;
+    assert!(matches!(next.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
+    next.acked(step(0, &[0], &[0.1, 0.2])).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_silent_connection_is_closed_and_a_speaking_one_is_not() {
+    let server = Server::with(|config| Config { first_byte: Duration::from_millis(60), ..config }).await;
+    server.open("strips").await;
+    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    let address = server.address.trim_start_matches("http://").to_owned();
+    let mut silent = TcpStream::connect(address).await.expect("connects");
+    let read = within(silent.read(&mut [0; 1])).await;
+    assert!(matches!(read, Ok(0) | Err(_)), "{read:?}");
+    driver.acked(step(1, &[0], &[0.1, 0.2])).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_frozen_writer_is_released() {
+    let (keepalive, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
+    let server = Server::with(|config| Config { keepalive, keepalive_timeout, ..config }).await;
+    server.open("strips").await;
+    let proxy = Proxy::start(server.address.trim_start_matches("http://").to_owned()).await;
+    let mut frozen = Driver::connect(proxy.channel().await).await;
+    assert!(matches!(frozen.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
+    frozen.acked(step(1, &[0], &[0.1, 0.2])).await;
+    proxy.freeze();
+    let begin = Instant::now();
+    let next = async {
+        loop {
+            let mut next = Driver::connect(server.channel().await).await;
+            if matches!(next.open("strips", Policy::Lossless, 0).await, Told::Opened(_)) {
+                return;
+            }
+        }
+    };
+    within(next).await;
+    assert!(begin.elapsed() < Duration::from_secs(10), "{:?}", begin.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_stops_in_time_whatever_its_clients_do() {
+    let drain = Duration::from_millis(300);
+    let server = Server::with(|config| Config { drain, ..config }).await;
+    server.open("sheet").await;
+    let subscribe =
+        v1::StreamVerticesRequest { scene: "sheet".into(), delivery: 1, ..v1::StreamVerticesRequest::default() };
+    // Somebody who never reads, and a writer who never looks at its replies.
+    let unread = server.vertices().await.stream_vertices(subscribe).await.expect("subscribes");
+    let driver = server.drive("sheet", Policy::Lossless, 8).await;
+    for number in 1..=8 {
+        driver.step(step(number, &[], &[])).await;
+    }
+    let begin = Instant::now();
+    server.stop().await.expect("a clean stop");
+    assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
+    drop((unread, driver));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_silent_upload_is_given_up_and_leaves_nothing_behind() {
+    let server = Server::with(|config| Config { stall: Duration::from_millis(60), ..config }).await;
+    let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5 };
+    let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
+    let never = tokio_stream::StreamExt::chain(tokio_stream::iter([part]), tokio_stream::pending());
+    let status = within(server.scenes().await.upload_scene(never)).await.expect_err("it never ends");
+    assert_eq!(status.code(), Code::DeadlineExceeded);
+    let uploads = server.engine.config().state.join("uploads");
+    assert_eq!(std::fs::read_dir(uploads).expect("a folder").count(), 0);
+}
+
+/// Forwards connections until it is frozen; then it keeps them open and forwards nothing.
+struct Proxy {
+    address: String,
+    frozen: Arc<watch::Sender<bool>>,
+}
+
+impl Proxy {
+    async fn start(server: String) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let address = format!("http://{}", listener.local_addr().expect("an address"));
+        let frozen = Arc::new(watch::Sender::new(false));
+        let freezing = Arc::clone(&frozen);
+        tokio::spawn(async move {
+            while let Ok((mut near, _)) = listener.accept().await {
+                let mut far = TcpStream::connect(&server).await.expect("the server");
+                let mut frozen = freezing.subscribe();
+                tokio::spawn(async move {
+                    tokio::select! {
+                        _ = tokio::io::copy_bidirectional(&mut near, &mut far) => {}
+                        () = async { frozen.wait_for(|frozen| *frozen).await.map(drop).unwrap_or_default() } => {
+                            tokio::time::sleep(PATIENCE).await;
+                        }
+                    }
+                });
+            }
+        });
+        Self { address, frozen }
+    }
+
+    async fn channel(&self) -> Channel {
+        Channel::from_shared(self.address.clone()).expect("an address").connect().await.expect("a connection")
+    }
+
+    fn freeze(&self) {
+        self.frozen.send_replace(true);
+    }
+}

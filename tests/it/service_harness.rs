@@ -1,0 +1,346 @@
+//! A server on a free loopback port, scenes made in code, and clients with default limits.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use modalcast::config::{BackendChoice, Config, RendererChoice};
+use modalcast::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast::engine::{Engine, SceneSource};
+use modalcast::error::{Error, Result, invalid};
+use modalcast::scene::{Parts, RawUpdate, Scene, State, Update};
+use modalcast::{reference, service};
+use modalcast_proto::v1;
+use prost::Message as _;
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Streaming;
+use tonic::transport::Channel;
+
+use v1::drive_scene_request::Kind as Asked;
+use v1::drive_scene_response::Kind as Told;
+use v1::frame_service_client::FrameServiceClient;
+use v1::scene_service_client::SceneServiceClient;
+use v1::step_service_client::StepServiceClient;
+use v1::vertex_service_client::VertexServiceClient;
+
+/// The longest that any answer may take before a test gives up.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Scenes made in code: `strips` (two small domains), `sheet` (more than 1 MiB of everything), `panic`.
+pub(crate) struct InCode;
+
+impl SceneSource for InCode {
+    fn open(&self, source: &str) -> Result<Arc<Scene>> {
+        match source {
+            "strips" => Ok(strips()),
+            "sheet" => Ok(sheet()),
+            "panic" => panic!("a planted panic of a loader"),
+            _ => Err(Error::NotFound { what: "scene", given: source.into() }),
+        }
+    }
+
+    fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>> {
+        let path = folder.join(if entry.is_empty() { "scene.txt" } else { entry });
+        let text = std::fs::read_to_string(path).map_err(|error| invalid("entry", "a file", error))?;
+        self.open(text.trim())
+    }
+
+    fn list(&self) -> Vec<String> {
+        ["panic", "sheet", "strips"].map(String::from).to_vec()
+    }
+}
+
+/// Two squares of four vertices and two modes; `right` hangs on `left`.
+pub(crate) fn strips() -> Arc<Scene> {
+    let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.125 * (entry % 3) as f32 }).collect();
+    let shape = Shape::new(grid(2), Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
+    let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
+    let notes = [("species".to_owned(), "none".to_owned())].into();
+    let metadata = Metadata { eigenvalues: vec![1.0, 4.0], notes };
+    let left = Domain { metadata, ..domain("left", None) };
+    scene("strips", shape, vec![left, domain("right", Some(joint))])
+}
+
+/// One sheet of 300 x 300 vertices and four modes.
+pub(crate) fn sheet() -> Arc<Scene> {
+    let rows = 3 * 300 * 300;
+    let columns = (0..4 * rows).map(|entry| ((entry % 1009) as f32 - 504.0) / 1009.0).collect();
+    let shape = Shape::new(grid(300), Modes::from_columns(rows, 4, columns).expect("fits")).expect("fits");
+    scene("sheet", shape, vec![domain("sheet", None)])
+}
+
+fn grid(side: u32) -> Mesh {
+    let rest = (0..side * side).map(|at| [(at % side) as f32, (at / side) as f32, 0.0]).collect::<Vec<_>>();
+    let uvs = rest.iter().map(|[x, y, _]| [x / side as f32, y / side as f32]).collect();
+    let cells = (0..(side - 1) * (side - 1)).map(|cell| cell % (side - 1) + cell / (side - 1) * side);
+    let triangles = cells.flat_map(|at| [[at, at + 1, at + side], [at + 1, at + side + 1, at + side]]).collect();
+    let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
+    Mesh::indexed(rest, normals, uvs, triangles).expect("a grid")
+}
+
+fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
+    Domain {
+        name: name.into(),
+        shape: 0,
+        material: 0,
+        runs: vec![],
+        placement: Transform::IDENTITY,
+        attachment,
+        runs: vec![],
+        rest_q: vec![],
+        shares_q_with: None,
+        metadata: Metadata::default(),
+    }
+}
+
+fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
+    let parts = Parts { shapes: vec![shape], materials: vec![Material::default()], domains, ..Parts::named(name) };
+    Scene::new(parts).expect("a scene")
+}
+
+/// Settings of a test server: the reference deformer, no renderer, any free port.
+pub(crate) fn config(state: &Path) -> Config {
+    Config {
+        listen: ([127, 0, 0, 1], 0).into(),
+        state: state.to_owned(),
+        backend: BackendChoice::Reference,
+        renderer: RendererChoice::Off,
+        message_bytes: 1 << 20,
+        ..Config::default()
+    }
+}
+
+/// A running server.
+pub(crate) struct Server {
+    pub(crate) engine: Engine,
+    pub(crate) address: String,
+    stop: Option<oneshot::Sender<()>>,
+    task: JoinHandle<Result<()>>,
+    /// Kept until the server is gone.
+    folder: Option<tempfile::TempDir>,
+}
+
+impl Server {
+    /// A server with a fresh state folder.
+    pub(crate) async fn fresh() -> Self {
+        Self::with(|config| config).await
+    }
+
+    pub(crate) async fn with(change: impl FnOnce(Config) -> Config) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut server = Self::start(change(config(folder.path()))).await;
+        server.folder = Some(folder);
+        server
+    }
+
+    pub(crate) async fn start(config: Config) -> Self {
+        Self::start_from(config, Arc::new(InCode)).await
+    }
+
+    pub(crate) async fn start_from(config: Config, source: Arc<dyn SceneSource>) -> Self {
+        let config = config.checked().expect("settings");
+        let listener = service::bind(&config).await.expect("a port");
+        let address = format!("http://{}", listener.local_addr().expect("an address"));
+        let engine = Engine::start(config, source).await.expect("an engine");
+        let (stop, stopped) = oneshot::channel();
+        let shutdown = async {
+            stopped.await.ok();
+        };
+        let task = tokio::spawn(service::serve(engine.clone(), listener, shutdown));
+        Self { engine, address, stop: Some(stop), task, folder: None }
+    }
+
+    pub(crate) async fn channel(&self) -> Channel {
+        Channel::from_shared(self.address.clone()).expect("an address").connect().await.expect("a connection")
+    }
+
+    pub(crate) async fn scenes(&self) -> SceneServiceClient<Channel> {
+        SceneServiceClient::new(self.channel().await)
+    }
+
+    pub(crate) async fn vertices(&self) -> VertexServiceClient<Channel> {
+        VertexServiceClient::new(self.channel().await)
+    }
+
+    pub(crate) async fn frames(&self) -> FrameServiceClient<Channel> {
+        FrameServiceClient::new(self.channel().await)
+    }
+
+    /// Opens a scene under its own name.
+    pub(crate) async fn open(&self, source: &str) -> v1::SceneInfo {
+        let request = v1::OpenSceneRequest { source: source.into(), scene: String::new() };
+        self.scenes().await.open_scene(request).await.expect("opens").into_inner().scene.expect("an info")
+    }
+
+    /// A step stream that has been opened.
+    pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> Driver {
+        let mut driver = Driver::connect(self.channel().await).await;
+        let opened = driver.open(scene, policy, window).await;
+        assert!(matches!(opened, Told::Opened(_)), "{opened:?}");
+        driver
+    }
+
+    /// Ends the server and waits for it.
+    pub(crate) async fn stop(mut self) -> Result<()> {
+        self.stop.take().expect("not stopped yet").send(()).ok();
+        within(self.task).await.expect("no panic")
+    }
+}
+
+/// The result of some work, if it comes in time.
+pub(crate) async fn within<T>(work: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, work).await.expect("an answer in time")
+}
+
+/// A physics process.
+pub(crate) struct Driver {
+    sender: mpsc::Sender<v1::DriveSceneRequest>,
+    pub(crate) replies: Streaming<v1::DriveSceneResponse>,
+}
+
+impl Driver {
+    pub(crate) async fn connect(channel: Channel) -> Self {
+        let (sender, requests) = mpsc::channel(1024);
+        let mut client = StepServiceClient::new(channel);
+        let replies = within(client.drive_scene(ReceiverStream::new(requests))).await.expect("a stream").into_inner();
+        Self { sender, replies }
+    }
+
+    pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> Told {
+        let open = v1::OpenDrive { scene: scene.into(), policy: policy.into(), window };
+        self.send(Asked::Open(open)).await;
+        self.reply().await
+    }
+
+    pub(crate) async fn send(&self, kind: Asked) {
+        self.sender.send(v1::DriveSceneRequest { kind: Some(kind) }).await.expect("the stream lives");
+    }
+
+    pub(crate) async fn step(&self, step: v1::Step) {
+        self.send(Asked::Step(step)).await;
+    }
+
+    pub(crate) async fn reply(&mut self) -> Told {
+        let reply = within(self.replies.message()).await.expect("the stream goes on").expect("a reply");
+        reply.kind.expect("a kind")
+    }
+
+    /// Sends a step and expects its acknowledgement.
+    pub(crate) async fn acked(&mut self, step: v1::Step) -> v1::Acknowledgement {
+        let number = step.number;
+        self.step(step).await;
+        match self.reply().await {
+            Told::Ack(ack) if ack.step == number => ack,
+            other => panic!("step {number} was answered with {other:?}"),
+        }
+    }
+
+    /// Expects a refusal.
+    pub(crate) async fn rejection(&mut self) -> v1::Rejection {
+        match self.reply().await {
+            Told::Rejection(rejection) => rejection,
+            other => panic!("expected a rejection, not {other:?}"),
+        }
+    }
+
+    /// Says no more and waits until the server has said all.
+    pub(crate) async fn finish(self) {
+        let Self { sender, mut replies } = self;
+        drop(sender);
+        while within(replies.message()).await.expect("a clean end").is_some() {}
+    }
+
+    /// Its two directions, to be used at the same time.
+    pub(crate) fn split(self) -> (mpsc::Sender<v1::DriveSceneRequest>, Streaming<v1::DriveSceneResponse>) {
+        (self.sender, self.replies)
+    }
+
+    /// Goes away without a word.
+    pub(crate) fn vanish(self) {}
+}
+
+/// A step that sets the coordinates of some domains.
+pub(crate) fn step(number: u64, q_domains: &[u32], q: &[f32]) -> v1::Step {
+    let q = q.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
+    v1::Step { number, time: number as f64 * 0.5, q_domains: q_domains.to_vec(), q, ..v1::Step::default() }
+}
+
+/// What the reference says the vertices are after some steps.
+pub(crate) fn expected(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
+    let mut state = State::rest(scene);
+    for step in steps.iter().cloned() {
+        let raw = RawUpdate {
+            number: step.number,
+            time: step.time,
+            q_domains: step.q_domains,
+            q: step.q,
+            transform_domains: step.transform_domains,
+            transforms: step.transforms,
+        };
+        state.apply(scene, &Update::parse(scene, &raw).expect("a good step"));
+    }
+    let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
+    (round(reference::deform(scene, &state)), round(reference::orient_normals(scene, &state)))
+}
+
+/// Vertices put together again.
+#[derive(Debug)]
+pub(crate) struct Got {
+    pub(crate) head: v1::VertexHead,
+    pub(crate) positions: Vec<f32>,
+    pub(crate) normals: Vec<f32>,
+}
+
+impl Got {
+    pub(crate) fn step(&self) -> v1::StepId {
+        self.head.step.expect("a step")
+    }
+}
+
+/// The vertices that the scene shows.
+pub(crate) async fn get_vertices(server: &Server, request: v1::GetVerticesRequest) -> Result<Got, tonic::Status> {
+    let mut stream = within(server.vertices().await.get_vertices(request)).await?.into_inner();
+    let mut chunks = Vec::new();
+    while let Some(response) = within(stream.message()).await? {
+        assert!(response.encoded_len() <= (1 << 20) + 4096, "{} bytes", response.encoded_len());
+        chunks.push(response.chunk.expect("a chunk"));
+    }
+    Ok(join(chunks))
+}
+
+/// The next step of a vertex stream.
+pub(crate) async fn next_vertices(
+    stream: &mut Streaming<v1::StreamVerticesResponse>,
+) -> Result<Option<Got>, tonic::Status> {
+    let mut chunks = Vec::<v1::VertexChunk>::new();
+    while let Some(response) = within(stream.message()).await? {
+        chunks.push(response.chunk.expect("a chunk"));
+        let total = chunks[0].head.as_ref().expect("a head first").total;
+        if chunks.iter().map(|chunk| chunk.data.len() as u64).sum::<u64>() == total {
+            return Ok(Some(join(chunks)));
+        }
+    }
+    assert!(chunks.is_empty(), "the stream ended within a step");
+    Ok(None)
+}
+
+fn join(mut chunks: Vec<v1::VertexChunk>) -> Got {
+    let head = chunks[0].head.take().expect("a head first");
+    let mut bytes = Vec::new();
+    for chunk in chunks {
+        assert_eq!(chunk.offset, bytes.len() as u64);
+        assert!(chunk.head.is_none(), "one head per reply");
+        bytes.extend_from_slice(&chunk.data);
+    }
+    assert_eq!(head.total, bytes.len() as u64);
+    let (positions, normals) = bytes.split_at(head.position_bytes as usize);
+    let floats = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, f32>(bytes);
+    Got { positions: floats(positions), normals: floats(normals), head }
+}
+
+/// The refusal inside a status.
+pub(crate) fn details(status: &tonic::Status) -> v1::Rejection {
+    v1::Rejection::decode(status.details()).expect("a rejection in the details")
+}

@@ -1,0 +1,220 @@
+//! Steps over the wire: what is acknowledged is what the scene shows, in both policies.
+
+use modalcast::engine::{Delivery, View, Which};
+use modalcast_proto::v1;
+use v1::Policy;
+use v1::drive_scene_response::Kind as Told;
+
+use crate::service_harness::{Server, expected, get_vertices, next_vertices, sheet, step, strips, within};
+
+fn vertices_of(scene: &str) -> v1::GetVerticesRequest {
+    v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn acknowledged_steps_give_the_vertices_of_the_reference_and_name_their_step() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    let mut turned = step(1, &[1], &[0.5, -0.25]);
+    let turn = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
+    turned.transform_domains = vec![1];
+    turned.transforms = turn.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
+    let steps = [step(0, &[], &[0.1, 0.2, 0.3, 0.4]), turned, step(7, &[0], &[0.75, 0.0])];
+    for sent in 0..steps.len() {
+        let ack = driver.acked(steps[sent].clone()).await;
+        let stages: Vec<&str> = ack.stages.iter().map(|stage| stage.stage.as_str()).collect();
+        assert_eq!(stages, ["parse", "queue", "deform"]);
+        let got = get_vertices(&server, vertices_of("strips")).await.expect("vertices");
+        assert_eq!((got.positions.clone(), got.normals.clone()), expected(&strips(), &steps[..=sent]));
+        let want = v1::StepId { run: 1, number: steps[sent].number, time: steps[sent].time };
+        assert_eq!(got.step(), want);
+    }
+    // The control: other steps give other vertices.
+    assert_ne!(expected(&strips(), &steps[..2]), expected(&strips(), &steps));
+    driver.finish().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_stream() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let request = v1::StreamVerticesRequest {
+        scene: "strips".into(),
+        selection: Some(v1::VertexSelection { domains: vec![1], positions_only: true }),
+        delivery: v1::Delivery::Lossless.into(),
+        steps: 30,
+    };
+    // It may come before any step, and before any writer.
+    let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
+    let mut driver = server.drive("strips", Policy::Lossless, 4).await;
+    let steps: Vec<_> = (0..40).map(|number| step(number * 2, &[1], &[0.01 * number as f32, 1.0])).collect();
+    let read = async {
+        for sent in 0..30 {
+            let got = next_vertices(&mut stream).await.expect("goes on").expect("a step");
+            assert_eq!((got.step().number, got.head.skipped), (steps[sent].number, 0));
+            assert_eq!(got.positions, expected(&strips(), &steps[..=sent]).0[12..]);
+            assert!(got.normals.is_empty());
+        }
+        assert!(next_vertices(&mut stream).await.expect("a clean end").is_none());
+    };
+    let write = async {
+        for step in &steps {
+            driver.acked(step.clone()).await;
+        }
+    };
+    tokio::join!(read, write);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is_refused_by_name() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut feed =
+        server.engine.find("strips").expect("open").watch(View::Vertices, Delivery::Lossless).await.expect("a feed");
+    let mut driver = server.drive("strips", Policy::Lossless, 2).await;
+    // Two steps wait in the feed; the third is done but not acknowledged, the fourth waits, the fifth is too many.
+    driver.acked(step(1, &[0], &[0.1, 0.0])).await;
+    driver.acked(step(2, &[0], &[0.2, 0.0])).await;
+    for number in 3..=5 {
+        driver.step(step(number, &[0], &[number as f32 / 10.0, 0.0])).await;
+    }
+    let rejection = driver.rejection().await;
+    assert_eq!((rejection.step, rejection.field.as_str()), (Some(5), "window"));
+    assert_eq!(rejection.expected, "at most 2 steps without acknowledgement");
+    // Reading lets the rest through, and the refused step was not applied.
+    for number in 1..=4 {
+        assert_eq!(within(feed.next()).await.expect("goes on").step.number, number);
+    }
+    for number in 3..=4 {
+        assert!(matches!(driver.reply().await, Told::Ack(ack) if ack.step == number));
+    }
+    let got = get_vertices(&server, vertices_of("strips")).await.expect("vertices");
+    assert_eq!(got.positions, expected(&strips(), &[step(4, &[0], &[0.4, 0.0])]).0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_subscriber_that_never_reads_is_cut_off_and_the_writer_goes_on() {
+    let stall = std::time::Duration::from_millis(50);
+    let server = Server::with(|config| modalcast::config::Config { stall, ..config }).await;
+    server.open("strips").await;
+    let mut feed =
+        server.engine.find("strips").expect("open").watch(View::Vertices, Delivery::Lossless).await.expect("a feed");
+    let mut driver = server.drive("strips", Policy::Lossless, 1).await;
+    for number in 1..=6 {
+        driver.acked(step(number, &[0], &[0.1, 0.0])).await;
+    }
+    let cut = within(feed.cut_off()).await;
+    assert!(matches!(cut, modalcast::error::Error::Busy { .. }), "{cut}");
+    within(feed.next()).await.expect("the first that it held");
+    within(feed.next()).await.expect("the second");
+    assert_eq!(within(feed.next()).await.expect_err("the end"), cut);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn under_latest_the_state_equals_having_applied_all_and_skipped_steps_are_counted() {
+    let server = Server::fresh().await;
+    server.open("sheet").await;
+    let mut driver = server.drive("sheet", Policy::Latest, 4).await;
+    let transform = |offset: f32| -> Vec<u8> {
+        let rows = [1.0, 0.0, 0.0, offset, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
+        rows.iter().flat_map(|number| number.to_le_bytes()).collect()
+    };
+    // Only the first step moves the sheet, so losing any one shows.
+    let mut steps = vec![v1::Step { transforms: transform(5.0).into(), ..step(1, &[], &[]) }];
+    steps.extend((2..=200).map(|number| step(number, &[0], &[0.001 * number as f32, 0.5, 0.0, 1.0])));
+    for step in &steps {
+        driver.step(step.clone()).await;
+    }
+    let mut acks = 0;
+    let last = loop {
+        match driver.reply().await {
+            Told::Ack(ack) if ack.step == 200 => break ack,
+            Told::Ack(_) => acks += 1,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(last.skipped > 0, "200 steps were sent at once and {acks} acknowledged before the last");
+    assert!(last.skipped + acks < 200);
+    let got = get_vertices(&server, vertices_of("sheet")).await.expect("vertices");
+    assert_eq!((got.positions, got.normals), expected(&sheet(), &steps));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_latest_subscriber_gets_the_current_step_at_once_and_counts_what_it_missed() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    driver.acked(step(3, &[0], &[0.1, 0.0])).await;
+    let host = server.engine.find("strips").expect("open");
+    let mut feed = host.watch(View::Vertices, Delivery::Latest).await.expect("a feed");
+    let first = within(feed.next()).await.expect("the current step");
+    assert_eq!((first.step.number, first.skipped), (3, 0));
+    for number in 4..=8 {
+        driver.acked(step(number, &[0], &[0.1, 0.0])).await;
+    }
+    let second = within(feed.next()).await.expect("the newest step");
+    assert_eq!((second.step.number, second.skipped), (8, 4));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_writer_is_told_who_holds_the_scene_and_comes_in_when_the_first_has_gone() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut first = server.drive("strips", Policy::Lossless, 0).await;
+    first.acked(step(100, &[0], &[0.1, 0.0])).await;
+    let mut second = crate::service_harness::Driver::connect(server.channel().await).await;
+    let Told::Rejection(refusal) = second.open("strips", Policy::Lossless, 0).await else { panic!("let in") };
+    assert!(refusal.field.contains("writer"), "{refusal:?}");
+    assert!(refusal.given.contains("127.0.0.1") && refusal.given.contains("run 1"), "{refusal:?}");
+    first.acked(step(101, &[0], &[0.2, 0.0])).await;
+    first.finish().await;
+    // The very stream that was refused comes in, and its numbers begin anew.
+    let Told::Opened(opened) = second.open("strips", Policy::Latest, 100_000).await else { panic!("kept out") };
+    assert_eq!((opened.run, opened.window), (2, 256));
+    assert_eq!(opened.scene.and_then(|scene| scene.last_step).map(|step| (step.run, step.number)), Some((1, 101)));
+    second.acked(step(0, &[0], &[0.3, 0.0])).await;
+    second.vanish();
+    let third = async {
+        loop {
+            let mut third = crate::service_harness::Driver::connect(server.channel().await).await;
+            if let Told::Opened(opened) = third.open("strips", Policy::Lossless, 0).await {
+                return opened.run;
+            }
+        }
+    };
+    assert_eq!(within(third).await, 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn exact_and_minimum_steps_are_waited_for_and_a_step_that_has_passed_is_named() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    let host = server.engine.find("strips").expect("open");
+    let mut waiting =
+        [Which::Exact(2), Which::Minimum(3), Which::Exact(5)].map(|which| Box::pin(host.show(which, View::Vertices)));
+    for request in &mut waiting {
+        // One poll puts the request in place.
+        assert!(tokio::time::timeout(std::time::Duration::ZERO, request).await.is_err(), "there is no step yet");
+    }
+    for number in [1, 2, 4, 5] {
+        driver.acked(step(number, &[0], &[number as f32, 0.0])).await;
+    }
+    let mut shown = Vec::new();
+    for request in waiting {
+        shown.push(within(request).await.expect("its step").step.number);
+    }
+    assert_eq!(shown, [2, 4, 5]);
+    let ask = |step| v1::GetVerticesRequest { step: Some(step), ..vertices_of("strips") };
+    use v1::get_vertices_request::Step::{ExactStep, MinimumStep};
+    let gone = get_vertices(&server, ask(ExactStep(4))).await.expect_err("it has passed");
+    assert_eq!(gone.code(), tonic::Code::FailedPrecondition);
+    let why = crate::service_harness::details(&gone);
+    assert!(why.given == "4" && why.expected.starts_with('5'), "{why:?}");
+    let begin = std::time::Instant::now();
+    let late = v1::GetVerticesRequest { deadline_ms: 80, ..ask(MinimumStep(99)) };
+    let late = get_vertices(&server, late).await.expect_err("it never comes");
+    assert_eq!(late.code(), tonic::Code::DeadlineExceeded);
+    assert!(begin.elapsed() < std::time::Duration::from_secs(5), "{:?}", begin.elapsed());
+}
