@@ -81,7 +81,7 @@ pub enum Lens {
 }
 
 /// The part of the image's half that a framed scene may take.
-const MARGIN: f64 = 0.84;
+const MARGIN: f64 = 0.94;
 
 /// A camera. Near and far are distances in scene units; both 0 means: fit them to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
