@@ -17,6 +17,7 @@ mod gl;
 mod light;
 mod passes;
 mod plan;
+mod programs;
 mod scene_buffers;
 mod shaders;
 mod target;

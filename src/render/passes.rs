@@ -1,8 +1,9 @@
 //! The passes of one frame, in order: shadow, blur, opaque, sky, ground, blended, encode.
 
 use super::frame::{Frame, above_ground};
-use super::geometry::{Group, Kind};
+use super::geometry::Kind;
 use super::gl::{Fixed, Gl, Program};
+use super::programs::DrawGroup;
 use super::scene_buffers::{MATERIAL_BYTES, SceneBuffers};
 use super::shaders::{
     COLOUR_UNIT, LANES, MATERIAL_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TRIANGLE_MATERIAL_UNIT,
@@ -37,10 +38,10 @@ pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<(
     let (Some(map), Some([blur_x, blur_y])) = (&buffers.shadow, &buffers.programs.blur) else { return Ok(()) };
     gl.begin(&map.framebuffer, map.size, map.size);
     gl.set(Fixed { depth_write: true, ..Fixed::default() });
-    for group in &buffers.groups {
-        if let Some(program) = &buffers.programs.shadow[group.kind as usize] {
-            bind_material(buffers, group, program, group.kind != Kind::Opaque)?;
-            gl.draw_indexed(&buffers.casters, group.first_triangle, group.triangles);
+    for drawn in &buffers.groups {
+        if let Some(program) = &drawn.shadow {
+            bind_material(buffers, drawn, program, drawn.group.kind != Kind::Opaque)?;
+            gl.draw_indexed(&buffers.casters, drawn.group.first_triangle, drawn.group.triangles);
         }
     }
     ran.passes.push("shadow");
@@ -70,11 +71,9 @@ pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot
         gl.check("opaque")?;
     }
     gl.set(Fixed { depth_clamp: true, ..Fixed::default() });
-    if let Some(program) = &programs.sky {
-        made(gl, buffers, program, 3);
-        ran.passes.push("sky");
-        gl.check("sky")?;
-    }
+    made(gl, buffers, &programs.sky, 3);
+    ran.passes.push("sky");
+    gl.check("sky")?;
     if let Some(program) = programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) {
         gl.set(Fixed { depth_clamp: true, depth_write: true, ..Fixed::default() });
         made(gl, buffers, program, 6);
@@ -101,9 +100,10 @@ pub(super) fn encode(gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
 /// Draws the groups of these kinds; whether there were any.
 fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ran: &mut Ran) -> Result<bool> {
     let before = ran.draws;
-    for group in buffers.groups.iter().filter(|group| kinds.contains(&group.kind)) {
-        let single = buffers.programs.mask_single.as_ref().filter(|_| group.kind == Kind::Mask && target.samples == 1);
-        let Some(program) = single.or(buffers.programs.surface[group.kind as usize].as_ref()) else { continue };
+    for drawn in buffers.groups.iter().filter(|drawn| kinds.contains(&drawn.group.kind)) {
+        let group = &drawn.group;
+        let single = drawn.surface_single.as_ref().filter(|_| target.samples == 1);
+        let program = single.unwrap_or(&drawn.surface);
         gl.set(Fixed {
             depth_write: group.kind != Kind::Blend,
             cull: !group.double_sided,
@@ -111,7 +111,7 @@ fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ra
             coverage: group.kind == Kind::Mask && target.samples > 1,
             depth_clamp: false,
         });
-        bind_material(buffers, group, program, true)?;
+        bind_material(buffers, drawn, program, true)?;
         gl.draw_indexed(&buffers.corners, group.first_triangle, group.triangles);
         ran.draws += 1;
     }
@@ -124,11 +124,17 @@ fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
 }
 
 /// Uses a program, with the one material of the group, or with the place where its triangles begin.
-fn bind_material(buffers: &SceneBuffers, group: &Group, program: &Program, reads_it: bool) -> Result<()> {
-    if let Some(material) = group.material {
+fn bind_material(buffers: &SceneBuffers, drawn: &DrawGroup, program: &Program, reads_it: bool) -> Result<()> {
+    if let Some(material) = drawn.group.material {
         buffers.buffer("materials")?.bind_uniform(MATERIAL, MATERIAL_BYTES * material, MATERIAL_BYTES);
     }
-    let looks_up = reads_it && group.material.is_none();
-    program.bind(looks_up.then_some(group.first_triangle as u32));
+    if let Some(colour) = drawn.colour {
+        buffers.colours[colour].bind(COLOUR_UNIT);
+    }
+    if let Some(normal) = drawn.normal {
+        buffers.normals[normal].bind(NORMAL_UNIT);
+    }
+    let looks_up = reads_it && drawn.group.material.is_none();
+    program.bind(looks_up.then_some(drawn.group.first_triangle as u32));
     Ok(())
 }

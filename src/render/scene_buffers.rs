@@ -8,10 +8,11 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::SharedBuffers;
-use super::geometry::{Geometry, Group, Kind};
-use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Program, Texture, TextureKind, VertexArray};
+use super::geometry::Geometry;
+use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Texture, TextureKind, VertexArray};
 use super::plan::{Allocation, Plan, plan};
-use super::shaders::{Options, Source};
+use super::programs::{Compile, DrawGroup, Programs};
+use super::shaders::Options;
 use super::textures::{Array, Use, arrays, levels, place};
 use crate::domain::AlphaMode;
 use crate::error::{Result, during};
@@ -40,7 +41,7 @@ pub struct SceneBuffers {
     pub(super) scene: Arc<Scene>,
     pub(super) buffers: BTreeMap<String, Buffer>,
     pub(super) views: Views,
-    pub(super) groups: Vec<Group>,
+    pub(super) groups: Vec<DrawGroup>,
     pub(super) corners: VertexArray,
     pub(super) casters: VertexArray,
     /// No attributes: for triangles that shaders make themselves.
@@ -69,26 +70,9 @@ pub(super) struct ShadowMap {
     pub(super) framebuffer: Framebuffer,
 }
 
-/// Programs by kind of triangle; absent where the scene has no such triangles.
-#[derive(Debug, Default)]
-pub(super) struct Programs {
-    pub(super) surface: [Option<Rc<Program>>; 3],
-    /// Cut-outs in a picture of one sample a pixel.
-    pub(super) mask_single: Option<Rc<Program>>,
-    pub(super) shadow: [Option<Rc<Program>>; 3],
-    pub(super) blur: Option<[Rc<Program>; 2]>,
-    pub(super) ground: Option<Rc<Program>>,
-    pub(super) sky: Option<Rc<Program>>,
-}
-
 impl SceneBuffers {
     /// Allocates and fills what the plan of the scene says; `compile` gives programs that may be shared.
-    pub(super) fn new(
-        gl: &Rc<Gl>,
-        scene: &Arc<Scene>,
-        samples: u32,
-        compile: &mut dyn FnMut(Source) -> Result<Rc<Program>>,
-    ) -> Result<Self> {
+    pub(super) fn new(gl: &Rc<Gl>, scene: &Arc<Scene>, samples: u32, compile: &mut Compile<'_>) -> Result<Self> {
         let plan = plan(scene);
         let geometry = Geometry::new(scene);
         let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
@@ -97,19 +81,23 @@ impl SceneBuffers {
         let (views, shared) = (views(gl, scene, &buffers)?, shared(&buffers)?);
         let (corners, casters) = vertex_arrays(gl, &buffers)?;
         let options = Options {
+            defines: plan.defines.clone(),
             colour_arrays: images[0].len(),
             normal_arrays: images[1].len(),
             blur: scene.look.shadow.unwrap_or_default().blur,
-            plan: plan.clone(),
+            samples,
         };
-        let programs = Programs::compile(&options, &geometry.groups, samples, compile)?;
+        let groups = geometry.groups.iter();
+        let groups: Result<Vec<DrawGroup>> =
+            groups.map(|group| DrawGroup::compile(scene, *group, &images, &options, compile)).collect();
+        let programs = Programs::compile(&options, &plan, compile)?;
         let [colours, normals] = images;
         Ok(Self {
             shared,
             scene: Arc::clone(scene),
             buffers,
             views,
-            groups: geometry.groups,
+            groups: groups?,
             corners,
             casters,
             nothing: gl.vertex_array(None, &[])?,
@@ -291,38 +279,5 @@ impl ShadowMap {
             moments: map(gl::RG32F, gl::LINEAR)?,
             framebuffer,
         })
-    }
-}
-
-impl Programs {
-    fn compile(
-        options: &Options,
-        groups: &[Group],
-        samples: u32,
-        compile: &mut dyn FnMut(Source) -> Result<Rc<Program>>,
-    ) -> Result<Self> {
-        let mut programs = Self::default();
-        let plan = &options.plan;
-        let has = |pass: &str| plan.passes.contains(&pass);
-        for kind in [Kind::Opaque, Kind::Mask, Kind::Blend] {
-            if !groups.iter().any(|group| group.kind == kind) {
-                continue;
-            }
-            programs.surface[kind as usize] = Some(compile(options.surface(kind, samples))?);
-            if kind == Kind::Mask {
-                programs.mask_single = Some(compile(options.surface(kind, 1))?);
-            }
-            if has("shadow") {
-                programs.shadow[kind as usize] = Some(compile(options.shadow(kind))?);
-            }
-        }
-        if has("blur") {
-            programs.blur = Some([compile(options.blur(true))?, compile(options.blur(false))?]);
-        }
-        if has("ground") {
-            programs.ground = Some(compile(options.ground())?);
-        }
-        programs.sky = Some(compile(options.sky())?);
-        Ok(programs)
     }
 }

@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 
 use super::geometry::Kind;
 use super::gl;
-use super::plan::Plan;
 
 const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
 const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
@@ -28,14 +27,16 @@ pub(super) const LANES: u32 = 64;
 /// Texels that one invocation of the blur makes, along its direction.
 pub(super) const RUN: u32 = 8;
 
-/// What the sources depend on besides the plan.
+/// What the sources depend on.
 #[derive(Debug, Clone)]
 pub(super) struct Options {
-    pub(super) plan: Plan,
+    pub(super) defines: Vec<&'static str>,
     pub(super) colour_arrays: usize,
     pub(super) normal_arrays: usize,
     /// Standard deviation of the blur in texels.
     pub(super) blur: f32,
+    /// Samples a pixel of an ordinary picture.
+    pub(super) samples: u32,
 }
 
 /// The text of a program's stages.
@@ -48,11 +49,28 @@ pub(super) struct Source {
 impl Options {
     fn head(&self, more: &[&str]) -> String {
         let mut text = String::from("#version 430 core\n");
-        for define in self.plan.defines.iter().chain(more) {
+        for define in self.defines.iter().chain(more) {
             writeln!(text, "#define {define}").ok();
         }
         writeln!(text, "#define STRIDE {}", super::scene_buffers::MATERIAL_BYTES / 16).ok();
         text
+    }
+
+    /// The same for triangles of one material: without the images that it has not, and with the one array of each use
+    /// that is bound for it.
+    pub(super) fn narrowed(&self, colour: bool, normal: bool) -> Self {
+        let keeps = |define: &&'static str| match *define {
+            "TEXTURES" => colour,
+            "NORMAL_MAPS" => normal,
+            "UVS" => colour || normal,
+            _ => true,
+        };
+        Self {
+            defines: self.defines.iter().copied().filter(keeps).collect(),
+            colour_arrays: usize::from(colour),
+            normal_arrays: usize::from(normal),
+            ..*self
+        }
     }
 
     /// Draws triangles of one kind into the picture.
@@ -183,7 +201,8 @@ mod tests {
 
     fn options(alpha_mode: AlphaMode) -> Options {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
-        Options { plan: super::super::plan::plan(&scene), colour_arrays: 0, normal_arrays: 0, blur: 2.0 }
+        let plan = super::super::plan::plan(&scene);
+        Options { defines: plan.defines, colour_arrays: 0, normal_arrays: 0, blur: 2.0, samples: 4 }
     }
 
     #[test]
@@ -194,6 +213,14 @@ mod tests {
         assert!(!text(options.surface(Kind::Blend, 4)).contains("discard"));
         assert!(text(options.surface(Kind::Mask, 4)).contains("discard"));
         assert_eq!(options.shadow(Kind::Opaque).stages.len(), 1, "depth alone needs no fragment shader");
+    }
+
+    #[test]
+    fn a_material_without_images_gets_a_program_without_lookups() {
+        let full = Options { defines: vec!["TEXTURES", "NORMAL_MAPS", "UVS", "SHADOWS"], ..options(AlphaMode::Opaque) };
+        assert_eq!(full.narrowed(false, false).defines, ["SHADOWS"]);
+        assert_eq!(full.narrowed(true, false).defines, ["TEXTURES", "UVS", "SHADOWS"]);
+        assert_eq!(full.narrowed(false, true).normal_arrays, 1);
     }
 
     #[test]
