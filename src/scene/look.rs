@@ -88,8 +88,8 @@ impl Default for Look {
     fn default() -> Self {
         Self {
             sun: [0.45, 0.80, 0.55],
-            sunlight: [1.0, 0.95, 0.86],
-            skylight: [0.30, 0.34, 0.40],
+            sunlight: [0.80, 0.76, 0.69],
+            skylight: [0.25, 0.28, 0.33],
             zenith: [0.25, 0.45, 0.78],
             horizon: [0.78, 0.85, 0.92],
             shadow: Some(Shadow::default()),
