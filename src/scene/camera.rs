@@ -90,14 +90,29 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A camera that frames the rest bounds of a scene from the front, a little above and aside.
+    /// A camera that frames the rest bounds of a scene in pictures at least as wide as they are high.
     pub fn framing(scene: &Scene) -> Self {
+        Self::framing_for(scene, 1.0)
+    }
+
+    /// A camera that frames the rest bounds of a scene from the front, a little above and aside, in pictures of this
+    /// width over height.
+    pub fn framing_for(scene: &Scene, aspect: f64) -> Self {
         let up = scene.up.vector();
-        let aside = scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
+        let back = (scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90)).normalize();
+        let right = up.cross(&back).normalize();
         let bounds = scene.rest_bounds;
         let degrees = 32.0_f64;
-        let distance = 0.56 * bounds.diagonal().max(1e-12) / (degrees.to_radians() / 2.0).tan();
-        let eye = bounds.centre() + aside * distance;
+        // Every corner of the box is inside; what is in the box seldom reaches them.
+        let slope = 0.96 * (degrees.to_radians() / 2.0).tan();
+        let reach = |corner: Point3<f64>| {
+            let from_centre = corner - bounds.centre();
+            let across = from_centre.dot(&right).abs() / aspect;
+            let across = across.max(from_centre.dot(&back.cross(&right)).abs());
+            from_centre.dot(&back) + across / slope
+        };
+        let distance = bounds.corners().map(reach).into_iter().fold(1e-12, f64::max);
+        let eye = bounds.centre() + back * distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.centre().coords.into(), up: up.into() };
         Self { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
     }
