@@ -67,7 +67,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 fn camera(args: &Args, scene: &Scene) -> Camera {
     let (Ok(eye), Ok(target)) = (args.eye.clone().try_into(), args.target.clone().try_into()) else {
-        return Camera::framing(scene);
+        return Camera::framing(scene, args.size.width, args.size.height);
     };
     let view = View::LookAt { eye, target, up: scene.up.vector().into() };
     Camera { view, lens: Lens::FieldOfView(args.field_of_view), near: 0.0, far: 0.0 }

@@ -23,23 +23,20 @@ pub struct Staged {
 }
 
 impl Staged {
-    /// Deforms the rest state. On failure the buffers come back, so that their owner can free them.
-    pub(super) fn new(
-        scene: &Arc<Scene>,
-        mut deformer: Box<dyn Deformer>,
-        buffers: Option<SceneBuffers>,
-    ) -> Result<Self, (Error, Option<SceneBuffers>)> {
+    /// A scene whose output is to be made by [`Self::rest`] before anything else.
+    pub(super) fn new(scene: &Arc<Scene>, deformer: Box<dyn Deformer>, buffers: Option<SceneBuffers>) -> Self {
         let shown = Arc::new(State::rest(scene));
-        let deformed = match deformer.deform(&shown) {
-            Ok(deformed) => deformed,
-            Err(error) => return Err((error, buffers)),
-        };
+        Self { scene: Arc::clone(scene), deformer, buffers, filled: false, bounds: scene.rest_bounds, shown }
+    }
+
+    /// Deforms the rest state.
+    pub(super) fn rest(&mut self) -> Result<()> {
+        let deformed = self.deformer.deform(&self.shown)?;
         if !is_near(&deformed.bounds) {
-            let refusal = invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds));
-            return Err((refusal, buffers));
+            return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
         }
-        let scene = Arc::clone(scene);
-        Ok(Self { scene, deformer, buffers, filled: false, bounds: deformed.bounds, shown })
+        self.bounds = deformed.bounds;
+        Ok(())
     }
 
     /// The scene.
@@ -120,7 +117,7 @@ impl Staged {
     fn overflow(&mut self, state: &State) -> Result<Error> {
         let scene = Arc::clone(&self.scene);
         let surface = self.deformer.surface()?;
-        let is_far = |number: &f32| !(f64::from(*number).abs() <= FARTHEST);
+        let is_far = |number: &f32| number.is_nan() || f64::from(*number).abs() > FARTHEST;
         let at = surface.positions.iter().position(is_far).unwrap_or(0);
         let domain = scene.layout.slots.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
         let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));
@@ -143,7 +140,9 @@ mod tests {
     fn staged() -> Staged {
         let scene = testing::two_strips();
         let deformer = Box::new(ReferenceDeformer::new(&scene));
-        Staged::new(&scene, deformer, None).map_err(|(error, _)| error).expect("a scene at rest")
+        let mut staged = Staged::new(&scene, deformer, None);
+        staged.rest().expect("a scene at rest");
+        staged
     }
 
     #[test]

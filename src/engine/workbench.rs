@@ -81,10 +81,14 @@ impl Workbench {
             (_, Backend::Reference) => Box::new(ReferenceDeformer::new(scene)),
             _ => Box::new(CpuDeformer::new(scene)),
         };
-        Staged::new(scene, deformer, buffers).map_err(|(error, buffers)| {
-            self.unload(buffers);
-            error
-        })
+        let mut staged = Staged::new(scene, deformer, buffers);
+        match staged.rest() {
+            Ok(()) => Ok(staged),
+            Err(error) => {
+                self.unstage(staged);
+                Err(error)
+            }
+        }
     }
 
     /// Frees what a staged scene holds.

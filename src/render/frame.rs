@@ -143,7 +143,8 @@ mod tests {
     #[test]
     fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
-        let mut shot = Shot { camera: Camera::framing(&scene), width: 64, height: 64, bounds: scene.rest_bounds };
+        let mut shot =
+            Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: scene.rest_bounds };
         let good = Frame::new(&scene, &shot).expect("good");
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }).expect("replaced"), good);

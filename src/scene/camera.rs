@@ -80,6 +80,9 @@ pub enum Lens {
     Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
 }
 
+/// The part of the image's half that a framed scene may take.
+const MARGIN: f64 = 0.94;
+
 /// A camera. Near and far are distances in scene units; both 0 means: fit them to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
@@ -90,29 +93,25 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A camera that frames the rest bounds of a scene in pictures at least as wide as they are high.
-    pub fn framing(scene: &Scene) -> Self {
-        Self::framing_for(scene, 1.0)
-    }
-
-    /// A camera that frames the rest bounds of a scene from the front, a little above and aside, in pictures of this
-    /// width over height.
-    pub fn framing_for(scene: &Scene, aspect: f64) -> Self {
+    /// A camera that frames the rest bounds of a scene from the front, a little above and aside, in an image of this
+    /// size: the bounds fill it but for a margin.
+    pub fn framing(scene: &Scene, width: u32, height: u32) -> Self {
         let up = scene.up.vector();
-        let back = (scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90)).normalize();
-        let right = up.cross(&back).normalize();
-        let bounds = scene.rest_bounds;
-        let degrees = 32.0_f64;
-        // Every corner of the box is inside; what is in the box seldom reaches them.
-        let slope = 0.96 * (degrees.to_radians() / 2.0).tan();
-        let reach = |corner: Point3<f64>| {
-            let from_centre = corner - bounds.centre();
-            let across = from_centre.dot(&right).abs() / aspect;
-            let across = across.max(from_centre.dot(&back.cross(&right)).abs());
-            from_centre.dot(&back) + across / slope
+        let aside = scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
+        let (bounds, degrees) = (scene.rest_bounds, 28.0_f64);
+        let slope = MARGIN * (degrees / 2.0).to_radians().tan();
+        let aspect = f64::from(width.max(1)) / f64::from(height.max(1));
+        let right = up.cross(&aside).normalize();
+        let above = aside.cross(&right);
+        // A corner that is nearer by `depth` must stay inside the image's cone, so it needs that much more distance.
+        let distance = |corner: &Point3<f64>| {
+            let offset = corner - bounds.centre();
+            let wide = offset.dot(&right).abs() / (slope * aspect);
+            offset.dot(&aside) + wide.max(offset.dot(&above).abs() / slope)
         };
-        let distance = bounds.corners().map(reach).into_iter().fold(1e-12, f64::max);
-        let eye = bounds.centre() + back * distance;
+        let distance = bounds.corners().iter().map(distance).fold(0.0, f64::max);
+        let distance = if distance > 0.0 { distance } else { 1.0 };
+        let eye = bounds.centre() + aside * distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.centre().coords.into(), up: up.into() };
         Self { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
     }
@@ -212,7 +211,7 @@ impl Camera {
         let farthest = depths.iter().copied().fold(0.0, f64::max);
         let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
         let far = (farthest.max(0.0) + 4.0 * bounds.diagonal()).max(1e-6);
-        (nearest.mul_add(0.5, 0.0).clamp(far * 1e-4, far * 0.5), far)
+        ((0.5 * nearest).clamp(far * 1e-4, far * 0.5), far)
     }
 }
 
@@ -230,5 +229,42 @@ mod tests {
         assert!(!bounds.is_finite());
         let other = Bounds { min: [0.0; 3], max: [1.0; 3] };
         assert!(!other.union(bounds).is_finite() && !bounds.union(other).is_finite());
+    }
+
+    #[test]
+    fn a_framed_scene_fills_the_image_up_to_the_margin_whatever_its_shape() {
+        for (size, width, height) in [([1.0, 8.0, 1.0], 1280, 720), ([9.0, 1.0, 2.0], 1280, 720), ([1.0; 3], 200, 900)]
+        {
+            let scene = block(size);
+            let camera = Camera::framing(&scene, width, height);
+            let clip = camera.clip_from_camera(width, height, &scene.rest_bounds) * camera.camera_from_world();
+            let reach = scene.rest_bounds.corners().map(|corner| {
+                let point = clip.transform_point(&corner);
+                point.x.abs().max(point.y.abs())
+            });
+            let reach = reach.into_iter().fold(0.0, f64::max);
+            assert!((reach - MARGIN).abs() < 1e-6, "{size:?} reaches {reach}");
+        }
+    }
+
+    fn block(size: [f32; 3]) -> std::sync::Arc<Scene> {
+        use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+        let rest = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];
+        let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a mesh");
+        let mut parts = crate::scene::Parts::named("block");
+        parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
+        parts.materials = vec![Material::default()];
+        parts.domains = vec![Domain {
+            name: "block".into(),
+            shape: 0,
+            material: 0,
+            placement: Transform::IDENTITY,
+            attachment: None,
+            runs: vec![],
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: Metadata::default(),
+        }];
+        Scene::new(parts).expect("a scene")
     }
 }

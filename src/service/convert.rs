@@ -114,9 +114,10 @@ pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Pictur
         let expected = format!("1 to {most} pixels a side, or 0 x 0 for 1280 x 720");
         return Err(invalid("picture.size", expected, format!("{width} x {height}")));
     }
+    let framing = Camera::framing(scene, width, height);
     let camera = match picture.camera {
-        None => Camera::framing(scene),
-        Some(camera) => camera::parse(scene, camera).map_err(|error| error.within("picture"))?,
+        None => framing,
+        Some(camera) => camera::parse(framing, camera).map_err(|error| error.within("picture"))?,
     };
     Ok((View::Frame { camera, width, height }, format))
 }

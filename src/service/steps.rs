@@ -100,7 +100,7 @@ impl Session {
 
     async fn open(&mut self, open: v1::OpenDrive) -> Result<()> {
         if self.drive.is_some() {
-            return Err(invalid("open", "one open per stream", "a second"));
+            return Err(invalid("open", "one open per stream", format!("a second, of '{}'", open.scene)));
         }
         let policy = policy(open.policy)?;
         let host = self.engine.find(&open.scene)?;

@@ -52,7 +52,7 @@ fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
     let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
     let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&to_share))).expect("a deformer");
     let bounds = direct.deform(&state).expect("deforms").bounds;
-    let shot = Shot { camera: Camera::framing(&scene), width: 320, height: 240, bounds };
+    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 320, height: 240, bounds };
     let shown = renderer.draw(&to_share, &shot).expect("draws");
     renderer.upload(&to_fill, direct.surface().expect("copies")).expect("uploads");
     let uploaded = renderer.draw(&to_fill, &shot).expect("draws");

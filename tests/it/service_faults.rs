@@ -57,19 +57,30 @@ async fn a_writer_that_reads_no_refusals_is_cut_off_and_its_connection_lives() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let channel = server.channel().await;
-    let driver = Driver::connect(channel.clone()).await;
+    let mut driver = Driver::connect(channel.clone()).await;
+    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
     // So many long refusals that no buffer on the way holds them.
     let open = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
     let (sender, mut replies) = driver.split();
-    let send = async {
+    let flood = tokio::spawn(async move {
         for _ in 0..20_000 {
             let kind = Some(v1::drive_scene_request::Kind::Open(open.clone()));
             if sender.send(v1::DriveSceneRequest { kind }).await.is_err() {
                 return;
             }
         }
+    });
+    // It reads nothing until it has lost its place, and another has it.
+    let next = async {
+        loop {
+            let mut next = Driver::connect(channel.clone()).await;
+            if matches!(next.open("strips", Policy::Lossless, 0).await, Told::Opened(_)) {
+                return next;
+            }
+        }
     };
-    within(send).await;
+    let mut next = within(next).await;
+    next.acked(step(0, &[0], &[0.1, 0.2])).await;
     let mut refusals = 0;
     let end = loop {
         match within(replies.message()).await {
@@ -80,9 +91,8 @@ async fn a_writer_that_reads_no_refusals_is_cut_off_and_its_connection_lives() {
     };
     assert!(refusals < 20_000, "{refusals}");
     assert_eq!(end.code(), Code::ResourceExhausted, "{end:?}");
-    let mut next = Driver::connect(channel).await;
-    assert!(matches!(next.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
-    next.acked(step(0, &[0], &[0.1, 0.2])).await;
+    within(flood).await.expect("it ends with its stream");
+    next.acked(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

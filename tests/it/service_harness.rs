@@ -88,7 +88,6 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
-        runs: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),

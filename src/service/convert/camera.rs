@@ -4,11 +4,10 @@ use modalcast_proto::v1;
 
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
-use crate::scene::{Camera, Lens, Scene, View};
+use crate::scene::{Camera, Lens, View};
 
 /// The checked camera.
-pub(super) fn parse(scene: &Scene, camera: v1::Camera) -> Result<Camera> {
-    let framing = Camera::framing(scene);
+pub(super) fn parse(framing: Camera, camera: v1::Camera) -> Result<Camera> {
     let view = match camera.view {
         None => framing.view,
         Some(v1::camera::View::LookAt(look)) => View::LookAt {

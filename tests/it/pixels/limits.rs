@@ -97,10 +97,13 @@ fn a_frame_too_large_for_four_samples_is_drawn_with_one_and_keeps_its_cut_outs()
 fn the_same_input_gives_the_same_bytes_and_another_does_not() {
     let scene = full().add(lying(1.0, 0.5), Material::default()).add(lying(0.5, 1.0), Material::default()).scene();
     let mut renderer = open();
-    let first = draw(&mut renderer, &scene, Camera::framing(&scene), 96);
-    assert!(first.image.rgba == draw(&mut renderer, &scene, Camera::framing(&scene), 96).image.rgba);
-    assert!(first.image.rgba == draw(&mut open(), &scene, Camera::framing(&scene), 96).image.rgba, "another context");
-    let mut moved = Camera::framing(&scene);
+    let first = draw(&mut renderer, &scene, Camera::framing(&scene, 64, 64), 96);
+    assert!(first.image.rgba == draw(&mut renderer, &scene, Camera::framing(&scene, 64, 64), 96).image.rgba);
+    assert!(
+        first.image.rgba == draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 96).image.rgba,
+        "another context"
+    );
+    let mut moved = Camera::framing(&scene, 64, 64);
     moved.lens = modalcast::scene::Lens::FieldOfView(33.0);
     assert!(first.image.rgba != draw(&mut renderer, &scene, moved, 96).image.rgba, "control");
 }
@@ -116,7 +119,7 @@ fn degenerate_triangles_light_from_straight_up_and_a_camera_inside_the_mesh_are_
     let shown = picture(&scene);
     assert!(shown.count(|pixel| pixel != shown.at(0, 0)) > 100);
     let view = View::LookAt { eye: [0.1, 0.3, 0.1], target: [1.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
-    let inside = draw(&mut open(), &scene, Camera { view, ..Camera::framing(&scene) }, 64);
+    let inside = draw(&mut open(), &scene, Camera { view, ..Camera::framing(&scene, 64, 64) }, 64);
     assert_eq!(inside.image.rgba.len(), 4 * 64 * 64);
 }
 
@@ -151,7 +154,7 @@ fn a_scene_far_from_the_origin_still_shows() {
         domain.placement = place;
     }
     let scene = Stage(parts).scene();
-    let shown = draw(&mut open(), &scene, Camera::framing(&scene), 64);
+    let shown = draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 64);
     assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
 }
 
@@ -159,7 +162,7 @@ fn a_scene_far_from_the_origin_still_shows() {
 fn renderers_come_and_go_on_many_threads_and_on_one() {
     let draw_one = || {
         let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
-        draw(&mut open(), &scene, Camera::framing(&scene), 32).image.rgba
+        draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 32).image.rgba
     };
     let first = draw_one();
     let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_one(), draw_one()])).collect();
@@ -169,12 +172,12 @@ fn renderers_come_and_go_on_many_threads_and_on_one() {
     let (mut left, mut right) = (open(), open());
     let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
     let buffers = left.load(&scene).expect("loads");
-    assert!(draw(&mut right, &scene, Camera::framing(&scene), 32).image.rgba == first);
+    assert!(draw(&mut right, &scene, Camera::framing(&scene, 64, 64), 32).image.rgba == first);
     drop(right);
     let mut deformer = ReferenceDeformer::new(&scene);
     let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
     left.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = Shot { camera: Camera::framing(&scene), width: 32, height: 32, bounds };
+    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 32, height: 32, bounds };
     assert!(left.draw(&buffers, &shot).expect("draws").rgba == first, "two contexts on one thread keep apart");
 }
 

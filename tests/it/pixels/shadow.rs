@@ -149,7 +149,7 @@ fn every_up_axis_gives_the_same_picture() {
         let triangles = vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
         let mesh = modalcast::domain::Mesh::indexed(rest, normals, vec![], triangles).expect("two squares");
         let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
-        draw(&mut open(), &scene, Camera::framing(&scene), 64)
+        draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 64)
     };
     let upright = shown(UpAxis::Y);
     for up in [UpAxis::X, UpAxis::Z] {
