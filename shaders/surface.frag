@@ -2,12 +2,13 @@
 //   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e,
 // v_l to the sun, v_e to the eye, s_f the share of the sun that arrives.
 in vec3 world;
-in vec3 normal_world;
+// Centroids: at the rim of a triangle the middle of the pixel may lie outside it, where images repeat and normals overshoot.
+centroid in vec3 normal_world;
 #ifdef UVS
-in vec2 uv_image;
+centroid in vec2 uv_image;
 #endif
 #ifdef NORMAL_MAPS
-in vec4 tangent_world;
+centroid in vec4 tangent_world;
 #endif
 layout(location = 0) out vec4 colour;
 

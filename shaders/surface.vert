@@ -4,14 +4,14 @@ layout(location = 1) in vec3 normal;
 layout(binding = 13) uniform samplerBuffer positions;
 
 out vec3 world;
-out vec3 normal_world;
+centroid out vec3 normal_world;
 #ifdef UVS
 layout(location = 2) in vec2 uv;
-out vec2 uv_image;
+centroid out vec2 uv_image;
 #endif
 #ifdef NORMAL_MAPS
 layout(location = 3) in vec4 tangent;
-out vec4 tangent_world;
+centroid out vec4 tangent_world;
 #endif
 
 void main() {

@@ -5,7 +5,9 @@ layout(binding = 0) uniform sampler2D moments_map;
 
 float sunlit(vec3 world) {
     vec3 at = (frame.map_from_world * vec4(world, 1.0)).xyz;
-    if (any(lessThan(at.xy, vec2(0.0))) || any(greaterThan(at.xy, vec2(1.0)))) return 1.0;
+    // The rim holds no caster; the outermost texels are left alone, where filtering repeats the edge.
+    vec2 inside = min(at.xy, 1.0 - at.xy) * frame.shadow.w;
+    if (min(inside.x, inside.y) < 1.0) return 1.0;
     vec2 moments = textureLod(moments_map, at.xy, 0.0).xy;
     float behind = clamp(at.z, 0.0, 1.0) - 0.5 - moments.x;
     if (behind <= 0.0) return 1.0;

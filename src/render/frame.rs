@@ -100,7 +100,7 @@ fn ground_disc(scene: &Scene, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
     centre[up] = scene.rest_bounds.min[up];
     let mut aside = eye - centre;
     aside[up] = 0.0;
-    (centre, 2.0 * scene.rest_bounds.diagonal().max(aside.norm()).max(1e-6))
+    (centre, 3.5 * scene.rest_bounds.diagonal().max(aside.norm()).max(1e-6))
 }
 
 /// Normalised device coordinates (x, y, 1) to a direction in the world.

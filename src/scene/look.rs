@@ -63,7 +63,7 @@ pub struct Ground {
 
 impl Default for Ground {
     fn default() -> Self {
-        Self { colour: [0.50, 0.47, 0.40] }
+        Self { colour: [0.40, 0.41, 0.36] }
     }
 }
 
@@ -88,10 +88,11 @@ impl Default for Look {
     fn default() -> Self {
         Self {
             sun: [0.45, 0.80, 0.55],
-            sunlight: [1.0, 0.95, 0.86],
-            skylight: [0.30, 0.34, 0.40],
-            zenith: [0.25, 0.45, 0.78],
-            horizon: [0.78, 0.85, 0.92],
+            // Ambient and sun together stay about at 1, so that white surfaces keep some shape.
+            sunlight: [0.82, 0.77, 0.69],
+            skylight: [0.25, 0.28, 0.33],
+            zenith: [0.16, 0.36, 0.72],
+            horizon: [0.72, 0.82, 0.90],
             shadow: Some(Shadow::default()),
             ground: Some(Ground::default()),
         }

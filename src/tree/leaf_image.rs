@@ -8,8 +8,8 @@ use crate::error::Result;
 
 const SIDE: usize = 256;
 
-/// The leaf's part of the image, from the left edge.
-pub(super) const LEAF_SPAN: [f32; 2] = [0.0, 0.90];
+/// The leaf's part of the image. It keeps off the left edge, where a repeating image lets the strip of the right one in.
+pub(super) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
 
 /// The middle of the strip for stems.
 pub(super) const STEM_U: f32 = 0.965;
@@ -45,8 +45,8 @@ pub(super) fn texture(name: &str, palette: &Palette, random: &mut Random) -> Res
         let u = ((pixel % SIDE) as f32 + 0.5) / SIDE as f32;
         let v = ((pixel / SIDE) as f32 + 0.5) / SIDE as f32;
         let shade = 1.0 + 0.08 * mottle[0].at(u, v) + 0.05 * mottle[1].at(u, v);
-        let (colour, cover) =
-            if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, u / LEAF_SPAN[1] - 0.5, 1.0 - v) };
+        let across = (u - LEAF_SPAN[0]) / (LEAF_SPAN[1] - LEAF_SPAN[0]) - 0.5;
+        let (colour, cover) = if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, across, 1.0 - v) };
         rgba.extend(colour.map(|channel| (shade * channel).clamp(0.0, 255.0) as u8));
         rgba.push((255.0 * cover).round() as u8);
     }

@@ -98,14 +98,15 @@ fn phong_at_a_pixel_equals_the_arithmetic_in_f64() {
 }
 
 #[test]
-fn the_sky_goes_from_horizon_to_zenith_with_the_root_of_the_sine() {
+fn the_sky_goes_from_horizon_to_zenith_by_its_formula() {
     let mut stage = Stage::new();
     stage.0.look.zenith = [0.1, 0.3, 0.8];
     stage.0.look.horizon = [0.7, 0.8, 0.9];
     let shown = picture(&stage.add(facing(-0.1, -0.1, 0.1, 0.1, 0.0), plain([0.0; 3])).scene());
     for (x, y) in [(5, 3), (60, 20), (32, 60)] {
         let direction = Vector3::new((f64::from(x) - 31.5) / 100.0, (31.5 - f64::from(y)) / 100.0, -1.0).normalize();
-        let share = direction.y.max(0.0).sqrt();
+        let sine = direction.y.max(0.0);
+        let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
         let mix = |low: f64, high: f64| low + share * (high - low);
         assert!(close(shown.at(x, y), [mix(0.7, 0.1), mix(0.8, 0.3), mix(0.9, 0.8)], 1.0), "{:?}", shown.at(x, y));
     }
