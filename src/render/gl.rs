@@ -65,6 +65,8 @@ pub(super) struct Fixed {
     pub(super) depth_write: bool,
     /// Depth outside near and far is clamped rather than clipped.
     pub(super) depth_clamp: bool,
+    /// Drawn a little farther away than it is, so that what lies in the same plane is seen.
+    pub(super) behind: bool,
     pub(super) cull: bool,
     pub(super) blend: bool,
     /// Alpha becomes the share of samples that are covered.
@@ -250,12 +252,14 @@ impl Gl {
         };
         flip(glow::DEPTH_TEST, true);
         flip(glow::DEPTH_CLAMP, fixed.depth_clamp);
+        flip(glow::POLYGON_OFFSET_FILL, fixed.behind);
         flip(glow::CULL_FACE, fixed.cull);
         flip(glow::BLEND, fixed.blend);
         flip(glow::SAMPLE_ALPHA_TO_COVERAGE, fixed.coverage);
         // SAFETY: plain state.
         unsafe {
             gl.depth_func(glow::LEQUAL);
+            gl.polygon_offset(1.0, 8.0);
             gl.depth_mask(fixed.depth_write);
             gl.blend_func(glow::SRC_ALPHA, glow::ONE_MINUS_SRC_ALPHA);
         }

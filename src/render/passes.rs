@@ -75,7 +75,7 @@ pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot
     ran.passes.push("sky");
     gl.check("sky")?;
     if let Some(program) = programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) {
-        gl.set(Fixed { depth_clamp: true, depth_write: true, ..Fixed::default() });
+        gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
         made(gl, buffers, program, 6);
         ran.passes.push("ground");
         gl.check("ground")?;
@@ -109,7 +109,7 @@ fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ra
             cull: !group.double_sided,
             blend: group.kind == Kind::Blend,
             coverage: group.kind == Kind::Mask && target.samples > 1,
-            depth_clamp: false,
+            ..Fixed::default()
         });
         bind_material(buffers, drawn, program, true)?;
         gl.draw_indexed(&buffers.corners, group.first_triangle, group.triangles);

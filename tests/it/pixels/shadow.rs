@@ -136,6 +136,20 @@ fn a_lit_surface_does_not_shadow_itself() {
 }
 
 #[test]
+fn a_floor_in_the_plane_of_the_ground_covers_it() {
+    for height in [0.0, 1e-7] {
+        let shown = from_above(stage().add(lying(1.5, height), Material { ambient: [1.0, 0.0, 0.0], ..paint() }));
+        let floor = shown.count(|[r, g, b]| r > 100 && g < 10 && b < 10);
+        assert_eq!(floor, 900, "at {height}");
+    }
+}
+
+/// Seen by ambient light alone.
+fn paint() -> Material {
+    Material { diffuse: [0.0; 3], ..Material::default() }
+}
+
+#[test]
 fn every_up_axis_gives_the_same_picture() {
     let shown = |up: UpAxis| {
         let turn = up.from_y_up();
