@@ -21,3 +21,8 @@ pub use modalcast_proto::v1::{SceneInfo, StepId};
 pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
 pub use step::Step;
 pub use vertices::{VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
+
+/// The project's README shows a client; here it is compiled.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct ProjectReadme;
