@@ -30,10 +30,14 @@
 //! | `error` | what can go wrong, sorted by who can act | |
 //!
 //! # Invariants
-//! 1. No arrow points up. 2. No proto type below `service`. 3. No GL or CUDA call off the device thread. 4. Every channel
-//! is bounded and says what it does when full. 5. No kernel without a launcher and a twin of its name. 6. Behind the
-//! constructors of `domain` and `scene` no length, index or float is checked again. 7. Nothing below `engine` knows of
-//! sessions or threads. 8. Nothing panics on input.
+//! 1. No arrow points up.
+//! 2. No proto type below `service`.
+//! 3. No GL or CUDA call off the device thread.
+//! 4. Every channel is bounded and says what it does when full.
+//! 5. No kernel without a launcher and a twin of its name.
+//! 6. Behind the constructors of `domain` and `scene` no length, index or float is checked again.
+//! 7. Nothing below `engine` knows of streams or sessions.
+//! 8. Nothing panics on input.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

@@ -1,5 +1,7 @@
 //! Stage names in one enum, stage times in milliseconds, and the log.
 
+use std::io::IsTerminal as _;
+
 /// A stage of the work; its name is the same in logs, replies and records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Stage {
@@ -63,7 +65,10 @@ pub fn ms_since(begin: std::time::Instant) -> f64 {
 pub fn log_to_stderr() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).try_init().ok();
+    let colours = std::io::stderr().is_terminal();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(colours);
+    // Somebody else's log stays.
+    log.try_init().ok();
 }
 
 #[cfg(test)]

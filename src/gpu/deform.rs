@@ -156,7 +156,7 @@ mod tests {
         }
         assert!(number_of(ordered(f32::NAN)).is_nan());
         assert!(number_of(0).is_nan());
-        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(|number| ordered(number));
+        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(ordered);
         assert_eq!(bounds_of(&good), Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
         for bad in [f32::NAN, f32::INFINITY] {
             let mut keys = good;

@@ -351,7 +351,7 @@ mod tests {
         std::fs::write(&broken, b"no library").expect("a file");
         let mut found = Vec::new();
         find_below(folder.path(), 5, &mut found);
-        assert_eq!(found, [broken.clone()]);
+        assert_eq!(found, std::slice::from_ref(&broken));
         let refusal = Nvrtc::find(&found).expect_err("broken").to_string();
         assert!(refusal.contains(&broken.display().to_string()), "{refusal}");
     }

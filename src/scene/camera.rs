@@ -150,7 +150,8 @@ impl Camera {
             _ => {}
         }
         let fitted = self.near == 0.0 && self.far == 0.0;
-        if !fitted && !(self.near > 0.0 && self.far > self.near && self.far.is_finite()) {
+        let ordered = self.near > 0.0 && self.far > self.near && self.far.is_finite();
+        if !(fitted || ordered) {
             return Err(invalid(
                 "camera.near/far",
                 "0 < near < far, or both 0",

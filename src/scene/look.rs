@@ -88,8 +88,9 @@ impl Default for Look {
     fn default() -> Self {
         Self {
             sun: [0.45, 0.80, 0.55],
-            sunlight: [1.15, 1.06, 0.92],
-            skylight: [0.30, 0.34, 0.39],
+            // Ambient and sun together stay about at 1, so that white surfaces keep some shape.
+            sunlight: [0.82, 0.77, 0.69],
+            skylight: [0.25, 0.28, 0.33],
             zenith: [0.16, 0.36, 0.72],
             horizon: [0.72, 0.82, 0.90],
             shadow: Some(Shadow::default()),

@@ -21,13 +21,15 @@ pub struct RawUpdate {
     pub transforms: bytes::Bytes,
 }
 
+/// A domain, and the first number and the count of its coordinates among the values of a step.
+type Part = (u32, usize, usize);
+
 /// A step that fits its scene: every index in range, every length right, every number finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Update {
     pub number: u64,
     pub time: f64,
-    /// Domain, and first number and count in `values`.
-    q: Vec<(u32, usize, usize)>,
+    q: Vec<Part>,
     values: Vec<f32>,
     pub transforms: Vec<(u32, Transform)>,
 }
@@ -69,7 +71,7 @@ impl Update {
     }
 }
 
-fn parse_q(scene: &Scene, raw: &RawUpdate) -> Result<(Vec<(u32, usize, usize)>, Vec<f32>)> {
+fn parse_q(scene: &Scene, raw: &RawUpdate) -> Result<(Vec<Part>, Vec<f32>)> {
     let everyone = raw.q_domains.is_empty() && !raw.q.is_empty();
     let domains = named(scene, "step.q_domains", &raw.q_domains, everyone)?;
     let mut expected = 0;

@@ -161,8 +161,7 @@ mod tests {
         let respond = respond(|outlet: Outlet<u32>| async move {
             outlet.send(1).await?;
             outlet.send(2).await?;
-            let nothing: Option<u32> = None;
-            outlet.send(nothing.expect("a planted panic")).await
+            panic!("a planted panic")
         });
         let mut replies = respond.into_inner();
         use tokio_stream::StreamExt as _;

@@ -73,7 +73,9 @@ pub fn grow(recipe: &Recipe) -> Result<Parts> {
     let mut random = Random::new(recipe.seed);
     let mut parts = Parts::named("tree");
     parts.rigid_transforms = true;
-    parts.look = Look { sun: [0.52, 0.74, 0.62], ..Look::default() };
+    // Leaves and bark are dark, so a noon sun does not wash them out.
+    parts.look =
+        Look { sun: [0.52, 0.74, 0.62], sunlight: [1.15, 1.06, 0.92], skylight: [0.30, 0.34, 0.39], ..Look::default() };
     add_materials(&mut parts, &mut random.fork())?;
     let molds = plan::plan(&mut random.fork());
     let cast = molds.par_iter().map(Mold::cast).collect::<Result<Vec<_>>>()?;

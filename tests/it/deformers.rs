@@ -92,10 +92,9 @@ fn cpu_equals_its_twin_for_all_sizes_ranks_shears_and_mirrors() {
     let tangents = reference::orient_tangents(&scene, &state).into_flattened();
     assert_eq!(first_wrong(&surface.tangents, &tangents, loose), None);
     for point in &want {
-        for axis in 0..3 {
-            let slack = 1e-6 * diagonal;
-            assert!(point[axis] >= told.bounds.min[axis] - slack && point[axis] <= told.bounds.max[axis] + slack);
-        }
+        let slack = 1e-6 * diagonal;
+        let sides = point.iter().zip(told.bounds.min.iter().zip(&told.bounds.max));
+        sides.for_each(|(at, (min, max))| assert!(*at >= min - slack && *at <= max + slack));
     }
 }
 

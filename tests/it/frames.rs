@@ -9,7 +9,7 @@ use v1::render_frame_request::Step as Which;
 use crate::service_harness::{Server, details, step, within};
 
 async fn server() -> Server {
-    let server = Server::with(|config| Config { renderer: RendererChoice::Software, ..config }).await;
+    let server = Server::with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
     server.open("strips").await;
     server
 }

@@ -1,15 +1,22 @@
 //! The real inputs, at `MODALCAST_DATA` or `../shared/data`: every modal one deforms as its reference says.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use modalcast::config::{BackendChoice, Config};
 use modalcast::cpu::CpuDeformer;
 use modalcast::deform::Deformer;
 use modalcast::scene::{Scene, State};
 use modalcast::{load, reference};
 
+use modalcast_proto::v1;
+
 use crate::deformers::Noise;
+use crate::service_harness::{Server, config, details, get_vertices};
 use crate::tolerance::largest_error;
+
+/// The real inputs that have modes.
+const MODAL: [&str; 5] = ["vega/simpleBridge", "vega/A", "gltf/MorphStressTest", "sofa/hexaBeam", "sofa/finger"];
 
 fn data(path: &str) -> String {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
@@ -71,9 +78,62 @@ fn the_tree_agrees_with_its_reference() {
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_modal_inputs_agree_with_their_reference() {
-    for path in ["vega/simpleBridge", "vega/A", "gltf/MorphStressTest", "sofa/hexaBeam", "sofa/finger"] {
+    for path in MODAL {
         let scene = load::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}"));
         assert!(scene.needs.modes, "{path} has modes");
         agrees(&scene);
     }
+}
+
+/// Opens every modal input on a server of this backend, drives one step over gRPC, and compares what is streamed back.
+async fn streamed_agrees(backend: BackendChoice) {
+    let state = tempfile::tempdir().expect("a folder");
+    let repository = Arc::new(load::Repository::new(Some(Path::new(&data("")))).expect("the real inputs"));
+    let server = Server::start_from(Config { backend, ..config(state.path()) }, repository).await;
+    for source in MODAL.iter().chain(&["tree"]) {
+        let path = if *source == "tree" { (*source).to_owned() } else { data(source) };
+        let scene = load::open(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
+        let name = server.open(source).await.scene;
+        let bent = bent(&scene, 0.0501);
+        let q: Vec<u8> = bent.q.iter().flat_map(|number| number.to_le_bytes()).collect();
+        let mut driver = server.drive(&name, v1::Policy::Lossless, 0).await;
+        driver.acked(v1::Step { number: 1, q: q.into(), ..v1::Step::default() }).await;
+        let ask = v1::GetVerticesRequest { scene: name.clone(), ..v1::GetVerticesRequest::default() };
+        let got = get_vertices(&server, ask).await.expect("vertices");
+        assert_eq!(got.step().number, 1);
+        let want = reference::deform(&scene, &bent);
+        let error = largest_error(&got.positions, &want) / scene.rest_bounds.diagonal();
+        println!("{source}: streamed by {backend:?}, off by {error:.2e} of the diagonal");
+        assert!(error <= 1e-5, "{source}: {error}");
+        let rest = reference::deform(&scene, &State::rest(&scene));
+        assert!(largest_error(&got.positions, &rest) >= 0.05 * scene.rest_bounds.diagonal(), "the control moved");
+        driver.finish().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+async fn real_vertices_streamed_by_the_cpu_agree_with_the_reference() {
+    streamed_agrees(BackendChoice::Cpu).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "needs an NVIDIA GPU and the real inputs"]
+async fn gpu_vertices_of_real_inputs_streamed_by_cuda_agree_with_the_reference() {
+    streamed_agrees(BackendChoice::Cuda).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+async fn real_malformed_modes_are_refused_by_name_and_the_server_goes_on() {
+    let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+    std::fs::copy(data("sofa/ball/modes.txt"), scenes.path().join("modes.txt")).expect("copied");
+    std::fs::copy(data("sofa/hexaBeam/hexaBeam.derived.obj"), scenes.path().join("ball.obj")).expect("copied");
+    let repository = Arc::new(load::Repository::new(Some(scenes.path())).expect("a repository"));
+    let server = Server::start_from(config(state.path()), repository).await;
+    let open = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: String::new() };
+    let refusal = server.scenes().await.open_scene(open("ball.obj")).await.expect_err("malformed");
+    let why = details(&refusal);
+    assert!(why.expected.contains("684 x 32") && why.given.contains("684 x 35"), "{why:?}");
+    server.scenes().await.open_scene(open("tree")).await.expect("the server lives");
 }

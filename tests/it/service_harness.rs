@@ -8,7 +8,7 @@ use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast::engine::{Engine, SceneSource};
 use modalcast::error::{Error, Result, invalid};
-use modalcast::scene::{Parts, RawUpdate, Scene, State, Update};
+use modalcast::scene::{Look, Parts, RawUpdate, Scene, Shadow, State, Update};
 use modalcast::{reference, service};
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -95,7 +95,10 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
 }
 
 fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
-    let parts = Parts { shapes: vec![shape], materials: vec![Material::default()], domains, ..Parts::named(name) };
+    // A small shadow map, because these tests are about the wire.
+    let look = Look { shadow: Some(Shadow { size: 128, ..Shadow::default() }), ..Look::default() };
+    let materials = vec![Material::default()];
+    let parts = Parts { shapes: vec![shape], materials, domains, look, ..Parts::named(name) };
     Scene::new(parts).expect("a scene")
 }
 
