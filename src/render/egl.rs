@@ -191,11 +191,16 @@ pub(super) fn none_fits(wanted: &str, tried: &[String]) -> Error {
 impl Context {
     /// Makes a context on a candidate and makes it current on this thread.
     pub(super) fn open(candidate: &Candidate) -> Result<Self> {
-        let api = api()?;
-        let _door = door();
+        let made = Self::make(candidate.display)?;
+        // Not under the lock: a failure here drops the context, which takes the lock itself.
+        made.make_current()?;
+        Ok(made)
+    }
+
+    fn make(display: egl::Display) -> Result<Self> {
+        let instance = &api()?.instance;
         let fail = during::<egl::Error>("EGL context");
-        let display = candidate.display;
-        let instance = &api.instance;
+        let _door = door();
         instance.initialize(display).map_err(during("EGL initialise"))?;
         let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&fail)?.to_string_lossy();
         if !extensions.contains("EGL_KHR_surfaceless_context") {
@@ -213,9 +218,7 @@ impl Context {
             egl::NONE,
         ];
         let context = instance.create_context(display, config, None, &wanted).map_err(&fail)?;
-        let made = Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context };
-        made.make_current()?;
-        Ok(made)
+        Ok(Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context })
     }
 
     /// Makes it current on this thread unless it is so already.

@@ -202,7 +202,7 @@ mod tests {
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
         assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"]);
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
-        assert_eq!(plan.left_out[4].bytes, 20 * 2048 * 2048, "map and moments");
+        assert_eq!(plan.left_out[4].bytes, 20 * 1024 * 1024, "map and moments");
     }
 
     #[test]

@@ -50,7 +50,7 @@ pub struct Shadow {
 
 impl Default for Shadow {
     fn default() -> Self {
-        Self { size: 2048, blur: 2.0, least_variance: 2e-6, bleeding: 0.2, alpha_threshold: 0.5 }
+        Self { size: 1024, blur: 1.5, least_variance: 2e-6, bleeding: 0.2, alpha_threshold: 0.5 }
     }
 }
 

@@ -190,6 +190,23 @@ fn two_blended_layers_equal_the_arithmetic() {
 }
 
 #[test]
+fn a_blended_layer_hides_none_behind_it_that_comes_later() {
+    let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..plain(diffuse) };
+    let shown = |second: f32| {
+        let first = facing(-2.0, -2.0, 2.0, 2.0, 0.0);
+        let scene = Stage::new()
+            .add(first, layer([1.0, 0.0, 0.0]))
+            .add(facing(-2.0, -2.0, 2.0, 2.0, second), layer([0.0, 1.0, 0.0]))
+            .scene();
+        picture(&scene).at(32, 32)
+    };
+    // No depth is written, so that the later layer is blended over the earlier one wherever it is.
+    for second in [-1.0, 1.0] {
+        assert!(close(shown(second), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0), "{second}: {:?}", shown(second));
+    }
+}
+
+#[test]
 fn a_back_is_drawn_only_of_what_has_two_sides_and_its_normal_turns_to_the_viewer() {
     let from_behind = |double_sided: bool| {
         let mut stage = Stage::new();

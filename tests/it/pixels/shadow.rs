@@ -66,6 +66,15 @@ fn the_shadow_of_a_floating_square_is_ambient_only_and_goes_with_caster_or_shado
 }
 
 #[test]
+fn a_surface_in_the_shadow_keeps_its_ambient_light_and_loses_the_rest() {
+    let floor = Material { ambient: [0.9, 0.5, 0.2], specular: [0.5; 3], shininess: 1.0, ..Material::default() };
+    let shaded = aside(stage().add(lying(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+    assert!(close(shaded.at(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", shaded.at(32, 32));
+    let [r, g, b] = shaded.at(32, 8);
+    assert!(r > 190 && g > 190 && b > 190, "control: lit beside the shadow, {:?}", [r, g, b]);
+}
+
+#[test]
 fn the_shadow_of_a_cut_out_has_the_hole_too_and_an_opaque_one_has_not() {
     let cut = aside(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     assert!(close(cut.at(32, 32), ground(1.0, 0.8), 4.0), "the hole: {:?}", cut.at(32, 32));
