@@ -2,7 +2,8 @@
 
 say() { printf '\033[1m== %s\033[0m\n' "$*" >&2; }
 refuse() { printf 'modalcast: %s\n' "$*" >&2; exit 1; }
-has_library() { /sbin/ldconfig -p 2>/dev/null | grep -q "$1"; }
+# Without -q, so that grep reads to the end: a pipe closed early would look like a failure under pipefail.
+has_library() { /sbin/ldconfig -p 2>/dev/null | grep -F "$1" >/dev/null; }
 
 # Debian packages by name: installed when we are root, else named.
 need_packages() {
@@ -38,7 +39,9 @@ need_rust() {
 # OpenGL through EGL: NVIDIA's driver brings its own vendor library, Mesa's renders on the CPU.
 need_egl() {
     has_library 'libEGL.so.1' || need_packages libegl1
-    has_library 'libEGL_nvidia.so.0' || need_packages libegl-mesa0 libgl1-mesa-dri
+    has_library 'libEGL_nvidia.so.0' || has_library 'libEGL_mesa.so.0' || need_packages libegl-mesa0
+    has_library 'libEGL_nvidia.so.0' || compgen -G '/usr/lib*/**/dri/swrast_dri.so' >/dev/null ||
+        compgen -G '/usr/lib/*/dri/swrast_dri.so' >/dev/null || need_packages libgl1-mesa-dri
 }
 
 # NVRTC from the PyPI wheel, into an ignored folder that the server searches.

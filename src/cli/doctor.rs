@@ -35,7 +35,7 @@ pub(super) fn examine() -> Value {
     let cuda = gpu::probe();
     json!({
         "can_draw": renderer.is_ok(),
-        "deforms_on": if cuda.devices.is_empty() || cuda.nvrtc_problem.is_some() { "cpu" } else { "cuda" },
+        "deforms_on": if deforms_on_cuda() { "cuda" } else { "cpu" },
         "cpu_threads": std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
         "cuda": cuda,
         "renderer": renderer.as_ref().ok(),
@@ -43,6 +43,11 @@ pub(super) fn examine() -> Value {
         "egl_devices": devices.as_ref().ok(),
         "egl_problem": devices.as_ref().err().map(ToString::to_string),
     })
+}
+
+/// What `--backend auto` would choose: a device, and a compiler that fits its driver.
+fn deforms_on_cuda() -> bool {
+    gpu::Device::open(0).and_then(|device| device.check_compiler()).is_ok()
 }
 
 fn lines(report: &Value) -> Vec<String> {

@@ -2,6 +2,7 @@
 
 use serde_json::{Value, json};
 
+use super::options::working;
 use super::{Outcome, say};
 use crate::error::during;
 use crate::scene::Scene;
@@ -24,7 +25,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let scene = load::open(&args.scene)?;
+    let scene = working("loading", || load::open(&args.scene))?;
     if args.json {
         say(serde_json::to_string_pretty(&json(&scene)).map_err(during("inspect"))?);
     } else {

@@ -29,6 +29,22 @@ impl std::fmt::Display for Size {
     }
 }
 
+/// Does work that may take a while behind a spinner, which shows only on a terminal.
+pub(super) fn working<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
+    let spinner = indicatif::ProgressBar::new_spinner().with_message(what);
+    spinner.enable_steady_tick(std::time::Duration::from_millis(120));
+    let done = work();
+    spinner.finish_and_clear();
+    done
+}
+
+/// A point, written X,Y,Z.
+pub(super) fn triple(text: &str) -> Result<[f64; 3]> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
+    let triple = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+    triple.ok_or_else(|| invalid("point", "three numbers X,Y,Z", text))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -36,6 +52,8 @@ mod tests {
     #[test]
     fn sizes_are_two_numbers_and_an_x() {
         assert_eq!("1280x720".parse::<Size>(), Ok(Size { width: 1280, height: 720 }));
+        assert_eq!(triple("4, -1,.5"), Ok([4.0, -1.0, 0.5]));
+        assert!(triple("1,2").is_err() && triple("a,b,c").is_err());
         for wrong in ["1280", "1280x", "x720", "1280x-1", "1280 x 720", "1x2x3"] {
             assert!(wrong.parse::<Size>().is_err(), "{wrong}");
         }

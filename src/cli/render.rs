@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::options::Size;
+use super::options::{Size, triple, working};
 use super::{Outcome, say};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::Workbench;
@@ -32,11 +32,11 @@ pub(super) struct Args {
     #[arg(long, default_value = "1280x720")]
     size: Size,
     /// Where the camera is, in scene units; without it the camera frames the scene.
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 3, requires = "target")]
-    eye: Vec<f64>,
+    #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "target")]
+    eye: Option<[f64; 3]>,
     /// What the camera looks at.
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 3, requires = "eye")]
-    target: Vec<f64>,
+    #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
+    target: Option<[f64; 3]>,
     /// Vertical field of view in degrees.
     #[arg(long, default_value_t = 35.0)]
     field_of_view: f64,
@@ -49,7 +49,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let scene = load::open(&args.scene)?;
+    let scene = working("loading", || load::open(&args.scene))?;
     let mut state = State::rest(&scene);
     if let Some(path) = &args.q {
         state.q = coordinates(&scene, path)?;
@@ -66,7 +66,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 fn camera(args: &Args, scene: &Scene) -> Camera {
-    let (Ok(eye), Ok(target)) = (args.eye.clone().try_into(), args.target.clone().try_into()) else {
+    let (Some(eye), Some(target)) = (args.eye, args.target) else {
         return Camera::framing(scene, args.size.width, args.size.height);
     };
     let view = View::LookAt { eye, target, up: scene.up.vector().into() };
@@ -75,21 +75,23 @@ fn camera(args: &Args, scene: &Scene) -> Camera {
 
 /// Reads q and checks its shape against the scene.
 fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
-    let place = path.display().to_string();
+    let place = format!("q in {}", path.display());
     let wanted = format!("{} coordinates, all domains in order", scene.layout.coordinates);
-    let single = ndarray_npy::read_npy::<_, ndarray::ArrayD<f32>>(path);
-    let array = single.or_else(|_| {
-        ndarray_npy::read_npy::<_, ndarray::ArrayD<f64>>(path).map(|array| array.mapv(|number| number as f32))
-    });
-    let array = array.map_err(|error| invalid(format!("q in {place}"), "a .npy file of f32 or f64", error))?;
-    // A leading axis of one is what saving a single step of a trajectory leaves.
-    if array.len() != scene.layout.coordinates || array.shape().iter().filter(|side| **side != 1).count() > 1 {
-        return Err(invalid(format!("q in {place}: shape"), wanted, format!("{:?}", array.shape())));
+    let bytes = fs::metadata(path).map_err(|error| invalid(&place, "a .npy file", error))?.len();
+    // The header of a .npy file and f64 entries: nothing larger can fit.
+    let most = 8 * scene.layout.coordinates as u64 + 65536;
+    if bytes > most {
+        return Err(invalid(&place, format!("{wanted}: at most {most} bytes"), format!("{bytes} bytes")));
     }
-    match array.iter().position(|number| !number.is_finite()) {
-        None => Ok(array.iter().copied().collect()),
-        Some(at) => {
-            Err(invalid(format!("q in {place}, entry {at}"), "a finite number", format!("{:?}", array.iter().nth(at))))
-        }
+    let bytes = fs::read(path).map_err(|error| invalid(&place, "a readable file", error))?;
+    let array = load::parse_numpy(&bytes).map_err(|error| error.within(&place))?;
+    // A leading axis of one is what saving a single step of a trajectory leaves.
+    let sides = array.shape.iter().filter(|side| **side != 1).count();
+    if array.entries.len() != scene.layout.coordinates || sides > 1 {
+        return Err(invalid(format!("{place}: shape"), wanted, format!("{:?}", array.shape)));
+    }
+    match array.entries.iter().position(|number| !number.is_finite()) {
+        None => Ok(array.entries),
+        Some(at) => Err(invalid(format!("{place}, entry {at}"), "a finite number", array.entries[at])),
     }
 }

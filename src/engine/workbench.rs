@@ -139,19 +139,17 @@ fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, S
     match config.backend {
         BackendChoice::Cpu => Ok((Backend::Cpu, None, "not asked for".into())),
         BackendChoice::Reference => Ok((Backend::Reference, None, "not asked for".into())),
-        BackendChoice::Cuda => {
-            let device = gpu::Device::open(config.cuda_device)?;
-            let name = device.name().to_owned();
-            Ok((Backend::Cuda, Some(device), name))
-        }
-        BackendChoice::Auto => Ok(match gpu::Device::open(config.cuda_device) {
-            Ok(device) => {
-                let name = device.name().to_owned();
-                (Backend::Cuda, Some(device), name)
-            }
-            Err(error) => (Backend::Cpu, None, error.to_string()),
-        }),
+        BackendChoice::Cuda => open_cuda(config),
+        BackendChoice::Auto => open_cuda(config).or_else(|error| Ok((Backend::Cpu, None, error.to_string()))),
     }
+}
+
+/// A device that deforms: one without a compiler for its kernels does not count.
+fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
+    let device = gpu::Device::open(config.cuda_device)?;
+    device.check_compiler()?;
+    let name = device.name().to_owned();
+    Ok((Backend::Cuda, Some(device), name))
 }
 
 fn open_renderer(config: &Config, cuda: bool) -> Result<Renderer> {

@@ -251,8 +251,8 @@ fn candidates() -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> = ["libnvrtc.so.13", "libnvrtc.so"].map(PathBuf::from).into();
     let beside = std::env::current_exe().ok();
     let above = beside.iter().flat_map(|exe| exe.ancestors().skip(1).take(4));
-    let here = std::env::current_dir().ok();
-    for folder in here.iter().map(PathBuf::as_path).chain(above) {
+    // Never the working directory: starting the server somewhere must not run what lies there.
+    for folder in above {
         find_below(&folder.join(".tools/nvrtc"), 5, &mut found);
     }
     for toolkit in entries(Path::new("/usr/local")) {

@@ -43,12 +43,39 @@ fn module_of(path: &Path) -> String {
     first.trim_end_matches(".rs").to_owned()
 }
 
-/// Every `crate::name` of a text outside its comments.
+/// Every module that a text names as `crate::name` or in `crate::{...}`, outside its comments.
 fn uses(text: &str) -> BTreeSet<String> {
-    let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
-    let words = code.flat_map(|line| line.split("crate::").skip(1).map(str::to_owned).collect::<Vec<_>>());
-    let name = |rest: String| rest.chars().take_while(|letter| letter.is_alphanumeric() || *letter == '_').collect();
-    words.map(name).filter(|name: &String| !name.is_empty()).collect()
+    let code: Vec<&str> = text.lines().filter(|line| !line.trim_start().starts_with("//")).collect();
+    let name = |rest: &str| -> String {
+        rest.trim_start().chars().take_while(|letter| letter.is_alphanumeric() || *letter == '_').collect()
+    };
+    let code = code.join("\n");
+    let names = code.split("crate::").skip(1).flat_map(|rest| match rest.strip_prefix('{') {
+        Some(group) => first_names(group).into_iter().map(name).collect::<Vec<_>>(),
+        None => vec![name(rest)],
+    });
+    names.filter(|name| !name.is_empty()).collect()
+}
+
+/// The entries of a group import up to its closing brace, without what is nested in them.
+fn first_names(group: &str) -> Vec<&str> {
+    let (mut depth, mut begin, mut entries) = (0, 0, Vec::new());
+    for (at, letter) in group.char_indices() {
+        match letter {
+            '{' => depth += 1,
+            '}' if depth == 0 => {
+                entries.push(&group[begin..at]);
+                break;
+            }
+            '}' => depth -= 1,
+            ',' if depth == 0 => {
+                entries.push(&group[begin..at]);
+                begin = at + 1;
+            }
+            _ => {}
+        }
+    }
+    entries
 }
 
 /// What a module uses without leave.
@@ -96,6 +123,8 @@ fn provoked_faults_are_seen() {
     let table = table("//! | `low` | x | |\n//! | `high` | x | `low` |\n");
     assert_eq!(illegal("high", "use crate::low::Thing;", &table), Vec::<String>::new());
     assert_eq!(illegal("low", "use crate::high::Thing;", &table), ["low uses high"]);
+    assert_eq!(illegal("low", "use crate::{\n    own::{A, B},\n    high,\n};", &table), ["low uses high"]);
+    assert_eq!(illegal("low", "use crate::{own::{high}, error};", &table), Vec::<String>::new());
     assert_eq!(illegal("stray", "", &table), ["stray is not in the table"]);
     assert_eq!(illegal("low", "use modalcast_proto::v1;", &table), ["low names proto"]);
 }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use super::super::options::working;
 use crate::error::Result;
 use crate::load;
 use crate::scene::Scene;
@@ -21,7 +22,7 @@ pub(super) struct Input {
 impl Input {
     /// Finds a scene by built-in name or path.
     pub(super) fn find(source: &str) -> Result<Self> {
-        let scene = load::open(source)?;
+        let scene = working("loading", || load::open(source))?;
         let path = Path::new(source);
         let Some(path) = path.canonicalize().ok().filter(|_| path.exists()) else {
             return Ok(Self { scene, source: source.into(), repository: None, cubic: None, vega_config: None });
@@ -30,7 +31,8 @@ impl Input {
         let folder = if path.is_dir() { path.clone() } else { path.parent().unwrap_or(&path).to_path_buf() };
         Ok(Self {
             scene,
-            source: name,
+            // With "./" it is a path, even where a built-in scene has that name.
+            source: format!("./{name}"),
             repository: path.parent().map(Path::to_path_buf),
             cubic: only_file(&folder, "cub"),
             vega_config: only_file(&folder, "config"),

@@ -7,16 +7,18 @@ mod verdict;
 
 use std::fs;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::ValueEnum as _;
 
 use super::options::Size;
+use super::options::working;
 use super::{Outcome, say};
 use crate::config::BackendChoice;
 use crate::error::{Result, during};
 use input::Input;
 use processes::{Process, program};
+use verdict::Verdict;
 
 /// Drives a scene with a physics process, fetches its frames and vertices over the network, and checks them.
 #[derive(Debug, clap::Args)]
@@ -29,7 +31,7 @@ pub(super) struct Args {
     #[arg(long, default_value = "tree")]
     scene: String,
     /// How many steps to drive, and frames to save.
-    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(2..=100_000))]
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(2..=1000))]
     frames: u32,
     /// The size of the frames in pixels.
     #[arg(long, default_value = "1280x720")]
@@ -46,19 +48,17 @@ pub(super) struct Args {
     /// Where to write the table as JSON too.
     #[arg(long)]
     report: Option<PathBuf>,
-    /// How long the whole run may take, in seconds.
-    #[arg(long, default_value_t = 600)]
+    /// How long the processes may take in all, in seconds.
+    #[arg(long, default_value_t = 600, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     timeout: u64,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
     let input = Input::find(&args.scene)?;
-    let scratch = tempfile_folder()?;
-    let outcome = drive(args, &input, scratch.as_path());
-    // What the processes left behind is worthless once they have ended.
-    fs::remove_dir_all(&scratch).ok();
-    let ran = outcome?;
-    let verdict = verdict::Verdict::of(&input.scene, &ran, args.frames)?;
+    // What the processes leave here is worthless once they have ended, and goes with the folder.
+    let scratch = tempfile::tempdir().map_err(during("demo"))?;
+    let ran = drive(args, &input, scratch.path())?;
+    let verdict = working("comparing with the f64 reference", || Verdict::of(&input.scene, &ran, args.frames))?;
     for line in verdict.table() {
         say(line);
     }
@@ -67,11 +67,11 @@ pub(super) fn run(args: &Args) -> Outcome {
         fs::write(path, text + "\n").map_err(during("demo"))?;
     }
     say(format!("frames in {}", args.out.display()));
-    Ok(verdict.passed())
+    Ok(verdict.broken().is_empty())
 }
 
 /// The verdict with what it was measured on and how, to be kept.
-fn record(verdict: &verdict::Verdict) -> serde_json::Value {
+fn record(verdict: &Verdict) -> serde_json::Value {
     let command: Vec<String> = std::env::args().skip(1).collect();
     serde_json::json!({
         "command": format!("modalcast {}", command.join(" ")),
@@ -97,11 +97,11 @@ struct Ran {
 }
 
 fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
-    let patience = Duration::from_secs(args.timeout);
+    let end = Instant::now() + Duration::from_secs(args.timeout);
     let (count, dt) = (args.frames.to_string(), args.dt.to_string());
     clear_frames(&args.out)?;
     let mut server = Process::start("server", &program("modalcast")?, &server_flags(args, input, scratch))?;
-    let url = server.wait_for("listening on ", patience)?;
+    let url = server.wait_for("listening on ", end)?;
     let common = ["--server", url.as_str(), "--scene", "demo"];
 
     let out = args.out.to_string_lossy();
@@ -109,12 +109,12 @@ fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
     let mut flags = vec!["frames", "--open", input.source.as_str(), "--count", &count, "--size", &size, "--json"];
     flags.extend(["--delivery", "lossless", "--out", &out]);
     let mut frames = Process::start("fetch", &program("modalcast-fetch")?, &[&flags[..], &common].concat())?;
-    frames.wait_for("ready", patience)?;
+    frames.wait_for("ready", end)?;
 
     let vertices_file = scratch.join("vertices.npy").to_string_lossy().into_owned();
     let flags = ["vertices", "--count", &count, "--delivery", "lossless", "--out", &vertices_file, "--json"];
     let mut vertices = Process::start("vertices", &program("modalcast-fetch")?, &[&flags[..], &common].concat())?;
-    vertices.wait_for("ready", patience)?;
+    vertices.wait_for("ready", end)?;
 
     let record = scratch.join("record").to_string_lossy().into_owned();
     let mut flags = vec!["auto", "--steps", &count, "--dt", &dt, "--policy", "lossless", "--record", &record, "--json"];
@@ -128,11 +128,11 @@ fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
     }
     let sim = Process::start("physics", &program("modalcast-sim")?, &[&flags[..], &common].concat())?;
 
-    let sim = sim.finish(patience)?;
-    let frames = frames.finish(patience)?;
-    vertices.finish(patience)?;
+    let sim = sim.finish(end)?;
+    let frames = frames.finish(end)?;
+    vertices.finish(end)?;
     let told = Process::start("info", &program("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
-    let told = told.finish(patience)?;
+    let told = told.finish(end)?;
     server.stop();
     let record = scratch.join("record");
     Ok(Ran {
@@ -161,23 +161,38 @@ fn read<D: ndarray::Dimension>(path: &std::path::Path) -> Result<ndarray::Array<
     ndarray_npy::read_npy(path).map_err(|error| during("demo")(format!("{}: {error}", path.display())))
 }
 
-/// A fresh folder for what the processes exchange.
-fn tempfile_folder() -> Result<PathBuf> {
-    let folder = std::env::temp_dir().join(format!("modalcast-demo-{}", std::process::id()));
-    fs::create_dir_all(&folder).map_err(during("demo"))?;
-    Ok(folder)
-}
-
-/// PNG files in the output folder, sorted.
+/// The frames of a demo in a folder: `frame_00000.png` and so on, and nothing else that may lie there.
 fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
     let entries = fs::read_dir(folder).map_err(during("demo"))?;
     let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
-    files.retain(|path| path.extension().is_some_and(|ending| ending == "png"));
-    files.sort();
+    files.retain(|path| path.file_name().is_some_and(|name| is_frame(&name.to_string_lossy())));
     Ok(files)
+}
+
+/// Whether `modalcast-fetch frames` gives a file this name.
+fn is_frame(name: &str) -> bool {
+    let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".png"));
+    number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|digit| digit.is_ascii_digit()))
 }
 
 fn clear_frames(folder: &std::path::Path) -> Result<()> {
     fs::create_dir_all(folder).map_err(during("demo"))?;
     frame_files(folder)?.iter().try_for_each(fs::remove_file).map_err(during("demo"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_frames_of_a_demo_are_replaced() {
+        let folder = tempfile::tempdir().expect("a folder");
+        for name in ["frame_00000.png", "frame_100000.png", "holiday.png", "frame_1.png", "frame_00001.jpg"] {
+            fs::write(folder.path().join(name), b"x").expect("written");
+        }
+        assert_eq!(frame_files(folder.path()).expect("listed").len(), 2);
+        clear_frames(folder.path()).expect("cleared");
+        let left = fs::read_dir(folder.path()).expect("listed").count();
+        assert_eq!(left, 3, "what is no frame stays");
+    }
 }

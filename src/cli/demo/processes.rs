@@ -6,6 +6,8 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process};
+
 use crate::error::{Error, Result, during};
 
 /// Lines that a child may be ahead of us. A child that prints more waits, which harms nobody here.
@@ -30,6 +32,7 @@ pub(super) struct Process {
     name: &'static str,
     child: Child,
     lines: Receiver<String>,
+    begin: Instant,
 }
 
 impl Process {
@@ -50,12 +53,11 @@ impl Process {
                 }
             }
         });
-        Ok(Self { name, child, lines })
+        Ok(Self { name, child, lines, begin: Instant::now() })
     }
 
     /// Waits for a line with this beginning and returns the rest of it.
-    pub(super) fn wait_for(&mut self, beginning: &str, patience: Duration) -> Result<String> {
-        let end = Instant::now() + patience;
+    pub(super) fn wait_for(&mut self, beginning: &str, end: Instant) -> Result<String> {
         loop {
             let line = self.next_line(end, beginning)?;
             if let Some(rest) = line.strip_prefix(beginning) {
@@ -65,8 +67,7 @@ impl Process {
     }
 
     /// Waits for the end and returns the last line, which is JSON.
-    pub(super) fn finish(mut self, patience: Duration) -> Result<serde_json::Value> {
-        let end = Instant::now() + patience;
+    pub(super) fn finish(mut self, end: Instant) -> Result<serde_json::Value> {
         let mut last = String::new();
         while let Some(line) = self.line_or_end(end, "its end")? {
             last = line;
@@ -80,8 +81,9 @@ impl Process {
 
     /// Asks the child to end, as Ctrl-C would, and waits a little before insisting.
     pub(super) fn stop(&mut self) {
-        let pid = self.child.id().to_string();
-        Command::new("kill").args(["-TERM", &pid]).status().ok();
+        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
+            kill_process(pid, Signal::TERM).ok(); // It has ended already, then.
+        }
         let end = Instant::now() + Duration::from_secs(15);
         while Instant::now() < end && matches!(self.child.try_wait(), Ok(None)) {
             std::thread::sleep(Duration::from_millis(20));
@@ -100,7 +102,8 @@ impl Process {
             Ok(line) => Ok(Some(line)),
             Err(RecvTimeoutError::Disconnected) => Ok(None),
             Err(RecvTimeoutError::Timeout) => {
-                Err(Error::Deadline { what: format!("'{what}' of {}", self.name), ms: 0 })
+                let ms = u64::try_from(self.begin.elapsed().as_millis()).unwrap_or(u64::MAX);
+                Err(Error::Deadline { what: format!("'{what}' of {}", self.name), ms })
             }
         }
     }
