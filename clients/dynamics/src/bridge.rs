@@ -1,12 +1,12 @@
 //! A span under a pulsating load to its coordinates: reduced StVK forces under implicit Newmark.
 //!
-//! The load pulls the middle of the span down, spread evenly over the vertices there; its strength is calibrated so
-//! that the equilibrium under it deflects by a wanted share of the diagonal. The run begins in that equilibrium and the
+//! The load pushes the middle of the span, spread evenly over the vertices there; its strength is calibrated so that
+//! the equilibrium under it deflects by a wanted share of the diagonal. The run begins in that equilibrium and the
 //! load then goes up and down as (1 + cos) / 2.
 
 use std::f64::consts::TAU;
 
-use nalgebra::DVector;
+use nalgebra::{DVector, Vector3};
 use serde_json::json;
 
 use crate::affine::Affine;
@@ -26,6 +26,17 @@ pub struct Options {
     pub deflection: f64,
     /// Seconds per pulse.
     pub period: f64,
+    pub toward: Toward,
+}
+
+/// Where the load pushes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Toward {
+    /// Like a wind: across the span, with a lift of 0.3 of it.
+    Across,
+    /// Like a weight. A span near the ground then dips below the ground plane of a picture.
+    Down,
+    Up,
 }
 
 /// The span.
@@ -55,7 +66,7 @@ impl Bridge {
         let ranks = || format!("{:?}", model.parts.iter().map(|part| part.rank).collect::<Vec<_>>());
         let part = part.ok_or_else(|| invalid("scene", format!("a domain of rank {rank}"), ranks()))?;
         let system = System::new(force, settings)?;
-        let direction = pull(&model, &model.parts[part])?;
+        let direction = pull(&model, &model.parts[part], options.toward)?;
         let wanted = options.deflection * model.diagonal();
         let (strength, q) = calibrate(&system, &model.parts[part], &direction, wanted)?;
         let load = direction * strength;
@@ -96,9 +107,12 @@ impl Scenario for Bridge {
 
     fn report(&self) -> Report {
         let load = format!(
-            "a force of {:.4} (reduced mass 1) on the middle tenth of the span, downwards, pulsating every {} s; it holds \
-             the span at {:.4} of the diagonal, where the run begins",
-            self.strength, self.options.period, self.still,
+            "a force of {:.4} (reduced mass 1) on the middle tenth of the span, {}, pulsating every {} s; it holds the \
+             span at {:.4} of the diagonal, where the run begins",
+            self.strength,
+            self.options.toward.words(),
+            self.options.period,
+            self.still,
         );
         Report::from_iter([
             ("load".to_owned(), json!(load)),
@@ -109,18 +123,36 @@ impl Scenario for Bridge {
     }
 }
 
-/// U^T of a unit force that pulls down, spread over the middle tenth of the longer horizontal axis (or over the whole
+impl Toward {
+    const fn words(self) -> &'static str {
+        match self {
+            Self::Across => "across it with a lift of 0.3",
+            Self::Down => "downwards",
+            Self::Up => "upwards",
+        }
+    }
+
+    fn direction(self, model: &Model) -> Vector3<f64> {
+        match self {
+            Self::Across => (model.ground_axes().1 + 0.3 * model.up).normalize(),
+            Self::Down => -model.up,
+            Self::Up => model.up,
+        }
+    }
+}
+
+/// U^T of a unit force, spread over the middle tenth of the longer horizontal axis (or over the whole
 /// part, when nothing there can move).
-fn pull(model: &Model, part: &Part) -> Result<DVector<f64>> {
+fn pull(model: &Model, part: &Part, toward: Toward) -> Result<DVector<f64>> {
     let (axis, _) = model.ground_axes();
-    let along = |rest: &nalgebra::Vector3<f64>| part.placement.apply(rest).dot(&axis);
+    let along = |rest: &Vector3<f64>| part.placement.apply(rest).dot(&axis);
     let places = || part.samples.iter().map(|sample| along(&sample.rest));
     let (low, high) = places().fold((f64::MAX, f64::MIN), |(low, high), at| (low.min(at), high.max(at)));
-    let down = -(part.placement.linear.transpose() * model.up);
+    let push = part.placement.linear.transpose() * toward.direction(model);
     let of = |near: f64| {
         let near = |at: f64| (at - 0.5 * (low + high)).abs() <= near * (high - low);
         let chosen: Vec<_> = part.samples.iter().filter(|sample| near(along(&sample.rest))).collect();
-        let sum = |mode| chosen.iter().map(|sample| sample.column(mode, part.rank).dot(&down)).sum::<f64>();
+        let sum = |mode| chosen.iter().map(|sample| sample.column(mode, part.rank).dot(&push)).sum::<f64>();
         DVector::from_fn(part.rank, |mode, _| sum(mode) / chosen.len().max(1) as f64)
     };
     let force = Some(of(0.05)).filter(|force| force.norm() > 0.0).unwrap_or_else(|| of(1.0));
@@ -171,7 +203,7 @@ mod tests {
         Bridge::new(plant(), chain(&[40.0, 90.0], 30.0, 4.0), &Settings::default(), options).expect("valid")
     }
 
-    const OPTIONS: Options = Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0 };
+    const OPTIONS: Options = Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0, toward: Toward::Across };
 
     #[test]
     fn the_run_begins_at_the_wanted_deflection_and_moves() {

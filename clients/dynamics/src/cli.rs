@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use modalcast_client::Policy;
+use modalcast_dynamics::bridge::Toward;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -162,6 +163,26 @@ pub(crate) struct Load {
     /// Seconds per pulse.
     #[arg(long, default_value_t = 2.0, value_parser = positive)]
     pub(crate) period: f64,
+    /// Where it pushes: across the span with some lift (a wind), down (a weight), or up.
+    #[arg(long, value_enum, default_value = "across")]
+    pub(crate) toward: TowardOption,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(crate) enum TowardOption {
+    Across,
+    Down,
+    Up,
+}
+
+impl From<TowardOption> for Toward {
+    fn from(option: TowardOption) -> Self {
+        match option {
+            TowardOption::Across => Self::Across,
+            TowardOption::Down => Self::Down,
+            TowardOption::Up => Self::Up,
+        }
+    }
 }
 
 impl Command {

@@ -96,7 +96,8 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
         }
         Command::Bridge { files, load, .. } => {
             let model = Model::learn(client, scene, WATCHED).await?;
-            let options = BridgeOptions { dt, deflection: load.deflection, period: load.period };
+            let options =
+                BridgeOptions { dt, deflection: load.deflection, period: load.period, toward: load.toward.into() };
             bridge(model, files, options)
         }
         Command::Sweep { share, .. } => {
