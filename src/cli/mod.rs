@@ -7,6 +7,8 @@ mod options;
 mod render;
 mod serve;
 
+use std::io::Write as _;
+
 use clap::{Parser, Subcommand};
 
 use crate::error::Error;
@@ -72,9 +74,13 @@ fn exit_code(error: &Error) -> u8 {
 }
 
 /// Prints a line of a command's result. The only way to standard output, so that logs never mix with results.
-#[expect(clippy::print_stdout, reason = "results of commands go to standard output")]
 fn say(line: impl std::fmt::Display) {
-    println!("{line}");
+    if let Err(error) = writeln!(std::io::stdout(), "{line}")
+        && error.kind() != std::io::ErrorKind::BrokenPipe
+    {
+        // A reader that has seen enough is no fault; a full disk is worth a word.
+        eprintln!("modalcast: standard output: {error}");
+    }
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use super::options::{Size, triple, working};
 use super::{Outcome, say};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::Workbench;
-use crate::error::{Result, during, invalid};
+use crate::error::{Error, Result, invalid};
 use crate::frame;
 use crate::load;
 use crate::scene::{Camera, Lens, Scene, State, View};
@@ -37,9 +37,9 @@ pub(super) struct Args {
     /// What the camera looks at.
     #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
     target: Option<[f64; 3]>,
-    /// Vertical field of view in degrees.
-    #[arg(long, default_value_t = 35.0)]
-    field_of_view: f64,
+    /// Vertical field of view in degrees; 35 without it.
+    #[arg(long, requires = "eye")]
+    field_of_view: Option<f64>,
     /// Which deformer to use.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendChoice,
@@ -59,7 +59,8 @@ pub(super) fn run(args: &Args) -> Outcome {
     staged.deform(&Arc::new(state))?;
     let image = bench.draw(&mut staged, &camera(args, &scene), args.size.width, args.size.height)?;
     let bytes = frame::png(image.width, image.height, &image.rgba)?;
-    fs::write(&args.out, bytes).map_err(during("write"))?;
+    let place = format!("--out {}", args.out.display());
+    fs::write(&args.out, bytes).map_err(|error| invalid(place, "a file that can be written", error))?;
     bench.unstage(staged);
     say(format!("{} ({}, {})", args.out.display(), args.size, bench.backend().name()));
     Ok(true)
@@ -70,13 +71,16 @@ fn camera(args: &Args, scene: &Scene) -> Camera {
         return Camera::framing(scene, args.size.width, args.size.height);
     };
     let view = View::LookAt { eye, target, up: scene.up.vector().into() };
-    Camera { view, lens: Lens::FieldOfView(args.field_of_view), near: 0.0, far: 0.0 }
+    Camera { view, lens: Lens::FieldOfView(args.field_of_view.unwrap_or(35.0)), near: 0.0, far: 0.0 }
 }
 
 /// Reads q and checks its shape against the scene.
 fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
     let place = format!("q in {}", path.display());
     let wanted = format!("{} coordinates, all domains in order", scene.layout.coordinates);
+    if !path.exists() {
+        return Err(Error::NotFound { what: "q", given: path.display().to_string() });
+    }
     let bytes = fs::metadata(path).map_err(|error| invalid(&place, "a .npy file", error))?.len();
     // The header of a .npy file and f64 entries: nothing larger can fit.
     let most = 8 * scene.layout.coordinates as u64 + 65536;

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser as _;
-use modalcast_client::{Client, Error as ClientError};
+use modalcast_client::{Client, Code, Error as ClientError};
 use modalcast_dynamics::bridge::{Bridge, Options as BridgeOptions};
 use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::model::Model;
@@ -48,8 +48,8 @@ fn main() -> ExitCode {
 /// The documented exit code of an error.
 const fn code(error: &Error) -> u8 {
     match error {
+        Error::Client(ClientError::Connect { .. } | ClientError::Refused { code: Code::Unavailable, .. }) => 3,
         Error::Client(ClientError::Refused { .. } | ClientError::Rejected(_)) => 1,
-        Error::Client(ClientError::Connect { .. }) => 3,
         Error::Client(ClientError::File { .. }) => 4,
         Error::Client(_) | Error::Invalid { .. } => 5,
     }
@@ -65,9 +65,8 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
     let mut scenario = scenario(&client, &scene, &arguments.command).await?;
     let (stopper, stop) = watch::channel(false);
     tokio::spawn(async move {
-        if tokio::signal::ctrl_c().await.is_ok() {
-            stopper.send_replace(true);
-        }
+        told_to_stop().await;
+        stopper.send_replace(true);
         // The first interrupt ends the run in order; a second one does not wait for a server that has stalled.
         if tokio::signal::ctrl_c().await.is_ok() {
             std::process::exit(130);
@@ -82,6 +81,19 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
         record: common.record.clone(),
     };
     run(&client, scenario.as_mut(), &options, &stop).await
+}
+
+/// Ctrl-C or SIGTERM.
+async fn told_to_stop() {
+    use tokio::signal::unix::{SignalKind, signal};
+    let Ok(mut terminate) = signal(SignalKind::terminate()) else {
+        tokio::signal::ctrl_c().await.ok(); // Without a signal to wait for the run ends by itself.
+        return;
+    };
+    tokio::select! {
+        _ = tokio::signal::ctrl_c() => {}
+        _ = terminate.recv() => {}
+    }
 }
 
 async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box<dyn Scenario>> {

@@ -77,8 +77,12 @@ impl Sway {
     /// Calibrates the wind to the tree.
     ///
     /// # Errors
-    /// `Invalid` when an eigenvalue or a damping ratio cannot be used.
+    /// `Invalid` when there is no eigenvalue, or one or a damping ratio cannot be used.
     pub fn new(model: Model, options: Options) -> Result<Self> {
+        if model.parts.iter().all(|part| part.eigenvalues.is_empty()) {
+            let given = format!("{} domains without any; try the sweep", model.parts.len());
+            return Err(invalid("scene.eigenvalues", "a domain whose modes have eigenvalues", given));
+        }
         let along = model.horizontal(options.direction);
         let wind = Wind { seed: options.seed, along, across: model.up.cross(&along), delay: 0.25 / model.height() };
         let modes = oscillators(&model, options.dt)?;

@@ -19,14 +19,15 @@ pub struct Client {
 }
 
 impl Client {
-    /// Connects, or says why not within five seconds. `url` is `http://host:port`.
+    /// Connects, or says why not within five seconds. `url` is `http://host:port`, or `host:port`.
     ///
     /// # Errors
     /// `Connect` when the URL is none or nobody answers.
     pub async fn connect(url: &str) -> Result<Self> {
         let refused = |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: chain(&fault) };
         // An unread stream may fill its own window but never the connection's, or every other call would wait too.
-        let endpoint = Endpoint::from_shared(url.to_owned())
+        let whole = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        let endpoint = Endpoint::from_shared(whole)
             .map_err(refused)?
             .connect_timeout(Duration::from_secs(5))
             .initial_stream_window_size(1 << 20)

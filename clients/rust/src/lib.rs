@@ -20,6 +20,7 @@ pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};
 pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
 pub use step::Step;
+pub use tonic::Code;
 pub use vertices::{VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
 
 /// The project's README shows a client; here it is compiled.

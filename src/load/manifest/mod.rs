@@ -8,16 +8,20 @@
 //! transforms = "rigid"       # a promise that no step shears or scales; else "affine"
 //! shadows = true             # false: no shadow map
 //! ground = true              # false: no ground plane
-//! look.sunlight = [1.0, 0.9, 0.8]
+//! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
+//! look.shadow = { size = 2048, blur = 2.0 }   # and least_variance, bleeding, alpha_threshold
 //!
 //! model = "fern_02.glb"      # a scene of one model, or a [[domain]] for each of several
 //! modes = "fern.npy"         # U of a model of one domain; "" for none
 //! placement = { translation = [0, 0, 0], axis = [0, 1, 0], degrees = 90, scale = 2.0 }
 //!
-//! [material."*"]             # a material's name, or * for all
-//! colour_texture = "leaf.png"
-//! alpha_mode = "mask"
+//! [material."*"]             # a material's name, or * for all; what is missing stays as the model has it
+//! diffuse = [0.8, 0.1, 0.1]  # linear, 0 to 1; ambient follows unless it is given
+//! specular = [0.2, 0.2, 0.2] # and shininess, alpha
+//! colour_texture = "leaf.png"   # "" takes it away; normal_texture likewise
+//! alpha_mode = "mask"        # opaque, mask or blend
 //! cutoff = 0.5
+//! double_sided = true
 //!
 //! [[domain]]                 # models that are named twice are instances: they share mesh and U
 //! name = "branch"

@@ -67,7 +67,8 @@ impl Patch {
             (AlphaMode::Mask { .. }, Some(cutoff)) => AlphaMode::Mask { cutoff },
             (_, Some(cutoff)) => return Err(invalid(place("cutoff"), "the alpha_mode mask with it", cutoff)),
         };
-        material.ambient = self.ambient.unwrap_or(material.ambient);
+        // A colour that is meant to be seen is meant in the shade too.
+        material.ambient = self.ambient.or(self.diffuse).unwrap_or(material.ambient);
         material.diffuse = self.diffuse.unwrap_or(material.diffuse);
         material.specular = self.specular.unwrap_or(material.specular);
         material.shininess = self.shininess.unwrap_or(material.shininess);

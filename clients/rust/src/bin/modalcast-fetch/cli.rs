@@ -50,6 +50,12 @@ pub(crate) enum Command {
     Info,
     /// Open scenes, and what could be opened.
     List,
+    /// Close a scene; the files of an uploaded one are removed.
+    Close {
+        /// The scene's name on the server.
+        #[arg(long)]
+        scene: String,
+    },
 }
 
 /// Which scene.
@@ -81,9 +87,9 @@ pub(crate) struct PictureOptions {
     /// Which way is up for the camera.
     #[arg(long, value_name = "X,Y,Z", value_parser = triple, default_value = "0,1,0", allow_hyphen_values = true)]
     up: [f64; 3],
-    /// Vertical field of view in degrees.
-    #[arg(long, default_value_t = 40.0)]
-    fov: f64,
+    /// Vertical field of view in degrees; 35 without it.
+    #[arg(long, requires = "camera_eye")]
+    fov: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -95,7 +101,7 @@ pub(crate) enum FormatOption {
 impl PictureOptions {
     pub(crate) fn picture(&self) -> Picture {
         let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
-        let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov), clip: None });
+        let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
         let format = match self.format {
             FormatOption::Png => Format::Png,
             FormatOption::Raw => Format::Rgba,

@@ -35,8 +35,8 @@ fn main() -> ExitCode {
 /// The documented exit code of an error.
 const fn code(error: &Error) -> u8 {
     match error {
+        Error::Connect { .. } | Error::Refused { code: modalcast_client::Code::Unavailable, .. } => 3,
         Error::Refused { .. } | Error::Rejected(_) => 1,
-        Error::Connect { .. } => 3,
         Error::File { .. } => 4,
         Error::Malformed { .. } | Error::Ended { .. } | Error::Deadline { .. } => 5,
     }
@@ -51,5 +51,6 @@ async fn run(arguments: &Arguments) -> Result<()> {
         Command::Vertices(options) => vertices::fetch(&client, options, json).await,
         Command::Info => output::info(&client, json).await,
         Command::List => output::list(&client, json).await,
+        Command::Close { scene } => client.delete_scene(scene).await,
     }
 }
