@@ -60,8 +60,9 @@ pub struct Config {
     /// The largest upload of one scene, and its number of files.
     pub upload_bytes: u64,
     pub upload_files: u32,
-    /// How long a request waits that names no deadline.
+    /// How long a request waits that names no deadline, and the longest that any waits.
     pub deadline: Duration,
+    pub longest_deadline: Duration,
     /// Frame and vertex streams per scene, and single requests waiting on one scene.
     pub subscribers: usize,
     pub waiting: usize,
@@ -96,6 +97,7 @@ impl Default for Config {
             upload_bytes: 4 << 30,
             upload_files: 4096,
             deadline: Duration::from_secs(30),
+            longest_deadline: Duration::from_secs(600),
             subscribers: 32,
             waiting: 64,
             stall: Duration::from_secs(30),
@@ -138,7 +140,8 @@ impl Config {
         number("subscribers", self.subscribers as u64, 1, 4096)?;
         number("waiting", self.waiting as u64, 1, 65536)?;
         number("connections", self.connections as u64, 1, 65536)?;
-        number("deadline (ms)", ms(self.deadline), 1, HOUR)?;
+        number("longest_deadline (ms)", ms(self.longest_deadline), 1, HOUR)?;
+        number("deadline (ms)", ms(self.deadline), 1, ms(self.longest_deadline))?;
         number("stall (ms)", ms(self.stall), 1, HOUR)?;
         number("drain (ms)", ms(self.drain), 1, HOUR)?;
         number("first_byte (ms)", ms(self.first_byte), 1, HOUR)?;

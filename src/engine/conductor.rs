@@ -7,7 +7,7 @@ use std::time::Instant;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::keep::Keeper;
-use super::lane::{Lane, Policy, Waiting};
+use super::lane::{Lane, Place, Policy, Waiting};
 use super::viewer::{Delivery, Shown, StepName, View, Viewer};
 use super::worker::{SceneId, Worker};
 use crate::config::Config;
@@ -34,7 +34,7 @@ pub(super) struct Ask {
 
 /// What a scene can be told. The queue is bounded; whoever finds it full hears `Busy`.
 pub(super) enum Message {
-    Drive { who: String, policy: Policy, window: u32, reply: oneshot::Sender<Result<(Arc<Lane>, u64)>> },
+    Drive { who: String, policy: Policy, window: u32, reply: oneshot::Sender<Result<(Place, u64)>> },
     Watch { viewer: Viewer, reply: oneshot::Sender<Result<()>> },
     Ask(Ask),
     Stop { error: Error, done: oneshot::Sender<()> },
@@ -187,9 +187,7 @@ impl Conductor {
         // An ignored result below means: the asker has gone, and its answer goes with it.
         match message {
             Message::Drive { who, policy, window, reply } => {
-                if let Err(Ok((lane, _))) = reply.send(self.admit(who, policy, window)) {
-                    lane.close();
-                }
+                reply.send(self.admit(who, policy, window)).ok();
             }
             Message::Watch { viewer, reply } => {
                 reply.send(self.seat(viewer)).ok();
@@ -209,7 +207,7 @@ impl Conductor {
     }
 
     /// One writer at a time; a dead one makes room.
-    fn admit(&mut self, who: String, policy: Policy, window: u32) -> Result<(Arc<Lane>, u64)> {
+    fn admit(&mut self, who: String, policy: Policy, window: u32) -> Result<(Place, u64)> {
         if let Some(writer) = self.writer.as_ref().filter(|writer| !writer.lane.is_closed()) {
             let seconds = writer.since.elapsed().as_secs();
             let holder = format!("{} has driven run {} for {seconds} s", writer.who, self.run);
@@ -218,7 +216,7 @@ impl Conductor {
         self.run += 1;
         let lane = Arc::new(Lane::new(policy, window, Arc::clone(&self.wake)));
         self.writer = Some(Writer { lane: Arc::clone(&lane), who, since: Instant::now() });
-        Ok((lane, self.run))
+        Ok((Place(lane), self.run))
     }
 
     fn seat(&mut self, mut viewer: Viewer) -> Result<()> {

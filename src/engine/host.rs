@@ -8,7 +8,7 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::conductor::{Ask, Beginning, Conductor, Means, Message, Which};
-use super::lane::{Lane, Policy, Report, Waiting};
+use super::lane::{Place, Policy, Report, Waiting};
 use super::ledger::Origin;
 use super::viewer::{Delivery, Feed, Shown, StepName, View};
 use super::worker::SceneId;
@@ -81,8 +81,8 @@ impl Host {
     /// `Taken` with who holds the place and since when; `NotFound` when the scene has been closed.
     pub async fn drive(&self, who: String, policy: Policy, window: u32) -> Result<Drive> {
         let window = window.clamp(1, self.largest_window);
-        let (lane, run) = self.tell(|reply| Message::Drive { who, policy, window, reply }).await?;
-        Ok(Drive { lane, scene: Arc::clone(&self.scene), run, window, policy, last: None })
+        let (place, run) = self.tell(|reply| Message::Drive { who, policy, window, reply }).await?;
+        Ok(Drive { place, scene: Arc::clone(&self.scene), run, window, policy, last: None })
     }
 
     /// Subscribes to the scene's steps. When this returns, the subscription holds.
@@ -141,7 +141,7 @@ impl Host {
 /// The writer's place of a scene; dropping it makes room for the next writer.
 #[derive(Debug)]
 pub struct Drive {
-    lane: Arc<Lane>,
+    place: Place,
     scene: Arc<Scene>,
     /// Counts the writers of the scene.
     pub run: u64,
@@ -163,7 +163,7 @@ impl Drive {
             return Err(invalid("step.number", format!("a number above {last}"), raw.number));
         }
         let update = Update::parse(&self.scene, raw)?;
-        self.lane.offer(Waiting::new(update, ms_since(begin)))?;
+        self.place.0.offer(Waiting::new(update, ms_since(begin)))?;
         self.last = Some(raw.number);
         Ok(())
     }
@@ -173,22 +173,16 @@ impl Drive {
     /// # Errors
     /// Why the drive was ended by the server.
     pub async fn next_report(&self) -> Result<Report> {
-        self.lane.next_report().await
+        self.place.0.next_report().await
     }
 
     /// Whether there is nothing left to hear of.
     pub fn is_drained(&self) -> bool {
-        self.lane.is_drained()
+        self.place.0.is_drained()
     }
 
     /// Whether the server has ended it.
     pub fn is_ended(&self) -> bool {
-        self.lane.is_closed()
-    }
-}
-
-impl Drop for Drive {
-    fn drop(&mut self) {
-        self.lane.close();
+        self.place.0.is_closed()
     }
 }

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -128,7 +128,10 @@ fn keep(shared: &Shared, folder: &Path) {
 /// Writes beside the file, then renames: a reader sees the old or the new, never a half.
 pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let beside = path.with_extension("new");
-    fs::write(&beside, bytes)?;
+    let mut file = fs::File::create(&beside)?;
+    file.write_all(bytes)?;
+    // Without this a power failure could leave the new name with none of the bytes.
+    file.sync_all()?;
     fs::rename(&beside, path)
 }
 

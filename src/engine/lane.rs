@@ -62,6 +62,17 @@ pub(super) struct Lane {
     writer: Notify,
 }
 
+/// The writer's place at a lane. Dropping it makes room for the next writer, also where it is dropped on its way to a
+/// client that has gone.
+#[derive(Debug)]
+pub(super) struct Place(pub Arc<Lane>);
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
 #[derive(Debug, Default)]
 struct Inner {
     waiting: VecDeque<Waiting>,

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -42,7 +43,7 @@ impl Ledger {
     /// Takes the folder and reads its list.
     ///
     /// # Errors
-    /// `Unavailable` when another server uses the folder or it cannot be made; `Invalid` when the list is damaged.
+    /// `Unavailable` when another server uses the folder, or it cannot be made or read.
     pub(super) fn open(folder: &Path) -> Result<Self> {
         let unusable = |reason: String| Error::Unavailable {
             what: "state folder",
@@ -53,11 +54,7 @@ impl Ledger {
         fs::create_dir_all(folder.join("uploads")).map_err(refuse)?;
         let lock = File::create(folder.join("lock")).map_err(refuse)?;
         lock.try_lock().map_err(|_| unusable(format!("{} is in use by another server", folder.display())))?;
-        let entries = match fs::read(folder.join("scenes.json")) {
-            Ok(bytes) => serde_json::from_slice(&bytes)
-                .map_err(|error| invalid("scenes.json of the state folder", "a map of scenes", error))?,
-            Err(_) => BTreeMap::new(),
-        };
+        let entries = read(&folder.join("scenes.json")).map_err(refuse)?;
         remove_leftovers(&folder.join("uploads"));
         Ok(Self { folder: folder.to_owned(), entries: Mutex::new(entries), lock: Mutex::new(Some(lock)) })
     }
@@ -66,18 +63,14 @@ impl Ledger {
         self.guard().clone()
     }
 
-    /// Adds a scene. Writes to disk.
+    /// Adds a scene. Writes to disk; a failure changes nothing.
     pub(super) fn add(&self, name: &str, origin: &Origin) -> Result<()> {
-        let mut entries = self.guard();
-        entries.insert(name.to_owned(), origin.clone());
-        self.write(&entries)
+        self.change(|entries| entries.insert(name.to_owned(), origin.clone())).map(drop)
     }
 
-    /// Removes a scene; whether it was there. Writes to disk.
+    /// Removes a scene; whether it was there. Writes to disk; a failure changes nothing.
     pub(super) fn remove(&self, name: &str) -> Result<bool> {
-        let mut entries = self.guard();
-        let was_there = entries.remove(name).is_some();
-        self.write(&entries).map(|()| was_there)
+        self.change(|entries| entries.remove(name)).map(|entry| entry.is_some())
     }
 
     /// Where steps are kept.
@@ -95,14 +88,33 @@ impl Ledger {
         self.lock.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
-    fn write(&self, entries: &BTreeMap<String, Origin>) -> Result<()> {
-        let text = serde_json::to_vec_pretty(entries).map_err(during("writing scenes.json"))?;
-        replace(&self.folder.join("scenes.json"), &text).map_err(during("writing scenes.json"))
+    /// Changes the list on disk, then here, so that both are always the same.
+    fn change<T>(&self, change: impl FnOnce(&mut BTreeMap<String, Origin>) -> T) -> Result<T> {
+        let mut entries = self.guard();
+        let mut changed = entries.clone();
+        let result = change(&mut changed);
+        let text = serde_json::to_vec_pretty(&changed).map_err(during("writing scenes.json"))?;
+        replace(&self.folder.join("scenes.json"), &text).map_err(during("writing scenes.json"))?;
+        *entries = changed;
+        Ok(result)
     }
 
     fn guard(&self) -> MutexGuard<'_, BTreeMap<String, Origin>> {
         self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// The list on disk; empty when there is none. A damaged one is set aside, so that it is neither lost nor in the way.
+fn read(path: &Path) -> io::Result<BTreeMap<String, Origin>> {
+    let bytes = match fs::read(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
+        read => read?,
+    };
+    serde_json::from_slice(&bytes).or_else(|error| {
+        let aside = path.with_extension("json.damaged");
+        tracing::warn!(%error, "the list of open scenes is damaged; it is kept as {} and begins empty", aside.display());
+        fs::rename(path, aside).map(|()| BTreeMap::new())
+    })
 }
 
 /// Uploads that a killed server never finished.
@@ -166,6 +178,34 @@ mod tests {
         for source in ["", "/", "..", "a/.."] {
             assert!(own_name(source).is_err(), "{source:?} passed");
         }
+    }
+
+    #[test]
+    fn a_damaged_list_is_set_aside_and_an_unreadable_one_is_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let list = folder.path().join("scenes.json");
+        fs::write(&list, b"{\"a\":").expect("written");
+        let ledger = Ledger::open(folder.path()).expect("it starts");
+        assert!(ledger.entries().is_empty() && !list.exists());
+        assert_eq!(fs::read(folder.path().join("scenes.json.damaged")).expect("set aside"), b"{\"a\":");
+        drop(ledger);
+        // A folder in its place can be read by nobody.
+        fs::create_dir(&list).expect("a folder");
+        assert!(matches!(Ledger::open(folder.path()), Err(Error::Unavailable { .. })));
+    }
+
+    #[test]
+    fn a_list_that_cannot_be_written_stays_as_it_is() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let ledger = Ledger::open(folder.path()).expect("free");
+        let origin = Origin::Repository { source: "strips".into() };
+        ledger.add("a", &origin).expect("written");
+        fs::create_dir(folder.path().join("scenes.new")).expect("in the way of every writing");
+        assert!(matches!(ledger.add("b", &origin), Err(Error::Fault { .. })));
+        assert!(matches!(ledger.remove("a"), Err(Error::Fault { .. })));
+        assert_eq!(ledger.entries().into_keys().collect::<Vec<_>>(), ["a"]);
+        fs::remove_dir(folder.path().join("scenes.new")).expect("out of the way");
+        assert_eq!(ledger.remove("a"), Ok(true));
     }
 
     #[test]

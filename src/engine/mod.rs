@@ -254,9 +254,7 @@ impl Engine {
         let work = async move {
             let seat = engine.shared.registry.seat(&name, &origin, upload.is_some())?;
             let opened = seat.open(|| engine.host(name.clone(), origin, upload)).await;
-            if opened.is_err() {
-                engine.shared.registry.remove(&name, &seat);
-            }
+            engine.shared.registry.leave(&name, &seat);
             opened
         };
         tokio::spawn(work).await.map_err(crate::error::during("open"))?
@@ -327,16 +325,18 @@ impl Engine {
             None => {}
         }
         let (engine, key) = (self.clone(), name.to_owned());
-        let was_kept = aside("close", move || {
+        let removed = aside("close", move || {
             engine.shared.means.keeper.forget(&key);
             std::fs::remove_dir_all(engine.shared.ledger.upload(&key)).ok(); // Only uploads have a folder.
             engine.shared.ledger.remove(&key)
         })
-        .await?;
-        // The name is free only now, so that nobody's new files are removed with the old ones.
+        .await;
+        // The name is free only now, so that nobody's new files are removed with the old ones; but free it is, even
+        // when the list could not be written.
         if let Some(seat) = &seat {
             self.shared.registry.remove(name, seat);
         }
+        let was_kept = removed?;
         if seat.is_some() || was_kept { Ok(()) } else { Err(not_open(name)) }
     }
 }

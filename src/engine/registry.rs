@@ -1,6 +1,7 @@
 //! Scenes by name. A name is claimed before its scene is loaded, so that two openings of one name share one loading.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::OnceCell;
@@ -14,10 +15,12 @@ use crate::error::{Error, Result};
 pub(super) struct Seat {
     origin: Origin,
     cell: OnceCell<Arc<Host>>,
+    /// How many openings sit here; changed under the registry's lock only.
+    openings: AtomicUsize,
 }
 
 impl Seat {
-    /// The scene, loaded by the first who asks; the others wait.
+    /// The scene, loaded by the first who asks; the others wait, and the next of them tries anew if that fails.
     pub(super) async fn open<F>(&self, load: impl FnOnce() -> F) -> Result<Arc<Host>>
     where
         F: Future<Output = Result<Arc<Host>>>,
@@ -46,19 +49,23 @@ impl Registry {
         Self { limit, seats: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Claims a name, or joins whoever claimed it for the same source. A `fresh` claim joins nobody.
+    /// Claims a name, or joins whoever claimed it for the same source, until [`Self::leave`]. A `fresh` claim joins
+    /// nobody.
     pub(super) fn seat(&self, name: &str, origin: &Origin, fresh: bool) -> Result<Arc<Seat>> {
         let mut seats = self.lock();
         if let Some(seat) = seats.get(name) {
             return match !fresh && seat.origin == *origin {
-                true => Ok(Arc::clone(seat)),
+                true => {
+                    seat.openings.fetch_add(1, Ordering::Relaxed);
+                    Ok(Arc::clone(seat))
+                }
                 false => Err(taken(name, seat)),
             };
         }
         if seats.len() >= self.limit {
             return Err(Error::Busy { queue: "list of open scenes", limit: self.limit });
         }
-        let seat = Arc::new(Seat { origin: origin.clone(), cell: OnceCell::new() });
+        let seat = Arc::new(Seat { origin: origin.clone(), cell: OnceCell::new(), openings: AtomicUsize::new(1) });
         seats.insert(name.to_owned(), Arc::clone(&seat));
         Ok(seat)
     }
@@ -81,12 +88,19 @@ impl Registry {
         self.lock().values().filter_map(|seat| seat.host().cloned()).filter(|host| !host.is_closing()).collect()
     }
 
-    /// Gives a name back, unless somebody else has claimed it since.
+    /// Ends an opening. The last one gives the name back if none has brought a scene.
+    pub(super) fn leave(&self, name: &str, seat: &Arc<Seat>) {
+        let mut seats = self.lock();
+        let is_last = seat.openings.fetch_sub(1, Ordering::Relaxed) == 1;
+        if is_last && seat.host().is_none() {
+            seats.remove(name);
+        }
+    }
+
+    /// Gives the name of a closed scene back, unless somebody else has claimed it since.
     pub(super) fn remove(&self, name: &str, seat: &Arc<Seat>) {
         let mut seats = self.lock();
-        let is_ours = seats.get(name).is_some_and(|held| Arc::ptr_eq(held, seat));
-        let is_usable = seat.host().is_some_and(|host| !host.is_closing());
-        if is_ours && !is_usable {
+        if seats.get(name).is_some_and(|held| Arc::ptr_eq(held, seat)) {
             seats.remove(name);
         }
     }

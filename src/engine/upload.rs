@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::Write as _;
+use std::io::{self, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -68,7 +68,7 @@ impl Upload {
     ///
     /// # Errors
     /// `Invalid` for a path that leaves the folder or comes twice, for more files or bytes than announced, for a hash
-    /// that is none, and when the file before it is not whole.
+    /// that is none, and when the file before it is not whole; `Fault` of the disk.
     pub fn file(&mut self, path: &str, bytes: u64, sha256: &[u8]) -> Result<()> {
         self.check_whole()?;
         checked_path("file.path", path)?;
@@ -86,7 +86,12 @@ impl Upload {
             return Err(invalid("header.total_bytes", self.announced.total_bytes.to_string(), self.claimed));
         }
         let place = self.folder.join(path);
-        let clash = |_| invalid("file.path", "a path whose folders are no files", path);
+        let clash = |error: io::Error| match error.kind() {
+            ErrorKind::AlreadyExists | ErrorKind::NotADirectory | ErrorKind::InvalidFilename => {
+                invalid("file.path", "a path whose folders are no files", path)
+            }
+            _ => during("upload")(error),
+        };
         if let Some(parent) = place.parent() {
             fs::create_dir_all(parent).map_err(clash)?;
         }
@@ -182,6 +187,7 @@ fn hex(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::error::Error;
 
     fn begin(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let announced = Announcement { scene: "s".into(), entry: String::new(), files, total_bytes };
@@ -221,6 +227,16 @@ mod tests {
         for path in ["a", "a/b"] {
             assert!(upload.file(path, 0, &sha(b"")).is_err(), "{path} passed");
         }
+    }
+
+    #[test]
+    fn a_fault_of_the_disk_is_not_the_clients() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut upload = begin(folder.path(), 1, 0);
+        // A link to itself can be made into nothing, whoever tries.
+        fs::remove_dir(&upload.folder).expect("is there");
+        std::os::unix::fs::symlink(&upload.folder, &upload.folder).expect("linked");
+        assert!(matches!(upload.file("a/b", 0, &sha(b"")), Err(Error::Fault { .. })));
     }
 
     #[test]

@@ -25,6 +25,13 @@ use crate::error::{Result, invalid};
 /// The largest number of domains of one scene.
 pub const MAX_DOMAINS: usize = 1 << 20;
 
+/// The most bytes of one domain's name, and of all its notes; a description of the domain travels in one message.
+const MAX_NAME: usize = 4 << 10;
+const MAX_NOTES: usize = 64 << 10;
+
+/// The most vertices of a parent that carry one frame.
+const MAX_ATTACHMENT_ROWS: usize = 4096;
+
 /// What a loader hands to [`Scene::new`].
 #[derive(Debug, Clone, Default)]
 pub struct Parts {
@@ -158,6 +165,7 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
     below("shape", domain.shape, parts.shapes.len())?;
     below("material", domain.material, parts.materials.len())?;
     check_runs(parts, domain)?;
+    check_texts(domain)?;
     let rank = parts.shapes[domain.shape].modes.rank();
     crate::domain::Transform::new(domain.placement.0).map_err(|error| error.within("placement"))?;
     if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
@@ -177,9 +185,24 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
         // Parents come first, so the hierarchy has no cycle and one pass in order composes it.
         below("parent", attachment.parent, index)?;
         let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest().len();
+        if attachment.rows.len() > MAX_ATTACHMENT_ROWS {
+            let expected = format!("at most {MAX_ATTACHMENT_ROWS} vertices");
+            return Err(invalid("attachment.rows", expected, attachment.rows.len()));
+        }
         for row in &attachment.rows {
             below("attachment.rows", *row as usize, vertices)?;
         }
+    }
+    Ok(())
+}
+
+fn check_texts(domain: &Domain) -> Result<()> {
+    if domain.name.len() > MAX_NAME {
+        return Err(invalid("name", format!("at most {MAX_NAME} bytes"), domain.name.len()));
+    }
+    let bytes: usize = domain.metadata.notes.iter().map(|(name, text)| name.len() + text.len()).sum();
+    if bytes > MAX_NOTES {
+        return Err(invalid("notes", format!("at most {MAX_NOTES} bytes in all"), bytes));
     }
     Ok(())
 }
@@ -231,7 +254,7 @@ impl Parts {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Mesh, Modes, Run, Transform};
+    use crate::domain::{Attachment, Mesh, Modes, Run, Transform};
 
     /// One domain of two triangles, with a plain and a blended material.
     fn square(runs: Vec<Run>) -> Parts {
@@ -263,6 +286,24 @@ mod tests {
     fn a_material_of_any_run_counts_for_what_the_scene_needs() {
         assert!(Scene::new(square(vec![run(0, 0), run(1, 1)])).expect("good").needs.blend);
         assert!(!Scene::new(square(vec![])).expect("good").needs.blend, "the second material is unused");
+    }
+
+    #[test]
+    fn names_notes_and_attachments_that_no_description_could_carry_are_refused_by_name() {
+        let with = |name: usize, note: usize, rows: usize| {
+            let mut parts = square(vec![]);
+            let mut second = parts.domains[0].clone();
+            second.name = "x".repeat(name);
+            second.metadata.notes = [("a".into(), "x".repeat(note - 3)), ("b".into(), "y".into())].into();
+            second.attachment = Some(Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![3; rows] });
+            parts.domains.push(second);
+            Scene::new(parts).map(drop).map_err(|error| error.to_string())
+        };
+        assert_eq!(with(4096, 65536, 4096), Ok(()));
+        let refusal = |field, most, given| Err(format!("domain 1: {field}: expected at most {most}, given {given}"));
+        assert_eq!(with(4097, 65536, 4096), refusal("name", "4096 bytes", 4097));
+        assert_eq!(with(4096, 65537, 4096), refusal("notes", "65536 bytes in all", 65537));
+        assert_eq!(with(4096, 65536, 4097), refusal("attachment.rows", "4096 vertices", 4097));
     }
 
     #[test]

@@ -123,16 +123,29 @@ fn parse_transforms(scene: &Scene, raw: &RawUpdate) -> Result<Vec<(u32, Transfor
     domains.into_iter().zip(raw.transforms.chunks_exact(48)).map(parse).collect()
 }
 
-/// The domains that a list names, or all of them.
+/// The domains that a list names, each once, or all of them.
 fn named(scene: &Scene, field: &str, list: &[u32], everyone: bool) -> Result<Vec<u32>, Error> {
     let count = scene.domains.len();
     if everyone {
         return Ok((0..count as u32).collect());
     }
-    match list.iter().position(|domain| *domain as usize >= count) {
-        None => Ok(list.to_vec()),
-        Some(at) => Err(invalid(format!("{field}[{at}]"), format!("an index below {count}"), list[at])),
+    if list.len() > count {
+        return Err(invalid(field, format!("at most {count} indices"), list.len()));
     }
+    // One bit per domain: a list of a million costs as much per index as one of ten.
+    let mut seen = vec![0_u64; count.div_ceil(64)];
+    for (at, domain) in list.iter().enumerate() {
+        let index = *domain as usize;
+        if index >= count {
+            return Err(invalid(format!("{field}[{at}]"), format!("an index below {count}"), domain));
+        }
+        let (word, bit) = (index / 64, 1 << (index % 64));
+        if seen[word] & bit != 0 {
+            return Err(invalid(format!("{field}[{at}]"), "an index that was not named before", domain));
+        }
+        seen[word] |= bit;
+    }
+    Ok(list.to_vec())
 }
 
 /// Little-endian numbers at any alignment.

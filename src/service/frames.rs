@@ -21,7 +21,7 @@ impl v1::frame_service_server::FrameService for Frames {
         request: Request<v1::RenderFrameRequest>,
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let config = self.0.config();
-        let deadline = Deadline::of(request.metadata(), request.get_ref().deadline_ms, Some(config.deadline));
+        let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
         let host = self.0.find(&request.scene).map_err(status)?;
         let (view, format) = picture(&self.0, &host.scene, request.picture).map_err(status)?;
@@ -46,7 +46,7 @@ impl v1::frame_service_server::FrameService for Frames {
         &self,
         request: Request<v1::StreamFramesRequest>,
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
-        let deadline = Deadline::of(request.metadata(), 0, None);
+        let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
         let host = self.0.find(&request.scene).map_err(status)?;
         let (view, format) = picture(&self.0, &host.scene, request.picture).map_err(status)?;

@@ -1,7 +1,10 @@
 //! Scenes: open, upload, list, delete, describe, and rows of U.
 
+use std::time::{Duration, Instant};
+
 use modalcast_proto::v1;
 use modalcast_proto::v1::upload_scene_request::Part;
+use prost::Message as _;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::convert::{announcement, scene_info};
@@ -13,6 +16,9 @@ use crate::error::{Error, Result, during, invalid};
 
 /// The most bytes of source names that a list carries.
 const MOST_SOURCES: usize = 512 << 10;
+
+/// The slowest upload that is waited for to its end, bytes per second.
+const SLOWEST_UPLOAD: f64 = 32768.0;
 
 /// `SceneService`.
 pub(super) struct Scenes(pub(super) Engine);
@@ -37,13 +43,11 @@ impl v1::scene_service_server::SceneService for Scenes {
         request: Request<Streaming<v1::UploadSceneRequest>>,
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
         let mut parts = request.into_inner();
-        let (limit, patience) = (self.0.config().message_bytes, self.0.config().stall);
+        let limit = self.0.config().message_bytes;
+        let mut patience = Patience::new(self.0.config().stall);
         let mut upload = None;
-        loop {
-            // A client that falls silent must not keep its place and its disk space.
-            let silent = |_| Error::Deadline { what: "the next part".into(), ms: patience.as_millis() as u64 };
-            let next = tokio::time::timeout(patience, parts.message()).await.map_err(|late| status(silent(late)))?;
-            let Some(request) = next.map_err(|fault| transport(fault, limit))? else { break };
+        while let Some(request) = patience.hold(parts.message()).await?.map_err(|fault| transport(fault, limit))? {
+            patience.regain(request.encoded_len());
             let part = request.part.ok_or_else(|| status(invalid("part", "header, file or chunk", "none")))?;
             upload = Some(receive(&self.0, upload, part).await.map_err(status)?);
         }
@@ -100,6 +104,33 @@ impl v1::scene_service_server::SceneService for Scenes {
         let request = request.into_inner();
         let host = self.0.find(&request.scene).map_err(status)?;
         describe::modes(host, request, self.0.config().chunk_bytes).map_err(status)
+    }
+}
+
+/// How long an upload is waited for. Waiting uses it up and bytes bring it back, so that a client which falls silent,
+/// or sends a byte now and then, does not keep its place and its disk space for ever.
+struct Patience {
+    most: Duration,
+    left: Duration,
+}
+
+impl Patience {
+    const fn new(most: Duration) -> Self {
+        Self { most, left: most }
+    }
+
+    /// Waits for the client; only that is counted, not the work on what it sent.
+    async fn hold<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
+        let begin = Instant::now();
+        let late = |_| Error::Deadline { what: "enough of the upload".into(), ms: self.most.as_millis() as u64 };
+        let part = tokio::time::timeout(self.left, part).await.map_err(|end| status(late(end)))?;
+        self.left = self.left.saturating_sub(begin.elapsed());
+        Ok(part)
+    }
+
+    fn regain(&mut self, bytes: usize) {
+        let earned = Duration::from_secs_f64(bytes as f64 / SLOWEST_UPLOAD);
+        self.left = self.most.min(self.left + earned);
     }
 }
 

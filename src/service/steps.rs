@@ -29,7 +29,7 @@ impl v1::step_service_server::StepService for Steps {
         request: Request<Streaming<v1::DriveSceneRequest>>,
     ) -> Result<Response<Self::DriveSceneStream>, Status> {
         let who = request.remote_addr().map_or_else(|| "a local client".into(), |address| address.to_string());
-        let deadline = Deadline::of(request.metadata(), 0, None);
+        let deadline = Deadline::of_stream(request.metadata());
         let session = Session {
             engine: self.0.clone(),
             who,

@@ -12,6 +12,7 @@ use tonic::metadata::MetadataMap;
 use tonic::{Response, Status};
 
 use super::status::status;
+use crate::config::Config;
 use crate::error::{Error, Result};
 
 /// A reply stream.
@@ -48,7 +49,8 @@ fn gone() -> Status {
     Status::cancelled("the client has gone")
 }
 
-/// A stream that `work` fills. How `work` ends is how the stream ends; there is always room to say so.
+/// A stream that `work` fills. How `work` ends is how the stream ends; there is always room to say so. When the client
+/// leaves, `work` is dropped wherever it waits, so that what it holds is free for others.
 pub(super) fn respond<T, W, F>(work: W) -> Response<Replies<T>>
 where
     T: Send + 'static,
@@ -57,7 +59,14 @@ where
 {
     let (sender, replies) = mpsc::channel(AHEAD + 1);
     let last_word = sender.clone().try_reserve_owned();
-    let work = tokio::spawn(work(Outlet(sender)));
+    let client = sender.clone();
+    let work = work(Outlet(sender));
+    let work = tokio::spawn(async move {
+        tokio::select! {
+            end = work => end,
+            () = client.closed() => Err(gone()),
+        }
+    });
     tokio::spawn(async move {
         let end = work.await.unwrap_or_else(|_| Err(Status::internal("the call failed on our side")));
         if let (Err(status), Ok(last_word)) = (end, last_word) {
@@ -91,16 +100,21 @@ pub(super) struct Deadline {
 }
 
 impl Deadline {
-    /// The smaller of what the request says (0: nothing) and what its `grpc-timeout` header says; `default` if neither.
-    pub(super) fn of(metadata: &MetadataMap, ms: u32, default: Option<Duration>) -> Self {
+    /// Of a single request: the smaller of what it says (0: nothing) and what its `grpc-timeout` header says, or the
+    /// configured one if neither; never later than the configured longest.
+    pub(super) fn of_request(metadata: &MetadataMap, ms: u32, config: &Config) -> Self {
         let asked = (ms > 0).then(|| Duration::from_millis(ms.into()));
-        let header = metadata.get("grpc-timeout").and_then(|text| parse_timeout(text.to_str().ok()?));
-        let time = match (asked, header) {
-            (Some(asked), Some(header)) => Some(asked.min(header)),
-            (asked, header) => asked.or(header).or(default),
-        };
-        let at = time.and_then(|time| Some((Instant::now().checked_add(time)?, time.as_millis() as u64)));
-        Self { at }
+        let time = asked.into_iter().chain(header(metadata)).min().unwrap_or(config.deadline);
+        Self::after(time.min(config.longest_deadline))
+    }
+
+    /// Of a stream: what its `grpc-timeout` header says, if it has one.
+    pub(super) fn of_stream(metadata: &MetadataMap) -> Self {
+        header(metadata).map_or(Self { at: None }, Self::after)
+    }
+
+    fn after(time: Duration) -> Self {
+        Self { at: Instant::now().checked_add(time).map(|at| (at, time.as_millis() as u64)) }
     }
 
     /// The work's result, or `DEADLINE_EXCEEDED` when it is not there in time; the work is dropped then.
@@ -111,6 +125,10 @@ impl Deadline {
             Err(_) => Err(status(Error::Deadline { what: what.into(), ms })),
         }
     }
+}
+
+fn header(metadata: &MetadataMap) -> Option<Duration> {
+    parse_timeout(metadata.get("grpc-timeout")?.to_str().ok()?)
 }
 
 /// The header's at most eight digits and its unit.
@@ -154,6 +172,38 @@ mod tests {
         for text in ["", "S", "123456789S", "-1S", "1s", "1 S", "1é", "é"] {
             assert_eq!(parse_timeout(text), None, "{text}");
         }
+    }
+
+    #[test]
+    fn a_request_is_over_after_the_shortest_time_it_names_and_never_after_the_longest() {
+        let config = Config::default();
+        let ms = |header: Option<&'static str>, ms| {
+            let mut metadata = MetadataMap::new();
+            if let Some(header) = header {
+                metadata.insert("grpc-timeout", header.parse().expect("a header"));
+            }
+            let of = |deadline: Deadline| deadline.at.map(|(_, ms)| ms);
+            (of(Deadline::of_request(&metadata, ms, &config)), of(Deadline::of_stream(&metadata)))
+        };
+        assert_eq!(ms(None, 0), (Some(30_000), None));
+        assert_eq!(ms(None, 80), (Some(80), None));
+        assert_eq!(ms(Some("50m"), 80), (Some(50), Some(50)));
+        assert_eq!(ms(Some("2S"), 80), (Some(80), Some(2000)));
+        assert_eq!(ms(None, u32::MAX), (Some(600_000), None));
+        assert_eq!(ms(Some("99H"), 0), (Some(600_000), Some(99 * 3_600_000)));
+    }
+
+    #[tokio::test]
+    async fn work_ends_where_it_waits_when_its_client_leaves() {
+        let (held, ended) = tokio::sync::oneshot::channel::<()>();
+        let replies = respond(move |_outlet: Outlet<u32>| async move {
+            std::future::pending::<()>().await;
+            drop(held);
+            Ok(())
+        });
+        drop(replies);
+        let end = tokio::time::timeout(Duration::from_secs(10), ended).await.expect("the work is dropped");
+        assert!(end.is_err());
     }
 
     #[tokio::test]

@@ -23,7 +23,7 @@ impl v1::vertex_service_server::VertexService for Vertices {
         request: Request<v1::GetVerticesRequest>,
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
         let config = self.0.config();
-        let deadline = Deadline::of(request.metadata(), request.get_ref().deadline_ms, Some(config.deadline));
+        let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
         let host = self.0.find(&request.scene).map_err(status)?;
         let selection = select(&host, request.selection)?;
@@ -48,7 +48,7 @@ impl v1::vertex_service_server::VertexService for Vertices {
         &self,
         request: Request<v1::StreamVerticesRequest>,
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
-        let deadline = Deadline::of(request.metadata(), 0, None);
+        let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
         let host = self.0.find(&request.scene).map_err(status)?;
         let selection = select(&host, request.selection)?;

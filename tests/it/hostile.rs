@@ -43,6 +43,18 @@ fn bad_steps() -> Vec<BadStep> {
         ),
         ("no such domain, q", step(11, &[0, 2], &[0.0; 4]), ["step.q_domains[1]", "an index below 2", "2"]),
         ("no such domain, T", transforms(&[9], &[0.0; 12]), ["step.transform_domains[0]", "an index below 2", "9"]),
+        ("a domain twice, q", step(11, &[1, 1], &[0.0; 4]), ["step.q_domains[1]", "an index that was not named", "1"]),
+        (
+            "a domain twice, T",
+            transforms(&[0, 0], &[0.0; 24]),
+            ["step.transform_domains[1]", "an index that was not named", "0"],
+        ),
+        ("too many domains, q", step(11, &[0, 1, 0], &[0.0; 6]), ["step.q_domains", "at most 2 indices", "3"]),
+        (
+            "too many domains, T",
+            transforms(&[0, 1, 0], &[0.0; 36]),
+            ["step.transform_domains", "at most 2 indices", "3"],
+        ),
         ("T too short", transforms(&[0], &[0.0; 11]), ["step.transforms", "48 bytes", "44 bytes"]),
         (
             "infinity in T",

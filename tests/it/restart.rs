@@ -111,6 +111,31 @@ fn a_damaged_step_is_left_out_and_its_scene_begins_at_rest() {
 }
 
 #[test]
+fn a_list_that_cannot_be_written_fails_the_call_and_leaves_the_name_free() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let open = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: "name".into() };
+    let delete = || v1::DeleteSceneRequest { scene: "name".into() };
+    runtime().block_on(async {
+        let server = Server::start(config(folder.path())).await;
+        let mut scenes = server.scenes().await;
+        scenes.open_scene(open("strips")).await.expect("opens");
+        let obstacle = folder.path().join("scenes.new");
+        std::fs::create_dir(&obstacle).expect("in the way of every writing");
+        let status = scenes.delete_scene(delete()).await.expect_err("it stays in the list");
+        assert_eq!(status.code(), tonic::Code::Internal, "{status:?}");
+        let status = scenes.open_scene(open("sheet")).await.expect_err("it does not come into the list");
+        assert_eq!(status.code(), tonic::Code::Internal, "{status:?}");
+        assert!(server.engine.list().is_empty());
+        std::fs::remove_dir(&obstacle).expect("out of the way");
+        // What could not be removed can be removed now, once, and the name has always been free.
+        scenes.delete_scene(delete()).await.expect("it was still in the list");
+        let status = scenes.delete_scene(delete()).await.expect_err("it is gone");
+        assert_eq!(status.code(), tonic::Code::NotFound, "{status:?}");
+        scenes.open_scene(open("sheet")).await.expect("opens under the same name");
+    });
+}
+
+#[test]
 fn an_upload_comes_back_and_a_closed_scene_does_not() {
     let folder = tempfile::tempdir().expect("a folder");
     runtime().block_on(async {

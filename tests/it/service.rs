@@ -1,5 +1,8 @@
 //! Scenes over the wire: open, describe, list, upload, delete; health, reflection and limits.
 
+use modalcast::engine::SceneSource;
+use modalcast::error::Result;
+use modalcast::scene::Scene;
 use modalcast_proto::v1;
 use prost::Message as _;
 use tokio_stream::StreamExt as _;
@@ -7,6 +10,55 @@ use v1::Array;
 use v1::describe_scene_response::Part;
 
 use crate::service_harness::{Server, details, expected, get_vertices, sheet, strips, within};
+
+/// A source whose first opening fails when it is told to, and whose second takes a while.
+struct FailsOnce {
+    opened: std::sync::atomic::AtomicUsize,
+    fail: std::sync::Mutex<std::sync::mpsc::Receiver<()>>,
+}
+
+impl SceneSource for FailsOnce {
+    fn open(&self, source: &str) -> Result<std::sync::Arc<Scene>> {
+        if self.opened.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
+            self.fail.lock().expect("unpoisoned").recv().expect("a word");
+            return Err(modalcast::error::invalid("source", "a second try", source));
+        }
+        std::thread::sleep(std::time::Duration::from_millis(100));
+        Ok(strips())
+    }
+
+    fn open_within(&self, _: &std::path::Path, entry: &str) -> Result<std::sync::Arc<Scene>> {
+        self.open(entry)
+    }
+
+    fn list(&self) -> Vec<String> {
+        vec![]
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_opening_that_outlives_a_failed_one_of_the_same_name_is_registered() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (fail, told) = std::sync::mpsc::sync_channel(1);
+    let source = std::sync::Arc::new(FailsOnce { opened: 0.into(), fail: told.into() });
+    let server = Server::start_from(crate::service_harness::config(folder.path()), source.clone()).await;
+    let open = || {
+        let engine = server.engine.clone();
+        tokio::spawn(async move { engine.open("strips", "").await })
+    };
+    let first = open();
+    while source.opened.load(std::sync::atomic::Ordering::SeqCst) == 0 {
+        tokio::time::sleep(std::time::Duration::from_millis(1)).await;
+    }
+    let second = open();
+    tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    fail.send(()).expect("it listens");
+    assert!(within(first).await.expect("no panic").is_err());
+    within(second).await.expect("no panic").expect("opens");
+    server.engine.find("strips").expect("what was opened is there");
+    server.engine.close("strips").await.expect("closes");
+    server.engine.open("other", "strips").await.expect("its name is free for another source");
+}
 
 /// The largest message: a chunk of 1 MiB and its envelope.
 const LARGEST: usize = (1 << 20) + 4096;

@@ -13,6 +13,7 @@ use tonic::Code;
 use tonic::transport::Channel;
 use v1::Policy;
 use v1::drive_scene_response::Kind as Told;
+use v1::upload_scene_request::Part;
 
 use crate::service_harness::{Driver, PATIENCE, Server, step, within};
 
@@ -156,6 +157,21 @@ async fn a_silent_upload_is_given_up_and_leaves_nothing_behind() {
     let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
     let never = tokio_stream::StreamExt::chain(tokio_stream::iter([part]), tokio_stream::pending());
     let status = within(server.scenes().await.upload_scene(never)).await.expect_err("it never ends");
+    assert_eq!(status.code(), Code::DeadlineExceeded);
+    let uploads = server.engine.config().state.join("uploads");
+    assert_eq!(std::fs::read_dir(uploads).expect("a folder").count(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_upload_that_trickles_is_given_up_though_no_pause_is_long() {
+    let server = Server::with(|config| Config { stall: Duration::from_millis(400), ..config }).await;
+    let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
+    let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
+    let parts = [Part::Header(header), Part::File(file)].into_iter();
+    let parts = parts.chain(std::iter::repeat_with(|| Part::Chunk(b"x"[..].into())).take(5000));
+    let requests = tokio_stream::iter(parts.map(|part| v1::UploadSceneRequest { part: Some(part) }));
+    let trickle = tokio_stream::StreamExt::throttle(requests, Duration::from_millis(20));
+    let status = within(server.scenes().await.upload_scene(trickle)).await.expect_err("too slow");
     assert_eq!(status.code(), Code::DeadlineExceeded);
     let uploads = server.engine.config().state.join("uploads");
     assert_eq!(std::fs::read_dir(uploads).expect("a folder").count(), 0);

@@ -187,6 +187,33 @@ async fn a_second_writer_is_told_who_holds_the_scene_and_comes_in_when_the_first
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn requests_whose_clients_have_left_make_room_for_others() {
+    let server = Server::with(|config| modalcast::config::Config { waiting: 4, ..config }).await;
+    server.open("strips").await;
+    let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
+    let never = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertices_of("strips") };
+    let mut client = server.vertices().await;
+    // Of eight that wait for a step that never comes, four are turned away, and so is whoever comes next.
+    let mut waits = Vec::new();
+    for _ in 0..8 {
+        waits.push(client.get_vertices(never.clone()).await.expect("a stream").into_inner());
+    }
+    let mut held = tokio::task::JoinSet::new();
+    for mut stream in waits {
+        held.spawn(async move { stream.message().await.expect_err("no step").code() });
+    }
+    for _ in 0..4 {
+        let code = within(held.join_next()).await.expect("one of eight").expect("no panic");
+        assert_eq!(code, tonic::Code::ResourceExhausted);
+    }
+    let busy = get_vertices(&server, vertices_of("strips")).await.expect_err("all places are taken");
+    assert_eq!(busy.code(), tonic::Code::ResourceExhausted);
+    held.shutdown().await;
+    let served = async { while get_vertices(&server, vertices_of("strips")).await.is_err() {} };
+    within(served).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn exact_and_minimum_steps_are_waited_for_and_a_step_that_has_passed_is_named() {
     let server = Server::fresh().await;
     server.open("strips").await;
