@@ -57,7 +57,7 @@ pub(super) struct Args {
     #[arg(long, default_value_t = Config::default().upload_bytes)]
     upload_bytes: u64,
     /// How long a request waits that names no deadline, in milliseconds.
-    #[arg(long, default_value_t = 30_000)]
+    #[arg(long, default_value_t = 30_000, value_parser = clap::value_parser!(u64).range(1..=600_000))]
     deadline_ms: u64,
 }
 
