@@ -17,6 +17,7 @@ pub use needs::Needs;
 pub use state::State;
 pub use update::{RawUpdate, Update};
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::domain::{AlphaMode, Domain, Material, Shape, Texture};
@@ -93,6 +94,7 @@ impl Scene {
             check_domain(&parts, index).map_err(|error| error.within(&format!("domain {index}")))?;
         }
         parts.look.check()?;
+        leave_out_unplaced_textures(&mut parts);
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
         let needs = Needs::of(&parts);
@@ -224,6 +226,34 @@ fn check_runs(parts: &Parts, domain: &Domain) -> Result<()> {
     Ok(())
 }
 
+/// A texture on a shape without texture coordinates would show one texel everywhere: such domains get a copy of their
+/// material without textures, and a remark says so.
+fn leave_out_unplaced_textures(parts: &mut Parts) {
+    let mut copies: BTreeMap<usize, usize> = BTreeMap::new();
+    let Parts { shapes, materials, domains, remarks, .. } = parts;
+    for domain in domains.iter_mut().filter(|domain| shapes[domain.shape].mesh.corners().uvs.is_empty()) {
+        let runs = domain.runs.iter_mut().map(|run| &mut run.material);
+        for material in std::iter::once(&mut domain.material).chain(runs) {
+            let textured = &materials[*material];
+            if textured.colour_texture.is_none() && textured.normal_texture.is_none() {
+                continue;
+            }
+            let textured = textured.clone();
+            *material = *copies.entry(*material).or_insert_with(|| {
+                let name = &textured.name;
+                remarks.push(format!("textures of material '{name}' left out where there are no texture coordinates"));
+                let alpha_mode = match textured.alpha_mode {
+                    AlphaMode::Mask { cutoff } if textured.alpha >= cutoff => AlphaMode::Opaque,
+                    kept => kept,
+                };
+                let plain = Material { colour_texture: None, normal_texture: None, alpha_mode, ..textured };
+                materials.push(plain);
+                materials.len() - 1
+            });
+        }
+    }
+}
+
 /// Tangents only where a normal map will read them.
 fn add_tangents(parts: &mut Parts) {
     for domain in &parts.domains {
@@ -276,6 +306,30 @@ mod tests {
         parts.materials = vec![Material::default(), Material { alpha_mode: AlphaMode::Blend, ..Material::default() }];
         parts.domains.push(domain);
         parts
+    }
+
+    #[test]
+    fn a_texture_that_has_no_place_is_left_out_with_a_remark_and_one_that_has_stays() {
+        let textured = || {
+            let mut parts = square(vec![]);
+            parts.textures = vec![Texture::new("leaf", 1, 1, vec![0; 4]).expect("a texture")];
+            parts.materials[0].colour_texture = Some(0);
+            parts.materials[0].alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
+            parts
+        };
+        let scene = Scene::new(textured()).expect("a scene");
+        let shown = &scene.materials[scene.domains[0].material];
+        assert_eq!((shown.colour_texture, shown.alpha_mode), (None, AlphaMode::Opaque));
+        assert!(!scene.needs.textures && !scene.needs.mask);
+        assert!(scene.remarks[0].contains("no texture coordinates"), "{:?}", scene.remarks);
+        let mut placed = textured();
+        let mesh = &placed.shapes[0].mesh;
+        let corners = mesh.corners().clone();
+        let uvs = vec![[0.0, 0.0]; 4];
+        let mesh = Mesh::indexed(mesh.rest().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
+        placed.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
+        let scene = Scene::new(placed).expect("a scene");
+        assert!(scene.needs.textures && scene.needs.mask && scene.remarks.is_empty());
     }
 
     fn run(first_triangle: usize, material: usize) -> Run {
