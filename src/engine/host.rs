@@ -82,6 +82,7 @@ impl Host {
     pub async fn drive(&self, who: String, policy: Policy, window: u32) -> Result<Drive> {
         let window = window.clamp(1, self.largest_window);
         let (place, run) = self.tell(|reply| Message::Drive { who, policy, window, reply }).await?;
+        tracing::info!(scene = self.name, run, ?policy, "driven by a new writer");
         Ok(Drive { place, scene: Arc::clone(&self.scene), run, window, policy, last: None })
     }
 

@@ -292,6 +292,8 @@ impl Engine {
             host.stop(error.clone()).await;
             return Err(error);
         }
+        let layout = &host.scene.layout;
+        tracing::info!(scene = name, domains = layout.slots.len(), vertices = layout.vertices, "opened");
         Ok(host)
     }
 
