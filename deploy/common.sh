@@ -39,9 +39,11 @@ need_rust() {
 # OpenGL through EGL: NVIDIA's driver brings its own vendor library, Mesa's renders on the CPU.
 need_egl() {
     has_library 'libEGL.so.1' || need_packages libegl1
-    has_library 'libEGL_nvidia.so.0' || has_library 'libEGL_mesa.so.0' || need_packages libegl-mesa0
-    has_library 'libEGL_nvidia.so.0' || compgen -G '/usr/lib*/**/dri/swrast_dri.so' >/dev/null ||
-        compgen -G '/usr/lib/*/dri/swrast_dri.so' >/dev/null || need_packages libgl1-mesa-dri
+    has_library 'libEGL_nvidia.so.0' && return 0
+    has_library 'libEGL_mesa.so.0' || need_packages libegl-mesa0
+    # Where Mesa keeps its drivers differs; Debian's package is asked for only where none is found.
+    compgen -G '/usr/lib/*/dri/swrast_dri.so' >/dev/null || compgen -G '/usr/lib*/dri/swrast_dri.so' >/dev/null ||
+        need_packages libgl1-mesa-dri
 }
 
 # NVRTC from the PyPI wheel, into an ignored folder that the server searches.
