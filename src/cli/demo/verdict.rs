@@ -256,4 +256,39 @@ mod tests {
         assert_eq!(worse(f64::INFINITY, 1.0), f64::INFINITY);
         assert_eq!(worse(1.0, 2.0), 2.0);
     }
+
+    /// Two steps of the tree at rest, as honest processes would leave them.
+    fn at_rest(scene: &Scene) -> Ran {
+        let (domains, vertices) = (scene.domains.len(), scene.layout.vertices);
+        let state = State::rest(scene);
+        let rest = reference::deform(scene, &state);
+        Ran {
+            frames: json!({}),
+            sim: json!({}),
+            server: json!({}),
+            q: ndarray::Array2::zeros((2, scene.layout.coordinates)),
+            transforms: ndarray::Array3::from_shape_fn((2, domains, 12), |(_, domain, at)| {
+                state.transforms[domain].0[at]
+            }),
+            vertices: ndarray::Array3::from_shape_fn((2, vertices, 3), |(_, vertex, axis)| rest[vertex][axis] as f32),
+            frames_on_disk: 2,
+        }
+    }
+
+    #[test]
+    fn every_broken_promise_is_named_and_kept_ones_are_not() {
+        let scene = crate::load::open("tree").expect("the tree");
+        let broken = |spoil: &dyn Fn(&mut Ran)| {
+            let mut ran = at_rest(&scene);
+            spoil(&mut ran);
+            Verdict::of(&scene, &ran, 2).expect("as many steps").broken().join("; ")
+        };
+        let still = broken(&|_| {});
+        assert_eq!(still, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
+        assert!(broken(&|ran| ran.frames_on_disk = 1).contains("2 frames"));
+        assert!(broken(&|ran| ran.vertices[[1, 77, 0]] += 0.01).contains("vertices within"));
+        assert!(broken(&|ran| ran.vertices[[1, 77, 0]] = f32::NAN).contains("vertices within"));
+        let child = scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("a child");
+        assert!(broken(&|ran| ran.transforms[[1, child, 3]] += 0.1).contains("joints within"));
+    }
 }
