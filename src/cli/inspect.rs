@@ -70,6 +70,7 @@ fn json(scene: &Scene) -> Value {
         "totals": totals(scene),
         "needs": scene.needs,
         "look": scene.look,
+        "deform": scene.deformation,
         "remarks": scene.remarks,
         "deform": gpu::plan(scene),
         "render": render::plan(scene),

@@ -4,6 +4,7 @@
 //! the renderer use the same packing ([`Layout`]).
 
 mod camera;
+mod deformation;
 mod layout;
 mod look;
 mod needs;
@@ -11,6 +12,7 @@ mod state;
 mod update;
 
 pub use camera::{Bounds, Camera, Lens, View};
+pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
 pub use look::{Ground, Look, Shadow, UpAxis};
 pub use needs::Needs;
@@ -47,6 +49,7 @@ pub struct Parts {
     /// World position of the frame in which all transforms are given, metres.
     pub origin: [f64; 3],
     pub look: Look,
+    pub deformation: Deformation,
     /// The scene's promise that no step will shear or scale a domain unevenly; a step that does is refused.
     pub rigid_transforms: bool,
     /// What the loader could not use, in words, for `inspect` and the log.
@@ -65,6 +68,7 @@ pub struct Scene {
     pub unit: f64,
     pub origin: [f64; 3],
     pub look: Look,
+    pub deformation: Deformation,
     pub rigid_transforms: bool,
     pub remarks: Vec<String>,
     pub layout: Layout,
@@ -94,6 +98,7 @@ impl Scene {
             check_domain(&parts, index).map_err(|error| error.within(&format!("domain {index}")))?;
         }
         parts.look.check()?;
+        parts.deformation.check()?;
         leave_out_unplaced_textures(&mut parts);
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
@@ -108,6 +113,7 @@ impl Scene {
             unit: parts.unit,
             origin: parts.origin,
             look: parts.look,
+            deformation: parts.deformation,
             rigid_transforms: parts.rigid_transforms,
             remarks: parts.remarks,
             layout,

@@ -1,6 +1,6 @@
 //! What a scene needs, computed once at load; kernels, shaders, passes and buffers follow it and nothing else.
 
-use super::Parts;
+use super::{Normals, Parts};
 
 /// A feature is compiled, allocated and run only when its flag is set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -19,12 +19,20 @@ pub struct Needs {
     pub shadows: bool,
     /// Steps may shear or scale unevenly: normals need the inverse transpose.
     pub shear: bool,
+    /// Normals follow the deformed triangles: their adjacency exists.
+    pub exact_normals: bool,
+    /// Modes that cannot matter at a step's q are left out: lists of modes exist.
+    pub truncation: bool,
+    /// Sums carry their rounding errors along.
+    pub compensated: bool,
 }
 
 impl Needs {
     pub(super) fn of(parts: &Parts) -> Self {
+        // What is done about modes costs nothing where there are none.
+        let modes = parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0);
         Self {
-            modes: parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0),
+            modes,
             textures: parts.any_material(|material| material.colour_texture.is_some()),
             normal_maps: parts.domains.iter().any(|domain| {
                 domain.materials().any(|material| parts.materials[material].normal_texture.is_some())
@@ -34,11 +42,14 @@ impl Needs {
             blend: parts.any_material(|material| material.alpha_mode == crate::domain::AlphaMode::Blend),
             shadows: parts.look.shadow.is_some(),
             shear: !parts.rigid_transforms || !parts.domains.iter().all(|domain| domain.placement.is_similarity()),
+            exact_normals: modes && parts.deformation.normals == Normals::Exact,
+            truncation: modes && parts.deformation.truncation.is_some(),
+            compensated: modes && parts.deformation.compensated,
         }
     }
 
     /// Each flag with its name, in a fixed order.
-    pub fn flags(&self) -> [(&'static str, bool); 7] {
+    pub fn flags(&self) -> [(&'static str, bool); 10] {
         [
             ("modes", self.modes),
             ("textures", self.textures),
@@ -47,6 +58,9 @@ impl Needs {
             ("blend", self.blend),
             ("shadows", self.shadows),
             ("shear", self.shear),
+            ("exact_normals", self.exact_normals),
+            ("truncation", self.truncation),
+            ("compensated", self.compensated),
         ]
     }
 }

@@ -39,6 +39,7 @@ pub(super) fn assemble(files: &Files, manifest: &Manifest, entries: &[Entry], ow
     parts.unit = manifest.unit.unwrap_or(parts.unit);
     parts.origin = manifest.origin;
     parts.look = manifest.look.unwrap_or(parts.look);
+    parts.deformation = manifest.deform;
     match manifest.shadows {
         Some(false) => parts.look.shadow = None,
         Some(true) => parts.look.shadow = Some(parts.look.shadow.unwrap_or_default()),

@@ -10,6 +10,7 @@
 //! ground = true              # false: no ground plane
 //! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
 //! look.shadow = { size = 2048, blur = 2.0 }   # and least_variance, bleeding, alpha_threshold
+//! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
 //!
 //! model = "fern_02.glb"      # a scene of one model, or a [[domain]] for each of several
 //! modes = "fern.npy"         # U of a model of one domain; "" for none
@@ -43,7 +44,7 @@ use placement::Placement;
 
 use super::files::Files;
 use crate::error::{Result, invalid};
-use crate::scene::{Look, Parts, UpAxis};
+use crate::scene::{Deformation, Look, Parts, UpAxis};
 
 /// The name that makes a folder a scene.
 pub(super) const FILE: &str = "scene.toml";
@@ -63,6 +64,8 @@ struct Manifest {
     look: Option<Look>,
     shadows: Option<bool>,
     ground: Option<bool>,
+    #[serde(default)]
+    deform: Deformation,
     #[serde(default)]
     material: BTreeMap<String, Patch>,
     model: Option<String>,

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::*;
 use crate::domain::{AlphaMode, Transform};
+use crate::scene::{Deformation, Normals, Storage};
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
@@ -27,17 +28,24 @@ fn scene(toml: &str) -> Result<Parts> {
 fn one_model_with_everything_said_about_the_scene() {
     let parts = scene(
         "name = 'n'\nup = 'z'\nunit = 0.01\norigin = [1.5, 0, 0]\ntransforms = 'rigid'\nshadows = false\n\
-         model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n",
+         model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n\
+         deform = { storage = 'int8', normals = 'exact', truncation = 1e-4 }\n",
     )
     .expect("good");
     assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
     assert_eq!((parts.origin, parts.rigid_transforms), ([1.5, 0.0, 0.0], true));
     assert!(parts.look.shadow.is_none() && parts.look.ground.is_some());
     assert_eq!(parts.look.sunlight, [2.0; 3]);
+    let deformation =
+        Deformation { storage: Storage::Int8, normals: Normals::Exact, truncation: Some(1e-4), compensated: false };
+    assert_eq!(parts.deformation, deformation);
     assert_eq!(parts.shapes[0].modes.rank(), 2);
     assert_eq!(parts.domains[0].placement.translation(), nalgebra::Vector3::new(1.0, 2.0, 3.0));
     let plain = scene("model = 'a.obj'\n").expect("good");
     assert_eq!((plain.name.as_str(), plain.up, plain.rigid_transforms), ("folder", UpAxis::Y, false));
+    assert_eq!(plain.deformation, Deformation::default());
+    let refusal = scene("model = 'a.obj'\ndeform.storage = 'int3'\n").expect_err("no such type").to_string();
+    assert!(refusal.contains("int3"), "{refusal}");
 }
 
 #[test]
