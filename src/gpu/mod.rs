@@ -10,6 +10,7 @@ mod deformer;
 mod device;
 mod interop;
 mod layout;
+mod measure;
 mod memory;
 mod nvrtc;
 mod orient;
@@ -18,13 +19,18 @@ mod pack;
 mod plan;
 mod probe;
 mod report;
+mod roof;
+mod trial;
 
 pub use deformer::CudaDeformer;
 pub use device::Device;
 pub use layout::{Agreement, agreements};
+pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
 pub use plan::{Buffer, Kernel, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
+pub use roof::{Roofs, roofs};
+pub use trial::{KernelFacts, Trial};
 
 /// OpenGL buffers to write into, by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
