@@ -20,7 +20,9 @@ mod plan;
 mod probe;
 mod report;
 mod roof;
+mod thesis;
 mod trial;
+mod turns;
 
 pub use deformer::CudaDeformer;
 pub use device::Device;
@@ -30,7 +32,9 @@ pub use plan::{Buffer, Kernel, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use roof::{Roofs, roofs};
+pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
 pub use trial::{KernelFacts, Trial};
+pub use turns::Part;
 
 /// OpenGL buffers to write into, by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
