@@ -4,6 +4,7 @@ mod deformers;
 mod frames;
 mod hostile;
 mod layering;
+mod normals;
 mod pixels;
 mod real;
 mod restart;
