@@ -4,10 +4,13 @@
 //! needs ([`plan`]), and a cache on disk keeps the machine code. All domains of a scene go through two launches a step,
 //! straight into OpenGL's buffers when the driver shares them.
 
+mod apply;
+mod bounds;
 mod cache;
 mod deform;
 mod deformer;
 mod device;
+mod inputs;
 mod interop;
 mod layout;
 mod memory;
@@ -18,6 +21,7 @@ mod pack;
 mod plan;
 mod probe;
 mod report;
+mod work;
 
 pub use deformer::CudaDeformer;
 pub use device::Device;

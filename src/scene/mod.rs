@@ -4,19 +4,23 @@
 //! the renderer use the same packing ([`Layout`]).
 
 mod camera;
+mod cells;
 mod deformation;
 mod layout;
 mod look;
 mod needs;
+mod rigid;
 mod state;
 mod update;
 
 pub use camera::{Bounds, Camera, Lens, View};
+pub use cells::{Cells, GRID, REACH, nearest};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
 pub use look::{Ground, Look, Shadow, UpAxis};
 pub use needs::Needs;
-pub use state::State;
+pub use rigid::TransformFormat;
+pub use state::{Changed, State};
 pub use update::{RawUpdate, Update};
 
 use std::collections::BTreeMap;

@@ -1,6 +1,7 @@
 //! Claims that need no GPU. One binary.
 
 mod deformers;
+mod far;
 mod frames;
 mod hostile;
 mod layering;
