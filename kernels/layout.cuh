@@ -7,6 +7,10 @@ constexpr unsigned BLOCK = 256;
 constexpr unsigned TILE_QUADS = 32;
 // `first_tangent` of a shape without tangents.
 constexpr unsigned NO_TANGENTS = 0xffffffffu;
+// `first_member` of a shape without smoothing groups.
+constexpr unsigned NO_GROUPS = 0xffffffffu;
+// Marks the first vertex of each fan of a ring.
+constexpr unsigned RING_START = 0x80000000u;
 
 // The start of a step's inputs, copied with them: where to write, and what is to be computed anew.
 struct Header {
@@ -53,6 +57,16 @@ struct CornerSlot {
     unsigned first_tangent;
 };
 static_assert(sizeof(CornerSlot) == 12, "CornerSlot differs from src/gpu/layout.rs");
+
+// The same for `normals`. Instances share all but `first` and `first_vertex`.
+struct NormalSlot {
+    unsigned first; // packed corner
+    unsigned first_normal;
+    unsigned first_tangent;
+    unsigned first_vertex; // packed vertex
+    unsigned first_member;
+};
+static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/gpu/layout.rs");
 
 // A changed domain in the list of `apply`.
 struct Change {
@@ -113,6 +127,25 @@ struct OrientArgs {
     unsigned rest_corners;
 };
 static_assert(sizeof(OrientArgs) == 64, "OrientArgs differs from src/gpu/layout.rs");
+
+struct NormalsArgs {
+    const Header* header;
+    const NormalSlot* slots;
+    const unsigned* first_domains;
+    const float* rest_normals;
+    const float4* rest_tangents;
+    const float4* transforms;
+    const unsigned* stamps;
+    const unsigned* members;
+    const unsigned* begins;
+    const unsigned* rings;
+    const float* group_normals;
+    unsigned corners;
+    unsigned rest_corners;
+    unsigned groups;
+    unsigned reserved;
+};
+static_assert(sizeof(NormalsArgs) == 104, "NormalsArgs differs from src/gpu/layout.rs");
 
 // Whether a domain changed after this output was last written.
 __device__ inline bool is_stale(const Header* header, const unsigned* stamps, unsigned domain) {

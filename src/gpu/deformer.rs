@@ -11,10 +11,10 @@ use super::apply::Apply;
 use super::bounds::{Bounds, bounds_of};
 use super::deform::Deform;
 use super::device::Device;
+use super::directions::Directions;
 use super::inputs::Inputs;
 use super::layout::Header;
 use super::memory::PageLock;
-use super::orient::Orient;
 use super::output::{Output, sizes};
 use super::plan::{Plan, plan};
 use crate::deform::{Backend, Deformed, Deformer, Surface};
@@ -45,7 +45,7 @@ pub struct CudaDeformer {
 struct Kernels {
     deform: Deform,
     bounds: Bounds,
-    orient: Orient,
+    directions: Directions,
     apply: Apply,
 }
 
@@ -70,11 +70,11 @@ impl CudaDeformer {
         let plan = plan(scene);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let [deform, bounds, orient, apply] = [0, 1, 2, 3].map(|index| &plan.kernels[index]);
+        let [deform, bounds, directions, apply] = [0, 1, 2, 3].map(|index| &plan.kernels[index]);
         let deform = Deform::new(device, scene, deform)?;
         let kernels = Kernels {
             bounds: Bounds::new(device, bounds)?,
-            orient: Orient::new(device, scene, orient)?,
+            directions: Directions::new(device, scene, directions)?,
             apply: Apply::new(device, deform.packing(), apply)?,
             deform,
         };
@@ -133,7 +133,7 @@ impl CudaDeformer {
         }
         kernels.deform.launch(device, values)?;
         kernels.bounds.launch(device, values, kernels.deform.boxes(device))?;
-        kernels.orient.launch(device, values)?;
+        kernels.directions.launch(device, values)?;
         let bounds = values.header + std::mem::offset_of!(Header, bounds) as u64;
         let answer = self.answer.as_mut_slice().map_err(during("capture"))?;
         // SAFETY: the header has six words of bounds, so has `answer`, and the deformer waits for the stream before it
@@ -168,7 +168,8 @@ impl CudaDeformer {
         steps.shown = 0;
         let graph = if some.is_some() { &self.some } else { &self.whole };
         let inputs = &mut self.inputs;
-        self.output.write(&self.device, some.is_some(), |to| {
+        let keep = some.is_some() || self.kernels.directions.reads_positions();
+        self.output.write(&self.device, keep, |to| {
             let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
             match some {
                 Some(_) => inputs.write_header(&header)?,

@@ -3,6 +3,7 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::DeviceRepr;
 
+use crate::domain::RING_START;
 use crate::storage::TILE_QUADS;
 
 /// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
@@ -10,6 +11,9 @@ pub(super) const BLOCK: u32 = 256;
 
 /// `first_tangent` of a shape without tangents.
 pub(super) const NO_TANGENTS: u32 = u32::MAX;
+
+/// `first_member` of a shape without smoothing groups.
+pub(super) const NO_GROUPS: u32 = u32::MAX;
 
 /// The start of a step's inputs; pointers are device addresses.
 #[repr(C)]
@@ -130,6 +134,38 @@ pub(super) struct OrientArgs {
     pub rest_corners: u32,
 }
 
+/// Where the corners of one domain lie, and the vertices around which `normals` gathers.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct NormalSlot {
+    pub first: u32,
+    pub first_normal: u32,
+    pub first_tangent: u32,
+    pub first_vertex: u32,
+    pub first_member: u32,
+}
+
+/// Arguments of `normals`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct NormalsArgs {
+    pub header: u64,
+    pub slots: u64,
+    pub first_domains: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub transforms: u64,
+    pub stamps: u64,
+    pub members: u64,
+    pub begins: u64,
+    pub rings: u64,
+    pub group_normals: u64,
+    pub corners: u32,
+    pub rest_corners: u32,
+    pub groups: u32,
+    pub reserved: u32,
+}
+
 const _: () = assert!(size_of::<Header>() == 80, "Header differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
@@ -139,6 +175,8 @@ const _: () = assert!(size_of::<DeformArgs>() == 112, "DeformArgs differs from k
 const _: () = assert!(size_of::<BoundsArgs>() == 24, "BoundsArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<ApplyArgs>() == 56, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<OrientArgs>() == 64, "OrientArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalsArgs>() == 104, "NormalsArgs differs from kernels/layout.cuh");
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in kernels/layout.cuh.
 unsafe impl DeviceRepr for DeformArgs {}
@@ -148,6 +186,8 @@ unsafe impl DeviceRepr for BoundsArgs {}
 unsafe impl DeviceRepr for ApplyArgs {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for OrientArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for NormalsArgs {}
 
 /// A size or an offset that both sides must agree on.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -189,10 +229,17 @@ pub fn agreements() -> Vec<Agreement> {
         OrientArgs {
             header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, corners, rest_corners
         }
+        NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
+        NormalsArgs {
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, members, begins, rings,
+            group_normals, corners, rest_corners, groups, reserved
+        }
     };
     list.push(Agreement { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
     list.push(Agreement { expression: "BLOCK".into(), host: BLOCK });
     list.push(Agreement { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
+    list.push(Agreement { expression: "NO_GROUPS".into(), host: NO_GROUPS });
+    list.push(Agreement { expression: "RING_START".into(), host: RING_START });
     list
 }
 

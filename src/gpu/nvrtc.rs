@@ -13,10 +13,11 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
 /// Headers that kernels may include, by name.
-const HEADERS: [(&str, &str); 3] = [
+const HEADERS: [(&str, &str); 4] = [
     ("layout.cuh", include_str!("../../kernels/layout.cuh")),
     ("chunk.cuh", include_str!("../../kernels/chunk.cuh")),
     ("ordered.cuh", include_str!("../../kernels/ordered.cuh")),
+    ("turn.cuh", include_str!("../../kernels/turn.cuh")),
 ];
 
 /// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not know.

@@ -50,7 +50,8 @@ impl Output {
         matches!(self, Self::Shared(_))
     }
 
-    /// Lets `work` write all of the outputs, or with `keep` parts of them, so that the rest stays what it was.
+    /// Lets `work` write all of the outputs, or with `keep` parts of them, so that the rest stays what it was, and read
+    /// them.
     pub(super) fn write(
         &mut self,
         device: &Device,

@@ -65,7 +65,7 @@ pub(super) fn tangent_count(scene: &Scene) -> usize {
 pub(super) mod tests {
     use super::*;
     use crate::domain::{Attachment, Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-    use crate::scene::{Parts, Storage};
+    use crate::scene::{Normals, Parts, Storage};
     use std::sync::Arc;
 
     fn shape(vertices: usize, rank: usize) -> Shape {
@@ -104,6 +104,13 @@ pub(super) mod tests {
     pub(in super::super) fn stored(shapes: &[(usize, usize)], storage: Storage) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.storage = storage;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// The same without normal maps, with exact normals.
+    pub(in super::super) fn exact(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.deformation.normals = Normals::Exact;
         Scene::new(parts).expect("a scene")
     }
 

@@ -4,8 +4,9 @@ use serde::Serialize;
 
 use super::apply::most_changes;
 use super::inputs::Sizes;
-use super::layout::{BLOCK, Change, CornerSlot, Lane, Tile};
+use super::layout::{BLOCK, Change, CornerSlot, Lane, NormalSlot, Tile};
 use super::pack;
+use super::rings::Counts;
 use super::work::{Coordinates, Work};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
@@ -19,7 +20,7 @@ pub(super) struct KernelSource {
 }
 
 /// All kernels there are.
-pub(super) const KERNELS: [KernelSource; 4] = [
+pub(super) const KERNELS: [KernelSource; 5] = [
     KernelSource {
         name: "deform",
         source: include_str!("../../kernels/deform.cu"),
@@ -29,6 +30,11 @@ pub(super) const KERNELS: [KernelSource; 4] = [
     KernelSource {
         name: "orient",
         source: include_str!("../../kernels/orient.cu"),
+        features: &["NORMAL_MAPS", "SHEAR"],
+    },
+    KernelSource {
+        name: "normals",
+        source: include_str!("../../kernels/normals.cu"),
         features: &["NORMAL_MAPS", "SHEAR"],
     },
     KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &[] },
@@ -72,6 +78,12 @@ pub enum Role {
     Stamps,
     RestNormals,
     RestTangents,
+    /// The smoothing group of each corner, where normals follow the surface.
+    Members,
+    /// Vertices around each group, and where they begin.
+    Rings,
+    /// The geometric normal of each group at rest.
+    GroupNormals,
     /// Where each domain's corners lie.
     CornerSlots,
     /// The first domain of each block of corners.
@@ -97,7 +109,7 @@ pub struct LeftOut {
     pub feature: &'static str,
     /// What is not compiled, computed or stored.
     pub what: &'static str,
-    /// Device bytes that are not allocated.
+    /// Device bytes that are not allocated, as far as they are known: rings that are not made have no length.
     pub bytes: u64,
 }
 
@@ -126,6 +138,7 @@ pub fn plan(scene: &Scene) -> Plan {
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let domains = scene.domains.len() as u64;
     let inputs = Sizes::of(scene, &coordinates).total();
+    let corner_slot = if needs.exact_normals { size_of::<NormalSlot>() } else { size_of::<CornerSlot>() };
     let mut buffers = vec![
         (Role::Words, 16 * work.words),
         (Role::Rest, 48 * work.rest),
@@ -135,7 +148,7 @@ pub fn plan(scene: &Scene) -> Plan {
         (Role::Boxes, 24 * u64::from(kernels[0].blocks)),
         (Role::Stamps, 4 * domains),
         (Role::RestNormals, 12 * rest_corners),
-        (Role::CornerSlots, domains * size_of::<CornerSlot>() as u64),
+        (Role::CornerSlots, domains * corner_slot as u64),
         (Role::CornerBlocks, 4 * (u64::from(blocks(layout.corners)) + 1)),
         (Role::Inputs, inputs),
         (Role::Positions, 12 * vertices),
@@ -144,6 +157,12 @@ pub fn plan(scene: &Scene) -> Plan {
     if needs.normal_maps {
         buffers.push((Role::RestTangents, 16 * pack::tangent_count(scene) as u64));
         buffers.push((Role::Tangents, 16 * corners));
+    }
+    if needs.exact_normals {
+        let counts = Counts::of(scene);
+        buffers.push((Role::Members, 4 * counts.members));
+        buffers.push((Role::Rings, 4 * (counts.groups + 1 + counts.rings)));
+        buffers.push((Role::GroupNormals, 12 * counts.groups));
     }
     let changes = (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * coordinates.total;
     Plan {
@@ -188,14 +207,15 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
             source: kernel.source,
         }
     };
-    let [deform, bounds, orient, apply] = KERNELS;
+    let [deform, bounds, orient, normals, apply] = KERNELS;
+    let directions = if needs.exact_normals { normals } else { orient };
     let warps = work.tiles.len() * if narrow { 4 } else { 1 };
     let boxes = warps.div_ceil(BLOCK as usize).min(MOST_BLOCKS);
     let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
     vec![
         compiled(deform, warps, TILE_QUADS as u32),
         compiled(bounds, boxes, BLOCK),
-        compiled(orient, blocks(scene.layout.corners) as usize, BLOCK),
+        compiled(directions, blocks(scene.layout.corners) as usize, BLOCK),
         compiled(apply, changes, BLOCK),
     ]
 }
@@ -205,6 +225,12 @@ const MOST_BLOCKS: usize = 264;
 
 fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
     let needs = scene.needs;
+    let more = (size_of::<NormalSlot>() - size_of::<CornerSlot>()) * scene.domains.len();
+    let exact_normals = LeftOut {
+        feature: "exact_normals",
+        what: "`normals` in the place of `orient`, and its rings",
+        bytes: Counts::bytes_of_possible_members(scene) + more as u64,
+    };
     let all = [
         (needs.modes, LeftOut { feature: "modes", what: "the sum U q in `deform`", bytes: 0 }),
         (
@@ -217,6 +243,7 @@ fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
         ),
         (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose in `orient`", bytes: 0 }),
         (needs.truncation, LeftOut { feature: "truncation", what: "lists of modes in `deform`", bytes: 0 }),
+        (needs.exact_normals, exact_normals),
         (needs.compensated, LeftOut { feature: "compensated", what: "the compensation in `deform`", bytes: 0 }),
     ];
     all.into_iter().filter(|(needed, _)| !needed).map(|(_, part)| part).collect()
@@ -246,7 +273,8 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pack::tests::{scene, stored};
+    use super::super::pack::tests::{exact, scene, stored};
+    use super::super::rings::Rings;
     use super::*;
 
     fn defines(plan: &Plan) -> Vec<(&str, Vec<&str>)> {
@@ -264,7 +292,7 @@ mod tests {
         assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
         assert_eq!(bare.bytes_in, 80 + 48 * 4, "a header and four transforms, no q");
         let left_out: Vec<_> = bare.left_out.iter().map(|part| part.feature).collect();
-        assert_eq!(left_out, ["modes", "normal_maps", "shear", "truncation", "compensated"]);
+        assert_eq!(left_out, ["modes", "normal_maps", "shear", "truncation", "exact_normals", "compensated"]);
         assert_eq!(bare.left_out[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
     }
 
@@ -276,7 +304,7 @@ mod tests {
         assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
         assert_eq!(full.bytes(Role::RestTangents), 16 * 302, "only the shape with a normal map");
         assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
-        assert_eq!(full.left_out.len(), 2);
+        assert_eq!(full.left_out.len(), 3);
     }
 
     #[test]
@@ -287,6 +315,27 @@ mod tests {
             plan.bytes(Role::Words)
         };
         assert_eq!(Storage::ALL.map(bytes), [75 * 48 * 8, 75 * 48 * 4, 75 * 48 * 4, 75 * 48 * 2]);
+    }
+
+    #[test]
+    fn exact_normals_take_the_place_of_rigid_ones_and_their_tables_are_planned() {
+        let scene = exact(&[(7, 2), (300, 0), (513, 4)]);
+        let (plan, rings) = (plan(&scene), Rings::new(&scene));
+        assert_eq!((plan.kernels[2].name, plan.kernels[2].defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
+        assert_eq!(plan.launches(), 4);
+        for (role, bytes) in [
+            (Role::CornerSlots, size_of_val(super::super::rings::slots(&scene).as_slice())),
+            (Role::Members, size_of_val(rings.members.as_slice())),
+            (Role::Rings, size_of_val(rings.begins.as_slice()) + size_of_val(rings.rings.as_slice())),
+            (Role::GroupNormals, size_of_val(rings.normals.as_slice())),
+        ] {
+            assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
+        }
+        assert_eq!(plan.bytes(Role::Members), 4 * (9 + 515), "the shape without modes has no groups");
+        let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], Storage::F32));
+        assert_eq!(rigid.bytes(Role::Members) + rigid.bytes(Role::Rings) + rigid.bytes(Role::GroupNormals), 0);
+        let left_out = rigid.left_out.iter().find(|part| part.feature == "exact_normals").expect("left out");
+        assert_eq!(left_out.bytes, 4 * (9 + 515) + 8 * 6, "members, and eight bytes more per slot");
     }
 
     #[test]

@@ -5,6 +5,7 @@ mod far;
 mod frames;
 mod hostile;
 mod layering;
+mod normals;
 mod pixels;
 mod real;
 mod restart;
