@@ -8,4 +8,5 @@ mod judge;
 mod real;
 mod scenes;
 mod trials;
+mod tune;
 mod twins;
