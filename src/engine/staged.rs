@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::deform::{Deformed, Deformer, Surface};
 use crate::error::{Error, Result, during, invalid};
 use crate::render::{Renderer, SceneBuffers};
-use crate::scene::{Bounds, Camera, Scene, State, nearest};
+use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
 
 /// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
 const FARTHEST: f64 = 1e18;
@@ -100,7 +100,7 @@ impl Staged {
                 return Ok((self.bounds, uploaded));
             }
         };
-        let view = nearest(camera.eye().into());
+        let view = nearest_cell(camera.eye().into());
         let positions = &self.deformer.surface()?.positions;
         let (positions, bounds) = apart.seen_from(view, &self.scene.layout.slots, positions);
         renderer.upload_apart(buffers, &positions, view)?;
