@@ -5,6 +5,7 @@
 //! straight into OpenGL's buffers when the driver shares them.
 
 mod cache;
+mod cublas;
 mod deform;
 mod deformer;
 mod device;
@@ -16,6 +17,7 @@ mod nvrtc;
 mod orient;
 mod output;
 mod pack;
+mod plain_update;
 mod plan;
 mod probe;
 mod report;
@@ -24,6 +26,7 @@ mod thesis;
 mod trial;
 mod turns;
 
+pub use cublas::{Cublas, Peer, cublas_version};
 pub use deformer::CudaDeformer;
 pub use device::Device;
 pub use layout::{Agreement, agreements};

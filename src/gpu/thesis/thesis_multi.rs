@@ -53,7 +53,7 @@ impl Multi {
             }
             let define = format!("WIDTH={width}");
             kernels.push(Kernel {
-                compiled: Compiled::new(device, &CODE, "thesis_multi", &[&define])?,
+                compiled: Compiled::new(device, &CODE, &[&define])?,
                 entries: upload(device, &packed.entries)?,
                 meta: upload(device, &packed.meta)?,
                 lanes: packed.meta.len(),
