@@ -118,7 +118,7 @@ mod tests {
             }
             for lane in (0..WARP).filter(busy) {
                 let [place, _, fours, _] = packed.meta[first + lane].map(|number| number as usize);
-                if lane % packed.width % fours == 0 {
+                if (lane % packed.width).is_multiple_of(fours) {
                     u[place] = sub_sums[lane..lane + fours].iter().sum();
                     written[place] += 1;
                 }
