@@ -7,6 +7,7 @@
 mod apply;
 mod bounds;
 mod cache;
+mod cublas;
 mod deform;
 mod deformer;
 mod device;
@@ -20,6 +21,7 @@ mod nvrtc;
 mod ours;
 mod output;
 mod pack;
+mod plain_update;
 mod plan;
 mod probe;
 mod report;
@@ -30,6 +32,7 @@ mod trial;
 mod turns;
 mod work;
 
+pub use cublas::{Cublas, Peer, cublas_version};
 pub use deformer::CudaDeformer;
 pub use device::Device;
 pub use layout::{Agreement, agreements};
