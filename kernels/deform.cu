@@ -17,7 +17,8 @@
 //   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
 //                 WITHOUT_POSITIONS, for measuring                                                          (out)
 //   boxes         [warps][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                   (out)
-// Launch: one warp a block; 4 / SPAN blocks a tile, or any number of blocks with LISTED.
+// Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles from `first` on, or any number of blocks with
+// LISTED. Tiles without modes, which come last in the list, are launched beside the others without MODES.
 // CPU twin: src/reference/deform.rs.
 //
 // The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
@@ -32,11 +33,18 @@
 #else
 #define AHEAD 4
 #endif
-// Blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill registers.
+// Warps of a block, and blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill
+// registers. Tiles of modes read long runs and do best in blocks of one warp; those without wait for one thing after the
+// other, and as many as possible must wait at once.
 #if defined(SHEAR) || defined(LISTED)
+constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 16;
-#else
+#elif defined(MODES)
+constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 24;
+#else
+constexpr unsigned WARPS = 2;
+constexpr unsigned RESIDENT = 18;
 #endif
 
 #ifdef MODES
@@ -164,26 +172,42 @@ struct Chosen {
     }
 };
 
-__device__ __forceinline__ void sum_modes(const DeformArgs& args, const Part& part, Sums& sums) {
-    const Chosen chosen(args, part);
+// Adds `COUNT` chunks from the i-th chosen on, all of them loaded before the first is summed.
+template <unsigned COUNT>
+__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const Part& part, const Chosen& chosen, unsigned& i,
+                                           Sums& sums) {
     const uint4* words = args.words + part.first_word + part.quad;
     const size_t step = 3 * (size_t)part.width;
-    unsigned i = 0;
-    for (; i + AHEAD <= chosen.count; i += AHEAD) {
-        Chunk chunks[AHEAD];
+    Chunk chunks[COUNT];
 #pragma unroll
-        for (unsigned k = 0; k < AHEAD; ++k) {
-            chunks[k].load(part, words + chosen[i + k] * step);
-        }
-#pragma unroll
-        for (unsigned k = 0; k < AHEAD; ++k) {
-            add_chunk(sums, chunks[k], amounts_of(args, part, chosen[i + k]));
-        }
+    for (unsigned k = 0; k < COUNT; ++k) {
+        chunks[k].load(part, words + chosen[i + k] * step);
     }
-    for (; i < chosen.count; ++i) {
-        Chunk chunk;
-        chunk.load(part, words + chosen[i] * step);
-        add_chunk(sums, chunk, amounts_of(args, part, chosen[i]));
+#pragma unroll
+    for (unsigned k = 0; k < COUNT; ++k) {
+        add_chunk(sums, chunks[k], amounts_of(args, part, chosen[i + k]));
+    }
+    i += COUNT;
+}
+
+__device__ __forceinline__ void sum_modes(const DeformArgs& args, const Part& part, Sums& sums) {
+    const Chosen chosen(args, part);
+    unsigned i = 0;
+    while (i + AHEAD <= chosen.count) {
+        sum_chunks<AHEAD>(args, part, chosen, i, sums);
+    }
+    const unsigned left = chosen.count - i;
+    if (AHEAD > 8 && left & 8) {
+        sum_chunks<8>(args, part, chosen, i, sums);
+    }
+    if (AHEAD > 4 && left & 4) {
+        sum_chunks<4>(args, part, chosen, i, sums);
+    }
+    if (left & 2) {
+        sum_chunks<2>(args, part, chosen, i, sums);
+    }
+    if (left & 1) {
+        sum_chunks<1>(args, part, chosen, i, sums);
     }
 }
 #endif
@@ -263,21 +287,33 @@ struct Shared {
     unsigned mended[32][6];
 };
 
-// World positions from `bent`, [axis][vertex] sums; x0 is added here.
+// What a vertex has besides its modes: x0 and T.
+struct Base {
+    Items x, y, z;
+    float4 a, b, c;
+    __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
+        const float4* from = args.rest + 3 * (size_t)part.rest;
+        x = items_of(from, part.within);
+        y = items_of(from + 1, part.within);
+        z = items_of(from + 2, part.within);
+        const float4* rows = args.transforms + 3 * (size_t)part.domain;
+        a = __ldg(rows);
+        b = __ldg(rows + 1);
+        c = __ldg(rows + 2);
+    }
+};
+
+// World positions from `bent`, [axis][vertex] sums.
 __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, const Part& part, unsigned tile,
-                                      unsigned share, const float (&bent)[FLOATS]) {
-    const float4* from = args.rest + 3 * (size_t)part.rest;
-    const Items x = items_of(from, part.within), y = items_of(from + 1, part.within),
-                z = items_of(from + 2, part.within);
-    const float4* rows = args.transforms + 3 * (size_t)part.domain;
-    const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
+                                      unsigned share, const Base& base, const float (&bent)[FLOATS]) {
     float world[FLOATS], total = 0.0f;
 #pragma unroll
     for (unsigned i = 0; i < SPAN; ++i) {
-        const float px = x.of[i] + bent[i], py = y.of[i] + bent[SPAN + i], pz = z.of[i] + bent[2 * SPAN + i];
-        world[3 * i] = placed(a, px, py, pz);
-        world[3 * i + 1] = placed(b, px, py, pz);
-        world[3 * i + 2] = placed(c, px, py, pz);
+        const float px = base.x.of[i] + bent[i], py = base.y.of[i] + bent[SPAN + i],
+                    pz = base.z.of[i] + bent[2 * SPAN + i];
+        world[3 * i] = placed(base.a, px, py, pz);
+        world[3 * i + 1] = placed(base.b, px, py, pz);
+        world[3 * i + 2] = placed(base.c, px, py, pz);
         // Zero, unless one of them is not finite.
         total = fmaf(0.0f, world[3 * i] + world[3 * i + 1] + world[3 * i + 2], total);
     }
@@ -286,8 +322,8 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
     if (part.count > 0) {
         box_of(world, part.count, keys);
         if (total != 0.0f) {
-            unsigned(&mended)[6] = shared.mended[threadIdx.x];
-            mend(args, tile, share, staged(shared.stage) + FLOATS * threadIdx.x, part.count, mended);
+            unsigned(&mended)[6] = shared.mended[lane_of()];
+            mend(args, tile, share, staged(shared.stage) + FLOATS * lane_of(), part.count, mended);
 #pragma unroll
             for (unsigned side = 0; side < 6; ++side) {
                 keys[side] = mended[side];
@@ -298,29 +334,51 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
 #pragma unroll
     for (unsigned side = 0; side < 6; ++side) {
         const unsigned key = warp_max(keys[side]);
-        if (threadIdx.x == side) {
+        if (lane_of() == side) {
             args.boxes[6 * ((size_t)tile * SHARE + share) + side] = key;
         }
     }
 }
 
+#ifdef MODES
+// Asks early for what is read after the modes.
+__device__ __forceinline__ void prefetch_rest(const DeformArgs& args, const Part& part) {
+    prefetch(args.rest + 3 * (size_t)part.rest);
+#ifdef ORIENT
+    if (part.kind & TILE_CORNERS) {
+        prefetch(args.rest_normals + 3 * (size_t)part.rest);
+#ifdef NORMAL_MAPS
+        prefetch(args.rest_tangents + 4 * (size_t)part.rest);
+#endif
+    }
+#endif
+}
+
+__device__ __forceinline__ void sum(const DeformArgs& args, const Part& part, float (&bent)[FLOATS]) {
+    Sums sums;
+    sums.clear();
+    sum_modes(args, part, sums);
+#pragma unroll
+    for (unsigned i = 0; i < FLOATS; ++i) {
+        bent[i] = sums.total(i);
+    }
+}
+#endif
+
 __device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, unsigned tile, unsigned share) {
     const Part part = part_of(args, tile, share);
+#ifdef ORIENT
+    Normals normals;
+#endif
     if (part.kind & TILE_VERTICES) {
-        float bent[FLOATS];
-#ifdef MODES
-        Sums sums;
-        sums.clear();
-        sum_modes(args, part, sums);
-#pragma unroll
-        for (unsigned i = 0; i < FLOATS; ++i) {
-            bent[i] = sums.total(i);
-        }
-#else
-#pragma unroll
-        for (unsigned i = 0; i < FLOATS; ++i) {
-            bent[i] = 0.0f;
-        }
+        float bent[FLOATS] = {};
+        Base base;
+#if defined(MODES) && defined(NARROW)
+        base.load(args, part);
+        sum(args, part, bent);
+#elif defined(MODES)
+        prefetch_rest(args, part);
+        sum(args, part, bent);
 #endif
 #ifdef DISPLACEMENTS
         float u[FLOATS];
@@ -332,24 +390,39 @@ __device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, 
         store(args.header->displacements, shared.stage, (part.kind & TILE_LAST) > 0);
 #endif
 #ifndef WITHOUT_POSITIONS
-        place(args, shared, part, tile, share, bent);
+#if !(defined(MODES) && defined(NARROW))
+        base.load(args, part);
+#endif
+#ifdef ORIENT
+        // Before the positions leave, so that both are on their way at once.
+        if (part.kind & TILE_CORNERS) {
+            normals.load(args, part);
+        }
+#endif
+        place(args, shared, part, tile, share, base, bent);
 #endif
     }
 #ifdef ORIENT
     if (part.kind & TILE_CORNERS) {
-        orient(args, shared.stage, part);
+        if (!(part.kind & TILE_VERTICES)) {
+            normals.load(args, part);
+        }
+        orient(args, shared.stage, part, normals);
     }
 #endif
 }
 
-extern "C" __global__ void __launch_bounds__(32, RESIDENT) deform(const __grid_constant__ DeformArgs args) {
-    __shared__ Shared shared;
+extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) deform(const __grid_constant__ DeformArgs args) {
+    __shared__ Shared shared[WARPS];
+    const unsigned warp = blockIdx.x * WARPS + threadIdx.x / 32;
 #ifdef LISTED
     const unsigned warps = SHARE * __ldg(&args.header->stale);
-    for (unsigned warp = blockIdx.x; warp < warps; warp += gridDim.x) {
-        compute(args, shared, __ldg(args.list + warp / SHARE), warp % SHARE);
+    for (unsigned i = warp; i < warps; i += gridDim.x * WARPS) {
+        compute(args, shared[threadIdx.x / 32], __ldg(args.list + i / SHARE), i % SHARE);
     }
 #else
-    compute(args, shared, blockIdx.x / SHARE, blockIdx.x % SHARE);
+    if (warp < SHARE * args.count) {
+        compute(args, shared[threadIdx.x / 32], args.first + warp / SHARE, warp % SHARE);
+    }
 #endif
 }

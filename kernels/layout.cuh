@@ -93,8 +93,10 @@ struct DeformArgs {
     const unsigned* kept_counts;
     const unsigned short* kept;
     unsigned* boxes;
+    unsigned first; // tile
+    unsigned count; // of tiles
 };
-static_assert(sizeof(DeformArgs) == 128, "DeformArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(DeformArgs) == 136, "DeformArgs differs from src/gpu/layout.rs");
 
 struct BoundsArgs {
     Header* header;

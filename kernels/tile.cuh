@@ -12,6 +12,10 @@ constexpr unsigned SPAN = 4;
 constexpr unsigned SHARE = 4 / SPAN; // warps of a tile
 constexpr unsigned FLOATS = 3 * SPAN;
 
+__device__ __forceinline__ unsigned lane_of() {
+    return threadIdx.x % 32;
+}
+
 // One lane's part of a tile.
 struct Part {
     unsigned kind;
@@ -32,7 +36,7 @@ struct Part {
 __device__ __forceinline__ Part part_of(const DeformArgs& args, unsigned tile, unsigned share) {
     const uint4 head = __ldg((const uint4*)(args.tiles + tile));
     const uint4 tail = __ldg((const uint4*)(args.tiles + tile) + 1);
-    const unsigned place = share * 32 + threadIdx.x;
+    const unsigned place = share * 32 + lane_of();
     Part part;
     part.quad = place / SHARE;
     part.within = place % SHARE * SPAN;
@@ -83,10 +87,10 @@ __device__ __forceinline__ float* staged(Stage& stage) {
 __device__ __forceinline__ void put(Stage& stage, const float (&numbers)[FLOATS], unsigned item, unsigned count) {
 #pragma unroll
     for (unsigned i = 0; i < FLOATS; ++i) {
-        staged(stage)[FLOATS * threadIdx.x + i] = numbers[i];
+        staged(stage)[FLOATS * lane_of() + i] = numbers[i];
     }
-    stage.places[threadIdx.x] = item;
-    stage.counts[threadIdx.x] = count;
+    stage.places[lane_of()] = item;
+    stage.counts[lane_of()] = count;
 }
 
 // Three numbers an item. Lanes of one domain write one run, so that sectors are written whole; where a whole warp has
@@ -97,12 +101,12 @@ __device__ __forceinline__ void store(float* packed, Stage& stage, bool is_run) 
     if (is_run && first % 4 == 0 && stage.counts[31] == SPAN) {
         float4* run = (float4*)(packed + 3 * (size_t)first);
 #pragma unroll
-        for (unsigned i = threadIdx.x; i < 8 * FLOATS; i += 32) {
+        for (unsigned i = lane_of(); i < 8 * FLOATS; i += 32) {
             __stcs(run + i, stage.numbers[i]);
         }
     } else {
 #pragma unroll
-        for (unsigned i = threadIdx.x; i < 32 * FLOATS; i += 32) {
+        for (unsigned i = lane_of(); i < 32 * FLOATS; i += 32) {
             const unsigned lane = i / FLOATS, within = i % FLOATS;
             if (within < 3 * stage.counts[lane]) {
                 __stcs(packed + 3 * (size_t)stage.places[lane] + within, staged(stage)[i]);
@@ -116,7 +120,7 @@ __device__ __forceinline__ void store(float* packed, Stage& stage, bool is_run) 
 __device__ __forceinline__ void store_quadruples(float4* packed, Stage& stage) {
     __syncwarp();
 #pragma unroll
-    for (unsigned i = threadIdx.x; i < 32 * SPAN; i += 32) {
+    for (unsigned i = lane_of(); i < 32 * SPAN; i += 32) {
         const unsigned lane = i / SPAN, within = i % SPAN;
         if (within < stage.counts[lane]) {
             __stcs(packed + stage.places[lane] + within, stage.numbers[i]);
@@ -142,4 +146,9 @@ __device__ __forceinline__ Items items_of(const float4* from, unsigned within) {
     items.of[3] = four.w;
 #endif
     return items;
+}
+
+// Asks for the line of an address, so that whoever loads it later finds it in the L2.
+__device__ __forceinline__ void prefetch(const void* address) {
+    asm volatile("prefetch.global.L2 [%0];" ::"l"(address));
 }

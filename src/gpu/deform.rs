@@ -3,28 +3,40 @@
 
 use std::sync::Arc;
 
-use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{CudaFunction, CudaSlice, CudaStream, LaunchConfig, PushKernelArg as _};
 
 use super::device::Device;
 use super::inputs::{Packing, Values};
 use super::layout::DeformArgs;
 use super::memory::{address, room, upload};
-use super::plan::Kernel;
+use super::plan::{Kernel, Launch, warps};
+use super::trial::KernelFacts;
 use super::work::{Coordinates, Source, Work, corner_shifts, orients, side_by_side};
-use crate::error::{Result, during};
+use crate::error::{Error, Result, during};
 use crate::scene::Scene;
-use crate::storage::{Plane, Tiles};
+use crate::storage::{Plane, TILE_QUADS, Tiles};
 
 /// Words of U that go to the device in one piece while packing, so that packing needs little memory of its own.
 const PIECE: usize = 1 << 22;
 
+/// The tiles that one launch computes.
+#[derive(Debug)]
+struct Class {
+    function: CudaFunction,
+    config: LaunchConfig,
+    first: u32,
+    count: u32,
+}
+
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
 pub(super) struct Deform {
-    pub(super) function: CudaFunction,
-    /// The same for a list of tiles.
+    /// Of tiles with modes, and of those without.
+    classes: Vec<Class>,
+    /// For a list of tiles of either kind.
     listed: CudaFunction,
-    config: LaunchConfig,
+    /// A second stream, so that both classes run beside each other.
+    beside: Arc<CudaStream>,
     tiles: CudaSlice<u8>,
     lanes: CudaSlice<u8>,
     lane_scales: CudaSlice<u8>,
@@ -44,7 +56,8 @@ pub(super) struct Deform {
 }
 
 impl Deform {
-    pub(super) fn new(device: &Device, scene: &Arc<Scene>, kernel: &Kernel) -> Result<Self> {
+    /// `kernels` are those of [`Launch::Modes`] and [`Launch::Rigid`] that the scene has.
+    pub(super) fn new(device: &Device, scene: &Arc<Scene>, kernels: &[Kernel]) -> Result<Self> {
         let coordinates = Coordinates::new(scene);
         let work = Work::new(scene, &coordinates);
         let mut load = Load::new(device, scene, &work)?;
@@ -52,11 +65,14 @@ impl Deform {
         let (words, load) = load.finish()?;
         let (rest, scales, factors) = (upload(device, &load.rest)?, upload(device, &load.scales)?, load.factors);
         let (normals, tangents) = directions(scene, &work);
+        let classes = kernels.iter().map(|kernel| Class::new(device, kernel, &work)).collect::<Result<Vec<_>>>()?;
+        // With modes where any tile has them: tiles without do nothing there.
+        let [kernel, ..] = kernels else { return Err(during("deform")("a scene without tiles")) };
         let listed: Vec<&str> = kernel.defines.iter().copied().chain(["LISTED"]).collect();
         Ok(Self {
-            function: device.function(kernel.name, kernel.source, &kernel.defines)?,
+            classes,
             listed: device.function(kernel.name, kernel.source, &listed)?,
-            config: config(kernel),
+            beside: device.context().new_stream().map_err(during("deform"))?,
             tiles: upload(device, &work.tiles)?,
             lanes: upload(device, &work.lanes)?,
             lane_scales: upload(device, &work.lane_scales)?,
@@ -67,8 +83,8 @@ impl Deform {
             corner_shifts: upload(device, &corner_shifts(scene))?,
             scales,
             list: room(device, 4 * work.tiles.len() as u64)?,
-            boxes: room(device, 24 * u64::from(kernel.blocks))?,
-            warps: kernel.blocks,
+            boxes: room(device, 24 * warps(&work))?,
+            warps: warps(&work) as u32,
             directed: work.quads.directed,
             packing: Arc::new(Packing {
                 scene: Arc::clone(scene),
@@ -97,21 +113,38 @@ impl Deform {
 
     /// Starts the kernel on all tiles; the header among the values says where everything goes.
     pub(super) fn launch(&self, device: &Device, values: Values) -> Result<()> {
-        self.launch_as(device, values, (&self.function, self.config))
+        let fail = during("deform");
+        let [first, others @ ..] = self.classes.as_slice() else { return Ok(()) };
+        if !others.is_empty() {
+            self.beside.join(device.stream()).map_err(&fail)?;
+        }
+        self.launch_as(device, values, (device.stream(), first))?;
+        for class in others {
+            self.launch_as(device, values, (&self.beside, class))?;
+            device.stream().join(&self.beside).map_err(&fail)?;
+        }
+        Ok(())
     }
 
     /// Starts it on the tiles of the list, as many as the header says.
     pub(super) fn launch_listed(&self, device: &Device, values: Values) -> Result<()> {
         let grid_dim = (self.warps.min(LISTED_BLOCKS), 1, 1);
-        self.launch_as(device, values, (&self.listed, LaunchConfig { grid_dim, ..self.config }))
+        let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
+        let class = Class { function: self.listed.clone(), config, first: 0, count: 0 };
+        self.launch_as(device, values, (device.stream(), &class))
     }
 
-    fn launch_as(
-        &self,
-        device: &Device,
-        values: Values,
-        (function, config): (&CudaFunction, LaunchConfig),
-    ) -> Result<()> {
+    /// Launches of a whole step.
+    pub(super) fn launches(&self) -> usize {
+        self.classes.len()
+    }
+
+    /// What the driver says of the kernels.
+    pub(super) fn facts(&self) -> Vec<KernelFacts> {
+        self.classes.iter().filter_map(|class| KernelFacts::of("deform", &class.function).ok()).collect()
+    }
+
+    fn launch_as(&self, device: &Device, values: Values, (stream, class): (&Arc<CudaStream>, &Class)) -> Result<()> {
         let at = |buffer: &CudaSlice<u8>| address(device, buffer);
         let args = DeformArgs {
             header: values.header,
@@ -131,14 +164,33 @@ impl Deform {
             kept_counts: values.kept_counts,
             kept: values.kept,
             boxes: at(&self.boxes),
+            first: class.first,
+            count: class.count,
         };
-        let mut launch = device.stream().launch_builder(function);
+        let mut launch = stream.launch_builder(&class.function);
         // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
         // words, x0, normals, transforms and q of the same scene, and the list names such tiles; there are as many boxes
         // as warps; and the header's outputs have the sizes that `Output` checked. Tangents and shifts are read only by
         // a kernel that was compiled for a scene that has them.
-        unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
+        unsafe { launch.arg(&args).launch(class.config) }.map_err(during("deform"))?;
         Ok(())
+    }
+}
+
+impl Class {
+    fn new(device: &Device, kernel: &Kernel, work: &Work) -> Result<Self> {
+        let function = device.function(kernel.name, kernel.source, &kernel.defines)?;
+        let most = function.max_threads_per_block().map_err(during("deform"))?;
+        if most != kernel.threads as i32 {
+            let reason = format!("the kernel is made for {most} threads a block, {} were planned", kernel.threads);
+            return Err(Error::Fault { stage: "deform", reason });
+        }
+        let with_modes = work.tiles.iter().filter(|tile| tile.chunks > 0).count() as u32;
+        let (first, count) = match kernel.launch {
+            Launch::Modes => (0, with_modes),
+            _ => (with_modes, work.tiles.len() as u32 - with_modes),
+        };
+        Ok(Self { function, config: config(kernel), first, count })
     }
 }
 

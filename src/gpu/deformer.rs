@@ -16,7 +16,7 @@ use super::layout::Header;
 use super::memory::PageLock;
 use super::normals::Normals;
 use super::output::{Output, sizes};
-use super::plan::{Plan, plan};
+use super::plan::{Launch, Plan, plan};
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::{Error, Result, during};
 use crate::scene::{Changed, Scene, State};
@@ -71,12 +71,11 @@ impl CudaDeformer {
         let plan = plan(scene);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let [deform, bounds, apply] = [0, 1, 2].map(|index| &plan.kernels[index]);
-        let deform = Deform::new(device, scene, deform)?;
+        let deform = Deform::new(device, scene, &plan.tiles())?;
         let kernels = Kernels {
-            bounds: Bounds::new(device, bounds)?,
-            normals: plan.kernels.get(3).map(|normals| Normals::new(device, scene, normals)).transpose()?,
-            apply: Apply::new(device, deform.packing(), apply)?,
+            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
+            normals: plan.kernel(Launch::Normals).map(|normals| Normals::new(device, scene, normals)).transpose()?,
+            apply: Apply::new(device, deform.packing(), plan.needed(Launch::Apply)?)?,
             deform,
         };
         // SAFETY: the memory is written by the copy that ends every graph before anyone looks.

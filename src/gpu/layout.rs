@@ -92,6 +92,8 @@ pub(super) struct DeformArgs {
     pub kept_counts: u64,
     pub kept: u64,
     pub boxes: u64,
+    pub first: u32,
+    pub count: u32,
 }
 
 /// Arguments of `bounds`.
@@ -155,7 +157,7 @@ const _: () = assert!(size_of::<Header>() == 80, "Header differs from kernels/la
 const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<DeformArgs>() == 128, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 136, "DeformArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BoundsArgs>() == 24, "BoundsArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<ApplyArgs>() == 72, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
@@ -202,7 +204,7 @@ pub fn agreements() -> Vec<Agreement> {
         Change { domain, first_q, count, source }
         DeformArgs {
             header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
-            transforms, q, list, kept_counts, kept, boxes
+            transforms, q, list, kept_counts, kept, boxes, first, count
         }
         BoundsArgs { header, boxes, count, reserved }
         ApplyArgs { header, changes, new_transforms, new_q, stale, transforms, q, stamps, list }

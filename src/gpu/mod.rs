@@ -38,7 +38,7 @@ pub use device::Device;
 pub use layout::{Agreement, agreements};
 pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
 pub use ours::{Extent, Ours};
-pub use plan::{Buffer, Kernel, LeftOut, Plan, Role, plan};
+pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use roof::{Roofs, roofs};

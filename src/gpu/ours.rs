@@ -13,7 +13,7 @@ use super::inputs::{Inputs, Values};
 use super::layout::Header;
 use super::memory::{address, download, room};
 use super::normals::Normals;
-use super::plan::{Plan, Role, plan};
+use super::plan::{Kernel, Launch, Plan, Role, plan};
 use super::trial::{KernelFacts, Trial};
 use super::turns::Turns;
 use crate::error::{Result, during, invalid};
@@ -88,22 +88,22 @@ impl Ours {
         (extent, changed): (Extent, Option<&[u32]>),
     ) -> Result<Self> {
         let plan = plan(scene);
-        let [mut deform, bounds, apply] = [0, 1, 2].map(|index| plan.kernels[index].clone());
-        let normals = plan.kernels.get(3).filter(|_| extent == Extent::Whole);
+        let normals = plan.kernel(Launch::Normals).filter(|_| extent == Extent::Whole);
         let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
-        if extent != Extent::Whole {
-            deform.defines.retain(|define| *define != "ORIENT");
+        let mut tiles = plan.tiles();
+        for kernel in &mut tiles {
+            kernel.shape_for(extent);
         }
         if extent == Extent::Uq {
-            deform.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
+            tiles.retain(|kernel| kernel.launch == Launch::Modes);
         }
-        let deform = Deform::new(device, scene, &deform)?;
+        let deform = Deform::new(device, scene, &tiles)?;
         let outputs = room(device, outputs_of(&plan).iter().sum())?;
         let mut ours = Self {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
             extent,
             scene: Arc::clone(scene),
-            bounds: Bounds::new(device, &bounds)?,
+            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
             normals,
             listed: changed.is_some(),
             inputs: Vec::new(),
@@ -113,7 +113,7 @@ impl Ours {
             deform,
             plan,
         };
-        let mut apply = Apply::new(device, ours.deform.packing(), &apply)?;
+        let mut apply = Apply::new(device, ours.deform.packing(), ours.plan.needed(Launch::Apply)?)?;
         for state in states {
             let header = Header { everything: 1, step: 1, ..ours.header(device) };
             let mut inputs = Inputs::new(device, ours.deform.packing())?;
@@ -147,6 +147,18 @@ impl Ours {
 
     fn values(&self, device: &Device, turn: usize) -> Values {
         self.inputs[turn % self.inputs.len()].values(device)
+    }
+}
+
+impl Kernel {
+    /// Leaves out what the part of the step does without.
+    fn shape_for(&mut self, extent: Extent) {
+        if extent != Extent::Whole {
+            self.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS"].contains(define));
+        }
+        if extent == Extent::Uq {
+            self.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
+        }
     }
 }
 
@@ -239,12 +251,15 @@ impl Trial for Ours {
     }
 
     fn launches(&self) -> usize {
-        1 + usize::from(self.extent == Extent::Whole) + usize::from(self.normals.is_some())
+        let more = [self.extent == Extent::Whole, self.normals.is_some()].map(usize::from);
+        self.deform.launches() + more[0] + more[1]
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
-        let functions = [("deform", &self.deform.function), ("bounds", &self.bounds.function)];
-        let functions = functions.into_iter().chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
-        functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
+        let mut facts = self.deform.facts();
+        let functions = std::iter::once(("bounds", &self.bounds.function));
+        let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
+        facts.extend(functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()));
+        facts
     }
 }

@@ -8,6 +8,7 @@ use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
 use super::pack;
 use super::rings::Counts;
 use super::work::{Coordinates, Work, corner_shifts, orients};
+use crate::error::{Error, Result};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
 
@@ -42,9 +43,25 @@ pub(super) const STORAGES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE_INT8"]
 /// each multiprocessor of a large device.
 const FEW_TILES: usize = 1024;
 
+/// What a launch is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Launch {
+    /// `deform` of the tiles that have modes.
+    Modes,
+    /// `deform` of the others.
+    Rigid,
+    Bounds,
+    /// Normals that follow the surface.
+    Normals,
+    /// In steps that change few domains; one launch of `deform` for listed tiles then takes the place of the two.
+    Apply,
+}
+
 /// A kernel as one scene compiles it; launched at most once a step.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Kernel {
+    pub launch: Launch,
     pub name: &'static str,
     /// Macros that switch parts of it on.
     pub defines: Vec<&'static str>,
@@ -113,7 +130,7 @@ pub struct LeftOut {
 /// What the CUDA deformer compiles, allocates and launches for a scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Plan {
-    /// Launched in this order, each once a step; `apply` only in steps that change few domains.
+    /// Those that the scene has, in the order in which a step launches them; `apply` is first where it is launched.
     pub kernels: Vec<Kernel>,
     pub buffers: Vec<Buffer>,
     /// Bytes to the device and from it in each step, besides the vertices themselves.
@@ -143,7 +160,7 @@ pub fn plan(scene: &Scene) -> Plan {
         (Role::Tiles, ((size_of::<Tile>() + 4) * work.tiles.len()) as u64),
         (Role::Lanes, (work.lanes.len() * size_of::<Lane>() + 4 * work.lane_scales.len()) as u64),
         (Role::CornerShifts, 4 * corner_shifts(scene).len() as u64),
-        (Role::Boxes, 24 * u64::from(kernels[0].blocks)),
+        (Role::Boxes, 24 * warps(&work)),
         (Role::Stamps, 4 * domains),
         (Role::RestNormals, if needs.exact_normals { 12 * rest_corners } else { 48 * directed }),
         (Role::Inputs, inputs),
@@ -186,46 +203,68 @@ const fn storage_define(storage: Storage) -> Option<&'static str> {
     }
 }
 
+/// Whether a lane takes one item instead of four.
+pub(super) const fn is_narrow(work: &Work) -> bool {
+    work.tiles.len() < FEW_TILES
+}
+
+/// Warps of all tiles.
+pub(super) const fn warps(work: &Work) -> u64 {
+    work.tiles.len() as u64 * if is_narrow(work) { 4 } else { 1 }
+}
+
+/// Threads of a block of `deform`: WARPS in its source, which the launcher compares.
+fn threads_of(defines: &[&str]) -> u32 {
+    let one = ["MODES", "SHEAR", "LISTED"].iter().any(|macro_name| defines.contains(macro_name));
+    TILE_QUADS as u32 * if one { 1 } else { 2 }
+}
+
 fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     let needs = scene.needs;
-    let narrow = work.tiles.len() < FEW_TILES;
-    let flags = [
-        ("MODES", needs.modes),
-        ("NARROW", narrow),
-        ("TRUNCATED", needs.truncation),
-        ("COMPENSATED", needs.compensated),
-        ("ORIENT", orients(scene)),
-        ("SHIFTED", !corner_shifts(scene).is_empty()),
-        ("NORMAL_MAPS", needs.normal_maps),
-        ("SHEAR", needs.shear),
-    ];
-    let compiled = |kernel: KernelSource, blocks: usize, threads: u32| {
-        let turns = kernel.name != "deform" || orients(scene);
-        let wanted =
-            |name: &str| kernel.features.contains(&name) && (turns || !["NORMAL_MAPS", "SHEAR"].contains(&name));
-        let on = flags.iter().filter(|(name, on)| *on && wanted(name)).map(|(name, _)| *name);
-        let storage = storage_define(scene.deformation.storage).filter(|_| needs.modes && kernel.name == "deform");
-        Kernel {
-            name: kernel.name,
-            defines: on.chain(storage).collect(),
-            blocks: blocks as u32,
-            threads,
-            source: kernel.source,
-        }
-    };
+    let with_modes = work.tiles.iter().filter(|tile| tile.chunks > 0).count();
+    let rigid = work.tiles.len() - with_modes;
     let [deform, bounds, apply, normals] = KERNELS;
-    let warps = work.tiles.len() * if narrow { 4 } else { 1 };
-    let boxes = warps.div_ceil(BLOCK as usize).min(MOST_BLOCKS);
+    let per_tile = warps(work) as usize / work.tiles.len();
+    let tiles = |launch, tiles: usize| {
+        let defines = deform_defines(scene, work, launch == Launch::Modes);
+        let threads = threads_of(&defines);
+        let blocks = (tiles * per_tile).div_ceil(threads as usize / TILE_QUADS) as u32;
+        Kernel { launch, name: deform.name, defines, blocks, threads, source: deform.source }
+    };
+    let walk = |launch, kernel: &KernelSource, blocks: usize| {
+        let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear)];
+        let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
+        let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
+        Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: kernel.source }
+    };
+    let boxes = warps(work).div_ceil(u64::from(BLOCK)).min(MOST_BLOCKS as u64) as usize;
     let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
-    let mut kernels = vec![
-        compiled(deform, warps, TILE_QUADS as u32),
-        compiled(bounds, boxes, BLOCK),
-        compiled(apply, changes, BLOCK),
-    ];
+    let mut kernels = Vec::new();
+    kernels.extend((with_modes > 0).then(|| tiles(Launch::Modes, with_modes)));
+    kernels.extend((rigid > 0).then(|| tiles(Launch::Rigid, rigid)));
+    kernels.push(walk(Launch::Bounds, &bounds, boxes));
     if needs.exact_normals {
-        kernels.push(compiled(normals, blocks(scene.layout.corners) as usize, BLOCK));
+        kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
     }
+    kernels.push(walk(Launch::Apply, &apply, changes));
     kernels
+}
+
+/// The macros of `deform`, for tiles with modes or for those without.
+fn deform_defines(scene: &Scene, work: &Work, modes: bool) -> Vec<&'static str> {
+    let (needs, orients) = (scene.needs, orients(scene));
+    let flags = [
+        ("MODES", modes),
+        ("NARROW", is_narrow(work)),
+        ("TRUNCATED", modes && needs.truncation),
+        ("COMPENSATED", modes && needs.compensated),
+        ("ORIENT", orients),
+        ("SHIFTED", !corner_shifts(scene).is_empty()),
+        ("NORMAL_MAPS", orients && needs.normal_maps),
+        ("SHEAR", orients && needs.shear),
+    ];
+    let on = flags.iter().filter(|(_, on)| *on).map(|(name, _)| *name);
+    on.chain(storage_define(scene.deformation.storage).filter(|_| modes)).collect()
 }
 
 /// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
@@ -269,9 +308,27 @@ impl Plan {
         self.buffers.iter().map(|buffer| buffer.bytes).sum()
     }
 
+    /// The kernel of a launch, if the scene has it.
+    pub fn kernel(&self, launch: Launch) -> Option<&Kernel> {
+        self.kernels.iter().find(|kernel| kernel.launch == launch)
+    }
+
+    /// The kernel of a launch that every scene has.
+    pub(super) fn needed(&self, launch: Launch) -> Result<&Kernel> {
+        let missing = || Error::Fault { stage: "plan", reason: format!("no kernel for {launch:?}") };
+        self.kernel(launch).ok_or_else(missing)
+    }
+
+    /// The kernels of tiles, those with modes first.
+    pub(super) fn tiles(&self) -> Vec<Kernel> {
+        self.kernels.iter().filter(|kernel| [Launch::Modes, Launch::Rigid].contains(&kernel.launch)).cloned().collect()
+    }
+
     /// The most kernel launches of one step, whatever the number of domains.
-    pub const fn launches(&self) -> usize {
-        self.kernels.len()
+    pub fn launches(&self) -> usize {
+        let has = |launch| usize::from(self.kernel(launch).is_some());
+        // All tiles in two launches, or the listed ones in one behind `apply`.
+        has(Launch::Bounds) + has(Launch::Normals) + 2.max(has(Launch::Modes) + has(Launch::Rigid))
     }
 }
 
@@ -324,7 +381,8 @@ mod tests {
     fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
         let scene = exact(&[(7, 2), (300, 0), (513, 4)]);
         let (plan, rings) = (plan(&scene), Rings::new(&scene));
-        assert_eq!((plan.kernels[3].name, plan.kernels[3].defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
+        let normals = plan.kernel(Launch::Normals).expect("asked for");
+        assert_eq!((normals.name, normals.defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
         assert_eq!(plan.kernels[0].defines, ["MODES", "NARROW"]);
         assert_eq!(plan.launches(), 4);
         for (role, bytes) in [
