@@ -11,16 +11,16 @@ use crate::scene::Scene;
 /// The one of the two kernels that a scene has.
 #[derive(Debug)]
 pub(super) enum Directions {
-    Rigid(Orient),
-    Exact(Normals),
+    Rigid(Box<Orient>),
+    Exact(Box<Normals>),
 }
 
 impl Directions {
     pub(super) fn new(device: &Device, scene: &Scene, kernel: &Kernel) -> Result<Self> {
         if scene.needs.exact_normals {
-            Normals::new(device, scene, kernel).map(Self::Exact)
+            Ok(Self::Exact(Box::new(Normals::new(device, scene, kernel)?)))
         } else {
-            Orient::new(device, scene, kernel).map(Self::Rigid)
+            Ok(Self::Rigid(Box::new(Orient::new(device, scene, kernel)?)))
         }
     }
 
