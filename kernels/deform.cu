@@ -8,7 +8,8 @@
 //   scales        with STORE_INT8: per tile of U and mode                                                   (in)
 //   kept          with TRUNCATED: per domain the chunks that are summed, ascending                          (in)
 //   positions     [vertices][3] f32, in the header                                                          (out)
-//   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header             (out)
+//   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
+//                 WITHOUT_POSITIONS, for measuring                                                          (out)
 //   boxes         [blocks][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                  (out)
 // Launch: one warp a block. A lane computes a quad, or with NARROW one vertex of it, four blocks a tile: then small
 // scenes fill the device too. Domains that have not changed since this output was written are passed over.
@@ -387,6 +388,7 @@ extern "C" __global__ void __launch_bounds__(32, RESIDENT) deform(const __grid_c
     put(stage, part, world);
     store(args.header->displacements, stage);
 #endif
+#ifndef WITHOUT_POSITIONS
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
     if (part.count > 0) {
         add_rest(part, bent);
@@ -422,4 +424,5 @@ extern "C" __global__ void __launch_bounds__(32, RESIDENT) deform(const __grid_c
             args.boxes[6 * (size_t)blockIdx.x + side] = key;
         }
     }
+#endif
 }

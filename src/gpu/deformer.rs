@@ -19,7 +19,7 @@ use super::output::{Output, sizes};
 use super::plan::{Plan, plan};
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::{Error, Result, during};
-use crate::scene::{Scene, State};
+use crate::scene::{Changed, Scene, State};
 
 /// The CUDA deformer of one scene. Lives and dies on the thread that owns the OpenGL context, and before the buffers
 /// that it shares.
@@ -143,7 +143,10 @@ impl CudaDeformer {
 
     fn run(&mut self, state: &State) -> Result<crate::scene::Bounds> {
         let steps = &mut self.steps;
-        let changed = None::<&[u32]>;
+        let changed = match &state.changed {
+            Changed::Some(list) if state.serial == steps.serial + 1 => Some(list.as_slice()),
+            _ => None,
+        };
         steps.begun = steps.begun.wrapping_add(1).max(1);
         let some = match changed {
             Some(list) if steps.shown > 0 => {
@@ -176,6 +179,7 @@ impl CudaDeformer {
         })?;
         self.device.stream().synchronize().map_err(during("deform"))?;
         self.steps.shown = self.steps.begun;
+        self.steps.serial = state.serial;
         Ok(bounds_of(self.answer.as_slice().map_err(during("deform"))?))
     }
 

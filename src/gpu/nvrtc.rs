@@ -138,7 +138,8 @@ impl Nvrtc {
         self.compile_with_log(job).map(|(cubin, _)| cubin)
     }
 
-    fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
+    /// The same, and what the compiler said.
+    pub(super) fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
         let fail = during("compile");
         let options = strings(job.options.iter().map(String::as_str))?;
         let pointers: Vec<_> = options.iter().map(|option| option.as_ptr()).collect();

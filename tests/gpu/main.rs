@@ -8,4 +8,5 @@ mod judge;
 mod normals;
 mod real;
 mod scenes;
+mod trials;
 mod twins;
