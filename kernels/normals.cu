@@ -15,7 +15,7 @@
 // A thread per corner, not per group: corners of one group repeat its sum, from cache. A pass over groups would write and
 // read 12 bytes for each of them and cost a launch, which pays only where groups have two corners and more on average.
 // For groups of k triangles and one corner each, DRAM moves 4 bytes of members, 4 of begins, 4 (k + 2) of rings, 12 of
-// geometric normals and 12 of positions per corner on top of the 24 of `orient`: 88 in all at k = 6.
+// geometric normals and 12 of positions per corner, besides 24 for the rest normal and the new one: 88 in all at k = 6.
 //
 // Each thread gathers for itself, without atomics, in the order of the ring: runs agree bit by bit. Sums are f64:
 // differences and products of two f32 are exact there or nearly so, and neither over- nor underflow, so that nothing

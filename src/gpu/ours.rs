@@ -5,14 +5,14 @@ use std::sync::Arc;
 use cudarc::driver::CudaSlice;
 use serde::Serialize;
 
-use super::apply::Apply;
+use super::apply::{Apply, Lengths};
 use super::bounds::Bounds;
 use super::deform::Deform;
 use super::device::Device;
 use super::inputs::{Inputs, Values};
 use super::layout::Header;
 use super::memory::{address, download, room};
-use super::orient::Orient;
+use super::normals::Normals;
 use super::plan::{Plan, Role, plan};
 use super::trial::{KernelFacts, Trial};
 use super::turns::Turns;
@@ -49,7 +49,8 @@ pub struct Ours {
     scene: Arc<Scene>,
     deform: Deform,
     bounds: Bounds,
-    orient: Orient,
+    normals: Option<Normals>,
+    listed: bool,
     inputs: Vec<Inputs>,
     outputs: CudaSlice<u8>,
     turns: Turns,
@@ -87,7 +88,12 @@ impl Ours {
         (extent, changed): (Extent, Option<&[u32]>),
     ) -> Result<Self> {
         let plan = plan(scene);
-        let [mut deform, bounds, orient, apply] = [0, 1, 2, 3].map(|index| plan.kernels[index].clone());
+        let [mut deform, bounds, apply] = [0, 1, 2].map(|index| plan.kernels[index].clone());
+        let normals = plan.kernels.get(3).filter(|_| extent == Extent::Whole);
+        let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
+        if extent != Extent::Whole {
+            deform.defines.retain(|define| *define != "ORIENT");
+        }
         if extent == Extent::Uq {
             deform.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
         }
@@ -98,7 +104,8 @@ impl Ours {
             extent,
             scene: Arc::clone(scene),
             bounds: Bounds::new(device, &bounds)?,
-            orient: Orient::new(device, scene, &orient)?,
+            normals,
+            listed: changed.is_some(),
             inputs: Vec::new(),
             outputs,
             turns: Turns::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
@@ -112,12 +119,12 @@ impl Ours {
             let mut inputs = Inputs::new(device, ours.deform.packing())?;
             send(device, &mut inputs, &header, state)?;
             if let Some(changed) = changed {
-                let header = Header { since: 1, step: 2, changed: changed.len() as u32, ..header };
-                if !apply.write(ours.deform.packing(), state, changed)? {
-                    return Err(invalid("changed", "a quarter of the domains at most", changed.len()));
-                }
+                let lengths = apply.write(ours.deform.packing(), state, changed)?;
+                let too_many = || invalid("changed", "a quarter of the domains at most", changed.len());
+                let Lengths { changed, stale } = lengths.ok_or_else(too_many)?;
+                let header = Header { since: 1, step: 2, changed, stale, ..header };
                 send(device, &mut inputs, &header, state)?;
-                apply.launch(device, inputs.values(device))?;
+                apply.launch(device, inputs.values(device), ours.deform.list(device))?;
                 device.stream().synchronize().map_err(during("upload"))?;
             }
             ours.inputs.push(inputs);
@@ -193,12 +200,15 @@ impl Trial for Ours {
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
         let values = self.values(device, turn);
         self.turns.start(device, turn);
-        self.deform.launch(device, values)?;
+        if self.listed {
+            self.deform.launch_listed(device, values)?;
+        } else {
+            self.deform.launch(device, values)?;
+        }
         if self.extent == Extent::Whole {
             self.bounds.launch(device, values, self.deform.boxes(device))?;
-            self.orient.launch(device, values)?;
         }
-        Ok(())
+        self.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, values))
     }
 
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
@@ -229,12 +239,12 @@ impl Trial for Ours {
     }
 
     fn launches(&self) -> usize {
-        if self.extent == Extent::Whole { 3 } else { 1 }
+        1 + usize::from(self.extent == Extent::Whole) + usize::from(self.normals.is_some())
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
         let functions = [("deform", &self.deform.function), ("bounds", &self.bounds.function)];
-        let functions = functions.into_iter().chain([("orient", &self.orient.function)]);
+        let functions = functions.into_iter().chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
         functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
     }
 }

@@ -4,10 +4,10 @@ use serde::Serialize;
 
 use super::apply::most_changes;
 use super::inputs::Sizes;
-use super::layout::{BLOCK, Change, CornerSlot, Lane, NormalSlot, Tile};
+use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
 use super::pack;
 use super::rings::Counts;
-use super::work::{Coordinates, Work};
+use super::work::{Coordinates, Work, corner_shifts, orients};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
 
@@ -20,24 +20,19 @@ pub(super) struct KernelSource {
 }
 
 /// All kernels there are.
-pub(super) const KERNELS: [KernelSource; 5] = [
+pub(super) const KERNELS: [KernelSource; 4] = [
     KernelSource {
         name: "deform",
         source: include_str!("../../kernels/deform.cu"),
-        features: &["MODES", "NARROW", "TRUNCATED", "COMPENSATED"],
+        features: &["MODES", "NARROW", "TRUNCATED", "COMPENSATED", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"],
     },
     KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &[] },
-    KernelSource {
-        name: "orient",
-        source: include_str!("../../kernels/orient.cu"),
-        features: &["NORMAL_MAPS", "SHEAR"],
-    },
+    KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &[] },
     KernelSource {
         name: "normals",
         source: include_str!("../../kernels/normals.cu"),
         features: &["NORMAL_MAPS", "SHEAR"],
     },
-    KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &[] },
 ];
 
 /// The macros that choose what U is stored in; none for f32.
@@ -69,9 +64,11 @@ pub enum Role {
     Rest,
     /// Scales of U, with `Int8`.
     Scales,
-    /// The work of each warp.
+    /// The work of each warp, and a list of some of it.
     Tiles,
     Lanes,
+    /// From vertices to corners, per domain; where they differ.
+    CornerShifts,
     /// A box of each warp's vertices.
     Boxes,
     /// The step that last changed each domain.
@@ -138,33 +135,37 @@ pub fn plan(scene: &Scene) -> Plan {
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let domains = scene.domains.len() as u64;
     let inputs = Sizes::of(scene, &coordinates).total();
-    let corner_slot = if needs.exact_normals { size_of::<NormalSlot>() } else { size_of::<CornerSlot>() };
+    let directed = if orients(scene) { work.quads.end - work.quads.directed } else { 0 };
     let mut buffers = vec![
         (Role::Words, 16 * work.words),
-        (Role::Rest, 48 * work.rest),
+        (Role::Rest, 48 * work.quads.rest),
         (Role::Scales, 4 * work.scales),
-        (Role::Tiles, (work.tiles.len() * size_of::<Tile>()) as u64),
+        (Role::Tiles, ((size_of::<Tile>() + 4) * work.tiles.len()) as u64),
         (Role::Lanes, (work.lanes.len() * size_of::<Lane>() + 4 * work.lane_scales.len()) as u64),
+        (Role::CornerShifts, 4 * corner_shifts(scene).len() as u64),
         (Role::Boxes, 24 * u64::from(kernels[0].blocks)),
         (Role::Stamps, 4 * domains),
-        (Role::RestNormals, 12 * rest_corners),
-        (Role::CornerSlots, domains * corner_slot as u64),
-        (Role::CornerBlocks, 4 * (u64::from(blocks(layout.corners)) + 1)),
+        (Role::RestNormals, if needs.exact_normals { 12 * rest_corners } else { 48 * directed }),
         (Role::Inputs, inputs),
         (Role::Positions, 12 * vertices),
         (Role::Normals, 12 * corners),
     ];
     if needs.normal_maps {
-        buffers.push((Role::RestTangents, 16 * pack::tangent_count(scene) as u64));
+        let rigid = 64 * directed;
+        let bytes = if needs.exact_normals { 16 * pack::tangent_count(scene) as u64 } else { rigid };
+        buffers.push((Role::RestTangents, bytes));
         buffers.push((Role::Tangents, 16 * corners));
     }
     if needs.exact_normals {
         let counts = Counts::of(scene);
+        buffers.push((Role::CornerSlots, domains * size_of::<NormalSlot>() as u64));
+        buffers.push((Role::CornerBlocks, 4 * (u64::from(blocks(layout.corners)) + 1)));
         buffers.push((Role::Members, 4 * counts.members));
         buffers.push((Role::Rings, 4 * (counts.groups + 1 + counts.rings)));
         buffers.push((Role::GroupNormals, 12 * counts.groups));
     }
-    let changes = (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * coordinates.total;
+    let changes =
+        (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * (coordinates.total + work.tiles.len());
     Plan {
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
@@ -193,11 +194,16 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
         ("NARROW", narrow),
         ("TRUNCATED", needs.truncation),
         ("COMPENSATED", needs.compensated),
+        ("ORIENT", orients(scene)),
+        ("SHIFTED", !corner_shifts(scene).is_empty()),
         ("NORMAL_MAPS", needs.normal_maps),
         ("SHEAR", needs.shear),
     ];
     let compiled = |kernel: KernelSource, blocks: usize, threads: u32| {
-        let on = flags.iter().filter(|(name, on)| *on && kernel.features.contains(name)).map(|(name, _)| *name);
+        let turns = kernel.name != "deform" || orients(scene);
+        let wanted =
+            |name: &str| kernel.features.contains(&name) && (turns || !["NORMAL_MAPS", "SHEAR"].contains(&name));
+        let on = flags.iter().filter(|(name, on)| *on && wanted(name)).map(|(name, _)| *name);
         let storage = storage_define(scene.deformation.storage).filter(|_| needs.modes && kernel.name == "deform");
         Kernel {
             name: kernel.name,
@@ -207,17 +213,19 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
             source: kernel.source,
         }
     };
-    let [deform, bounds, orient, normals, apply] = KERNELS;
-    let directions = if needs.exact_normals { normals } else { orient };
+    let [deform, bounds, apply, normals] = KERNELS;
     let warps = work.tiles.len() * if narrow { 4 } else { 1 };
     let boxes = warps.div_ceil(BLOCK as usize).min(MOST_BLOCKS);
     let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
-    vec![
+    let mut kernels = vec![
         compiled(deform, warps, TILE_QUADS as u32),
         compiled(bounds, boxes, BLOCK),
-        compiled(directions, blocks(scene.layout.corners) as usize, BLOCK),
         compiled(apply, changes, BLOCK),
-    ]
+    ];
+    if needs.exact_normals {
+        kernels.push(compiled(normals, blocks(scene.layout.corners) as usize, BLOCK));
+    }
+    kernels
 }
 
 /// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
@@ -225,23 +233,19 @@ const MOST_BLOCKS: usize = 264;
 
 fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
     let needs = scene.needs;
-    let more = (size_of::<NormalSlot>() - size_of::<CornerSlot>()) * scene.domains.len();
+    let more = size_of::<NormalSlot>() * scene.domains.len();
     let exact_normals = LeftOut {
         feature: "exact_normals",
-        what: "`normals` in the place of `orient`, and its rings",
+        what: "`normals` behind `deform`, and its rings",
         bytes: Counts::bytes_of_possible_members(scene) + more as u64,
     };
     let all = [
         (needs.modes, LeftOut { feature: "modes", what: "the sum U q in `deform`", bytes: 0 }),
         (
             needs.normal_maps,
-            LeftOut {
-                feature: "normal_maps",
-                what: "tangents in `orient` and their two buffers",
-                bytes: tangent_bytes,
-            },
+            LeftOut { feature: "normal_maps", what: "tangents and their two buffers", bytes: tangent_bytes },
         ),
-        (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose in `orient`", bytes: 0 }),
+        (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose", bytes: 0 }),
         (needs.truncation, LeftOut { feature: "truncation", what: "lists of modes in `deform`", bytes: 0 }),
         (needs.exact_normals, exact_normals),
         (needs.compensated, LeftOut { feature: "compensated", what: "the compensation in `deform`", bytes: 0 }),
@@ -286,7 +290,7 @@ mod tests {
         let bare = plan(&scene(&[(7, 0), (300, 0)], false, true));
         assert_eq!(
             defines(&bare),
-            [("deform", vec!["NARROW"]), ("bounds", vec![]), ("orient", vec![]), ("apply", vec![])]
+            [("deform", vec!["NARROW", "ORIENT", "SHIFTED"]), ("bounds", vec![]), ("apply", vec![])]
         );
         assert_eq!(bare.bytes(Role::Tangents) + bare.bytes(Role::RestTangents), 0);
         assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
@@ -299,10 +303,9 @@ mod tests {
     #[test]
     fn a_scene_that_needs_more_leaves_less_out() {
         let full = plan(&scene(&[(7, 2), (300, 0)], true, false));
-        assert_eq!(full.kernels[0].defines, ["MODES", "NARROW"]);
-        assert_eq!(full.kernels[2].defines, ["NORMAL_MAPS", "SHEAR"]);
+        assert_eq!(full.kernels[0].defines, ["MODES", "NARROW", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]);
         assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
-        assert_eq!(full.bytes(Role::RestTangents), 16 * 302, "only the shape with a normal map");
+        assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
         assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
         assert_eq!(full.left_out.len(), 3);
     }
@@ -311,17 +314,18 @@ mod tests {
     fn storage_decides_the_bytes_of_u_and_the_macro_that_reads_it() {
         let bytes = |storage| {
             let plan = plan(&stored(&[(300, 8)], storage));
-            assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("NARROW")));
+            assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("SHEAR")));
             plan.bytes(Role::Words)
         };
         assert_eq!(Storage::ALL.map(bytes), [75 * 48 * 8, 75 * 48 * 4, 75 * 48 * 4, 75 * 48 * 2]);
     }
 
     #[test]
-    fn exact_normals_take_the_place_of_rigid_ones_and_their_tables_are_planned() {
+    fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
         let scene = exact(&[(7, 2), (300, 0), (513, 4)]);
         let (plan, rings) = (plan(&scene), Rings::new(&scene));
-        assert_eq!((plan.kernels[2].name, plan.kernels[2].defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
+        assert_eq!((plan.kernels[3].name, plan.kernels[3].defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
+        assert_eq!(plan.kernels[0].defines, ["MODES", "NARROW"]);
         assert_eq!(plan.launches(), 4);
         for (role, bytes) in [
             (Role::CornerSlots, size_of_val(super::super::rings::slots(&scene).as_slice())),
@@ -335,13 +339,13 @@ mod tests {
         let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], Storage::F32));
         assert_eq!(rigid.bytes(Role::Members) + rigid.bytes(Role::Rings) + rigid.bytes(Role::GroupNormals), 0);
         let left_out = rigid.left_out.iter().find(|part| part.feature == "exact_normals").expect("left out");
-        assert_eq!(left_out.bytes, 4 * (9 + 515) + 8 * 6, "members, and eight bytes more per slot");
+        assert_eq!(left_out.bytes, 4 * (9 + 515) + 20 * 6, "members and slots");
     }
 
     #[test]
     fn launches_do_not_grow_with_the_number_of_domains() {
         let (few, many) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
-        assert_eq!((plan(&few).launches(), plan(&many).launches()), (4, 4));
+        assert_eq!((plan(&few).launches(), plan(&many).launches()), (3, 3));
     }
 
     #[test]
@@ -349,15 +353,10 @@ mod tests {
         let scene = scene(&[(7, 2), (300, 0), (513, 4)], true, false);
         let plan = plan(&scene);
         let work = Work::new(&scene, &Coordinates::new(&scene));
-        let corner_slots = pack::corner_slots(&scene);
-        let corner_blocks = pack::first_domains(corner_slots.iter().map(|slot| slot.first), scene.layout.corners);
         for (role, bytes) in [
-            (Role::Tiles, size_of_val(work.tiles.as_slice())),
+            (Role::Tiles, size_of_val(work.tiles.as_slice()) + 4 * work.tiles.len()),
             (Role::Lanes, size_of_val(work.lanes.as_slice())),
-            (Role::CornerSlots, size_of_val(corner_slots.as_slice())),
-            (Role::CornerBlocks, size_of_val(corner_blocks.as_slice())),
-            (Role::RestNormals, size_of_val(pack::rest_normals(&scene).as_slice())),
-            (Role::RestTangents, size_of_val(pack::rest_tangents(&scene).as_slice())),
+            (Role::CornerShifts, size_of_val(corner_shifts(&scene).as_slice())),
         ] {
             assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
         }

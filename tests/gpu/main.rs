@@ -9,4 +9,5 @@ mod normals;
 mod real;
 mod scenes;
 mod trials;
+mod tune;
 mod twins;
