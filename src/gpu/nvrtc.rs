@@ -319,7 +319,8 @@ mod tests {
                     sizes.push(cubin);
                 }
                 // Leaving a feature out must leave code out.
-                assert!(sizes[0].len() < sizes[sizes.len() - 1].len(), "{}: a define changes nothing", kernel.name);
+                let grows = sizes[0].len() < sizes[sizes.len() - 1].len();
+                assert_eq!(grows, !kernel.features.is_empty(), "{}: a define changes nothing", kernel.name);
             }
         }
     }
