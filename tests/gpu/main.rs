@@ -9,5 +9,4 @@ mod normals;
 mod real;
 mod scenes;
 mod trials;
-mod tune;
 mod twins;
