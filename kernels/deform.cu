@@ -2,9 +2,9 @@
 // too, in one launch over a flat list of tiles; and a box of each warp's x.
 //   tiles, lanes  the work of each warp (layout.cuh)                                                        (in)
 //   words         U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                              (in)
-//   rest          x0, [quads][12] f32: 4 x, 4 y, 4 z                                                        (in)
-//   rest_normals  [quads][12] f32, likewise; with ORIENT                                                    (in)
-//   rest_tangents [quads][16] f32: 4 x, 4 y, 4 z, 4 signs of the bitangent; with ORIENT and NORMAL_MAPS     (in)
+//   rest          x0, per tile of one domain [3][width][4] f32, of quads in mixed tiles [3][4]              (in)
+//   rest_normals  likewise; with ORIENT                                                                     (in)
+//   rest_tangents likewise, x, y, z and the sign of the bitangent; with ORIENT and NORMAL_MAPS              (in)
 //   corner_shifts with SHIFTED: per domain, from a vertex to its corner                                     (in)
 //   transforms    [domains][3] float4: the rows of world_from_domain, relative to the state's origin        (in)
 //   q             packed coordinates, times the factor of their mode with STORE_F16 and STORE_BF16          (in)
@@ -16,9 +16,8 @@
 //   tangents      [corners] float4, in the header                                                           (out)
 //   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
 //                 WITHOUT_POSITIONS, for measuring                                                          (out)
-//   boxes         [warps][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                   (out)
-// Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles from `first` on, or any number of blocks with
-// LISTED. Tiles without modes, which come last in the list, are launched beside the others without MODES.
+//   boxes         [tiles][4][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                (out)
+// Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles, or any number of blocks with LISTED.
 // CPU twin: src/reference/deform.rs.
 //
 // The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
@@ -34,17 +33,23 @@
 #define AHEAD 4
 #endif
 // Warps of a block, and blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill
-// registers. Tiles of modes read long runs and do best in blocks of one warp; those without wait for one thing after the
-// other, and as many as possible must wait at once.
-#if defined(SHEAR) || defined(LISTED)
+// registers. Tiles of modes read long runs and do best in blocks of one warp.
+#if defined(NARROW) && defined(MODES)
+constexpr unsigned WARPS = 1;
+constexpr unsigned RESIDENT = 10;
+#elif defined(SHEAR) || defined(LISTED)
 constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 16;
 #elif defined(MODES)
 constexpr unsigned WARPS = 1;
+#ifdef NORMAL_MAPS
 constexpr unsigned RESIDENT = 24;
 #else
+constexpr unsigned RESIDENT = 28;
+#endif
+#else
 constexpr unsigned WARPS = 2;
-constexpr unsigned RESIDENT = 18;
+constexpr unsigned RESIDENT = 16;
 #endif
 
 #ifdef MODES
@@ -220,6 +225,7 @@ __device__ __forceinline__ float placed(const float4& row, float x, float y, flo
 __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
     const Part part = part_of(args, tile, share);
     const unsigned within = part.within + vertex;
+    const float* rest = first_of(args.rest, part, 3);
     double bent[3];
     for (unsigned axis = 0; axis < 3; ++axis) {
         double sum = 0.0;
@@ -233,7 +239,7 @@ __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned t
             }
         }
 #endif
-        bent[axis] = (double)((const float*)(args.rest + 3 * (size_t)part.rest))[4 * axis + within] + sum;
+        bent[axis] = (double)rest[4 * axis * part.stride + vertex] + sum;
     }
     const float4* rows = args.transforms + 3 * (size_t)part.domain;
     float placed[3];
@@ -292,10 +298,9 @@ struct Base {
     Items x, y, z;
     float4 a, b, c;
     __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
-        const float4* from = args.rest + 3 * (size_t)part.rest;
-        x = items_of(from, part.within);
-        y = items_of(from + 1, part.within);
-        z = items_of(from + 2, part.within);
+        x = items_of(args.rest, part, 3, 0);
+        y = items_of(args.rest, part, 3, 1);
+        z = items_of(args.rest, part, 3, 2);
         const float4* rows = args.transforms + 3 * (size_t)part.domain;
         a = __ldg(rows);
         b = __ldg(rows + 1);
@@ -318,7 +323,7 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
         total = fmaf(0.0f, world[3 * i] + world[3 * i + 1] + world[3 * i + 2], total);
     }
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-    put(shared.stage, world, part.item, part.count);
+    put(shared.stage, part, part.item, world);
     if (part.count > 0) {
         box_of(world, part.count, keys);
         if (total != 0.0f) {
@@ -330,30 +335,18 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
             }
         }
     }
-    store(args.header->positions, shared.stage, (part.kind & TILE_LAST) > 0);
+    store(args.header->positions, shared.stage, part);
+    // Four boxes a tile: one of each warp, or four times that of the only one.
 #pragma unroll
     for (unsigned side = 0; side < 6; ++side) {
         const unsigned key = warp_max(keys[side]);
-        if (lane_of() == side) {
-            args.boxes[6 * ((size_t)tile * SHARE + share) + side] = key;
+        if (lane_of() / 6 < SPAN && lane_of() % 6 == side) {
+            args.boxes[24 * (size_t)tile + 6 * share + lane_of()] = key;
         }
     }
 }
 
 #ifdef MODES
-// Asks early for what is read after the modes.
-__device__ __forceinline__ void prefetch_rest(const DeformArgs& args, const Part& part) {
-    prefetch(args.rest + 3 * (size_t)part.rest);
-#ifdef ORIENT
-    if (part.kind & TILE_CORNERS) {
-        prefetch(args.rest_normals + 3 * (size_t)part.rest);
-#ifdef NORMAL_MAPS
-        prefetch(args.rest_tangents + 4 * (size_t)part.rest);
-#endif
-    }
-#endif
-}
-
 __device__ __forceinline__ void sum(const DeformArgs& args, const Part& part, float (&bent)[FLOATS]) {
     Sums sums;
     sums.clear();
@@ -377,7 +370,6 @@ __device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, 
         base.load(args, part);
         sum(args, part, bent);
 #elif defined(MODES)
-        prefetch_rest(args, part);
         sum(args, part, bent);
 #endif
 #ifdef DISPLACEMENTS
@@ -386,8 +378,8 @@ __device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, 
         for (unsigned i = 0; i < FLOATS; ++i) {
             u[i] = bent[i % 3 * SPAN + i / 3];
         }
-        put(shared.stage, u, part.item, part.count);
-        store(args.header->displacements, shared.stage, (part.kind & TILE_LAST) > 0);
+        put(shared.stage, part, part.item, u);
+        store(args.header->displacements, shared.stage, part);
 #endif
 #ifndef WITHOUT_POSITIONS
 #if !(defined(MODES) && defined(NARROW))
@@ -422,7 +414,7 @@ extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) deform(const 
     }
 #else
     if (warp < SHARE * args.count) {
-        compute(args, shared[threadIdx.x / 32], args.first + warp / SHARE, warp % SHARE);
+        compute(args, shared[threadIdx.x / 32], warp / SHARE, warp % SHARE);
     }
 #endif
 }

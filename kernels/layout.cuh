@@ -93,8 +93,8 @@ struct DeformArgs {
     const unsigned* kept_counts;
     const unsigned short* kept;
     unsigned* boxes;
-    unsigned first; // tile
     unsigned count; // of tiles
+    unsigned reserved;
 };
 static_assert(sizeof(DeformArgs) == 136, "DeformArgs differs from src/gpu/layout.rs");
 

@@ -56,17 +56,20 @@ __device__ __forceinline__ Rows normal_rows(const Rows& m) {
 #endif
 
 
-// Turns the directions of a lane again, in f64. `from` is the first number of the lane's first item, [numbers][4];
-// `to` is staged, `stride` numbers an item.
-__device__ __noinline__ void turn_again(const float4* transforms, unsigned domain, const float* from, float* to,
-                                        unsigned stride, bool is_normal) {
+// Turns `count` directions again, in f64: normals of three numbers, tangents of four. `from` is the first number of the
+// first, `row` leads from its x to its y; `to` is staged.
+__device__ __noinline__ void turn_again(const float4* transforms, unsigned domain, const float* from, unsigned row,
+                                        float* to, unsigned count, unsigned numbers) {
     const Rows m = linear_of(transforms, domain);
-    for (unsigned i = 0; i < SPAN; ++i) {
-        const double3 v = make_double3(from[i], from[4 + i], from[8 + i]);
-        const float3 turned = is_normal ? turn_normal(m, v) : turn(m, v);
-        to[stride * i] = turned.x;
-        to[stride * i + 1] = turned.y;
-        to[stride * i + 2] = turned.z;
+    for (unsigned i = 0; i < count; ++i) {
+        const double3 v = make_double3(from[i], from[row + i], from[2 * row + i]);
+        // Zeros are the tangents of a shape without any, and stay.
+        if (numbers == 3 || v.x != 0.0 || v.y != 0.0 || v.z != 0.0) {
+            const float3 turned = numbers == 3 ? turn_normal(m, v) : turn(m, v);
+            to[numbers * i] = turned.x;
+            to[numbers * i + 1] = turned.y;
+            to[numbers * i + 2] = turned.z;
+        }
     }
 }
 
@@ -77,7 +80,8 @@ __device__ __forceinline__ float3 turned(const Matrix& m, float x, float y, floa
     const float square = fmaf(v.x, v.x, fmaf(v.y, v.y, v.z * v.z));
     // Not fminf, which would pass over a NaN.
     shortest = counts && !(square >= shortest) ? square : shortest;
-    const float inverse = 1.0f / sqrtf(square);
+    // Within two units in the last place.
+    const float inverse = rsqrtf(square);
     return make_float3(v.x * inverse, v.y * inverse, v.z * inverse);
 }
 
@@ -85,10 +89,9 @@ __device__ __forceinline__ float3 turned(const Matrix& m, float x, float y, floa
 struct Normals {
     Items x, y, z;
     __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
-        const float4* from = args.rest_normals + 3 * (size_t)part.rest;
-        x = items_of(from, part.within);
-        y = items_of(from + 1, part.within);
-        z = items_of(from + 2, part.within);
+        x = items_of(args.rest_normals, part, 3, 0);
+        y = items_of(args.rest_normals, part, 3, 1);
+        z = items_of(args.rest_normals, part, 3, 2);
     }
 };
 
@@ -98,38 +101,37 @@ __device__ __forceinline__ void orient_normals(const DeformArgs& args, Stage& st
 #pragma unroll
     for (unsigned i = 0; i < SPAN; ++i) {
         const bool is_there = i < part.count;
-        const float3 normal =
-            turned(matrix, rest.x.of[i], rest.y.of[i], rest.z.of[i], is_there, shortest);
+        const float3 normal = turned(matrix, rest.x.of[i], rest.y.of[i], rest.z.of[i], is_there, shortest);
         normals[3 * i] = normal.x;
         normals[3 * i + 1] = normal.y;
         normals[3 * i + 2] = normal.z;
     }
-    put(stage, normals, corner, part.count);
+    put(stage, part, corner, normals);
     if (!(shortest > SHORT)) {
-        const float* from = (const float*)(args.rest_normals + 3 * (size_t)part.rest) + part.within;
-        turn_again(args.transforms, part.domain, from, staged(stage) + FLOATS * lane_of(), 3, true);
+        turn_again(args.transforms, part.domain, first_of(args.rest_normals, part, 3), 4 * part.stride,
+                   staged(stage) + FLOATS * lane_of(), part.count, 3);
     }
-    store(args.header->normals, stage, (part.kind & TILE_LAST) > 0);
+    store(args.header->normals, stage, part);
 }
 
 #ifdef NORMAL_MAPS
 __device__ __forceinline__ void orient_tangents(const DeformArgs& args, Stage& stage, const Part& part,
                                                 const Matrix& matrix, float hand) {
-    const float4* from = args.rest_tangents + 4 * (size_t)part.rest;
-    const Items x = items_of(from, part.within), y = items_of(from + 1, part.within),
-                z = items_of(from + 2, part.within), sign = items_of(from + 3, part.within);
+    const Items x = items_of(args.rest_tangents, part, 4, 0), y = items_of(args.rest_tangents, part, 4, 1),
+                z = items_of(args.rest_tangents, part, 4, 2), sign = items_of(args.rest_tangents, part, 4, 3);
     float shortest = 1.0f;
 #pragma unroll
     for (unsigned i = 0; i < SPAN; ++i) {
         // A shape without tangents has zeros, which stay zeros.
         const bool is_there = sign.of[i] != 0.0f;
         const float3 tangent = turned(matrix, x.of[i], y.of[i], z.of[i], is_there, shortest);
-        stage.numbers[SPAN * lane_of() + i] =
-            is_there ? make_float4(tangent.x, tangent.y, tangent.z, sign.of[i] * hand) : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        stage.numbers[SPAN * lane_of() + i] = is_there
+                                                  ? make_float4(tangent.x, tangent.y, tangent.z, sign.of[i] * hand)
+                                                  : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
     if (!(shortest > SHORT)) {
-        turn_again(args.transforms, part.domain, (const float*)from + part.within,
-                   staged(stage) + 4 * SPAN * lane_of(), 4, false);
+        turn_again(args.transforms, part.domain, first_of(args.rest_tangents, part, 4), 4 * part.stride,
+                   staged(stage) + 4 * SPAN * lane_of(), part.count, 4);
     }
     store_quadruples(args.header->tangents, stage);
 }

@@ -27,7 +27,9 @@ struct Part {
     unsigned item;   // the same, packed: a vertex, or a corner of a tile of corners alone
     unsigned count;  // items to be written
     unsigned domain;
-    unsigned rest; // quad of x0, and of normals and tangents
+    unsigned run;    // items of the whole warp in a tile of one domain, from lane 0's on; else 0
+    unsigned rest;   // quad of x0, normals and tangents: the tile's first, or in a mixed tile the lane's own
+    unsigned stride; // from one number of the quad to the next, in fours
     unsigned first_q;
     unsigned first_scale;
 };
@@ -46,12 +48,16 @@ __device__ __forceinline__ Part part_of(const DeformArgs& args, unsigned tile, u
     part.first_word = head.x | (unsigned long long)head.y << 32;
     const unsigned last = part.kind & TILE_LAST;
     unsigned items = 0;
+    part.run = 0;
     part.item = part.domain = part.rest = part.first_q = part.first_scale = 0;
+    part.stride = last > 0 ? part.width : 1;
     if (last > 0) {
         items = part.quad + 1 == part.width ? last : part.quad < part.width ? 4 : 0;
         part.item = head.z + 4 * part.quad;
+        const unsigned all = 4 * (part.width - 1) + last, before = 32 * SPAN * share;
+        part.run = all > before ? min(32 * SPAN, all - before) : 0;
         part.domain = tail.x;
-        part.rest = head.w + part.quad;
+        part.rest = head.w;
         part.first_q = tail.y;
         part.first_scale = tail.z;
     } else if (part.quad < part.width) {
@@ -73,82 +79,107 @@ __device__ __forceinline__ Part part_of(const DeformArgs& args, unsigned tile, u
     return part;
 }
 
-// A warp's numbers on their way out, [lane][item][axis], and where each lane's items belong.
+// A warp's numbers on their way out, [lane][item][number], and where each lane's items belong.
 struct Stage {
     float4 numbers[32 * SPAN]; // room for four numbers an item
-    unsigned places[32];
-    unsigned counts[32];
+    uint2 places[32];          // first item, and how many
 };
 
 __device__ __forceinline__ float* staged(Stage& stage) {
     return (float*)stage.numbers;
 }
 
-__device__ __forceinline__ void put(Stage& stage, const float (&numbers)[FLOATS], unsigned item, unsigned count) {
-#pragma unroll
-    for (unsigned i = 0; i < FLOATS; ++i) {
-        staged(stage)[FLOATS * lane_of() + i] = numbers[i];
-    }
-    stage.places[lane_of()] = item;
-    stage.counts[lane_of()] = count;
+// Three numbers an item, whose first of this lane is `first`.
+__device__ __forceinline__ void put(Stage& stage, const Part& part, unsigned first, const float (&numbers)[FLOATS]) {
+#ifdef NARROW
+    float* to = staged(stage) + 3 * lane_of();
+    to[0] = numbers[0];
+    to[1] = numbers[1];
+    to[2] = numbers[2];
+#else
+    float4* to = stage.numbers + 3 * lane_of();
+    to[0] = make_float4(numbers[0], numbers[1], numbers[2], numbers[3]);
+    to[1] = make_float4(numbers[4], numbers[5], numbers[6], numbers[7]);
+    to[2] = make_float4(numbers[8], numbers[9], numbers[10], numbers[11]);
+#endif
+    stage.places[lane_of()] = make_uint2(first, part.count);
 }
 
-// Three numbers an item. Lanes of one domain write one run, so that sectors are written whole; where a whole warp has
-// one run that begins at 16 bytes, it writes 16 bytes a lane.
-__device__ __forceinline__ void store(float* packed, Stage& stage, bool is_run) {
+// Writes what was put, so that sectors are written whole. A warp of one domain writes one run, 16 bytes a lane where it
+// begins at such.
+__device__ __forceinline__ void store(float* packed, Stage& stage, const Part& part) {
     __syncwarp();
-    const unsigned first = stage.places[0];
-    if (is_run && first % 4 == 0 && stage.counts[31] == SPAN) {
-        float4* run = (float4*)(packed + 3 * (size_t)first);
+    if (part.kind & TILE_LAST) {
+        const unsigned first = stage.places[0].x, floats = 3 * part.run;
+        float* run = packed + 3 * (size_t)first;
+        const unsigned fours = first % 4 == 0 ? floats / 4 : 0;
 #pragma unroll
         for (unsigned i = lane_of(); i < 8 * FLOATS; i += 32) {
-            __stcs(run + i, stage.numbers[i]);
+            if (i < fours) {
+                __stcs((float4*)run + i, stage.numbers[i]);
+            }
+        }
+        for (unsigned i = 4 * fours + lane_of(); i < floats; i += 32) {
+            __stcs(run + i, staged(stage)[i]);
         }
     } else {
+        // Number 32 k + lane of the stage belongs to lane (32 k + lane) / FLOATS, which repeats every three k but for a
+        // whole number of lanes.
+        unsigned owner[3], within[3];
 #pragma unroll
-        for (unsigned i = lane_of(); i < 32 * FLOATS; i += 32) {
-            const unsigned lane = i / FLOATS, within = i % FLOATS;
-            if (within < 3 * stage.counts[lane]) {
-                __stcs(packed + 3 * (size_t)stage.places[lane] + within, staged(stage)[i]);
+        for (unsigned k = 0; k < 3; ++k) {
+            owner[k] = (32 * k + lane_of()) / FLOATS;
+            within[k] = (32 * k + lane_of()) % FLOATS;
+        }
+#pragma unroll
+        for (unsigned k = 0; k < FLOATS; ++k) {
+            const uint2 place = stage.places[owner[k % 3] + 96 / FLOATS * (k / 3)];
+            if (within[k % 3] < 3 * place.y) {
+                __stcs(packed + (3 * (size_t)place.x + within[k % 3]), staged(stage)[32 * k + lane_of()]);
             }
         }
     }
     __syncwarp();
 }
 
-// Four numbers an item, which lie in the stage already; places and counts are those of the last `put`.
+// Four numbers an item, which lie in the stage already; places are those of the last `put`.
 __device__ __forceinline__ void store_quadruples(float4* packed, Stage& stage) {
     __syncwarp();
 #pragma unroll
-    for (unsigned i = lane_of(); i < 32 * SPAN; i += 32) {
-        const unsigned lane = i / SPAN, within = i % SPAN;
-        if (within < stage.counts[lane]) {
-            __stcs(packed + stage.places[lane] + within, stage.numbers[i]);
+    for (unsigned k = 0; k < SPAN; ++k) {
+        const unsigned i = 32 * k + lane_of();
+        const uint2 place = stage.places[i / SPAN];
+        if (i % SPAN < place.y) {
+            __stcs(packed + place.x + i % SPAN, stage.numbers[i]);
         }
     }
     __syncwarp();
 }
 
-// Four numbers of a quad, or with NARROW one of them: `from` is [numbers][4].
+// One number of each of a lane's items.
 struct Items {
     float of[SPAN];
 };
 
-__device__ __forceinline__ Items items_of(const float4* from, unsigned within) {
+// The first number of a lane's first item in a table of `numbers` for each item: [tile][numbers][width] fours, or of
+// quads in mixed tiles [quad][numbers] fours.
+__device__ __forceinline__ const float* first_of(const float4* table, const Part& part, unsigned numbers) {
+    const unsigned quad = part.kind & TILE_LAST ? part.quad : 0;
+    return (const float*)(table + numbers * (size_t)part.rest + quad) + part.within;
+}
+
+// Number `number` of a lane's items.
+__device__ __forceinline__ Items items_of(const float4* table, const Part& part, unsigned numbers, unsigned number) {
+    const float* from = first_of(table, part, numbers) + 4 * number * part.stride;
     Items items;
 #ifdef NARROW
-    items.of[0] = __ldg((const float*)from + within);
+    items.of[0] = __ldg(from);
 #else
-    const float4 four = __ldg(from);
+    const float4 four = __ldg((const float4*)from);
     items.of[0] = four.x;
     items.of[1] = four.y;
     items.of[2] = four.z;
     items.of[3] = four.w;
 #endif
     return items;
-}
-
-// Asks for the line of an address, so that whoever loads it later finds it in the L2.
-__device__ __forceinline__ void prefetch(const void* address) {
-    asm volatile("prefetch.global.L2 [%0];" ::"l"(address));
 }

@@ -71,7 +71,7 @@ impl CudaDeformer {
         let plan = plan(scene);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let deform = Deform::new(device, scene, &plan.tiles())?;
+        let deform = Deform::new(device, scene, plan.needed(Launch::Deform)?)?;
         let kernels = Kernels {
             bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
             normals: plan.kernel(Launch::Normals).map(|normals| Normals::new(device, scene, normals)).transpose()?,

@@ -92,8 +92,8 @@ pub(super) struct DeformArgs {
     pub kept_counts: u64,
     pub kept: u64,
     pub boxes: u64,
-    pub first: u32,
     pub count: u32,
+    pub reserved: u32,
 }
 
 /// Arguments of `bounds`.
@@ -204,7 +204,7 @@ pub fn agreements() -> Vec<Agreement> {
         Change { domain, first_q, count, source }
         DeformArgs {
             header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
-            transforms, q, list, kept_counts, kept, boxes, first, count
+            transforms, q, list, kept_counts, kept, boxes, count, reserved
         }
         BoundsArgs { header, boxes, count, reserved }
         ApplyArgs { header, changes, new_transforms, new_q, stale, transforms, q, stamps, list }

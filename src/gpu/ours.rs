@@ -90,14 +90,9 @@ impl Ours {
         let plan = plan(scene);
         let normals = plan.kernel(Launch::Normals).filter(|_| extent == Extent::Whole);
         let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
-        let mut tiles = plan.tiles();
-        for kernel in &mut tiles {
-            kernel.shape_for(extent);
-        }
-        if extent == Extent::Uq {
-            tiles.retain(|kernel| kernel.launch == Launch::Modes);
-        }
-        let deform = Deform::new(device, scene, &tiles)?;
+        let mut deform = plan.needed(Launch::Deform)?.clone();
+        deform.shape_for(extent);
+        let deform = Deform::new(device, scene, &deform)?;
         let outputs = room(device, outputs_of(&plan).iter().sum())?;
         let mut ours = Self {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
@@ -252,11 +247,11 @@ impl Trial for Ours {
 
     fn launches(&self) -> usize {
         let more = [self.extent == Extent::Whole, self.normals.is_some()].map(usize::from);
-        self.deform.launches() + more[0] + more[1]
+        1 + more[0] + more[1]
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
-        let mut facts = self.deform.facts();
+        let mut facts: Vec<KernelFacts> = self.deform.facts().into_iter().collect();
         let functions = std::iter::once(("bounds", &self.bounds.function));
         let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
         facts.extend(functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()));

@@ -47,14 +47,11 @@ const FEW_TILES: usize = 1024;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Launch {
-    /// `deform` of the tiles that have modes.
-    Modes,
-    /// `deform` of the others.
-    Rigid,
+    Deform,
     Bounds,
     /// Normals that follow the surface.
     Normals,
-    /// In steps that change few domains; one launch of `deform` for listed tiles then takes the place of the two.
+    /// In steps that change few domains, before all others.
     Apply,
 }
 
@@ -160,7 +157,7 @@ pub fn plan(scene: &Scene) -> Plan {
         (Role::Tiles, ((size_of::<Tile>() + 4) * work.tiles.len()) as u64),
         (Role::Lanes, (work.lanes.len() * size_of::<Lane>() + 4 * work.lane_scales.len()) as u64),
         (Role::CornerShifts, 4 * corner_shifts(scene).len() as u64),
-        (Role::Boxes, 24 * warps(&work)),
+        (Role::Boxes, 96 * work.tiles.len() as u64),
         (Role::Stamps, 4 * domains),
         (Role::RestNormals, if needs.exact_normals { 12 * rest_corners } else { 48 * directed }),
         (Role::Inputs, inputs),
@@ -208,11 +205,6 @@ pub(super) const fn is_narrow(work: &Work) -> bool {
     work.tiles.len() < FEW_TILES
 }
 
-/// Warps of all tiles.
-pub(super) const fn warps(work: &Work) -> u64 {
-    work.tiles.len() as u64 * if is_narrow(work) { 4 } else { 1 }
-}
-
 /// Threads of a block of `deform`: WARPS in its source, which the launcher compares.
 fn threads_of(defines: &[&str]) -> u32 {
     let one = ["MODES", "SHEAR", "LISTED"].iter().any(|macro_name| defines.contains(macro_name));
@@ -221,28 +213,22 @@ fn threads_of(defines: &[&str]) -> u32 {
 
 fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     let needs = scene.needs;
-    let with_modes = work.tiles.iter().filter(|tile| tile.chunks > 0).count();
-    let rigid = work.tiles.len() - with_modes;
     let [deform, bounds, apply, normals] = KERNELS;
-    let per_tile = warps(work) as usize / work.tiles.len();
-    let tiles = |launch, tiles: usize| {
-        let defines = deform_defines(scene, work, launch == Launch::Modes);
-        let threads = threads_of(&defines);
-        let blocks = (tiles * per_tile).div_ceil(threads as usize / TILE_QUADS) as u32;
-        Kernel { launch, name: deform.name, defines, blocks, threads, source: deform.source }
-    };
+    let defines = deform_defines(scene, work);
+    let threads = threads_of(&defines);
+    let warps = work.tiles.len() * if is_narrow(work) { 4 } else { 1 };
+    let blocks_of_tiles = warps.div_ceil(threads as usize / TILE_QUADS) as u32;
+    let launch = Launch::Deform;
+    let deform = Kernel { launch, name: deform.name, defines, blocks: blocks_of_tiles, threads, source: deform.source };
     let walk = |launch, kernel: &KernelSource, blocks: usize| {
         let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear)];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
         let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
         Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: kernel.source }
     };
-    let boxes = warps(work).div_ceil(u64::from(BLOCK)).min(MOST_BLOCKS as u64) as usize;
+    let boxes = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
     let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
-    let mut kernels = Vec::new();
-    kernels.extend((with_modes > 0).then(|| tiles(Launch::Modes, with_modes)));
-    kernels.extend((rigid > 0).then(|| tiles(Launch::Rigid, rigid)));
-    kernels.push(walk(Launch::Bounds, &bounds, boxes));
+    let mut kernels = vec![deform, walk(Launch::Bounds, &bounds, boxes)];
     if needs.exact_normals {
         kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
     }
@@ -250,21 +236,21 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     kernels
 }
 
-/// The macros of `deform`, for tiles with modes or for those without.
-fn deform_defines(scene: &Scene, work: &Work, modes: bool) -> Vec<&'static str> {
+/// The macros of `deform`.
+fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
     let (needs, orients) = (scene.needs, orients(scene));
     let flags = [
-        ("MODES", modes),
+        ("MODES", needs.modes),
         ("NARROW", is_narrow(work)),
-        ("TRUNCATED", modes && needs.truncation),
-        ("COMPENSATED", modes && needs.compensated),
+        ("TRUNCATED", needs.truncation),
+        ("COMPENSATED", needs.compensated),
         ("ORIENT", orients),
         ("SHIFTED", !corner_shifts(scene).is_empty()),
         ("NORMAL_MAPS", orients && needs.normal_maps),
         ("SHEAR", orients && needs.shear),
     ];
     let on = flags.iter().filter(|(_, on)| *on).map(|(name, _)| *name);
-    on.chain(storage_define(scene.deformation.storage).filter(|_| modes)).collect()
+    on.chain(storage_define(scene.deformation.storage).filter(|_| needs.modes)).collect()
 }
 
 /// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
@@ -319,16 +305,9 @@ impl Plan {
         self.kernel(launch).ok_or_else(missing)
     }
 
-    /// The kernels of tiles, those with modes first.
-    pub(super) fn tiles(&self) -> Vec<Kernel> {
-        self.kernels.iter().filter(|kernel| [Launch::Modes, Launch::Rigid].contains(&kernel.launch)).cloned().collect()
-    }
-
     /// The most kernel launches of one step, whatever the number of domains.
-    pub fn launches(&self) -> usize {
-        let has = |launch| usize::from(self.kernel(launch).is_some());
-        // All tiles in two launches, or the listed ones in one behind `apply`.
-        has(Launch::Bounds) + has(Launch::Normals) + 2.max(has(Launch::Modes) + has(Launch::Rigid))
+    pub const fn launches(&self) -> usize {
+        self.kernels.len()
     }
 }
 

@@ -44,6 +44,61 @@ pub(super) struct Work {
     pub spans: Vec<[(u32, u32); 2]>,
 }
 
+/// Quads of N numbers as the kernel reads them: per tile of its own `[N][width]` fours, else `[N]` fours a quad.
+fn arranged<const N: usize>(quads: &[[[f32; 4]; N]], own: bool) -> Vec<[f32; 4]> {
+    if !own {
+        return quads.as_flattened().to_vec();
+    }
+    let tile = |tile: &[[[f32; 4]; N]]| -> Vec<[f32; 4]> {
+        (0..N).flat_map(|number| tile.iter().map(move |quad| quad[number])).collect()
+    };
+    quads.chunks(TILE_QUADS).flat_map(tile).collect()
+}
+
+/// Numbers of items, as quads: what fills up is zero.
+fn quads_of_items<const N: usize>(items: &[[f32; N]]) -> Vec<[[f32; 4]; N]> {
+    let mut quads = vec![[[0.0; 4]; N]; items.len().div_ceil(QUAD)];
+    for (at, item) in items.iter().enumerate() {
+        (0..N).for_each(|number| quads[at / QUAD][number][at % QUAD] = item[number]);
+    }
+    quads
+}
+
+/// x0 of all shapes, three fours a quad.
+pub(super) fn rest_positions(scene: &Scene, work: &Work) -> Vec<[f32; 4]> {
+    let mut all = vec![[0.0; 4]; 3 * work.quads.rest as usize];
+    let own = own_tiles(scene);
+    for (index, shape) in scene.shapes.iter().enumerate() {
+        let fours = arranged(&quads_of_items(shape.mesh.rest()), own[index]);
+        all[3 * work.quads.vertices[index] as usize..][..fours.len()].copy_from_slice(&fours);
+    }
+    all
+}
+
+/// Normals and tangents at rest of all shapes, three and four fours a quad from the first that has any; none where a
+/// scene needs none.
+pub(super) fn rest_directions(scene: &Scene, work: &Work) -> [Vec<[f32; 4]>; 2] {
+    if !orients(scene) {
+        return [Vec::new(), Vec::new()];
+    }
+    let count = (work.quads.end - work.quads.directed) as usize;
+    let mut normals = vec![[0.0; 4]; 3 * count];
+    let mut tangents = vec![[0.0; 4]; if scene.needs.normal_maps { 4 * count } else { 0 }];
+    let vertices = own_tiles(scene);
+    for (index, shape) in scene.shapes.iter().enumerate() {
+        let corners = &shape.mesh.corners().normals;
+        let own = if is_alike(shape) { vertices[index] } else { has_own_tiles(corners.len()) };
+        let first = (u64::from(work.quads.corners[index]) - work.quads.directed) as usize;
+        let fours = arranged(&quads_of_items(corners), own);
+        normals[3 * first..][..fours.len()].copy_from_slice(&fours);
+        if !shape.tangents().is_empty() {
+            let fours = arranged(&quads_of_items(shape.tangents()), own);
+            tangents[4 * first..][..fours.len()].copy_from_slice(&fours);
+        }
+    }
+    [normals, tangents]
+}
+
 /// Where quads of x0, normals and tangents lie: first x0 of shapes whose corners are others than their vertices, then
 /// x0, normals and tangents of those whose corner i is vertex i, then normals and tangents of the others.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -286,17 +341,31 @@ struct Place {
     rest: u32,
 }
 
-/// Every tile with its role, in the order of the domains.
-fn items(scene: &Scene) -> Vec<(Role, Item)> {
+/// Whether so many items of a domain are too many to share a tile.
+const fn has_own_tiles(items: usize) -> bool {
+    items.div_ceil(QUAD) > SMALL
+}
+
+/// Of each shape, whether its vertices have tiles of their own.
+fn own_tiles(scene: &Scene) -> Vec<bool> {
     let mut users = vec![0_usize; scene.shapes.len()];
     scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
+    let own = |(shape, users): (&Shape, usize)| {
+        has_own_tiles(shape.mesh.rest().len()) || (shape.modes.rank() > 0 && users > 1)
+    };
+    scene.shapes.iter().zip(users).map(own).collect()
+}
+
+/// Every tile with its role, in the order of the domains.
+fn items(scene: &Scene) -> Vec<(Role, Item)> {
+    let own = own_tiles(scene);
     let alike: Vec<bool> = scene.shapes.iter().map(is_alike).collect();
     let mut items = Vec::new();
     // Per role, the domains that wait for their tile to fill up, and its quads.
     let mut open: std::collections::BTreeMap<Role, (Vec<usize>, usize)> = std::collections::BTreeMap::new();
-    let mut add = |domain: usize, role: Role, count: usize, alone: bool| {
+    let mut add = |domain: usize, role: Role, count: usize, own: bool| {
         let quads = count.div_ceil(QUAD);
-        if quads > SMALL || alone {
+        if own {
             items.extend((0..quads.div_ceil(TILE_QUADS)).map(|tile| (role, Item::Own { domain, tile })));
             return;
         }
@@ -313,9 +382,9 @@ fn items(scene: &Scene) -> Vec<(Role, Item)> {
         let chunks = chunks_of(scene, shape);
         let both = orients(scene) && alike[domain.shape];
         let flags = TILE_VERTICES | if both { TILE_CORNERS } else { 0 };
-        add(index, Role { chunks, flags }, slot.vertices, chunks > 0 && users[domain.shape] > 1);
+        add(index, Role { chunks, flags }, slot.vertices, own[domain.shape]);
         if orients(scene) && !both {
-            add(index, Role { chunks: 0, flags: TILE_CORNERS }, slot.corners, false);
+            add(index, Role { chunks: 0, flags: TILE_CORNERS }, slot.corners, has_own_tiles(slot.corners));
         }
     }
     let rest: Vec<_> = open.into_iter().map(|(role, (waiting, _))| (role, Item::Mixed(waiting))).collect();
@@ -362,7 +431,7 @@ mod tests {
     struct Loaded {
         words: Vec<Plane>,
         scales: Vec<f32>,
-        rest: Vec<[f32; 12]>,
+        rest: Vec<[f32; 4]>,
         factors: Vec<Vec<f32>>,
     }
 
@@ -371,7 +440,7 @@ mod tests {
         let mut loaded = Loaded {
             words: Vec::new(),
             scales: vec![0.0; work.scales as usize],
-            rest: vec![[0.0; 12]; work.quads.rest as usize],
+            rest: rest_positions(scene, work),
             factors: Vec::new(),
         };
         for source in &work.sources {
@@ -385,7 +454,6 @@ mod tests {
         for shape in 0..scene.shapes.len() {
             let own = tiles(shape);
             loaded.scales[work.first_scale[shape] as usize..][..own.scales().len()].copy_from_slice(own.scales());
-            loaded.rest[work.quads.vertices[shape] as usize..][..own.rest().len()].copy_from_slice(own.rest());
             loaded.factors.push(own.factors().to_vec());
         }
         loaded
@@ -398,7 +466,7 @@ mod tests {
             let count = if quad + 1 == usize::from(tile.width) { last } else { 4 };
             let step = quad as u32;
             let item = tile.first + 4 * step;
-            (tile.domain as usize, item, count, tile.rest + step, tile.first_q, tile.first_scale)
+            (tile.domain as usize, item, count, tile.rest, tile.first_q, tile.first_scale)
         } else {
             let at = tile.first as usize + quad;
             let lane = work.lanes[at];
@@ -413,8 +481,8 @@ mod tests {
         let mut seen = vec![0; scene.layout.corners];
         let shifts = corner_shifts(scene);
         for tile in work.tiles.iter().filter(|tile| tile.kind & TILE_CORNERS > 0) {
-            for quad in 0..usize::from(tile.width) {
-                let (domain, item, count, rest, ..) = lane(work, tile, quad);
+            for in_tile in 0..usize::from(tile.width) {
+                let (domain, item, count, rest, ..) = lane(work, tile, in_tile);
                 let both = tile.kind & TILE_VERTICES > 0;
                 let shift = if both { shifts.get(domain).copied().unwrap_or(0) } else { 0 };
                 let slot = scene.layout.slots[domain];
@@ -422,7 +490,9 @@ mod tests {
                     let corner = item.wrapping_add(shift) as usize + within;
                     seen[corner] += 1;
                     let quad = work.quads.corners[scene.domains[domain].shape] as usize;
-                    assert_eq!(rest as usize, quad + (corner - slot.first_corner) / 4);
+                    let own = usize::from(tile.kind & TILE_LAST) > 0;
+                    let lane = if own { in_tile } else { 0 };
+                    assert_eq!(rest as usize + lane, quad + (corner - slot.first_corner) / 4);
                     assert!(rest as u64 >= work.quads.directed && (rest as u64) < work.quads.end);
                 }
             }
@@ -453,7 +523,10 @@ mod tests {
                     seen[packed] += 1;
                     let vertex = packed - scene.layout.slots[domain].first_vertex;
                     for axis in 0..3 {
-                        assert_eq!(loaded.rest[rest as usize][4 * axis + within], shape.mesh.rest()[vertex][axis]);
+                        let own = usize::from(tile.kind & TILE_LAST) > 0;
+                        let (step, lane) = if own { (usize::from(tile.width), quad) } else { (1, 0) };
+                        let at = 3 * rest as usize + axis * step + lane;
+                        assert_eq!(loaded.rest[at][within], shape.mesh.rest()[vertex][axis]);
                         for mode in 0..shape.modes.rank() {
                             let size = 4 / per_chunk;
                             let byte = ((mode % per_chunk * 3 + axis) * 4 + within) * size;
@@ -507,10 +580,16 @@ mod tests {
     #[test]
     fn corners_that_are_the_vertices_share_their_tiles_and_have_no_room_of_their_own() {
         let work = check(&super::super::pack::tests::alike(&[(7, 2), (300, 0), (9, 0)]));
-        assert!(work.tiles.iter().all(|tile| tile.kind & !TILE_LAST == TILE_VERTICES | TILE_CORNERS));
+        assert!(
+            work.tiles.iter().all(|tile| tile.kind & (TILE_VERTICES | TILE_CORNERS) == TILE_VERTICES | TILE_CORNERS)
+        );
         assert_eq!((work.quads.directed, work.quads.end), (0, work.quads.rest));
         let work = check(&single(&[(7, 2), (300, 0)]));
-        assert!(work.tiles.iter().all(|tile| [TILE_VERTICES, TILE_CORNERS].contains(&(tile.kind & !TILE_LAST))));
+        assert!(
+            work.tiles
+                .iter()
+                .all(|tile| [TILE_VERTICES, TILE_CORNERS].contains(&(tile.kind & (TILE_VERTICES | TILE_CORNERS))))
+        );
     }
 
     /// Every shape used by one domain.
