@@ -12,4 +12,5 @@ mod service_faults;
 mod service_files;
 mod service_harness;
 mod steps;
+mod storages;
 mod tolerance;
