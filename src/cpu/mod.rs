@@ -10,6 +10,8 @@ mod changes;
 mod decode;
 mod deform;
 mod extent;
+#[cfg(target_arch = "x86_64")]
+mod fused;
 mod kept;
 mod orient;
 mod rate;

@@ -2,23 +2,13 @@
 
 use pulp::NullaryFnOnce;
 
-#[cfg(target_arch = "x86_64")]
-pulp::simd_type!({
-    /// 256-bit vectors, fused multiply-add and conversion of halves.
-    struct Wide {
-        avx: f!("avx"),
-        avx2: f!("avx2"),
-        fma: f!("fma"),
-        f16c: f!("f16c"),
-    }
-});
-
-/// Runs work on the widest vectors there are. Results do not depend on them: `mul_add` rounds once everywhere. What
-/// the work calls must be `#[inline(always)]`, or it stays compiled for any machine.
+/// Runs work on 256-bit vectors with fused multiply-add where the machine has them. Results do not depend on that:
+/// `mul_add` rounds once everywhere. What the work calls must be `#[inline(always)]`, or it stays compiled for any
+/// machine.
 #[inline(always)]
 pub(super) fn vectorized<W: NullaryFnOnce>(work: W) -> W::Output {
     #[cfg(target_arch = "x86_64")]
-    if let Some(wide) = Wide::try_new() {
+    if let Some(wide) = pulp::x86::V3::try_new() {
         return wide.vectorize(work);
     }
     work.call()
