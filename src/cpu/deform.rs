@@ -9,7 +9,7 @@ use super::sum::{Coordinates, Scratch, Summed, sum};
 use super::tile::{self, Packed, PerTile, Tile};
 use crate::domain::Transform;
 use crate::scene::{Scene, State};
-use crate::storage::{self, QUAD, TILE_QUADS, Tiles};
+use crate::storage::{QUAD, TILE_QUADS, Tiles};
 
 /// The most vertices of a tile.
 pub(super) const TILE: usize = QUAD * TILE_QUADS;
@@ -99,7 +99,9 @@ fn add_rest(rest: &[[f32; 12]], sums: &mut Coordinates) {
     let width = QUAD * rest.len();
     for (axis, sums) in sums[..3 * width].chunks_exact_mut(width).enumerate() {
         for (sums, quad) in sums.chunks_exact_mut(QUAD).zip(rest) {
-            (0..QUAD).for_each(|vertex| sums[vertex] += quad[QUAD * axis + vertex]);
+            for (sum, rest) in sums.iter_mut().zip(&quad[QUAD * axis..][..QUAD]) {
+                *sum += *rest;
+            }
         }
     }
 }
@@ -107,12 +109,15 @@ fn add_rest(rest: &[[f32; 12]], sums: &mut Coordinates) {
 /// World positions of a tile from `[axis][vertex]`, `width` vertices an axis, which are overwritten.
 #[inline(always)]
 fn put(transform: &Transform, bent: &mut Coordinates, width: usize, out: &mut [f32]) -> Extent {
-    let rows: [[f32; 4]; 3] = std::array::from_fn(|row| std::array::from_fn(|column| transform.0[4 * row + column]));
+    let t = transform.0;
     let (x, yz) = bent[..3 * width].split_at_mut(width);
     let (y, z) = yz.split_at_mut(width);
     for ((x, y), z) in x.iter_mut().zip(y.iter_mut()).zip(z.iter_mut()) {
-        let world = rows.map(|[a, b, c, offset]| c.mul_add(*z, b.mul_add(*y, a.mul_add(*x, offset))));
-        [*x, *y, *z] = world;
+        // No closure here: it would be compiled without fused multiply-adds.
+        let [a, b, c] = [*x, *y, *z];
+        *x = c.mul_add(t[2], b.mul_add(t[1], a.mul_add(t[0], t[3])));
+        *y = c.mul_add(t[6], b.mul_add(t[5], a.mul_add(t[4], t[7])));
+        *z = c.mul_add(t[10], b.mul_add(t[9], a.mul_add(t[8], t[11])));
     }
     let count = out.len() / 3;
     for (((out, x), y), z) in out.chunks_exact_mut(3).zip(&*x).zip(&*y).zip(&*z) {
@@ -144,7 +149,7 @@ fn rescue(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> Extent {
 
 fn bent_in_f64(tiles: &Tiles, q: &[f32], vertex: usize) -> [f64; 3] {
     [0, 1, 2].map(|axis| {
-        let rest = tiles.rest()[vertex / storage::QUAD][QUAD * axis + vertex % QUAD];
+        let rest = tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD];
         let part = |(mode, q): (usize, &f32)| tiles.decoded(vertex, axis, mode) * f64::from(*q);
         q.iter().enumerate().map(part).sum::<f64>() + f64::from(rest)
     })

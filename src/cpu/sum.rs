@@ -202,19 +202,16 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
         let length = self.sums.len();
         let columns = columns.map(|column| &column[..length]);
         if COMPENSATED {
-            let lost = &mut self.lost[..length];
-            for at in 0..length {
+            for (at, (sum, lost)) in self.sums.iter_mut().zip(self.lost.iter_mut()).enumerate() {
                 for mode in 0..N {
-                    (self.sums[at], lost[at]) = add_exactly(self.sums[at], lost[at], columns[mode][at], amounts[mode]);
+                    (*sum, *lost) = add_exactly(*sum, *lost, columns[mode][at], amounts[mode]);
                 }
             }
         } else {
-            for at in 0..length {
-                let mut sum = self.sums[at];
+            for (at, sum) in self.sums.iter_mut().enumerate() {
                 for mode in 0..N {
-                    sum = columns[mode][at].mul_add(amounts[mode], sum);
+                    *sum = columns[mode][at].mul_add(amounts[mode], *sum);
                 }
-                self.sums[at] = sum;
             }
         }
     }
@@ -257,7 +254,7 @@ mod tests {
         let mut noise = Noise(1);
         for (vertices, rank) in [(128, 32), (4, 1), (12, 5), (128, 7), (140, 33), (52, 512)] {
             // Every fifth entry is so small that f16 holds it as a subnormal.
-            let entry = |at: usize, value: f32| if at % 5 == 0 { value * 1e-8 } else { value };
+            let entry = |at: usize, value: f32| if at.is_multiple_of(5) { value * 1e-8 } else { value };
             let columns = (0..3 * vertices * rank).map(|at| entry(at, noise.next())).collect();
             let shape = with_columns(vertices, rank, columns, &mut noise);
             for storage in Storage::ALL {
