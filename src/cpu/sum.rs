@@ -197,21 +197,27 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
         }
     }
 
+    #[expect(clippy::needless_range_loop, reason = "one index for all columns leaves no check inside the loop")]
     #[inline(always)]
     fn add<const N: usize>(&mut self, columns: [&[f32]; N], amounts: [f32; N]) {
         let length = self.sums.len();
         let columns = columns.map(|column| &column[..length]);
         if COMPENSATED {
-            for (at, (sum, lost)) in self.sums.iter_mut().zip(self.lost.iter_mut()).enumerate() {
+            let lost = &mut self.lost[..length];
+            for at in 0..length {
+                let mut pair = (self.sums[at], lost[at]);
                 for mode in 0..N {
-                    (*sum, *lost) = add_exactly(*sum, *lost, columns[mode][at], amounts[mode]);
+                    pair = add_exactly(pair, columns[mode][at], amounts[mode]);
                 }
+                (self.sums[at], lost[at]) = pair;
             }
         } else {
-            for (at, sum) in self.sums.iter_mut().enumerate() {
+            for at in 0..length {
+                let mut sum = self.sums[at];
                 for mode in 0..N {
-                    *sum = columns[mode][at].mul_add(amounts[mode], *sum);
+                    sum = columns[mode][at].mul_add(amounts[mode], sum);
                 }
+                self.sums[at] = sum;
             }
         }
     }
@@ -219,7 +225,7 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
 
 /// The next sum, and all that was lost so far: TwoProduct by fused multiply-add, TwoSum of Knuth.
 #[inline(always)]
-fn add_exactly(sum: f32, lost: f32, entry: f32, amount: f32) -> (f32, f32) {
+fn add_exactly((sum, lost): (f32, f32), entry: f32, amount: f32) -> (f32, f32) {
     let product = entry * amount;
     let product_lost = entry.mul_add(amount, -product);
     let next = sum + product;
