@@ -1,97 +1,428 @@
-// x = T (x0 + U q) for every vertex of every domain of a scene, and the bounds of all x, in one launch.
-//   columns     per shape [1 + r][3][stride] f32: x0, then the columns of U, one plane per axis         (in)
-//   transforms  [domains][3] float4: the rows of world_from_domain, relative to the scene's origin      (in)
-//   q           [coordinates] f32, packed; read only with MODES                                         (in)
-//   positions   [vertices][3] f32: world, scene units, relative to the scene's origin                   (out)
-//   bounds      [6] u32: `ordered` maxima of -x, -y, -z, x, y, z; zero before the launch                (in, out)
-// Launch: BLOCK threads a block, a thread a packed vertex, ceil(vertices / BLOCK) blocks, whichever domains they meet.
+// x = T (x0 + U q) for every vertex of every domain of a scene, with ORIENT rigid normals and tangents of every corner
+// too, in one launch over a flat list of tiles; and a box of each warp's x.
+//   tiles, lanes  the work of each warp (layout.cuh)                                                        (in)
+//   words         U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                              (in)
+//   rest          x0, [quads][12] f32: 4 x, 4 y, 4 z                                                        (in)
+//   rest_normals  [quads][12] f32, likewise; with ORIENT                                                    (in)
+//   rest_tangents [quads][16] f32: 4 x, 4 y, 4 z, 4 signs of the bitangent; with ORIENT and NORMAL_MAPS     (in)
+//   corner_shifts with SHIFTED: per domain, from a vertex to its corner                                     (in)
+//   transforms    [domains][3] float4: the rows of world_from_domain, relative to the state's origin        (in)
+//   q             packed coordinates, times the factor of their mode with STORE_F16 and STORE_BF16          (in)
+//   scales        with STORE_INT8: per tile of U and mode                                                   (in)
+//   kept          with TRUNCATED: per domain the chunks that are summed, ascending                          (in)
+//   list          with LISTED: the tiles to be computed, as many as the header says; else all are           (in)
+//   positions     [vertices][3] f32, in the header                                                          (out)
+//   normals       [corners][3] f32, in the header                                                           (out)
+//   tangents      [corners] float4, in the header                                                           (out)
+//   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
+//                 WITHOUT_POSITIONS, for measuring                                                          (out)
+//   boxes         [warps][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                   (out)
+// Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles from `first` on, or any number of blocks with
+// LISTED. Tiles without modes, which come last in the list, are launched beside the others without MODES.
 // CPU twin: src/reference/deform.rs.
-#include "layout.cuh"
+//
+// The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
+// agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost.
+#include "chunk.cuh"
+#include "ordered.cuh"
+#include "orient.cuh"
 
-// An integer that grows with x and is never 0; of a NaN it is the largest, so that a NaN wins every maximum.
-__device__ unsigned ordered(float x) {
-    const unsigned bits = __float_as_uint(x);
-    if (x != x) {
-        return 0xffffffffu;
-    }
-    return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
-}
-
-__device__ unsigned warp_max(unsigned key) {
-#if __CUDA_ARCH__ >= 800
-    return __reduce_max_sync(0xffffffffu, key);
+// The chunks that a lane reads before it sums the first.
+#ifdef NARROW
+#define AHEAD (16 / CHUNK_MODES)
 #else
-    for (int lanes = 16; lanes > 0; lanes /= 2) {
-        key = max(key, __shfl_xor_sync(0xffffffffu, key, lanes));
-    }
-    return key;
+#define AHEAD 4
 #endif
-}
+// Warps of a block, and blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill
+// registers. Tiles of modes read long runs and do best in blocks of one warp; those without wait for one thing after the
+// other, and as many as possible must wait at once.
+#if defined(SHEAR) || defined(LISTED)
+constexpr unsigned WARPS = 1;
+constexpr unsigned RESIDENT = 16;
+#elif defined(MODES)
+constexpr unsigned WARPS = 1;
+constexpr unsigned RESIDENT = 24;
+#else
+constexpr unsigned WARPS = 2;
+constexpr unsigned RESIDENT = 18;
+#endif
 
-// The modes of a vertex are summed in the order of the columns, whatever the block: runs agree bit by bit. The sum
-// begins at +0 and so stays +0 where the rows of U are zero.
-__device__ float3 position_of(const DeformArgs& args, unsigned vertex) {
-    const unsigned domain = domain_of(args.slots, args.first_domains, vertex);
-    const VertexSlot slot = args.slots[domain];
-    const float* entry = args.columns + slot.first_entry + (vertex - slot.first);
-    float3 bent = make_float3(__ldg(entry), __ldg(entry + slot.stride), __ldg(entry + 2 * (size_t)slot.stride));
 #ifdef MODES
-    if (slot.rank > 0) {
-        const size_t stride = slot.stride;
-        const float* q = args.q + slot.first_q;
-        float3 u = make_float3(0.0f, 0.0f, 0.0f);
-#pragma unroll 4
-        for (unsigned mode = 0; mode < slot.rank; ++mode) {
-            entry += 3 * stride;
-            const float amount = __ldg(q + mode);
-            u.x = fmaf(__ldg(entry), amount, u.x);
-            u.y = fmaf(__ldg(entry + stride), amount, u.y);
-            u.z = fmaf(__ldg(entry + 2 * stride), amount, u.z);
-        }
-        bent.x += u.x;
-        bent.y += u.y;
-        bent.z += u.z;
-    }
+// What entry (mode, axis) of the chunks is multiplied with.
+struct Amounts {
+    float of[CHUNK_MODES];
+};
+
+__device__ __forceinline__ Amounts amounts_of(const DeformArgs& args, const Part& part, unsigned chunk) {
+    Amounts amounts;
+#if defined(STORE_INT8)
+    const float4 q = __ldg((const float4*)(args.q + part.first_q) + chunk);
+    const float4 scale = __ldg((const float4*)(args.scales + part.first_scale) + chunk);
+    amounts.of[0] = q.x * scale.x;
+    amounts.of[1] = q.y * scale.y;
+    amounts.of[2] = q.z * scale.z;
+    amounts.of[3] = q.w * scale.w;
+#elif defined(STORE_F16) || defined(STORE_BF16)
+    const float2 q = __ldg((const float2*)(args.q + part.first_q) + chunk);
+    amounts.of[0] = q.x;
+    amounts.of[1] = q.y;
+#else
+    amounts.of[0] = __ldg(args.q + part.first_q + chunk);
 #endif
-    const float4* rows = args.transforms + 3 * (size_t)domain;
-    const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
-    return make_float3(fmaf(a.x, bent.x, fmaf(a.y, bent.y, fmaf(a.z, bent.z, a.w))),
-                       fmaf(b.x, bent.x, fmaf(b.y, bent.y, fmaf(b.z, bent.z, b.w))),
-                       fmaf(c.x, bent.x, fmaf(c.y, bent.y, fmaf(c.z, bent.z, c.w))));
+    return amounts;
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK) deform(const DeformArgs args) {
-    __shared__ float staged[3 * BLOCK];
-    __shared__ unsigned reach[6];
-    const unsigned vertex = blockIdx.x * BLOCK + threadIdx.x;
-    if (threadIdx.x < 6) {
-        reach[threadIdx.x] = 0;
-    }
-    __syncthreads();
-    unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-    if (vertex < args.vertices) {
-        const float3 x = position_of(args, vertex);
-        const float coordinates[3] = {x.x, x.y, x.z};
-        for (unsigned axis = 0; axis < 3; ++axis) {
-            staged[3 * threadIdx.x + axis] = coordinates[axis];
-            keys[axis] = ordered(-coordinates[axis]);
-            keys[3 + axis] = ordered(coordinates[axis]);
+// Sums of products, three to a vertex. COMPENSATED carries what rounding took away (Ogita, Rump and Oishi, "Accurate sum
+// and dot product", algorithm Dot2) and costs as many registers again.
+struct Sums {
+    float of[FLOATS];
+#ifdef COMPENSATED
+    float lost[FLOATS];
+#endif
+    __device__ __forceinline__ void clear() {
+#pragma unroll
+        for (unsigned i = 0; i < FLOATS; ++i) {
+            of[i] = 0.0f;
+#ifdef COMPENSATED
+            lost[i] = 0.0f;
+#endif
         }
     }
+    __device__ __forceinline__ void add(unsigned i, float entry, float amount) {
+#ifdef COMPENSATED
+        const float product = __fmul_rn(entry, amount), sum = __fadd_rn(of[i], product);
+        const float taken = __fadd_rn(sum, -of[i]);
+        const float left = __fadd_rn(__fadd_rn(of[i], -__fadd_rn(sum, -taken)), __fadd_rn(product, -taken));
+        lost[i] = __fadd_rn(lost[i], __fadd_rn(left, fmaf(entry, amount, -product)));
+        of[i] = sum;
+#else
+        of[i] = fmaf(entry, amount, of[i]);
+#endif
+    }
+    __device__ __forceinline__ float total(unsigned i) const {
+#ifdef COMPENSATED
+        return of[i] + lost[i];
+#else
+        return of[i];
+#endif
+    }
+};
+
+#ifdef NARROW
+struct Chunk {
+    float entries[3 * CHUNK_MODES];
+    __device__ __forceinline__ void load(const Part& part, const uint4* words) {
+#pragma unroll
+        for (unsigned i = 0; i < 3 * CHUNK_MODES; ++i) {
+            entries[i] = entry_at(words, part.width, i / 3, i % 3, part.within);
+        }
+    }
+    __device__ __forceinline__ float entry(unsigned mode, unsigned axis, unsigned) const { return entries[3 * mode + axis]; }
+};
+#else
+struct Chunk {
+    unsigned words[12];
+    __device__ __forceinline__ void load(const Part& part, const uint4* from) {
+#pragma unroll
+        for (unsigned i = 0; i < 3; ++i) {
+            const uint4 word = __ldcs(from + i * part.width);
+            words[4 * i] = word.x;
+            words[4 * i + 1] = word.y;
+            words[4 * i + 2] = word.z;
+            words[4 * i + 3] = word.w;
+        }
+    }
+    __device__ __forceinline__ float entry(unsigned mode, unsigned axis, unsigned vertex) const {
+        return entry_of(words, (mode * 3 + axis) * 4 + vertex);
+    }
+};
+#endif
+
+__device__ __forceinline__ void add_chunk(Sums& sums, const Chunk& chunk, const Amounts& amounts) {
+#pragma unroll
+    for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
+#pragma unroll
+        for (unsigned axis = 0; axis < 3; ++axis) {
+#pragma unroll
+            for (unsigned vertex = 0; vertex < SPAN; ++vertex) {
+                sums.add(SPAN * axis + vertex, chunk.entry(mode, axis, vertex), amounts.of[mode]);
+            }
+        }
+    }
+}
+
+// The chunks that a domain sums: all of them, or with TRUNCATED those on its list.
+struct Chosen {
+    unsigned count;
+#ifdef TRUNCATED
+    const unsigned short* list;
+#endif
+    __device__ __forceinline__ Chosen(const DeformArgs& args, const Part& part) : count(part.chunks) {
+#ifdef TRUNCATED
+        list = args.kept + part.first_q / CHUNK_MODES;
+        count = part.chunks == 0 || part.count == 0 ? 0 : __ldg(args.kept_counts + part.domain);
+#endif
+    }
+    __device__ __forceinline__ unsigned operator[](unsigned i) const {
+#ifdef TRUNCATED
+        return __ldg(list + i);
+#else
+        return i;
+#endif
+    }
+};
+
+// Adds `COUNT` chunks from the i-th chosen on, all of them loaded before the first is summed.
+template <unsigned COUNT>
+__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const Part& part, const Chosen& chosen, unsigned& i,
+                                           Sums& sums) {
+    const uint4* words = args.words + part.first_word + part.quad;
+    const size_t step = 3 * (size_t)part.width;
+    Chunk chunks[COUNT];
+#pragma unroll
+    for (unsigned k = 0; k < COUNT; ++k) {
+        chunks[k].load(part, words + chosen[i + k] * step);
+    }
+#pragma unroll
+    for (unsigned k = 0; k < COUNT; ++k) {
+        add_chunk(sums, chunks[k], amounts_of(args, part, chosen[i + k]));
+    }
+    i += COUNT;
+}
+
+__device__ __forceinline__ void sum_modes(const DeformArgs& args, const Part& part, Sums& sums) {
+    const Chosen chosen(args, part);
+    unsigned i = 0;
+    while (i + AHEAD <= chosen.count) {
+        sum_chunks<AHEAD>(args, part, chosen, i, sums);
+    }
+    const unsigned left = chosen.count - i;
+    if (AHEAD > 8 && left & 8) {
+        sum_chunks<8>(args, part, chosen, i, sums);
+    }
+    if (AHEAD > 4 && left & 4) {
+        sum_chunks<4>(args, part, chosen, i, sums);
+    }
+    if (left & 2) {
+        sum_chunks<2>(args, part, chosen, i, sums);
+    }
+    if (left & 1) {
+        sum_chunks<1>(args, part, chosen, i, sums);
+    }
+}
+#endif
+
+__device__ __forceinline__ float placed(const float4& row, float x, float y, float z) {
+    return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
+}
+
+// The x of one vertex of this lane in f64, rounded once: for what overflowed on its way in f32 although it need not.
+__device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
+    const Part part = part_of(args, tile, share);
+    const unsigned within = part.within + vertex;
+    double bent[3];
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        double sum = 0.0;
+#ifdef MODES
+        const Chosen chosen(args, part);
+        for (unsigned i = 0; i < chosen.count; ++i) {
+            const Amounts amounts = amounts_of(args, part, chosen[i]);
+            const uint4* words = args.words + part.first_word + part.quad + chosen[i] * 3 * (size_t)part.width;
+            for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
+                sum += (double)entry_at(words, part.width, mode, axis, within) * (double)amounts.of[mode];
+            }
+        }
+#endif
+        bent[axis] = (double)((const float*)(args.rest + 3 * (size_t)part.rest))[4 * axis + within] + sum;
+    }
+    const float4* rows = args.transforms + 3 * (size_t)part.domain;
+    float placed[3];
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        const float4 row = rows[axis];
+        placed[axis] = (float)(row.x * bent[0] + row.y * bent[1] + row.z * bent[2] + row.w);
+    }
+    return make_float3(placed[0], placed[1], placed[2]);
+}
+
+// The six sides of what a lane staged, as keys. Vertices that are not there count as the first.
+__device__ __forceinline__ void box_of(const float (&world)[FLOATS], unsigned count, unsigned (&keys)[6]) {
+#pragma unroll
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        float low = world[axis], high = world[axis];
+#pragma unroll
+        for (unsigned vertex = 1; vertex < SPAN; ++vertex) {
+            const float number = vertex < count ? world[3 * vertex + axis] : world[axis];
+            low = fminf(low, number);
+            high = fmaxf(high, number);
+        }
+        keys[axis] = ordered(-low);
+        keys[3 + axis] = ordered(high);
+    }
+}
+
+// Computes anew what is not finite of `count` staged vertices, and says what the box is then: a NaN wins.
+__device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigned share, float* numbers, unsigned count,
+                                  unsigned (&keys)[6]) {
+    for (unsigned side = 0; side < 6; ++side) {
+        keys[side] = 0;
+    }
+    for (unsigned vertex = 0; vertex < count; ++vertex) {
+        float* at = numbers + 3 * vertex;
+        if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
+            const float3 exact = placed_exactly(args, tile, share, vertex);
+            at[0] = exact.x;
+            at[1] = exact.y;
+            at[2] = exact.z;
+        }
+        for (unsigned axis = 0; axis < 3; ++axis) {
+            keys[axis] = max(keys[axis], ordered(-at[axis]));
+            keys[3 + axis] = max(keys[3 + axis], ordered(at[axis]));
+        }
+    }
+}
+
+// The way out of a warp, and of the boxes of lanes that had to mend theirs.
+struct Shared {
+    Stage stage;
+    unsigned mended[32][6];
+};
+
+// What a vertex has besides its modes: x0 and T.
+struct Base {
+    Items x, y, z;
+    float4 a, b, c;
+    __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
+        const float4* from = args.rest + 3 * (size_t)part.rest;
+        x = items_of(from, part.within);
+        y = items_of(from + 1, part.within);
+        z = items_of(from + 2, part.within);
+        const float4* rows = args.transforms + 3 * (size_t)part.domain;
+        a = __ldg(rows);
+        b = __ldg(rows + 1);
+        c = __ldg(rows + 2);
+    }
+};
+
+// World positions from `bent`, [axis][vertex] sums.
+__device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, const Part& part, unsigned tile,
+                                      unsigned share, const Base& base, const float (&bent)[FLOATS]) {
+    float world[FLOATS], total = 0.0f;
+#pragma unroll
+    for (unsigned i = 0; i < SPAN; ++i) {
+        const float px = base.x.of[i] + bent[i], py = base.y.of[i] + bent[SPAN + i],
+                    pz = base.z.of[i] + bent[2 * SPAN + i];
+        world[3 * i] = placed(base.a, px, py, pz);
+        world[3 * i + 1] = placed(base.b, px, py, pz);
+        world[3 * i + 2] = placed(base.c, px, py, pz);
+        // Zero, unless one of them is not finite.
+        total = fmaf(0.0f, world[3 * i] + world[3 * i + 1] + world[3 * i + 2], total);
+    }
+    unsigned keys[6] = {0, 0, 0, 0, 0, 0};
+    put(shared.stage, world, part.item, part.count);
+    if (part.count > 0) {
+        box_of(world, part.count, keys);
+        if (total != 0.0f) {
+            unsigned(&mended)[6] = shared.mended[lane_of()];
+            mend(args, tile, share, staged(shared.stage) + FLOATS * lane_of(), part.count, mended);
+#pragma unroll
+            for (unsigned side = 0; side < 6; ++side) {
+                keys[side] = mended[side];
+            }
+        }
+    }
+    store(args.header->positions, shared.stage, (part.kind & TILE_LAST) > 0);
+#pragma unroll
     for (unsigned side = 0; side < 6; ++side) {
         const unsigned key = warp_max(keys[side]);
-        if (threadIdx.x % 32 == 0) {
-            atomicMax(&reach[side], key);
+        if (lane_of() == side) {
+            args.boxes[6 * ((size_t)tile * SHARE + share) + side] = key;
         }
     }
-    __syncthreads();
-    store_triples(args.positions, staged, args.vertices);
-    // Most blocks lie inside what others have reported: looking first keeps them from queueing at six addresses. The
-    // value read may be old, but it only grows, so no maximum is lost.
-    if (threadIdx.x < 6) {
-        const unsigned key = reach[threadIdx.x];
-        if (key > *(volatile unsigned*)(args.bounds + threadIdx.x)) {
-            atomicMax(args.bounds + threadIdx.x, key);
-        }
+}
+
+#ifdef MODES
+// Asks early for what is read after the modes.
+__device__ __forceinline__ void prefetch_rest(const DeformArgs& args, const Part& part) {
+    prefetch(args.rest + 3 * (size_t)part.rest);
+#ifdef ORIENT
+    if (part.kind & TILE_CORNERS) {
+        prefetch(args.rest_normals + 3 * (size_t)part.rest);
+#ifdef NORMAL_MAPS
+        prefetch(args.rest_tangents + 4 * (size_t)part.rest);
+#endif
     }
+#endif
+}
+
+__device__ __forceinline__ void sum(const DeformArgs& args, const Part& part, float (&bent)[FLOATS]) {
+    Sums sums;
+    sums.clear();
+    sum_modes(args, part, sums);
+#pragma unroll
+    for (unsigned i = 0; i < FLOATS; ++i) {
+        bent[i] = sums.total(i);
+    }
+}
+#endif
+
+__device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, unsigned tile, unsigned share) {
+    const Part part = part_of(args, tile, share);
+#ifdef ORIENT
+    Normals normals;
+#endif
+    if (part.kind & TILE_VERTICES) {
+        float bent[FLOATS] = {};
+        Base base;
+#if defined(MODES) && defined(NARROW)
+        base.load(args, part);
+        sum(args, part, bent);
+#elif defined(MODES)
+        prefetch_rest(args, part);
+        sum(args, part, bent);
+#endif
+#ifdef DISPLACEMENTS
+        float u[FLOATS];
+#pragma unroll
+        for (unsigned i = 0; i < FLOATS; ++i) {
+            u[i] = bent[i % 3 * SPAN + i / 3];
+        }
+        put(shared.stage, u, part.item, part.count);
+        store(args.header->displacements, shared.stage, (part.kind & TILE_LAST) > 0);
+#endif
+#ifndef WITHOUT_POSITIONS
+#if !(defined(MODES) && defined(NARROW))
+        base.load(args, part);
+#endif
+#ifdef ORIENT
+        // Before the positions leave, so that both are on their way at once.
+        if (part.kind & TILE_CORNERS) {
+            normals.load(args, part);
+        }
+#endif
+        place(args, shared, part, tile, share, base, bent);
+#endif
+    }
+#ifdef ORIENT
+    if (part.kind & TILE_CORNERS) {
+        if (!(part.kind & TILE_VERTICES)) {
+            normals.load(args, part);
+        }
+        orient(args, shared.stage, part, normals);
+    }
+#endif
+}
+
+extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) deform(const __grid_constant__ DeformArgs args) {
+    __shared__ Shared shared[WARPS];
+    const unsigned warp = blockIdx.x * WARPS + threadIdx.x / 32;
+#ifdef LISTED
+    const unsigned warps = SHARE * __ldg(&args.header->stale);
+    for (unsigned i = warp; i < warps; i += gridDim.x * WARPS) {
+        compute(args, shared[threadIdx.x / 32], __ldg(args.list + i / SHARE), i % SHARE);
+    }
+#else
+    if (warp < SHARE * args.count) {
+        compute(args, shared[threadIdx.x / 32], args.first + warp / SHARE, warp % SHARE);
+    }
+#endif
 }

@@ -13,6 +13,7 @@ mod extent;
 #[cfg(target_arch = "x86_64")]
 mod fused;
 mod kept;
+mod normals;
 mod orient;
 mod rate;
 mod simd;
@@ -116,7 +117,13 @@ impl Deformer for CpuDeformer {
             kept.follow(&self.scene, state, &self.changes);
         }
         self.deform_positions(state);
-        orient::orient(&self.scene, state, self.corner_work.of(&self.changes), &mut self.surface);
+        // Either kind of normals depends on the domain's own positions and T alone.
+        let corners = self.corner_work.of(&self.changes);
+        if self.scene.needs.exact_normals {
+            normals::normals(&self.scene, state, corners, &mut self.surface);
+        } else {
+            orient::orient(&self.scene, state, corners, &mut self.surface);
+        }
         Ok(Deformed { bounds: Extent::all(&self.extents), ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 

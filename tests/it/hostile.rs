@@ -9,10 +9,13 @@ use v1::drive_scene_request::Kind as Asked;
 use v1::drive_scene_response::Kind as Told;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Driver, Server, details, expected, get_vertices, step, strips, within};
+use crate::service_harness::{Driver, Server, details, expected, get_vertices, rigid_step, step, strips, within};
 
 /// A bad step: its name, the step, and how field, expected and given begin.
 type BadStep = (&'static str, v1::Step, [&'static str; 3]);
+
+/// No rotation, as a quaternion.
+const UPRIGHT: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 fn bad_steps() -> Vec<BadStep> {
     let transforms = |domains: &[u32], numbers: &[f32]| v1::Step {
@@ -67,6 +70,55 @@ fn bad_steps() -> Vec<BadStep> {
     ]
 }
 
+/// Bad steps in the other formats of transforms.
+fn bad_formats() -> Vec<BadStep> {
+    let bytes = |format: i32| v1::Step {
+        transform_domains: vec![0],
+        transforms: vec![0; 48].into(),
+        transform_format: format,
+        ..step(11, &[], &[])
+    };
+    let misnamed = |format: v1::TransformFormat| bytes(format.into());
+    let overflow = rigid_step(11, v1::TransformFormat::RigidF64, &[(0, UPRIGHT, [1e7; 3]), (1, UPRIGHT, [1e7; 3])]);
+    let overflow = v1::Step { q_domains: vec![1], q: step(11, &[1], &[f32::MAX, 0.0]).q, ..overflow };
+    vec![
+        ("a format of no version", bytes(9), ["step.transform_format", "a format of this version", "9"]),
+        ("48 bytes as 28", misnamed(v1::TransformFormat::RigidF32), ["step.transforms", "28 bytes (1 tr", "48 bytes"]),
+        ("48 bytes as 40", misnamed(v1::TransformFormat::RigidF64), ["step.transforms", "40 bytes (1 tr", "48 bytes"]),
+        (
+            "no rotation",
+            rigid_step(11, v1::TransformFormat::RigidF32, &[(1, [0.0; 4], [0.0; 3])]),
+            ["step.transforms of domain 'right': rotation", "a quaternion x y z w of norm 1", "norm 0"],
+        ),
+        (
+            "twice a rotation",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, [0.0, 2.0, 0.0, 0.0], [0.0; 3])]),
+            ["step.transforms of domain 'left': rotation", "a quaternion x y z w of norm 1", "norm 2"],
+        ),
+        (
+            "NaN in a quaternion",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, [0.0, f32::NAN, 0.0, 1.0], [0.0; 3])]),
+            ["step.transforms of domain 'right': rotation[1]", "a finite", "NaN"],
+        ),
+        (
+            "infinity in an f32 translation",
+            rigid_step(11, v1::TransformFormat::RigidF32, &[(0, UPRIGHT, [0.0, 1e300, 0.0])]),
+            ["step.transforms of domain 'left': translation[1]", "a finite", "inf"],
+        ),
+        (
+            "infinity in an f64 translation",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, UPRIGHT, [0.0, 0.0, f64::NEG_INFINITY])]),
+            ["step.transforms of domain 'left': translation[2]", "a finite", "-inf"],
+        ),
+        (
+            "an f64 translation beyond all worlds",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, UPRIGHT, [-1e300, 0.0, 0.0])]),
+            ["step.transforms of domain 'right': translation[0]", "at most 1.09", "-1000000000"],
+        ),
+        ("q that overflows far away", overflow, ["step.q of domain 'right'", "q and transform", "vertex"]),
+    ]
+}
+
 fn begins(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> bool {
     rejection.field.starts_with(field) && rejection.expected.starts_with(expected) && rejection.given.starts_with(given)
 }
@@ -84,7 +136,7 @@ async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client
     let want = expected(&strips(), &[good]);
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     // A refused overflow keeps its number, so what follows counts from there.
-    for (index, (name, mut bad, refusal)) in bad_steps().into_iter().enumerate() {
+    for (index, (name, mut bad, refusal)) in bad_steps().into_iter().chain(bad_formats()).enumerate() {
         let goes_back = bad.number < 11;
         bad.number += if goes_back { 0 } else { index as u64 };
         let number = bad.number;
@@ -95,6 +147,7 @@ async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client
         assert_eq!(rejection.step, Some(number), "{name}");
         let got = get_vertices(&server, ask.clone()).await.expect("vertices");
         assert_eq!((got.step().number, &got.positions, &got.normals), (10, &want.0, &want.1), "{name}");
+        assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
         other.acked(step(index as u64, &[0], &[0.5, 0.5])).await;
     }
     driver.acked(step(1000, &[0], &[0.0, 0.0])).await;
