@@ -1,4 +1,7 @@
 //! Which domains changed since the last step: their q or T differs in some bit.
+//!
+//! The values are compared, whatever the state's list of changes says: a list would miss numbers that were written by
+//! hand, and a state of another history with the same serial number.
 
 use rayon::prelude::*;
 

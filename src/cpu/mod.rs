@@ -2,7 +2,8 @@
 //!
 //! A vertex sums its modes in their order by fused multiply-adds, whatever tile it falls in and whichever domains
 //! changed, so equal inputs give bit-identical outputs on any number of cores. Domains whose q and T are those of the
-//! step before keep their vertices. Where modes are left out within a budget, which ones depends on earlier steps too.
+//! step before keep their vertices and normals. Where modes are left out within a budget, which ones depends on earlier
+//! steps too.
 
 #[cfg(test)]
 mod bench;
