@@ -35,7 +35,7 @@
 //! 2. No proto type below `service`.
 //! 3. No GL or CUDA call off the device thread.
 //! 4. Every channel is bounded and says what it does when full.
-//! 5. No kernel without a launcher and a twin of its name.
+//! 5. No kernel without a launcher of its name and a twin: of its name too, unless the test's table names another.
 //! 6. Behind the constructors of `domain` and `scene` no length, index or float is checked again.
 //! 7. Nothing below `engine` knows of streams or sessions.
 //! 8. Nothing panics on input.

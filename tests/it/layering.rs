@@ -134,6 +134,40 @@ fn is_only_measured(name: &str) -> bool {
     name.starts_with("thesis_") || ["roof", "plain_update"].contains(&name)
 }
 
+/// Kernels that put into one place what deformers on the host find there: their twin is a method of the scene's values.
+const TWINS_ELSEWHERE: [(&str, Twin); 2] = [
+    ("apply", Twin { file: "src/scene/state.rs", of: "State", method: "apply" }),
+    ("bounds", Twin { file: "src/scene/camera.rs", of: "Bounds", method: "union" }),
+];
+
+#[derive(Clone, Copy)]
+struct Twin {
+    file: &'static str,
+    of: &'static str,
+    method: &'static str,
+}
+
+impl Twin {
+    /// Whether the file's text has the method in its type's own block, and the kernel's text names it.
+    fn is_in(&self, file: &str, kernel: &str) -> bool {
+        let block = file.split(&format!("\nimpl {} {{", self.of)).nth(1).and_then(|rest| rest.split("\n}\n").next());
+        let has = block.is_some_and(|block| block.contains(&format!("\n    pub fn {}(", self.method)));
+        let named = format!("{}::{}.", self.of, self.method);
+        has && kernel.lines().any(|line| line.contains("CPU twin: ") && line.ends_with(&named))
+    }
+}
+
+#[test]
+fn a_twin_elsewhere_is_missed_when_its_method_is_or_when_the_kernel_does_not_name_it() {
+    let twin = Twin { file: "", of: "Sum", method: "add" };
+    let (kernel, file) = ("// CPU twin: Sum::add.\n", "\nimpl Sum {\n    /// Adds.\n    pub fn add(self) {}\n}\n");
+    assert!(twin.is_in(file, kernel));
+    assert!(!twin.is_in(file, "// CPU twin: Sum::take.\n"));
+    assert!(!twin.is_in(&file.replace("add", "take"), kernel));
+    assert!(!twin.is_in(&file.replace("Sum", "Total"), kernel));
+    assert!(!twin.is_in("\nimpl Sum {\n}\n\nimpl Total {\n    pub fn add(self) {}\n}\n", kernel));
+}
+
 #[test]
 fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
     let kernels = files(&root().join("kernels"), &["cu"]);
@@ -146,6 +180,11 @@ fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
         if is_only_measured(&name) {
             let text = fs::read_to_string(launcher).expect("a file");
             assert!(text.contains("    fn twin_of_"), "{} has no twin of {name}", launcher.display());
+            continue;
+        }
+        if let Some((_, twin)) = TWINS_ELSEWHERE.iter().find(|(kernel, _)| *kernel == name) {
+            let [file, text] = [&root().join(twin.file), &kernel].map(|path| fs::read_to_string(path).expect("a file"));
+            assert!(twin.is_in(&file, &text), "{name} and {}::{} do not know each other", twin.of, twin.method);
             continue;
         }
         for folder in ["src/reference", "src/cpu"] {

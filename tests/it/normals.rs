@@ -2,6 +2,7 @@
 
 mod build;
 mod extremes;
+mod kept;
 
 use modalcast::reference;
 use modalcast::scene::Normals;

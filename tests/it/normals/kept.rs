@@ -1,0 +1,76 @@
+//! Exact normals of domains that a step leaves alone are kept, and are those that a fresh deformer computes.
+
+use modalcast::cpu::CpuDeformer;
+use modalcast::deform::{Deformer, Surface};
+use modalcast::scene::{Scene, State};
+
+use super::build::{cube, scene, sheet, sphere, state, tube, with_mode};
+use super::linear_parts;
+use crate::deformers::Noise;
+
+/// A wave that bends and shears.
+fn wave([x, y, z]: [f32; 3]) -> [f32; 3] {
+    [0.3 * y * z, 0.2 * x * x, (2.0 * x + y).sin() + 0.4 * z]
+}
+
+fn bits(numbers: &[f32]) -> Vec<u32> {
+    numbers.iter().map(|number| number.to_bits()).collect()
+}
+
+/// All numbers of a surface as bits.
+fn all(surface: &Surface) -> [Vec<u32>; 3] {
+    [&surface.positions, &surface.normals, &surface.tangents].map(|numbers| bits(numbers))
+}
+
+/// The normals of one domain as bits.
+fn normals_of(scene: &Scene, surface: &Surface, domain: usize) -> Vec<u32> {
+    let slot = scene.layout.slots[domain];
+    bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
+}
+
+/// Changes the q of one domain, the T of another, or both of all; returns which domains it changed.
+fn change(scene: &Scene, state: &mut State, step: usize, noise: &mut Noise) -> Vec<usize> {
+    let domains = match step {
+        0 => vec![3],
+        1 => vec![1],
+        2 => vec![],
+        3 => (0..scene.domains.len()).collect(),
+        _ => vec![0, 2],
+    };
+    for domain in &domains {
+        let slot = scene.layout.slots[*domain];
+        if step != 1 {
+            state.q[slot.first_q..][..slot.rank].iter_mut().for_each(|number| *number += noise.next());
+        }
+        if step % 2 == 1 {
+            state.transforms[*domain].0.iter_mut().for_each(|number| *number += 0.3 * noise.next());
+        }
+    }
+    domains
+}
+
+#[test]
+fn normals_of_unchanged_domains_are_kept_and_all_are_those_of_a_fresh_deformer_on_any_number_of_threads() {
+    let meshes = [sheet(33, 30), cube(), tube(40, 20, 0.0), sphere(3), sheet(2, 2)];
+    let scene = scene(meshes.map(|mesh| with_mode(mesh, wave)).into());
+    let mut state = state(&scene, 0.4, linear_parts()[2], [1.0, 2.0, 3.0]);
+    let mut kept = CpuDeformer::new(&scene);
+    kept.deform(&state).expect("deforms");
+    let (mut noise, mut before) = (Noise(3), kept.surface().expect("one").clone());
+    for step in 0..5 {
+        let changed = change(&scene, &mut state, step, &mut noise);
+        kept.deform(&state).expect("deforms");
+        let now = kept.surface().expect("one").clone();
+        for domain in 0..scene.domains.len() {
+            let same = normals_of(&scene, &now, domain) == normals_of(&scene, &before, domain);
+            assert_eq!(same, !changed.contains(&domain), "step {step}, domain {domain}");
+        }
+        for threads in [1, 2, 5] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+            let mut fresh = CpuDeformer::new(&scene);
+            pool.install(|| fresh.deform(&state)).expect("deforms");
+            assert!(all(fresh.surface().expect("one")) == all(&now), "step {step}, {threads} threads");
+        }
+        before = now;
+    }
+}
