@@ -1,0 +1,267 @@
+//! Errors of all variants of one load: over random seeds, and step by step along a trajectory.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use super::errors::{Collect, Errors, Orientation, Spread, Tally, Turned, Yardstick, step_errors};
+use super::exact::{Exact, Judged, judge};
+use super::loads::Load;
+use super::motion::{Motion, Truth};
+use super::sources::{Origin, Sources, Split};
+use super::variant::Variant;
+use crate::deform::Surface;
+use crate::reference;
+use crate::scene::{Camera, State};
+
+/// Of how many seeds the sources of error are split. Each costs five evaluations in f64.
+const SPLIT: usize = 4;
+
+/// How well conditioned the sums of a load are: sum |U q| / |u| of its vertices.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Condition {
+    /// The largest finite one.
+    pub largest: f64,
+    /// The median over the states of the median over the vertices that have modes.
+    pub median: f64,
+    /// How many vertices of all states have terms that sum to exactly zero.
+    pub infinite: u64,
+}
+
+/// What was found of one variant.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Found {
+    pub errors: Errors,
+    /// Error of x(k + 1) - x(k) along the trajectory, metres.
+    pub step_metres: Spread,
+    pub sources: Sources,
+    pub orientation: Orientation,
+    /// Whether the same state gives the same bits again.
+    pub repeatable: bool,
+    /// Why it did not pass; empty when it did.
+    pub faults: Vec<String>,
+}
+
+impl Found {
+    /// Whether the variant may be timed.
+    pub fn passed(&self) -> bool {
+        self.faults.is_empty()
+    }
+}
+
+/// [`Found`] while it is collected.
+struct Case<'a> {
+    variant: &'a mut dyn Variant,
+    tally: Tally,
+    turned: Turned,
+    split: Split,
+    steps: Collect,
+    before: Option<(Vec<f32>, Arc<Vec<Judged>>)>,
+    repeatable: bool,
+    fault: Option<String>,
+}
+
+/// One state to look at.
+struct Look<'a> {
+    truth: &'a Truth,
+    state: State,
+    /// What exact storage of all modes gives, and its bound.
+    judged: Arc<Vec<Judged>>,
+    origin: Option<Origin>,
+    first: bool,
+    along: bool,
+}
+
+/// Looks at `seeds` random states and the whole trajectory.
+pub fn validate(
+    load: &Load,
+    motion: &Motion,
+    variants: &mut [Box<dyn Variant>],
+    seeds: usize,
+) -> (Vec<Found>, Condition) {
+    let camera = Camera::framing(&load.scene, super::errors::IMAGE.0, super::errors::IMAGE.1);
+    let yardstick = Yardstick::new(&load.scene, &camera);
+    let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut())).collect();
+    let mut conditions = Conditions::default();
+    for at in 0..seeds + motion.steps() {
+        let along = at >= seeds;
+        let truth = if along { motion.step(at - seeds) } else { motion.seed(at) };
+        let state = truth.state();
+        let judged = Arc::new(judge(&load.scene, &Truth::of(&state), &Exact));
+        conditions.add(&judged);
+        let origin = (at < SPLIT.min(seeds)).then(|| Origin::new(&load.scene, truth.clone(), &state));
+        let look = Look { truth: &truth, state, judged, origin, first: at == 0, along };
+        cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
+    }
+    (cases.into_iter().map(|case| case.found(&yardstick)).collect(), conditions.condition())
+}
+
+impl<'a> Case<'a> {
+    fn new(variant: &'a mut dyn Variant) -> Self {
+        Self {
+            variant,
+            tally: Tally::default(),
+            turned: Turned::default(),
+            split: Split::default(),
+            steps: Collect::default(),
+            before: None,
+            repeatable: true,
+            fault: None,
+        }
+    }
+
+    fn look(&mut self, yardstick: &Yardstick, look: &Look<'_>) {
+        if self.fault.is_some() {
+            return;
+        }
+        let surface = match self.variant.surface(&look.state) {
+            Ok(surface) => surface.clone(),
+            Err(error) => {
+                self.fault = Some(error.to_string());
+                return;
+            }
+        };
+        if surface.positions.len() != 3 * look.judged.len() {
+            self.fault = Some(format!("{} coordinates for {} vertices", surface.positions.len(), look.judged.len()));
+            return;
+        }
+        if look.first {
+            let again = self.variant.surface(&look.state);
+            self.repeatable = again.is_ok_and(|again| bits(again).eq(bits(&surface)));
+        }
+        let judged = self.judged(look);
+        self.tally.add(yardstick, &surface.positions, &judged);
+        self.orient(look, &surface);
+        if let Some(origin) = &look.origin {
+            origin.split(self.variant.scene(), self.variant.ingredients(), &surface.positions, &mut self.split);
+        }
+        if look.along {
+            if let Some((positions, before)) = &self.before {
+                self.steps = self.steps.join(step_errors([positions, &surface.positions], [before, &judged]));
+            }
+            self.before = Some((surface.positions, judged));
+        }
+    }
+
+    /// The exact positions with this variant's own bound.
+    fn judged(&self, look: &Look<'_>) -> Arc<Vec<Judged>> {
+        let ingredients = self.variant.ingredients();
+        match ingredients.is_exact() {
+            true => Arc::clone(&look.judged),
+            false => Arc::new(judge(self.variant.scene(), &Truth::of(&look.state), ingredients)),
+        }
+    }
+
+    fn orient(&mut self, look: &Look<'_>, surface: &Surface) {
+        let scene = self.variant.scene();
+        if !surface.normals.is_empty() {
+            self.turned.add_normals(&surface.normals, &reference::orient_normals(scene, &look.state));
+        }
+        if !surface.tangents.is_empty() {
+            let want = reference::orient_tangents(scene, &look.state);
+            self.turned.add_tangents(&surface.tangents, &want, &surface.normals);
+        }
+    }
+
+    fn found(self, yardstick: &Yardstick) -> Found {
+        let (errors, orientation) = (self.tally.errors(yardstick), self.turned.orientation());
+        let mut faults: Vec<String> = self.fault.into_iter().collect();
+        if !errors.passed() {
+            let Errors { of_bound, not_finite, .. } = errors;
+            faults.push(format!("{of_bound:.3} times its a-priori bound, {not_finite} coordinates not finite"));
+        }
+        if orientation.broken > 0 {
+            faults.push(format!("{} normals or tangents are no directions", orientation.broken));
+        }
+        Found {
+            errors,
+            step_metres: self.steps.spread(yardstick.unit()).unwrap_or_default(),
+            sources: self.split.sources(yardstick.unit()),
+            orientation,
+            repeatable: self.repeatable,
+            faults,
+        }
+    }
+}
+
+fn bits(surface: &Surface) -> impl Iterator<Item = u32> + '_ {
+    let lists = [&surface.positions, &surface.normals, &surface.tangents];
+    lists.into_iter().flatten().map(|number| number.to_bits())
+}
+
+/// [`Condition`] while it is collected.
+#[derive(Debug, Default)]
+struct Conditions {
+    largest: f64,
+    infinite: u64,
+    medians: Vec<f64>,
+}
+
+impl Conditions {
+    fn add(&mut self, judged: &[Judged]) {
+        let all = || judged.iter().map(|judged| judged.condition).filter(|condition| *condition > 0.0);
+        let (mut finite, count) = (all().filter(|condition| condition.is_finite()).collect::<Vec<_>>(), all().count());
+        self.infinite += (count - finite.len()) as u64;
+        self.largest = finite.iter().copied().fold(self.largest, f64::max);
+        self.medians.extend(median(&mut finite));
+    }
+
+    fn condition(mut self) -> Condition {
+        let median = median(&mut self.medians).unwrap_or(0.0);
+        Condition { largest: self.largest, median, infinite: self.infinite }
+    }
+}
+
+fn median(numbers: &mut [f64]) -> Option<f64> {
+    let middle = numbers.len().checked_sub(1)? / 2;
+    Some(*numbers.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cpu::CpuDeformer;
+    use crate::deform::Backend;
+    use crate::report::loads::{Kind, Size};
+    use crate::report::testing::Damaged;
+    use crate::report::variant::{Driven, Label};
+
+    fn find(kind: Kind, damage: f32) -> (Found, Condition) {
+        let load = kind.build(Size::Quick).expect("built");
+        let label = Label::new("cpu", Backend::Cpu, &load.scene);
+        let cpu = Driven::new(label, &load.scene, CpuDeformer::new(&load.scene));
+        let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(Damaged::new(cpu, damage))];
+        let motion = Motion::new(&load, None);
+        let (mut found, condition) = validate(&load, &motion, &mut variants, 4);
+        (found.remove(0), condition)
+    }
+
+    #[test]
+    fn the_cpu_passes_on_every_kind_of_load_with_all_figures_filled() {
+        let (found, condition) = find(Kind::A { dressed: true }, 0.0);
+        assert!(found.passed() && found.repeatable, "{:?}", found.faults);
+        assert_eq!(found.errors.states, 4 + 24);
+        assert!(found.errors.metres.largest > 0.0 && found.errors.of_diagonal.largest < 1e-6, "{found:?}");
+        assert!(found.step_metres.largest > 0.0 && found.step_metres.largest < 2e-6, "{found:?}");
+        let normals = found.orientation.normals_degrees.expect("normals");
+        let tangents = found.orientation.tangents_degrees.expect("tangents");
+        assert!(normals.largest < 1e-4 && tangents.largest < 1e-4, "{found:?}");
+        assert!(found.orientation.normal_dot_tangent.expect("dots").largest < 1e-6, "{found:?}");
+        let Sources { storage, q, accumulation, transform, origin, truncation } = found.sources;
+        assert_eq!([storage, truncation], [Spread::default(); 2]);
+        assert!([q, accumulation, transform, origin].iter().all(|part| part.largest > 0.0), "{:?}", found.sources);
+        assert!(condition.median > 1.0 && condition.largest > condition.median, "{condition:?}");
+        for kind in [Kind::B, Kind::C, Kind::Cancelling, Kind::Plant(1)] {
+            let (found, _) = find(kind, 0.0);
+            assert!(found.passed(), "{kind:?}: {:?}", found.faults);
+        }
+    }
+
+    #[test]
+    fn a_damaged_variant_fails_with_its_fault_in_words() {
+        let (found, _) = find(Kind::B, 1e-3);
+        assert!(!found.passed() && found.faults[0].contains("times its a-priori bound"), "{:?}", found.faults);
+        let (found, _) = find(Kind::B, f32::NAN);
+        assert!(found.faults[0].contains("not finite"), "{:?}", found.faults);
+    }
+}
