@@ -1,21 +1,54 @@
-// What the host hands to the kernels, and how a thread finds its domain. Twin: src/gpu/layout.rs; tests compare the size
-// and the offset of every field.
+// What the host hands to the kernels. Twin: src/gpu/layout.rs; tests compare the size and the offset of every field.
 #pragma once
 
-// Threads of a block, and the packed vertices or corners that one block computes.
+// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
 constexpr unsigned BLOCK = 256;
+// The most quads (4 vertices of one domain) of a tile, which is the work of one warp.
+constexpr unsigned TILE_QUADS = 32;
 // `first_tangent` of a shape without tangents.
 constexpr unsigned NO_TANGENTS = 0xffffffffu;
+// `first_member` of a shape without smoothing groups.
+constexpr unsigned NO_GROUPS = 0xffffffffu;
+// Marks the first vertex of each fan of a ring.
+constexpr unsigned RING_START = 0x80000000u;
 
-// Where the vertices of one domain lie. Instances share `first_entry`, domains with common coordinates `first_q`.
-struct VertexSlot {
-    unsigned long long first_entry; // of x0 and U in `columns`
-    unsigned first;                 // packed vertex
-    unsigned stride;                // floats from one plane of `columns` to the next
-    unsigned rank;                  // r
+// The start of a step's inputs, copied with them: where to write, and what is to be computed anew.
+struct Header {
+    float* positions;
+    float* normals;
+    float4* tangents;
+    float* displacements;
+    unsigned since;      // this output holds all that changed up to this step
+    unsigned everything; // the last step that changed all domains
+    unsigned step;       // this step; counts from 1
+    unsigned changed;    // domains in the list of `apply`
+    unsigned bounds[6];  // `ordered` maxima of -x, -y, -z, x, y, z; sent as zeros
+    unsigned reserved[2];
+};
+static_assert(sizeof(Header) == 80, "Header differs from src/gpu/layout.rs");
+
+// The work of one warp: up to 32 quads and their part of U, [chunk][3][width] words of 16 bytes.
+struct Tile {
+    unsigned long long first_word; // of its U
+    unsigned first;                // first packed vertex; of a mixed tile, first entry of `lanes`
+    unsigned rest;                 // first quad of x0
+    unsigned domain;
+    unsigned first_q;
+    unsigned first_scale;
+    unsigned short chunks;
+    unsigned char width; // quads
+    unsigned char kind;  // 0: quads of several domains; else all of one, and so many vertices in the last quad
+};
+static_assert(sizeof(Tile) == 32, "Tile differs from src/gpu/layout.rs");
+
+// A quad of a mixed tile.
+struct Lane {
+    unsigned vertex; // first packed vertex
+    unsigned rest;   // quad of x0
+    unsigned domain; // four times its index, plus its vertices less one
     unsigned first_q;
 };
-static_assert(sizeof(VertexSlot) == 24, "VertexSlot differs from src/gpu/layout.rs");
+static_assert(sizeof(Lane) == 16, "Lane differs from src/gpu/layout.rs");
 
 // Where the corners of one domain lie. Instances share `first_normal` and `first_tangent`.
 struct CornerSlot {
@@ -25,34 +58,102 @@ struct CornerSlot {
 };
 static_assert(sizeof(CornerSlot) == 12, "CornerSlot differs from src/gpu/layout.rs");
 
+// The same for `normals`. Instances share all but `first` and `first_vertex`.
+struct NormalSlot {
+    unsigned first; // packed corner
+    unsigned first_normal;
+    unsigned first_tangent;
+    unsigned first_vertex; // packed vertex
+    unsigned first_member;
+};
+static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/gpu/layout.rs");
+
+// A changed domain in the list of `apply`.
+struct Change {
+    unsigned domain;
+    unsigned first_q; // in the packed coordinates
+    unsigned count;   // of coordinates
+    unsigned source;  // of its coordinates in the list's values
+};
+static_assert(sizeof(Change) == 16, "Change differs from src/gpu/layout.rs");
+
 struct DeformArgs {
-    const VertexSlot* slots;
-    const unsigned* first_domains;
-    const float* columns;
+    const Header* header;
+    const Tile* tiles;
+    const Lane* lanes;
+    const uint4* words;
+    const float4* rest;
+    const float* scales;
+    const unsigned* lane_scales;
     const float4* transforms;
     const float* q;
-    float* positions;
-    unsigned* bounds;
-    unsigned vertices;
+    const unsigned* stamps;
+    const unsigned* kept_counts;
+    const unsigned short* kept;
+    unsigned* boxes;
+    unsigned tiles_count;
     unsigned reserved;
 };
-static_assert(sizeof(DeformArgs) == 64, "DeformArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(DeformArgs) == 112, "DeformArgs differs from src/gpu/layout.rs");
+
+struct BoundsArgs {
+    Header* header;
+    const unsigned* boxes;
+    unsigned count;
+    unsigned reserved;
+};
+static_assert(sizeof(BoundsArgs) == 24, "BoundsArgs differs from src/gpu/layout.rs");
+
+struct ApplyArgs {
+    const Header* header;
+    const Change* changes;
+    const float4* new_transforms;
+    const float* new_q;
+    float4* transforms;
+    float* q;
+    unsigned* stamps;
+};
+static_assert(sizeof(ApplyArgs) == 56, "ApplyArgs differs from src/gpu/layout.rs");
 
 struct OrientArgs {
+    const Header* header;
     const CornerSlot* slots;
     const unsigned* first_domains;
     const float* rest_normals;
     const float4* rest_tangents;
     const float4* transforms;
-    float* normals;
-    float4* tangents;
+    const unsigned* stamps;
     unsigned corners;
     unsigned rest_corners;
 };
 static_assert(sizeof(OrientArgs) == 64, "OrientArgs differs from src/gpu/layout.rs");
 
-// The domain of a packed vertex or corner: the last slot that begins at or before it. `first_domains[b]` is the domain
-// of the first item of block b, and one more entry names the last domain; inside one domain nothing is searched.
+struct NormalsArgs {
+    const Header* header;
+    const NormalSlot* slots;
+    const unsigned* first_domains;
+    const float* rest_normals;
+    const float4* rest_tangents;
+    const float4* transforms;
+    const unsigned* stamps;
+    const unsigned* members;
+    const unsigned* begins;
+    const unsigned* rings;
+    const float* group_normals;
+    unsigned corners;
+    unsigned rest_corners;
+    unsigned groups;
+    unsigned reserved;
+};
+static_assert(sizeof(NormalsArgs) == 104, "NormalsArgs differs from src/gpu/layout.rs");
+
+// Whether a domain changed after this output was last written.
+__device__ inline bool is_stale(const Header* header, const unsigned* stamps, unsigned domain) {
+    return max(__ldg(&header->everything), __ldg(stamps + domain)) > __ldg(&header->since);
+}
+
+// The domain of a packed corner: the last slot that begins at or before it. `first_domains[b]` is the domain of the
+// first item of block b, and one more entry names the last domain; inside one domain nothing is searched.
 template <typename Slot>
 __device__ inline unsigned domain_of(const Slot* slots, const unsigned* first_domains, unsigned item) {
     unsigned low = first_domains[blockIdx.x];

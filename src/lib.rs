@@ -16,14 +16,15 @@
 //! | `service` | gRPC: wire to values and back; the only module that names proto | `config`, `engine`, `deform`, `scene`, `domain`, `telemetry`, `error` |
 //! | `report` | error against run time: synthetic scenes, errors by source, timing, tables and plots | `config`, `gpu`, `cpu`, `reference`, `load`, `tree`, `deform`, `scene`, `domain`, `telemetry`, `error` |
 //! | `engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `deform`, `scene`, `domain`, `telemetry`, `error` |
-//! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `deform`, `scene`, `domain`, `error` |
-//! | `cpu` | the f32 deformer of machines without a GPU | `deform`, `scene`, `domain`, `error` |
+//! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage`, `deform`, `scene`, `domain`, `error` |
+//! | `cpu` | the f32 deformer of machines without a GPU | `storage`, `deform`, `scene`, `domain`, `error` |
 //! | `reference` | the same in f64, plain: the definition that the others are tested against | `deform`, `scene`, `domain`, `error` |
 //! | `render` | EGL and OpenGL: buffers, passes, readback | `deform`, `scene`, `domain`, `error` |
 //! | `frame` | pixels to bytes; pure functions | `error` |
 //! | `load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
 //! | `tree` | the built-in scene: beams to modes, modes to skin | `scene`, `domain`, `error` |
 //! | `deform` | what every deformer does, as a trait | `scene`, `error` |
+//! | `storage` | U in tiles as cpu and gpu read it: storage types, a-priori bounds, mode truncation; pure | `scene`, `domain`, `error` |
 //! | `scene` | the set of domains, its packing and needs; one step as values; cameras | `domain`, `error` |
 //! | `domain` | mesh, modes U, material, texture; parsed once, immutable | `error` |
 //! | `telemetry` | stage names and times, tracing | `error` |
@@ -57,5 +58,6 @@ pub mod render;
 pub mod report;
 pub mod scene;
 pub mod service;
+pub mod storage;
 pub mod telemetry;
 pub mod tree;

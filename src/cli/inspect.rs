@@ -34,7 +34,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(true)
 }
 
-/// Bytes of a shape as it is kept: rest positions, corners, triangles and U.
+/// Bytes of a shape as it is kept: rest positions, corners, triangles, U, and rings where normals need them.
 fn bytes_of(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
@@ -44,6 +44,7 @@ fn bytes_of(scene: &Scene, domain: usize) -> usize {
         + per_corner * corners.vertices.len()
         + 12 * shape.mesh.triangles().len()
         + 4 * shape.modes.columns().len()
+        + shape.smoothing().map_or(0, |smoothing| smoothing.bytes() as usize)
 }
 
 fn json(scene: &Scene) -> Value {

@@ -4,6 +4,7 @@
 //! bit-identical outputs on any number of cores.
 
 mod deform;
+mod normals;
 mod orient;
 mod tile;
 
@@ -50,7 +51,11 @@ impl Deformer for CpuDeformer {
     fn deform(&mut self, state: &State) -> Result<Deformed> {
         let begin = Instant::now();
         let bounds = deform::deform(&self.scene, state, &self.vertex_tiles, &mut self.surface.positions);
-        orient::orient(&self.scene, state, &self.corner_tiles, &mut self.surface);
+        if self.scene.needs.exact_normals {
+            normals::normals(&self.scene, state, &self.corner_tiles, &mut self.surface);
+        } else {
+            orient::orient(&self.scene, state, &self.corner_tiles, &mut self.surface);
+        }
         Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 

@@ -17,7 +17,8 @@ pub(super) fn orient(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut
     }
 }
 
-fn orient_normals(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
+/// World normals of a tile.
+pub(super) fn orient_normals(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
     let linear = state.transforms[tile.domain].linear();
     // Without shear A itself turns normals, up to a mirror's sign, which the cofactors carry.
     let turn = if scene.needs.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
@@ -28,7 +29,8 @@ fn orient_normals(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
     }
 }
 
-fn orient_tangents(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
+/// World tangents of a tile; left as they are where the shape has none.
+pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
     let tangents = scene.shape_of(tile.domain).tangents();
     if tangents.is_empty() {
         return;
@@ -48,7 +50,7 @@ fn scaled(matrix: Matrix3<f64>) -> Matrix3<f32> {
     if largest > 0.0 { (matrix / largest).cast() } else { matrix.cast() }
 }
 
-fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
+pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     let adjugate = |row: usize, column: usize| {
         let at = |i: usize, j: usize| linear[((row + i) % 3, (column + j) % 3)];
         at(1, 1) * at(2, 2) - at(1, 2) * at(2, 1)
@@ -56,7 +58,8 @@ fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::from_fn(adjugate)
 }
 
-fn unit(vector: Vector3<f32>) -> Vector3<f32> {
+/// A vector over its length, +Z when it has none.
+pub(super) fn unit(vector: Vector3<f32>) -> Vector3<f32> {
     let square = vector.norm_squared();
     if square > 1e-30 { vector / square.sqrt() } else { Vector3::z() }
 }

@@ -6,6 +6,7 @@
 mod material;
 mod mesh;
 mod modes;
+mod smoothing;
 mod tangents;
 mod texture;
 mod transform;
@@ -13,6 +14,7 @@ mod transform;
 pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};
+pub use smoothing::{MAX_RING_TRIANGLES, RING_START, Smoothing};
 pub use texture::Texture;
 pub use transform::Transform;
 
@@ -25,6 +27,8 @@ pub struct Shape {
     pub modes: Modes,
     /// Per corner: unit tangent and the sign of the bitangent. Empty unless a normal map needs it.
     pub(crate) tangents: Vec<[f32; 4]>,
+    /// None unless normals follow its deformed triangles.
+    smoothing: Option<Smoothing>,
 }
 
 impl Shape {
@@ -40,7 +44,7 @@ impl Shape {
                 3 * modes.vertices(),
             ));
         }
-        Ok(Self { mesh, modes, tangents: Vec::new() })
+        Ok(Self { mesh, modes, tangents: Vec::new(), smoothing: None })
     }
 
     /// Per corner: unit tangent (xyz) and sign of the bitangent (w); empty when no normal map needs them.
@@ -53,6 +57,16 @@ impl Shape {
         if self.tangents.is_empty() {
             self.tangents = tangents::lengyel(&self.mesh);
         }
+    }
+
+    /// Smoothing groups and the triangles around them; none when normals turn with the domain alone.
+    pub const fn smoothing(&self) -> Option<&Smoothing> {
+        self.smoothing.as_ref()
+    }
+
+    /// Makes the smoothing groups if they are not there yet.
+    pub(crate) fn add_smoothing(&mut self) {
+        self.smoothing.get_or_insert_with(|| Smoothing::of(&self.mesh));
     }
 }
 

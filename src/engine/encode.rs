@@ -9,7 +9,7 @@ use super::viewer::{Body, Shown, StepName};
 use crate::deform::Surface;
 use crate::error::{Result, during, invalid};
 use crate::frame;
-use crate::scene::{Layout, Scene};
+use crate::scene::{Cells, Layout, Scene};
 use crate::telemetry::{Stage, StageTimes, ms_since};
 
 // Vertices are copied as they lie in memory, and the wire is little-endian.
@@ -33,6 +33,16 @@ pub struct Encoded {
     pub skipped: u64,
     pub stages: StageTimes,
     pub bytes: Bytes,
+}
+
+/// Vertices as bytes, and what they are relative to.
+#[derive(Debug, Clone)]
+pub struct Packed {
+    pub encoded: Encoded,
+    /// World position, metres.
+    pub origin: [f64; 3],
+    /// Bytes of the chosen domains' own origins at the end of the reply; 0 when `origin` holds for all of them.
+    pub origin_bytes: u64,
 }
 
 /// Which vertices of a scene.
@@ -113,18 +123,38 @@ pub async fn encode_frame(shown: Shown, format: Format) -> Result<Encoded> {
     Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, bytes: bytes.into() })
 }
 
-/// Packs the chosen vertices: all positions in row order of U, then all normals.
+/// Packs the chosen vertices: all positions in row order of U, then all normals, then the origins of the domains when
+/// they are not all the same.
 ///
 /// # Errors
 /// `Fault` when it was a picture that was shown.
-pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<Encoded> {
+pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<Packed> {
     let Body::Vertices(surface) = shown.body else { return Err(during("copy")("a picture is no vertices")) };
     let mut stages = shown.stages;
     let begin = Instant::now();
-    let selection = Arc::clone(selection);
-    let bytes = aside("copy", move || Ok(pack(&surface, &selection))).await?;
+    let (selection, cells) = (Arc::clone(selection), shown.cells);
+    let work = move || {
+        let mut bytes = pack(&surface, &selection);
+        let before = bytes.len();
+        let origin = push_origins(&selection, cells.as_deref(), &mut bytes);
+        Ok((origin, (bytes.len() - before) as u64, bytes))
+    };
+    let (origin, origin_bytes, bytes) = aside("copy", work).await?;
     stages.push((Stage::Encode, ms_since(begin)));
-    Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, bytes: bytes.into() })
+    let encoded = Encoded { step: shown.step, skipped: shown.skipped, stages, bytes: bytes.into() };
+    Ok(Packed { encoded, origin, origin_bytes })
+}
+
+/// The origin of the reply in metres; appends the chosen domains' own ones when they differ from it.
+fn push_origins(selection: &Selection, cells: Option<&Cells>, bytes: &mut Vec<u8>) -> [f64; 3] {
+    let scene = &selection.scene;
+    let metres = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
+    let Some(cells) = cells else { return scene.origin };
+    let own = || selection.domains.iter().map(|domain| cells.cell_of(*domain as usize));
+    if own().any(|cell| cell != cells.shared()) {
+        bytes.extend(own().map(metres).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
+    }
+    metres(cells.shared())
 }
 
 fn pack(surface: &Surface, selection: &Selection) -> Vec<u8> {

@@ -14,7 +14,7 @@ use sha2::{Digest as _, Sha256};
 
 use crate::domain::Transform;
 use crate::error::{Result, during, invalid};
-use crate::scene::{Scene, State};
+use crate::scene::{Cells, Scene, State};
 
 /// Time between two writings.
 const REST: Duration = Duration::from_millis(100);
@@ -22,6 +22,9 @@ const REST: Duration = Duration::from_millis(100);
 /// A step file: this, then run and number (u64), time (f64), the counts of q and of transforms (u64), q (f32), the
 /// transforms (12 f32 each), and the SHA-256 of all before it. Little-endian.
 const MAGIC: &[u8; 8] = b"MCSTEP01";
+/// A step file of a state with cells: as above, with the shared cell (3 f64) and the translations (3 f64 each) after the
+/// transforms.
+const MAGIC_CELLS: &[u8; 8] = b"MCSTEP02";
 const HEAD: usize = 8 + 5 * 8;
 const HASH: usize = 32;
 
@@ -146,7 +149,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 fn encode(state: &State) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(HEAD + 4 * state.q.len() + 48 * state.transforms.len() + HASH);
-    bytes.extend_from_slice(MAGIC);
+    bytes.extend_from_slice(if state.cells.is_some() { MAGIC_CELLS } else { MAGIC });
     bytes.extend_from_slice(&state.run.to_le_bytes());
     bytes.extend_from_slice(&state.step.to_le_bytes());
     bytes.extend_from_slice(&state.time.to_le_bytes());
@@ -154,6 +157,11 @@ fn encode(state: &State) -> Vec<u8> {
     bytes.extend_from_slice(&(state.transforms.len() as u64).to_le_bytes());
     let transforms = state.transforms.iter().flat_map(|transform| transform.0);
     bytes.extend(state.q.iter().copied().chain(transforms).flat_map(f32::to_le_bytes));
+    if let Some(cells) = &state.cells {
+        let shared = cells.shared();
+        let translations = cells.translations().as_flattened();
+        bytes.extend(shared.iter().chain(translations).flat_map(|number| number.to_le_bytes()));
+    }
     let hash = Sha256::digest(&bytes);
     bytes.extend_from_slice(&hash);
     bytes
@@ -161,12 +169,14 @@ fn encode(state: &State) -> Vec<u8> {
 
 fn decode(bytes: &[u8], scene: &Scene) -> Result<State> {
     let rest = State::rest(scene);
-    let size = HEAD + 4 * rest.q.len() + 48 * rest.transforms.len() + HASH;
+    let has_cells = bytes.starts_with(MAGIC_CELLS);
+    let extra = if has_cells { 24 * (1 + rest.transforms.len()) } else { 0 };
+    let size = HEAD + 4 * rest.q.len() + 48 * rest.transforms.len() + extra + HASH;
     if bytes.len() != size {
         return Err(invalid("kept step", format!("{size} bytes for this scene"), format!("{} bytes", bytes.len())));
     }
     let (body, hash) = bytes.split_at(size - HASH);
-    if Sha256::digest(body).as_slice() != hash || !body.starts_with(MAGIC) {
+    if Sha256::digest(body).as_slice() != hash || !(has_cells || body.starts_with(MAGIC)) {
         return Err(invalid("kept step", "bytes that match their SHA-256", "a damaged file"));
     }
     let word = |at: usize| {
@@ -179,7 +189,8 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<State> {
         let expected = format!("{} coordinates and {} transforms", rest.q.len(), rest.transforms.len());
         return Err(invalid("kept step", expected, format!("{counts:?}")));
     }
-    let (q, transforms) = body[HEAD..].split_at(4 * rest.q.len());
+    let (q, places) = body[HEAD..].split_at(4 * rest.q.len());
+    let (transforms, cells) = places.split_at(48 * rest.transforms.len());
     let number = |word: &[u8]| f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
     let transform = |bytes: &[u8]| Transform(std::array::from_fn(|entry| number(&bytes[4 * entry..])));
     Ok(State {
@@ -188,7 +199,22 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<State> {
         time: f64::from_le_bytes(word(3)),
         q: q.chunks_exact(4).map(number).collect(),
         transforms: transforms.chunks_exact(48).map(transform).collect(),
+        cells: if has_cells { Some(Arc::new(decode_cells(cells)?)) } else { None },
+        ..rest
     })
+}
+
+/// The shared cell, then the translations.
+fn decode_cells(bytes: &[u8]) -> Result<Cells> {
+    let point = |bytes: &[u8]| {
+        std::array::from_fn(|axis| {
+            let mut word = [0; 8];
+            word.copy_from_slice(&bytes[8 * axis..8 * axis + 8]);
+            f64::from_le_bytes(word)
+        })
+    };
+    let (shared, translations) = bytes.split_at(24);
+    Cells::restore(point(shared), translations.chunks_exact(24).map(point).collect())
 }
 
 #[cfg(test)]
@@ -216,6 +242,27 @@ mod tests {
         }
         assert!(decode(&bytes[..bytes.len() - 1], &scene).is_err());
         assert!(decode(&[], &scene).is_err());
+    }
+
+    #[test]
+    fn a_step_with_cells_comes_back_with_them_and_one_cut_short_is_refused() {
+        use crate::scene::{RawUpdate, TransformFormat, Update};
+        let scene = testing::two_strips();
+        let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
+        let translation = [1e7 + 0.125, -3.5, 0.0_f64].into_iter().flat_map(f64::to_le_bytes);
+        let raw = RawUpdate {
+            transform_domains: vec![1],
+            transforms: rotation.chain(translation).collect(),
+            transform_format: TransformFormat::RigidF64,
+            ..RawUpdate::default()
+        };
+        let mut state = moved(&scene);
+        state.apply(&scene, &Update::parse(&scene, &raw).expect("a good step"));
+        let bytes = encode(&state);
+        let kept = decode(&bytes, &scene).expect("whole");
+        assert_eq!((&kept, kept.cell_of(1)), (&state, [9766.0 * 1024.0, 0.0, 0.0]));
+        assert_ne!(State { cells: None, ..kept }, state, "the cells count");
+        assert!(decode(&bytes[..bytes.len() - 24], &scene).is_err());
     }
 
     #[test]

@@ -22,7 +22,7 @@ mod workbench;
 mod worker;
 
 pub use conductor::Which;
-pub use encode::{Encoded, Format, Selection, checked_domains, encode_frame, pack_vertices};
+pub use encode::{Encoded, Format, Packed, Selection, checked_domains, encode_frame, pack_vertices};
 pub use host::{Drive, Host};
 pub use lane::{Policy, Report};
 pub use ledger::{Origin, checked_name};

@@ -80,7 +80,7 @@ impl Conductor {
                 Body::Vertices(surface)
             }
         };
-        Ok(Shown { step: StepName::of(&self.state), skipped, stages, body })
+        Ok(Shown { step: StepName::of(&self.state), skipped, stages, cells: self.state.cells.clone(), body })
     }
 
     /// The current vertices, copied from the device at most once per step.

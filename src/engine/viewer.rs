@@ -10,7 +10,7 @@ use tokio::sync::{Notify, mpsc, watch};
 use crate::deform::Surface;
 use crate::error::{Error, Result, during};
 use crate::render::Image;
-use crate::scene::{Camera, State};
+use crate::scene::{Camera, Cells, State};
 use crate::telemetry::StageTimes;
 
 /// How many pictures a lossless subscriber may be behind before it holds back the writer.
@@ -62,6 +62,8 @@ pub struct Shown {
     /// Steps passed over since this subscriber's last one.
     pub skipped: u64,
     pub stages: StageTimes,
+    /// What vertices are relative to, when that is not the scene's origin for all.
+    pub cells: Option<Arc<Cells>>,
     pub body: Body,
 }
 
@@ -191,7 +193,7 @@ mod tests {
 
     fn shown(number: u64) -> Result<Shown> {
         let step = StepName { run: 1, number, time: 0.0 };
-        Ok(Shown { step, skipped: 0, stages: vec![], body: Body::Vertices(Arc::default()) })
+        Ok(Shown { step, skipped: 0, stages: vec![], cells: None, body: Body::Vertices(Arc::default()) })
     }
 
     #[tokio::test]

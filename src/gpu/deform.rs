@@ -1,59 +1,96 @@
-//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, and the bounds of all x.
+//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, and a box of each warp's vertices.
 
-use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PinnedHostSlice, PushKernelArg as _};
+use std::sync::Arc;
+
+use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
 
 use super::device::Device;
+use super::inputs::{Packing, Values};
 use super::layout::DeformArgs;
-use super::memory::{Inputs, address, room, upload};
-use super::pack;
+use super::memory::{address, room, upload};
 use super::plan::Kernel;
+use super::work::{Coordinates, Source, Work, side_by_side};
 use crate::error::{Result, during};
-use crate::scene::{Bounds, Scene};
+use crate::scene::Scene;
+use crate::storage::{Plane, Tiles};
 
-/// Floats that go to the device in one piece while packing, so that packing needs little memory of its own.
-const PIECE: usize = 1 << 23;
+/// Words of U that go to the device in one piece while packing, so that packing needs little memory of its own.
+const PIECE: usize = 1 << 22;
 
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
 pub(super) struct Deform {
-    function: CudaFunction,
+    pub(super) function: CudaFunction,
     config: LaunchConfig,
-    slots: CudaSlice<u8>,
-    first_domains: CudaSlice<u8>,
-    columns: CudaSlice<u8>,
-    vertices: u32,
+    tiles: CudaSlice<u8>,
+    lanes: CudaSlice<u8>,
+    lane_scales: CudaSlice<u8>,
+    words: CudaSlice<u8>,
+    rest: CudaSlice<u8>,
+    scales: CudaSlice<u8>,
+    /// Six keys per block.
+    boxes: CudaSlice<u8>,
+    tiles_count: u32,
+    packing: Arc<Packing>,
 }
 
 impl Deform {
-    pub(super) fn new(device: &Device, scene: &Scene, kernel: &Kernel) -> Result<Self> {
-        let slots = pack::vertex_slots(scene);
-        let firsts = pack::first_domains(slots.iter().map(|slot| slot.first), scene.layout.vertices);
+    pub(super) fn new(device: &Device, scene: &Arc<Scene>, kernel: &Kernel) -> Result<Self> {
+        let coordinates = Coordinates::new(scene);
+        let work = Work::new(scene, &coordinates);
+        let mut load = Load::new(device, scene, &work)?;
+        work.sources.iter().try_for_each(|source| load.add(source))?;
+        let (words, load) = load.finish()?;
+        let Load { rest, scales, factors, .. } = load;
         Ok(Self {
             function: device.function(kernel.name, kernel.source, &kernel.defines)?,
             config: config(kernel),
-            slots: upload(device, &slots)?,
-            first_domains: upload(device, &firsts)?,
-            columns: upload_columns(device, scene)?,
-            vertices: scene.layout.vertices as u32,
+            tiles: upload(device, &work.tiles)?,
+            lanes: upload(device, &work.lanes)?,
+            lane_scales: upload(device, &work.lane_scales)?,
+            words,
+            rest: upload(device, &rest)?,
+            scales: upload(device, &scales)?,
+            boxes: room(device, 24 * u64::from(kernel.blocks))?,
+            tiles_count: work.tiles.len() as u32,
+            packing: Arc::new(Packing { scene: Arc::clone(scene), coordinates, factors }),
         })
     }
 
-    /// Starts the kernel; `positions` is the address of the packed positions.
-    pub(super) fn launch(&self, device: &Device, inputs: &Inputs, extent: &Extent, positions: u64) -> Result<()> {
+    /// How coordinates are to be laid out for it.
+    pub(super) const fn packing(&self) -> &Arc<Packing> {
+        &self.packing
+    }
+
+    /// The address of its boxes, and how many there are.
+    pub(super) fn boxes(&self, device: &Device) -> (u64, u32) {
+        (address(device, &self.boxes), self.config.grid_dim.0)
+    }
+
+    /// Starts the kernel; the header among the values says where positions go.
+    pub(super) fn launch(&self, device: &Device, values: Values) -> Result<()> {
+        let at = |buffer: &CudaSlice<u8>| address(device, buffer);
         let args = DeformArgs {
-            slots: address(device, &self.slots),
-            first_domains: address(device, &self.first_domains),
-            columns: address(device, &self.columns),
-            transforms: inputs.transforms,
-            q: inputs.q,
-            positions,
-            bounds: address(device, &extent.buffer),
-            vertices: self.vertices,
+            header: values.header,
+            tiles: at(&self.tiles),
+            lanes: at(&self.lanes),
+            words: at(&self.words),
+            rest: at(&self.rest),
+            scales: at(&self.scales),
+            lane_scales: at(&self.lane_scales),
+            transforms: values.transforms,
+            q: values.q,
+            stamps: values.stamps,
+            kept_counts: values.kept_counts,
+            kept: values.kept,
+            boxes: at(&self.boxes),
+            tiles_count: self.tiles_count,
             reserved: 0,
         };
         let mut launch = device.stream().launch_builder(&self.function);
-        // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `pack`, whose slots lie inside the
-        // columns, transforms and q of the same scene, and `positions` has three floats per vertex, as `Output` checks.
+        // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
+        // words, x0, transforms and q of the same scene; there are as many boxes as blocks; and the header's positions
+        // have three floats per vertex, as `Output` checks.
         unsafe { launch.arg(&args).launch(self.config) }.map_err(during("deform"))?;
         Ok(())
     }
@@ -63,106 +100,82 @@ pub(super) fn config(kernel: &Kernel) -> LaunchConfig {
     LaunchConfig { grid_dim: (kernel.blocks, 1, 1), block_dim: (kernel.threads, 1, 1), shared_mem_bytes: 0 }
 }
 
-fn upload_columns(device: &Device, scene: &Scene) -> Result<CudaSlice<u8>> {
-    let fail = during("upload");
-    let (places, floats) = pack::placements(scene);
-    let mut columns = room(device, 4 * floats)?;
-    let mut send = |piece: &[f32], end: u64| {
-        let (begin, end) = (4 * end as usize - size_of_val(piece), 4 * end as usize);
-        let mut part = columns.slice_mut(begin..end);
-        device.stream().memcpy_htod(bytemuck::cast_slice::<f32, u8>(piece), &mut part).map_err(&fail)
-    };
-    let mut piece = Vec::new();
-    let mut end = 0;
-    for (shape, place) in scene.shapes.iter().zip(&places) {
-        pack::push_columns(shape, place.stride, &mut piece);
-        end = place.first_entry + 3 * (1 + shape.modes.rank() as u64) * place.stride as u64;
-        if piece.len() >= PIECE {
-            send(&piece, end)?;
-            piece.clear();
-        }
-    }
-    if !piece.is_empty() {
-        send(&piece, end)?;
-    }
-    Ok(columns)
+/// U on its way to the device, source by source, and what is small of all shapes, kept until the end.
+struct Load<'a> {
+    device: &'a Device,
+    scene: &'a Scene,
+    work: &'a Work,
+    words: CudaSlice<u8>,
+    sent: usize,
+    piece: Vec<Plane>,
+    rest: Vec<[f32; 12]>,
+    scales: Vec<f32>,
+    factors: Vec<Vec<f32>>,
+    seen: Vec<bool>,
 }
 
-/// Six maxima that the blocks of `deform` raise: of -x, -y, -z, x, y and z.
-#[derive(Debug)]
-pub(super) struct Extent {
-    buffer: CudaSlice<u8>,
-    pinned: PinnedHostSlice<u32>,
-}
-
-impl Extent {
-    pub(super) fn new(device: &Device) -> Result<Self> {
-        // SAFETY: the memory is written by the copy in `read` before anyone looks.
-        let pinned = unsafe { device.context().alloc_pinned_with_flags(6, 0) }.map_err(during("allocate"))?;
-        Ok(Self { buffer: room(device, 24)?, pinned })
+impl<'a> Load<'a> {
+    fn new(device: &'a Device, scene: &'a Scene, work: &'a Work) -> Result<Self> {
+        let shapes = scene.shapes.len();
+        Ok(Self {
+            device,
+            scene,
+            work,
+            words: room(device, 16 * work.words)?,
+            sent: 0,
+            piece: Vec::new(),
+            rest: vec![[0.0; 12]; work.rest as usize],
+            scales: vec![0.0; work.scales as usize],
+            factors: vec![Vec::new(); shapes],
+            seen: vec![false; shapes],
+        })
     }
 
-    /// Back to "no vertex yet".
-    pub(super) fn clear(&mut self, device: &Device) -> Result<()> {
-        device.stream().memset_zeros(&mut self.buffer).map_err(during("deform"))
-    }
-
-    /// Waits for the kernels and reads the bounds.
-    pub(super) fn read(&mut self, device: &Device) -> Result<Bounds> {
-        let fail = during("deform");
-        let host = self.pinned.as_mut_slice().map_err(&fail)?;
-        // SAFETY: the buffer was made with 24 bytes, `host` has six words.
-        unsafe { super::memory::download(device, address(device, &self.buffer), host) }?;
-        Ok(bounds_of(host))
-    }
-}
-
-fn bounds_of(keys: &[u32]) -> Bounds {
-    let mut bounds = Bounds::EMPTY;
-    for axis in 0..3 {
-        bounds.min[axis] = -f64::from(number_of(keys[axis]));
-        bounds.max[axis] = f64::from(number_of(keys[3 + axis]));
-    }
-    bounds
-}
-
-/// The inverse of `ordered` in `kernels/deform.cu`. Zero, which no number has, gives a NaN like the NaN's own key.
-fn number_of(key: u32) -> f32 {
-    f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// `ordered` of the kernel, word by word.
-    fn ordered(x: f32) -> u32 {
-        match x {
-            x if x.is_nan() => u32::MAX,
-            x if x.is_sign_negative() => !x.to_bits(),
-            x => x.to_bits() | 0x8000_0000,
+    fn add(&mut self, source: &Source) -> Result<()> {
+        match source {
+            Source::Shape(shape) => {
+                let tiles = self.tiles_of(*shape);
+                self.piece.extend_from_slice(tiles.planes());
+            }
+            Source::Mixed(shapes) => {
+                let all: Vec<Tiles> = shapes.iter().map(|shape| self.tiles_of(*shape)).collect();
+                self.piece.extend(side_by_side(&all));
+            }
         }
+        if self.piece.len() >= PIECE { self.send() } else { Ok(()) }
     }
 
-    #[test]
-    fn keys_keep_the_order_of_numbers_and_a_nan_or_nothing_is_not_finite() {
-        let rising = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
-        for pair in rising.windows(2) {
-            assert!(ordered(pair[0]) < ordered(pair[1]), "{pair:?}");
-            assert!(ordered(pair[0]) > 0);
+    /// The tiles of a shape; what is small of them is kept.
+    fn tiles_of(&mut self, shape: usize) -> Tiles {
+        let tiles = Tiles::new(&self.scene.shapes[shape], self.scene.deformation.storage);
+        let (rest, scale) = (self.work.first_rest[shape] as usize, self.work.first_scale[shape] as usize);
+        self.rest[rest..][..tiles.rest().len()].copy_from_slice(tiles.rest());
+        self.scales[scale..][..tiles.scales().len()].copy_from_slice(tiles.scales());
+        self.factors[shape] = tiles.factors().to_vec();
+        self.seen[shape] = true;
+        tiles
+    }
+
+    fn send(&mut self) -> Result<()> {
+        let bytes: &[u8] = bytemuck::cast_slice(&self.piece);
+        let mut part = self.words.slice_mut(self.sent..self.sent + bytes.len());
+        self.device.stream().memcpy_htod(bytes, &mut part).map_err(during("upload"))?;
+        self.sent += bytes.len();
+        self.piece.clear();
+        Ok(())
+    }
+
+    /// The words, all there, and the rest with the shapes that have no modes.
+    fn finish(mut self) -> Result<(CudaSlice<u8>, Self)> {
+        if !self.piece.is_empty() {
+            self.send()?;
         }
-        for number in rising {
-            assert_eq!(number_of(ordered(number)).to_bits(), number.to_bits());
+        for shape in 0..self.seen.len() {
+            if !self.seen[shape] && self.scene.shapes[shape].modes.rank() == 0 {
+                self.tiles_of(shape);
+            }
         }
-        assert!(number_of(ordered(f32::NAN)).is_nan());
-        assert!(number_of(0).is_nan());
-        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(ordered);
-        assert_eq!(bounds_of(&good), Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
-        for bad in [f32::NAN, f32::INFINITY] {
-            let mut keys = good;
-            keys[4] = ordered(bad);
-            assert!(!bounds_of(&keys).is_finite());
-        }
-        assert!(!bounds_of(&[0; 6]).is_finite());
+        let words = std::mem::replace(&mut self.words, room(self.device, 0)?);
+        Ok((words, self))
     }
 }

@@ -1,35 +1,64 @@
-//! The deformer `cuda`: a step's values to the device in one copy, two kernels, the bounds back.
+//! The deformer `cuda`: a step is one graph of copies and kernels, and the bounds come back with it.
 
 use std::sync::Arc;
 use std::time::Instant;
 
+use cudarc::driver::sys::{CUgraphInstantiate_flags, CUstreamCaptureMode};
+use cudarc::driver::{CudaGraph, PinnedHostSlice, result};
+
 use super::GlBuffers;
-use super::deform::{Deform, Extent};
+use super::apply::Apply;
+use super::bounds::{Bounds, bounds_of};
+use super::deform::Deform;
 use super::device::Device;
-use super::memory::{Inputs, PageLock};
-use super::orient::Orient;
+use super::directions::Directions;
+use super::inputs::Inputs;
+use super::layout::Header;
+use super::memory::PageLock;
 use super::output::{Output, sizes};
 use super::plan::{Plan, plan};
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::{Error, Result, during};
-use crate::scene::{Bounds, Scene, State};
+use crate::scene::{Changed, Scene, State};
 
 /// The CUDA deformer of one scene. Lives and dies on the thread that owns the OpenGL context, and before the buffers
 /// that it shares.
-#[derive(Debug)]
 pub struct CudaDeformer {
+    // Graphs first: they name the memory of all that follows.
+    whole: Option<CudaGraph>,
+    some: Option<CudaGraph>,
     device: Arc<Device>,
     plan: Plan,
-    deform: Deform,
-    orient: Orient,
+    kernels: Kernels,
     inputs: Inputs,
-    extent: Extent,
+    answer: PinnedHostSlice<u32>,
     output: Output,
+    steps: Steps,
     // Declared before `surface`, so dropped before it: the locks are on its memory.
     locks: Vec<PageLock>,
     surface: Surface,
     /// Whether `surface` holds what the device holds.
     fresh: bool,
+}
+
+#[derive(Debug)]
+struct Kernels {
+    deform: Deform,
+    bounds: Bounds,
+    directions: Directions,
+    apply: Apply,
+}
+
+/// Which step the output shows.
+#[derive(Debug, Clone, Copy, Default)]
+struct Steps {
+    /// The last step that was begun.
+    begun: u32,
+    /// The last one that ended well, and the state's serial number then; 0 when the output shows nothing whole.
+    shown: u32,
+    serial: u64,
+    /// The last step that changed all domains.
+    everything: u32,
 }
 
 impl CudaDeformer {
@@ -41,14 +70,24 @@ impl CudaDeformer {
         let plan = plan(scene);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let [deform, orient] = [0, 1].map(|index| &plan.kernels[index]);
-        let (deform, orient) = (Deform::new(device, scene, deform)?, Orient::new(device, scene, orient)?);
-        let deformer = Self {
+        let [deform, bounds, directions, apply] = [0, 1, 2, 3].map(|index| &plan.kernels[index]);
+        let deform = Deform::new(device, scene, deform)?;
+        let kernels = Kernels {
+            bounds: Bounds::new(device, bounds)?,
+            directions: Directions::new(device, scene, directions)?,
+            apply: Apply::new(device, deform.packing(), apply)?,
             deform,
-            orient,
-            inputs: Inputs::new(device, scene.domains.len(), scene.layout.coordinates)?,
-            extent: Extent::new(device)?,
+        };
+        // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
+        let answer = unsafe { device.context().alloc_pinned_with_flags(6, 0) }.map_err(during("allocate"))?;
+        let mut deformer = Self {
+            whole: None,
+            some: None,
+            inputs: Inputs::new(device, kernels.deform.packing())?,
+            kernels,
+            answer,
             output: Output::new(device, &plan, gl)?,
+            steps: Steps::default(),
             locks: Vec::new(),
             surface: Surface::default(),
             fresh: true,
@@ -57,6 +96,8 @@ impl CudaDeformer {
         };
         // Tables were copied from memory that is gone by now; wait here, so that a fault of theirs shows here.
         deformer.device.stream().synchronize().map_err(during("upload"))?;
+        deformer.whole = Some(deformer.capture(false)?);
+        deformer.some = Some(deformer.capture(true)?);
         Ok(deformer)
     }
 
@@ -65,16 +106,81 @@ impl CudaDeformer {
         &self.plan
     }
 
-    fn run(&mut self, state: &State) -> Result<Bounds> {
-        let (device, deform, orient) = (&*self.device, &self.deform, &self.orient);
-        self.inputs.send(device, state)?;
-        self.extent.clear(device)?;
-        let (inputs, extent) = (&self.inputs, &self.extent);
-        self.output.write(device, |to| {
-            deform.launch(device, inputs, extent, to.positions)?;
-            orient.launch(device, inputs, to)
+    /// How far the modes that were left out may have moved a vertex in the last step, scene units.
+    pub fn truncation_bound(&self) -> f64 {
+        self.inputs.truncation_bound()
+    }
+
+    /// A step as a graph: copies in, kernels, the bounds out. `some`: of a list of changed domains.
+    fn capture(&mut self, some: bool) -> Result<CudaGraph> {
+        let fail = during("capture");
+        let stream = Arc::clone(self.device.stream());
+        stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_THREAD_LOCAL).map_err(&fail)?;
+        let started = self.start(some);
+        // The capture ends whatever happened, or the stream would stay in it.
+        let graph = stream.end_capture(CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH);
+        started?;
+        let empty = || Error::Fault { stage: "capture", reason: "the graph is empty".into() };
+        graph.map_err(&fail)?.ok_or_else(empty)
+    }
+
+    fn start(&mut self, some: bool) -> Result<()> {
+        let Self { device, kernels, inputs, .. } = self;
+        let values = inputs.values(device);
+        inputs.send(device, some.then_some(size_of::<Header>()))?;
+        if some {
+            kernels.apply.launch(device, values)?;
+        }
+        kernels.deform.launch(device, values)?;
+        kernels.bounds.launch(device, values, kernels.deform.boxes(device))?;
+        kernels.directions.launch(device, values)?;
+        let bounds = values.header + std::mem::offset_of!(Header, bounds) as u64;
+        let answer = self.answer.as_mut_slice().map_err(during("capture"))?;
+        // SAFETY: the header has six words of bounds, so has `answer`, and the deformer waits for the stream before it
+        // reads them.
+        unsafe { result::memcpy_dtoh_async(answer, bounds, device.stream().cu_stream()) }.map_err(during("capture"))
+    }
+
+    fn run(&mut self, state: &State) -> Result<crate::scene::Bounds> {
+        let steps = &mut self.steps;
+        let changed = match &state.changed {
+            Changed::Some(list) if state.serial == steps.serial + 1 => Some(list.as_slice()),
+            _ => None,
+        };
+        steps.begun = steps.begun.wrapping_add(1).max(1);
+        let some = match changed {
+            Some(list) if steps.shown > 0 => {
+                self.kernels.apply.write(self.kernels.deform.packing(), state, list)?.then_some(list)
+            }
+            _ => None,
+        };
+        if some.is_none() {
+            steps.everything = steps.begun;
+        }
+        let since = if some.is_some() { steps.shown } else { 0 };
+        let header = Header {
+            since,
+            everything: steps.everything,
+            step: steps.begun,
+            changed: some.map_or(0, |list| list.len() as u32),
+            ..Header::default()
+        };
+        steps.shown = 0;
+        let graph = if some.is_some() { &self.some } else { &self.whole };
+        let inputs = &mut self.inputs;
+        let keep = some.is_some() || self.kernels.directions.reads_positions();
+        self.output.write(&self.device, keep, |to| {
+            let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
+            match some {
+                Some(_) => inputs.write_header(&header)?,
+                None => inputs.write(&header, state)?,
+            }
+            graph.as_ref().map_or(Ok(()), |graph| graph.launch().map_err(during("deform")))
         })?;
-        self.extent.read(device)
+        self.device.stream().synchronize().map_err(during("deform"))?;
+        self.steps.shown = self.steps.begun;
+        self.steps.serial = state.serial;
+        Ok(bounds_of(self.answer.as_slice().map_err(during("deform"))?))
     }
 
     fn fetch(&mut self) -> Result<()> {

@@ -24,6 +24,7 @@ type GetDevices = unsafe extern "C" fn(*mut c_uint, *mut c_int, c_uint, c_uint) 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Access {
     WriteAll,
+    WriteSome,
     Read,
 }
 
@@ -98,6 +99,7 @@ impl Interop {
         }
         let flags = match access {
             Access::WriteAll => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_WRITE_DISCARD,
+            Access::WriteSome => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_NONE,
             Access::Read => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_READ_ONLY,
         };
         self.access = None;

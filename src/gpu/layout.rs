@@ -3,20 +3,56 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::DeviceRepr;
 
-/// Threads of a block, and the packed vertices or corners that one block computes.
+use crate::domain::RING_START;
+use crate::storage::TILE_QUADS;
+
+/// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
 pub(super) const BLOCK: u32 = 256;
 
 /// `first_tangent` of a shape without tangents.
 pub(super) const NO_TANGENTS: u32 = u32::MAX;
 
-/// Where the vertices of one domain lie.
+/// `first_member` of a shape without smoothing groups.
+pub(super) const NO_GROUPS: u32 = u32::MAX;
+
+/// The start of a step's inputs; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Header {
+    pub positions: u64,
+    pub normals: u64,
+    pub tangents: u64,
+    pub displacements: u64,
+    pub since: u32,
+    pub everything: u32,
+    pub step: u32,
+    pub changed: u32,
+    pub bounds: [u32; 6],
+    pub reserved: [u32; 2],
+}
+
+/// The work of one warp of `deform`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct VertexSlot {
-    pub first_entry: u64,
+pub(super) struct Tile {
+    pub first_word: u64,
     pub first: u32,
-    pub stride: u32,
-    pub rank: u32,
+    pub rest: u32,
+    pub domain: u32,
+    pub first_q: u32,
+    pub first_scale: u32,
+    pub chunks: u16,
+    pub width: u8,
+    pub kind: u8,
+}
+
+/// A quad of a mixed tile.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Lane {
+    pub vertex: u32,
+    pub rest: u32,
+    pub domain: u32,
     pub first_q: u32,
 }
 
@@ -29,45 +65,129 @@ pub(super) struct CornerSlot {
     pub first_tangent: u32,
 }
 
-/// Arguments of `deform`; pointers are device addresses.
+/// A changed domain in the list of `apply`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Change {
+    pub domain: u32,
+    pub first_q: u32,
+    pub count: u32,
+    pub source: u32,
+}
+
+/// Arguments of `deform`; pointers are device addresses, as in all arguments below.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct DeformArgs {
-    pub slots: u64,
-    pub first_domains: u64,
-    pub columns: u64,
+    pub header: u64,
+    pub tiles: u64,
+    pub lanes: u64,
+    pub words: u64,
+    pub rest: u64,
+    pub scales: u64,
+    pub lane_scales: u64,
     pub transforms: u64,
     pub q: u64,
-    pub positions: u64,
-    pub bounds: u64,
-    pub vertices: u32,
+    pub stamps: u64,
+    pub kept_counts: u64,
+    pub kept: u64,
+    pub boxes: u64,
+    pub tiles_count: u32,
     pub reserved: u32,
 }
 
-/// Arguments of `orient`; pointers are device addresses.
+/// Arguments of `bounds`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct BoundsArgs {
+    pub header: u64,
+    pub boxes: u64,
+    pub count: u32,
+    pub reserved: u32,
+}
+
+/// Arguments of `apply`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct ApplyArgs {
+    pub header: u64,
+    pub changes: u64,
+    pub new_transforms: u64,
+    pub new_q: u64,
+    pub transforms: u64,
+    pub q: u64,
+    pub stamps: u64,
+}
+
+/// Arguments of `orient`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct OrientArgs {
+    pub header: u64,
     pub slots: u64,
     pub first_domains: u64,
     pub rest_normals: u64,
     pub rest_tangents: u64,
     pub transforms: u64,
-    pub normals: u64,
-    pub tangents: u64,
+    pub stamps: u64,
     pub corners: u32,
     pub rest_corners: u32,
 }
 
-const _: () = assert!(size_of::<VertexSlot>() == 24, "VertexSlot differs from kernels/layout.cuh");
+/// Where the corners of one domain lie, and the vertices around which `normals` gathers.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct NormalSlot {
+    pub first: u32,
+    pub first_normal: u32,
+    pub first_tangent: u32,
+    pub first_vertex: u32,
+    pub first_member: u32,
+}
+
+/// Arguments of `normals`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct NormalsArgs {
+    pub header: u64,
+    pub slots: u64,
+    pub first_domains: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub transforms: u64,
+    pub stamps: u64,
+    pub members: u64,
+    pub begins: u64,
+    pub rings: u64,
+    pub group_normals: u64,
+    pub corners: u32,
+    pub rest_corners: u32,
+    pub groups: u32,
+    pub reserved: u32,
+}
+
+const _: () = assert!(size_of::<Header>() == 80, "Header differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<CornerSlot>() == 12, "CornerSlot differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<DeformArgs>() == 64, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 112, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoundsArgs>() == 24, "BoundsArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<ApplyArgs>() == 56, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<OrientArgs>() == 64, "OrientArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalsArgs>() == 104, "NormalsArgs differs from kernels/layout.cuh");
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in kernels/layout.cuh.
 unsafe impl DeviceRepr for DeformArgs {}
 // SAFETY: as above.
+unsafe impl DeviceRepr for BoundsArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for ApplyArgs {}
+// SAFETY: as above.
 unsafe impl DeviceRepr for OrientArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for NormalsArgs {}
 
 /// A size or an offset that both sides must agree on.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -93,15 +213,33 @@ macro_rules! agreements {
 /// Every size, offset and constant that host and device share, with the host's value.
 pub fn agreements() -> Vec<Agreement> {
     let mut list = agreements! {
-        VertexSlot { first_entry, first, stride, rank, first_q }
+        Header {
+            positions, normals, tangents, displacements, since, everything, step, changed, bounds, reserved
+        }
+        Tile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
+        Lane { vertex, rest, domain, first_q }
         CornerSlot { first, first_normal, first_tangent }
-        DeformArgs { slots, first_domains, columns, transforms, q, positions, bounds, vertices, reserved }
+        Change { domain, first_q, count, source }
+        DeformArgs {
+            header, tiles, lanes, words, rest, scales, lane_scales, transforms, q, stamps, kept_counts, kept, boxes,
+            tiles_count, reserved
+        }
+        BoundsArgs { header, boxes, count, reserved }
+        ApplyArgs { header, changes, new_transforms, new_q, transforms, q, stamps }
         OrientArgs {
-            slots, first_domains, rest_normals, rest_tangents, transforms, normals, tangents, corners, rest_corners
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, corners, rest_corners
+        }
+        NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
+        NormalsArgs {
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, members, begins, rings,
+            group_normals, corners, rest_corners, groups, reserved
         }
     };
+    list.push(Agreement { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
     list.push(Agreement { expression: "BLOCK".into(), host: BLOCK });
     list.push(Agreement { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
+    list.push(Agreement { expression: "NO_GROUPS".into(), host: NO_GROUPS });
+    list.push(Agreement { expression: "RING_START".into(), host: RING_START });
     list
 }
 

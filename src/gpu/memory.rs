@@ -1,14 +1,13 @@
-//! Device buffers, the pinned way in for a step's values, and host memory that the device copies into.
+//! Device buffers, and host memory that the device copies into.
 
 use std::ffi::c_void;
 use std::sync::Arc;
 
 use bytemuck::Pod;
-use cudarc::driver::{CudaContext, CudaSlice, DevicePtr as _, PinnedHostSlice, result, sys};
+use cudarc::driver::{CudaContext, CudaSlice, DevicePtr as _, result, sys};
 
 use super::device::Device;
 use crate::error::{Result, during};
-use crate::scene::State;
 
 /// Bytes on the device, zeroed.
 pub(super) fn room(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
@@ -42,44 +41,6 @@ pub(super) unsafe fn download<T: Pod>(device: &Device, from: u64, to: &mut [T]) 
     let copied = unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) };
     let waited = stream.synchronize();
     copied.and(waited).map_err(during("download"))
-}
-
-/// Transforms and q of a step: pinned on the host, packed one behind the other on the device, sent in one copy.
-#[derive(Debug)]
-pub(super) struct Inputs {
-    pinned: PinnedHostSlice<f32>,
-    buffer: CudaSlice<u8>,
-    /// Addresses of the transforms and of q.
-    pub transforms: u64,
-    pub q: u64,
-}
-
-impl Inputs {
-    pub(super) fn new(device: &Device, domains: usize, coordinates: usize) -> Result<Self> {
-        let floats = 12 * domains + coordinates;
-        // SAFETY: the memory is written whole before it is first read, in `send`.
-        let pinned = unsafe { device.context().alloc_pinned(floats) }.map_err(during("allocate"))?;
-        let buffer = room(device, 4 * floats as u64)?;
-        let transforms = address(device, &buffer);
-        Ok(Self { pinned, buffer, transforms, q: transforms + 48 * domains as u64 })
-    }
-
-    /// Starts the copy. The caller waits for the stream before the next call.
-    pub(super) fn send(&mut self, device: &Device, state: &State) -> Result<()> {
-        let fail = during("upload");
-        let host = self.pinned.as_mut_slice().map_err(&fail)?;
-        let transforms: &[f32] = bytemuck::cast_slice(&state.transforms);
-        host[..transforms.len()].copy_from_slice(transforms);
-        host[transforms.len()..].copy_from_slice(&state.q);
-        let bytes = std::mem::size_of_val(host);
-        // SAFETY: `pinned` has `bytes` bytes and outlives the copy: the deformer waits for the stream before it writes
-        // here again and before it goes away. `buffer` has as many.
-        let sent = unsafe {
-            let host = std::slice::from_raw_parts(host.as_ptr().cast::<u8>(), bytes);
-            result::memcpy_htod_async(address(device, &self.buffer), host, device.stream().cu_stream())
-        };
-        sent.map_err(fail)
-    }
 }
 
 /// Host memory locked in place, so that the device copies into it at full speed.

@@ -4,27 +4,46 @@
 //! needs ([`plan`]), and a cache on disk keeps the machine code. All domains of a scene go through two launches a step,
 //! straight into OpenGL's buffers when the driver shares them.
 
+mod apply;
+mod bounds;
 mod cache;
 mod deform;
 mod deformer;
 mod device;
+mod directions;
+mod inputs;
 mod interop;
 mod layout;
+mod measure;
 mod memory;
+mod normals;
 mod nvrtc;
 mod orient;
+mod ours;
 mod output;
 mod pack;
 mod plan;
 mod probe;
 mod report;
+mod rings;
+mod roof;
+mod thesis;
+mod trial;
+mod turns;
+mod work;
 
 pub use deformer::CudaDeformer;
 pub use device::Device;
 pub use layout::{Agreement, agreements};
+pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
+pub use ours::{Extent, Ours};
 pub use plan::{Buffer, Kernel, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
+pub use roof::{Roofs, roofs};
+pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
+pub use trial::{KernelFacts, Trial};
+pub use turns::Part;
 
 /// OpenGL buffers to write into, by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

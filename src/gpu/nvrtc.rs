@@ -13,7 +13,12 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
 /// Headers that kernels may include, by name.
-const HEADERS: [(&str, &str); 1] = [("layout.cuh", include_str!("../../kernels/layout.cuh"))];
+const HEADERS: [(&str, &str); 4] = [
+    ("layout.cuh", include_str!("../../kernels/layout.cuh")),
+    ("chunk.cuh", include_str!("../../kernels/chunk.cuh")),
+    ("ordered.cuh", include_str!("../../kernels/ordered.cuh")),
+    ("turn.cuh", include_str!("../../kernels/turn.cuh")),
+];
 
 /// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not know.
 const INVALID_OPTION: c_int = 5;
@@ -133,7 +138,8 @@ impl Nvrtc {
         self.compile_with_log(job).map(|(cubin, _)| cubin)
     }
 
-    fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
+    /// The same, and what the compiler said.
+    pub(super) fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
         let fail = during("compile");
         let options = strings(job.options.iter().map(String::as_str))?;
         let pointers: Vec<_> = options.iter().map(|option| option.as_ptr()).collect();

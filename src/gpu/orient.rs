@@ -4,9 +4,9 @@ use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
 
 use super::deform::config;
 use super::device::Device;
+use super::inputs::Values;
 use super::layout::OrientArgs;
-use super::memory::{Inputs, address, upload};
-use super::output::Addresses;
+use super::memory::{address, upload};
 use super::pack;
 use super::plan::Kernel;
 use crate::error::{Result, during};
@@ -15,7 +15,7 @@ use crate::scene::Scene;
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
 pub(super) struct Orient {
-    function: CudaFunction,
+    pub(super) function: CudaFunction,
     config: LaunchConfig,
     slots: CudaSlice<u8>,
     first_domains: CudaSlice<u8>,
@@ -42,22 +42,22 @@ impl Orient {
         })
     }
 
-    /// Starts the kernel.
-    pub(super) fn launch(&self, device: &Device, inputs: &Inputs, to: Addresses) -> Result<()> {
+    /// Starts the kernel; the header among the values says where normals and tangents go.
+    pub(super) fn launch(&self, device: &Device, values: Values) -> Result<()> {
         let args = OrientArgs {
+            header: values.header,
             slots: address(device, &self.slots),
             first_domains: address(device, &self.first_domains),
             rest_normals: address(device, &self.rest_normals),
             rest_tangents: self.rest_tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
-            transforms: inputs.transforms,
-            normals: to.normals,
-            tangents: to.tangents,
+            transforms: values.transforms,
+            stamps: values.stamps,
             corners: self.corners,
             rest_corners: self.rest_corners,
         };
         let mut launch = device.stream().launch_builder(&self.function);
         // SAFETY: `OrientArgs` is the kernel's only argument. The tables come from `pack`, whose slots lie inside the
-        // rest normals, tangents and transforms of the same scene; the outputs have the sizes that `Output` checked,
+        // rest normals, tangents and transforms of the same scene; the header's outputs have the sizes that `Output` checked,
         // and the tangents are read and written only by a kernel that was compiled for a scene with normal maps.
         unsafe { launch.arg(&args).launch(self.config) }.map_err(during("orient"))?;
         Ok(())

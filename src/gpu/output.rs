@@ -50,9 +50,15 @@ impl Output {
         matches!(self, Self::Shared(_))
     }
 
-    /// Lets `work` write all of the outputs.
-    pub(super) fn write(&mut self, device: &Device, work: impl FnOnce(Addresses) -> Result<()>) -> Result<()> {
-        self.with(device, Access::WriteAll, work)
+    /// Lets `work` write all of the outputs, or with `keep` parts of them, so that the rest stays what it was, and read
+    /// them.
+    pub(super) fn write(
+        &mut self,
+        device: &Device,
+        keep: bool,
+        work: impl FnOnce(Addresses) -> Result<()>,
+    ) -> Result<()> {
+        self.with(device, if keep { Access::WriteSome } else { Access::WriteAll }, work)
     }
 
     /// Copies the outputs into `surface`, whose lists have the right lengths, and waits for it.

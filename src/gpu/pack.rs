@@ -1,59 +1,7 @@
-//! A scene to the tables that the kernels read: slots, blocks, columns (x0 and U), rest normals and tangents. Pure.
-//!
-//! A shape's part of `columns` is [1 + r][3][stride] f32: x0 and then each mode, a plane per axis, so that consecutive
-//! vertices lie at consecutive addresses. Domains that are instances of one shape share it.
+//! A scene to the tables that `orient` reads: slots, blocks, rest normals and tangents. Pure.
 
-use super::layout::{BLOCK, CornerSlot, NO_TANGENTS, VertexSlot};
-use crate::domain::Shape;
+use super::layout::{BLOCK, CornerSlot, NO_TANGENTS};
 use crate::scene::Scene;
-
-/// Planes begin at whole sectors of 32 bytes.
-const SECTOR: usize = 8;
-
-/// Where a shape's planes begin, and floats from one to the next.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Placement {
-    pub first_entry: u64,
-    pub stride: usize,
-}
-
-/// The place of each shape in `columns`, and the floats of all.
-pub(super) fn placements(scene: &Scene) -> (Vec<Placement>, u64) {
-    let mut total = 0;
-    let place = |shape: &Shape| {
-        let stride = shape.mesh.rest().len().next_multiple_of(SECTOR);
-        let placement = Placement { first_entry: total, stride };
-        total += 3 * (1 + shape.modes.rank() as u64) * stride as u64;
-        placement
-    };
-    let list = scene.shapes.iter().map(place).collect();
-    (list, total)
-}
-
-/// Appends a shape's planes: x0, then each column of U.
-pub(super) fn push_columns(shape: &Shape, stride: usize, out: &mut Vec<f32>) {
-    let columns = (0..shape.modes.rank()).map(|mode| shape.modes.column(mode));
-    for column in std::iter::once(shape.mesh.rest().as_flattened()).chain(columns) {
-        for axis in 0..3 {
-            let begin = out.len();
-            out.extend(column.iter().skip(axis).step_by(3));
-            out.resize(begin + stride, 0.0);
-        }
-    }
-}
-
-/// One slot per domain, for `deform`.
-pub(super) fn vertex_slots(scene: &Scene) -> Vec<VertexSlot> {
-    let (places, _) = placements(scene);
-    let slot = |(domain, slot): (&crate::domain::Domain, &crate::scene::Slot)| VertexSlot {
-        first_entry: places[domain.shape].first_entry,
-        first: slot.first_vertex as u32,
-        stride: places[domain.shape].stride as u32,
-        rank: slot.rank as u32,
-        first_q: slot.first_q as u32,
-    };
-    scene.domains.iter().zip(&scene.layout.slots).map(slot).collect()
-}
 
 /// One slot per domain, for `orient`.
 pub(super) fn corner_slots(scene: &Scene) -> Vec<CornerSlot> {
@@ -116,8 +64,8 @@ pub(super) fn tangent_count(scene: &Scene) -> usize {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::domain::{Attachment, Corners, Domain, Material, Mesh, Metadata, Modes, Texture, Transform};
-    use crate::scene::Parts;
+    use crate::domain::{Attachment, Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+    use crate::scene::{Normals, Parts, Storage};
     use std::sync::Arc;
 
     fn shape(vertices: usize, rank: usize) -> Shape {
@@ -149,6 +97,31 @@ pub(super) mod tests {
 
     /// A scene whose shapes have these vertices and ranks, each used by two domains.
     pub(in super::super) fn scene(shapes: &[(usize, usize)], normal_maps: bool, rigid: bool) -> Arc<Scene> {
+        Scene::new(parts(shapes, normal_maps, rigid)).expect("a scene")
+    }
+
+    /// The same without normal maps, U stored so.
+    pub(in super::super) fn stored(shapes: &[(usize, usize)], storage: Storage) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.deformation.storage = storage;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// The same without normal maps, with exact normals.
+    pub(in super::super) fn exact(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.deformation.normals = Normals::Exact;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// Every shape used by one domain.
+    pub(in super::super) fn used_once(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.domains = (0..shapes.len()).map(|index| domain(index, 0)).collect();
+        Scene::new(parts).expect("a scene")
+    }
+
+    fn parts(shapes: &[(usize, usize)], normal_maps: bool, rigid: bool) -> Parts {
         let mut parts = Parts::named("test");
         parts.rigid_transforms = rigid;
         parts.shapes = shapes.iter().map(|(vertices, rank)| shape(*vertices, *rank)).collect();
@@ -157,45 +130,15 @@ pub(super) mod tests {
         parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
         let last = shapes.len() - 1;
         parts.domains = (0..2 * shapes.len()).map(|index| domain(index / 2, usize::from(index / 2 == last))).collect();
-        Scene::new(parts).expect("a scene")
+        parts
     }
 
     const SHAPES: [(usize, usize); 4] = [(7, 2), (300, 0), (8, 5), (513, 1)];
 
     #[test]
-    fn every_rest_position_and_entry_of_u_lies_where_its_slot_says() {
-        let scene = scene(&SHAPES, false, false);
-        let (places, total) = placements(&scene);
-        let mut columns = Vec::new();
-        for (shape, place) in scene.shapes.iter().zip(&places) {
-            assert_eq!(columns.len() as u64, place.first_entry);
-            push_columns(shape, place.stride, &mut columns);
-        }
-        assert_eq!(columns.len() as u64, total);
-        for (domain, slot) in vertex_slots(&scene).iter().enumerate() {
-            let shape = scene.shape_of(domain);
-            assert_eq!(slot.rank as usize, shape.modes.rank());
-            for (vertex, rest) in shape.mesh.rest().iter().enumerate() {
-                for axis in 0..3 {
-                    let at = |plane: usize| {
-                        columns[slot.first_entry as usize + (3 * plane + axis) * slot.stride as usize + vertex]
-                    };
-                    assert_eq!(at(0), rest[axis]);
-                    for mode in 0..shape.modes.rank() {
-                        assert_eq!(at(1 + mode), shape.modes.at(vertex, axis, mode));
-                    }
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn instances_share_columns_and_normals_but_not_vertices() {
+    fn instances_share_normals_but_not_corners() {
         let scene = scene(&SHAPES, true, false);
-        let (vertices, corners) = (vertex_slots(&scene), corner_slots(&scene));
-        assert_eq!(vertices[0].first_entry, vertices[1].first_entry);
-        assert_eq!(vertices[1].first, 7);
-        assert_eq!((vertices[0].first_q, vertices[1].first_q), (0, 2));
+        let corners = corner_slots(&scene);
         assert_eq!(corners[0].first_normal, corners[1].first_normal);
         assert_ne!(corners[0].first, corners[1].first);
         assert_eq!(corners[0].first_tangent, NO_TANGENTS, "only the last shape has a normal map");
@@ -211,7 +154,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_first_domain_of_each_block_brackets_the_domains_of_all_its_vertices() {
+    fn the_first_domain_of_each_block_brackets_the_domains_of_all_its_corners() {
         let sizes: [&[u32]; 5] = [&[1], &[256], &[255, 1, 1], &[7; 1000], &[1000, 3, 256, 512, 1, 700]];
         for sizes in sizes {
             let firsts: Vec<u32> =

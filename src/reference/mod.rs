@@ -1,12 +1,14 @@
 //! The definition in f64, plain and without cleverness. Shares no code with the other deformers.
 
 mod deform;
+mod normals;
 mod orient;
 
 use std::sync::Arc;
 use std::time::Instant;
 
 pub use deform::deform;
+pub use normals::{exact_normals, exact_tangents};
 pub use orient::{orient_normals, orient_tangents};
 
 use crate::deform::{Backend, Deformed, Deformer, Surface};
@@ -37,9 +39,14 @@ impl Deformer for ReferenceDeformer {
         let positions = deform(&self.scene, state);
         let mut bounds = crate::scene::Bounds::EMPTY;
         positions.iter().for_each(|position| bounds.include(*position));
+        let (normals, tangents) = if self.scene.needs.exact_normals {
+            (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
+        } else {
+            (orient_normals(&self.scene, state), orient_tangents(&self.scene, state))
+        };
         self.surface.positions = positions.into_flattened().into_iter().map(|number| number as f32).collect();
-        self.surface.normals = round(orient_normals(&self.scene, state));
-        self.surface.tangents = round(orient_tangents(&self.scene, state));
+        self.surface.normals = round(normals);
+        self.surface.tangents = round(tangents);
         Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 

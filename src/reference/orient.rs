@@ -42,7 +42,7 @@ pub fn orient_tangents(scene: &Scene, state: &State) -> Vec<[f64; 4]> {
     tangents
 }
 
-fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
+pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     let [a, b, c] = [0, 1, 2].map(|row| linear.row(row).transpose());
     Matrix3::from_rows(&[b.cross(&c).transpose(), c.cross(&a).transpose(), a.cross(&b).transpose()])
 }

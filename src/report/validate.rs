@@ -62,8 +62,7 @@ struct Case<'a> {
 }
 
 /// One state to look at.
-struct Look<'a> {
-    truth: &'a Truth,
+struct Look {
     state: State,
     /// What exact storage of all modes gives, and its bound.
     judged: Arc<Vec<Judged>>,
@@ -89,8 +88,8 @@ pub fn validate(
         let state = truth.state();
         let judged = Arc::new(judge(&load.scene, &Truth::of(&state), &Exact));
         conditions.add(&judged);
-        let origin = (at < SPLIT.min(seeds)).then(|| Origin::new(&load.scene, truth.clone(), &state));
-        let look = Look { truth: &truth, state, judged, origin, first: at == 0, along };
+        let origin = (at < SPLIT.min(seeds)).then(|| Origin::new(&load.scene, truth, &state));
+        let look = Look { state, judged, origin, first: at == 0, along };
         cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
     }
     (cases.into_iter().map(|case| case.found(&yardstick)).collect(), conditions.condition())
@@ -110,7 +109,7 @@ impl<'a> Case<'a> {
         }
     }
 
-    fn look(&mut self, yardstick: &Yardstick, look: &Look<'_>) {
+    fn look(&mut self, yardstick: &Yardstick, look: &Look) {
         if self.fault.is_some() {
             return;
         }
@@ -144,7 +143,7 @@ impl<'a> Case<'a> {
     }
 
     /// The exact positions with this variant's own bound.
-    fn judged(&self, look: &Look<'_>) -> Arc<Vec<Judged>> {
+    fn judged(&self, look: &Look) -> Arc<Vec<Judged>> {
         let ingredients = self.variant.ingredients();
         match ingredients.is_exact() {
             true => Arc::clone(&look.judged),
@@ -152,7 +151,7 @@ impl<'a> Case<'a> {
         }
     }
 
-    fn orient(&mut self, look: &Look<'_>, surface: &Surface) {
+    fn orient(&mut self, look: &Look, surface: &Surface) {
         let scene = self.variant.scene();
         if !surface.normals.is_empty() {
             self.turned.add_normals(&surface.normals, &reference::orient_normals(scene, &look.state));

@@ -1,5 +1,7 @@
 //! Where each domain's vertices, corners, triangles and coordinates lie in the packed buffers of a scene.
 
+use std::collections::BTreeMap;
+
 use crate::domain::{Domain, Shape};
 use crate::error::{Result, invalid};
 
@@ -29,13 +31,21 @@ pub struct Layout {
     pub triangles: usize,
     /// Length of the packed q.
     pub coordinates: usize,
+    /// By `first_q`: all domains of rank above 0 that share coordinates, ascending. Empty where nobody shares.
+    pub sharers: BTreeMap<usize, Vec<u32>>,
 }
 
 impl Layout {
     pub(super) fn new(shapes: &[Shape], domains: &[Domain]) -> Result<Self> {
-        let mut layout =
-            Self { slots: Vec::with_capacity(domains.len()), vertices: 0, corners: 0, triangles: 0, coordinates: 0 };
-        for domain in domains {
+        let mut layout = Self {
+            slots: Vec::with_capacity(domains.len()),
+            vertices: 0,
+            corners: 0,
+            triangles: 0,
+            coordinates: 0,
+            sharers: BTreeMap::new(),
+        };
+        for (index, domain) in domains.iter().enumerate() {
             let shape = &shapes[domain.shape];
             let rank = shape.modes.rank();
             let shared = domain.shares_q_with.map(|twin| layout.slots[twin].first_q);
@@ -53,6 +63,10 @@ impl Layout {
             layout.corners += slot.corners;
             layout.triangles += slot.triangles;
             layout.coordinates += if shared.is_some() { 0 } else { rank };
+            if let Some(twin) = domain.shares_q_with.filter(|_| rank > 0) {
+                // The first to share is whoever owns the coordinates: a twin of a twin finds the list there already.
+                layout.sharers.entry(slot.first_q).or_insert_with(|| vec![twin as u32]).push(index as u32);
+            }
             layout.slots.push(slot);
         }
         // Device indices are 32 bit and address three numbers per vertex and corner.

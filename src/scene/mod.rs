@@ -4,25 +4,29 @@
 //! the renderer use the same packing ([`Layout`]).
 
 mod camera;
+mod cells;
 mod deformation;
 mod layout;
 mod look;
 mod needs;
+mod rigid;
 mod state;
 mod update;
 
 pub use camera::{Bounds, Camera, Lens, View};
+pub use cells::{Cells, GRID, REACH, nearest};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
 pub use look::{Ground, Look, Shadow, UpAxis};
 pub use needs::Needs;
-pub use state::State;
+pub use rigid::TransformFormat;
+pub use state::{Changed, State};
 pub use update::{RawUpdate, Update};
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::domain::{AlphaMode, Domain, Material, Shape, Texture};
+use crate::domain::{AlphaMode, Domain, MAX_RING_TRIANGLES, Material, Shape, Texture};
 use crate::error::{Result, invalid};
 
 /// The largest number of domains of one scene.
@@ -103,6 +107,9 @@ impl Scene {
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
         let needs = Needs::of(&parts);
+        if needs.exact_normals {
+            add_smoothing(&mut parts)?;
+        }
         let mut scene = Self {
             name: parts.name,
             shapes: parts.shapes,
@@ -269,6 +276,23 @@ fn add_tangents(parts: &mut Parts) {
             shape.add_tangents();
         }
     }
+}
+
+/// Smoothing groups of the shapes that bend; normals of the others turn with their domain.
+fn add_smoothing(parts: &mut Parts) -> Result<()> {
+    let mut triangles = 0;
+    for domain in &parts.domains {
+        let shape = &mut parts.shapes[domain.shape];
+        if shape.modes.rank() > 0 && shape.smoothing().is_none() {
+            triangles += shape.mesh.triangles().len();
+            if triangles > MAX_RING_TRIANGLES {
+                let expected = format!("at most {MAX_RING_TRIANGLES} triangles of shapes with modes");
+                return Err(invalid("deform.normals", expected, triangles));
+            }
+            shape.add_smoothing();
+        }
+    }
+    Ok(())
 }
 
 impl Parts {

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::Scene;
+use super::rigid::{self, Parsed};
+use super::{Scene, TransformFormat};
 use crate::domain::Transform;
 use crate::error::{Error, Result, invalid};
 
@@ -17,8 +18,9 @@ pub struct RawUpdate {
     pub q: bytes::Bytes,
     /// Domains whose transforms follow; empty with bytes in `transforms` means all domains in order.
     pub transform_domains: Vec<u32>,
-    /// Twelve little-endian f32 per named domain, concatenated. Any alignment.
+    /// One transform per named domain in `transform_format`, little-endian, concatenated. Any alignment.
     pub transforms: bytes::Bytes,
+    pub transform_format: TransformFormat,
 }
 
 /// A domain, and the first number and the count of its coordinates among the values of a step.
@@ -31,7 +33,11 @@ pub struct Update {
     pub time: f64,
     q: Vec<Part>,
     values: Vec<f32>,
+    /// Each named domain's transform relative to the scene's origin, rounded to f32.
     pub transforms: Vec<(u32, Transform)>,
+    /// Those domains of `transforms`, in the same order, whose translation was given in f64: relative to the scene's
+    /// origin, not rounded.
+    translations: Vec<(u32, [f64; 3])>,
 }
 
 impl Update {
@@ -44,8 +50,23 @@ impl Update {
             return Err(invalid("step.time", "a finite number", raw.time));
         }
         let (q, values) = parse_q(scene, raw)?;
-        let transforms = parse_transforms(scene, raw)?;
-        Ok(Self { number: raw.number, time: raw.time, q, values, transforms })
+        let (transforms, translations) = parse_transforms(scene, raw)?;
+        Ok(Self { number: raw.number, time: raw.time, q, values, transforms, translations })
+    }
+
+    /// Whether a translation was given in f64.
+    pub const fn has_f64(&self) -> bool {
+        !self.translations.is_empty()
+    }
+
+    /// Each domain whose transform changes, with its translation relative to the scene's origin as exact as it was given.
+    pub fn placements(&self) -> impl Iterator<Item = (usize, Transform, [f64; 3])> {
+        let mut exact = self.translations.iter().peekable();
+        self.transforms.iter().map(move |(domain, transform)| {
+            let given = exact.next_if(|(named, _)| named == domain);
+            let translation = given.map_or_else(|| transform.translation().into(), |(_, translation)| *translation);
+            (*domain as usize, *transform, translation)
+        })
     }
 
     /// Each domain whose coordinates change, with its r numbers.
@@ -57,16 +78,30 @@ impl Update {
     pub fn over(self, older: &Self) -> Self {
         let mut q: BTreeMap<u32, &[f32]> = BTreeMap::new();
         let mut transforms = BTreeMap::new();
+        // Only what was given in f64 stays so: a newer f32 translation of the same domain replaces it.
+        let mut translations = BTreeMap::new();
         for step in [older, &self] {
             q.extend(step.coordinates().map(|(domain, values)| (domain as u32, values)));
             transforms.extend(step.transforms.iter().copied());
+            if !translations.is_empty() {
+                for (domain, _) in &step.transforms {
+                    translations.remove(domain);
+                }
+            }
+            translations.extend(step.translations.iter().copied());
         }
-        let mut merged = Self { number: self.number, time: self.time, q: vec![], values: vec![], transforms: vec![] };
+        let mut merged = Self {
+            number: self.number,
+            time: self.time,
+            q: vec![],
+            values: vec![],
+            transforms: transforms.into_iter().collect(),
+            translations: translations.into_iter().collect(),
+        };
         for (domain, values) in q {
             merged.q.push((domain, merged.values.len(), values.len()));
             merged.values.extend_from_slice(values);
         }
-        merged.transforms = transforms.into_iter().collect();
         merged
     }
 }
@@ -99,28 +134,41 @@ fn parse_q(scene: &Scene, raw: &RawUpdate) -> Result<(Vec<Part>, Vec<f32>)> {
     Ok((places, values))
 }
 
-fn parse_transforms(scene: &Scene, raw: &RawUpdate) -> Result<Vec<(u32, Transform)>> {
+/// Transforms of the named domains, and which of their translations were given in f64.
+type Transforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
+
+fn parse_transforms(scene: &Scene, raw: &RawUpdate) -> Result<Transforms> {
     let everyone = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
     let domains = named(scene, "step.transform_domains", &raw.transform_domains, everyone)?;
-    if raw.transforms.len() != 48 * domains.len() {
-        let wanted = format!("{} bytes ({} transforms of 12 numbers)", 48 * domains.len(), domains.len());
+    let size = raw.transform_format.bytes();
+    if raw.transforms.len() != size * domains.len() {
+        let wanted = format!("{} bytes ({} transforms of {size})", size * domains.len(), domains.len());
         return Err(invalid("step.transforms", wanted, format!("{} bytes", raw.transforms.len())));
     }
-    let parse = |(domain, bytes): (u32, &[u8])| {
+    let origin = scene.origin.map(|metres| metres / scene.unit);
+    let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
+    for (domain, bytes) in domains.into_iter().zip(raw.transforms.chunks_exact(size)) {
+        let parsed = match raw.transform_format {
+            TransformFormat::Affine => parse_affine(scene, bytes),
+            TransformFormat::RigidF32 => rigid::rigid_f32(bytes),
+            TransformFormat::RigidF64 => rigid::rigid_f64(bytes, origin),
+        };
         let name = || format!("step.transforms of domain '{}'", scene.domains[domain as usize].name);
-        let mut entries = [0.0; 12];
-        entries.copy_from_slice(&floats(bytes));
-        let transform = Transform::new(entries).map_err(|error| error.within(&name()))?;
-        if !scene.needs.shear && !transform.is_similarity() {
-            return Err(invalid(
-                name(),
-                "no shear and one scale (the scene declares rigid transforms)",
-                format!("{entries:?}"),
-            ));
-        }
-        Ok((domain, transform))
-    };
-    domains.into_iter().zip(raw.transforms.chunks_exact(48)).map(parse).collect()
+        let (transform, translation) = parsed.map_err(|error| error.within(&name()))?;
+        transforms.push((domain, transform));
+        translations.extend(translation.map(|translation| (domain, translation)));
+    }
+    Ok((transforms, translations))
+}
+
+/// The only format that can shear.
+fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<Parsed> {
+    let (transform, kept) = rigid::affine(bytes)?;
+    if !scene.needs.shear && !transform.is_similarity() {
+        let expected = "no shear and one scale (the scene declares rigid transforms)";
+        return Err(invalid("linear", expected, format!("{:?}", transform.0)));
+    }
+    Ok((transform, kept))
 }
 
 /// The domains that a list names, each once, or all of them.

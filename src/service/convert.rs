@@ -5,7 +5,7 @@ use modalcast_proto::v1;
 
 use crate::engine::{self, Delivery, Engine, Format, Host, Policy, StepName, View, Which};
 use crate::error::{Result, invalid};
-use crate::scene::{Camera, RawUpdate, Scene};
+use crate::scene::{Camera, RawUpdate, Scene, TransformFormat};
 use crate::telemetry::StageTimes;
 
 mod camera;
@@ -61,15 +61,22 @@ pub(super) fn stages(times: &StageTimes) -> Vec<v1::StageTime> {
     times.iter().map(wire).collect()
 }
 
-pub(super) fn raw_update(step: v1::Step) -> RawUpdate {
-    RawUpdate {
+pub(super) fn raw_update(step: v1::Step) -> Result<RawUpdate> {
+    let transform_format = match v1::TransformFormat::try_from(step.transform_format) {
+        Ok(v1::TransformFormat::Unspecified | v1::TransformFormat::AffineF32) => TransformFormat::Affine,
+        Ok(v1::TransformFormat::RigidF32) => TransformFormat::RigidF32,
+        Ok(v1::TransformFormat::RigidF64) => TransformFormat::RigidF64,
+        Err(_) => return Err(invalid("step.transform_format", "a format of this version", step.transform_format)),
+    };
+    Ok(RawUpdate {
         number: step.number,
         time: step.time,
         q_domains: step.q_domains,
         q: step.q,
         transform_domains: step.transform_domains,
         transforms: step.transforms,
-    }
+        transform_format,
+    })
 }
 
 /// Unspecified means lossless.

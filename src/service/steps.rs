@@ -119,7 +119,7 @@ impl Session {
 
     fn step(&mut self, step: v1::Step) -> Result<()> {
         match &mut self.drive {
-            Some(drive) => drive.step(&raw_update(step)),
+            Some(drive) => drive.step(&raw_update(step)?),
             None => Err(invalid("kind", "open, before any step", "a step")),
         }
     }

@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status};
 use super::convert::{delivery, said, stages, step_id, which_of_vertices};
 use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
-use crate::engine::{Encoded, Engine, Feed, Host, Selection, View, pack_vertices};
+use crate::engine::{Engine, Feed, Host, Packed, Selection, View, pack_vertices};
 
 /// `VertexService`.
 pub(super) struct Vertices(pub(super) Engine);
@@ -33,7 +33,7 @@ impl v1::vertex_service_server::VertexService for Vertices {
             let work = async {
                 let shown = host.show(which, View::Vertices).await.map_err(status)?;
                 let vertices = pack_vertices(shown, &selection).await.map_err(status)?;
-                for chunk in chunks(&host, &vertices, &selection, most) {
+                for chunk in chunks(&vertices, &selection, most) {
                     outlet.send(v1::GetVerticesResponse { chunk: Some(chunk) }).await?;
                 }
                 Ok(())
@@ -55,14 +55,13 @@ impl v1::vertex_service_server::VertexService for Vertices {
         let delivery = delivery(request.delivery).map_err(status)?;
         // The subscription holds before the reply's head is sent, so that a client may count on the next step.
         let feed = host.watch(View::Vertices, delivery).await.map_err(status)?;
-        let show = Show { host, selection, most: self.0.config().chunk_bytes, steps: request.steps };
+        let show = Show { selection, most: self.0.config().chunk_bytes, steps: request.steps };
         Ok(respond(move |outlet| deadline.hold("the end of the vertex stream", show.run(feed, outlet))))
     }
 }
 
 /// How a stream of vertices is sent.
 struct Show {
-    host: Arc<Host>,
     selection: Arc<Selection>,
     most: usize,
     /// 0: without end.
@@ -78,7 +77,7 @@ impl Show {
                 () = outlet.closed() => return Ok(()),
             };
             let vertices = pack_vertices(shown, &self.selection).await.map_err(status)?;
-            for chunk in chunks(&self.host, &vertices, &self.selection, self.most) {
+            for chunk in chunks(&vertices, &self.selection, self.most) {
                 tokio::select! {
                     sent = outlet.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent?,
                     error = feed.cut_off() => return Err(status(error)),
@@ -95,15 +94,11 @@ fn select(host: &Host, selection: Option<v1::VertexSelection>) -> Result<Arc<Sel
     Selection::new(&host.scene, domains, positions_only).map(Arc::new).map_err(status)
 }
 
-fn chunks(
-    host: &Host,
-    vertices: &Encoded,
-    selection: &Selection,
-    most: usize,
-) -> impl Iterator<Item = v1::VertexChunk> + use<> {
+fn chunks(packed: &Packed, selection: &Selection, most: usize) -> impl Iterator<Item = v1::VertexChunk> + use<> {
+    let vertices = &packed.encoded;
     let head = v1::VertexHead {
         step: Some(step_id(vertices.step)),
-        origin: host.scene.origin.to_vec(),
+        origin: packed.origin.to_vec(),
         domains: selection.domains.clone(),
         vertices: selection.vertices().collect(),
         corners: selection.corners().collect(),
@@ -111,6 +106,7 @@ fn chunks(
         total: vertices.bytes.len() as u64,
         skipped: vertices.skipped,
         stages: stages(&vertices.stages),
+        origin_bytes: packed.origin_bytes,
     };
     let mut head = Some(head);
     let cut = move |(offset, data): (u64, Bytes)| v1::VertexChunk { head: head.take(), offset, data };

@@ -7,4 +7,5 @@ mod interop;
 mod judge;
 mod real;
 mod scenes;
+mod trials;
 mod twins;

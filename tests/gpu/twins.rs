@@ -34,7 +34,7 @@ fn gpu_every_combination_of_features_equals_its_twin() {
         let scene = scenes::scene(&[(300, rank), (40, 0), (7, rank)], 4, normal_maps, rigid);
         assert_eq!((scene.needs.modes, scene.needs.normal_maps, scene.needs.shear), (modes, normal_maps, !rigid));
         let mut deformer = deformer(&scene);
-        assert!(deformer.plan().launches() <= 2);
+        assert!(deformer.plan().launches() <= 4);
         let name = format!("modes {modes} normal maps {normal_maps} rigid {rigid}");
         check(&name, &scene, &scenes::state(&scene, 9), &mut deformer);
         assert_eq!(deformer.surface().expect("copies").tangents.is_empty(), !normal_maps);
@@ -43,11 +43,11 @@ fn gpu_every_combination_of_features_equals_its_twin() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_twenty_thousand_small_domains_of_mixed_ranks_take_two_launches_and_equal_the_twin() {
+fn gpu_twenty_thousand_small_domains_of_mixed_ranks_take_four_launches_and_equal_the_twin() {
     let shapes: Vec<_> = (0..50).map(|index| (7, index % 5)).collect();
     let scene = scenes::scene(&shapes, 400, true, false);
     let mut deformer = deformer(&scene);
-    assert_eq!((scene.domains.len(), deformer.plan().launches()), (20_000, 2));
+    assert_eq!((scene.domains.len(), deformer.plan().launches()), (20_000, 4));
     let state = scenes::state(&scene, 3);
     check("20,000 domains", &scene, &state, &mut deformer);
     report("20,000 domains of 7", &mut deformer, &state);

@@ -9,10 +9,13 @@ use v1::drive_scene_request::Kind as Asked;
 use v1::drive_scene_response::Kind as Told;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Driver, Server, details, expected, get_vertices, step, strips, within};
+use crate::service_harness::{Driver, Server, details, expected, get_vertices, rigid_step, step, strips, within};
 
 /// A bad step: its name, the step, and how field, expected and given begin.
 type BadStep = (&'static str, v1::Step, [&'static str; 3]);
+
+/// No rotation, as a quaternion.
+const UPRIGHT: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 fn bad_steps() -> Vec<BadStep> {
     let transforms = |domains: &[u32], numbers: &[f32]| v1::Step {
@@ -25,6 +28,9 @@ fn bad_steps() -> Vec<BadStep> {
     let mut odd = step(11, &[0], &[0.0, 0.0]);
     odd.q = odd.q.slice(..7);
     let timeless = v1::Step { time: f64::NAN, ..step(11, &[0], &[0.0, 0.0]) };
+    let formatless = v1::Step { transform_format: 9, ..transforms(&[0], &[1.0; 12]) };
+    let misnamed =
+        |format: v1::TransformFormat| v1::Step { transform_format: format.into(), ..transforms(&[0], &[1.0; 12]) };
     vec![
         ("q too short", step(11, &[1], &[0.5]), ["step.q of domain 'right'", "8 bytes (2 coordinates)", "4 bytes"]),
         ("q too long", step(11, &[0], &[0.5; 3]), ["step.q of domain 'left'", "8 bytes (2 coordinates)", "12 bytes"]),
@@ -61,7 +67,40 @@ fn bad_steps() -> Vec<BadStep> {
             transforms(&[1], &infinite),
             ["step.transforms of domain 'right': transform[7]", "a finite", "inf"],
         ),
+        ("a format of no version", formatless, ["step.transform_format", "a format of this version", "9"]),
+        ("48 bytes as 28", misnamed(v1::TransformFormat::RigidF32), ["step.transforms", "28 bytes (1 tr", "48 bytes"]),
+        ("48 bytes as 40", misnamed(v1::TransformFormat::RigidF64), ["step.transforms", "40 bytes (1 tr", "48 bytes"]),
         ("NaN time", timeless, ["step.time", "a finite number", "NaN"]),
+        (
+            "no rotation",
+            rigid_step(11, v1::TransformFormat::RigidF32, &[(1, [0.0; 4], [0.0; 3])]),
+            ["step.transforms of domain 'right': rotation", "a quaternion x y z w of norm 1", "norm 0"],
+        ),
+        (
+            "twice a rotation",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, [0.0, 2.0, 0.0, 0.0], [0.0; 3])]),
+            ["step.transforms of domain 'left': rotation", "a quaternion x y z w of norm 1", "norm 2"],
+        ),
+        (
+            "NaN in a quaternion",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, [0.0, f32::NAN, 0.0, 1.0], [0.0; 3])]),
+            ["step.transforms of domain 'right': rotation[1]", "a finite", "NaN"],
+        ),
+        (
+            "infinity in an f32 translation",
+            rigid_step(11, v1::TransformFormat::RigidF32, &[(0, UPRIGHT, [0.0, 1e300, 0.0])]),
+            ["step.transforms of domain 'left': translation[1]", "a finite", "inf"],
+        ),
+        (
+            "infinity in an f64 translation",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, UPRIGHT, [0.0, 0.0, f64::NEG_INFINITY])]),
+            ["step.transforms of domain 'left': translation[2]", "a finite", "-inf"],
+        ),
+        (
+            "an f64 translation beyond all worlds",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, UPRIGHT, [-1e300, 0.0, 0.0])]),
+            ["step.transforms of domain 'right': translation[0]", "at most 1.09", "-1000000000"],
+        ),
         ("a number that goes back", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
         ("a number that comes again", step(10, &[0], &[0.0; 2]), ["step.number", "a number above 10", "10"]),
     ]

@@ -1,9 +1,11 @@
 //! Claims that need no GPU. One binary.
 
 mod deformers;
+mod far;
 mod frames;
 mod hostile;
 mod layering;
+mod normals;
 mod pixels;
 mod real;
 mod restart;

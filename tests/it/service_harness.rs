@@ -8,7 +8,7 @@ use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast::engine::{Engine, SceneSource};
 use modalcast::error::{Error, Result, invalid};
-use modalcast::scene::{Look, Parts, RawUpdate, Scene, Shadow, State, Update};
+use modalcast::scene::{Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
 use modalcast::{reference, service};
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -28,13 +28,15 @@ use v1::vertex_service_client::VertexServiceClient;
 /// The longest that any answer may take before a test gives up.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Scenes made in code: `strips` (two small domains), `sheet` (more than 1 MiB of everything), `panic`.
+/// Scenes made in code: `strips` (two small domains), `far` (the same elsewhere), `sheet` (more than 1 MiB of everything),
+/// `panic`.
 pub(crate) struct InCode;
 
 impl SceneSource for InCode {
     fn open(&self, source: &str) -> Result<Arc<Scene>> {
         match source {
             "strips" => Ok(strips()),
+            "far" => Ok(far_strips()),
             "sheet" => Ok(sheet()),
             "panic" => panic!("a planted panic of a loader"),
             _ => Err(Error::NotFound { what: "scene", given: source.into() }),
@@ -54,13 +56,26 @@ impl SceneSource for InCode {
 
 /// Two squares of four vertices and two modes; `right` hangs on `left`.
 pub(crate) fn strips() -> Arc<Scene> {
+    let (shape, domains) = two_strips();
+    scene("strips", shape, domains)
+}
+
+/// The same in half metres, 17,000 km from the world's origin.
+pub(crate) fn far_strips() -> Arc<Scene> {
+    let (shape, domains) = two_strips();
+    let (shapes, materials) = (vec![shape], vec![Material::default()]);
+    let parts = Parts { shapes, materials, domains, unit: 0.5, origin: [1e7, -1e7, 1e7 + 0.25], ..Parts::named("far") };
+    Scene::new(parts).expect("a scene")
+}
+
+fn two_strips() -> (Shape, Vec<Domain>) {
     let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.125 * (entry % 3) as f32 }).collect();
     let shape = Shape::new(grid(2), Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
     let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
     let notes = [("species".to_owned(), "none".to_owned())].into();
     let metadata = Metadata { eigenvalues: vec![1.0, 4.0], notes };
     let left = Domain { metadata, ..domain("left", None) };
-    scene("strips", shape, vec![left, domain("right", Some(joint))])
+    (shape, vec![left, domain("right", Some(joint))])
 }
 
 /// One sheet of 300 x 300 vertices and four modes.
@@ -269,10 +284,41 @@ pub(crate) fn step(number: u64, q_domains: &[u32], q: &[f32]) -> v1::Step {
     v1::Step { number, time: number as f64 * 0.5, q_domains: q_domains.to_vec(), q, ..v1::Step::default() }
 }
 
+/// A step that places domains by quaternions x y z w and translations, in one of the two rigid formats.
+pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, places: &[(u32, [f32; 4], [f64; 3])]) -> v1::Step {
+    let mut bytes = Vec::new();
+    for (_, rotation, translation) in places {
+        bytes.extend(rotation.iter().flat_map(|number| number.to_le_bytes()));
+        match format {
+            v1::TransformFormat::RigidF64 => bytes.extend(translation.iter().flat_map(|number| number.to_le_bytes())),
+            _ => bytes.extend(translation.iter().flat_map(|number| (*number as f32).to_le_bytes())),
+        }
+    }
+    v1::Step {
+        transform_domains: places.iter().map(|(domain, ..)| *domain).collect(),
+        transforms: bytes.into(),
+        transform_format: format.into(),
+        ..step(number, &[], &[])
+    }
+}
+
 /// What the reference says the vertices are after some steps.
 pub(crate) fn expected(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
+    let state = state_after(scene, steps);
+    let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
+    (round(reference::deform(scene, &state)), round(reference::orient_normals(scene, &state)))
+}
+
+/// The state that some steps leave behind.
+pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> State {
+    use v1::TransformFormat as Wire;
     let mut state = State::rest(scene);
     for step in steps.iter().cloned() {
+        let transform_format = match step.transform_format() {
+            Wire::Unspecified | Wire::AffineF32 => TransformFormat::Affine,
+            Wire::RigidF32 => TransformFormat::RigidF32,
+            Wire::RigidF64 => TransformFormat::RigidF64,
+        };
         let raw = RawUpdate {
             number: step.number,
             time: step.time,
@@ -280,11 +326,11 @@ pub(crate) fn expected(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>
             q: step.q,
             transform_domains: step.transform_domains,
             transforms: step.transforms,
+            transform_format,
         };
         state.apply(scene, &Update::parse(scene, &raw).expect("a good step"));
     }
-    let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
-    (round(reference::deform(scene, &state)), round(reference::orient_normals(scene, &state)))
+    state
 }
 
 /// Vertices put together again.
@@ -293,6 +339,8 @@ pub(crate) struct Got {
     pub(crate) head: v1::VertexHead,
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
+    /// Three numbers per chosen domain; empty when the head's origin holds for all.
+    pub(crate) origins: Vec<f64>,
 }
 
 impl Got {
@@ -337,9 +385,11 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> Got {
         bytes.extend_from_slice(&chunk.data);
     }
     assert_eq!(head.total, bytes.len() as u64);
-    let (positions, normals) = bytes.split_at(head.position_bytes as usize);
+    let (positions, rest) = bytes.split_at(head.position_bytes as usize);
+    let (normals, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
     let floats = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, f32>(bytes);
-    Got { positions: floats(positions), normals: floats(normals), head }
+    let origins = bytemuck::pod_collect_to_vec::<u8, f64>(origins);
+    Got { positions: floats(positions), normals: floats(normals), origins, head }
 }
 
 /// The refusal inside a status.

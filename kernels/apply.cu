@@ -1,0 +1,26 @@
+// Puts the transforms and coordinates of the changed domains into their places and stamps them with the step.
+//   header          how many changed, and the step                       (in)
+//   changes         [changed]                                            (in)
+//   new_transforms  [changed][3] float4                                  (in)
+//   new_q           the coordinates of the changed domains, packed       (in)
+//   transforms, q   of all domains                                       (out)
+//   stamps          [domains] u32: the step that last changed a domain   (out)
+// Launch: BLOCK threads a block, a warp a changed domain at a time, any number of blocks. CPU twin: State::apply.
+#include "layout.cuh"
+
+extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant__ ApplyArgs args) {
+    const unsigned lane = threadIdx.x % 32, warps = gridDim.x * (BLOCK / 32);
+    const unsigned changed = args.header->changed;
+    for (unsigned index = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; index < changed; index += warps) {
+        const Change change = args.changes[index];
+        if (lane < 3) {
+            args.transforms[3 * (size_t)change.domain + lane] = args.new_transforms[3 * (size_t)index + lane];
+        }
+        if (lane == 3) {
+            args.stamps[change.domain] = args.header->step;
+        }
+        for (unsigned i = lane; i < change.count; i += 32) {
+            args.q[change.first_q + i] = args.new_q[change.source + i];
+        }
+    }
+}

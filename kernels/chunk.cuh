@@ -1,0 +1,53 @@
+// U as it is stored: 48 bytes hold the entries of one quad (4 vertices) for as many modes as fit, as three words of 16
+// bytes. Entry e = (mode * 3 + axis) * 4 + vertex. Twin: src/storage.
+#pragma once
+
+#if defined(STORE_F16) || defined(STORE_BF16)
+constexpr unsigned CHUNK_MODES = 2;
+#elif defined(STORE_INT8)
+constexpr unsigned CHUNK_MODES = 4;
+#else
+constexpr unsigned CHUNK_MODES = 1;
+#endif
+constexpr unsigned ENTRY_BYTES = 4 / CHUNK_MODES;
+
+// The number that the lowest bits of `bits` stand for, before its mode's factor or scale.
+__device__ __forceinline__ float number_of(unsigned bits) {
+#if defined(STORE_F16)
+    float number;
+    asm("{ .reg .b16 low, high; mov.b32 {low, high}, %1; cvt.f32.f16 %0, low; }" : "=f"(number) : "r"(bits));
+    return number;
+#elif defined(STORE_BF16)
+    return __uint_as_float(bits << 16);
+#elif defined(STORE_INT8)
+    // A byte put below the exponent of 2^23 is that many units above it; the code is the byte less 128. Both are exact.
+    return __uint_as_float(__byte_perm(bits, 0x4b000000u, 0x7650u)) - 8388736.0f;
+#else
+    return __uint_as_float(bits);
+#endif
+}
+
+// Entry `entry` of a chunk whose twelve words are in registers; `entry` is known when this is compiled.
+__device__ __forceinline__ float entry_of(const unsigned (&words)[12], unsigned entry) {
+    const unsigned word = words[entry / CHUNK_MODES];
+#if defined(STORE_INT8)
+    return __uint_as_float(__byte_perm(word, 0x4b000000u, 0x7650u | entry % 4)) - 8388736.0f;
+#else
+    return number_of(entry % CHUNK_MODES == 0 ? word : word >> 16);
+#endif
+}
+
+// What entry (mode, axis) of vertex `vertex` of a chunk is, read by itself. `words` is the quad's first word of 16 bytes
+// and `stride` leads from one word of the quad to the next.
+__device__ __forceinline__ float entry_at(const uint4* words, unsigned stride, unsigned mode, unsigned axis,
+                                          unsigned vertex) {
+    const unsigned byte = ((mode * 3 + axis) * 4) * ENTRY_BYTES;
+    const char* word = (const char*)(words + (size_t)(byte / 16) * stride) + byte % 16 + vertex * ENTRY_BYTES;
+#if defined(STORE_F16) || defined(STORE_BF16)
+    return number_of(__ldcs((const unsigned short*)word));
+#elif defined(STORE_INT8)
+    return number_of(__ldcs((const unsigned char*)word));
+#else
+    return __ldcs((const float*)word);
+#endif
+}

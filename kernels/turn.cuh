@@ -1,0 +1,68 @@
+// Directions under the linear part A of a transform: normals by the inverse transpose, tangents by A. Without SHEAR
+// every A is a rotation or reflection times one scale, which turns normals as it turns tangents.
+//
+// A is handled in f64: cofactors and determinant of a nearly singular A cancel, and the sign of the determinant decides
+// which way a surface faces. Products of two f32 are exact in f64, and every other step is rounded as the twin rounds
+// it (no fused multiply-add), so that what vanishes there vanishes here. Nothing over- or underflows.
+#pragma once
+#include "layout.cuh"
+
+struct Rows {
+    double3 a, b, c;
+};
+
+__device__ inline Rows linear_of(const float4* transforms, unsigned domain) {
+    const float4* rows = transforms + 3 * (size_t)domain;
+    const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
+    return {make_double3(a.x, a.y, a.z), make_double3(b.x, b.y, b.z), make_double3(c.x, c.y, c.z)};
+}
+
+__device__ inline double minor_of(double a, double b, double c, double d) {
+    return __dsub_rn(__dmul_rn(a, d), __dmul_rn(b, c));
+}
+
+__device__ inline double dot(const double3& row, const double3& v) {
+    return __dadd_rn(__dadd_rn(__dmul_rn(row.x, v.x), __dmul_rn(row.y, v.y)), __dmul_rn(row.z, v.z));
+}
+
+// +1 or -1; of a zero determinant its sign bit decides, as in the twin.
+__device__ inline double hand_of(const Rows& m) {
+    const double first = __dmul_rn(m.a.x, minor_of(m.b.y, m.b.z, m.c.y, m.c.z));
+    const double second = __dmul_rn(m.a.y, minor_of(m.b.x, m.b.z, m.c.x, m.c.z));
+    const double third = __dmul_rn(m.a.z, minor_of(m.b.x, m.b.y, m.c.x, m.c.y));
+    return copysign(1.0, __dadd_rn(__dsub_rn(first, second), third));
+}
+
+// v over its length, +Z when v is zero. A power of two brings the largest component to [1, 2) first, without rounding.
+__device__ inline float3 unit(const double3& v) {
+    const double largest = fmax(fmax(fabs(v.x), fabs(v.y)), fabs(v.z));
+    if (!(largest > 0.0)) {
+        return make_float3(0.0f, 0.0f, 1.0f);
+    }
+    const int exponent = (__double2hiint(largest) >> 20) & 0x7ff;
+    const double scale = __hiloint2double((2046 - exponent) << 20, 0);
+    const float x = (float)(v.x * scale), y = (float)(v.y * scale), z = (float)(v.z * scale);
+    const float inverse = 1.0f / sqrtf(fmaf(x, x, fmaf(y, y, z * z)));
+    return make_float3(x * inverse, y * inverse, z * inverse);
+}
+
+__device__ inline float3 turn(const Rows& m, const double3& v) {
+    return unit(make_double3(dot(m.a, v), dot(m.b, v), dot(m.c, v)));
+}
+
+#ifdef SHEAR
+__device__ inline double3 cross(const double3& v, const double3& w, double hand) {
+    return make_double3(hand * minor_of(v.y, v.z, w.y, w.z), hand * minor_of(v.z, v.x, w.z, w.x),
+                        hand * minor_of(v.x, v.y, w.x, w.y));
+}
+
+// The inverse transpose is the cofactor matrix over the determinant; only its sign survives normalising.
+__device__ inline float3 turn_normal(const Rows& m, const double3& normal) {
+    const double hand = hand_of(m);
+    return turn({cross(m.b, m.c, hand), cross(m.c, m.a, hand), cross(m.a, m.b, hand)}, normal);
+}
+#else
+__device__ inline float3 turn_normal(const Rows& m, const double3& normal) {
+    return turn(m, normal);
+}
+#endif

@@ -1,0 +1,336 @@
+//! Smoothing groups of a mesh, and the triangles around each: what normals of a deformed surface are gathered from.
+//!
+//! Corners of one vertex whose rest normals agree within 0.1 degrees form a group: a seam of texture coordinates splits
+//! corners but not groups, a hard edge splits both. The triangles that a group's corners belong to are kept as a ring:
+//! the group's own vertex first, then the vertices around it. Two neighbours in a ring are, in this order, the other
+//! two vertices of one triangle, unless the second of them carries [`RING_START`]. A closed fan of k triangles takes
+//! k + 2 entries instead of the 2 k of a list of pairs, and each vertex is read once where it would be read twice.
+//!
+//! Memory: 4 bytes per corner, 20 per group (its ring's begin, own vertex and geometric normal), and 4 (k + 1) per group
+//! of k triangles that form one fan; at the most 24 per triangle, when no two of a group share an edge.
+
+use nalgebra::Vector3;
+
+use super::Mesh;
+
+/// Marks the first vertex of each fan of a ring.
+pub const RING_START: u32 = 1 << 31;
+
+/// The most triangles of all shapes together whose rings an index of 32 bits can address.
+pub const MAX_RING_TRIANGLES: usize = 1 << 28;
+
+/// Rest normals of a group differ by at most this: the length of the chord of 0.1 degrees.
+const SAME_NORMAL: f64 = 1.745_329e-3;
+
+/// A group whose area vectors cancel to less than this part of their lengths has no geometric normal: a leaf whose two
+/// sides share corners, for example.
+const CANCELLED: f64 = 1.0 / 1024.0;
+
+/// The groups of one mesh.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Smoothing {
+    members: Vec<u32>,
+    begins: Vec<u32>,
+    rings: Vec<u32>,
+    normals: Vec<[f32; 3]>,
+}
+
+/// The two other vertices of a triangle around some vertex, in its winding.
+type Pair = (u32, u32);
+
+impl Smoothing {
+    /// The groups of a mesh with at most [`MAX_RING_TRIANGLES`] triangles. O(c log c) for c corners.
+    pub(super) fn of(mesh: &Mesh) -> Self {
+        let members = number(&leaders(mesh));
+        let groups = members.iter().max().map_or(0, |last| *last as usize + 1);
+        let mut own = vec![0; groups];
+        for (group, vertex) in members.iter().zip(&mesh.corners().vertices) {
+            own[*group as usize] = *vertex;
+        }
+        let (firsts, mut pairs) = pairs_of_groups(mesh, &members, groups);
+        let mut smoothing = Self { members, begins: vec![0], rings: Vec::new(), normals: Vec::with_capacity(groups) };
+        let mut chain = Chain::default();
+        for (group, own) in own.into_iter().enumerate() {
+            let around = &mut pairs[firsts[group]..firsts[group + 1]];
+            smoothing.normals.push(geometric_normal(mesh, own, around));
+            smoothing.rings.push(own);
+            chain.add(around, &mut smoothing.rings);
+            smoothing.begins.push(smoothing.rings.len() as u32);
+        }
+        smoothing
+    }
+
+    /// The number of groups.
+    pub fn groups(&self) -> usize {
+        self.normals.len()
+    }
+
+    /// The group of each corner. Groups are numbered in the order of their first corners.
+    pub fn members(&self) -> &[u32] {
+        &self.members
+    }
+
+    /// Where each group's ring begins in [`Self::rings`], and one more: where the last ends.
+    pub fn begins(&self) -> &[u32] {
+        &self.begins
+    }
+
+    /// All rings, one behind the other.
+    pub fn rings(&self) -> &[u32] {
+        &self.rings
+    }
+
+    /// The ring of one group: its vertex, then fans of vertices around it.
+    pub fn ring(&self, group: usize) -> &[u32] {
+        &self.rings[self.begins[group] as usize..self.begins[group + 1] as usize]
+    }
+
+    /// Per group: the unit normal at rest that its triangles have by their windings, weighted by area; zeros where
+    /// they have none (no triangle, no area, or areas that cancel).
+    pub fn normals(&self) -> &[[f32; 3]] {
+        &self.normals
+    }
+
+    /// Host bytes of all lists.
+    pub fn bytes(&self) -> u64 {
+        (4 * (self.members.len() + self.begins.len() + self.rings.len()) + 12 * self.normals.len()) as u64
+    }
+}
+
+/// For each corner the corner that stands for its group.
+fn leaders(mesh: &Mesh) -> Vec<u32> {
+    let corners = mesh.corners();
+    let vertex = |corner: u32| corners.vertices[corner as usize];
+    let normal = |corner: u32| corners.normals[corner as usize];
+    let by_normal = |a: u32, b: u32| {
+        let axes = normal(a).into_iter().zip(normal(b)).map(|(a, b)| a.total_cmp(&b));
+        axes.fold(std::cmp::Ordering::Equal, std::cmp::Ordering::then)
+    };
+    let mut order: Vec<u32> = (0..corners.vertices.len() as u32).collect();
+    // In this order the groups do not depend on the order of corners in a file.
+    order.sort_unstable_by(|a, b| vertex(*a).cmp(&vertex(*b)).then(by_normal(*a, *b)).then(a.cmp(b)));
+    let mut leader_of = vec![0; order.len()];
+    let mut leaders: Vec<u32> = Vec::new();
+    for corner in order {
+        if leaders.last().is_some_and(|leader| vertex(*leader) != vertex(corner)) {
+            leaders.clear();
+        }
+        // Leaders ascend in x, so only those of a narrow band need a look, however many corners a vertex has.
+        let mut band =
+            leaders.iter().rev().take_while(|leader| apart(normal(corner), normal(**leader), 1) <= SAME_NORMAL);
+        let found = band.find(|leader| apart(normal(corner), normal(**leader), 3) <= SAME_NORMAL).copied();
+        leader_of[corner as usize] = found.unwrap_or_else(|| {
+            leaders.push(corner);
+            corner
+        });
+    }
+    leader_of
+}
+
+/// The distance of two points in their first axes.
+fn apart(a: [f32; 3], b: [f32; 3], axes: usize) -> f64 {
+    (0..axes).map(|axis| (f64::from(a[axis]) - f64::from(b[axis])).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Leaders to group numbers, in the order of the groups' first corners.
+fn number(leader_of: &[u32]) -> Vec<u32> {
+    const NEW: u32 = u32::MAX;
+    let mut numbers = vec![NEW; leader_of.len()];
+    let mut count = 0;
+    let group = |leader: &u32| {
+        let number = &mut numbers[*leader as usize];
+        if *number == NEW {
+            *number = count;
+            count += 1;
+        }
+        *number
+    };
+    leader_of.iter().map(group).collect()
+}
+
+/// The pairs around each group, and where each group's begin. A triangle that names a vertex twice has no area whatever
+/// the positions and is left out.
+fn pairs_of_groups(mesh: &Mesh, members: &[u32], groups: usize) -> (Vec<usize>, Vec<Pair>) {
+    let spokes = || {
+        mesh.triangles().iter().flat_map(|triangle| {
+            let [a, b, c] = triangle.map(|corner| mesh.corners().vertices[corner as usize]);
+            let whole = a != b && b != c && c != a;
+            let around = triangle.map(|corner| members[corner as usize] as usize).into_iter();
+            around.zip([(b, c), (c, a), (a, b)]).filter(move |_| whole)
+        })
+    };
+    let mut firsts = vec![0; groups + 1];
+    spokes().for_each(|(group, _)| firsts[group + 1] += 1);
+    for group in 0..groups {
+        firsts[group + 1] += firsts[group];
+    }
+    let mut next = firsts.clone();
+    let mut pairs = vec![(0, 0); firsts[groups]];
+    for (group, pair) in spokes() {
+        pairs[next[group]] = pair;
+        next[group] += 1;
+    }
+    (firsts, pairs)
+}
+
+fn geometric_normal(mesh: &Mesh, own: u32, pairs: &[Pair]) -> [f32; 3] {
+    let at = |vertex: u32| Vector3::from(mesh.rest()[vertex as usize]).cast::<f64>();
+    let (mut sum, mut lengths) = (Vector3::zeros(), 0.0);
+    for (from, to) in pairs {
+        let area = (at(*from) - at(own)).cross(&(at(*to) - at(own)));
+        sum += area;
+        lengths += area.norm();
+    }
+    let resolved = sum.norm() > CANCELLED * lengths;
+    sum.try_normalize(0.0).filter(|_| resolved).map_or([0.0; 3], |unit| unit.cast::<f32>().into())
+}
+
+/// Puts pairs behind each other where one ends as the next begins. Keeps its memory from group to group.
+#[derive(Default)]
+struct Chain {
+    /// At the first pair of each beginning: how many pairs with it are in a ring already.
+    taken: Vec<usize>,
+    ends: Vec<u32>,
+}
+
+impl Chain {
+    /// Appends the fans of a group: first those with a free border, from it, then the closed ones, each in the order of
+    /// vertex indices. O(k log k) for k pairs.
+    fn add(&mut self, pairs: &mut [Pair], ring: &mut Vec<u32>) {
+        pairs.sort_unstable();
+        self.taken.clear();
+        self.taken.resize(pairs.len(), 0);
+        self.ends.clear();
+        self.ends.extend(pairs.iter().map(|(_, to)| *to));
+        self.ends.sort_unstable();
+        for bordered in [true, false] {
+            for (from, _) in pairs.iter() {
+                if self.ends.binary_search(from).is_err() == bordered {
+                    self.follow(pairs, *from, ring);
+                }
+            }
+        }
+    }
+
+    fn follow(&mut self, pairs: &[Pair], from: u32, ring: &mut Vec<u32>) {
+        let Some(mut at) = self.take(pairs, from) else { return };
+        ring.extend([from | RING_START, at]);
+        while let Some(next) = self.take(pairs, at) {
+            ring.push(next);
+            at = next;
+        }
+    }
+
+    /// The end of a pair that begins so and was not taken yet.
+    fn take(&mut self, pairs: &[Pair], from: u32) -> Option<u32> {
+        let first = pairs.partition_point(|pair| pair.0 < from);
+        let taken = self.taken.get_mut(first)?;
+        let (_, to) = pairs.get(first + *taken).filter(|pair| pair.0 == from)?;
+        *taken += 1;
+        Some(*to)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Corners;
+    use super::*;
+
+    /// The pairs that a ring stands for, sorted.
+    fn unrolled(ring: &[u32]) -> Vec<Pair> {
+        let steps = ring[1..].windows(2).filter(|step| step[1] & RING_START == 0);
+        let mut pairs: Vec<Pair> = steps.map(|step| (step[0] & !RING_START, step[1])).collect();
+        pairs.sort_unstable();
+        pairs
+    }
+
+    /// A mesh of given corners (vertex, normal) and triangles over scattered positions.
+    fn mesh(corners: &[(u32, [f32; 3])], triangles: Vec<[u32; 3]>) -> Mesh {
+        let rest = (0..60_u32).map(|at| [at as f32, (at * at % 17) as f32, (at * 5 % 7) as f32]).collect();
+        let (vertices, normals) = corners.iter().copied().unzip();
+        Mesh::new(rest, Corners { vertices, normals, uvs: vec![] }, triangles).expect("a mesh")
+    }
+
+    const UP: [f32; 3] = [0.0, 0.0, 1.0];
+    const SIDE: [f32; 3] = [1.0, 0.0, 0.0];
+
+    #[test]
+    fn corners_group_by_vertex_and_rest_normal_whatever_their_order() {
+        let degrees = |angle: f32| [angle.to_radians().sin(), 0.0, angle.to_radians().cos()];
+        let corners = [(3, SIDE), (5, UP), (3, degrees(0.09)), (3, UP), (3, degrees(0.3)), (5, UP), (4, UP)];
+        let groups = Smoothing::of(&mesh(&corners, vec![[0, 1, 6]]));
+        assert_eq!(groups.members(), [0, 1, 2, 2, 3, 1, 4]);
+        let mut turned = corners;
+        turned.reverse();
+        assert_eq!(Smoothing::of(&mesh(&turned, vec![[0, 1, 6]])).members(), [0, 1, 2, 3, 3, 1, 4]);
+    }
+
+    #[test]
+    fn rings_hold_each_triangle_of_each_group_once_in_its_winding() {
+        let mut number = 1_u32;
+        let mut random = |below: u32| {
+            number = number.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (number >> 8) % below
+        };
+        for _ in 0..50 {
+            let corners: Vec<_> = (0..20).map(|_| (random(9), [UP, SIDE][random(2) as usize])).collect();
+            let triangles: Vec<[u32; 3]> = (0..40).map(|_| [0; 3].map(|_| random(20))).collect();
+            let mesh = mesh(&corners, triangles.clone());
+            let smoothing = Smoothing::of(&mesh);
+            let vertex = |corner: u32| corners[corner as usize].0;
+            for group in 0..smoothing.groups() {
+                let mut want = Vec::new();
+                for (at, triangle) in triangles.iter().flat_map(|triangle| (0..3).map(move |at| (at, triangle))) {
+                    let [a, b, c] = [0, 1, 2].map(|step| vertex(triangle[(at + step) % 3]));
+                    if smoothing.members()[triangle[at] as usize] as usize == group && a != b && b != c && c != a {
+                        assert_eq!(a, smoothing.ring(group)[0]);
+                        want.push((b, c));
+                    }
+                }
+                want.sort_unstable();
+                assert_eq!(unrolled(smoothing.ring(group)), want);
+            }
+        }
+    }
+
+    #[test]
+    fn a_closed_fan_of_six_takes_eight_entries_an_open_one_of_four_six_and_no_triangle_one() {
+        let corners: Vec<_> = (0..8).map(|vertex| (vertex, UP)).collect();
+        let closed = (1..=6).map(|at| [0, at, at % 6 + 1]).collect();
+        let smoothing = Smoothing::of(&mesh(&corners, closed));
+        assert_eq!(smoothing.ring(0), [0, 1 | RING_START, 2, 3, 4, 5, 6, 1]);
+        assert_eq!(smoothing.ring(7), [7]);
+        assert_eq!(smoothing.normals()[7], [0.0; 3]);
+        let open = [3, 2, 5, 4].map(|at| [0, at, at + 1]).into();
+        let smoothing = Smoothing::of(&mesh(&corners, open));
+        assert_eq!(smoothing.ring(0), [0, 2 | RING_START, 3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn the_geometric_normal_is_that_of_the_winding_and_none_where_two_sides_cancel() {
+        let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2.0, 0.0, 0.0]];
+        let of = |triangles: Vec<[u32; 3]>| {
+            let mesh = Mesh::indexed(rest.clone(), vec![UP; 4], vec![], triangles).expect("a mesh");
+            Smoothing::of(&mesh).normals()[0]
+        };
+        assert_eq!(of(vec![[0, 1, 2]]), UP);
+        assert_eq!(of(vec![[0, 2, 1]]), [0.0, 0.0, -1.0], "against the rest normal");
+        assert_eq!(of(vec![[0, 1, 2], [2, 1, 0]]), [0.0; 3], "both sides");
+        assert_eq!(of(vec![[0, 1, 3]]), [0.0; 3], "no area");
+        assert_eq!(of(vec![[0, 1, 1]]), [0.0; 3], "a vertex twice");
+    }
+
+    #[test]
+    fn memory_is_what_the_lists_have_and_a_crowd_at_one_vertex_is_quick() {
+        let turn = |at: u32| {
+            let (height, angle) = (at as f32 / 50_000.0 - 1.0, at as f32);
+            let radius = (1.0 - height * height).sqrt();
+            [radius * angle.cos(), radius * angle.sin(), height]
+        };
+        let corners: Vec<_> = (0..100_000).map(|at| (0, turn(at))).collect();
+        let smoothing = Smoothing::of(&mesh(&corners, vec![[0, 1, 2]; 100_000]));
+        assert!(smoothing.groups() > 50_000, "{} groups", smoothing.groups());
+        let groups = smoothing.groups() as u64;
+        assert_eq!(smoothing.bytes(), 4 * 100_000 + 20 * groups + 4, "a triangle that names a vertex thrice adds none");
+    }
+}

@@ -1,0 +1,103 @@
+//! Launches `kernels/apply.cu`: new transforms and coordinates of the domains that changed, straight from pinned memory.
+
+use cudarc::driver::{CudaFunction, LaunchConfig, PinnedHostSlice, PushKernelArg as _, sys};
+
+use super::deform::config;
+use super::device::Device;
+use super::inputs::{Packing, Values};
+use super::layout::{ApplyArgs, Change};
+use super::plan::Kernel;
+use crate::error::{Result, during};
+use crate::scene::State;
+
+/// A list pays while it has at most this part of the domains; else the whole state is copied.
+const MOST: usize = 4;
+
+/// The kernel, and the list that it reads over the bus: `[changes][transforms][q]`.
+#[derive(Debug)]
+pub(super) struct Apply {
+    function: CudaFunction,
+    config: LaunchConfig,
+    pinned: PinnedHostSlice<u32>,
+    most: usize,
+    coordinates: usize,
+}
+
+/// Words of a [`Change`] and of a transform.
+const CHANGE: usize = size_of::<Change>() / 4;
+const TRANSFORM: usize = 12;
+
+/// The longest list for so many domains.
+pub(super) const fn most_changes(domains: usize) -> usize {
+    domains / MOST
+}
+
+impl Apply {
+    pub(super) fn new(device: &Device, packing: &Packing, kernel: &Kernel) -> Result<Self> {
+        let most = most_changes(packing.scene.domains.len());
+        let coordinates = packing.coordinates.total;
+        let words = (CHANGE + TRANSFORM) * most + coordinates;
+        // SAFETY: the kernel reads only what `write` wrote.
+        let pinned = unsafe {
+            let flags = sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP;
+            device.context().alloc_pinned_with_flags(words.max(4), flags)
+        };
+        let pinned = pinned.map_err(during("allocate"))?;
+        let function = device.function(kernel.name, kernel.source, &kernel.defines)?;
+        Ok(Self { function, config: config(kernel), pinned, most, coordinates })
+    }
+
+    /// Writes the list; the caller has waited for the last launch. Returns whether it fits.
+    pub(super) fn write(&mut self, packing: &Packing, state: &State, changed: &[u32]) -> Result<bool> {
+        if changed.len() > self.most {
+            return Ok(false);
+        }
+        let words = self.pinned.as_mut_slice().map_err(during("upload"))?;
+        let (changes, rest) = words.split_at_mut(CHANGE * self.most);
+        let (transforms, q) = rest.split_at_mut(TRANSFORM * self.most);
+        let mut source = 0;
+        for (index, domain) in changed.iter().enumerate() {
+            let (at, first) = (*domain as usize, source);
+            let transform: [u32; TRANSFORM] = bytemuck::cast(state.transforms[at].0);
+            transforms[TRANSFORM * index..][..TRANSFORM].copy_from_slice(&transform);
+            let own = state.q_of(&packing.scene, at);
+            if source + own.len().next_multiple_of(4) > self.coordinates {
+                // Domains that share coordinates may name them more often than there is room.
+                return Ok(false);
+            }
+            packing.put_q(at, own, |number| {
+                q[source] = number.to_bits();
+                source += 1;
+            });
+            let change = Change {
+                domain: *domain,
+                first_q: packing.coordinates.first[at],
+                count: (source - first) as u32,
+                source: first as u32,
+            };
+            changes[CHANGE * index..][..CHANGE].copy_from_slice(bytemuck::cast_slice(&[change]));
+        }
+        Ok(true)
+    }
+
+    /// Starts the kernel; the header among the values says how long the list is.
+    pub(super) fn launch(&mut self, device: &Device, values: Values) -> Result<()> {
+        let fail = during("apply");
+        let list = self.pinned.as_mut_ptr().map_err(&fail)? as u64;
+        let new_transforms = list + 4 * (CHANGE * self.most) as u64;
+        let args = ApplyArgs {
+            header: values.header,
+            changes: list,
+            new_transforms,
+            new_q: new_transforms + 4 * (TRANSFORM * self.most) as u64,
+            transforms: values.transforms,
+            q: values.q,
+            stamps: values.stamps,
+        };
+        let mut launch = device.stream().launch_builder(&self.function);
+        // SAFETY: `ApplyArgs` is the kernel's only argument. Pinned memory has one address on host and device (unified
+        // addressing), and the list names domains and coordinates of the scene that the buffers were made for.
+        unsafe { launch.arg(&args).launch(self.config) }.map_err(fail)?;
+        Ok(())
+    }
+}

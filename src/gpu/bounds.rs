@@ -1,0 +1,84 @@
+//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`.
+
+use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg as _};
+
+use super::deform::config;
+use super::device::Device;
+use super::inputs::Values;
+use super::layout::BoundsArgs;
+use super::plan::Kernel;
+use crate::error::{Result, during};
+
+/// The kernel.
+#[derive(Debug)]
+pub(super) struct Bounds {
+    pub(super) function: CudaFunction,
+    config: LaunchConfig,
+}
+
+impl Bounds {
+    pub(super) fn new(device: &Device, kernel: &Kernel) -> Result<Self> {
+        Ok(Self { function: device.function(kernel.name, kernel.source, &kernel.defines)?, config: config(kernel) })
+    }
+
+    /// Starts the kernel on `count` boxes; the result goes into the header among the values.
+    pub(super) fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
+        let args = BoundsArgs { header: values.header, boxes, count, reserved: 0 };
+        let mut launch = device.stream().launch_builder(&self.function);
+        // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
+        // allocated them.
+        unsafe { launch.arg(&args).launch(self.config) }.map_err(during("bounds"))?;
+        Ok(())
+    }
+}
+
+/// The bounds that the six keys stand for.
+pub(super) fn bounds_of(keys: &[u32]) -> crate::scene::Bounds {
+    let mut bounds = crate::scene::Bounds::EMPTY;
+    for axis in 0..3 {
+        bounds.min[axis] = -f64::from(number_of(keys[axis]));
+        bounds.max[axis] = f64::from(number_of(keys[3 + axis]));
+    }
+    bounds
+}
+
+/// The inverse of `ordered` in `kernels/ordered.cuh`. Zero, which no number has, gives a NaN like the NaN's own key.
+fn number_of(key: u32) -> f32 {
+    f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `ordered` of the kernel, word by word.
+    fn ordered(x: f32) -> u32 {
+        match x {
+            x if x.is_nan() => u32::MAX,
+            x if x.is_sign_negative() => !x.to_bits(),
+            x => x.to_bits() | 0x8000_0000,
+        }
+    }
+
+    #[test]
+    fn keys_keep_the_order_of_numbers_and_a_nan_or_nothing_is_not_finite() {
+        let rising = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
+        for pair in rising.windows(2) {
+            assert!(ordered(pair[0]) < ordered(pair[1]), "{pair:?}");
+            assert!(ordered(pair[0]) > 0);
+        }
+        for number in rising {
+            assert_eq!(number_of(ordered(number)).to_bits(), number.to_bits());
+        }
+        assert!(number_of(ordered(f32::NAN)).is_nan());
+        assert!(number_of(0).is_nan());
+        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(ordered);
+        assert_eq!(bounds_of(&good), crate::scene::Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut keys = good;
+            keys[4] = ordered(bad);
+            assert!(!bounds_of(&keys).is_finite());
+        }
+        assert!(!bounds_of(&[0; 6]).is_finite());
+    }
+}

@@ -1,0 +1,240 @@
+//! The deformer's own kernels as a trial: the same launchers and tables, on values that lie on the device already.
+
+use std::sync::Arc;
+
+use cudarc::driver::CudaSlice;
+use serde::Serialize;
+
+use super::apply::Apply;
+use super::bounds::Bounds;
+use super::deform::Deform;
+use super::device::Device;
+use super::inputs::{Inputs, Values};
+use super::layout::Header;
+use super::memory::{address, download, room};
+use super::orient::Orient;
+use super::plan::{Plan, Role, plan};
+use super::trial::{KernelFacts, Trial};
+use super::turns::Turns;
+use crate::error::{Result, during, invalid};
+use crate::scene::{Scene, State};
+
+/// Which part of a step is launched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Extent {
+    /// u = U q alone. For the judge, x = T (x0 + u) follows on the host, in f64.
+    Uq,
+    /// Positions, and a box of each warp's.
+    Positions,
+    /// Positions, the bounds of all, normals, and tangents where the scene has normal maps.
+    Whole,
+}
+
+impl Extent {
+    const fn suffix(self) -> &'static str {
+        match self {
+            Self::Uq => "_uq",
+            Self::Positions => "_positions",
+            Self::Whole => "",
+        }
+    }
+}
+
+/// The deformer `cuda` over a scene, for several steps.
+#[derive(Debug)]
+pub struct Ours {
+    name: String,
+    extent: Extent,
+    scene: Arc<Scene>,
+    deform: Deform,
+    bounds: Bounds,
+    orient: Orient,
+    inputs: Vec<Inputs>,
+    outputs: CudaSlice<u8>,
+    turns: Turns,
+    plan: Plan,
+    /// Vertices, domains and coordinates that are computed.
+    counts: Counts,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Counts {
+    vertices: u64,
+    domains: u64,
+    coordinates: u64,
+    words: u64,
+    rest: u64,
+}
+
+impl Ours {
+    /// Packs the scene and the values of each state onto the device.
+    ///
+    /// # Errors
+    /// `Invalid` when there is no state; `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
+    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], extent: Extent) -> Result<Self> {
+        Self::of_changed(device, scene, states, (extent, None))
+    }
+
+    /// The same, with all domains but these passed over as unchanged. What the others show is then undefined.
+    ///
+    /// # Errors
+    /// As [`Self::new`], and `Invalid` when the list is longer than a list of changes may be.
+    pub fn of_changed(
+        device: &Device,
+        scene: &Arc<Scene>,
+        states: &[State],
+        (extent, changed): (Extent, Option<&[u32]>),
+    ) -> Result<Self> {
+        let plan = plan(scene);
+        let [mut deform, bounds, orient, apply] = [0, 1, 2, 3].map(|index| plan.kernels[index].clone());
+        if extent == Extent::Uq {
+            deform.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
+        }
+        let deform = Deform::new(device, scene, &deform)?;
+        let outputs = room(device, outputs_of(&plan).iter().sum())?;
+        let mut ours = Self {
+            name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
+            extent,
+            scene: Arc::clone(scene),
+            bounds: Bounds::new(device, &bounds)?,
+            orient: Orient::new(device, scene, &orient)?,
+            inputs: Vec::new(),
+            outputs,
+            turns: Turns::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
+            counts: counts(scene, &plan, changed),
+            deform,
+            plan,
+        };
+        let mut apply = Apply::new(device, ours.deform.packing(), &apply)?;
+        for state in states {
+            let header = Header { everything: 1, step: 1, ..ours.header(device) };
+            let mut inputs = Inputs::new(device, ours.deform.packing())?;
+            send(device, &mut inputs, &header, state)?;
+            if let Some(changed) = changed {
+                let header = Header { since: 1, step: 2, changed: changed.len() as u32, ..header };
+                if !apply.write(ours.deform.packing(), state, changed)? {
+                    return Err(invalid("changed", "a quarter of the domains at most", changed.len()));
+                }
+                send(device, &mut inputs, &header, state)?;
+                apply.launch(device, inputs.values(device))?;
+                device.stream().synchronize().map_err(during("upload"))?;
+            }
+            ours.inputs.push(inputs);
+        }
+        Ok(ours)
+    }
+
+    fn header(&self, device: &Device) -> Header {
+        let [positions, normals, tangents] = outputs_of(&self.plan);
+        let begin = address(device, &self.outputs);
+        debug_assert!(positions + normals + tangents > 0);
+        Header {
+            positions: begin,
+            normals: begin + positions,
+            tangents: begin + positions + normals,
+            displacements: begin,
+            ..Header::default()
+        }
+    }
+
+    fn values(&self, device: &Device, turn: usize) -> Values {
+        self.inputs[turn % self.inputs.len()].values(device)
+    }
+}
+
+fn send(device: &Device, inputs: &mut Inputs, header: &Header, state: &State) -> Result<()> {
+    inputs.write(header, state)?;
+    inputs.send(device, None)?;
+    device.stream().synchronize().map_err(during("upload"))
+}
+
+/// Bytes of positions, normals and tangents, each filled up so that the next begins where a float4 may.
+fn outputs_of(plan: &Plan) -> [u64; 3] {
+    [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role).next_multiple_of(16))
+}
+
+fn counts(scene: &Scene, plan: &Plan, changed: Option<&[u32]>) -> Counts {
+    let slots = &scene.layout.slots;
+    match changed {
+        None => Counts {
+            vertices: scene.layout.vertices as u64,
+            domains: slots.len() as u64,
+            coordinates: scene.layout.coordinates as u64,
+            words: plan.bytes(Role::Words),
+            rest: plan.bytes(Role::Rest),
+        },
+        Some(list) => {
+            let chosen = || list.iter().map(|domain| slots[*domain as usize]);
+            let share = |slot: crate::scene::Slot| (slot.vertices * slot.rank) as u64;
+            let all: u64 = slots.iter().map(|slot| share(*slot)).sum();
+            let own: u64 = chosen().map(share).sum();
+            let vertices: u64 = chosen().map(|slot| slot.vertices as u64).sum();
+            Counts {
+                vertices,
+                domains: list.len() as u64,
+                coordinates: chosen().map(|slot| slot.rank as u64).sum(),
+                words: plan.bytes(Role::Words) * own / all.max(1),
+                rest: 12 * vertices,
+            }
+        }
+    }
+}
+
+impl Trial for Ours {
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn turns(&self) -> usize {
+        self.inputs.len()
+    }
+
+    fn launch(&self, device: &Device, turn: usize) -> Result<()> {
+        let values = self.values(device, turn);
+        self.turns.start(device, turn);
+        self.deform.launch(device, values)?;
+        if self.extent == Extent::Whole {
+            self.bounds.launch(device, values, self.deform.boxes(device))?;
+            self.orient.launch(device, values)?;
+        }
+        Ok(())
+    }
+
+    fn positions(&self, device: &Device) -> Result<Vec<f32>> {
+        let mut numbers = vec![0.0_f32; (self.plan.bytes(Role::Positions) / 4) as usize];
+        // SAFETY: the outputs begin with three floats per vertex.
+        unsafe { download(device, address(device, &self.outputs), &mut numbers) }?;
+        if self.extent != Extent::Uq {
+            return Ok(numbers);
+        }
+        Ok(self.turns.finish_on_host(|domain, vertex| {
+            let at = 3 * (self.scene.layout.slots[domain].first_vertex + vertex);
+            [numbers[at], numbers[at + 1], numbers[at + 2]]
+        }))
+    }
+
+    fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let Counts { vertices, domains, coordinates, words, rest } = self.counts;
+        let mut bytes = vec![("U", words), ("scales", self.plan.bytes(Role::Scales)), ("q", 4 * coordinates)];
+        bytes.push(("u or x", 12 * vertices));
+        if self.extent != Extent::Uq {
+            bytes.extend([("x0", rest), ("T", 48 * domains)]);
+        }
+        if self.extent == Extent::Whole {
+            let roles = [Role::RestNormals, Role::Normals, Role::RestTangents, Role::Tangents];
+            bytes.push(("normals and tangents", roles.iter().map(|role| self.plan.bytes(*role)).sum()));
+        }
+        bytes
+    }
+
+    fn launches(&self) -> usize {
+        if self.extent == Extent::Whole { 3 } else { 1 }
+    }
+
+    fn kernels(&self) -> Vec<KernelFacts> {
+        let functions = [("deform", &self.deform.function), ("bounds", &self.bounds.function)];
+        let functions = functions.into_iter().chain([("orient", &self.orient.function)]);
+        functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
+    }
+}

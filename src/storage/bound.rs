@@ -1,0 +1,212 @@
+//! How far a deformer's x may be off, before it has computed anything: one number per source of error.
+//!
+//! The sum of a vertex is a chain of fused multiply-adds from +0 over its modes in ascending order, then `+ x0`, then
+//! three fused multiply-adds per row of T, all in f32. With u = 2^-24 and gamma_k = k u / (1 - k u) a chain of k
+//! roundings is off by at most gamma_k times the sum of the magnitudes of its terms (Higham, Accuracy and Stability of
+//! Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding that underflows. A
+//! compensated sum is off by u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot Product, 2005,
+//! proposition 5.5), plus 5 k 2^-149.
+//!
+//! A bound is a length: that of the error of a vertex's position, in scene units. It holds for sums without overflow, and
+//! is infinite where q times a factor overflows f32.
+
+use super::Tiles;
+use crate::domain::{Shape, Transform};
+use crate::scene::Storage;
+
+/// A little more than what the few thousand f64 operations of a bound can lose.
+const ROUND_UP: f64 = 1.0 + 1e-12;
+/// Half a unit in the last place of f32, relative.
+const UNIT: f64 = 1.0 / (1 << 24) as f64;
+/// Half of the smallest f32.
+const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
+const SQRT_3: f64 = 1.732_050_807_568_878;
+
+/// The largest error of a vertex of one tile or domain by source, in scene units.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
+pub struct Bound {
+    /// Entries of U as they are stored: of r modes `sum_j |q_j| step_j / 2` per axis.
+    pub storage: f64,
+    /// q times the factor or scale of a mode, rounded to f32.
+    pub coordinates: f64,
+    /// The sum over the modes.
+    pub accumulation: f64,
+    /// `x0 + u`.
+    pub rest: f64,
+    /// Multiplying with A and adding the translation.
+    pub transform: f64,
+}
+
+impl Bound {
+    /// All sources together.
+    pub fn total(&self) -> f64 {
+        (self.storage + self.coordinates + self.accumulation + self.rest + self.transform) * ROUND_UP
+    }
+
+    /// Source by source the larger one.
+    pub fn max(self, other: Self) -> Self {
+        Self {
+            storage: self.storage.max(other.storage),
+            coordinates: self.coordinates.max(other.coordinates),
+            accumulation: self.accumulation.max(other.accumulation),
+            rest: self.rest.max(other.rest),
+            transform: self.transform.max(other.transform),
+        }
+    }
+}
+
+/// What a bound depends on besides the shape.
+#[derive(Debug, Clone, Copy)]
+pub struct Step<'a> {
+    /// Coordinates of the domain; zero where a mode is left out.
+    pub q: &'a [f32],
+    pub transform: Transform,
+    pub compensated: bool,
+}
+
+/// A mode of a tile.
+#[derive(Debug, Clone, Copy, Default)]
+struct Reach {
+    /// The longest of its vertices' rows, as stored.
+    length: f64,
+    /// An entry is off by at most this.
+    half_step: f64,
+    /// Its stored entries times this are its decoded ones.
+    factor: f32,
+}
+
+/// What bounds need to know of one shape in one storage type.
+#[derive(Debug, Clone)]
+pub struct Reaches {
+    rank: usize,
+    /// `[tile][mode]`.
+    modes: Vec<Reach>,
+    /// The longest x0 per tile.
+    rest: Vec<f64>,
+}
+
+impl Reaches {
+    /// Looks at every entry of `shape`, which `tiles` were made of.
+    pub fn new(shape: &Shape, tiles: &Tiles) -> Self {
+        let mut reaches = Self { rank: tiles.rank(), modes: Vec::new(), rest: Vec::new() };
+        for tile in 0..tiles.count() {
+            let place = tiles.tile(tile);
+            let vertices = || place.first_vertex..place.first_vertex + place.vertices;
+            let rest = vertices().map(|vertex| length(shape.mesh.rest()[vertex].map(f64::from)));
+            reaches.rest.push(rest.fold(0.0, f64::max) * ROUND_UP);
+            for mode in 0..tiles.rank() {
+                let row = |vertex| [0, 1, 2].map(|axis| tiles.decoded(vertex, axis, mode));
+                let longest = vertices().map(|vertex| length(row(vertex))).fold(0.0, f64::max);
+                let entries = &shape.modes.column(mode)[3 * place.first_vertex..][..3 * place.vertices];
+                let largest = entries.iter().fold(0.0, |largest: f32, entry| largest.max(entry.abs()));
+                reaches.modes.push(Reach {
+                    length: longest * ROUND_UP,
+                    half_step: half_step(tiles, tile, mode, largest),
+                    factor: factor(tiles, tile, mode),
+                });
+            }
+        }
+        reaches
+    }
+
+    /// Bounds of the vertices of tile `tile`.
+    pub fn tile(&self, tile: usize, step: &Step) -> Bound {
+        let modes = &self.modes[self.rank * tile..][..self.rank];
+        let (mut storage, mut lost, mut moved, mut terms) = (0.0, 0.0, 0.0, 0.0);
+        for (reach, q) in modes.iter().zip(step.q).filter(|(reach, q)| **q != 0.0 && reach.length > 0.0) {
+            let amount = f64::from(q.abs());
+            // The product of two f32 is exact in f64, so what its rounding loses is known.
+            let (exact, rounded) = (amount * f64::from(reach.factor), f64::from(q.abs() * reach.factor));
+            storage += amount * reach.half_step;
+            lost += stored_length(reach) * (exact - rounded).abs();
+            moved += stored_length(reach) * rounded;
+            terms += 1.0;
+        }
+        self.finish(tile, step, [SQRT_3 * storage, lost, moved, terms])
+    }
+
+    /// Bounds of all vertices.
+    pub fn domain(&self, step: &Step) -> Bound {
+        (0..self.rest.len()).map(|tile| self.tile(tile, step)).fold(Bound::default(), Bound::max)
+    }
+
+    fn finish(&self, tile: usize, step: &Step, parts: [f64; 4]) -> Bound {
+        let [storage, lost, moved, terms] = parts.map(|part| part * ROUND_UP);
+        let accumulation = match step.compensated {
+            false => gamma(terms) * moved + 2.0 * SQRT_3 * terms * UNDERFLOW,
+            true => UNIT * moved + gamma(terms).powi(2) * moved + 10.0 * SQRT_3 * terms * UNDERFLOW,
+        };
+        let bent = self.rest[tile] + moved + accumulation;
+        let rest = if terms > 0.0 { UNIT * bent } else { 0.0 };
+        let stretch = norm(&step.transform);
+        let entries = step.transform.linear().norm() * ROUND_UP;
+        let offset = step.transform.translation().norm() * ROUND_UP;
+        let transform = gamma(3.0) * (entries * (bent + rest) + offset) + 6.0 * SQRT_3 * UNDERFLOW;
+        let [storage, coordinates, accumulation, rest] =
+            [storage, lost, accumulation, rest].map(|part| part * stretch * ROUND_UP);
+        Bound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP }
+    }
+}
+
+/// At least `||A||_2`, by at most 1e-7 of itself too large. The root of the largest eigenvalue of A^T A, by the
+/// trigonometric formula for 3x3 matrices (Smith, Eigenvalues of a symmetric 3x3 matrix, 1961).
+pub fn norm(transform: &Transform) -> f64 {
+    let linear = transform.linear();
+    let largest = linear.abs().max();
+    if largest == 0.0 {
+        return 0.0;
+    }
+    // Of entries of at most 1, so that no square leaves f64.
+    let linear = linear / largest;
+    let gram = linear.transpose() * linear;
+    let mean = gram.trace() / 3.0;
+    let off = gram - nalgebra::Matrix3::identity() * mean;
+    let spread = (off.norm_squared() / 6.0).sqrt();
+    let eigenvalue = if spread > 0.0 {
+        let angle = ((off / spread).determinant() / 2.0).clamp(-1.0, 1.0).acos() / 3.0;
+        mean + 2.0 * spread * angle.cos()
+    } else {
+        mean
+    };
+    eigenvalue.sqrt() * largest * (1.0 + 5e-8)
+}
+
+/// gamma_k of f32.
+fn gamma(roundings: f64) -> f64 {
+    roundings * UNIT / (1.0 - roundings * UNIT)
+}
+
+fn length(vector: [f64; 3]) -> f64 {
+    vector.iter().map(|number| number * number).sum::<f64>().sqrt()
+}
+
+/// The longest row in units of the factor; 0 for a mode of zeros.
+fn stored_length(reach: &Reach) -> f64 {
+    if reach.factor > 0.0 { reach.length / f64::from(reach.factor) } else { 0.0 }
+}
+
+fn factor(tiles: &Tiles, tile: usize, mode: usize) -> f32 {
+    match tiles.storage() {
+        Storage::F32 => 1.0,
+        Storage::F16 | Storage::Bf16 => tiles.factors()[mode],
+        Storage::Int8 => tiles.scales()[tiles.tile(tile).first_scale + mode],
+    }
+}
+
+/// The most that rounding to the storage type moves an entry of a tile whose largest one is `largest`.
+fn half_step(tiles: &Tiles, tile: usize, mode: usize, largest: f32) -> f64 {
+    let factor = f64::from(factor(tiles, tile, mode));
+    // Half the distance of neighbours: 2^-11 of the power of two below f16, 2^-8 below bf16; both have a smallest one.
+    let below = f64::exp2(f64::from(super::pack::exponent(largest)));
+    match tiles.storage() {
+        _ if largest == 0.0 => 0.0,
+        Storage::F32 => 0.0,
+        Storage::F16 => (below * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
+        // A whole smallest step: an f32 lies between, so a value there may be rounded twice.
+        Storage::Bf16 => (below * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
+        Storage::Int8 => factor / 2.0 * ROUND_UP,
+    }
+}
+
+#[cfg(test)]
+mod tests;

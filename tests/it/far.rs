@@ -1,0 +1,164 @@
+//! Transforms in their three formats over the wire, and domains ten thousand kilometres away: vertices to the millimetre.
+
+use modalcast::config::{BackendChoice, Config};
+use modalcast::scene::Scene;
+use modalcast_proto::v1;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use v1::TransformFormat::{AffineF32, RigidF32, RigidF64, Unspecified};
+
+use crate::service_harness::{
+    Got, Server, config, expected, far_strips, get_vertices, rigid_step, state_after, step, strips,
+};
+
+/// One domain's place: quaternion x y z w, translation.
+type Place = ([f32; 4], [f64; 3]);
+
+fn ask(scene: &str, domains: &[u32]) -> v1::GetVerticesRequest {
+    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), positions_only: false });
+    v1::GetVerticesRequest { scene: scene.into(), selection, ..v1::GetVerticesRequest::default() }
+}
+
+fn turn(roll: f64, pitch: f64, yaw: f64) -> [f32; 4] {
+    let turn = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
+    [turn.i, turn.j, turn.k, turn.w].map(|number| number as f32)
+}
+
+/// World positions in metres by plain f64: unit (R (x0 + U q) + t) with t as sent.
+fn truth(scene: &Scene, domain: usize, q: &[f32], (rotation, translation): Place) -> Vec<Vector3<f64>> {
+    let [x, y, z, w] = rotation.map(f64::from);
+    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+    let shape = scene.shape_of(domain);
+    let one = |(vertex, rest): (usize, &[f32; 3])| {
+        let bent = Vector3::from_fn(|axis, _| {
+            let modes = q.iter().enumerate();
+            let moved: f64 = modes.map(|(mode, q)| f64::from(shape.modes.at(vertex, axis, mode)) * f64::from(*q)).sum();
+            f64::from(rest[axis]) + moved
+        });
+        scene.unit * (turn * bent + Vector3::from(translation))
+    };
+    shape.mesh.rest().iter().enumerate().map(one).collect()
+}
+
+/// World positions in metres as the reply says.
+fn told(scene: &Scene, got: &Got) -> Vec<Vector3<f64>> {
+    let mut points = got.positions.chunks_exact(3);
+    let mut world = Vec::new();
+    for (place, vertices) in got.head.vertices.iter().enumerate() {
+        let origin = if got.origins.is_empty() { &got.head.origin } else { &got.origins[3 * place..][..3] };
+        let origin = Vector3::from_column_slice(origin);
+        for point in points.by_ref().take(*vertices as usize) {
+            world.push(origin + scene.unit * Vector3::from_column_slice(point).cast::<f64>());
+        }
+    }
+    world
+}
+
+fn largest(got: &[Vector3<f64>], want: &[Vector3<f64>]) -> f64 {
+    assert_eq!(got.len(), want.len());
+    got.iter().zip(want).map(|(got, want)| (got - want).norm()).fold(0.0, f64::max)
+}
+
+async fn cpu() -> Server {
+    Server::with(|config| Config { backend: BackendChoice::Cpu, ..config }).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_three_formats_say_the_same_and_any_offset_of_their_bytes_will_do() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let place = (turn(0.3, -0.8, 2.0), [1.5, -2.25, 1e3]);
+    let matrix = state_after(&strips(), &[rigid_step(0, RigidF32, &[(1, place.0, place.1)])]).transforms[1];
+    let affine = |format: v1::TransformFormat| v1::Step {
+        transform_domains: vec![1],
+        transforms: bytemuck::cast_slice::<f32, u8>(&matrix.0).to_vec().into(),
+        transform_format: format.into(),
+        ..step(0, &[], &[])
+    };
+    let steps = [
+        affine(Unspecified),
+        affine(AffineF32),
+        rigid_step(0, RigidF32, &[(1, place.0, place.1)]),
+        rigid_step(0, RigidF64, &[(1, place.0, place.1)]),
+    ];
+    let want = expected(&strips(), &steps[..1]);
+    for (number, mut step) in steps.into_iter().enumerate() {
+        step.number = number as u64;
+        // A field of odd length before the bytes moves them to another alignment in the message.
+        step.q_domains = vec![0; usize::from(number % 2 == 1)];
+        step.q = vec![0; 8 * step.q_domains.len()].into();
+        driver.acked(step).await;
+        let got = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
+        assert_eq!((&got.positions, &got.normals), (&want.0, &want.1), "step {number}");
+        assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0));
+    }
+    // The control: another rotation gives other vertices.
+    let other = rigid_step(9, RigidF32, &[(1, turn(0.3, -0.8, 2.1), place.1)]);
+    assert_ne!(expected(&strips(), &[other]).0, want.0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_far_scene_and_a_domain_far_from_it_keep_the_millimetre() {
+    let server = cpu().await;
+    let scene = far_strips();
+    server.open("far").await;
+    let mut driver = server.drive("far", v1::Policy::Lossless, 0).await;
+    let q = [0.25, -0.5, 0.125, 0.75_f32];
+    driver.acked(step(0, &[], &q)).await;
+    // In half metres from the world's origin: the one by the scene's origin, the other 10,000 km east of it.
+    let home = scene.origin.map(|metres| metres / scene.unit);
+    let near = (turn(0.1, 0.2, 0.3), [home[0] + 3.001, home[1] - 2.003, home[2] + 0.007]);
+    let away = (turn(-1.0, 0.5, 0.9), [home[0] + 2e7 + 1.234, home[1] + 0.001, home[2] - 700.021]);
+    driver.acked(rigid_step(1, RigidF64, &[(0, near.0, near.1), (1, away.0, away.1)])).await;
+    let got = get_vertices(&server, ask("far", &[])).await.expect("vertices");
+    assert_eq!((got.head.origin.as_slice(), got.head.origin_bytes), (scene.origin.as_slice(), 48));
+    assert_eq!(got.origins[..3], scene.origin);
+    let want = [truth(&scene, 0, &q[..2], near), truth(&scene, 1, &q[2..], away)].concat();
+    let error = largest(&told(&scene, &got), &want);
+    assert!(error <= 1e-3, "{error} m");
+    // The control: rounded to f32 against the scene's origin, the far one is off by more.
+    let rounded = away.1[0] - home[0] - f64::from((away.1[0] - home[0]) as f32);
+    assert!(scene.unit * rounded.abs() > 1e-2, "{rounded}");
+    // Each alone, in any order, and without normals.
+    let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true });
+    let swapped = get_vertices(&server, v1::GetVerticesRequest { selection, ..ask("far", &[]) }).await.expect("both");
+    let want = [truth(&scene, 1, &q[2..], away), truth(&scene, 0, &q[..2], near)].concat();
+    assert!(swapped.normals.is_empty() && largest(&told(&scene, &swapped), &want) <= 1e-3);
+    let alone = get_vertices(&server, ask("far", &[0])).await.expect("the near one");
+    assert_eq!(alone.head.origin_bytes, 0);
+    assert!(largest(&told(&scene, &alone), &truth(&scene, 0, &q[..2], near)) <= 1e-3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_goes_far_takes_its_origin_along_and_keeps_it_over_a_restart() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let settings = || Config { backend: BackendChoice::Cpu, ..config(folder.path()) };
+    let server = Server::start(settings()).await;
+    let scene = strips();
+    server.open("strips").await;
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let places =
+        [(turn(0.0, 0.4, 0.0), [1e7 + 0.004, 5.006, -1e7 - 0.002]), (turn(1.0, 0.0, 0.0), [1e7 + 9.5, 0.0, -1e7])];
+    let both = |number| rigid_step(number, RigidF64, &[0, 1].map(|at| (at as u32, places[at].0, places[at].1)));
+    driver.acked(both(4)).await;
+    let got = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
+    assert_eq!(
+        (got.head.origin.as_slice(), got.head.origin_bytes),
+        ([9766.0 * 1024.0, 0.0, -9766.0 * 1024.0].as_slice(), 0)
+    );
+    let want = [truth(&scene, 0, &[], places[0]), truth(&scene, 1, &[], places[1])].concat();
+    let error = largest(&told(&scene, &got), &want);
+    assert!(error <= 1e-3, "{error} m");
+    driver.finish().await;
+    server.stop().await.expect("a clean stop");
+    let server = Server::start(settings()).await;
+    let kept = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
+    assert_eq!((kept.step().number, &kept.positions, &kept.head.origin), (4, &got.positions, &got.head.origin));
+    // What comes next in f64 is added to what was kept.
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let moved = (places[1].0, [1e7 + 11.5, 0.001, -1e7]);
+    driver.acked(rigid_step(0, RigidF64, &[(1, moved.0, moved.1)])).await;
+    let got = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
+    let want = [truth(&scene, 0, &[], places[0]), truth(&scene, 1, &[], moved)].concat();
+    assert!(got.origins.is_empty() && largest(&told(&scene, &got), &want) <= 1e-3);
+}

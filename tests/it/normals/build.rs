@@ -1,0 +1,174 @@
+//! Meshes whose deformed normals are known by algebra, and scenes of them.
+
+use std::sync::Arc;
+
+use modalcast::cpu::CpuDeformer;
+use modalcast::deform::{Deformer, Surface};
+use modalcast::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals};
+use modalcast::scene::{Normals, Parts, Scene, State};
+use nalgebra::{Matrix3, Vector3};
+
+pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
+
+/// A shape with one mode: its displacement at each rest position.
+pub(crate) fn with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
+    let column: Vec<f32> = mesh.rest().iter().flat_map(|rest| displacement(*rest)).collect();
+    let modes = Modes::from_columns(column.len(), 1, column).expect("modes");
+    Shape::new(mesh, modes).expect("a shape")
+}
+
+/// A flat grid over -1..1 x -1..1 at z = 0, facing up, u along x.
+pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
+    let at = |index: u32, count: u32| 2.0 * index as f32 / (count - 1) as f32 - 1.0;
+    let places = (0..rows).flat_map(|row| (0..columns).map(move |column| (at(column, columns), at(row, rows))));
+    let rest: Vec<_> = places.clone().map(|(x, y)| [x, y, 0.0]).collect();
+    let uvs = places.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
+    let normals = vec![UP; rest.len()];
+    Mesh::indexed(rest, normals, uvs, quads(columns, rows)).expect("a sheet")
+}
+
+/// Two triangles per cell of a grid, all cut alike.
+pub(crate) fn quads(columns: u32, rows: u32) -> Vec<[u32; 3]> {
+    let cells = (0..rows - 1).flat_map(|row| (0..columns - 1).map(move |column| row * columns + column));
+    cells.flat_map(|at| [[at, at + 1, at + columns + 1], [at, at + columns + 1, at + columns]]).collect()
+}
+
+/// A tube about y whose first and last corners lie on one line of vertices, as a seam of texture coordinates has it.
+/// The normals of the last line are turned by `tilt` degrees.
+pub(crate) fn tube(around: u32, rows: u32, tilt: f32) -> Mesh {
+    let turn = |column: u32| column as f32 / around as f32 * std::f32::consts::TAU;
+    let rest = (0..rows).flat_map(|row| (0..around).map(move |at| [turn(at).cos(), row as f32, -turn(at).sin()]));
+    let mut corners = Corners::default();
+    for (row, column) in (0..rows).flat_map(|row| (0..=around).map(move |column| (row, column))) {
+        let angle = turn(column % around) + if column == around { tilt.to_radians() } else { 0.0 };
+        corners.vertices.push(row * around + column % around);
+        corners.normals.push([angle.cos(), 0.0, -angle.sin()]);
+        corners.uvs.push([column as f32 / around as f32, 1.0 - row as f32]);
+    }
+    Mesh::new(rest.collect(), corners, quads(around + 1, rows)).expect("a tube")
+}
+
+/// A unit cube of 8 vertices and 24 corners: every edge is hard.
+pub(crate) fn cube() -> Mesh {
+    let rest = (0..8_u8).map(|at| [0, 1, 2].map(|axis| f32::from(at >> axis & 1))).collect();
+    let (mut corners, mut triangles) = (Corners::default(), Vec::new());
+    for (axis, side) in (0..3_usize).flat_map(|axis| [(axis, 0_u32), (axis, 1)]) {
+        let (next, last) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
+        let first = corners.vertices.len() as u32;
+        corners.vertices.extend([0, next, next | last, last].map(|at| at | side << axis));
+        let mut normal = [0.0; 3];
+        normal[axis] = if side == 1 { 1.0 } else { -1.0 };
+        corners.normals.extend([normal; 4]);
+        let cut = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
+        triangles.extend(cut.map(|triangle| triangle.map(|corner| first + corner)));
+    }
+    Mesh::new(rest, corners, triangles).expect("a cube")
+}
+
+/// A sphere of 8 x 4^level triangles with its area-weighted normals.
+pub(crate) fn sphere(level: u32) -> Mesh {
+    let mut triangles: Vec<[Vector3<f64>; 3]> = octants();
+    for _ in 0..level {
+        let split = |[a, b, c]: [Vector3<f64>; 3]| {
+            let [ab, bc, ca] = [a + b, b + c, c + a].map(|middle| middle.normalize());
+            [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        };
+        triangles = triangles.into_iter().flat_map(split).collect();
+    }
+    let mut rest: Vec<[f32; 3]> = Vec::new();
+    let mut number = |place: Vector3<f64>| {
+        let place: [f32; 3] = place.cast::<f32>().into();
+        let near = |other: &[f32; 3]| (0..3).all(|axis| (other[axis] - place[axis]).abs() < 1e-5);
+        rest.iter().position(near).unwrap_or_else(|| {
+            rest.push(place);
+            rest.len() - 1
+        }) as u32
+    };
+    let triangles: Vec<_> = triangles.into_iter().map(|triangle| triangle.map(&mut number)).collect();
+    let vertices: Vec<u32> = (0..rest.len() as u32).collect();
+    let normals = smooth_normals(&rest, &vertices, &triangles);
+    Mesh::indexed(rest, normals, vec![], triangles).expect("a sphere")
+}
+
+fn octants() -> Vec<[Vector3<f64>; 3]> {
+    let signs = (0..8).map(|bits| [0, 1, 2].map(|axis| if bits >> axis & 1 == 1 { -1.0 } else { 1.0 }));
+    let triangle = |[x, y, z]: [f64; 3]| {
+        let [a, b, c] = [Vector3::x() * x, Vector3::y() * y, Vector3::z() * z];
+        if x * y * z > 0.0 { [a, b, c] } else { [a, c, b] }
+    };
+    signs.map(triangle).collect()
+}
+
+/// A scene of shapes with exact normals; those with uvs have a normal map.
+pub(crate) fn scene(shapes: Vec<Shape>) -> Arc<Scene> {
+    scene_with(shapes, Normals::Exact)
+}
+
+pub(crate) fn scene_with(shapes: Vec<Shape>, normals: Normals) -> Arc<Scene> {
+    let mut parts = Parts::named("bent");
+    parts.deformation.normals = normals;
+    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
+    parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
+    parts.domains = (0..shapes.len()).map(domain).collect();
+    parts.shapes = shapes;
+    Scene::new(parts).expect("a scene")
+}
+
+fn domain(shape: usize) -> Domain {
+    Domain {
+        name: format!("shape {shape}"),
+        shape,
+        material: 0,
+        placement: Transform::IDENTITY,
+        attachment: None,
+        runs: vec![],
+        rest_q: vec![],
+        shares_q_with: None,
+        metadata: Metadata::default(),
+    }
+}
+
+/// The state with every coordinate at q and every transform the given linear part and translation.
+pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> State {
+    let mut state = State::rest(scene);
+    state.q.fill(q);
+    state.transforms.fill(Transform::from_parts(&linear, &translation.into()));
+    state
+}
+
+/// At rest but for q.
+pub(crate) fn bent(scene: &Scene, q: f32) -> State {
+    state(scene, q, Matrix3::identity(), [0.0; 3])
+}
+
+/// What the cpu deformer makes of a state.
+pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &State) -> Surface {
+    let mut cpu = CpuDeformer::new(scene);
+    cpu.deform(state).expect("deforms");
+    cpu.surface().expect("a surface").clone()
+}
+
+/// The exact normals and tangents of the reference.
+pub(crate) fn exact(scene: &Scene, state: &State) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
+    let positions = modalcast::reference::deform(scene, state);
+    let tangents = modalcast::reference::exact_tangents(scene, state, &positions);
+    (modalcast::reference::exact_normals(scene, state, &positions), tangents)
+}
+
+/// The angle between two directions in degrees, NaN when one is.
+pub(crate) fn degrees(a: [f64; 3], b: [f64; 3]) -> f64 {
+    let (a, b) = (Vector3::from(a), Vector3::from(b));
+    a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
+}
+
+/// The largest angle between f32 triples and directions, infinite when one is NaN or not of unit length.
+pub(crate) fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
+    assert_eq!(got.len(), 3 * want.len(), "as many directions");
+    let angle = |(got, want): (&[f32], &[f64; 3])| {
+        let got: [f64; 3] = [0, 1, 2].map(|axis| f64::from(got[axis]));
+        let is_unit = (Vector3::from(got).norm() - 1.0).abs() < 1e-6;
+        let angle = degrees(got, *want);
+        if is_unit && !angle.is_nan() { angle } else { f64::INFINITY }
+    };
+    got.chunks_exact(3).zip(want).map(angle).fold(0.0, f64::max)
+}
