@@ -4,14 +4,15 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::loads::Load;
+use super::loads::{Load, restated};
+use super::trials;
 use super::variant::{Driven, Label, Variant};
 use crate::cpu::CpuDeformer;
-use crate::deform::Backend;
+use crate::deform::{Backend, Deformer};
 use crate::error::{Error, Result};
-use crate::gpu::{CudaDeformer, Device};
+use crate::gpu::{self, CudaDeformer, Device};
 use crate::reference::ReferenceDeformer;
-use crate::scene::Scene;
+use crate::scene::{Deformation, Normals, Scene};
 
 /// Rates measured in the same run, in 10^9 bytes a second; `None` where nothing measured them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -20,6 +21,11 @@ pub struct Roofs {
     pub copy_gbs: Option<f64>,
     /// The best pure read.
     pub read_gbs: Option<f64>,
+    /// A graph that does nothing, microseconds.
+    pub empty_us: Option<f64>,
+    /// Copies from page-locked host memory and back.
+    pub pinned_h2d_gbs: Option<f64>,
+    pub pinned_d2h_gbs: Option<f64>,
 }
 
 /// A variant, or why it could not be made.
@@ -41,6 +47,9 @@ pub trait Bench {
     }
 }
 
+/// A deformer, or why it could not be made.
+type Made = Result<Box<dyn Deformer>>;
+
 /// Entries of U and x0 above which the reference is left out: its single thread would take minutes.
 const MOST_OF_REFERENCE: usize = 1 << 23;
 
@@ -48,42 +57,69 @@ const MOST_OF_REFERENCE: usize = 1 << 23;
 #[derive(Debug)]
 pub struct Machine {
     device: Result<Arc<Device>>,
+    cuda: Roofs,
 }
 
 impl Machine {
-    /// Looks for a CUDA device and a compiler that fits it.
+    /// Looks for a CUDA device and a compiler that fits it, and measures what the device's memory can do.
     pub fn open() -> Self {
-        let usable = |device: Arc<Device>| device.check_compiler().map(|()| device);
-        Self { device: Device::open(0).and_then(usable) }
+        let usable = |device: Arc<Device>| {
+            device.check_compiler()?;
+            let gpu::Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs } = gpu::roofs(&device)?;
+            let [copy_gbs, read_gbs, empty_us] = [copy_gbs, read_gbs, empty_us].map(Some);
+            let [pinned_h2d_gbs, pinned_d2h_gbs] = [pinned_h2d_gbs, pinned_d2h_gbs].map(Some);
+            Ok((device, Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs }))
+        };
+        match Device::open(0).and_then(usable) {
+            Ok((device, cuda)) => Self { device: Ok(device), cuda },
+            Err(error) => Self { device: Err(error), cuda: Roofs::default() },
+        }
     }
 }
 
 impl Bench for Machine {
     fn variants(&self, load: &Load) -> Vec<Offer> {
         let scene = &load.scene;
-        let cpu = Label::new("cpu f32", Backend::Cpu, scene);
-        let mut offers = vec![offer(cpu, |label| Ok(Driven::new(label, scene, CpuDeformer::new(scene))))];
+        let driven = |name: &str, backend: Backend, deformation: Deformation, make: &dyn Fn(&Arc<Scene>) -> Made| {
+            let label = Label { name: name.into(), backend, deformation };
+            offer(label, |label| {
+                let scene =
+                    if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
+                Ok(Driven::new(label, &scene, make(&scene)?))
+            })
+        };
+        let cpu = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CpuDeformer::new(scene))) };
+        let reference = |scene: &Arc<Scene>| -> Made { Ok(Box::new(ReferenceDeformer::new(scene))) };
+        let plain = scene.deformation;
+        let mut offers = vec![driven("cpu f32", Backend::Cpu, plain, &cpu)];
+        let exact = Deformation { normals: Normals::Exact, ..plain };
+        let bends = scene.needs.modes && trials::has_normals(scene) && plain.normals != Normals::Exact;
+        if bends {
+            offers.push(driven("cpu f32 exact normals", Backend::Cpu, exact, &cpu));
+        }
         if entries(scene) <= MOST_OF_REFERENCE {
-            let reference = Label::new("reference f64", Backend::Reference, scene);
-            offers.push(offer(reference, |label| Ok(Driven::new(label, scene, ReferenceDeformer::new(scene)))));
+            offers.push(driven("reference f64", Backend::Reference, plain, &reference));
         }
         if let Ok(device) = &self.device {
-            offers.extend(cuda(device, scene));
+            // A whole step as the server makes it: q and T to the device, kernels, bounds back.
+            let cuda = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CudaDeformer::new(device, scene, None)?)) };
+            offers.push(driven("cuda f32 step", Backend::Cuda, plain, &cuda));
+            if bends {
+                offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
+            }
+            offers.extend(trials::trials(device, scene));
         }
         offers
+    }
+
+    fn roofs(&self, backend: Backend) -> Roofs {
+        if backend == Backend::Cuda { self.cuda } else { Roofs::default() }
     }
 
     fn remarks(&self) -> Vec<String> {
         let missing = |error: &Error| format!("no CUDA variants: {error}");
         self.device.as_ref().err().map(missing).into_iter().collect()
     }
-}
-
-/// The CUDA variants of a scene.
-fn cuda(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
-    // A whole step as the server makes it: q and T to the device, kernels, bounds back.
-    let step = Label::new("cuda f32 step", Backend::Cuda, scene);
-    vec![offer(step, |label| Ok(Driven::new(label, scene, CudaDeformer::new(device, scene, None)?)))]
 }
 
 /// Makes a variant, or keeps why it could not be made.
@@ -105,7 +141,10 @@ mod tests {
         let machine = Machine::open();
         let load = Kind::C.build(Size::Quick).expect("built");
         let names: Vec<String> = machine.variants(&load).into_iter().map(|(label, _)| label.name).collect();
-        assert!(names.starts_with(&["cpu f32".into(), "reference f64".into()]), "{names:?}");
+        assert!(
+            names.starts_with(&["cpu f32", "cpu f32 exact normals", "reference f64"].map(String::from)),
+            "{names:?}"
+        );
         assert_eq!(machine.remarks().is_empty(), names.iter().any(|name| name.starts_with("cuda")));
         let remarks = machine.remarks();
         assert!(remarks.iter().all(|remark| remark.starts_with("no CUDA variants: ")), "{remarks:?}");

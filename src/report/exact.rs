@@ -8,49 +8,11 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::double::Double;
+use super::ingredients::Ingredients;
 use super::motion::Truth;
 use crate::domain::Modes;
-use crate::scene::Scene;
-
-/// What a deformer replaces in x = T (x0 + U q) before it computes, and how far off that may be.
-///
-/// The defaults replace nothing. Who replaces something says so in [`Self::is_exact`] too.
-pub trait Ingredients: Sync {
-    /// Whether nothing is replaced, so that all such deformers share their bounds.
-    fn is_exact(&self) -> bool {
-        true
-    }
-
-    /// U of a shape as it is stored, decoded; `None` when it is stored exactly.
-    fn decoded(&self, _shape: usize) -> Option<&Modes> {
-        None
-    }
-
-    /// How far the decoded entries of `mode` may lie from U at a vertex of a shape. Asked for only where
-    /// [`Self::decoded`] gives something.
-    fn entry_bound(&self, _shape: usize, _vertex: usize, _mode: usize) -> f64 {
-        0.0
-    }
-
-    /// Which modes of a domain are left out at these coordinates, appended to `left_out` in ascending order.
-    fn left_out(&self, _domain: usize, _truth: &Truth, _left_out: &mut Vec<usize>) {}
-
-    /// How far leaving out modes may move a vertex, in scene units.
-    fn truncation_bound(&self) -> f64 {
-        0.0
-    }
-
-    /// Roundings of a sum beyond one per mode, of x0 and of a decoding scale.
-    fn extra_roundings(&self) -> usize {
-        0
-    }
-}
-
-/// Nothing is replaced: U in f32 as it is, all modes.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Exact;
-
-impl Ingredients for Exact {}
+use crate::scene::{Scene, State};
+use crate::storage::Tiles;
 
 /// A vertex as it should be, and what f32 may make of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,59 +25,61 @@ pub struct Judged {
     pub condition: f64,
 }
 
+/// Roundings of a sum in f32 beyond one per mode: of x0, and of products and sums of their own in other orders.
+const EXTRA: usize = 3;
 /// Vertices per tile.
 const TILE: usize = 512;
 /// Above this quotient sum |U q| / |u| a sum in f64 is repeated in double-double.
 const CANCELS: f64 = 1e6;
 /// Unit roundoff of f32.
 const ROUND: f64 = 1.0 / (1 << 24) as f64;
-/// No result below the normal numbers of f32 errs by more in one operation, a scale of up to 256 included.
-const TINY: f64 = 7e-46 * 256.0;
+/// No result below the normal numbers of f32 errs by more in one operation: half the smallest f32.
+const TINY: f64 = 7.1e-46;
 
-/// Positions with all ingredients as given; `decode` and `truncate` say which of the deformer's replacements to take.
-pub fn positions(
-    scene: &Scene,
-    truth: &Truth,
-    ingredients: &dyn Ingredients,
-    decode: bool,
-    truncate: bool,
-) -> Vec<[f64; 3]> {
+/// Which of a deformer's replacements to take.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Take<'a> {
+    /// U as it is stored.
+    pub storage: Option<&'a Ingredients>,
+    /// No more modes than are kept.
+    pub truncation: Option<&'a Ingredients>,
+}
+
+/// Exact positions of a truth, but for what is taken from a deformer.
+pub fn positions(scene: &Scene, truth: &Truth, take: Take<'_>) -> Vec<[f64; 3]> {
     each_tile(scene, |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
-        let own = ingredients.decoded(shape).filter(|_| decode);
-        let sums = sum(
-            vertices.clone(),
-            &Terms {
-                modes: own.unwrap_or(&scene.shapes[shape].modes),
-                q: &kept(scene, domain, truth, truncate.then_some(ingredients)),
-            },
-        );
+        let mut q = own(scene, domain, truth).to_vec();
+        if let Some(ingredients) = take.truncation {
+            ingredients.truncate(domain, &mut q);
+        }
+        let stored = take.storage.and_then(|ingredients| ingredients.tiles(shape));
+        let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
+        let sums = sum(vertices.clone(), entries, &q);
         let rest = &scene.shapes[shape].mesh.rest()[vertices];
-        let bent =
-            rest.iter().zip(&sums).map(|(rest, sum)| std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]));
-        out.extend(bent.map(|bent| placed(&truth.transforms[domain], bent)));
+        for (rest, sum) in rest.iter().zip(&sums) {
+            let bent = std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]);
+            out.push(placed(&truth.transforms[domain], bent));
+        }
     })
 }
 
-/// Exact positions with the bounds of a deformer that has these ingredients. `truth` is what it was given, exactly.
-pub fn judge(scene: &Scene, truth: &Truth, ingredients: &dyn Ingredients) -> Vec<Judged> {
+/// Exact positions at a state, with the bounds of a deformer that has these ingredients.
+pub fn judge(scene: &Scene, state: &State, ingredients: &Ingredients) -> Vec<Judged> {
+    let truth = Truth::of(state);
     each_tile(scene, |domain, vertices, out| {
-        let shape = scene.domains[domain].shape;
-        let q = kept(scene, domain, truth, None);
-        let sums = sum(vertices.clone(), &Terms { modes: &scene.shapes[shape].modes, q: &q });
-        let transform = &truth.transforms[domain];
-        let stored = ingredients.decoded(shape).is_some();
-        for (vertex, sum) in vertices.zip(&sums) {
-            let rest = scene.shapes[shape].mesh.rest()[vertex].map(f64::from);
-            let storage = match stored {
-                true => {
-                    q.iter().enumerate().map(|(mode, q)| q.abs() * ingredients.entry_bound(shape, vertex, mode)).sum()
-                }
-                false => 0.0,
-            };
+        let shape = &scene.shapes[scene.domains[domain].shape];
+        let q = own(scene, domain, &truth);
+        let sums = sum(vertices.clone(), Entries::Exact(&shape.modes), q);
+        let (transform, roundings) = (&truth.transforms[domain], q.len() + EXTRA);
+        let rest = shape.mesh.rest()[vertices.clone()].iter().map(|rest| rest.map(f64::from));
+        let mut bounds: Vec<f64> =
+            rest.clone().zip(&sums).map(|(rest, sum)| bound(transform, &rest, sum, roundings)).collect();
+        if !ingredients.is_exact() {
+            ingredients.bounds(domain, state).widen(vertices.start, &mut bounds);
+        }
+        for ((rest, sum), bound) in rest.zip(&sums).zip(bounds) {
             let at = placed(transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
-            let roundings = q.len() + 3 + ingredients.extra_roundings();
-            let bound = bound(transform, &rest, sum, storage, roundings) + ingredients.truncation_bound();
             out.push(Judged { at, bound, condition: condition(sum) });
         }
     })
@@ -128,44 +92,61 @@ struct Sum {
     magnitude: [f64; 3],
 }
 
-struct Terms<'a> {
-    modes: &'a Modes,
-    q: &'a [f64],
+/// Where entries of U come from.
+#[derive(Clone, Copy)]
+enum Entries<'a> {
+    Exact(&'a Modes),
+    Stored(&'a Tiles),
 }
 
-/// Coordinates of a domain, zero for modes that a deformer leaves out.
-fn kept(scene: &Scene, domain: usize, truth: &Truth, truncating: Option<&dyn Ingredients>) -> Vec<f64> {
-    let slot = scene.layout.slots[domain];
-    let mut q = truth.q[slot.first_q..][..slot.rank].to_vec();
-    if let Some(ingredients) = truncating {
-        let mut left_out = Vec::new();
-        ingredients.left_out(domain, truth, &mut left_out);
-        left_out.into_iter().for_each(|mode| q[mode] = 0.0);
-    }
-    q
-}
-
-fn sum(vertices: Range<usize>, terms: &Terms<'_>) -> Vec<Sum> {
-    let count = 3 * vertices.len();
-    let (mut u, mut magnitude) = (vec![0.0; count], vec![0.0; count]);
-    for (mode, q) in terms.q.iter().enumerate() {
-        let column = &terms.modes.column(mode)[3 * vertices.start..][..count];
-        for ((u, magnitude), entry) in u.iter_mut().zip(&mut magnitude).zip(column) {
-            let term = f64::from(*entry) * q;
-            *u += term;
-            *magnitude += term.abs();
+impl Entries<'_> {
+    fn at(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
+        match self {
+            Self::Exact(modes) => f64::from(modes.at(vertex, axis, mode)),
+            Self::Stored(tiles) => tiles.decoded(vertex, axis, mode),
         }
     }
-    for (row, (u, magnitude)) in u.iter_mut().zip(&magnitude).enumerate() {
+
+    /// Hands each entry of a mode at these vertices to `take`, with its index among them.
+    fn each(&self, vertices: &Range<usize>, mode: usize, mut take: impl FnMut(usize, f64)) {
+        match self {
+            Self::Exact(modes) => {
+                let column = &modes.column(mode)[3 * vertices.start..3 * vertices.end];
+                column.iter().enumerate().for_each(|(at, entry)| take(at, f64::from(*entry)));
+            }
+            Self::Stored(tiles) => {
+                let rows = 3 * vertices.start..3 * vertices.end;
+                rows.enumerate().for_each(|(at, row)| take(at, tiles.decoded(row / 3, row % 3, mode)));
+            }
+        }
+    }
+}
+
+/// Coordinates of a domain.
+fn own<'a>(scene: &Scene, domain: usize, truth: &'a Truth) -> &'a [f64] {
+    let slot = scene.layout.slots[domain];
+    &truth.q[slot.first_q..][..slot.rank]
+}
+
+fn sum(vertices: Range<usize>, entries: Entries<'_>, q: &[f64]) -> Vec<Sum> {
+    let mut rows = vec![(0.0_f64, 0.0_f64); 3 * vertices.len()];
+    for (mode, q) in q.iter().enumerate().filter(|(_, q)| **q != 0.0) {
+        entries.each(&vertices, mode, |row, entry| {
+            let term = entry * q;
+            rows[row].0 += term;
+            rows[row].1 += term.abs();
+        });
+    }
+    for (row, (u, magnitude)) in rows.iter_mut().enumerate() {
         if *magnitude > CANCELS * u.abs() {
             let mut double = Double::default();
             let (vertex, axis) = (vertices.start + row / 3, row % 3);
-            terms.q.iter().enumerate().for_each(|(mode, q)| double.add(terms.modes.at(vertex, axis, mode).into(), *q));
+            q.iter().enumerate().for_each(|(mode, q)| double.add(entries.at(vertex, axis, mode), *q));
             *u = double.value();
         }
     }
-    let (u, magnitude) = (u.as_chunks().0, magnitude.as_chunks().0);
-    u.iter().zip(magnitude).map(|(u, magnitude)| Sum { u: *u, magnitude: *magnitude }).collect()
+    let vertex = |rows: &[(f64, f64); 3]| Sum { u: rows.map(|row| row.0), magnitude: rows.map(|row| row.1) };
+    rows.as_chunks().0.iter().map(vertex).collect()
 }
 
 fn placed(transform: &[f64; 12], bent: [f64; 3]) -> [f64; 3] {
@@ -182,9 +163,9 @@ fn gamma(roundings: usize) -> f64 {
     sum / (1.0 - sum)
 }
 
-fn bound(transform: &[f64; 12], rest: &[f64; 3], sum: &Sum, storage: f64, roundings: usize) -> f64 {
-    let bent: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis] + storage);
-    let off = bent.map(|bent| storage + gamma(roundings) * bent + roundings as f64 * TINY);
+fn bound(transform: &[f64; 12], rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
+    let bent: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis]);
+    let off = bent.map(|bent| gamma(roundings) * bent + roundings as f64 * TINY);
     let row = |row: usize| {
         let entry = |axis: usize| transform[4 * row + axis].abs();
         let carried: f64 = (0..3).map(|axis| entry(axis) * off[axis]).sum();
@@ -234,7 +215,7 @@ mod tests {
         for load in loads() {
             let state = Motion::new(&load, None).seed(0).state();
             let want = crate::reference::deform(&load.scene, &state);
-            let got = positions(&load.scene, &Truth::of(&state), &Exact, true, true);
+            let got = positions(&load.scene, &Truth::of(&state), Take::default());
             let apart = want.as_flattened().iter().zip(got.as_flattened()).map(|(a, b)| (a - b).abs());
             assert_eq!(want.len(), got.len());
             assert!(apart.fold(0.0, f64::max) <= 1e-14 * load.scene.rest_bounds.diagonal(), "{}", load.name);
@@ -251,7 +232,8 @@ mod tests {
                 let state = motion.seed(seed).state();
                 cpu.deform(&state).expect("deforms");
                 let surface = &cpu.surface().expect("a surface").positions;
-                for (got, want) in surface.as_chunks::<3>().0.iter().zip(judge(&load.scene, &Truth::of(&state), &Exact))
+                for (got, want) in
+                    surface.as_chunks::<3>().0.iter().zip(judge(&load.scene, &state, &Ingredients::of(&load.scene)))
                 {
                     let square: f64 = got.iter().zip(want.at).map(|(got, want)| (f64::from(*got) - want).powi(2)).sum();
                     tightest = tightest.max(square.sqrt() / want.bound);
@@ -266,7 +248,7 @@ mod tests {
         let load = Kind::Cancelling.build(Size::Quick).expect("built");
         let motion = Motion::new(&load, None);
         let median = |seed: usize| {
-            let judged = judge(&load.scene, &motion.seed(seed), &Exact);
+            let judged = judge(&load.scene, &motion.seed(seed).state(), &Ingredients::of(&load.scene));
             let mut conditions: Vec<f64> = judged.iter().map(|judged| judged.condition).collect();
             conditions.sort_by(f64::total_cmp);
             conditions[conditions.len() / 2]
@@ -281,7 +263,7 @@ mod tests {
         let columns = vec![1.0, 1.0, 1.0, 2f32.powi(-30), 0.0, 0.0, -1.0, -1.0, -1.0];
         let modes = Modes::from_columns(3, 3, columns).expect("modes");
         // 1e10 + 2^-30 - 1e10: f64 has 53 bits and 2^-30 lies 63 below.
-        let sums = sum(0..1, &Terms { modes: &modes, q: &[1e10, 1.0, 1e10] });
+        let sums = sum(0..1, Entries::Exact(&modes), &[1e10, 1.0, 1e10]);
         assert_eq!(sums[0].u, [2f64.powi(-30), 0.0, 0.0]);
     }
 }

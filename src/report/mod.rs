@@ -4,8 +4,8 @@
 //! is named, and fails the report.
 //!
 //! - [`loads`] and [`motion`]: seeded scenes, coordinates and transforms; [`record`]: recorded ones.
-//! - [`exact`] and `double`: positions in f64 with any ingredient exchanged, and bounds; [`errors`] and [`sources`]
-//!   measure against them.
+//! - [`exact`], [`ingredients`] and `double`: positions in f64 with any ingredient exchanged, and bounds; [`errors`] and
+//!   [`sources`] measure against them.
 //! - [`variant`] and [`bench`]: what is measured. A new variant implements [`variant::Variant`] and is offered by a
 //!   [`bench::Bench`].
 //! - [`table`], [`peers`], [`plot`]: what comes out.
@@ -14,6 +14,7 @@ pub mod bench;
 mod double;
 pub mod errors;
 pub mod exact;
+pub mod ingredients;
 pub mod loads;
 pub mod machine;
 pub mod motion;
@@ -28,6 +29,7 @@ mod testing;
 pub mod thesis;
 pub mod timing;
 pub mod traffic;
+mod trials;
 pub mod validate;
 pub mod variant;
 
@@ -200,8 +202,9 @@ fn measure(request: &Request, bench: &dyn Bench, load: &Load, motion: &Motion) -
                 None
             });
             let (label, traffic) = (variant.label(), variant.traffic());
+            let (launches, kernels) = variant.kernels();
             let row = Row::new(&load.name, label, found, traffic, (cache, timing));
-            rows.push(row.under(bench.roofs(label.backend)));
+            rows.push(Row { launches, kernels, ..row.under(bench.roofs(label.backend)) });
         }
     }
     (condition, rows)
@@ -251,13 +254,13 @@ mod tests {
     impl Bench for Mixed {
         fn variants(&self, load: &Load) -> Vec<Offer> {
             let label = |name: &str| Label::new(name, Backend::Cpu, &load.scene);
-            let cpu = |label: Label| Driven::new(label, &load.scene, CpuDeformer::new(&load.scene));
+            let cpu = |label: Label| Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
             let bad = |label: Label| Ok(Damaged::new(cpu(label), self.damage));
             vec![offer(label("good"), |label| Ok(cpu(label))), offer(label("bad"), bad)]
         }
 
         fn roofs(&self, _backend: Backend) -> Roofs {
-            Roofs { copy_gbs: Some(10.0), read_gbs: Some(12.0) }
+            Roofs { copy_gbs: Some(10.0), read_gbs: Some(12.0), ..Roofs::default() }
         }
     }
 

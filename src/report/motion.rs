@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::loads::Load;
 use super::record::Record;
 use crate::domain::Transform;
-use crate::scene::{Scene, State};
+use crate::scene::{Changed, Scene, State};
 
 /// The largest displacement by the first mode alone, as a share of the diagonal of its domain.
 const SHARE: f64 = 0.05;
@@ -38,7 +38,8 @@ impl Truth {
     pub fn state(&self) -> State {
         let transforms = self.transforms.iter().map(|entries| Transform(entries.map(|entry| entry as f32)));
         let q = self.q.iter().map(|number| *number as f32).collect();
-        State { run: 0, step: 0, time: 0.0, q, transforms: transforms.collect() }
+        let transforms = transforms.collect();
+        State { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
     }
 
     /// A state as a truth of its own.

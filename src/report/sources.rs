@@ -3,7 +3,8 @@
 use serde::Serialize;
 
 use super::errors::{Collect, Spread};
-use super::exact::{Exact, Ingredients, positions};
+use super::exact::{Take, positions};
+use super::ingredients::Ingredients;
 use super::motion::Truth;
 use crate::scene::{Scene, State};
 
@@ -45,7 +46,7 @@ impl Origin {
     pub(super) fn new(scene: &Scene, truth: Truth, state: &State) -> Self {
         let given = Truth::of(state);
         let at = |q: &[f64], transforms: &[[f64; 12]]| {
-            positions(scene, &Truth { q: q.to_vec(), transforms: transforms.to_vec() }, &Exact, false, false)
+            positions(scene, &Truth { q: q.to_vec(), transforms: transforms.to_vec() }, Take::default())
         };
         let exact = at(&truth.q, &truth.transforms);
         let q = apart(&exact, &at(&given.q, &truth.transforms));
@@ -55,21 +56,22 @@ impl Origin {
     }
 
     /// Adds what a variant made of it.
-    pub(super) fn split(&self, scene: &Scene, ingredients: &dyn Ingredients, got: &[f32], split: &mut Split) {
-        let stores = (0..scene.shapes.len()).any(|shape| ingredients.decoded(shape).is_some());
-        let truncates = ingredients.truncation_bound() > 0.0;
-        let alone = |decode: bool, truncate: bool| {
-            // Which modes are left out depends on what the deformer was given; their sizes hardly do.
-            apart(&self.exact, &positions(scene, &self.truth, ingredients, decode, truncate))
+    pub(super) fn split(&self, scene: &Scene, ingredients: &Ingredients, got: &[f32], split: &mut Split) {
+        let storage = Some(ingredients).filter(|ingredients| ingredients.stores());
+        let truncation = Some(ingredients).filter(|ingredients| ingredients.truncates());
+        // Which modes are left out depends on what the deformer was given; their sizes hardly do.
+        let alone = |take: Take<'_>| match take.storage.or(take.truncation) {
+            Some(_) => apart(&self.exact, &positions(scene, &self.truth, take)),
+            None => apart(&self.exact, &self.exact),
         };
-        let same = |list: &[[f64; 3]]| apart(list, list);
-        let storage = if stores { alone(true, false) } else { same(&self.exact) };
-        let truncation = if truncates { alone(false, true) } else { same(&self.exact) };
-        let own = (stores || truncates).then(|| positions(scene, &self.given, ingredients, true, true));
+        let from_storage = alone(Take { storage, truncation: None });
+        let from_truncation = alone(Take { storage: None, truncation });
+        let own = (!ingredients.is_exact()).then(|| positions(scene, &self.given, Take { storage, truncation }));
         let own = own.as_deref().unwrap_or(&self.plain);
         let rounded: Vec<[f64; 3]> = own.iter().map(|at| at.map(|number| f64::from(number as f32))).collect();
         let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.iter().map(|at| at.map(f64::from)).collect();
-        let parts = [storage, self.q, apart(&rounded, &got), self.transform, apart(own, &rounded), truncation];
+        let parts =
+            [from_storage, self.q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
         split.0.iter_mut().zip(parts).for_each(|(sum, part)| *sum = sum.join(part));
     }
 }
@@ -95,77 +97,57 @@ fn apart(one: &[[f64; 3]], other: &[[f64; 3]]) -> Collect {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::Modes;
-    use crate::report::loads::{Kind, Size};
+    use crate::report::loads::{Kind, Load, Size, restated};
     use crate::report::motion::Motion;
+    use crate::scene::{Deformation, Storage};
 
-    /// Stores U with 1/64 added to every entry, and leaves out mode 1.
-    struct Coarse(Modes);
-
-    impl Ingredients for Coarse {
-        fn is_exact(&self) -> bool {
-            false
-        }
-
-        fn decoded(&self, _shape: usize) -> Option<&Modes> {
-            Some(&self.0)
-        }
-
-        fn left_out(&self, _domain: usize, _truth: &Truth, left_out: &mut Vec<usize>) {
-            left_out.push(1);
-        }
-
-        fn truncation_bound(&self) -> f64 {
-            1.0
-        }
+    fn load() -> Load {
+        Kind::Single { power: 8, rank: 2 }.build(Size::Full).expect("built")
     }
 
-    fn split(ingredients: &dyn Ingredients, scene: &Scene, truth: &Truth, got: Option<&[f32]>) -> Sources {
-        let state = truth.state();
-        let origin = Origin::new(scene, truth.clone(), &state);
-        let perfect: Vec<f32> = positions(scene, &Truth::of(&state), ingredients, true, true)
-            .as_flattened()
-            .iter()
-            .map(|number| *number as f32)
-            .collect();
+    fn split(deformation: Deformation, truth: &Truth, got: Option<&[f32]>) -> Sources {
+        let (scene, state) = (restated(&load().scene, deformation).expect("restated"), truth.state());
+        let mut ingredients = Ingredients::of(&scene);
+        ingredients.follow(&state);
+        let all = Take { storage: Some(&ingredients), truncation: Some(&ingredients) };
+        let perfect = positions(&scene, &Truth::of(&state), all);
+        let perfect: Vec<f32> = perfect.as_flattened().iter().map(|number| *number as f32).collect();
         let mut split = Split::default();
-        origin.split(scene, ingredients, got.unwrap_or(&perfect), &mut split);
+        Origin::new(&scene, truth.clone(), &state).split(&scene, &ingredients, got.unwrap_or(&perfect), &mut split);
         split.sources(1.0)
+    }
+
+    /// Numbers that f32 holds, so that rounding them moves nothing.
+    fn even() -> Truth {
+        let identity = crate::domain::Transform::IDENTITY.0.map(f64::from);
+        Truth { q: vec![1.0, 0.5], transforms: vec![identity] }
     }
 
     #[test]
     fn each_source_is_seen_alone() {
-        let load = Kind::Single { power: 8, rank: 2 }.build(Size::Full).expect("built");
-        let scene = &load.scene;
-        let still = Motion::new(&load, None).seed(0).transforms;
-        // Numbers that f32 holds have no rounding; 1 + 2^-30 rounds to 1.
-        let exact =
-            Truth { q: vec![1.0, 0.5], transforms: vec![[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]] };
-        let none = split(&Exact, scene, &exact, None);
+        let plain = Deformation::default;
+        let none = split(plain(), &even(), None);
         assert!([none.storage, none.q, none.accumulation, none.transform, none.truncation] == [Spread::default(); 5]);
         assert!(none.origin.largest > 0.0 && none.origin.largest < 1e-6);
-        let odd = Truth { q: vec![1.0 + 2f64.powi(-30), 0.5], ..exact.clone() };
-        let found = split(&Exact, scene, &odd, None);
+        let found = split(plain(), &Truth { q: vec![1.0 + 2f64.powi(-30), 0.5], ..even() }, None);
         assert!(found.q.largest > 1e-10 && found.q.largest < 2e-9 && found.transform.largest == 0.0, "{found:?}");
-        let turned = Truth { transforms: still, ..exact.clone() };
-        let found = split(&Exact, scene, &turned, None);
+        let turned = Truth { transforms: Motion::new(&load(), None).seed(0).transforms, ..even() };
+        let found = split(plain(), &turned, None);
         assert!(found.transform.largest > 1e-9 && found.q.largest == 0.0, "{found:?}");
-        let shifted: Vec<f32> = scene.shapes[0].modes.columns().iter().map(|entry| entry + 1.0 / 64.0).collect();
-        let coarse = Coarse(Modes::from_columns(3 * scene.layout.vertices, 2, shifted).expect("modes"));
-        let found = split(&coarse, scene, &exact, None);
-        // Both coordinates together, on each of three axes.
-        let want = 1.5 / 64.0 * 3f64.sqrt();
-        assert!((found.storage.largest - want).abs() < 1e-6 && (found.storage.rms - want).abs() < 1e-6, "{found:?}");
-        assert!(found.truncation.largest > 0.2 && found.truncation.largest <= 0.5 * 3f64.sqrt(), "{found:?}");
-        assert_eq!(found.accumulation, Spread::default());
+        let found = split(Deformation { storage: Storage::Int8, ..plain() }, &even(), None);
+        // Half a step of 1/127 on each axis for coordinates of 1.5 together, at most.
+        assert!(found.storage.largest > 1e-3 && found.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{found:?}");
+        assert_eq!([found.accumulation, found.truncation], [Spread::default(); 2]);
+        // Mode 1 moves vertices by up to 0.5 sqrt(3); a mode goes when it moves none by half the budget.
+        let found = split(Deformation { truncation: Some(1.75), ..plain() }, &even(), None);
+        assert!(found.truncation.largest > 0.5 && found.truncation.largest <= 0.87, "{found:?}");
+        assert_eq!([found.accumulation, found.storage], [Spread::default(); 2]);
     }
 
     #[test]
     fn what_no_other_source_explains_is_accumulation() {
-        let load = Kind::Single { power: 4, rank: 2 }.build(Size::Full).expect("built");
-        let truth = Motion::new(&load, None).seed(0);
-        let got = vec![1e3_f32; 48];
-        let found = split(&Exact, &load.scene, &truth, Some(&got));
+        let got = vec![1e3_f32; 3 * 256];
+        let found = split(Deformation::default(), &Motion::new(&load(), None).seed(0), Some(&got));
         assert!(found.accumulation.largest > 1e3, "{found:?}");
         assert!(found.origin.largest < 1e-6);
     }

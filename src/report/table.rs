@@ -10,6 +10,7 @@ use super::validate::Found;
 use super::variant::Label;
 use crate::deform::Backend;
 use crate::error::{Error, Result, during};
+use crate::gpu::KernelFacts;
 use crate::scene::{Normals, Storage};
 
 /// One variant on one load with one state of the caches.
@@ -36,6 +37,9 @@ pub struct Row {
     /// The same over the rate of the best copy, and of the best pure read, of the same run.
     pub of_copy: Option<f64>,
     pub of_read: Option<f64>,
+    /// Kernel launches of a step, and what the driver says of each kernel; nothing on the CPU.
+    pub launches: usize,
+    pub kernels: Vec<KernelFacts>,
     /// None when the variant could not be made.
     pub found: Option<Found>,
 }
@@ -81,6 +85,8 @@ impl Row {
             gbs: None,
             of_copy: None,
             of_read: None,
+            launches: 0,
+            kernels: Vec::new(),
             found: None,
         }
     }
@@ -100,7 +106,7 @@ impl Row {
 }
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`.
-const COLUMNS: [(&str, &str); 52] = [
+const COLUMNS: [(&str, &str); 53] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("backend", "/backend"),
@@ -116,6 +122,7 @@ const COLUMNS: [(&str, &str); 52] = [
     ("replays", "/timing/replays"),
     ("bytes", "/bytes"),
     ("gb_per_s", "/gbs"),
+    ("launches", "/launches"),
     ("of_copy", "/of_copy"),
     ("of_read", "/of_read"),
     ("states", "/found/errors/states"),
@@ -235,7 +242,7 @@ pub(super) mod tests {
     fn rates_are_bytes_over_time_and_fractions_are_of_what_was_measured() {
         let row = row("a", "x", Cache::Warm, (2.0, 0.1));
         assert_eq!((row.gbs, row.of_copy), (Some(1.0), None));
-        let under = row.under(Roofs { copy_gbs: Some(4.0), read_gbs: None });
+        let under = row.under(Roofs { copy_gbs: Some(4.0), ..Roofs::default() });
         assert_eq!((under.of_copy, under.of_read), (Some(0.25), None));
     }
 
@@ -264,8 +271,11 @@ pub(super) mod tests {
 
     #[test]
     fn every_column_but_the_texts_names_a_place_that_a_full_row_has() {
-        let mut full =
-            row("a", "x", Cache::Warm, (2.0, 0.125)).under(Roofs { copy_gbs: Some(1.0), read_gbs: Some(1.0) });
+        let mut full = row("a", "x", Cache::Warm, (2.0, 0.125)).under(Roofs {
+            copy_gbs: Some(1.0),
+            read_gbs: Some(1.0),
+            ..Roofs::default()
+        });
         full.truncation_metres = Some(1e-3);
         let found = full.found.as_mut().expect("found");
         let spread = Some(Spread::default());

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::exact::Ingredients;
+use super::ingredients::Ingredients;
 use super::timing::{Cache, Timing};
 use super::traffic::Part;
 use super::variant::{Label, Variant};
@@ -32,7 +32,7 @@ impl<V: Variant> Variant for Damaged<V> {
         self.inner.scene()
     }
 
-    fn ingredients(&self) -> &dyn Ingredients {
+    fn ingredients(&self) -> &Ingredients {
         self.inner.ingredients()
     }
 
@@ -40,8 +40,8 @@ impl<V: Variant> Variant for Damaged<V> {
         self.inner.traffic()
     }
 
-    fn surface(&mut self, state: &State) -> Result<&Surface> {
-        self.surface = self.inner.surface(state)?.clone();
+    fn surface(&mut self, at: usize, state: &State) -> Result<&Surface> {
+        self.surface = self.inner.surface(at, state)?.clone();
         let last = self.surface.positions.last_mut().expect("a vertex");
         *last += self.damage;
         Ok(&self.surface)

@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::errors::{Collect, Errors, Orientation, Spread, Tally, Turned, Yardstick, step_errors};
-use super::exact::{Exact, Judged, judge};
+use super::errors::{Collect, Errors, IMAGE, Orientation, Spread, Tally, Turned, Yardstick, step_errors};
+use super::exact::{Judged, judge};
+use super::ingredients::Ingredients;
 use super::loads::Load;
-use super::motion::{Motion, Truth};
+use super::motion::Motion;
 use super::sources::{Origin, Sources, Split};
 use super::variant::Variant;
 use crate::deform::Surface;
@@ -57,17 +58,18 @@ struct Case<'a> {
     split: Split,
     steps: Collect,
     before: Option<(Vec<f32>, Arc<Vec<Judged>>)>,
+    first: Surface,
     repeatable: bool,
     fault: Option<String>,
 }
 
 /// One state to look at.
-struct Look {
-    state: State,
+struct Look<'a> {
+    at: usize,
+    state: &'a State,
     /// What exact storage of all modes gives, and its bound.
     judged: Arc<Vec<Judged>>,
     origin: Option<Origin>,
-    first: bool,
     along: bool,
 }
 
@@ -78,25 +80,26 @@ pub fn validate(
     variants: &mut [Box<dyn Variant>],
     seeds: usize,
 ) -> (Vec<Found>, Condition) {
-    let camera = Camera::framing(&load.scene, super::errors::IMAGE.0, super::errors::IMAGE.1);
+    let camera = Camera::framing(&load.scene, IMAGE.0, IMAGE.1);
     let yardstick = Yardstick::new(&load.scene, &camera);
-    let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut())).collect();
-    let mut conditions = Conditions::default();
-    for at in 0..seeds + motion.steps() {
-        let along = at >= seeds;
-        let truth = if along { motion.step(at - seeds) } else { motion.seed(at) };
-        let state = truth.state();
-        let judged = Arc::new(judge(&load.scene, &Truth::of(&state), &Exact));
+    let truth = |at: usize| if at < seeds { motion.seed(at) } else { motion.step(at - seeds) };
+    let states: Vec<State> = (0..seeds + motion.steps()).map(|at| truth(at).state()).collect();
+    let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut(), &states)).collect();
+    let (exact, mut conditions) = (Ingredients::of(&load.scene), Conditions::default());
+    for (at, state) in states.iter().enumerate() {
+        let judged = Arc::new(judge(&load.scene, state, &exact));
         conditions.add(&judged);
-        let origin = (at < SPLIT.min(seeds)).then(|| Origin::new(&load.scene, truth, &state));
-        let look = Look { state, judged, origin, first: at == 0, along };
+        let origin = (at < SPLIT.min(seeds)).then(|| Origin::new(&load.scene, truth(at), state));
+        let look = Look { at, state, judged, origin, along: at >= seeds };
         cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
     }
+    cases.iter_mut().for_each(|case| case.repeat(&states));
     (cases.into_iter().map(|case| case.found(&yardstick)).collect(), conditions.condition())
 }
 
 impl<'a> Case<'a> {
-    fn new(variant: &'a mut dyn Variant) -> Self {
+    fn new(variant: &'a mut dyn Variant, states: &[State]) -> Self {
+        let fault = variant.prepare(states).err().map(|error| error.to_string());
         Self {
             variant,
             tally: Tally::default(),
@@ -104,16 +107,17 @@ impl<'a> Case<'a> {
             split: Split::default(),
             steps: Collect::default(),
             before: None,
+            first: Surface::default(),
             repeatable: true,
-            fault: None,
+            fault,
         }
     }
 
-    fn look(&mut self, yardstick: &Yardstick, look: &Look) {
+    fn look(&mut self, yardstick: &Yardstick, look: &Look<'_>) {
         if self.fault.is_some() {
             return;
         }
-        let surface = match self.variant.surface(&look.state) {
+        let surface = match self.variant.surface(look.at, look.state) {
             Ok(surface) => surface.clone(),
             Err(error) => {
                 self.fault = Some(error.to_string());
@@ -124,15 +128,14 @@ impl<'a> Case<'a> {
             self.fault = Some(format!("{} coordinates for {} vertices", surface.positions.len(), look.judged.len()));
             return;
         }
-        if look.first {
-            let again = self.variant.surface(&look.state);
-            self.repeatable = again.is_ok_and(|again| bits(again).eq(bits(&surface)));
-        }
         let judged = self.judged(look);
         self.tally.add(yardstick, &surface.positions, &judged);
         self.orient(look, &surface);
         if let Some(origin) = &look.origin {
             origin.split(self.variant.scene(), self.variant.ingredients(), &surface.positions, &mut self.split);
+        }
+        if look.at == 0 {
+            self.first = surface.clone();
         }
         if look.along {
             if let Some((positions, before)) = &self.before {
@@ -142,24 +145,38 @@ impl<'a> Case<'a> {
         }
     }
 
+    /// Asks for the first state again, after all others. A deformer that leaves out modes may remember what it was given
+    /// before, so that its answers may differ.
+    fn repeat(&mut self, states: &[State]) {
+        if self.fault.is_none() && !self.variant.ingredients().truncates() {
+            let again = self.variant.surface(0, &states[0]);
+            self.repeatable = again.is_ok_and(|again| bits(again).eq(bits(&self.first)));
+        }
+    }
+
     /// The exact positions with this variant's own bound.
     fn judged(&self, look: &Look) -> Arc<Vec<Judged>> {
         let ingredients = self.variant.ingredients();
         match ingredients.is_exact() {
             true => Arc::clone(&look.judged),
-            false => Arc::new(judge(self.variant.scene(), &Truth::of(&look.state), ingredients)),
+            false => Arc::new(judge(self.variant.scene(), look.state, ingredients)),
         }
     }
 
-    fn orient(&mut self, look: &Look, surface: &Surface) {
-        let scene = self.variant.scene();
-        if !surface.normals.is_empty() {
-            self.turned.add_normals(&surface.normals, &reference::orient_normals(scene, &look.state));
+    fn orient(&mut self, look: &Look<'_>, surface: &Surface) {
+        if surface.normals.is_empty() {
+            return;
         }
-        if !surface.tangents.is_empty() {
-            let want = reference::orient_tangents(scene, &look.state);
-            self.turned.add_tangents(&surface.tangents, &want, &surface.normals);
-        }
+        let (scene, state) = (self.variant.scene(), look.state);
+        let exact = || look.judged.iter().map(|judged| judged.at).collect::<Vec<_>>();
+        let (normals, tangents) = match scene.needs.exact_normals {
+            true => {
+                (reference::exact_normals(scene, state, &exact()), reference::exact_tangents(scene, state, &exact()))
+            }
+            false => (reference::orient_normals(scene, state), reference::orient_tangents(scene, state)),
+        };
+        self.turned.add_normals(&surface.normals, &normals);
+        self.turned.add_tangents(&surface.tangents, &tangents, &surface.normals);
     }
 
     fn found(self, yardstick: &Yardstick) -> Found {
@@ -228,7 +245,7 @@ mod tests {
     fn find(kind: Kind, damage: f32) -> (Found, Condition) {
         let load = kind.build(Size::Quick).expect("built");
         let label = Label::new("cpu", Backend::Cpu, &load.scene);
-        let cpu = Driven::new(label, &load.scene, CpuDeformer::new(&load.scene));
+        let cpu = Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(Damaged::new(cpu, damage))];
         let motion = Motion::new(&load, None);
         let (mut found, condition) = validate(&load, &motion, &mut variants, 4);

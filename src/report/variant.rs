@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use super::exact::{Exact, Ingredients};
+use super::ingredients::Ingredients;
 use super::timing::{Cache, Timing};
 use super::traffic::{self, Part};
 use crate::deform::{Backend, Deformer, Surface};
 use crate::error::Result;
+use crate::gpu::KernelFacts;
 use crate::scene::{Deformation, Scene, State};
 
 /// What a variant is.
@@ -34,39 +35,53 @@ pub trait Variant {
     fn scene(&self) -> &Arc<Scene>;
 
     /// What it replaces in x = T (x0 + U q): this gives its a-priori bound.
-    fn ingredients(&self) -> &dyn Ingredients;
+    fn ingredients(&self) -> &Ingredients;
 
     /// The bytes that a step moves at least.
     fn traffic(&self) -> Vec<Part>;
 
-    /// The surface at `state`. Normals and tangents are empty when it makes none.
+    /// Takes all states that it will be asked for.
+    ///
+    /// # Errors
+    /// `Fault` when the device failed, or what else keeps it from being made.
+    fn prepare(&mut self, _states: &[State]) -> Result<()> {
+        Ok(())
+    }
+
+    /// The surface at state `at` of those, which is `state`. Normals and tangents are empty when it makes none.
     ///
     /// # Errors
     /// `Fault` when the device failed.
-    fn surface(&mut self, state: &State) -> Result<&Surface>;
+    fn surface(&mut self, at: usize, state: &State) -> Result<&Surface>;
 
     /// Times steps over rotating states; `None` when it cannot be timed with this cache.
     ///
     /// # Errors
     /// `Fault` when the device failed.
     fn time(&mut self, states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>>;
-}
 
-/// A deformer of the server as a variant, timed by the wall clock from the call until it returns.
-pub struct Driven<D> {
-    label: Label,
-    scene: Arc<Scene>,
-    deformer: D,
-}
-
-impl<D: Deformer> Driven<D> {
-    /// A deformer of this scene.
-    pub fn new(label: Label, scene: &Arc<Scene>, deformer: D) -> Self {
-        Self { label, scene: Arc::clone(scene), deformer }
+    /// Kernel launches of a step, and what the driver says of each kernel; nothing on the CPU.
+    fn kernels(&self) -> (usize, Vec<KernelFacts>) {
+        (0, Vec::new())
     }
 }
 
-impl<D: Deformer> Variant for Driven<D> {
+/// A deformer of the server as a variant, timed by the wall clock from the call until it returns.
+pub struct Driven {
+    label: Label,
+    scene: Arc<Scene>,
+    ingredients: Ingredients,
+    deformer: Box<dyn Deformer>,
+}
+
+impl Driven {
+    /// A deformer of this scene.
+    pub fn new(label: Label, scene: &Arc<Scene>, deformer: Box<dyn Deformer>) -> Self {
+        Self { label, scene: Arc::clone(scene), ingredients: Ingredients::of(scene), deformer }
+    }
+}
+
+impl Variant for Driven {
     fn label(&self) -> &Label {
         &self.label
     }
@@ -75,15 +90,16 @@ impl<D: Deformer> Variant for Driven<D> {
         &self.scene
     }
 
-    fn ingredients(&self) -> &dyn Ingredients {
-        &Exact
+    fn ingredients(&self) -> &Ingredients {
+        &self.ingredients
     }
 
     fn traffic(&self) -> Vec<Part> {
         traffic::of_scene(&self.scene)
     }
 
-    fn surface(&mut self, state: &State) -> Result<&Surface> {
+    fn surface(&mut self, _at: usize, state: &State) -> Result<&Surface> {
+        self.ingredients.follow(state);
         self.deformer.deform(state)?;
         self.deformer.surface()
     }
