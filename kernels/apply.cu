@@ -4,7 +4,9 @@
 //   new_transforms  [changed][3] float4                                  (in)
 //   new_q           the coordinates of the changed domains, packed       (in)
 //   transforms, q   of all domains                                       (out)
+//   stale           [stale] u32: the tiles that hold a changed domain    (in)
 //   stamps          [domains] u32: the step that last changed a domain   (out)
+//   list            [stale] u32, on the device                           (out)
 // Launch: BLOCK threads a block, a warp a changed domain at a time, any number of blocks. CPU twin: State::apply.
 #include "layout.cuh"
 
@@ -22,5 +24,9 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
         for (unsigned i = lane; i < change.count; i += 32) {
             args.q[change.first_q + i] = args.new_q[change.source + i];
         }
+    }
+    const unsigned stale = args.header->stale;
+    for (unsigned i = blockIdx.x * BLOCK + threadIdx.x; i < stale; i += gridDim.x * BLOCK) {
+        args.list[i] = args.stale[i];
     }
 }

@@ -1,95 +1,51 @@
-// x = T (x0 + U q) for every vertex of every domain of a scene, and a box of each warp's x, in one launch over a flat
-// list of tiles.
+// x = T (x0 + U q) for every vertex of every domain of a scene, with ORIENT rigid normals and tangents of every corner
+// too, in one launch over a flat list of tiles; and a box of each warp's x.
 //   tiles, lanes  the work of each warp (layout.cuh)                                                        (in)
 //   words         U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                              (in)
 //   rest          x0, [quads][12] f32: 4 x, 4 y, 4 z                                                        (in)
+//   rest_normals  [quads][12] f32, likewise; with ORIENT                                                    (in)
+//   rest_tangents [quads][16] f32: 4 x, 4 y, 4 z, 4 signs of the bitangent; with ORIENT and NORMAL_MAPS     (in)
+//   corner_shifts with SHIFTED: per domain, from a vertex to its corner                                     (in)
 //   transforms    [domains][3] float4: the rows of world_from_domain, relative to the state's origin        (in)
 //   q             packed coordinates, times the factor of their mode with STORE_F16 and STORE_BF16          (in)
 //   scales        with STORE_INT8: per tile of U and mode                                                   (in)
 //   kept          with TRUNCATED: per domain the chunks that are summed, ascending                          (in)
+//   list          with LISTED: the tiles to be computed, as many as the header says; else all are           (in)
 //   positions     [vertices][3] f32, in the header                                                          (out)
+//   normals       [corners][3] f32, in the header                                                           (out)
+//   tangents      [corners] float4, in the header                                                           (out)
 //   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
 //                 WITHOUT_POSITIONS, for measuring                                                          (out)
-//   boxes         [blocks][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                  (out)
-// Launch: one warp a block. A lane computes a quad, or with NARROW one vertex of it, four blocks a tile: then small
-// scenes fill the device too. Domains that have not changed since this output was written are passed over.
+//   boxes         [warps][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                   (out)
+// Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles from `first` on, or any number of blocks with
+// LISTED. Tiles without modes, which come last in the list, are launched beside the others without MODES.
 // CPU twin: src/reference/deform.rs.
 //
 // The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
 // agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost.
-#include "layout.cuh"
 #include "chunk.cuh"
 #include "ordered.cuh"
+#include "orient.cuh"
 
-// Vertices of a lane, and the chunks that it reads before it sums the first.
+// The chunks that a lane reads before it sums the first.
 #ifdef NARROW
-constexpr unsigned SPAN = 1;
 #define AHEAD (16 / CHUNK_MODES)
 #else
-constexpr unsigned SPAN = 4;
 #define AHEAD 4
 #endif
-constexpr unsigned FLOATS = 3 * SPAN;
-// Blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill registers.
+// Warps of a block, and blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill
+// registers. Tiles of modes read long runs and do best in blocks of one warp; those without wait for one thing after the
+// other, and as many as possible must wait at once.
+#if defined(SHEAR) || defined(LISTED)
+constexpr unsigned WARPS = 1;
+constexpr unsigned RESIDENT = 16;
+#elif defined(MODES)
+constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 24;
-
-// One lane's part of a tile.
-struct Part {
-    const uint4* words; // the quad's first
-    unsigned stride;    // to its next word
-    unsigned chunks;
-    unsigned within; // the lane's first vertex in its quad
-    unsigned vertex; // the same, packed
-    unsigned count;  // vertices to be written
-    unsigned domain;
-    const float* q;
-    const float* scales;
-    const float4* rest;
-};
-
-// A lane without a vertex has a count of 0 and looks at those of vertex 0.
-__device__ __forceinline__ Part part_of(const DeformArgs& args) {
-    constexpr unsigned SHARE = 4 / SPAN;
-    const unsigned tile_index = blockIdx.x / SHARE;
-    const uint4 head = __ldg((const uint4*)(args.tiles + tile_index));
-    const uint4 tail = __ldg((const uint4*)(args.tiles + tile_index) + 1);
-    const unsigned item = blockIdx.x % SHARE * 32 + threadIdx.x;
-    const unsigned quad = item / SHARE;
-    const unsigned width = tail.w >> 16 & 0xff, kind = tail.w >> 24;
-    Part part;
-    part.words = args.words + (head.x | (unsigned long long)head.y << 32) + quad;
-    part.stride = width;
-    part.chunks = tail.w & 0xffff;
-    part.within = item % SHARE * SPAN;
-    unsigned vertices = 0, rest = 0, first_q = 0, first_scale = 0;
-    if (kind > 0) {
-        vertices = quad + 1 == width ? kind : quad < width ? 4 : 0;
-        part.vertex = head.z + 4 * quad;
-        part.domain = tail.x;
-        rest = head.w + quad;
-        first_q = tail.y;
-        first_scale = tail.z;
-    } else if (quad < width) {
-        const uint4 lane = __ldg((const uint4*)(args.lanes + head.z + quad));
-        vertices = 1 + lane.z % 4;
-        part.vertex = lane.x;
-        part.domain = lane.z / 4;
-        rest = lane.y;
-        first_q = lane.w;
-#ifdef STORE_INT8
-        first_scale = __ldg(args.lane_scales + head.z + quad);
+#else
+constexpr unsigned WARPS = 2;
+constexpr unsigned RESIDENT = 18;
 #endif
-    } else {
-        part.vertex = 0;
-        part.domain = 0;
-    }
-    part.vertex += part.within;
-    part.count = vertices > part.within ? min(SPAN, vertices - part.within) : 0;
-    part.rest = args.rest + 3 * (size_t)rest;
-    part.q = args.q + first_q;
-    part.scales = args.scales + first_scale;
-    return part;
-}
 
 #ifdef MODES
 // What entry (mode, axis) of the chunks is multiplied with.
@@ -97,20 +53,21 @@ struct Amounts {
     float of[CHUNK_MODES];
 };
 
-__device__ __forceinline__ Amounts amounts_of(const Part& part, unsigned chunk) {
+__device__ __forceinline__ Amounts amounts_of(const DeformArgs& args, const Part& part, unsigned chunk) {
     Amounts amounts;
 #if defined(STORE_INT8)
-    const float4 q = __ldg((const float4*)part.q + chunk), scale = __ldg((const float4*)part.scales + chunk);
+    const float4 q = __ldg((const float4*)(args.q + part.first_q) + chunk);
+    const float4 scale = __ldg((const float4*)(args.scales + part.first_scale) + chunk);
     amounts.of[0] = q.x * scale.x;
     amounts.of[1] = q.y * scale.y;
     amounts.of[2] = q.z * scale.z;
     amounts.of[3] = q.w * scale.w;
 #elif defined(STORE_F16) || defined(STORE_BF16)
-    const float2 q = __ldg((const float2*)part.q + chunk);
+    const float2 q = __ldg((const float2*)(args.q + part.first_q) + chunk);
     amounts.of[0] = q.x;
     amounts.of[1] = q.y;
 #else
-    amounts.of[0] = __ldg(part.q + chunk);
+    amounts.of[0] = __ldg(args.q + part.first_q + chunk);
 #endif
     return amounts;
 }
@@ -157,7 +114,7 @@ struct Chunk {
     __device__ __forceinline__ void load(const Part& part, const uint4* words) {
 #pragma unroll
         for (unsigned i = 0; i < 3 * CHUNK_MODES; ++i) {
-            entries[i] = entry_at(words, part.stride, i / 3, i % 3, part.within);
+            entries[i] = entry_at(words, part.width, i / 3, i % 3, part.within);
         }
     }
     __device__ __forceinline__ float entry(unsigned mode, unsigned axis, unsigned) const { return entries[3 * mode + axis]; }
@@ -168,7 +125,7 @@ struct Chunk {
     __device__ __forceinline__ void load(const Part& part, const uint4* from) {
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {
-            const uint4 word = __ldcs(from + i * part.stride);
+            const uint4 word = __ldcs(from + i * part.width);
             words[4 * i] = word.x;
             words[4 * i + 1] = word.y;
             words[4 * i + 2] = word.z;
@@ -202,8 +159,8 @@ struct Chosen {
 #endif
     __device__ __forceinline__ Chosen(const DeformArgs& args, const Part& part) : count(part.chunks) {
 #ifdef TRUNCATED
-        list = args.kept + (part.q - args.q) / CHUNK_MODES;
-        count = part.chunks == 0 ? 0 : __ldg(args.kept_counts + part.domain);
+        list = args.kept + part.first_q / CHUNK_MODES;
+        count = part.chunks == 0 || part.count == 0 ? 0 : __ldg(args.kept_counts + part.domain);
 #endif
     }
     __device__ __forceinline__ unsigned operator[](unsigned i) const {
@@ -215,25 +172,42 @@ struct Chosen {
     }
 };
 
+// Adds `COUNT` chunks from the i-th chosen on, all of them loaded before the first is summed.
+template <unsigned COUNT>
+__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const Part& part, const Chosen& chosen, unsigned& i,
+                                           Sums& sums) {
+    const uint4* words = args.words + part.first_word + part.quad;
+    const size_t step = 3 * (size_t)part.width;
+    Chunk chunks[COUNT];
+#pragma unroll
+    for (unsigned k = 0; k < COUNT; ++k) {
+        chunks[k].load(part, words + chosen[i + k] * step);
+    }
+#pragma unroll
+    for (unsigned k = 0; k < COUNT; ++k) {
+        add_chunk(sums, chunks[k], amounts_of(args, part, chosen[i + k]));
+    }
+    i += COUNT;
+}
+
 __device__ __forceinline__ void sum_modes(const DeformArgs& args, const Part& part, Sums& sums) {
     const Chosen chosen(args, part);
-    const size_t step = 3 * (size_t)part.stride;
     unsigned i = 0;
-    for (; i + AHEAD <= chosen.count; i += AHEAD) {
-        Chunk chunks[AHEAD];
-#pragma unroll
-        for (unsigned k = 0; k < AHEAD; ++k) {
-            chunks[k].load(part, part.words + chosen[i + k] * step);
-        }
-#pragma unroll
-        for (unsigned k = 0; k < AHEAD; ++k) {
-            add_chunk(sums, chunks[k], amounts_of(part, chosen[i + k]));
-        }
+    while (i + AHEAD <= chosen.count) {
+        sum_chunks<AHEAD>(args, part, chosen, i, sums);
     }
-    for (; i < chosen.count; ++i) {
-        Chunk chunk;
-        chunk.load(part, part.words + chosen[i] * step);
-        add_chunk(sums, chunk, amounts_of(part, chosen[i]));
+    const unsigned left = chosen.count - i;
+    if (AHEAD > 8 && left & 8) {
+        sum_chunks<8>(args, part, chosen, i, sums);
+    }
+    if (AHEAD > 4 && left & 4) {
+        sum_chunks<4>(args, part, chosen, i, sums);
+    }
+    if (left & 2) {
+        sum_chunks<2>(args, part, chosen, i, sums);
+    }
+    if (left & 1) {
+        sum_chunks<1>(args, part, chosen, i, sums);
     }
 }
 #endif
@@ -243,8 +217,8 @@ __device__ __forceinline__ float placed(const float4& row, float x, float y, flo
 }
 
 // The x of one vertex of this lane in f64, rounded once: for what overflowed on its way in f32 although it need not.
-__device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned vertex) {
-    const Part part = part_of(args);
+__device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
+    const Part part = part_of(args, tile, share);
     const unsigned within = part.within + vertex;
     double bent[3];
     for (unsigned axis = 0; axis < 3; ++axis) {
@@ -252,14 +226,14 @@ __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned v
 #ifdef MODES
         const Chosen chosen(args, part);
         for (unsigned i = 0; i < chosen.count; ++i) {
-            const Amounts amounts = amounts_of(part, chosen[i]);
+            const Amounts amounts = amounts_of(args, part, chosen[i]);
+            const uint4* words = args.words + part.first_word + part.quad + chosen[i] * 3 * (size_t)part.width;
             for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
-                const uint4* words = part.words + chosen[i] * 3 * (size_t)part.stride;
-                sum += (double)entry_at(words, part.stride, mode, axis, within) * (double)amounts.of[mode];
+                sum += (double)entry_at(words, part.width, mode, axis, within) * (double)amounts.of[mode];
             }
         }
 #endif
-        bent[axis] = (double)((const float*)part.rest)[4 * axis + within] + sum;
+        bent[axis] = (double)((const float*)(args.rest + 3 * (size_t)part.rest))[4 * axis + within] + sum;
     }
     const float4* rows = args.transforms + 3 * (size_t)part.domain;
     float placed[3];
@@ -268,54 +242,6 @@ __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned v
         placed[axis] = (float)(row.x * bent[0] + row.y * bent[1] + row.z * bent[2] + row.w);
     }
     return make_float3(placed[0], placed[1], placed[2]);
-}
-
-// x0 + sums, in place of the sums' three numbers per vertex.
-__device__ __forceinline__ void add_rest(const Part& part, float (&bent)[FLOATS]) {
-#ifdef NARROW
-#pragma unroll
-    for (unsigned axis = 0; axis < 3; ++axis) {
-        bent[axis] += __ldg((const float*)part.rest + 4 * axis + part.within);
-    }
-#else
-#pragma unroll
-    for (unsigned axis = 0; axis < 3; ++axis) {
-        const float4 rest = __ldg(part.rest + axis);
-        bent[4 * axis] += rest.x;
-        bent[4 * axis + 1] += rest.y;
-        bent[4 * axis + 2] += rest.z;
-        bent[4 * axis + 3] += rest.w;
-    }
-#endif
-}
-
-// A warp's numbers on their way out, [lane][vertex][axis], and where each lane's vertices belong.
-struct Stage {
-    float numbers[32][FLOATS];
-    unsigned places[32];
-    unsigned counts[32];
-};
-
-__device__ __forceinline__ void put(Stage& stage, const Part& part, const float (&numbers)[FLOATS]) {
-#pragma unroll
-    for (unsigned i = 0; i < FLOATS; ++i) {
-        stage.numbers[threadIdx.x][i] = numbers[i];
-    }
-    stage.places[threadIdx.x] = 3 * part.vertex;
-    stage.counts[threadIdx.x] = 3 * part.count;
-}
-
-// Lanes of one domain write one run, so that sectors are written whole.
-__device__ __forceinline__ void store(float* packed, const Stage& stage) {
-    __syncwarp();
-#pragma unroll
-    for (unsigned i = threadIdx.x; i < 32 * FLOATS; i += 32) {
-        const unsigned lane = i / FLOATS, within = i % FLOATS;
-        if (within < stage.counts[lane]) {
-            __stcs(packed + stage.places[lane] + within, stage.numbers[lane][within]);
-        }
-    }
-    __syncwarp();
 }
 
 // The six sides of what a lane staged, as keys. Vertices that are not there count as the first.
@@ -334,15 +260,16 @@ __device__ __forceinline__ void box_of(const float (&world)[FLOATS], unsigned co
     }
 }
 
-// Computes anew what is not finite, and says what the box is then: a NaN wins.
-__device__ __noinline__ void mend(const DeformArgs& args, float* numbers, unsigned count, unsigned (&keys)[6]) {
+// Computes anew what is not finite of `count` staged vertices, and says what the box is then: a NaN wins.
+__device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigned share, float* numbers, unsigned count,
+                                  unsigned (&keys)[6]) {
     for (unsigned side = 0; side < 6; ++side) {
         keys[side] = 0;
     }
     for (unsigned vertex = 0; vertex < count; ++vertex) {
         float* at = numbers + 3 * vertex;
         if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
-            const float3 exact = placed_exactly(args, vertex);
+            const float3 exact = placed_exactly(args, tile, share, vertex);
             at[0] = exact.x;
             at[1] = exact.y;
             at[2] = exact.z;
@@ -354,75 +281,148 @@ __device__ __noinline__ void mend(const DeformArgs& args, float* numbers, unsign
     }
 }
 
-extern "C" __global__ void __launch_bounds__(32, RESIDENT) deform(const __grid_constant__ DeformArgs args) {
-    __shared__ Stage stage;
-    __shared__ unsigned mended[32][6];
-    const Part part = part_of(args);
-    const bool stale = part.count > 0 && is_stale(args.header, args.stamps, part.domain);
-    if (!__any_sync(0xffffffffu, stale)) {
-        return;
+// The way out of a warp, and of the boxes of lanes that had to mend theirs.
+struct Shared {
+    Stage stage;
+    unsigned mended[32][6];
+};
+
+// What a vertex has besides its modes: x0 and T.
+struct Base {
+    Items x, y, z;
+    float4 a, b, c;
+    __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
+        const float4* from = args.rest + 3 * (size_t)part.rest;
+        x = items_of(from, part.within);
+        y = items_of(from + 1, part.within);
+        z = items_of(from + 2, part.within);
+        const float4* rows = args.transforms + 3 * (size_t)part.domain;
+        a = __ldg(rows);
+        b = __ldg(rows + 1);
+        c = __ldg(rows + 2);
     }
-    float bent[FLOATS];
+};
+
+// World positions from `bent`, [axis][vertex] sums.
+__device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, const Part& part, unsigned tile,
+                                      unsigned share, const Base& base, const float (&bent)[FLOATS]) {
+    float world[FLOATS], total = 0.0f;
+#pragma unroll
+    for (unsigned i = 0; i < SPAN; ++i) {
+        const float px = base.x.of[i] + bent[i], py = base.y.of[i] + bent[SPAN + i],
+                    pz = base.z.of[i] + bent[2 * SPAN + i];
+        world[3 * i] = placed(base.a, px, py, pz);
+        world[3 * i + 1] = placed(base.b, px, py, pz);
+        world[3 * i + 2] = placed(base.c, px, py, pz);
+        // Zero, unless one of them is not finite.
+        total = fmaf(0.0f, world[3 * i] + world[3 * i + 1] + world[3 * i + 2], total);
+    }
+    unsigned keys[6] = {0, 0, 0, 0, 0, 0};
+    put(shared.stage, world, part.item, part.count);
+    if (part.count > 0) {
+        box_of(world, part.count, keys);
+        if (total != 0.0f) {
+            unsigned(&mended)[6] = shared.mended[lane_of()];
+            mend(args, tile, share, staged(shared.stage) + FLOATS * lane_of(), part.count, mended);
+#pragma unroll
+            for (unsigned side = 0; side < 6; ++side) {
+                keys[side] = mended[side];
+            }
+        }
+    }
+    store(args.header->positions, shared.stage, (part.kind & TILE_LAST) > 0);
+#pragma unroll
+    for (unsigned side = 0; side < 6; ++side) {
+        const unsigned key = warp_max(keys[side]);
+        if (lane_of() == side) {
+            args.boxes[6 * ((size_t)tile * SHARE + share) + side] = key;
+        }
+    }
+}
+
 #ifdef MODES
+// Asks early for what is read after the modes.
+__device__ __forceinline__ void prefetch_rest(const DeformArgs& args, const Part& part) {
+    prefetch(args.rest + 3 * (size_t)part.rest);
+#ifdef ORIENT
+    if (part.kind & TILE_CORNERS) {
+        prefetch(args.rest_normals + 3 * (size_t)part.rest);
+#ifdef NORMAL_MAPS
+        prefetch(args.rest_tangents + 4 * (size_t)part.rest);
+#endif
+    }
+#endif
+}
+
+__device__ __forceinline__ void sum(const DeformArgs& args, const Part& part, float (&bent)[FLOATS]) {
     Sums sums;
     sums.clear();
-    if (part.count > 0) {
-        sum_modes(args, part, sums);
-    }
+    sum_modes(args, part, sums);
 #pragma unroll
     for (unsigned i = 0; i < FLOATS; ++i) {
         bent[i] = sums.total(i);
     }
-#else
-#pragma unroll
-    for (unsigned i = 0; i < FLOATS; ++i) {
-        bent[i] = 0.0f;
-    }
+}
 #endif
-    float world[FLOATS];
+
+__device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, unsigned tile, unsigned share) {
+    const Part part = part_of(args, tile, share);
+#ifdef ORIENT
+    Normals normals;
+#endif
+    if (part.kind & TILE_VERTICES) {
+        float bent[FLOATS] = {};
+        Base base;
+#if defined(MODES) && defined(NARROW)
+        base.load(args, part);
+        sum(args, part, bent);
+#elif defined(MODES)
+        prefetch_rest(args, part);
+        sum(args, part, bent);
+#endif
 #ifdef DISPLACEMENTS
+        float u[FLOATS];
 #pragma unroll
-    for (unsigned i = 0; i < FLOATS; ++i) {
-        world[i] = bent[i % 3 * SPAN + i / 3];
-    }
-    put(stage, part, world);
-    store(args.header->displacements, stage);
+        for (unsigned i = 0; i < FLOATS; ++i) {
+            u[i] = bent[i % 3 * SPAN + i / 3];
+        }
+        put(shared.stage, u, part.item, part.count);
+        store(args.header->displacements, shared.stage, (part.kind & TILE_LAST) > 0);
 #endif
 #ifndef WITHOUT_POSITIONS
-    unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-    if (part.count > 0) {
-        add_rest(part, bent);
-        const float4* rows = args.transforms + 3 * (size_t)part.domain;
-        const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
-        float total = 0.0f;
-#pragma unroll
-        for (unsigned vertex = 0; vertex < SPAN; ++vertex) {
-            const float x = bent[vertex], y = bent[SPAN + vertex], z = bent[2 * SPAN + vertex];
-            world[3 * vertex] = placed(a, x, y, z);
-            world[3 * vertex + 1] = placed(b, x, y, z);
-            world[3 * vertex + 2] = placed(c, x, y, z);
-            // Zero, unless one of them is not finite.
-            total = fmaf(0.0f, world[3 * vertex] + world[3 * vertex + 1] + world[3 * vertex + 2], total);
+#if !(defined(MODES) && defined(NARROW))
+        base.load(args, part);
+#endif
+#ifdef ORIENT
+        // Before the positions leave, so that both are on their way at once.
+        if (part.kind & TILE_CORNERS) {
+            normals.load(args, part);
         }
-        put(stage, part, world);
-        box_of(world, part.count, keys);
-        if (total != 0.0f) {
-            mend(args, stage.numbers[threadIdx.x], part.count, mended[threadIdx.x]);
-#pragma unroll
-            for (unsigned side = 0; side < 6; ++side) {
-                keys[side] = mended[threadIdx.x][side];
-            }
-        }
-    } else {
-        stage.counts[threadIdx.x] = 0;
+#endif
+        place(args, shared, part, tile, share, base, bent);
+#endif
     }
-    store(args.header->positions, stage);
-#pragma unroll
-    for (unsigned side = 0; side < 6; ++side) {
-        const unsigned key = warp_max(keys[side]);
-        if (threadIdx.x == side) {
-            args.boxes[6 * (size_t)blockIdx.x + side] = key;
+#ifdef ORIENT
+    if (part.kind & TILE_CORNERS) {
+        if (!(part.kind & TILE_VERTICES)) {
+            normals.load(args, part);
         }
+        orient(args, shared.stage, part, normals);
+    }
+#endif
+}
+
+extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) deform(const __grid_constant__ DeformArgs args) {
+    __shared__ Shared shared[WARPS];
+    const unsigned warp = blockIdx.x * WARPS + threadIdx.x / 32;
+#ifdef LISTED
+    const unsigned warps = SHARE * __ldg(&args.header->stale);
+    for (unsigned i = warp; i < warps; i += gridDim.x * WARPS) {
+        compute(args, shared[threadIdx.x / 32], __ldg(args.list + i / SHARE), i % SHARE);
+    }
+#else
+    if (warp < SHARE * args.count) {
+        compute(args, shared[threadIdx.x / 32], args.first + warp / SHARE, warp % SHARE);
     }
 #endif
 }

@@ -22,41 +22,40 @@ struct Header {
     unsigned everything; // the last step that changed all domains
     unsigned step;       // this step; counts from 1
     unsigned changed;    // domains in the list of `apply`
+    unsigned stale;      // tiles in its other list
+    unsigned reserved;
     unsigned bounds[6];  // `ordered` maxima of -x, -y, -z, x, y, z; sent as zeros
-    unsigned reserved[2];
 };
 static_assert(sizeof(Header) == 80, "Header differs from src/gpu/layout.rs");
+
+// `kind` of a tile: how many items its last quad has, 0 in a mixed tile; whether positions are computed of its items,
+// and whether normals and tangents are. A tile of both computes corner i of a shape with vertex i.
+constexpr unsigned TILE_LAST = 7;
+constexpr unsigned TILE_VERTICES = 8;
+constexpr unsigned TILE_CORNERS = 16;
 
 // The work of one warp: up to 32 quads and their part of U, [chunk][3][width] words of 16 bytes.
 struct Tile {
     unsigned long long first_word; // of its U
-    unsigned first;                // first packed vertex; of a mixed tile, first entry of `lanes`
-    unsigned rest;                 // first quad of x0
+    unsigned first;                // first packed vertex or corner; of a mixed tile, first entry of `lanes`
+    unsigned rest;                 // first quad of x0, normals and tangents
     unsigned domain;
     unsigned first_q;
     unsigned first_scale;
     unsigned short chunks;
     unsigned char width; // quads
-    unsigned char kind;  // 0: quads of several domains; else all of one, and so many vertices in the last quad
+    unsigned char kind;
 };
 static_assert(sizeof(Tile) == 32, "Tile differs from src/gpu/layout.rs");
 
 // A quad of a mixed tile.
 struct Lane {
-    unsigned vertex; // first packed vertex
-    unsigned rest;   // quad of x0
-    unsigned domain; // four times its index, plus its vertices less one
+    unsigned item;   // first packed vertex or corner
+    unsigned rest;   // quad of x0, normals and tangents
+    unsigned domain; // four times its index, plus its items less one
     unsigned first_q;
 };
 static_assert(sizeof(Lane) == 16, "Lane differs from src/gpu/layout.rs");
-
-// Where the corners of one domain lie. Instances share `first_normal` and `first_tangent`.
-struct CornerSlot {
-    unsigned first; // packed corner
-    unsigned first_normal;
-    unsigned first_tangent;
-};
-static_assert(sizeof(CornerSlot) == 12, "CornerSlot differs from src/gpu/layout.rs");
 
 // The same for `normals`. Instances share all but `first` and `first_vertex`.
 struct NormalSlot {
@@ -83,18 +82,21 @@ struct DeformArgs {
     const Lane* lanes;
     const uint4* words;
     const float4* rest;
+    const float4* rest_normals;
+    const float4* rest_tangents;
+    const unsigned* corner_shifts;
     const float* scales;
     const unsigned* lane_scales;
     const float4* transforms;
     const float* q;
-    const unsigned* stamps;
+    const unsigned* list;
     const unsigned* kept_counts;
     const unsigned short* kept;
     unsigned* boxes;
-    unsigned tiles_count;
-    unsigned reserved;
+    unsigned first; // tile
+    unsigned count; // of tiles
 };
-static_assert(sizeof(DeformArgs) == 112, "DeformArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(DeformArgs) == 136, "DeformArgs differs from src/gpu/layout.rs");
 
 struct BoundsArgs {
     Header* header;
@@ -109,24 +111,13 @@ struct ApplyArgs {
     const Change* changes;
     const float4* new_transforms;
     const float* new_q;
+    const unsigned* stale;
     float4* transforms;
     float* q;
     unsigned* stamps;
+    unsigned* list;
 };
-static_assert(sizeof(ApplyArgs) == 56, "ApplyArgs differs from src/gpu/layout.rs");
-
-struct OrientArgs {
-    const Header* header;
-    const CornerSlot* slots;
-    const unsigned* first_domains;
-    const float* rest_normals;
-    const float4* rest_tangents;
-    const float4* transforms;
-    const unsigned* stamps;
-    unsigned corners;
-    unsigned rest_corners;
-};
-static_assert(sizeof(OrientArgs) == 64, "OrientArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(ApplyArgs) == 72, "ApplyArgs differs from src/gpu/layout.rs");
 
 struct NormalsArgs {
     const Header* header;

@@ -15,7 +15,7 @@
 // A thread per corner, not per group: corners of one group repeat its sum, from cache. A pass over groups would write and
 // read 12 bytes for each of them and cost a launch, which pays only where groups have two corners and more on average.
 // For groups of k triangles and one corner each, DRAM moves 4 bytes of members, 4 of begins, 4 (k + 2) of rings, 12 of
-// geometric normals and 12 of positions per corner on top of the 24 of `orient`: 88 in all at k = 6.
+// geometric normals and 12 of positions per corner, besides 24 for the rest normal and the new one: 88 in all at k = 6.
 //
 // Each thread gathers for itself, without atomics, in the order of the ring: runs agree bit by bit. Sums are f64:
 // differences and products of two f32 are exact there or nearly so, and neither over- nor underflow, so that nothing
@@ -54,8 +54,14 @@ __device__ double sum_of(const double3& v) {
     return fabs(v.x) + fabs(v.y) + fabs(v.z);
 }
 
-// The area vectors of a ring of two entries or more; w is what the twin calls B.
-__device__ double4 area_of(const unsigned* ring, const unsigned* end, const float* positions) {
+// The area vectors around a group, and what the twin calls B.
+struct Area {
+    double3 sum;
+    double rounding;
+};
+
+// Of a ring of two entries or more.
+__device__ Area area_of(const unsigned* ring, const unsigned* end, const float* positions) {
     const double3 own = position_of(positions, __ldg(ring));
     const double height = sum_of(own);
     double3 sum = make_double3(0.0, 0.0, 0.0), before = sum;
@@ -75,7 +81,7 @@ __device__ double4 area_of(const unsigned* ring, const unsigned* end, const floa
         before = edge;
         reach_before = reach;
     }
-    return make_double4(sum.x, sum.y, sum.z, rounding);
+    return {sum, rounding};
 }
 
 __device__ Turn turn_of(const NormalsArgs& args, const NormalSlot& slot, const Rows& linear, unsigned corner) {
@@ -92,16 +98,17 @@ __device__ Turn turn_of(const NormalsArgs& args, const NormalSlot& slot, const R
     }
     const float* positions = args.header->positions + 3 * (size_t)slot.first_vertex;
     const unsigned* rings = args.rings;
-    const double4 area = area_of(rings + __ldg(args.begins + group), rings + __ldg(args.begins + group + 1), positions);
-    const double least = RESOLUTION * area.w;
+    const Area area = area_of(rings + __ldg(args.begins + group), rings + __ldg(args.begins + group + 1), positions);
+    const double least = RESOLUTION * area.rounding;
+    const double3 sum = area.sum;
     // Also false when a position is not finite.
-    turn.is_told = area.x * area.x + area.y * area.y + area.z * area.z > least * least;
+    turn.is_told = sum.x * sum.x + sum.y * sum.y + sum.z * sum.z > least * least;
     if (!turn.is_told) {
         return turn;
     }
     // As the rest normal is turned by the inverse transpose, the sum is by the cofactors; a mirror is between them.
     const double hand = hand_of(linear);
-    turn.to = unit(make_double3(hand * area.x, hand * area.y, hand * area.z));
+    turn.to = unit(make_double3(hand * sum.x, hand * sum.y, hand * sum.z));
     turn.from = turn_normal(linear, normal);
     return turn;
 }

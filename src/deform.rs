@@ -8,7 +8,8 @@ use crate::scene::{Bounds, State};
 /// Deformed vertices of a whole scene, packed as the scene's layout says.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Surface {
-    /// World positions relative to the scene's origin, three numbers per vertex.
+    /// World positions, three numbers per vertex, relative to their domain's cell ([`State::cell_of`]): the scene's origin
+    /// unless steps took the domain far from it.
     pub positions: Vec<f32>,
     /// World unit normals, three numbers per corner.
     pub normals: Vec<f32>,
@@ -39,7 +40,7 @@ impl Backend {
 /// What a deformation tells besides the vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Deformed {
-    /// Bounds of all deformed positions. Not finite when f32 overflowed somewhere.
+    /// Bounds of all deformed positions as they are in [`Surface`]. Not finite when f32 overflowed somewhere.
     pub bounds: Bounds,
     /// Milliseconds from the call until the vertices were there.
     pub ms: f64,

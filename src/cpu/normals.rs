@@ -31,15 +31,15 @@ pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mu
         if !tangents.is_empty() {
             orient::orient_tangents(scene, state, tile, tangents);
         }
-        follow(&Bent::new(scene, state, tile.domain, positions), tile, normals, tangents);
+        follow(&Bent::new(scene, state, tile.domain, positions), tile.first, normals, tangents);
     });
 }
 
-/// Carries the rigid normals and tangents of a tile to where its surface turned.
-fn follow(bent: &Bent, tile: Tile, normals: &mut [f32], tangents: &mut [f32]) {
+/// Carries the rigid normals and tangents of a domain's corners from `first` on to where its surface turned.
+fn follow(bent: &Bent, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
     let Some(smoothing) = bent.smoothing else { return };
     let mut tangents = tangents.chunks_exact_mut(4);
-    for (group, normal) in smoothing.members()[tile.first..][..tile.count].iter().zip(normals.chunks_exact_mut(3)) {
+    for (group, normal) in smoothing.members()[first..].iter().zip(normals.chunks_exact_mut(3)) {
         let tangent = tangents.next();
         let Some(turn) = bent.turn(smoothing, *group as usize) else { continue };
         let carried = turn.carry(vector(normal)).try_normalize(0.0).unwrap_or(turn.to);

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use crate::deform::{Deformed, Deformer, Surface};
-use crate::error::{Error, Result, invalid};
+use crate::error::{Error, Result, during, invalid};
 use crate::render::{Renderer, SceneBuffers};
-use crate::scene::{Bounds, Scene, State};
+use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
 
 /// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
 const FARTHEST: f64 = 1e18;
@@ -44,7 +44,7 @@ impl Staged {
         &self.scene
     }
 
-    /// Bounds of the last deformation; finite.
+    /// Bounds of the last deformation, each domain relative to its cell; finite.
     pub const fn bounds(&self) -> Bounds {
         self.bounds
     }
@@ -87,8 +87,28 @@ impl Staged {
         self.deformer.surface()
     }
 
-    /// Makes the buffers if need be and brings the last deformation into them. True when an upload was needed.
-    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer) -> Result<bool> {
+    /// Makes the buffers if need be and brings the last deformation into them, in a frame that suits the camera. Returns
+    /// the bounds in that frame, and whether an upload was needed.
+    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<(Bounds, bool)> {
+        let uploaded = self.fill_shared(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        let apart = match &self.shown.cells {
+            Some(cells) if !cells.is_one() => Arc::clone(cells),
+            // All domains have one origin, so what the deformer wrote is drawn as it is.
+            cells => {
+                buffers.relative_to(cells.as_ref().map_or([0.0; 3], |cells| cells.shared()));
+                return Ok((self.bounds, uploaded));
+            }
+        };
+        let view = nearest_cell(camera.eye().into());
+        let positions = &self.deformer.surface()?.positions;
+        let (positions, bounds) = apart.seen_from(view, &self.scene.layout.slots, positions);
+        renderer.upload_apart(buffers, &positions, view)?;
+        Ok((bounds, true))
+    }
+
+    /// Makes the buffers if need be and fills those that the deformer does not write itself.
+    fn fill_shared(&mut self, renderer: &mut Renderer) -> Result<bool> {
         let shares = self.deformer.shares_buffers();
         let buffers = match self.buffers.take() {
             Some(buffers) => buffers,
@@ -104,7 +124,7 @@ impl Staged {
     }
 
     pub(super) fn buffers(&self) -> Result<&SceneBuffers> {
-        self.buffers.as_ref().ok_or_else(|| crate::error::during("draw")("the scene has no buffers"))
+        self.buffers.as_ref().ok_or_else(no_buffers)
     }
 
     /// Drops the deformer first: it may have the buffers mapped.
@@ -125,6 +145,10 @@ impl Staged {
         let field = format!("step.q of domain '{}'", scene.domains[domain].name);
         Ok(invalid(field, format!("q and transform that keep every vertex within {FARTHEST:e}"), given))
     }
+}
+
+fn no_buffers() -> Error {
+    during("draw")("the scene has no buffers")
 }
 
 fn is_near(bounds: &Bounds) -> bool {

@@ -105,9 +105,9 @@ impl Workbench {
         let camera = camera.checked()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let begin = Instant::now();
-        let uploaded = staged.fill_buffers(renderer)?;
+        let (bounds, uploaded) = staged.fill_buffers(renderer, &camera)?;
         let upload_ms = ms_since(begin);
-        let shot = Shot { camera, width, height, bounds: staged.bounds() };
+        let shot = Shot { camera, width, height, bounds };
         let mut image = renderer.draw(staged.buffers()?, &shot)?;
         if uploaded {
             image.passes.insert(0, (Stage::Upload.name(), upload_ms));

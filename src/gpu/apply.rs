@@ -13,7 +13,7 @@ use crate::scene::State;
 /// A list pays while it has at most this part of the domains; else the whole state is copied.
 const MOST: usize = 4;
 
-/// The kernel, and the list that it reads over the bus: `[changes][transforms][q]`.
+/// The kernel, and the lists that it reads over the bus: `[changes][transforms][q][tiles]`.
 #[derive(Debug)]
 pub(super) struct Apply {
     function: CudaFunction,
@@ -21,6 +21,16 @@ pub(super) struct Apply {
     pinned: PinnedHostSlice<u32>,
     most: usize,
     coordinates: usize,
+    /// Per tile, the list that named it last, and how many lists there were.
+    named: Vec<u32>,
+    lists: u32,
+}
+
+/// How long the lists of a step are.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Lengths {
+    pub changed: u32,
+    pub stale: u32,
 }
 
 /// Words of a [`Change`] and of a transform.
@@ -36,7 +46,7 @@ impl Apply {
     pub(super) fn new(device: &Device, packing: &Packing, kernel: &Kernel) -> Result<Self> {
         let most = most_changes(packing.scene.domains.len());
         let coordinates = packing.coordinates.total;
-        let words = (CHANGE + TRANSFORM) * most + coordinates;
+        let words = (CHANGE + TRANSFORM) * most + coordinates + packing.tiles;
         // SAFETY: the kernel reads only what `write` wrote.
         let pinned = unsafe {
             let flags = sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP;
@@ -44,17 +54,26 @@ impl Apply {
         };
         let pinned = pinned.map_err(during("allocate"))?;
         let function = device.function(kernel.name, kernel.source, &kernel.defines)?;
-        Ok(Self { function, config: config(kernel), pinned, most, coordinates })
+        Ok(Self {
+            function,
+            config: config(kernel),
+            pinned,
+            most,
+            coordinates,
+            named: vec![0; packing.tiles],
+            lists: 0,
+        })
     }
 
-    /// Writes the list; the caller has waited for the last launch. Returns whether it fits.
-    pub(super) fn write(&mut self, packing: &Packing, state: &State, changed: &[u32]) -> Result<bool> {
+    /// Writes the lists; the caller has waited for the last launch. None when there are too many changes for a list.
+    pub(super) fn write(&mut self, packing: &Packing, state: &State, changed: &[u32]) -> Result<Option<Lengths>> {
         if changed.len() > self.most {
-            return Ok(false);
+            return Ok(None);
         }
         let words = self.pinned.as_mut_slice().map_err(during("upload"))?;
         let (changes, rest) = words.split_at_mut(CHANGE * self.most);
-        let (transforms, q) = rest.split_at_mut(TRANSFORM * self.most);
+        let (transforms, rest) = rest.split_at_mut(TRANSFORM * self.most);
+        let (q, tiles) = rest.split_at_mut(self.coordinates);
         let mut source = 0;
         for (index, domain) in changed.iter().enumerate() {
             let (at, first) = (*domain as usize, source);
@@ -63,7 +82,7 @@ impl Apply {
             let own = state.q_of(&packing.scene, at);
             if source + own.len().next_multiple_of(4) > self.coordinates {
                 // Domains that share coordinates may name them more often than there is room.
-                return Ok(false);
+                return Ok(None);
             }
             packing.put_q(at, own, |number| {
                 q[source] = number.to_bits();
@@ -77,22 +96,27 @@ impl Apply {
             };
             changes[CHANGE * index..][..CHANGE].copy_from_slice(bytemuck::cast_slice(&[change]));
         }
-        Ok(true)
+        self.lists = self.lists.wrapping_add(1).max(1);
+        let stale = list_tiles(packing, changed, (&mut self.named, self.lists), tiles);
+        Ok(Some(Lengths { changed: changed.len() as u32, stale }))
     }
 
-    /// Starts the kernel; the header among the values says how long the list is.
-    pub(super) fn launch(&mut self, device: &Device, values: Values) -> Result<()> {
+    /// Starts the kernel; the header among the values says how long the lists are. That of tiles goes to `tiles`.
+    pub(super) fn launch(&mut self, device: &Device, values: Values, tiles: u64) -> Result<()> {
         let fail = during("apply");
         let list = self.pinned.as_mut_ptr().map_err(&fail)? as u64;
         let new_transforms = list + 4 * (CHANGE * self.most) as u64;
+        let new_q = new_transforms + 4 * (TRANSFORM * self.most) as u64;
         let args = ApplyArgs {
             header: values.header,
             changes: list,
             new_transforms,
-            new_q: new_transforms + 4 * (TRANSFORM * self.most) as u64,
+            new_q,
+            stale: new_q + 4 * self.coordinates as u64,
             transforms: values.transforms,
             q: values.q,
             stamps: values.stamps,
+            list: tiles,
         };
         let mut launch = device.stream().launch_builder(&self.function);
         // SAFETY: `ApplyArgs` is the kernel's only argument. Pinned memory has one address on host and device (unified
@@ -100,4 +124,22 @@ impl Apply {
         unsafe { launch.arg(&args).launch(self.config) }.map_err(fail)?;
         Ok(())
     }
+}
+
+/// Lists the tiles of the changed domains, each once, and returns how many there are.
+fn list_tiles(packing: &Packing, changed: &[u32], (named, list): (&mut [u32], u32), tiles: &mut [u32]) -> u32 {
+    let mut count = 0;
+    for domain in changed {
+        for (first, length) in packing.spans[*domain as usize] {
+            for tile in first..first + length {
+                let mark = &mut named[tile as usize];
+                if *mark != list {
+                    *mark = list;
+                    tiles[count] = tile;
+                    count += 1;
+                }
+            }
+        }
+    }
+    count as u32
 }

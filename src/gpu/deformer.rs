@@ -7,16 +7,16 @@ use cudarc::driver::sys::{CUgraphInstantiate_flags, CUstreamCaptureMode};
 use cudarc::driver::{CudaGraph, PinnedHostSlice, result};
 
 use super::GlBuffers;
-use super::apply::Apply;
+use super::apply::{Apply, Lengths};
 use super::bounds::{Bounds, bounds_of};
 use super::deform::Deform;
 use super::device::Device;
-use super::directions::Directions;
 use super::inputs::Inputs;
 use super::layout::Header;
 use super::memory::PageLock;
+use super::normals::Normals;
 use super::output::{Output, sizes};
-use super::plan::{Plan, plan};
+use super::plan::{Launch, Plan, plan};
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::{Error, Result, during};
 use crate::scene::{Changed, Scene, State};
@@ -45,7 +45,8 @@ pub struct CudaDeformer {
 struct Kernels {
     deform: Deform,
     bounds: Bounds,
-    directions: Directions,
+    /// Of a scene whose normals follow the surface.
+    normals: Option<Normals>,
     apply: Apply,
 }
 
@@ -70,12 +71,11 @@ impl CudaDeformer {
         let plan = plan(scene);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let [deform, bounds, directions, apply] = [0, 1, 2, 3].map(|index| &plan.kernels[index]);
-        let deform = Deform::new(device, scene, deform)?;
+        let deform = Deform::new(device, scene, &plan.tiles())?;
         let kernels = Kernels {
-            bounds: Bounds::new(device, bounds)?,
-            directions: Directions::new(device, scene, directions)?,
-            apply: Apply::new(device, deform.packing(), apply)?,
+            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
+            normals: plan.kernel(Launch::Normals).map(|normals| Normals::new(device, scene, normals)).transpose()?,
+            apply: Apply::new(device, deform.packing(), plan.needed(Launch::Apply)?)?,
             deform,
         };
         // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
@@ -115,7 +115,8 @@ impl CudaDeformer {
     fn capture(&mut self, some: bool) -> Result<CudaGraph> {
         let fail = during("capture");
         let stream = Arc::clone(self.device.stream());
-        stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_THREAD_LOCAL).map_err(&fail)?;
+        // Relaxed: a look at pinned memory asks the driver whether it is in use, which stricter modes refuse.
+        stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
         let started = self.start(some);
         // The capture ends whatever happened, or the stream would stay in it.
         let graph = stream.end_capture(CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH);
@@ -129,11 +130,13 @@ impl CudaDeformer {
         let values = inputs.values(device);
         inputs.send(device, some.then_some(size_of::<Header>()))?;
         if some {
-            kernels.apply.launch(device, values)?;
+            kernels.apply.launch(device, values, kernels.deform.list(device))?;
+            kernels.deform.launch_listed(device, values)?;
+        } else {
+            kernels.deform.launch(device, values)?;
         }
-        kernels.deform.launch(device, values)?;
         kernels.bounds.launch(device, values, kernels.deform.boxes(device))?;
-        kernels.directions.launch(device, values)?;
+        kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, values))?;
         let bounds = values.header + std::mem::offset_of!(Header, bounds) as u64;
         let answer = self.answer.as_mut_slice().map_err(during("capture"))?;
         // SAFETY: the header has six words of bounds, so has `answer`, and the deformer waits for the stream before it
@@ -148,27 +151,27 @@ impl CudaDeformer {
             _ => None,
         };
         steps.begun = steps.begun.wrapping_add(1).max(1);
-        let some = match changed {
-            Some(list) if steps.shown > 0 => {
-                self.kernels.apply.write(self.kernels.deform.packing(), state, list)?.then_some(list)
-            }
+        let some: Option<Lengths> = match changed {
+            Some(list) if steps.shown > 0 => self.kernels.apply.write(self.kernels.deform.packing(), state, list)?,
             _ => None,
         };
         if some.is_none() {
             steps.everything = steps.begun;
         }
-        let since = if some.is_some() { steps.shown } else { 0 };
+        let lengths = some.unwrap_or_default();
         let header = Header {
-            since,
+            since: if some.is_some() { steps.shown } else { 0 },
             everything: steps.everything,
             step: steps.begun,
-            changed: some.map_or(0, |list| list.len() as u32),
+            changed: lengths.changed,
+            stale: lengths.stale,
             ..Header::default()
         };
         steps.shown = 0;
         let graph = if some.is_some() { &self.some } else { &self.whole };
         let inputs = &mut self.inputs;
-        let keep = some.is_some() || self.kernels.directions.reads_positions();
+        // Normals that follow the surface read its positions again.
+        let keep = some.is_some() || self.kernels.normals.is_some();
         self.output.write(&self.device, keep, |to| {
             let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
             match some {

@@ -25,6 +25,10 @@ pub(super) struct Packing {
     pub coordinates: Coordinates,
     /// Per shape the factors of its modes; empty lists unless the storage has factors.
     pub factors: Vec<Vec<f32>>,
+    /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
+    pub spans: Vec<[(u32, u32); 2]>,
+    /// Tiles of all.
+    pub tiles: usize,
 }
 
 /// Device addresses of a step's values.

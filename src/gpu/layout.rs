@@ -15,6 +15,11 @@ pub(super) const NO_TANGENTS: u32 = u32::MAX;
 /// `first_member` of a shape without smoothing groups.
 pub(super) const NO_GROUPS: u32 = u32::MAX;
 
+/// Parts of [`Tile`]'s kind: the items of the last quad, or 0 in a mixed tile; what is computed of the items.
+pub(super) const TILE_LAST: u8 = 7;
+pub(super) const TILE_VERTICES: u8 = 8;
+pub(super) const TILE_CORNERS: u8 = 16;
+
 /// The start of a step's inputs; pointers are device addresses.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
@@ -27,8 +32,9 @@ pub(super) struct Header {
     pub everything: u32,
     pub step: u32,
     pub changed: u32,
+    pub stale: u32,
+    pub reserved: u32,
     pub bounds: [u32; 6],
-    pub reserved: [u32; 2],
 }
 
 /// The work of one warp of `deform`.
@@ -50,19 +56,10 @@ pub(super) struct Tile {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Lane {
-    pub vertex: u32,
+    pub item: u32,
     pub rest: u32,
     pub domain: u32,
     pub first_q: u32,
-}
-
-/// Where the corners of one domain lie.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct CornerSlot {
-    pub first: u32,
-    pub first_normal: u32,
-    pub first_tangent: u32,
 }
 
 /// A changed domain in the list of `apply`.
@@ -84,16 +81,19 @@ pub(super) struct DeformArgs {
     pub lanes: u64,
     pub words: u64,
     pub rest: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub corner_shifts: u64,
     pub scales: u64,
     pub lane_scales: u64,
     pub transforms: u64,
     pub q: u64,
-    pub stamps: u64,
+    pub list: u64,
     pub kept_counts: u64,
     pub kept: u64,
     pub boxes: u64,
-    pub tiles_count: u32,
-    pub reserved: u32,
+    pub first: u32,
+    pub count: u32,
 }
 
 /// Arguments of `bounds`.
@@ -114,24 +114,11 @@ pub(super) struct ApplyArgs {
     pub changes: u64,
     pub new_transforms: u64,
     pub new_q: u64,
+    pub stale: u64,
     pub transforms: u64,
     pub q: u64,
     pub stamps: u64,
-}
-
-/// Arguments of `orient`.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Pod, Zeroable)]
-pub(super) struct OrientArgs {
-    pub header: u64,
-    pub slots: u64,
-    pub first_domains: u64,
-    pub rest_normals: u64,
-    pub rest_tangents: u64,
-    pub transforms: u64,
-    pub stamps: u64,
-    pub corners: u32,
-    pub rest_corners: u32,
+    pub list: u64,
 }
 
 /// Where the corners of one domain lie, and the vertices around which `normals` gathers.
@@ -169,12 +156,10 @@ pub(super) struct NormalsArgs {
 const _: () = assert!(size_of::<Header>() == 80, "Header differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<CornerSlot>() == 12, "CornerSlot differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<DeformArgs>() == 112, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 136, "DeformArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BoundsArgs>() == 24, "BoundsArgs differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<ApplyArgs>() == 56, "ApplyArgs differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<OrientArgs>() == 64, "OrientArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<ApplyArgs>() == 72, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalsArgs>() == 104, "NormalsArgs differs from kernels/layout.cuh");
 
@@ -184,8 +169,6 @@ unsafe impl DeviceRepr for DeformArgs {}
 unsafe impl DeviceRepr for BoundsArgs {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for ApplyArgs {}
-// SAFETY: as above.
-unsafe impl DeviceRepr for OrientArgs {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for NormalsArgs {}
 
@@ -214,27 +197,26 @@ macro_rules! agreements {
 pub fn agreements() -> Vec<Agreement> {
     let mut list = agreements! {
         Header {
-            positions, normals, tangents, displacements, since, everything, step, changed, bounds, reserved
+            positions, normals, tangents, displacements, since, everything, step, changed, stale, reserved, bounds
         }
         Tile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
-        Lane { vertex, rest, domain, first_q }
-        CornerSlot { first, first_normal, first_tangent }
+        Lane { item, rest, domain, first_q }
         Change { domain, first_q, count, source }
         DeformArgs {
-            header, tiles, lanes, words, rest, scales, lane_scales, transforms, q, stamps, kept_counts, kept, boxes,
-            tiles_count, reserved
+            header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
+            transforms, q, list, kept_counts, kept, boxes, first, count
         }
         BoundsArgs { header, boxes, count, reserved }
-        ApplyArgs { header, changes, new_transforms, new_q, transforms, q, stamps }
-        OrientArgs {
-            header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, corners, rest_corners
-        }
+        ApplyArgs { header, changes, new_transforms, new_q, stale, transforms, q, stamps, list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {
             header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, members, begins, rings,
             group_normals, corners, rest_corners, groups, reserved
         }
     };
+    for (name, host) in [("TILE_LAST", TILE_LAST), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)] {
+        list.push(Agreement { expression: name.into(), host: u32::from(host) });
+    }
     list.push(Agreement { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
     list.push(Agreement { expression: "BLOCK".into(), host: BLOCK });
     list.push(Agreement { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });

@@ -5,15 +5,15 @@ use std::sync::Arc;
 use cudarc::driver::CudaSlice;
 use serde::Serialize;
 
-use super::apply::Apply;
+use super::apply::{Apply, Lengths};
 use super::bounds::Bounds;
 use super::deform::Deform;
 use super::device::Device;
 use super::inputs::{Inputs, Values};
 use super::layout::Header;
 use super::memory::{address, download, room};
-use super::orient::Orient;
-use super::plan::{Plan, Role, plan};
+use super::normals::Normals;
+use super::plan::{Kernel, Launch, Plan, Role, plan};
 use super::trial::{KernelFacts, Trial};
 use super::turns::Turns;
 use crate::error::{Result, during, invalid};
@@ -49,7 +49,8 @@ pub struct Ours {
     scene: Arc<Scene>,
     deform: Deform,
     bounds: Bounds,
-    orient: Orient,
+    normals: Option<Normals>,
+    listed: bool,
     inputs: Vec<Inputs>,
     outputs: CudaSlice<u8>,
     turns: Turns,
@@ -87,18 +88,24 @@ impl Ours {
         (extent, changed): (Extent, Option<&[u32]>),
     ) -> Result<Self> {
         let plan = plan(scene);
-        let [mut deform, bounds, orient, apply] = [0, 1, 2, 3].map(|index| plan.kernels[index].clone());
-        if extent == Extent::Uq {
-            deform.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
+        let normals = plan.kernel(Launch::Normals).filter(|_| extent == Extent::Whole);
+        let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
+        let mut tiles = plan.tiles();
+        for kernel in &mut tiles {
+            kernel.shape_for(extent);
         }
-        let deform = Deform::new(device, scene, &deform)?;
+        if extent == Extent::Uq {
+            tiles.retain(|kernel| kernel.launch == Launch::Modes);
+        }
+        let deform = Deform::new(device, scene, &tiles)?;
         let outputs = room(device, outputs_of(&plan).iter().sum())?;
         let mut ours = Self {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
             extent,
             scene: Arc::clone(scene),
-            bounds: Bounds::new(device, &bounds)?,
-            orient: Orient::new(device, scene, &orient)?,
+            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
+            normals,
+            listed: changed.is_some(),
             inputs: Vec::new(),
             outputs,
             turns: Turns::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
@@ -106,18 +113,18 @@ impl Ours {
             deform,
             plan,
         };
-        let mut apply = Apply::new(device, ours.deform.packing(), &apply)?;
+        let mut apply = Apply::new(device, ours.deform.packing(), ours.plan.needed(Launch::Apply)?)?;
         for state in states {
             let header = Header { everything: 1, step: 1, ..ours.header(device) };
             let mut inputs = Inputs::new(device, ours.deform.packing())?;
             send(device, &mut inputs, &header, state)?;
             if let Some(changed) = changed {
-                let header = Header { since: 1, step: 2, changed: changed.len() as u32, ..header };
-                if !apply.write(ours.deform.packing(), state, changed)? {
-                    return Err(invalid("changed", "a quarter of the domains at most", changed.len()));
-                }
+                let lengths = apply.write(ours.deform.packing(), state, changed)?;
+                let too_many = || invalid("changed", "a quarter of the domains at most", changed.len());
+                let Lengths { changed, stale } = lengths.ok_or_else(too_many)?;
+                let header = Header { since: 1, step: 2, changed, stale, ..header };
                 send(device, &mut inputs, &header, state)?;
-                apply.launch(device, inputs.values(device))?;
+                apply.launch(device, inputs.values(device), ours.deform.list(device))?;
                 device.stream().synchronize().map_err(during("upload"))?;
             }
             ours.inputs.push(inputs);
@@ -140,6 +147,18 @@ impl Ours {
 
     fn values(&self, device: &Device, turn: usize) -> Values {
         self.inputs[turn % self.inputs.len()].values(device)
+    }
+}
+
+impl Kernel {
+    /// Leaves out what the part of the step does without.
+    fn shape_for(&mut self, extent: Extent) {
+        if extent != Extent::Whole {
+            self.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS"].contains(define));
+        }
+        if extent == Extent::Uq {
+            self.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
+        }
     }
 }
 
@@ -193,12 +212,15 @@ impl Trial for Ours {
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
         let values = self.values(device, turn);
         self.turns.start(device, turn);
-        self.deform.launch(device, values)?;
+        if self.listed {
+            self.deform.launch_listed(device, values)?;
+        } else {
+            self.deform.launch(device, values)?;
+        }
         if self.extent == Extent::Whole {
             self.bounds.launch(device, values, self.deform.boxes(device))?;
-            self.orient.launch(device, values)?;
         }
-        Ok(())
+        self.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, values))
     }
 
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
@@ -229,12 +251,15 @@ impl Trial for Ours {
     }
 
     fn launches(&self) -> usize {
-        if self.extent == Extent::Whole { 3 } else { 1 }
+        let more = [self.extent == Extent::Whole, self.normals.is_some()].map(usize::from);
+        self.deform.launches() + more[0] + more[1]
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
-        let functions = [("deform", &self.deform.function), ("bounds", &self.bounds.function)];
-        let functions = functions.into_iter().chain([("orient", &self.orient.function)]);
-        functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
+        let mut facts = self.deform.facts();
+        let functions = std::iter::once(("bounds", &self.bounds.function));
+        let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
+        facts.extend(functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()));
+        facts
     }
 }

@@ -1,9 +1,17 @@
-//! A scene to the tables that `orient` reads: slots, blocks, rest normals and tangents. Pure.
+//! A scene to the tables that `normals` reads: slots, blocks, rest normals and tangents. Pure.
 
-use super::layout::{BLOCK, CornerSlot, NO_TANGENTS};
+use super::layout::{BLOCK, NO_TANGENTS};
 use crate::scene::Scene;
 
-/// One slot per domain, for `orient`.
+/// Where the corners of one domain lie. Instances share `first_normal` and `first_tangent`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct CornerSlot {
+    pub first: u32,
+    pub first_normal: u32,
+    pub first_tangent: u32,
+}
+
+/// One slot per domain.
 pub(super) fn corner_slots(scene: &Scene) -> Vec<CornerSlot> {
     let (mut normals, mut tangents) = (0, 0);
     let mut places = Vec::with_capacity(scene.shapes.len());
@@ -111,6 +119,18 @@ pub(super) mod tests {
     pub(in super::super) fn exact(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.normals = Normals::Exact;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// Every shape used by two domains, corner i being vertex i.
+    pub(in super::super) fn alike(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        for shape in &mut parts.shapes {
+            let (rest, corners) = (shape.mesh.rest().to_vec(), shape.mesh.corners().clone());
+            let (normals, uvs) = (corners.normals[..rest.len()].to_vec(), corners.uvs[..rest.len()].to_vec());
+            let mesh = Mesh::indexed(rest, normals, uvs, vec![[0, 1, 2]]).expect("a mesh");
+            *shape = Shape::new(mesh, shape.modes.clone()).expect("a shape");
+        }
         Scene::new(parts).expect("a scene")
     }
 

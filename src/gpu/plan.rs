@@ -4,10 +4,11 @@ use serde::Serialize;
 
 use super::apply::most_changes;
 use super::inputs::Sizes;
-use super::layout::{BLOCK, Change, CornerSlot, Lane, NormalSlot, Tile};
+use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
 use super::pack;
 use super::rings::Counts;
-use super::work::{Coordinates, Work};
+use super::work::{Coordinates, Work, corner_shifts, orients};
+use crate::error::{Error, Result};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
 
@@ -20,24 +21,19 @@ pub(super) struct KernelSource {
 }
 
 /// All kernels there are.
-pub(super) const KERNELS: [KernelSource; 5] = [
+pub(super) const KERNELS: [KernelSource; 4] = [
     KernelSource {
         name: "deform",
         source: include_str!("../../kernels/deform.cu"),
-        features: &["MODES", "NARROW", "TRUNCATED", "COMPENSATED"],
+        features: &["MODES", "NARROW", "TRUNCATED", "COMPENSATED", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"],
     },
     KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &[] },
-    KernelSource {
-        name: "orient",
-        source: include_str!("../../kernels/orient.cu"),
-        features: &["NORMAL_MAPS", "SHEAR"],
-    },
+    KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &[] },
     KernelSource {
         name: "normals",
         source: include_str!("../../kernels/normals.cu"),
         features: &["NORMAL_MAPS", "SHEAR"],
     },
-    KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &[] },
 ];
 
 /// The macros that choose what U is stored in; none for f32.
@@ -47,9 +43,25 @@ pub(super) const STORAGES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE_INT8"]
 /// each multiprocessor of a large device.
 const FEW_TILES: usize = 1024;
 
+/// What a launch is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Launch {
+    /// `deform` of the tiles that have modes.
+    Modes,
+    /// `deform` of the others.
+    Rigid,
+    Bounds,
+    /// Normals that follow the surface.
+    Normals,
+    /// In steps that change few domains; one launch of `deform` for listed tiles then takes the place of the two.
+    Apply,
+}
+
 /// A kernel as one scene compiles it; launched at most once a step.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Kernel {
+    pub launch: Launch,
     pub name: &'static str,
     /// Macros that switch parts of it on.
     pub defines: Vec<&'static str>,
@@ -69,9 +81,11 @@ pub enum Role {
     Rest,
     /// Scales of U, with `Int8`.
     Scales,
-    /// The work of each warp.
+    /// The work of each warp, and a list of some of it.
     Tiles,
     Lanes,
+    /// From vertices to corners, per domain; where they differ.
+    CornerShifts,
     /// A box of each warp's vertices.
     Boxes,
     /// The step that last changed each domain.
@@ -116,7 +130,7 @@ pub struct LeftOut {
 /// What the CUDA deformer compiles, allocates and launches for a scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Plan {
-    /// Launched in this order, each once a step; `apply` only in steps that change few domains.
+    /// Those that the scene has, in the order in which a step launches them; `apply` is first where it is launched.
     pub kernels: Vec<Kernel>,
     pub buffers: Vec<Buffer>,
     /// Bytes to the device and from it in each step, besides the vertices themselves.
@@ -138,33 +152,37 @@ pub fn plan(scene: &Scene) -> Plan {
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let domains = scene.domains.len() as u64;
     let inputs = Sizes::of(scene, &coordinates).total();
-    let corner_slot = if needs.exact_normals { size_of::<NormalSlot>() } else { size_of::<CornerSlot>() };
+    let directed = if orients(scene) { work.quads.end - work.quads.directed } else { 0 };
     let mut buffers = vec![
         (Role::Words, 16 * work.words),
-        (Role::Rest, 48 * work.rest),
+        (Role::Rest, 48 * work.quads.rest),
         (Role::Scales, 4 * work.scales),
-        (Role::Tiles, (work.tiles.len() * size_of::<Tile>()) as u64),
+        (Role::Tiles, ((size_of::<Tile>() + 4) * work.tiles.len()) as u64),
         (Role::Lanes, (work.lanes.len() * size_of::<Lane>() + 4 * work.lane_scales.len()) as u64),
-        (Role::Boxes, 24 * u64::from(kernels[0].blocks)),
+        (Role::CornerShifts, 4 * corner_shifts(scene).len() as u64),
+        (Role::Boxes, 24 * warps(&work)),
         (Role::Stamps, 4 * domains),
-        (Role::RestNormals, 12 * rest_corners),
-        (Role::CornerSlots, domains * corner_slot as u64),
-        (Role::CornerBlocks, 4 * (u64::from(blocks(layout.corners)) + 1)),
+        (Role::RestNormals, if needs.exact_normals { 12 * rest_corners } else { 48 * directed }),
         (Role::Inputs, inputs),
         (Role::Positions, 12 * vertices),
         (Role::Normals, 12 * corners),
     ];
     if needs.normal_maps {
-        buffers.push((Role::RestTangents, 16 * pack::tangent_count(scene) as u64));
+        let rigid = 64 * directed;
+        let bytes = if needs.exact_normals { 16 * pack::tangent_count(scene) as u64 } else { rigid };
+        buffers.push((Role::RestTangents, bytes));
         buffers.push((Role::Tangents, 16 * corners));
     }
     if needs.exact_normals {
         let counts = Counts::of(scene);
+        buffers.push((Role::CornerSlots, domains * size_of::<NormalSlot>() as u64));
+        buffers.push((Role::CornerBlocks, 4 * (u64::from(blocks(layout.corners)) + 1)));
         buffers.push((Role::Members, 4 * counts.members));
         buffers.push((Role::Rings, 4 * (counts.groups + 1 + counts.rings)));
         buffers.push((Role::GroupNormals, 12 * counts.groups));
     }
-    let changes = (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * coordinates.total;
+    let changes =
+        (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * (coordinates.total + work.tiles.len());
     Plan {
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
@@ -185,39 +203,68 @@ const fn storage_define(storage: Storage) -> Option<&'static str> {
     }
 }
 
+/// Whether a lane takes one item instead of four.
+pub(super) const fn is_narrow(work: &Work) -> bool {
+    work.tiles.len() < FEW_TILES
+}
+
+/// Warps of all tiles.
+pub(super) const fn warps(work: &Work) -> u64 {
+    work.tiles.len() as u64 * if is_narrow(work) { 4 } else { 1 }
+}
+
+/// Threads of a block of `deform`: WARPS in its source, which the launcher compares.
+fn threads_of(defines: &[&str]) -> u32 {
+    let one = ["MODES", "SHEAR", "LISTED"].iter().any(|macro_name| defines.contains(macro_name));
+    TILE_QUADS as u32 * if one { 1 } else { 2 }
+}
+
 fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     let needs = scene.needs;
-    let narrow = work.tiles.len() < FEW_TILES;
-    let flags = [
-        ("MODES", needs.modes),
-        ("NARROW", narrow),
-        ("TRUNCATED", needs.truncation),
-        ("COMPENSATED", needs.compensated),
-        ("NORMAL_MAPS", needs.normal_maps),
-        ("SHEAR", needs.shear),
-    ];
-    let compiled = |kernel: KernelSource, blocks: usize, threads: u32| {
-        let on = flags.iter().filter(|(name, on)| *on && kernel.features.contains(name)).map(|(name, _)| *name);
-        let storage = storage_define(scene.deformation.storage).filter(|_| needs.modes && kernel.name == "deform");
-        Kernel {
-            name: kernel.name,
-            defines: on.chain(storage).collect(),
-            blocks: blocks as u32,
-            threads,
-            source: kernel.source,
-        }
+    let with_modes = work.tiles.iter().filter(|tile| tile.chunks > 0).count();
+    let rigid = work.tiles.len() - with_modes;
+    let [deform, bounds, apply, normals] = KERNELS;
+    let per_tile = warps(work) as usize / work.tiles.len();
+    let tiles = |launch, tiles: usize| {
+        let defines = deform_defines(scene, work, launch == Launch::Modes);
+        let threads = threads_of(&defines);
+        let blocks = (tiles * per_tile).div_ceil(threads as usize / TILE_QUADS) as u32;
+        Kernel { launch, name: deform.name, defines, blocks, threads, source: deform.source }
     };
-    let [deform, bounds, orient, normals, apply] = KERNELS;
-    let directions = if needs.exact_normals { normals } else { orient };
-    let warps = work.tiles.len() * if narrow { 4 } else { 1 };
-    let boxes = warps.div_ceil(BLOCK as usize).min(MOST_BLOCKS);
+    let walk = |launch, kernel: &KernelSource, blocks: usize| {
+        let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear)];
+        let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
+        let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
+        Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: kernel.source }
+    };
+    let boxes = warps(work).div_ceil(u64::from(BLOCK)).min(MOST_BLOCKS as u64) as usize;
     let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
-    vec![
-        compiled(deform, warps, TILE_QUADS as u32),
-        compiled(bounds, boxes, BLOCK),
-        compiled(directions, blocks(scene.layout.corners) as usize, BLOCK),
-        compiled(apply, changes, BLOCK),
-    ]
+    let mut kernels = Vec::new();
+    kernels.extend((with_modes > 0).then(|| tiles(Launch::Modes, with_modes)));
+    kernels.extend((rigid > 0).then(|| tiles(Launch::Rigid, rigid)));
+    kernels.push(walk(Launch::Bounds, &bounds, boxes));
+    if needs.exact_normals {
+        kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
+    }
+    kernels.push(walk(Launch::Apply, &apply, changes));
+    kernels
+}
+
+/// The macros of `deform`, for tiles with modes or for those without.
+fn deform_defines(scene: &Scene, work: &Work, modes: bool) -> Vec<&'static str> {
+    let (needs, orients) = (scene.needs, orients(scene));
+    let flags = [
+        ("MODES", modes),
+        ("NARROW", is_narrow(work)),
+        ("TRUNCATED", modes && needs.truncation),
+        ("COMPENSATED", modes && needs.compensated),
+        ("ORIENT", orients),
+        ("SHIFTED", !corner_shifts(scene).is_empty()),
+        ("NORMAL_MAPS", orients && needs.normal_maps),
+        ("SHEAR", orients && needs.shear),
+    ];
+    let on = flags.iter().filter(|(_, on)| *on).map(|(name, _)| *name);
+    on.chain(storage_define(scene.deformation.storage).filter(|_| modes)).collect()
 }
 
 /// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
@@ -225,23 +272,19 @@ const MOST_BLOCKS: usize = 264;
 
 fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
     let needs = scene.needs;
-    let more = (size_of::<NormalSlot>() - size_of::<CornerSlot>()) * scene.domains.len();
+    let more = size_of::<NormalSlot>() * scene.domains.len();
     let exact_normals = LeftOut {
         feature: "exact_normals",
-        what: "`normals` in the place of `orient`, and its rings",
+        what: "`normals` behind `deform`, and its rings",
         bytes: Counts::bytes_of_possible_members(scene) + more as u64,
     };
     let all = [
         (needs.modes, LeftOut { feature: "modes", what: "the sum U q in `deform`", bytes: 0 }),
         (
             needs.normal_maps,
-            LeftOut {
-                feature: "normal_maps",
-                what: "tangents in `orient` and their two buffers",
-                bytes: tangent_bytes,
-            },
+            LeftOut { feature: "normal_maps", what: "tangents and their two buffers", bytes: tangent_bytes },
         ),
-        (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose in `orient`", bytes: 0 }),
+        (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose", bytes: 0 }),
         (needs.truncation, LeftOut { feature: "truncation", what: "lists of modes in `deform`", bytes: 0 }),
         (needs.exact_normals, exact_normals),
         (needs.compensated, LeftOut { feature: "compensated", what: "the compensation in `deform`", bytes: 0 }),
@@ -265,9 +308,27 @@ impl Plan {
         self.buffers.iter().map(|buffer| buffer.bytes).sum()
     }
 
+    /// The kernel of a launch, if the scene has it.
+    pub fn kernel(&self, launch: Launch) -> Option<&Kernel> {
+        self.kernels.iter().find(|kernel| kernel.launch == launch)
+    }
+
+    /// The kernel of a launch that every scene has.
+    pub(super) fn needed(&self, launch: Launch) -> Result<&Kernel> {
+        let missing = || Error::Fault { stage: "plan", reason: format!("no kernel for {launch:?}") };
+        self.kernel(launch).ok_or_else(missing)
+    }
+
+    /// The kernels of tiles, those with modes first.
+    pub(super) fn tiles(&self) -> Vec<Kernel> {
+        self.kernels.iter().filter(|kernel| [Launch::Modes, Launch::Rigid].contains(&kernel.launch)).cloned().collect()
+    }
+
     /// The most kernel launches of one step, whatever the number of domains.
-    pub const fn launches(&self) -> usize {
-        self.kernels.len()
+    pub fn launches(&self) -> usize {
+        let has = |launch| usize::from(self.kernel(launch).is_some());
+        // All tiles in two launches, or the listed ones in one behind `apply`.
+        has(Launch::Bounds) + has(Launch::Normals) + 2.max(has(Launch::Modes) + has(Launch::Rigid))
     }
 }
 
@@ -286,7 +347,7 @@ mod tests {
         let bare = plan(&scene(&[(7, 0), (300, 0)], false, true));
         assert_eq!(
             defines(&bare),
-            [("deform", vec!["NARROW"]), ("bounds", vec![]), ("orient", vec![]), ("apply", vec![])]
+            [("deform", vec!["NARROW", "ORIENT", "SHIFTED"]), ("bounds", vec![]), ("apply", vec![])]
         );
         assert_eq!(bare.bytes(Role::Tangents) + bare.bytes(Role::RestTangents), 0);
         assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
@@ -299,10 +360,9 @@ mod tests {
     #[test]
     fn a_scene_that_needs_more_leaves_less_out() {
         let full = plan(&scene(&[(7, 2), (300, 0)], true, false));
-        assert_eq!(full.kernels[0].defines, ["MODES", "NARROW"]);
-        assert_eq!(full.kernels[2].defines, ["NORMAL_MAPS", "SHEAR"]);
+        assert_eq!(full.kernels[0].defines, ["MODES", "NARROW", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]);
         assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
-        assert_eq!(full.bytes(Role::RestTangents), 16 * 302, "only the shape with a normal map");
+        assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
         assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
         assert_eq!(full.left_out.len(), 3);
     }
@@ -311,17 +371,19 @@ mod tests {
     fn storage_decides_the_bytes_of_u_and_the_macro_that_reads_it() {
         let bytes = |storage| {
             let plan = plan(&stored(&[(300, 8)], storage));
-            assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("NARROW")));
+            assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("SHEAR")));
             plan.bytes(Role::Words)
         };
         assert_eq!(Storage::ALL.map(bytes), [75 * 48 * 8, 75 * 48 * 4, 75 * 48 * 4, 75 * 48 * 2]);
     }
 
     #[test]
-    fn exact_normals_take_the_place_of_rigid_ones_and_their_tables_are_planned() {
+    fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
         let scene = exact(&[(7, 2), (300, 0), (513, 4)]);
         let (plan, rings) = (plan(&scene), Rings::new(&scene));
-        assert_eq!((plan.kernels[2].name, plan.kernels[2].defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
+        let normals = plan.kernel(Launch::Normals).expect("asked for");
+        assert_eq!((normals.name, normals.defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
+        assert_eq!(plan.kernels[0].defines, ["MODES", "NARROW"]);
         assert_eq!(plan.launches(), 4);
         for (role, bytes) in [
             (Role::CornerSlots, size_of_val(super::super::rings::slots(&scene).as_slice())),
@@ -335,13 +397,13 @@ mod tests {
         let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], Storage::F32));
         assert_eq!(rigid.bytes(Role::Members) + rigid.bytes(Role::Rings) + rigid.bytes(Role::GroupNormals), 0);
         let left_out = rigid.left_out.iter().find(|part| part.feature == "exact_normals").expect("left out");
-        assert_eq!(left_out.bytes, 4 * (9 + 515) + 8 * 6, "members, and eight bytes more per slot");
+        assert_eq!(left_out.bytes, 4 * (9 + 515) + 20 * 6, "members and slots");
     }
 
     #[test]
     fn launches_do_not_grow_with_the_number_of_domains() {
         let (few, many) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
-        assert_eq!((plan(&few).launches(), plan(&many).launches()), (4, 4));
+        assert_eq!((plan(&few).launches(), plan(&many).launches()), (3, 3));
     }
 
     #[test]
@@ -349,15 +411,10 @@ mod tests {
         let scene = scene(&[(7, 2), (300, 0), (513, 4)], true, false);
         let plan = plan(&scene);
         let work = Work::new(&scene, &Coordinates::new(&scene));
-        let corner_slots = pack::corner_slots(&scene);
-        let corner_blocks = pack::first_domains(corner_slots.iter().map(|slot| slot.first), scene.layout.corners);
         for (role, bytes) in [
-            (Role::Tiles, size_of_val(work.tiles.as_slice())),
+            (Role::Tiles, size_of_val(work.tiles.as_slice()) + 4 * work.tiles.len()),
             (Role::Lanes, size_of_val(work.lanes.as_slice())),
-            (Role::CornerSlots, size_of_val(corner_slots.as_slice())),
-            (Role::CornerBlocks, size_of_val(corner_blocks.as_slice())),
-            (Role::RestNormals, size_of_val(pack::rest_normals(&scene).as_slice())),
-            (Role::RestTangents, size_of_val(pack::rest_tangents(&scene).as_slice())),
+            (Role::CornerShifts, size_of_val(corner_shifts(&scene).as_slice())),
         ] {
             assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
         }

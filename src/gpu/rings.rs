@@ -74,16 +74,15 @@ pub(super) fn slots(scene: &Scene) -> Vec<NormalSlot> {
         })
     };
     let first_members: Vec<u32> = scene.shapes.iter().map(first_member).collect();
-    let slot =
-        |(corner, (domain, slot)): (super::layout::CornerSlot, (&crate::domain::Domain, &crate::scene::Slot))| {
-            NormalSlot {
-                first: corner.first,
-                first_normal: corner.first_normal,
-                first_tangent: corner.first_tangent,
-                first_vertex: slot.first_vertex as u32,
-                first_member: first_members[domain.shape],
-            }
-        };
+    let slot = |(corner, (domain, slot)): (super::pack::CornerSlot, (&crate::domain::Domain, &crate::scene::Slot))| {
+        NormalSlot {
+            first: corner.first,
+            first_normal: corner.first_normal,
+            first_tangent: corner.first_tangent,
+            first_vertex: slot.first_vertex as u32,
+            first_member: first_members[domain.shape],
+        }
+    };
     let domains = scene.domains.iter().zip(&scene.layout.slots);
     pack::corner_slots(scene).into_iter().zip(domains).map(slot).collect()
 }

@@ -67,11 +67,11 @@ impl KernelFacts {
     }
 }
 
-/// A kernel file that only trials use: one function of the same name, unless `functions` says otherwise.
+/// A kernel file that only trials use.
 #[derive(Debug)]
 pub(super) struct Code {
     pub source: &'static str,
-    /// The functions in it.
+    /// The functions in it; [`Compiled`] is the first.
     pub functions: &'static [&'static str],
     /// The lists of macros that it is ever compiled with.
     pub variants: &'static [&'static [&'static str]],
@@ -85,8 +85,9 @@ pub(super) struct Compiled {
 }
 
 impl Compiled {
-    /// Compiles a function of a file with one of its lists of macros.
-    pub(super) fn new(device: &Device, code: &Code, function: &str, defines: &[&str]) -> Result<Self> {
+    /// Compiles the first function of a file with one of its lists of macros.
+    pub(super) fn new(device: &Device, code: &Code, defines: &[&str]) -> Result<Self> {
+        let function = code.functions[0];
         let compiled = device.function(function, code.source, defines)?;
         let name = std::iter::once(function).chain(defines.iter().copied()).collect::<Vec<_>>().join(" ");
         Ok(Self { facts: KernelFacts::of(&name, &compiled)?, function: compiled })

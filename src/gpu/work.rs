@@ -1,11 +1,12 @@
 //! A scene to the work list of `deform`: one tile per warp, whatever domains it holds. Pure.
 //!
+//! A tile computes vertices, or corners, or both where corner i of a shape is its vertex i.
 //! A shape of more than [`SMALL`] quads, or one with modes that several domains share, is cut into tiles of its own, and
 //! its U lies on the device once. The quads of smaller domains with the same number of chunks fill tiles together, so
 //! that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first: a long tile that began last would be
 //! waited for.
 
-use super::layout::{Lane, Tile};
+use super::layout::{Lane, TILE_CORNERS, TILE_VERTICES, Tile};
 use crate::domain::Shape;
 use crate::scene::{Scene, Storage};
 use crate::storage::{Plane, TILE_QUADS, Tiles, modes_per_chunk};
@@ -35,12 +36,65 @@ pub(super) struct Work {
     pub sources: Vec<Source>,
     /// Words of 16 bytes.
     pub words: u64,
-    /// Of each shape, its first quad of x0, and the quads of all.
-    pub first_rest: Vec<u32>,
-    pub rest: u64,
+    pub quads: Quads,
     /// Of each shape, its first scale, and the scales of all.
     pub first_scale: Vec<u32>,
     pub scales: u64,
+    /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
+    pub spans: Vec<[(u32, u32); 2]>,
+}
+
+/// Where quads of x0, normals and tangents lie: first x0 of shapes whose corners are others than their vertices, then
+/// x0, normals and tangents of those whose corner i is vertex i, then normals and tangents of the others.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Quads {
+    /// Of each shape, its first quad of x0.
+    pub vertices: Vec<u32>,
+    /// Of each shape, its first quad of normals and tangents.
+    pub corners: Vec<u32>,
+    /// Quads of x0, and the first that has normals.
+    pub rest: u64,
+    pub directed: u64,
+    /// The end of all quads.
+    pub end: u64,
+}
+
+impl Quads {
+    fn new(scene: &Scene) -> Self {
+        let orients = orients(scene);
+        let places = |own: &dyn Fn(&Shape) -> Option<usize>, next: &mut u64| -> Vec<u32> {
+            let place = |shape| {
+                let first = *next;
+                *next += own(shape).map_or(0, |items| items.div_ceil(QUAD)) as u64;
+                first as u32
+            };
+            scene.shapes.iter().map(place).collect()
+        };
+        let (mut next, unlike) = (0, |shape: &Shape| !is_alike(shape));
+        let vertices = |shape: &Shape| shape.mesh.rest().len();
+        let before = places(&|shape| unlike(shape).then(|| vertices(shape)), &mut next);
+        let directed = next;
+        let alike = places(&|shape| is_alike(shape).then(|| vertices(shape)), &mut next);
+        let rest = next;
+        let corners = |shape: &Shape| shape.mesh.corners().vertices.len();
+        let behind = places(&|shape| (orients && unlike(shape)).then(|| corners(shape)), &mut next);
+        let choose = |others: &[u32]| {
+            let each = scene.shapes.iter().zip(&alike).zip(others);
+            each.map(|((shape, alike), other)| if is_alike(shape) { *alike } else { *other }).collect()
+        };
+        Self { vertices: choose(&before), corners: choose(&behind), rest, directed, end: next }
+    }
+}
+
+/// Whether corner i of a shape is its vertex i, so that one lane has both.
+pub(super) fn is_alike(shape: &Shape) -> bool {
+    let corners = &shape.mesh.corners().vertices;
+    corners.len() == shape.mesh.rest().len() && corners.iter().enumerate().all(|(at, vertex)| at as u32 == *vertex)
+}
+
+/// Whether `deform` turns normals; those that follow the surface come after it.
+pub(super) fn orients(scene: &Scene) -> bool {
+    !scene.needs.exact_normals
 }
 
 /// Where a domain's coordinates lie on the device: whole chunks of them.
@@ -73,6 +127,14 @@ impl Coordinates {
     }
 }
 
+/// What a domain's tile computes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Role {
+    chunks: usize,
+    /// Parts of [`Tile`]'s kind.
+    flags: u8,
+}
+
 /// One tile before it has its place: of one domain, or of the whole of several.
 enum Item {
     Own { domain: usize, tile: usize },
@@ -82,134 +144,190 @@ enum Item {
 impl Work {
     pub(super) fn new(scene: &Scene, coordinates: &Coordinates) -> Self {
         let mut items = items(scene);
-        items.sort_by_key(|(chunks, _)| std::cmp::Reverse(*chunks));
-        let storage = scene.deformation.storage;
+        items.sort_by_key(|(role, _)| std::cmp::Reverse(role.chunks));
         let mut work = Self::empty(scene);
         let mut first_words: Vec<Option<u64>> = vec![None; scene.shapes.len()];
-        for (chunks, item) in items {
+        for (role, item) in items {
+            let index = work.tiles.len() as u32;
             match item {
                 Item::Own { domain, tile } => {
-                    let shape = scene.domains[domain].shape;
-                    let first_word = *first_words[shape].get_or_insert_with(|| {
-                        if chunks > 0 {
-                            work.sources.push(Source::Shape(shape));
-                        }
-                        let first = work.words;
-                        work.words += (3 * chunks * quads_of(&scene.shapes[shape])) as u64;
-                        first
-                    });
-                    let own = work.own_tile(scene, coordinates, (domain, tile));
-                    let before = (3 * chunks * TILE_QUADS * tile) as u64;
+                    let first_word =
+                        work.place_words(scene, scene.domains[domain].shape, role.chunks, &mut first_words);
+                    let own = work.own_tile(scene, coordinates, role, (domain, tile));
+                    let before = (3 * role.chunks * TILE_QUADS * tile) as u64;
                     work.tiles.push(Tile { first_word: first_word + before, ..own });
+                    work.note_span(domain, role, index);
                 }
-                Item::Mixed(domains) => work.push_mixed(scene, coordinates, &domains, chunks),
+                Item::Mixed(domains) => {
+                    work.push_mixed(scene, coordinates, role, &domains);
+                    domains.iter().for_each(|domain| work.note_span(*domain, role, index));
+                }
             }
         }
-        if storage != Storage::Int8 {
+        if scene.deformation.storage != Storage::Int8 {
             work.lane_scales.clear();
         }
         work
     }
 
-    /// Room for x0 and scales of every shape, and no tiles yet.
+    /// Room for scales of every shape, and no tiles yet.
     fn empty(scene: &Scene) -> Self {
         let storage = scene.deformation.storage;
-        let (mut rest, mut scales) = (0_u64, 0_u64);
-        let (mut first_rest, mut first_scale) = (Vec::new(), Vec::new());
+        let (mut scales, mut first_scale) = (0_u64, Vec::new());
         for shape in &scene.shapes {
-            first_rest.push(rest as u32);
             first_scale.push(scales as u32);
-            rest += quads_of(shape) as u64;
             if storage == Storage::Int8 {
                 let per_tile = shape.modes.rank().next_multiple_of(modes_per_chunk(storage));
                 scales += (per_tile * quads_of(shape).div_ceil(TILE_QUADS)) as u64;
             }
         }
-        let (tiles, lanes, lane_scales, sources) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        Self { tiles, lanes, lane_scales, sources, words: 0, first_rest, rest, first_scale, scales }
-    }
-
-    fn own_tile(&self, scene: &Scene, coordinates: &Coordinates, (domain, tile): (usize, usize)) -> Tile {
-        let shape = scene.domains[domain].shape;
-        let vertices = scene.shapes[shape].mesh.rest().len() - QUAD * TILE_QUADS * tile;
-        let width = vertices.div_ceil(QUAD).min(TILE_QUADS);
-        let rank = scene.shapes[shape].modes.rank();
-        let per_chunk = modes_per_chunk(scene.deformation.storage);
-        Tile {
-            first_word: 0,
-            first: (scene.layout.slots[domain].first_vertex + QUAD * TILE_QUADS * tile) as u32,
-            rest: self.first_rest[shape] + (TILE_QUADS * tile) as u32,
-            domain: domain as u32,
-            first_q: coordinates.first[domain],
-            first_scale: self.first_scale[shape] + (tile * rank.next_multiple_of(per_chunk)) as u32,
-            chunks: rank.div_ceil(per_chunk) as u16,
-            width: width as u8,
-            kind: (vertices.min(QUAD * TILE_QUADS) - QUAD * (width - 1)) as u8,
+        Self {
+            tiles: Vec::new(),
+            lanes: Vec::new(),
+            lane_scales: Vec::new(),
+            sources: Vec::new(),
+            words: 0,
+            quads: Quads::new(scene),
+            first_scale,
+            scales,
+            spans: vec![[(0, 0); 2]; scene.domains.len()],
         }
     }
 
-    fn push_mixed(&mut self, scene: &Scene, coordinates: &Coordinates, domains: &[usize], chunks: usize) {
+    /// The first word of a shape that is stored by itself; its place is taken at the first call.
+    fn place_words(&mut self, scene: &Scene, shape: usize, chunks: usize, places: &mut [Option<u64>]) -> u64 {
+        if chunks == 0 {
+            return 0;
+        }
+        *places[shape].get_or_insert_with(|| {
+            self.sources.push(Source::Shape(shape));
+            let first = self.words;
+            self.words += (3 * chunks * quads_of(&scene.shapes[shape])) as u64;
+            first
+        })
+    }
+
+    /// The tiles of a domain's role follow each other.
+    fn note_span(&mut self, domain: usize, role: Role, index: u32) {
+        let (first, count) = &mut self.spans[domain][usize::from(role.flags & TILE_VERTICES == 0)];
+        if *count == 0 {
+            *first = index;
+        }
+        *count += 1;
+    }
+
+    fn own_tile(&self, scene: &Scene, coordinates: &Coordinates, role: Role, (domain, tile): (usize, usize)) -> Tile {
+        let place = self.place(scene, role, domain);
+        let items = place.items - QUAD * TILE_QUADS * tile;
+        let width = items.div_ceil(QUAD).min(TILE_QUADS);
+        let shape = scene.domains[domain].shape;
+        let scales = if role.chunks == 0 { 0 } else { tile * role.chunks * modes_per_chunk(scene.deformation.storage) };
+        Tile {
+            first_word: 0,
+            first: place.first + (QUAD * TILE_QUADS * tile) as u32,
+            rest: place.rest + (TILE_QUADS * tile) as u32,
+            domain: domain as u32,
+            first_q: coordinates.first[domain],
+            first_scale: self.first_scale[shape] + scales as u32,
+            chunks: role.chunks as u16,
+            width: width as u8,
+            kind: role.flags | (items.min(QUAD * TILE_QUADS) - QUAD * (width - 1)) as u8,
+        }
+    }
+
+    fn push_mixed(&mut self, scene: &Scene, coordinates: &Coordinates, role: Role, domains: &[usize]) {
         let first = self.lanes.len() as u32;
         for domain in domains {
-            let shape = scene.domains[*domain].shape;
-            let vertices = scene.shapes[shape].mesh.rest().len();
-            for quad in 0..vertices.div_ceil(QUAD) {
-                let count = (vertices - QUAD * quad).min(QUAD);
+            let place = self.place(scene, role, *domain);
+            for quad in 0..place.items.div_ceil(QUAD) {
+                let count = (place.items - QUAD * quad).min(QUAD);
                 self.lanes.push(Lane {
-                    vertex: (scene.layout.slots[*domain].first_vertex + QUAD * quad) as u32,
-                    rest: self.first_rest[shape] + quad as u32,
+                    item: place.first + (QUAD * quad) as u32,
+                    rest: place.rest + quad as u32,
                     domain: (QUAD * domain + count - 1) as u32,
                     first_q: coordinates.first[*domain],
                 });
-                self.lane_scales.push(self.first_scale[shape]);
+                self.lane_scales.push(self.first_scale[scene.domains[*domain].shape]);
             }
         }
         let width = self.lanes.len() as u32 - first;
-        let (chunks16, first_word) = (chunks as u16, self.words);
-        let (rest, domain, first_q, first_scale) = (0, 0, 0, 0);
-        let width8 = width as u8;
         self.tiles.push(Tile {
-            first_word,
+            first_word: self.words,
             first,
-            rest,
-            domain,
-            first_q,
-            first_scale,
-            chunks: chunks16,
-            width: width8,
-            kind: 0,
+            rest: 0,
+            domain: 0,
+            first_q: 0,
+            first_scale: 0,
+            chunks: role.chunks as u16,
+            width: width as u8,
+            kind: role.flags,
         });
-        if chunks > 0 {
+        if role.chunks > 0 {
             self.sources.push(Source::Mixed(domains.iter().map(|domain| scene.domains[*domain].shape).collect()));
-            self.words += (3 * chunks) as u64 * u64::from(width);
+            self.words += (3 * role.chunks) as u64 * u64::from(width);
+        }
+    }
+
+    /// The vertices of a domain, or its corners in a tile of corners alone.
+    fn place(&self, scene: &Scene, role: Role, domain: usize) -> Place {
+        let (slot, shape) = (scene.layout.slots[domain], scene.domains[domain].shape);
+        if role.flags & TILE_VERTICES > 0 {
+            Place { items: slot.vertices, first: slot.first_vertex as u32, rest: self.quads.vertices[shape] }
+        } else {
+            Place { items: slot.corners, first: slot.first_corner as u32, rest: self.quads.corners[shape] }
         }
     }
 }
 
-/// Every tile with its chunks, in the order of the domains.
-fn items(scene: &Scene) -> Vec<(usize, Item)> {
+/// Items of a domain, the first packed one, and the first quad of what they are at rest.
+struct Place {
+    items: usize,
+    first: u32,
+    rest: u32,
+}
+
+/// Every tile with its role, in the order of the domains.
+fn items(scene: &Scene) -> Vec<(Role, Item)> {
     let mut users = vec![0_usize; scene.shapes.len()];
     scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
+    let alike: Vec<bool> = scene.shapes.iter().map(is_alike).collect();
     let mut items = Vec::new();
-    // Per number of chunks, the domains that wait for their tile to fill up, and its quads.
-    let mut open: std::collections::BTreeMap<usize, (Vec<usize>, usize)> = std::collections::BTreeMap::new();
-    for (index, domain) in scene.domains.iter().enumerate() {
-        let shape = &scene.shapes[domain.shape];
-        let (quads, chunks) = (quads_of(shape), chunks_of(scene, shape));
-        if quads > SMALL || (chunks > 0 && users[domain.shape] > 1) {
-            items.extend((0..quads.div_ceil(TILE_QUADS)).map(|tile| (chunks, Item::Own { domain: index, tile })));
-            continue;
+    // Per role, the domains that wait for their tile to fill up, and its quads.
+    let mut open: std::collections::BTreeMap<Role, (Vec<usize>, usize)> = std::collections::BTreeMap::new();
+    let mut add = |domain: usize, role: Role, count: usize, alone: bool| {
+        let quads = count.div_ceil(QUAD);
+        if quads > SMALL || alone {
+            items.extend((0..quads.div_ceil(TILE_QUADS)).map(|tile| (role, Item::Own { domain, tile })));
+            return;
         }
-        let (waiting, filled) = open.entry(chunks).or_default();
+        let (waiting, filled) = open.entry(role).or_default();
         if *filled + quads > TILE_QUADS {
-            items.push((chunks, Item::Mixed(std::mem::take(waiting))));
+            items.push((role, Item::Mixed(std::mem::take(waiting))));
             *filled = 0;
         }
-        waiting.push(index);
+        waiting.push(domain);
         *filled += quads;
+    };
+    for (index, domain) in scene.domains.iter().enumerate() {
+        let (shape, slot) = (&scene.shapes[domain.shape], scene.layout.slots[index]);
+        let chunks = chunks_of(scene, shape);
+        let both = orients(scene) && alike[domain.shape];
+        let flags = TILE_VERTICES | if both { TILE_CORNERS } else { 0 };
+        add(index, Role { chunks, flags }, slot.vertices, chunks > 0 && users[domain.shape] > 1);
+        if orients(scene) && !both {
+            add(index, Role { chunks: 0, flags: TILE_CORNERS }, slot.corners, false);
+        }
     }
-    items.extend(open.into_iter().map(|(chunks, (waiting, _))| (chunks, Item::Mixed(waiting))));
+    let rest: Vec<_> = open.into_iter().map(|(role, (waiting, _))| (role, Item::Mixed(waiting))).collect();
+    items.extend(rest);
     items
+}
+
+/// From a domain's first vertex to its first corner, wrapping; empty when all are at the same place.
+pub(super) fn corner_shifts(scene: &Scene) -> Vec<u32> {
+    let shift = |slot: &crate::scene::Slot| (slot.first_corner as u32).wrapping_sub(slot.first_vertex as u32);
+    let shifts: Vec<u32> = scene.layout.slots.iter().map(shift).collect();
+    if orients(scene) && shifts.iter().any(|shift| *shift != 0) { shifts } else { Vec::new() }
 }
 
 fn quads_of(shape: &Shape) -> usize {
@@ -235,6 +353,7 @@ pub(super) fn side_by_side(shapes: &[Tiles]) -> Vec<Plane> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::layout::TILE_LAST;
     use super::super::pack::tests::{scene, stored};
     use super::*;
     use std::sync::Arc;
@@ -252,7 +371,7 @@ mod tests {
         let mut loaded = Loaded {
             words: Vec::new(),
             scales: vec![0.0; work.scales as usize],
-            rest: vec![[0.0; 12]; work.rest as usize],
+            rest: vec![[0.0; 12]; work.quads.rest as usize],
             factors: Vec::new(),
         };
         for source in &work.sources {
@@ -266,27 +385,49 @@ mod tests {
         for shape in 0..scene.shapes.len() {
             let own = tiles(shape);
             loaded.scales[work.first_scale[shape] as usize..][..own.scales().len()].copy_from_slice(own.scales());
-            loaded.rest[work.first_rest[shape] as usize..][..own.rest().len()].copy_from_slice(own.rest());
+            loaded.rest[work.quads.vertices[shape] as usize..][..own.rest().len()].copy_from_slice(own.rest());
             loaded.factors.push(own.factors().to_vec());
         }
         loaded
     }
 
-    /// A lane as the kernel sees it: domain, first vertex, vertices, first quad of x0, first q, first scale.
+    /// A lane as the kernel sees it: domain, first item, items, first quad of x0, first q, first scale.
     fn lane(work: &Work, tile: &Tile, quad: usize) -> (usize, u32, usize, u32, u32, u32) {
-        if tile.kind > 0 {
-            let last = quad + 1 == usize::from(tile.width);
-            let count = if last { usize::from(tile.kind) } else { 4 };
+        let last = usize::from(tile.kind & TILE_LAST);
+        if last > 0 {
+            let count = if quad + 1 == usize::from(tile.width) { last } else { 4 };
             let step = quad as u32;
-            let vertex = tile.first + 4 * step;
-            (tile.domain as usize, vertex, count, tile.rest + step, tile.first_q, tile.first_scale)
+            let item = tile.first + 4 * step;
+            (tile.domain as usize, item, count, tile.rest + step, tile.first_q, tile.first_scale)
         } else {
             let at = tile.first as usize + quad;
             let lane = work.lanes[at];
             let scale = work.lane_scales.get(at).copied().unwrap_or(0);
             let (domain, count) = ((lane.domain / 4) as usize, 1 + lane.domain as usize % 4);
-            (domain, lane.vertex, count, lane.rest, lane.first_q, scale)
+            (domain, lane.item, count, lane.rest, lane.first_q, scale)
         }
+    }
+
+    /// Counts the tiles that compute each packed corner, and checks where they look for its rest normal.
+    fn check_corners(scene: &Scene, work: &Work) {
+        let mut seen = vec![0; scene.layout.corners];
+        let shifts = corner_shifts(scene);
+        for tile in work.tiles.iter().filter(|tile| tile.kind & TILE_CORNERS > 0) {
+            for quad in 0..usize::from(tile.width) {
+                let (domain, item, count, rest, ..) = lane(work, tile, quad);
+                let both = tile.kind & TILE_VERTICES > 0;
+                let shift = if both { shifts.get(domain).copied().unwrap_or(0) } else { 0 };
+                let slot = scene.layout.slots[domain];
+                for within in 0..count {
+                    let corner = item.wrapping_add(shift) as usize + within;
+                    seen[corner] += 1;
+                    let quad = work.quads.corners[scene.domains[domain].shape] as usize;
+                    assert_eq!(rest as usize, quad + (corner - slot.first_corner) / 4);
+                    assert!(rest as u64 >= work.quads.directed && (rest as u64) < work.quads.end);
+                }
+            }
+        }
+        assert!(seen.iter().all(|times| *times == 1), "every corner is computed once");
     }
 
     /// Walks the work list as the kernel does and checks that every vertex finds its x0, its entries and its q.
@@ -297,12 +438,15 @@ mod tests {
         assert_eq!(loaded.words.len() as u64, work.words);
         let per_chunk = modes_per_chunk(scene.deformation.storage);
         let mut seen = vec![0; scene.layout.vertices];
-        for tile in &work.tiles {
+        check_corners(scene, &work);
+        for (index, tile) in work.tiles.iter().enumerate().filter(|(_, tile)| tile.kind & TILE_VERTICES > 0) {
             assert!((1..=TILE_QUADS).contains(&usize::from(tile.width)));
             for quad in 0..usize::from(tile.width) {
                 let (domain, first, count, rest, first_q, first_scale) = lane(&work, tile, quad);
                 let shape = &scene.shapes[scene.domains[domain].shape];
                 assert_eq!(first_q, coordinates.first[domain]);
+                let (begin, tiles) = work.spans[domain][0];
+                assert!((begin..begin + tiles).contains(&(index as u32)), "the domain knows its tiles");
                 assert_eq!(usize::from(tile.chunks), shape.modes.rank().div_ceil(per_chunk));
                 for within in 0..count {
                     let packed = first as usize + within;
@@ -347,15 +491,26 @@ mod tests {
 
     #[test]
     fn small_rigid_domains_fill_tiles_together_and_those_with_modes_do_unless_they_share_them() {
+        let vertices = |work: &Work| -> Vec<Tile> {
+            work.tiles.iter().filter(|tile| tile.kind & TILE_VERTICES > 0).copied().collect()
+        };
         // Two instances of each: those with modes share U and stay apart.
         let work = check(&scene(&[(7, 0); 40], false, false));
-        assert_eq!(work.tiles.len(), 80 * 2 / 32);
-        assert!(work.tiles.iter().all(|tile| (tile.kind, tile.width) == (0, 32)));
+        assert_eq!(vertices(&work).len(), 80 * 2 / 32);
+        assert!(vertices(&work).iter().all(|tile| (tile.kind & TILE_LAST, tile.width) == (0, 32)));
         let work = check(&scene(&[(7, 3); 40], false, false));
-        assert_eq!((work.tiles.len(), work.words), (80, 40 * 2 * 3 * 3));
-        let alone = single(&[(7, 3); 80]);
-        let work = check(&alone);
-        assert_eq!((work.tiles.len(), work.words), (80 * 2 / 32, 80 * 2 * 3 * 3));
+        assert_eq!((vertices(&work).len(), work.words), (80, 40 * 2 * 3 * 3));
+        let work = check(&single(&[(7, 3); 80]));
+        assert_eq!((vertices(&work).len(), work.words), (80 * 2 / 32, 80 * 2 * 3 * 3));
+    }
+
+    #[test]
+    fn corners_that_are_the_vertices_share_their_tiles_and_have_no_room_of_their_own() {
+        let work = check(&super::super::pack::tests::alike(&[(7, 2), (300, 0), (9, 0)]));
+        assert!(work.tiles.iter().all(|tile| tile.kind & !TILE_LAST == TILE_VERTICES | TILE_CORNERS));
+        assert_eq!((work.quads.directed, work.quads.end), (0, work.quads.rest));
+        let work = check(&single(&[(7, 2), (300, 0)]));
+        assert!(work.tiles.iter().all(|tile| [TILE_VERTICES, TILE_CORNERS].contains(&(tile.kind & !TILE_LAST))));
     }
 
     /// Every shape used by one domain.

@@ -2,7 +2,7 @@
 
 use crate::scene::{Scene, State};
 
-/// World positions relative to the scene's origin, three f64 per vertex, packed as the layout says.
+/// World positions relative to their domains' cells, three f64 per vertex, packed as the layout says.
 pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     let mut positions = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {

@@ -12,9 +12,9 @@
 //! - corners of one group with one rest normal keep one normal: seams stay closed and hard edges stay hard.
 //!
 //! A tangent is carried by the same rotation, then made orthogonal to the new normal; the bitangent keeps its sign, or
-//! is flipped by a mirroring T as in the rigid case. This follows how the surface tilts. It does not follow how modes
-//! turn or shear the surface within itself: that would take texture gradients per triangle, and so 8 more bytes per
-//! entry of every ring.
+//! is flipped by a mirroring T as in the rigid case. That takes no memory and no reads beyond those of rigid tangents
+//! and exact normals. It follows how the surface tilts, not how modes turn or shear it within itself: that would take
+//! texture gradients per triangle, and so 8 more bytes per entry of every ring.
 //!
 //! # What is kept
 //! A corner keeps its rigid normal and tangent where there is nothing to follow: its shape has no modes; its group has

@@ -34,17 +34,19 @@ const _: () = assert!(size_of::<Frame>() == 368, "Frame differs from shaders/sha
 const EDGE: f64 = 6.0;
 
 impl Frame {
-    /// The numbers of one shot.
+    /// The numbers of one shot of positions that are relative to `origin`, a point in scene units from the scene's
+    /// origin. It is taken off the camera in f64.
     ///
     /// # Errors
     /// `Invalid` when the camera's numbers overflow.
-    pub(super) fn new(scene: &Scene, shot: &Shot) -> Result<Self> {
+    pub(super) fn new(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Result<Self> {
         // Bounds that overflowed fit no shadow and no depth range; those at rest are always good.
         let sound = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
         let bounds = if sound { shot.bounds } else { scene.rest_bounds };
+        let home = home(scene, bounds, origin);
         let look = &scene.look;
         let to_sun = look.to_sun(scene.up);
-        let height = scene.rest_bounds.min[scene.up.index()];
+        let height = home.min[scene.up.index()];
         let shadow = look.shadow.unwrap_or_default();
         let light = LightBox::fit(&Fit {
             to_sun,
@@ -54,15 +56,17 @@ impl Frame {
             size: f64::from(shadow.size),
             rim: (3.0 * f64::from(shadow.blur)).ceil() + 1.0,
         });
-        let camera = shot.camera.camera_from_world();
-        let clip = shot.camera.clip_from_camera(shot.width, shot.height, &around(bounds, scene));
-        let (centre, fade) = ground_disc(scene, shot.camera.eye());
+        let viewer = shot.camera.relative_to(origin);
+        let camera = viewer.camera_from_world();
+        // The depth range is for the deformed and the rest state: planes must not jump when a branch bends.
+        let clip = viewer.clip_from_camera(shot.width, shot.height, &bounds.union(home));
+        let (centre, fade) = ground_disc(scene.up.index(), home, viewer.eye());
         let colour = |[r, g, b]: [f32; 3], fourth: f64| [r, g, b, fourth as f32];
         let frame = Self {
             clip_from_world: (clip * camera).cast().into(),
             map_from_world: light.map_from_world.cast().into(),
             world_from_image: world_from_image(&clip, &camera).cast().into(),
-            eye: wide(shot.camera.eye(), 0.0),
+            eye: wide(viewer.eye(), 0.0),
             to_sun: wide(to_sun, 0.0),
             sunlight: colour(look.sunlight, 0.0),
             skylight: colour(look.skylight, 0.0),
@@ -88,19 +92,26 @@ pub(super) fn above_ground(scene: &Scene, shot: &Shot) -> bool {
     shot.camera.eye()[up] > scene.rest_bounds.min[up]
 }
 
-/// Depth range for the deformed and the rest state: the camera's planes must not jump when a branch bends.
-fn around(bounds: Bounds, scene: &Scene) -> Bounds {
-    bounds.union(scene.rest_bounds)
+/// The rest bounds in the frame of the positions. A scene that has left the scene's origin for good, so that positions
+/// have another one, is as if it rested where it is now; its ground stays at its height.
+fn home(scene: &Scene, bounds: Bounds, origin: [f64; 3]) -> Bounds {
+    let rest = scene.rest_bounds;
+    if origin == [0.0; 3] {
+        return rest;
+    }
+    let mut shift = bounds.centre() - rest.centre();
+    shift[scene.up.index()] = -origin[scene.up.index()];
+    let moved = |corner: [f64; 3]| std::array::from_fn(|axis| corner[axis] + shift[axis]);
+    Bounds { min: moved(rest.min), max: moved(rest.max) }
 }
 
 /// Centre of the ground under the scene, and the distance D over which it fades.
-fn ground_disc(scene: &Scene, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
-    let up = scene.up.index();
-    let mut centre = scene.rest_bounds.centre().coords;
-    centre[up] = scene.rest_bounds.min[up];
+fn ground_disc(up: usize, home: Bounds, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
+    let mut centre = home.centre().coords;
+    centre[up] = home.min[up];
     let mut aside = eye - centre;
     aside[up] = 0.0;
-    (centre, 3.5 * scene.rest_bounds.diagonal().max(aside.norm()).max(1e-6))
+    (centre, 3.5 * home.diagonal().max(aside.norm()).max(1e-6))
 }
 
 /// Normalised device coordinates (x, y, 1) to a direction in the world.
@@ -141,16 +152,28 @@ mod tests {
     }
 
     #[test]
+    fn a_scene_that_left_for_good_rests_where_it_is_and_its_ground_stays_at_its_height() {
+        let scene = Scene::new(squares(vec![Material::default()])).expect("good");
+        let rest = scene.rest_bounds;
+        let moved = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] + 5.0, corner[2] - 7.0];
+        let bounds = Bounds { min: moved(rest.min), max: moved(rest.max) };
+        assert_eq!(home(&scene, bounds, [0.0; 3]), rest, "a scene at its origin rests where it rested");
+        let home = home(&scene, bounds, [1024.0, 2048.0, 0.0]);
+        let want = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 2048.0, corner[2] - 7.0];
+        assert_eq!(home, Bounds { min: want(rest.min), max: want(rest.max) });
+    }
+
+    #[test]
     fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
         let mut shot =
             Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: scene.rest_bounds };
-        let good = Frame::new(&scene, &shot).expect("good");
+        let good = Frame::new(&scene, &shot, [0.0; 3]).expect("good");
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
-            assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }).expect("replaced"), good);
+            assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced"), good);
         }
         shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-        let refusal = Frame::new(&scene, &shot).expect_err("overflows").to_string();
+        let refusal = Frame::new(&scene, &shot, [0.0; 3]).expect_err("overflows").to_string();
         assert!(refusal.starts_with("camera:"), "{refusal}");
     }
 }

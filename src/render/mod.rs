@@ -31,6 +31,7 @@ use std::time::{Duration, Instant};
 pub use self::device::{EglDevice, devices};
 use self::gl::{Gl, Program};
 pub use self::plan::{Allocation, Plan, Saving, plan};
+use self::scene_buffers::Apart;
 pub use self::scene_buffers::SceneBuffers;
 use self::shaders::Source;
 use self::target::Target;
@@ -193,6 +194,27 @@ impl Renderer {
         self.gl.check("upload")
     }
 
+    /// Fills positions that are drawn in place of the shared ones until [`SceneBuffers::relative_to`] says otherwise: for
+    /// domains in cells of their own, whose shared positions have no common origin. `origin` is theirs.
+    ///
+    /// # Errors
+    /// `Fault` when the positions are not the scene's, or OpenGL reports an error.
+    pub fn upload_apart(&mut self, buffers: &mut SceneBuffers, positions: &[f32], origin: [f64; 3]) -> Result<()> {
+        let bytes = buffers.buffer("positions")?.bytes;
+        if 4 * positions.len() as u64 != bytes {
+            let given = format!("{} numbers of positions, {} expected", positions.len(), bytes / 4);
+            return Err(during("upload")(given));
+        }
+        let apart = match buffers.apart.take() {
+            Some(apart) => apart,
+            None => Apart::new(&self.gl, bytes)?,
+        };
+        apart.buffer.write(bytemuck::cast_slice(positions));
+        buffers.apart = Some(apart);
+        buffers.origin = origin;
+        self.gl.check("upload")
+    }
+
     /// Draws one frame of what the shared buffers hold.
     ///
     /// # Errors
@@ -204,7 +226,7 @@ impl Renderer {
             let given = format!("{} x {}", shot.width, shot.height);
             return Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given));
         }
-        let numbers = frame::Frame::new(&buffers.scene, shot)?;
+        let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
         self.make_room(shot.width, shot.height)?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let gl = &self.gl;

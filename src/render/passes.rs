@@ -18,7 +18,7 @@ const MATERIAL: u32 = 1;
 
 /// Binds what all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
-    buffers.views.positions.bind(POSITION_UNIT);
+    buffers.drawn_positions().bind(POSITION_UNIT);
     buffers.views.materials.bind(MATERIAL_UNIT);
     if let Some(view) = &buffers.views.triangle_materials {
         view.bind(TRIANGLE_MATERIAL_UNIT);

@@ -50,7 +50,26 @@ pub struct SceneBuffers {
     pub(super) normals: Vec<Texture>,
     pub(super) shadow: Option<ShadowMap>,
     pub(super) programs: Programs,
+    /// What positions are relative to, in scene units from the scene's origin.
+    pub(super) origin: [f64; 3],
+    /// Positions that are drawn in place of the shared ones.
+    pub(super) apart: Option<Apart>,
     plan: Plan,
+}
+
+/// Positions of a scene whose domains have no common origin, brought to one.
+#[derive(Debug)]
+pub(super) struct Apart {
+    pub(super) buffer: Buffer,
+    view: Texture,
+}
+
+impl Apart {
+    pub(super) fn new(gl: &Rc<Gl>, bytes: u64) -> Result<Self> {
+        let buffer = gl.buffer(bytes, gl::DYNAMIC_DRAW, None)?;
+        let view = gl.view(&buffer, gl::RGB32F)?;
+        Ok(Self { buffer, view })
+    }
 }
 
 /// Buffers that shaders read like textures.
@@ -105,8 +124,22 @@ impl SceneBuffers {
             normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
             shadow: scene.look.shadow.map(|shadow| ShadowMap::new(gl, shadow.size)).transpose()?,
             programs,
+            origin: [0.0; 3],
+            apart: None,
             plan,
         })
+    }
+
+    /// Says what the positions in the shared buffers are relative to, in scene units from the scene's origin (which they
+    /// are until this is called), and that these are to be drawn.
+    pub fn relative_to(&mut self, origin: [f64; 3]) {
+        self.origin = origin;
+        self.apart = None;
+    }
+
+    /// The positions that are drawn.
+    pub(super) fn drawn_positions(&self) -> &Texture {
+        self.apart.as_ref().map_or(&self.views.positions, |apart| &apart.view)
     }
 
     /// The plan that was followed.
@@ -117,7 +150,8 @@ impl SceneBuffers {
     /// The buffers that the device really holds for this scene, by name.
     pub fn allocated(&self) -> Vec<Allocation> {
         let buffers = self.buffers.iter().map(|(name, buffer)| Allocation { name: name.clone(), bytes: buffer.bytes });
-        buffers.collect()
+        let apart = self.apart.iter().map(|apart| Allocation { name: "apart".into(), bytes: apart.buffer.bytes });
+        buffers.chain(apart).collect()
     }
 
     /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.

@@ -1,9 +1,8 @@
 //! Cameras and bounds, in f64 until the last matrix.
 
-use nalgebra::{Matrix4, Point3, Vector3};
+use nalgebra::{Matrix3x4, Matrix4, Point3, Vector3};
 
 use super::Scene;
-use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
 /// An axis-aligned box in scene units; empty when `min > max`.
@@ -67,8 +66,8 @@ pub enum View {
         target: [f64; 3],
         up: [f64; 3],
     },
-    /// `world_from_camera`, OpenGL's axes: x right, y up, looking along -z.
-    Pose(Transform),
+    /// `world_from_camera`, 3x4 row-major, OpenGL's axes: x right, y up, looking along -z.
+    Pose([f64; 12]),
 }
 
 /// How the camera projects.
@@ -130,9 +129,9 @@ impl Camera {
             }
         }
         if let View::Pose(pose) = self.view
-            && pose.inverse().is_none_or(|inverse| !inverse.0.iter().all(|number| number.is_finite()))
+            && !(pose.iter().all(|number| number.is_finite()) && inverse(pose).is_some())
         {
-            return Err(invalid("camera.pose", "a finite, regular transform", format!("{:?}", pose.0)));
+            return Err(invalid("camera.pose", "a finite, regular transform", format!("{pose:?}")));
         }
         match self.lens {
             Lens::FieldOfView(degrees) if !(degrees > 0.1 && degrees < 179.0) => {
@@ -167,7 +166,7 @@ impl Camera {
             View::LookAt { eye, target, up } => {
                 Matrix4::look_at_rh(&Point3::from(eye), &Point3::from(target), &Vector3::from(up))
             }
-            View::Pose(pose) => pose.to_matrix().try_inverse().unwrap_or_else(Matrix4::identity),
+            View::Pose(pose) => inverse(pose).unwrap_or_else(Matrix4::identity),
         }
     }
 
@@ -175,8 +174,23 @@ impl Camera {
     pub fn eye(&self) -> Vector3<f64> {
         match self.view {
             View::LookAt { eye, .. } => eye.into(),
-            View::Pose(pose) => pose.translation(),
+            View::Pose(pose) => Vector3::new(pose[3], pose[7], pose[11]),
         }
+    }
+
+    /// The same camera in a frame whose origin is at `origin`. All in f64: a camera beside a domain that is far from the
+    /// scene's origin sees it from beside it, to the last bit of f32.
+    #[must_use]
+    pub fn relative_to(self, origin: [f64; 3]) -> Self {
+        let moved = |point: [f64; 3]| std::array::from_fn(|axis| point[axis] - origin[axis]);
+        let view = match self.view {
+            View::LookAt { eye, target, up } => View::LookAt { eye: moved(eye), target: moved(target), up },
+            View::Pose(mut pose) => {
+                (0..3).for_each(|axis| pose[4 * axis + 3] -= origin[axis]);
+                View::Pose(pose)
+            }
+        };
+        Self { view, ..self }
     }
 
     /// `clip_from_camera` for an image of `width` x `height` pixels that shows `bounds`.
@@ -216,6 +230,13 @@ impl Camera {
     }
 }
 
+/// The inverse of a 3x4 row-major transform, when it has a finite one.
+fn inverse(pose: [f64; 12]) -> Option<Matrix4<f64>> {
+    let mut matrix = Matrix4::identity();
+    matrix.fixed_view_mut::<3, 4>(0, 0).copy_from(&Matrix3x4::from_row_slice(&pose));
+    matrix.try_inverse().filter(|inverse| inverse.iter().all(|number| number.is_finite()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -245,6 +266,28 @@ mod tests {
             });
             let reach = reach.into_iter().fold(0.0, f64::max);
             assert!((reach - MARGIN).abs() < 1e-6, "{size:?} reaches {reach}");
+        }
+    }
+
+    #[test]
+    fn a_camera_far_away_keeps_its_view_in_a_frame_beside_it_and_loses_it_in_f32() {
+        let (eye, target, up) = ([1e7 + 0.125, 2.0, -1e7 + 3.0], [1e7, 2.25, -1e7], [0.0, 1.0, 0.0]);
+        let lens = Lens::FieldOfView(30.0);
+        let look = Camera { view: View::LookAt { eye, target, up }, lens, near: 0.0, far: 0.0 };
+        let inverse = look.camera_from_world().try_inverse().expect("regular");
+        let pose = std::array::from_fn(|entry| inverse[(entry / 4, entry % 4)]);
+        let origin = [1e7, 0.0, -1e7];
+        let beside = View::LookAt { eye: [0.125, 2.0, 3.0], target: [0.0, 2.25, 0.0], up };
+        let want = Camera { view: beside, ..look }.camera_from_world();
+        let error = |camera: Camera| (camera.checked().expect("good").camera_from_world() - want).abs().max();
+        assert!(error(look.relative_to(origin)) < 1e-12);
+        assert!(error(Camera { view: View::Pose(pose), ..look }.relative_to(origin)) < 1e-7);
+        let rounded = View::Pose(pose.map(|number| f64::from(number as f32)));
+        assert!(error(Camera { view: rounded, ..look }.relative_to(origin)) > 0.05);
+        for bad in [f64::NAN, f64::INFINITY] {
+            let mut pose = pose;
+            pose[7] = bad;
+            assert!(Camera { view: View::Pose(pose), ..look }.checked().is_err());
         }
     }
 

@@ -62,7 +62,7 @@ impl Cells {
     /// # Errors
     /// `Invalid` when the shared cell is not on the grid or a translation is not finite.
     pub fn restore(shared: [f64; 3], translations: Vec<[f64; 3]>) -> Result<Self> {
-        if shared != nearest(shared) || !shared.iter().all(|number| number.is_finite()) {
+        if shared != nearest_cell(shared) || !shared.iter().all(|number| number.is_finite()) {
             return Err(invalid("cells.shared", format!("multiples of {GRID}"), format!("{shared:?}")));
         }
         match translations.iter().position(|translation| !translation.iter().all(|number| number.is_finite())) {
@@ -89,14 +89,14 @@ impl Cells {
     /// The cell of a domain, in scene units from the scene's origin.
     pub fn cell_of(&self, domain: usize) -> [f64; 3] {
         let translation = self.translations[domain];
-        if is_beyond(self.shared, translation) { nearest(translation) } else { self.shared }
+        if is_beyond(self.shared, translation) { nearest_cell(translation) } else { self.shared }
     }
 
     /// A transform with the translation that the domain has in its cell, rounded once.
     pub(super) fn express(&self, domain: usize, mut transform: Transform) -> Transform {
-        let cell = self.cell_of(domain);
-        for axis in 0..3 {
-            transform.0[4 * axis + 3] = (self.translations[domain][axis] - cell[axis]) as f32;
+        let own = difference(self.translations[domain], self.cell_of(domain));
+        for (row, along) in transform.0.chunks_exact_mut(4).zip(own) {
+            row[3] = along as f32;
         }
         transform
     }
@@ -123,7 +123,7 @@ impl Cells {
             let mut along: Vec<f64> = self.translations.iter().map(|translation| translation[axis]).collect();
             *along.select_nth_unstable_by(count / 2, f64::total_cmp).1
         };
-        let shared = nearest([0, 1, 2].map(median));
+        let shared = nearest_cell([0, 1, 2].map(median));
         let away = self.translations.iter().filter(|translation| is_beyond(shared, **translation)).count();
         let nearer = away < self.away;
         if nearer {
@@ -158,7 +158,7 @@ impl Cells {
 }
 
 /// The cell nearest to a point.
-pub fn nearest(point: [f64; 3]) -> [f64; 3] {
+pub fn nearest_cell(point: [f64; 3]) -> [f64; 3] {
     point.map(|along| (along / GRID).round() * GRID)
 }
 

@@ -39,7 +39,7 @@ pub enum Normals {
     /// Those of the rest state, turned by T alone (equation 3.8 of the thesis).
     #[default]
     Rigid,
-    /// Those of the deformed triangles, weighted by area.
+    /// Those that follow the deformed triangles, weighted by area (`reference/normals.rs` defines them).
     Exact,
 }
 

@@ -14,7 +14,7 @@ mod state;
 mod update;
 
 pub use camera::{Bounds, Camera, Lens, View};
-pub use cells::{Cells, GRID, REACH, nearest};
+pub use cells::{Cells, GRID, REACH, nearest_cell};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
 pub use look::{Ground, Look, Shadow, UpAxis};

@@ -59,7 +59,7 @@ fn gpu_overflow_makes_the_bounds_not_finite_and_the_next_step_is_good_again() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_nan_shows_in_both_bounds_of_its_axis_and_an_infinity_in_one() {
+fn gpu_what_overflows_shows_in_the_bounds_with_its_sign_and_infinity_less_infinity_is_computed_again() {
     let mut random = Random(4);
     let shape = scenes::shape(&mut random, 1000, 1);
     let mut column = vec![0.0; 3000];
@@ -71,10 +71,10 @@ fn gpu_a_nan_shows_in_both_bounds_of_its_axis_and_an_infinity_in_one() {
     let scene = Scene::new(parts).expect("a scene");
     let mut state = State::rest(&scene);
     state.q[0] = f32::MAX;
-    // Infinity minus infinity in the first row alone.
+    // Infinity less infinity in the first row, which is finite in f64; the others have no f32.
     state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
     let bounds = deformer(&scene).deform(&state).expect("deforms").bounds;
-    assert!(bounds.min[0].is_nan() && bounds.max[0].is_nan(), "{bounds:?}");
+    assert!(bounds.min[0].is_finite() && bounds.max[0].is_finite(), "{bounds:?}");
     assert!(bounds.min[1].is_finite() && bounds.max[1] == f64::INFINITY, "{bounds:?}");
     assert!(bounds.min[2] == f64::NEG_INFINITY && bounds.max[2].is_finite(), "{bounds:?}");
 }

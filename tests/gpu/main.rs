@@ -5,6 +5,7 @@ mod device;
 mod extremes;
 mod interop;
 mod judge;
+mod normals;
 mod real;
 mod scenes;
 mod trials;

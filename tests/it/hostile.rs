@@ -28,9 +28,6 @@ fn bad_steps() -> Vec<BadStep> {
     let mut odd = step(11, &[0], &[0.0, 0.0]);
     odd.q = odd.q.slice(..7);
     let timeless = v1::Step { time: f64::NAN, ..step(11, &[0], &[0.0, 0.0]) };
-    let formatless = v1::Step { transform_format: 9, ..transforms(&[0], &[1.0; 12]) };
-    let misnamed =
-        |format: v1::TransformFormat| v1::Step { transform_format: format.into(), ..transforms(&[0], &[1.0; 12]) };
     vec![
         ("q too short", step(11, &[1], &[0.5]), ["step.q of domain 'right'", "8 bytes (2 coordinates)", "4 bytes"]),
         ("q too long", step(11, &[0], &[0.5; 3]), ["step.q of domain 'left'", "8 bytes (2 coordinates)", "12 bytes"]),
@@ -67,10 +64,27 @@ fn bad_steps() -> Vec<BadStep> {
             transforms(&[1], &infinite),
             ["step.transforms of domain 'right': transform[7]", "a finite", "inf"],
         ),
-        ("a format of no version", formatless, ["step.transform_format", "a format of this version", "9"]),
+        ("NaN time", timeless, ["step.time", "a finite number", "NaN"]),
+        ("a number that goes back", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
+        ("a number that comes again", step(10, &[0], &[0.0; 2]), ["step.number", "a number above 10", "10"]),
+    ]
+}
+
+/// Bad steps in the other formats of transforms.
+fn bad_formats() -> Vec<BadStep> {
+    let bytes = |format: i32| v1::Step {
+        transform_domains: vec![0],
+        transforms: vec![0; 48].into(),
+        transform_format: format,
+        ..step(11, &[], &[])
+    };
+    let misnamed = |format: v1::TransformFormat| bytes(format.into());
+    let overflow = rigid_step(11, v1::TransformFormat::RigidF64, &[(0, UPRIGHT, [1e7; 3]), (1, UPRIGHT, [1e7; 3])]);
+    let overflow = v1::Step { q_domains: vec![1], q: step(11, &[1], &[f32::MAX, 0.0]).q, ..overflow };
+    vec![
+        ("a format of no version", bytes(9), ["step.transform_format", "a format of this version", "9"]),
         ("48 bytes as 28", misnamed(v1::TransformFormat::RigidF32), ["step.transforms", "28 bytes (1 tr", "48 bytes"]),
         ("48 bytes as 40", misnamed(v1::TransformFormat::RigidF64), ["step.transforms", "40 bytes (1 tr", "48 bytes"]),
-        ("NaN time", timeless, ["step.time", "a finite number", "NaN"]),
         (
             "no rotation",
             rigid_step(11, v1::TransformFormat::RigidF32, &[(1, [0.0; 4], [0.0; 3])]),
@@ -101,8 +115,7 @@ fn bad_steps() -> Vec<BadStep> {
             rigid_step(11, v1::TransformFormat::RigidF64, &[(1, UPRIGHT, [-1e300, 0.0, 0.0])]),
             ["step.transforms of domain 'right': translation[0]", "at most 1.09", "-1000000000"],
         ),
-        ("a number that goes back", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
-        ("a number that comes again", step(10, &[0], &[0.0; 2]), ["step.number", "a number above 10", "10"]),
+        ("q that overflows far away", overflow, ["step.q of domain 'right'", "q and transform", "vertex"]),
     ]
 }
 
@@ -123,7 +136,7 @@ async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client
     let want = expected(&strips(), &[good]);
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     // A refused overflow keeps its number, so what follows counts from there.
-    for (index, (name, mut bad, refusal)) in bad_steps().into_iter().enumerate() {
+    for (index, (name, mut bad, refusal)) in bad_steps().into_iter().chain(bad_formats()).enumerate() {
         let goes_back = bad.number < 11;
         bad.number += if goes_back { 0 } else { index as u64 };
         let number = bad.number;
@@ -134,6 +147,7 @@ async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client
         assert_eq!(rejection.step, Some(number), "{name}");
         let got = get_vertices(&server, ask.clone()).await.expect("vertices");
         assert_eq!((got.step().number, &got.positions, &got.normals), (10, &want.0, &want.1), "{name}");
+        assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
         other.acked(step(index as u64, &[0], &[0.5, 0.5])).await;
     }
     driver.acked(step(1000, &[0], &[0.0, 0.0])).await;

@@ -1,6 +1,7 @@
 //! Pictures against arithmetic, each with a negative control. Runs on whatever EGL gives, Mesa's llvmpipe included.
 
 mod build;
+mod far;
 mod limits;
 mod shading;
 mod shadow;

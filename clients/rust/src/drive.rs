@@ -120,8 +120,10 @@ impl Drive {
     ///
     /// # Errors
     /// `Rejected` reports the oldest refusal not reported yet. It names the step that was refused, usually an earlier
-    /// one; the step at hand has been sent and the stream goes on. Every other error is the end of the stream.
+    /// one; the step at hand has been sent and the stream goes on. `Step` says that the step at hand was not sent, and
+    /// the stream goes on, too. Every other error is the end of the stream.
     pub async fn step(&mut self, step: &Step) -> Result<()> {
+        step.check()?;
         self.wait(|progress, window| progress.outstanding.len() < window).await?;
         lock(&self.progress).outstanding.push_back(step.number());
         let message = v1::DriveSceneRequest { kind: Some(Ask::Step(step.to_wire())) };

@@ -52,6 +52,9 @@ pub enum Error {
     /// Something did not come in time.
     #[error("{what} did not come within {ms} ms")]
     Deadline { what: &'static str, ms: u64 },
+    /// A step that no message can carry; nothing was sent.
+    #[error("step {step} cannot be sent: {reason}")]
+    Step { step: u64, reason: &'static str },
     /// A local file could not be read or written.
     #[error("{path}: {reason}")]
     File { path: String, reason: String },

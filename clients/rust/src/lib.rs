@@ -19,7 +19,7 @@ pub use frames::{Camera, Delivery, Format, Frame, FrameRequest, Frames, FramesRe
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};
 pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
-pub use step::Step;
+pub use step::{Step, Transforms};
 pub use tonic::Code;
 pub use vertices::{VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
 

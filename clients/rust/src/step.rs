@@ -1,7 +1,49 @@
-//! One step as a physics process builds it: per domain r coordinates and a 3x4 transform, packed little-endian.
+//! One step as a physics process builds it: per domain r coordinates and a transform, packed little-endian.
 
 use bytes::{BufMut as _, BytesMut};
 use modalcast_proto::v1;
+
+use crate::error::{Error, Result};
+
+/// Where a domain is: `world_from_domain`, in scene units. A rotation is a quaternion x, y, z, w (w is the real part) whose
+/// norm is 1 within 0.001; the server normalises it in f64.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Transforms {
+    /// 48 bytes: row-major 3x4, the translation relative to the scene's origin. May shear and scale where the scene allows
+    /// it.
+    Affine([f32; 12]),
+    /// 28 bytes: a translation relative to the scene's origin.
+    RigidF32 { rotation: [f32; 4], translation: [f32; 3] },
+    /// 40 bytes: a translation from the world's origin; the server takes the scene's origin off in f64. Keeps
+    /// millimetres at 10,000 km.
+    RigidF64 { rotation: [f32; 4], translation: [f64; 3] },
+}
+
+impl Transforms {
+    const fn format(&self) -> v1::TransformFormat {
+        match self {
+            // What servers without the other formats understand, too.
+            Self::Affine(_) => v1::TransformFormat::Unspecified,
+            Self::RigidF32 { .. } => v1::TransformFormat::RigidF32,
+            Self::RigidF64 { .. } => v1::TransformFormat::RigidF64,
+        }
+    }
+
+    fn put(&self, bytes: &mut BytesMut) {
+        let mut floats = |list: &[f32]| list.iter().for_each(|number| bytes.put_f32_le(*number));
+        match self {
+            Self::Affine(entries) => floats(entries),
+            Self::RigidF32 { rotation, translation } => {
+                floats(rotation);
+                floats(translation);
+            }
+            Self::RigidF64 { rotation, translation } => {
+                floats(rotation);
+                translation.iter().for_each(|number| bytes.put_f64_le(*number));
+            }
+        }
+    }
+}
 
 /// A step under construction. What is not set keeps its value on the server.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -12,6 +54,10 @@ pub struct Step {
     q: BytesMut,
     transform_domains: Vec<u32>,
     transforms: BytesMut,
+    /// That of the first transform.
+    format: v1::TransformFormat,
+    /// A later transform had another one.
+    mixed: bool,
 }
 
 impl Step {
@@ -34,6 +80,13 @@ impl Step {
         self
     }
 
+    /// Sets where a domain is, in any of the three formats. All transforms of one step have the same.
+    #[must_use]
+    pub fn place(mut self, domain: u32, place: &Transforms) -> Self {
+        self.set_place(domain, place);
+        self
+    }
+
     /// As [`Self::q`], in place.
     pub fn set_q(&mut self, domain: u32, coordinates: &[f32]) {
         self.q_domains.push(domain);
@@ -42,8 +95,25 @@ impl Step {
 
     /// As [`Self::transform`], in place.
     pub fn set_transform(&mut self, domain: u32, world_from_domain: &[f32; 12]) {
+        self.set_place(domain, &Transforms::Affine(*world_from_domain));
+    }
+
+    /// As [`Self::place`], in place.
+    pub fn set_place(&mut self, domain: u32, place: &Transforms) {
+        if self.transform_domains.is_empty() {
+            self.format = place.format();
+        }
+        self.mixed |= self.format != place.format();
         self.transform_domains.push(domain);
-        world_from_domain.iter().for_each(|number| self.transforms.put_f32_le(*number));
+        place.put(&mut self.transforms);
+    }
+
+    /// Refuses a step whose transforms have several formats: no message can carry it.
+    pub(crate) fn check(&self) -> Result<()> {
+        match self.mixed {
+            false => Ok(()),
+            true => Err(Error::Step { step: self.number, reason: "its transforms are of several formats" }),
+        }
     }
 
     /// The step's number.
@@ -65,6 +135,7 @@ impl Step {
             q: self.q.clone().freeze(),
             transform_domains: self.transform_domains.clone(),
             transforms: self.transforms.clone().freeze(),
+            transform_format: self.format.into(),
         }
     }
 }
@@ -81,7 +152,36 @@ mod tests {
         assert_eq!(wire.q_domains, [2, 0]);
         let bytes: Vec<u8> = [1.0_f32, -2.0, 0.25].iter().flat_map(|number| number.to_le_bytes()).collect();
         assert_eq!(wire.q, bytes);
-        assert_eq!((wire.transform_domains, wire.transforms.len()), (vec![1], 48));
+        assert_eq!((&wire.transform_domains, wire.transforms.len()), (&vec![1], 48));
         assert_eq!(wire.transforms[12..16], 5.0_f32.to_le_bytes());
+        assert_eq!(wire.transform_format(), v1::TransformFormat::Unspecified);
+    }
+
+    #[test]
+    fn rigid_transforms_are_28_or_40_bytes_rotation_first_and_formats_do_not_mix() {
+        let rotation = [0.0, 0.6, 0.0, 0.8];
+        let narrow = Transforms::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
+        let wide = Transforms::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
+        let step = Step::new(0, 0.0).place(4, &narrow).place(2, &narrow);
+        assert_eq!((step.check().is_ok(), step.payload()), (true, 56));
+        let wire = step.clone().to_wire();
+        assert_eq!(
+            (wire.transform_domains.as_slice(), wire.transform_format()),
+            ([4, 2].as_slice(), v1::TransformFormat::RigidF32)
+        );
+        assert_eq!(
+            (&wire.transforms[4..8], &wire.transforms[24..28]),
+            (&0.6_f32.to_le_bytes()[..], &3.0_f32.to_le_bytes()[..])
+        );
+        let wire = Step::new(0, 0.0).place(1, &wide).to_wire();
+        assert_eq!((wire.transforms.len(), wire.transform_format()), (40, v1::TransformFormat::RigidF64));
+        assert_eq!(
+            (&wire.transforms[12..16], &wire.transforms[16..24]),
+            (&0.8_f32.to_le_bytes()[..], &1e7_f64.to_le_bytes()[..])
+        );
+        for mixed in [step.clone().place(1, &wide), step.transform(1, &[0.0; 12])] {
+            let refusal = mixed.check().expect_err("mixed").to_string();
+            assert_eq!(refusal, "step 0 cannot be sent: its transforms are of several formats");
+        }
     }
 }

@@ -1,5 +1,5 @@
-//! Deformed vertices: positions per row of U and normals per corner, world relative to the scene's origin, one set per
-//! step.
+//! Deformed vertices: positions per row of U and normals per corner, world relative to an origin that the set names, one
+//! set per step.
 
 use std::ops::Range;
 use std::pin::Pin;
@@ -67,8 +67,11 @@ pub struct VertexStreamRequest {
 #[derive(Debug, Clone, PartialEq)]
 pub struct VertexSet {
     pub step: v1::StepId,
-    /// The origin of all positions, metres.
+    /// The origin of all positions in the world, metres. It is the scene's until steps with f64 translations take domains
+    /// far from it, so it may differ from step to step.
     pub origin: Vec<f64>,
+    /// Per chosen domain: the origin of its own positions, when they are not all the same; else empty.
+    pub origins: Vec<[f64; 3]>,
     /// Per chosen domain: its index, its vertices and its corners.
     pub domains: Vec<(u32, u32, u32)>,
     /// Three per vertex, all chosen domains after each other.
@@ -84,6 +87,13 @@ impl VertexSet {
     pub fn range(&self, place: usize) -> Range<usize> {
         let before: usize = self.domains[..place].iter().map(|(_, vertices, _)| 3 * *vertices as usize).sum();
         before..before + 3 * self.domains[place].1 as usize
+    }
+
+    /// World position in metres of what the positions of the `place`-th chosen domain are relative to: a vertex is at
+    /// `origin_of(place) + unit * position`, with the unit of the scene's info.
+    pub fn origin_of(&self, place: usize) -> [f64; 3] {
+        let all = || std::array::from_fn(|axis| self.origin.get(axis).copied().unwrap_or(0.0));
+        self.origins.get(place).copied().unwrap_or_else(all)
     }
 }
 
@@ -190,20 +200,79 @@ fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
     if sum(&head.vertices) != head.position_bytes {
         return Err(malformed("vertices.position_bytes", sum(&head.vertices), head.position_bytes));
     }
+    let own = 24 * head.domains.len() as u64;
+    if head.origin_bytes != 0 && head.origin_bytes != own {
+        return Err(malformed("vertices.origin_bytes", format!("0 or {own}"), head.origin_bytes));
+    }
     let total = bytes.len() as u64;
-    if total != head.position_bytes && total != head.position_bytes + sum(&head.corners) {
-        let expected = format!("{} or {}", head.position_bytes, head.position_bytes + sum(&head.corners));
+    let bare = head.position_bytes + head.origin_bytes;
+    if total != bare && total != bare + sum(&head.corners) {
+        let expected = format!("{bare} or {}", bare + sum(&head.corners));
         return Err(malformed("vertices.total", expected, total));
     }
-    let (positions, normals) = bytes.split_at(head.position_bytes as usize);
+    let (positions, rest) = bytes.split_at(head.position_bytes as usize);
+    let (normals, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
     let domains = head.domains.iter().zip(&head.vertices).zip(&head.corners);
     Ok(VertexSet {
         step: head.step.ok_or_else(|| malformed("vertices.step", "a step", "none"))?,
         origin: head.origin,
+        origins: points(origins),
         domains: domains.map(|((domain, vertices), corners)| (*domain, *vertices, *corners)).collect(),
         positions: floats(positions),
         normals: floats(normals),
         skipped: head.skipped,
         stages: stages(head.stages),
     })
+}
+
+/// Little-endian f64 at any alignment, three per point.
+fn points(bytes: &[u8]) -> Vec<[f64; 3]> {
+    let number = |bytes: &[u8]| {
+        let mut word = [0; 8];
+        word.copy_from_slice(bytes);
+        f64::from_le_bytes(word)
+    };
+    bytes.chunks_exact(24).map(|point| [0, 8, 16].map(|at| number(&point[at..at + 8]))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn head(origin_bytes: u64) -> v1::VertexHead {
+        v1::VertexHead {
+            step: Some(v1::StepId::default()),
+            origin: vec![1.0, 2.0, 3.0],
+            domains: vec![4, 7],
+            vertices: vec![1, 0],
+            corners: vec![0, 1],
+            position_bytes: 12,
+            origin_bytes,
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn a_set_knows_the_origin_of_each_of_its_domains() {
+        let floats = [1.5_f32, 2.5, 3.5, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
+        let origins = [1e7_f64, 0.0, -1.0, 8.0, 9.0, 1e300].into_iter().flat_map(f64::to_le_bytes);
+        let whole: Vec<u8> = floats.clone().chain(origins).collect();
+        let with_own = set(head(48), &whole).expect("fits");
+        assert_eq!((with_own.positions.as_slice(), with_own.normals.len()), ([1.5, 2.5, 3.5].as_slice(), 3));
+        assert_eq!([with_own.origin_of(0), with_own.origin_of(1)], [[1e7, 0.0, -1.0], [8.0, 9.0, 1e300]]);
+        let bare = set(head(48), &[&whole[..12], &whole[24..]].concat()).expect("without normals");
+        assert_eq!((bare.normals.len(), bare.origin_of(1)), (0, [8.0, 9.0, 1e300]));
+        let plain = set(head(0), &floats.collect::<Vec<u8>>()).expect("fits");
+        assert_eq!((plain.origins.len(), plain.origin_of(1)), (0, [1.0, 2.0, 3.0]));
+    }
+
+    #[test]
+    fn origins_that_do_not_fit_are_refused_by_field() {
+        for (origin_bytes, length, field) in
+            [(24, 48, "origin_bytes"), (u64::MAX, 72, "origin_bytes"), (48, 24, "total"), (0, 72, "total")]
+        {
+            let refusal = set(head(origin_bytes), &vec![0; length]).expect_err(field).to_string();
+            assert!(refusal.contains(field), "{refusal}");
+        }
+    }
 }

@@ -53,7 +53,7 @@ impl Multi {
             }
             let define = format!("WIDTH={width}");
             kernels.push(Kernel {
-                compiled: Compiled::new(device, &CODE, "thesis_multi", &[&define])?,
+                compiled: Compiled::new(device, &CODE, &[&define])?,
                 entries: upload(device, &packed.entries)?,
                 meta: upload(device, &packed.meta)?,
                 lanes: packed.meta.len(),
@@ -118,7 +118,7 @@ mod tests {
             }
             for lane in (0..WARP).filter(busy) {
                 let [place, _, fours, _] = packed.meta[first + lane].map(|number| number as usize);
-                if lane % packed.width % fours == 0 {
+                if (lane % packed.width).is_multiple_of(fours) {
                     u[place] = sub_sums[lane..lane + fours].iter().sum();
                     written[place] += 1;
                 }

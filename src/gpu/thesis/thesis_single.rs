@@ -66,7 +66,7 @@ impl Single {
             return Err(invalid("modes", "at least 1 for the single-domain kernel", 0));
         }
         let lines = Lines::of(slot.vertices, slot.rank);
-        let compiled = Compiled::new(device, &CODE, "thesis_single", &[])?;
+        let compiled = Compiled::new(device, &CODE, &[])?;
         Ok(Self { compiled, buffer: upload(device, &lines.pack(scene))?, lines })
     }
 

@@ -128,7 +128,7 @@ impl Update {
         let (tangents, bytes) = (scene.needs.normal_maps, 16 * unfolded.targets.len() as u64);
         let defines: &[&str] = if tangents { &["TANGENTS"] } else { &[] };
         Ok(Self {
-            compiled: Compiled::new(device, &CODE, "thesis_update", defines)?,
+            compiled: Compiled::new(device, &CODE, defines)?,
             tables: [
                 upload(device, &unfolded.warps)?,
                 upload(device, &unfolded.sources)?,

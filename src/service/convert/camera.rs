@@ -2,7 +2,6 @@
 
 use modalcast_proto::v1;
 
-use crate::domain::Transform;
 use crate::error::{Result, invalid};
 use crate::scene::{Camera, Lens, View};
 
@@ -15,10 +14,7 @@ pub(super) fn parse(framing: Camera, camera: v1::Camera) -> Result<Camera> {
             target: exactly("camera.look_at.target", &look.target)?,
             up: exactly("camera.look_at.up", &look.up)?,
         },
-        Some(v1::camera::View::Pose(pose)) => {
-            let numbers: [f64; 12] = exactly("camera.pose", &pose.world_from_camera)?;
-            View::Pose(Transform(numbers.map(|number| number as f32)))
-        }
+        Some(v1::camera::View::Pose(pose)) => View::Pose(exactly("camera.pose", &pose.world_from_camera)?),
     };
     let lens = match camera.lens {
         None => framing.lens,

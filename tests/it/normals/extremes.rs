@@ -26,11 +26,13 @@ fn part_of_bound(scene: &Scene, positions: &[[f64; 3]], got: &[f32], want: &[[f6
             *rounding += l * (l + w) + m * (m + w);
         }
     }
-    let part = |((got, want), (sum, rounding)): ((&[f32], &[f64; 3]), &(Vector3<f64>, f64))| {
+    let mut most = 0.0_f64;
+    for ((got, want), (sum, rounding)) in got.chunks_exact(3).zip(want).zip(&sums) {
         let error = degrees([0, 1, 2].map(|axis| f64::from(got[axis])), *want).to_radians();
-        error / (BOUND * rounding / sum.norm() + 2e-7)
-    };
-    got.chunks_exact(3).zip(want).zip(&sums).map(part).fold(0.0, f64::max)
+        let part = error / (BOUND * rounding / sum.norm() + 2e-7);
+        most = if part.is_nan() { f64::INFINITY } else { most.max(part) };
+    }
+    most
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool)
         bar.inc(1);
     }
     bar.finish_and_clear();
-    summary.print("frames", &options.out, json);
+    summary.print("frames", &options.out, None, json);
     Ok(())
 }
 
@@ -45,7 +45,7 @@ pub(crate) async fn single(client: &Client, options: &FrameOptions, json: bool) 
     let frame = client.frame(&request).await?;
     write(&options.out, &frame)?;
     summary.add((frame.step.run, frame.step.number), frame.bytes.len() as u64, frame.skipped, &frame.stages);
-    summary.print("frames", &options.out, json);
+    summary.print("frames", &options.out, None, json);
     Ok(())
 }
 

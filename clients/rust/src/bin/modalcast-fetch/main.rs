@@ -36,7 +36,7 @@ fn main() -> ExitCode {
 const fn code(error: &Error) -> u8 {
     match error {
         Error::Connect { .. } | Error::Refused { code: modalcast_client::Code::Unavailable, .. } => 3,
-        Error::Refused { .. } | Error::Rejected(_) => 1,
+        Error::Refused { .. } | Error::Rejected(_) | Error::Step { .. } => 1,
         Error::File { .. } => 4,
         Error::Malformed { .. } | Error::Ended { .. } | Error::Deadline { .. } => 5,
     }

@@ -35,17 +35,20 @@ impl Summary {
         }
     }
 
-    /// Prints `what` (frames, steps) and where they went.
-    pub(crate) fn print(mut self, what: &str, out: &std::path::Path, json: bool) {
+    /// Prints `what` (frames, steps), where they went, and the origin of vertices in metres.
+    pub(crate) fn print(mut self, what: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
         let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
         let elapsed = self.start.elapsed().as_secs_f64();
         let count = self.steps.len();
         if json {
-            let summary = json!({
+            let mut summary = json!({
                 what: count, "out": out.display().to_string(), "steps": self.steps, "runs": self.runs,
                 "bytes": self.bytes, "skipped": self.skipped, "elapsed_s": elapsed,
                 "per_second": count as f64 / elapsed.max(1e-9), "stages_ms": medians,
             });
+            if let Some(origin) = origin {
+                summary["origin"] = json!(origin);
+            }
             println!("{summary}");
             return;
         }

@@ -10,7 +10,7 @@ use crate::output::{Summary, bar, scene};
 
 pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
-    let mut files = Files { options, open: None, summary: Summary::new() };
+    let mut files = Files { options, open: None, origin: vec![], summary: Summary::new() };
     match options.count {
         None => files.add(&single(client, options, &name).await?)?,
         Some(count) => stream(client, &name, count, &mut files).await?,
@@ -54,6 +54,8 @@ async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>)
 struct Files<'a> {
     options: &'a VerticesOptions,
     open: Option<(Writer, Option<Writer>)>,
+    /// That of the first step. Rows of one array have one.
+    origin: Vec<f64>,
     summary: Summary,
 }
 
@@ -64,6 +66,12 @@ impl Files<'_> {
             let normals = self.options.normals.as_ref();
             let normals = normals.map(|path| Writer::create(path, &[set.normals.len() / 3, 3])).transpose()?;
             self.open = Some((positions, normals));
+            self.origin = set.origin.clone();
+        }
+        if set.origin != self.origin || !set.origins.is_empty() {
+            let step = set.step.number;
+            let fault = format!("at step {step} positions have another origin than the rows before, or several");
+            return Err(Error::file(&self.options.out, fault));
         }
         if let Some((positions, normals)) = &mut self.open {
             positions.row(&set.positions)?;
@@ -81,7 +89,7 @@ impl Files<'_> {
             positions.finish()?;
             normals.map(Writer::finish).transpose()?;
         }
-        self.summary.print("steps", &self.options.out, json);
+        self.summary.print("steps", &self.options.out, Some(self.origin), json);
         Ok(())
     }
 }

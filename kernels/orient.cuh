@@ -1,0 +1,154 @@
+// Rigid normals and tangents of a tile: those of the rest state, turned by T alone (equation 3.8 of the thesis; normals
+// by the inverse transpose of A, tangents by A, a mirror flips the sign of the bitangent). CPU twin:
+// src/reference/orient.rs.
+//
+// The matrix of a lane is brought to entries of about 1 by a power of two; a direction that it leaves shorter than a
+// tenth has lost digits in f32 and is turned again in f64.
+#pragma once
+#include "tile.cuh"
+#include "turn.cuh"
+
+// A direction whose squared length is at most this was turned with too much cancellation.
+constexpr float SHORT = 0.01f;
+
+struct Matrix {
+    float3 a, b, c;
+};
+
+// A power of two that brings a number to [1, 2), or as near as f32 has one.
+__device__ __forceinline__ float scale_of(float largest) {
+    const unsigned exponent = __float_as_uint(largest) >> 23;
+    return __uint_as_float(max(254 - (int)exponent, 1) << 23);
+}
+
+__device__ __forceinline__ float largest_of(float a, float b, float c) {
+    return fmaxf(fmaxf(fabsf(a), fabsf(b)), fabsf(c));
+}
+
+// The linear part of a transform, its largest entry about 1: a power of two changes no digit.
+__device__ __forceinline__ Matrix matrix_of(const float4* transforms, unsigned domain) {
+    const float4* rows = transforms + 3 * (size_t)domain;
+    const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
+    const float largest = fmaxf(fmaxf(largest_of(a.x, a.y, a.z), largest_of(b.x, b.y, b.z)), largest_of(c.x, c.y, c.z));
+    const float scale = scale_of(largest);
+    return {make_float3(a.x * scale, a.y * scale, a.z * scale), make_float3(b.x * scale, b.y * scale, b.z * scale),
+            make_float3(c.x * scale, c.y * scale, c.z * scale)};
+}
+
+#ifdef SHEAR
+// Times a power of two that brings the largest entry to [1, 2), rounded once.
+__device__ __forceinline__ Matrix rounded(const Rows& m) {
+    const double row_a = fmax(fmax(fabs(m.a.x), fabs(m.a.y)), fabs(m.a.z));
+    const double row_b = fmax(fmax(fabs(m.b.x), fabs(m.b.y)), fabs(m.b.z));
+    const double row_c = fmax(fmax(fabs(m.c.x), fabs(m.c.y)), fabs(m.c.z));
+    const double largest = fmax(fmax(row_a, row_b), row_c);
+    const int exponent = (__double2hiint(largest) >> 20) & 0x7ff;
+    const double scale = largest > 0.0 ? __hiloint2double((2046 - exponent) << 20, 0) : 0.0;
+    return {make_float3(m.a.x * scale, m.a.y * scale, m.a.z * scale),
+            make_float3(m.b.x * scale, m.b.y * scale, m.b.z * scale),
+            make_float3(m.c.x * scale, m.c.y * scale, m.c.z * scale)};
+}
+
+__device__ __forceinline__ Rows normal_rows(const Rows& m) {
+    const double hand = hand_of(m);
+    return {cross(m.b, m.c, hand), cross(m.c, m.a, hand), cross(m.a, m.b, hand)};
+}
+#endif
+
+
+// Turns the directions of a lane again, in f64. `from` is the first number of the lane's first item, [numbers][4];
+// `to` is staged, `stride` numbers an item.
+__device__ __noinline__ void turn_again(const float4* transforms, unsigned domain, const float* from, float* to,
+                                        unsigned stride, bool is_normal) {
+    const Rows m = linear_of(transforms, domain);
+    for (unsigned i = 0; i < SPAN; ++i) {
+        const double3 v = make_double3(from[i], from[4 + i], from[8 + i]);
+        const float3 turned = is_normal ? turn_normal(m, v) : turn(m, v);
+        to[stride * i] = turned.x;
+        to[stride * i + 1] = turned.y;
+        to[stride * i + 2] = turned.z;
+    }
+}
+
+// A direction turned and of unit length; `shortest` remembers the least square of a length of those that count.
+__device__ __forceinline__ float3 turned(const Matrix& m, float x, float y, float z, bool counts, float& shortest) {
+    const float3 v = make_float3(fmaf(m.a.x, x, fmaf(m.a.y, y, m.a.z * z)), fmaf(m.b.x, x, fmaf(m.b.y, y, m.b.z * z)),
+                                 fmaf(m.c.x, x, fmaf(m.c.y, y, m.c.z * z)));
+    const float square = fmaf(v.x, v.x, fmaf(v.y, v.y, v.z * v.z));
+    // Not fminf, which would pass over a NaN.
+    shortest = counts && !(square >= shortest) ? square : shortest;
+    const float inverse = 1.0f / sqrtf(square);
+    return make_float3(v.x * inverse, v.y * inverse, v.z * inverse);
+}
+
+// Rest normals of a lane's corners.
+struct Normals {
+    Items x, y, z;
+    __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
+        const float4* from = args.rest_normals + 3 * (size_t)part.rest;
+        x = items_of(from, part.within);
+        y = items_of(from + 1, part.within);
+        z = items_of(from + 2, part.within);
+    }
+};
+
+__device__ __forceinline__ void orient_normals(const DeformArgs& args, Stage& stage, const Part& part,
+                                               const Normals& rest, const Matrix& matrix, unsigned corner) {
+    float normals[FLOATS], shortest = 1.0f;
+#pragma unroll
+    for (unsigned i = 0; i < SPAN; ++i) {
+        const bool is_there = i < part.count;
+        const float3 normal =
+            turned(matrix, rest.x.of[i], rest.y.of[i], rest.z.of[i], is_there, shortest);
+        normals[3 * i] = normal.x;
+        normals[3 * i + 1] = normal.y;
+        normals[3 * i + 2] = normal.z;
+    }
+    put(stage, normals, corner, part.count);
+    if (!(shortest > SHORT)) {
+        const float* from = (const float*)(args.rest_normals + 3 * (size_t)part.rest) + part.within;
+        turn_again(args.transforms, part.domain, from, staged(stage) + FLOATS * lane_of(), 3, true);
+    }
+    store(args.header->normals, stage, (part.kind & TILE_LAST) > 0);
+}
+
+#ifdef NORMAL_MAPS
+__device__ __forceinline__ void orient_tangents(const DeformArgs& args, Stage& stage, const Part& part,
+                                                const Matrix& matrix, float hand) {
+    const float4* from = args.rest_tangents + 4 * (size_t)part.rest;
+    const Items x = items_of(from, part.within), y = items_of(from + 1, part.within),
+                z = items_of(from + 2, part.within), sign = items_of(from + 3, part.within);
+    float shortest = 1.0f;
+#pragma unroll
+    for (unsigned i = 0; i < SPAN; ++i) {
+        // A shape without tangents has zeros, which stay zeros.
+        const bool is_there = sign.of[i] != 0.0f;
+        const float3 tangent = turned(matrix, x.of[i], y.of[i], z.of[i], is_there, shortest);
+        stage.numbers[SPAN * lane_of() + i] =
+            is_there ? make_float4(tangent.x, tangent.y, tangent.z, sign.of[i] * hand) : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    }
+    if (!(shortest > SHORT)) {
+        turn_again(args.transforms, part.domain, (const float*)from + part.within,
+                   staged(stage) + 4 * SPAN * lane_of(), 4, false);
+    }
+    store_quadruples(args.header->tangents, stage);
+}
+#endif
+
+__device__ __forceinline__ void orient(const DeformArgs& args, Stage& stage, const Part& part, const Normals& rest) {
+    unsigned corner = part.item;
+#ifdef SHIFTED
+    if (part.kind & TILE_VERTICES) {
+        corner += __ldg(args.corner_shifts + part.domain);
+    }
+#endif
+#ifdef SHEAR
+    orient_normals(args, stage, part, rest, rounded(normal_rows(linear_of(args.transforms, part.domain))), corner);
+#else
+    orient_normals(args, stage, part, rest, matrix_of(args.transforms, part.domain), corner);
+#endif
+#ifdef NORMAL_MAPS
+    const float hand = (float)hand_of(linear_of(args.transforms, part.domain));
+    orient_tangents(args, stage, part, matrix_of(args.transforms, part.domain), hand);
+#endif
+}
