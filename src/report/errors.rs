@@ -197,7 +197,10 @@ pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
 /// Errors of directions, in degrees.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Orientation {
+    /// From the normals that the variant means to give: by T, or of the deformed surface.
     pub normals_degrees: Option<Spread>,
+    /// From the normals of the deformed surface, whatever the variant means to give.
+    pub normals_to_surface_degrees: Option<Spread>,
     pub tangents_degrees: Option<Spread>,
     /// |n . t|: 0 when they are orthogonal.
     pub normal_dot_tangent: Option<Spread>,
@@ -209,6 +212,7 @@ pub struct Orientation {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Turned {
     normals: Collect,
+    to_surface: Collect,
     tangents: Collect,
     dots: Collect,
     broken: u64,
@@ -223,6 +227,12 @@ impl Turned {
                 None => self.broken += 1,
             }
         }
+    }
+
+    /// Adds how far normals are from those of the deformed surface.
+    pub fn add_to_surface(&mut self, got: &[f32], want: &[[f64; 3]]) {
+        let angle = |(got, want): (&[f32; 3], &[f64; 3])| degrees(got.map(f64::from), *want);
+        got.as_chunks().0.iter().zip(want).filter_map(angle).for_each(|angle| self.to_surface.add(angle));
     }
 
     /// Adds tangents, four f32 per corner, and what they make with the normals. Shapes without tangents have zeros.
@@ -246,6 +256,7 @@ impl Turned {
     pub fn orientation(&self) -> Orientation {
         Orientation {
             normals_degrees: self.normals.spread(1.0),
+            normals_to_surface_degrees: self.to_surface.spread(1.0),
             tangents_degrees: self.tangents.spread(1.0),
             normal_dot_tangent: self.dots.spread(1.0),
             broken: self.broken,

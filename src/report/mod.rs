@@ -132,7 +132,7 @@ pub fn deform(request: &Request, bench: &dyn Bench, mut progress: impl FnMut(&st
     let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
     let thesis = Peers::of(&rows, full);
     let name = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
-    let mut failed: Vec<String> = rows.iter().filter(|row| !row.passed).map(name).collect();
+    let mut failed: Vec<String> = rows.iter().filter(|row| !row.passed && !row.left_out).map(name).collect();
     // The rows of warm and cold caches say the same of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
@@ -322,6 +322,21 @@ mod tests {
         let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Broken, |_| {}).expect("a report");
         assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, given none"]);
         assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
+    }
+
+    #[test]
+    fn a_variant_that_lacks_what_is_not_here_is_left_out_with_the_reason_and_fails_nothing() {
+        struct Lacking;
+        impl Bench for Lacking {
+            fn variants(&self, load: &Load) -> Vec<Offer> {
+                let label = Label::new("peer", Backend::Cuda, &load.scene);
+                let (reason, remedy) = ("not found".into(), "install it".into());
+                vec![(label, Err(crate::error::Error::Unavailable { what: "a library", reason, remedy }))]
+            }
+        }
+        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| {}).expect("a report");
+        assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
+        assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
     }
 
     #[test]

@@ -76,6 +76,10 @@ fn cells(row: &Row) -> [String; 13] {
         small(errors.map(|errors| errors.of_diagonal.largest)),
         small(errors.and_then(|errors| Some(errors.pixels?.largest))),
         number(errors.map(|errors| errors.of_bound)),
-        if row.passed { "yes".into() } else { format!("no: {}", row.faults.join("; ")) },
+        match (row.passed, row.left_out) {
+            (true, _) => "yes".into(),
+            (false, true) => format!("left out: {}", row.faults.join("; ")),
+            (false, false) => format!("no: {}", row.faults.join("; ")),
+        },
     ]
 }

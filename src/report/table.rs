@@ -28,6 +28,8 @@ pub struct Row {
     pub passed: bool,
     /// Why not, in words.
     pub faults: Vec<String>,
+    /// Whether something that it needs is not here, so that it did not fail by not passing.
+    pub left_out: bool,
     /// None when it did not pass, or cannot be timed so.
     pub timing: Option<Timing>,
     pub bytes: u64,
@@ -53,6 +55,7 @@ impl Row {
             cache,
             passed: found.passed(),
             faults: found.faults.clone(),
+            left_out: found.left_out,
             timing,
             bytes,
             traffic,
@@ -64,7 +67,8 @@ impl Row {
 
     /// The row of a variant that could not be made.
     pub fn unmade(load: &str, label: &Label, error: &Error) -> Self {
-        Self { faults: vec![error.to_string()], ..Self::blank(load, label) }
+        let left_out = matches!(error, Error::Unavailable { .. });
+        Self { faults: vec![error.to_string()], left_out, ..Self::blank(load, label) }
     }
 
     fn blank(load: &str, label: &Label) -> Self {
@@ -79,6 +83,7 @@ impl Row {
             cache: Cache::Warm,
             passed: false,
             faults: Vec::new(),
+            left_out: false,
             timing: None,
             bytes: 0,
             traffic: Vec::new(),
@@ -106,7 +111,7 @@ impl Row {
 }
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`.
-const COLUMNS: [(&str, &str); 53] = [
+const COLUMNS: [(&str, &str); 56] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("backend", "/backend"),
@@ -155,6 +160,9 @@ const COLUMNS: [(&str, &str); 53] = [
     ("truncation_rms_m", "/found/sources/truncation/rms"),
     ("normals_largest_deg", "/found/orientation/normals_degrees/largest"),
     ("normals_rms_deg", "/found/orientation/normals_degrees/rms"),
+    ("normals_to_surface_largest_deg", "/found/orientation/normals_to_surface_degrees/largest"),
+    ("normals_to_surface_rms_deg", "/found/orientation/normals_to_surface_degrees/rms"),
+    ("left_out", "/left_out"),
     ("tangents_largest_deg", "/found/orientation/tangents_degrees/largest"),
     ("tangents_rms_deg", "/found/orientation/tangents_degrees/rms"),
     ("normal_dot_tangent", "/found/orientation/normal_dot_tangent/largest"),
@@ -224,6 +232,7 @@ pub(super) mod tests {
             orientation: Orientation::default(),
             repeatable: true,
             faults: Vec::new(),
+            left_out: false,
         };
         let timing = Timing { median_us: us, q1_us: us, q3_us: us, replays: 20 };
         let traffic = vec![Part { name: "U", formula: "4 x sum 3 n r", bytes: 2_000 }];
@@ -280,8 +289,13 @@ pub(super) mod tests {
         let found = full.found.as_mut().expect("found");
         let spread = Some(Spread::default());
         found.errors.pixels = spread;
-        found.orientation =
-            Orientation { normals_degrees: spread, tangents_degrees: spread, normal_dot_tangent: spread, broken: 0 };
+        found.orientation = Orientation {
+            normals_degrees: spread,
+            normals_to_surface_degrees: spread,
+            tangents_degrees: spread,
+            normal_dot_tangent: spread,
+            broken: 0,
+        };
         let value = serde_json::to_value(&full).expect("JSON");
         for (name, place) in COLUMNS.iter().filter(|(_, place)| !place.is_empty()) {
             assert!(value.pointer(place).is_some_and(|value| !value.is_null()), "{name}");

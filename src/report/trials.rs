@@ -10,11 +10,14 @@ use super::traffic::Part;
 use super::variant::{Label, Variant};
 use crate::deform::{Backend, Surface};
 use crate::error::{Error, Result};
-use crate::gpu::{self, Device, Extent, KernelFacts, Ours, Split, Thesis, Trial};
+use crate::gpu::{self, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
 use crate::scene::{Deformation, Scene, State, Storage};
 
 /// Makes a trial of a scene for some states.
 type Make = Box<dyn Fn(&Device, &Arc<Scene>, &[State]) -> Result<Box<dyn Trial>>>;
+
+/// The parts of a step that peers launch, and how their names tell.
+const PARTS: [(gpu::Part, &str); 2] = [(gpu::Part::Uq, " Uq"), (gpu::Part::Whole, "")];
 
 /// A trial as a variant. It is made once, when its states are known.
 struct Tried {
@@ -53,13 +56,31 @@ pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
     if scene.needs.modes {
         offers.push(ours(Storage::F32, Extent::Uq));
         offers.extend(thesis(device, scene));
+        offers.extend(cublas(device, scene));
     }
     offers
 }
 
+/// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.
+fn cublas(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+    let shared = scene.domains.len() > 1 && scene.shapes.len() == 1;
+    let fits = |peer: &Peer| match peer {
+        Peer::SgemvColumns | Peer::SgemvRows => scene.domains.len() == 1,
+        Peer::Instances => shared,
+        _ => scene.domains.len() > 1,
+    };
+    let made = |peer: Peer, (part, suffix): (gpu::Part, &str)| {
+        let label = Label::new(format!("{}{suffix}", peer.name().replace('_', " ")), Backend::Cuda, scene);
+        let make: Make =
+            Box::new(move |device, scene, states| Ok(Box::new(Cublas::new(device, scene, states, (peer, part))?)));
+        offer(label, |label| Ok(Tried::new(label, scene, device, make)))
+    };
+    let both = |peer: Peer| PARTS.map(|part| made(peer, part));
+    Peer::ALL.into_iter().filter(fits).flat_map(both).collect()
+}
+
 /// The thesis's kernels: those for one domain, else the grouped ones in all their splits. They take up to 32 modes.
 fn thesis(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
-    let parts = [(gpu::Part::Uq, " Uq"), (gpu::Part::Whole, "")];
     let made = |name: String, make: Make| {
         let label = Label::new(name, Backend::Cuda, scene);
         offer(label, |label| Ok(Tried::new(label, scene, device, make)))
@@ -76,8 +97,8 @@ fn thesis(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
     };
     let largest = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
     match (scene.domains.len(), largest) {
-        (1, _) => parts.into_iter().map(single).collect(),
-        (_, 0..=32) => Split::ALL.into_iter().flat_map(|split| parts.map(|part| multi(split, part))).collect(),
+        (1, _) => PARTS.into_iter().map(single).collect(),
+        (_, 0..=32) => Split::ALL.into_iter().flat_map(|split| PARTS.map(|part| multi(split, part))).collect(),
         _ => Vec::new(),
     }
 }

@@ -7,13 +7,15 @@ use serde::Serialize;
 use super::errors::{Collect, Errors, IMAGE, Orientation, Spread, Tally, Turned, Yardstick, step_errors};
 use super::exact::{Judged, judge};
 use super::ingredients::Ingredients;
-use super::loads::Load;
+use super::loads::{Load, restated};
 use super::motion::Motion;
 use super::sources::{Origin, Sources, Split};
+use super::trials::has_normals;
 use super::variant::Variant;
 use crate::deform::Surface;
+use crate::error::Error;
 use crate::reference;
-use crate::scene::{Camera, State};
+use crate::scene::{Camera, Deformation, Normals, State};
 
 /// Of how many seeds the sources of error are split. Each costs five evaluations in f64.
 const SPLIT: usize = 4;
@@ -41,6 +43,8 @@ pub struct Found {
     pub repeatable: bool,
     /// Why it did not pass; empty when it did.
     pub faults: Vec<String>,
+    /// Whether it was not looked at because something that it needs is not here.
+    pub left_out: bool,
 }
 
 impl Found {
@@ -61,6 +65,7 @@ struct Case<'a> {
     first: Surface,
     repeatable: bool,
     fault: Option<String>,
+    left_out: bool,
 }
 
 /// One state to look at.
@@ -70,6 +75,8 @@ struct Look<'a> {
     /// What exact storage of all modes gives, and its bound.
     judged: Arc<Vec<Judged>>,
     origin: Option<Origin>,
+    /// Normals of the deformed surface, of the states whose sources are split.
+    surface: Option<Vec<[f64; 3]>>,
     along: bool,
 }
 
@@ -85,12 +92,19 @@ pub fn validate(
     let truth = |at: usize| if at < seeds { motion.seed(at) } else { motion.step(at - seeds) };
     let states: Vec<State> = (0..seeds + motion.steps()).map(|at| truth(at).state()).collect();
     let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut(), &states)).collect();
+    // The scene whose normals are those of the deformed surface, where that bends and has any.
+    let exact_normals = Deformation { normals: Normals::Exact, ..load.scene.deformation };
+    let bends = load.scene.needs.modes && has_normals(&load.scene);
+    let bent = bends.then(|| restated(&load.scene, exact_normals)).and_then(Result::ok);
     let (exact, mut conditions) = (Ingredients::of(&load.scene), Conditions::default());
     for (at, state) in states.iter().enumerate() {
         let judged = Arc::new(judge(&load.scene, state, &exact));
         conditions.add(&judged);
-        let origin = (at < SPLIT.min(seeds)).then(|| Origin::new(&load.scene, truth(at), state));
-        let look = Look { at, state, judged, origin, along: at >= seeds };
+        let split = at < SPLIT.min(seeds);
+        let origin = split.then(|| Origin::new(&load.scene, truth(at), state));
+        let bent = bent.as_ref().filter(|_| split);
+        let surface = bent.map(|scene| reference::exact_normals(scene, state, &places(&judged)));
+        let look = Look { at, state, judged, origin, surface, along: at >= seeds };
         cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
     }
     cases.iter_mut().for_each(|case| case.repeat(&states));
@@ -99,7 +113,9 @@ pub fn validate(
 
 impl<'a> Case<'a> {
     fn new(variant: &'a mut dyn Variant, states: &[State]) -> Self {
-        let fault = variant.prepare(states).err().map(|error| error.to_string());
+        let fault = variant.prepare(states).err();
+        let left_out = matches!(fault, Some(Error::Unavailable { .. }));
+        let fault = fault.map(|error| error.to_string());
         Self {
             variant,
             tally: Tally::default(),
@@ -110,6 +126,7 @@ impl<'a> Case<'a> {
             first: Surface::default(),
             repeatable: true,
             fault,
+            left_out,
         }
     }
 
@@ -168,7 +185,7 @@ impl<'a> Case<'a> {
             return;
         }
         let (scene, state) = (self.variant.scene(), look.state);
-        let exact = || look.judged.iter().map(|judged| judged.at).collect::<Vec<_>>();
+        let exact = || places(&look.judged);
         let (normals, tangents) = match scene.needs.exact_normals {
             true => {
                 (reference::exact_normals(scene, state, &exact()), reference::exact_tangents(scene, state, &exact()))
@@ -176,6 +193,9 @@ impl<'a> Case<'a> {
             false => (reference::orient_normals(scene, state), reference::orient_tangents(scene, state)),
         };
         self.turned.add_normals(&surface.normals, &normals);
+        if let Some(want) = &look.surface {
+            self.turned.add_to_surface(&surface.normals, want);
+        }
         self.turned.add_tangents(&surface.tangents, &tangents, &surface.normals);
     }
 
@@ -196,8 +216,13 @@ impl<'a> Case<'a> {
             orientation,
             repeatable: self.repeatable,
             faults,
+            left_out: self.left_out,
         }
     }
+}
+
+fn places(judged: &[Judged]) -> Vec<[f64; 3]> {
+    judged.iter().map(|judged| judged.at).collect()
 }
 
 fn bits(surface: &Surface) -> impl Iterator<Item = u32> + '_ {
@@ -261,6 +286,8 @@ mod tests {
         assert!(found.step_metres.largest > 0.0 && found.step_metres.largest < 2e-6, "{found:?}");
         let normals = found.orientation.normals_degrees.expect("normals");
         let tangents = found.orientation.tangents_degrees.expect("tangents");
+        let to_surface = found.orientation.normals_to_surface_degrees.expect("normals");
+        assert!(to_surface.largest > 0.1, "rigid normals do not follow the surface: {found:?}");
         assert!(normals.largest < 1e-4 && tangents.largest < 1e-4, "{found:?}");
         assert!(found.orientation.normal_dot_tangent.expect("dots").largest < 1e-6, "{found:?}");
         let Sources { storage, q, accumulation, transform, origin, truncation } = found.sources;

@@ -53,6 +53,7 @@ pub(super) fn build(kind: Kind, size: Size) -> Result<Load> {
         Kind::Single { power, rank } => (vec![bare(sheet(cut(1 << power), rank))], false),
         Kind::A { dressed: true } => (vec![sheet(cut(1_500_000), 32)], true),
         Kind::A { dressed: false } => (vec![bare(sheet(cut(1_500_000), 32))], false),
+        Kind::Batch => (vec![bare(sheet(cut(1 << 18), 32))], false),
         Kind::Cancelling => (vec![bare(sheet(cut(1 << 16), 32))], false),
         Kind::B => (many(kind, cut(1_000), |rng| (1_500, mixed_rank(rng))), false),
         Kind::C => (many(kind, cut(200_000), |rng| (7, rare_rank(rng))), false),
@@ -64,7 +65,14 @@ pub(super) fn build(kind: Kind, size: Size) -> Result<Load> {
     }
     let paired = kind == Kind::Cancelling;
     let shapes = patches.par_iter().map(|patch| shape(patch, paired)).collect::<Result<Vec<_>>>()?;
-    Ok(Load { scene: scene(kind.name(), shapes, dressed)?, name: kind.name(), paired, species: None, remarks })
+    let instances = if kind == Kind::Batch { 16 } else { shapes.len() };
+    Ok(Load {
+        scene: scene(kind.name(), shapes, instances, dressed)?,
+        name: kind.name(),
+        paired,
+        species: None,
+        remarks,
+    })
 }
 
 fn many(kind: Kind, count: usize, size_of: impl Fn(&mut Rng) -> (usize, usize)) -> Vec<Patch> {
@@ -164,17 +172,18 @@ fn modes(patch: &Patch, paired: bool) -> Result<Modes> {
     Modes::from_columns(rows, patch.rank, entries)
 }
 
-/// A scene of one domain per shape, turned at random on a cubic lattice, with a normal map when `dressed`.
-pub(super) fn scene(name: String, shapes: Vec<Shape>, dressed: bool) -> Result<std::sync::Arc<Scene>> {
+/// A scene of `count` domains, which have the shapes in turn, each turned at random on a cubic lattice; with a normal map
+/// when `dressed`.
+pub(super) fn scene(name: String, shapes: Vec<Shape>, count: usize, dressed: bool) -> Result<std::sync::Arc<Scene>> {
     let mut rng = Rng::with_seed(seed_of(&name, usize::MAX));
-    let side = (shapes.len() as f64).cbrt().ceil() as usize;
-    let spacing = if shapes.len() > 1 { 0.15 } else { 0.0 };
+    let side = (count as f64).cbrt().ceil() as usize;
+    let spacing = if count > 1 { 0.15 } else { 0.0 };
     let domain = |index: usize| {
         let place = [index % side, index / side % side, index / side / side].map(|cell| cell as f64 * spacing);
-        let turn = if shapes.len() > 1 { any_turn(&mut rng) } else { Rotation3::identity() };
+        let turn = if count > 1 { any_turn(&mut rng) } else { Rotation3::identity() };
         Domain {
             name: index.to_string(),
-            shape: index,
+            shape: index % shapes.len(),
             material: 0,
             runs: Vec::new(),
             placement: Transform::from_parts(&turn.into_inner(), &Vector3::from(place)),
@@ -184,7 +193,7 @@ pub(super) fn scene(name: String, shapes: Vec<Shape>, dressed: bool) -> Result<s
             metadata: Metadata::default(),
         }
     };
-    let domains = (0..shapes.len()).map(domain).collect();
+    let domains = (0..count).map(domain).collect();
     let mut parts = Parts::named(name);
     if dressed {
         parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255])?];
@@ -235,6 +244,12 @@ mod tests {
     fn full_singles_have_the_size_of_their_name() {
         let scene = Kind::Single { power: 14, rank: 10 }.build(Size::Full).expect("built").scene;
         assert_eq!((scene.layout.vertices, scene.rank_of(0)), (1 << 14, 10));
+    }
+
+    #[test]
+    fn a_batch_has_sixteen_domains_and_one_u() {
+        let scene = Kind::Batch.build(Size::Quick).expect("built").scene;
+        assert_eq!((scene.domains.len(), scene.shapes.len(), scene.layout.coordinates), (16, 1, 16 * 32));
     }
 
     #[test]

@@ -7,6 +7,7 @@
 //! | `b` | 1,000 domains of 1,500 vertices, r mixed 0 to 64, about 17 on average |
 //! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
 //! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
+//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q for one U, beside `single-18-32` |
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
 //!
 //! `single` and `plants` name whole groups, `all` everything.
@@ -42,6 +43,7 @@ pub enum Kind {
     B,
     C,
     Cancelling,
+    Batch,
     /// Index into the thesis's plants.
     Plant(usize),
 }
@@ -63,7 +65,14 @@ impl Kind {
     /// Every load, in the order of the report.
     pub fn all() -> Vec<Self> {
         let mut kinds = Self::singles();
-        kinds.extend([Self::A { dressed: false }, Self::A { dressed: true }, Self::B, Self::C, Self::Cancelling]);
+        kinds.extend([
+            Self::A { dressed: false },
+            Self::A { dressed: true },
+            Self::B,
+            Self::C,
+            Self::Cancelling,
+            Self::Batch,
+        ]);
         kinds.extend((0..PLANTS.len()).map(Self::Plant));
         kinds
     }
@@ -91,6 +100,7 @@ impl Kind {
             ["b"] => Some(vec![Self::B]),
             ["c"] => Some(vec![Self::C]),
             ["cancel"] => Some(vec![Self::Cancelling]),
+            ["batch"] => Some(vec![Self::Batch]),
             ["plants"] => Some((0..PLANTS.len()).map(Self::Plant).collect()),
             ["plant", index] => {
                 let index = number(index).filter(|index| (1..=PLANTS.len()).contains(index));
@@ -98,7 +108,7 @@ impl Kind {
             }
             _ => None,
         };
-        let expected = "single-P-R (2^P vertices, P 2 to 22, R modes), a, a-positions, b, c, cancel, plant-1 to \
+        let expected = "single-P-R (2^P vertices, P 2 to 22, R modes), a, a-positions, b, c, cancel, batch, plant-1 to \
                         plant-12, or one of the groups single, plants, all";
         found.ok_or_else(|| invalid("load", expected, name))
     }
@@ -112,6 +122,7 @@ impl Kind {
             Self::B => "b".into(),
             Self::C => "c".into(),
             Self::Cancelling => "cancel".into(),
+            Self::Batch => "batch".into(),
             Self::Plant(index) => format!("plant-{}", index + 1),
         }
     }

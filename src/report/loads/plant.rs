@@ -22,7 +22,7 @@ pub(super) fn grow(index: usize, size: Size) -> Result<Load> {
     let patches = patches(&counts);
     let shapes = patches.par_iter().map(|patch| shape(patch, false)).collect::<Result<Vec<_>>>()?;
     let name = format!("plant-{}", index + 1);
-    let scene = scene(name.clone(), shapes, false)?;
+    let scene = scene(name.clone(), shapes, counts.domains, false)?;
     Ok(Load { name, scene, paired: false, species: Some(index), remarks: remarks(&printed, &counts) })
 }
 

@@ -45,11 +45,13 @@ impl<'a> Panel<'a> {
         let front = self.front();
         let steps: Vec<String> =
             front.iter().map(|index| format!("{:.1},{:.1}", places[*index].0, places[*index].1)).collect();
-        let _ = writeln!(
-            out,
-            "<polyline points=\"{}\" fill=\"none\" stroke=\"#999999\" stroke-width=\"1.5\" stroke-dasharray=\"5 3\"/>",
-            steps.join(" ")
-        );
+        if steps.len() > 1 {
+            let _ = writeln!(
+                out,
+                "<polyline points=\"{}\" fill=\"none\" stroke=\"#999999\" stroke-width=\"1.5\" stroke-dasharray=\"5 3\"/>",
+                steps.join(" ")
+            );
+        }
         for index in &front {
             let (x, y) = places[*index];
             let _ = writeln!(
@@ -62,7 +64,7 @@ impl<'a> Panel<'a> {
             let style = if row.cache == Cache::Warm { filled(colour) } else { hollow(colour) };
             mark(out, *place, row.backend, &style);
         }
-        self.labels(out, &places, &front);
+        self.labels(out, &places, &front, &colour);
         if self.points.is_empty() {
             let middle = (self.corner.0 + PANEL.0 / 2.0, self.corner.1 + PANEL.1 / 2.0);
             text(out, middle, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "nothing passed");
@@ -120,7 +122,7 @@ impl<'a> Panel<'a> {
     }
 
     /// Names beside the points of the front, and beside all warm points when there are few.
-    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize]) {
+    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], colour: &impl Fn(&str) -> &'static str) {
         let mut taken: Vec<Area> = places.iter().map(|(x, y)| (x - 7.0, y - 7.0, 14.0, 14.0)).collect();
         let few = self.points.len() <= 8;
         let warm = |at: &usize| front.contains(at) || (few && self.points[*at].0.cache == Cache::Warm);
@@ -128,8 +130,9 @@ impl<'a> Panel<'a> {
             let name = &self.points[at].0.name;
             // A label that finds no room is left out: the legend names its point too.
             if let Some(area) = self.room(places[at], width_of(name, LETTERS), &taken) {
+                let fill = colour(name);
                 let style = format!(
-                    "font-size=\"{LETTERS}\" fill=\"#222222\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
+                    "font-size=\"{LETTERS}\" fill=\"{fill}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
                 );
                 text(out, (area.0, area.1 + LETTERS), &style, name);
                 taken.push(area);
