@@ -264,8 +264,9 @@ mod tests {
     use crate::cpu::CpuDeformer;
     use crate::deform::Backend;
     use crate::report::loads::{Kind, Size};
-    use crate::report::testing::Damaged;
+    use crate::report::testing::{Damaged, Emulated};
     use crate::report::variant::{Driven, Label};
+    use crate::scene::Storage;
 
     fn find(kind: Kind, damage: f32) -> (Found, Condition) {
         let load = kind.build(Size::Quick).expect("built");
@@ -306,5 +307,33 @@ mod tests {
         assert!(!found.passed() && found.faults[0].contains("times its a-priori bound"), "{:?}", found.faults);
         let (found, _) = find(Kind::B, f32::NAN);
         assert!(found.faults[0].contains("not finite"), "{:?}", found.faults);
+    }
+
+    /// A deformer that does as one deformation says, judged by another.
+    fn emulate(does: Deformation, says: Deformation) -> Found {
+        let load = Kind::B.build(Size::Quick).expect("built");
+        let [done, said] = [does, says].map(|deformation| restated(&load.scene, deformation).expect("restated"));
+        let label = Label::new("emulated", Backend::Cpu, &said);
+        let (does, says) = (Ingredients::of(&done), Ingredients::of(&said));
+        let emulated = Emulated { label, scene: said, does, says, surface: Surface::default() };
+        let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
+        validate(&load, &Motion::new(&load, None), &mut variants, 3).0.remove(0)
+    }
+
+    #[test]
+    fn stored_and_truncated_deformers_keep_their_own_bounds_and_not_those_of_exact_ones() {
+        let storage = |storage| Deformation { storage, ..Deformation::default() };
+        let [half, brain, eighth] = [Storage::F16, Storage::Bf16, Storage::Int8].map(storage);
+        let short = Deformation { truncation: Some(1e-4), ..Deformation::default() };
+        for deformation in [half, brain, eighth, short, Deformation { truncation: Some(1e-4), ..eighth }] {
+            let found = emulate(deformation, deformation);
+            assert!(found.passed(), "{deformation:?}: {:?}", found.faults);
+            assert!(found.errors.of_bound > 0.05, "{deformation:?} is judged by a bound of its size: {found:?}");
+            assert_eq!(found.sources.accumulation, Spread::default(), "{deformation:?}");
+            assert_eq!(found.sources.storage.largest > 0.0, deformation.storage != Storage::F32);
+            assert_eq!(found.sources.truncation.largest > 0.0, deformation.truncation.is_some());
+            assert!(!emulate(deformation, Deformation::default()).passed(), "{deformation:?} is not exact");
+        }
+        assert!(!emulate(eighth, half).passed() && !emulate(brain, half).passed(), "coarser than it says");
     }
 }

@@ -140,10 +140,10 @@ mod tests {
 
     #[test]
     fn quick_plants_are_smaller_in_every_count_and_say_so() {
-        for index in 0..PLANTS.len() {
+        for (index, plant) in PLANTS.iter().enumerate() {
             let load = grow(index, Size::Quick).expect("grown");
             assert!(census(&load).iter().all(|count| *count > 0), "{}", load.name);
-            assert!(load.scene.layout.vertices <= PLANTS[index].rows / 20, "{}", load.name);
+            assert!(load.scene.layout.vertices <= plant.rows / 20, "{}", load.name);
             assert!(load.remarks.iter().any(|remark| remark.contains("quick")), "{:?}", load.remarks);
         }
     }

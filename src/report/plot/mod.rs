@@ -12,7 +12,7 @@ use super::Report;
 use super::table::Row;
 use crate::deform::Backend;
 use crate::error::{Result, during};
-use panel::Panel;
+use panel::{Look, Panel};
 
 /// Pixels of the PNG per unit of the SVG.
 const SCALE: f32 = 2.0;
@@ -57,13 +57,13 @@ pub fn svg(report: &Report) -> String {
     );
     text(&mut out, (MARGIN + 8.0, MARGIN + 40.0), "font-size=\"12\" fill=\"#555555\"", &report.made.line());
     let marks = "filled: warm caches, hollow: cold; ringed and joined: Pareto front of the warm ones; circle: CPU, \
-                 square: CUDA, diamond: reference";
+                 square and triangle: CUDA, diamond: reference";
     text(&mut out, (MARGIN + 8.0, MARGIN + 59.0), "font-size=\"12\" fill=\"#555555\"", marks);
     out.push_str(&legend);
     for (index, load) in loads.iter().enumerate() {
         let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
         let rows: Vec<&Row> = report.rows.iter().filter(|row| row.load == *load).collect();
-        Panel::new(corner, load, &rows).draw(&mut out, |name| colour(&names, name));
+        Panel::new(corner, load, &rows).draw(&mut out, |name| look(&names, name));
     }
     out.push_str("</svg>\n");
     out
@@ -101,21 +101,23 @@ fn names(rows: &[Row]) -> Vec<(&str, Backend)> {
     names
 }
 
-fn colour(names: &[(&str, Backend)], name: &str) -> &'static str {
+fn look(names: &[(&str, Backend)], name: &str) -> Look {
     let index = names.iter().position(|(own, _)| *own == name).unwrap_or(0);
-    COLOURS[index % COLOURS.len()]
+    let backend = names.get(index).map_or(Backend::Cpu, |(_, backend)| *backend);
+    Look { colour: COLOURS[index % COLOURS.len()], backend, round: index / COLOURS.len() }
 }
 
 /// The legend and its number of lines.
 fn legend(names: &[(&str, Backend)], width: f64) -> (String, usize) {
     let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
-    for (name, backend) in names {
+    for (name, _) in names {
+        let look = look(names, name);
         let wide = 30.0 + panel::width_of(name, 13.0);
         if x + wide > width - MARGIN && x > MARGIN + 8.0 {
             (x, line) = (MARGIN + 8.0, line + 1);
         }
         let y = MARGIN + HEAD + line as f64 * LEGEND;
-        panel::mark(&mut out, (x + 6.0, y - 4.0), *backend, &panel::filled(colour(names, name)));
+        panel::mark(&mut out, (x + 6.0, y - 4.0), look, &panel::filled(look.colour));
         text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
         x += wide + 10.0;
     }
@@ -162,6 +164,14 @@ mod tests {
         ];
         let names = names(&rows);
         assert_eq!(names, [("x", Backend::Cpu), ("y", Backend::Cpu)]);
-        assert_ne!(colour(&names, "x"), colour(&names, "y"));
+        assert_ne!(look(&names, "x").colour, look(&names, "y").colour);
+    }
+
+    #[test]
+    fn thirty_six_variants_of_the_device_all_look_different() {
+        let names: Vec<String> = (0..36).map(|index| index.to_string()).collect();
+        let list: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
+        let looks: Vec<Look> = names.iter().map(|name| look(&list, name)).collect();
+        assert!((0..36).all(|one| (0..one).all(|other| looks[one] != looks[other])));
     }
 }

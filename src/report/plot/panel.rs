@@ -39,7 +39,7 @@ impl<'a> Panel<'a> {
         Self { corner, title, points, time, error }
     }
 
-    pub(super) fn draw(&self, out: &mut String, colour: impl Fn(&str) -> &'static str) {
+    pub(super) fn draw(&self, out: &mut String, look: impl Fn(&str) -> Look) {
         self.frame(out);
         let places: Vec<(f64, f64)> = self.points.iter().map(|(_, (us, error))| self.place(*us, *error)).collect();
         let front = self.front();
@@ -59,12 +59,15 @@ impl<'a> Panel<'a> {
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"9\" fill=\"none\" stroke=\"#444444\" stroke-width=\"1.2\"/>"
             );
         }
-        for ((row, _), place) in self.points.iter().zip(&places) {
-            let colour = colour(&row.name);
-            let style = if row.cache == Cache::Warm { filled(colour) } else { hollow(colour) };
-            mark(out, *place, row.backend, &style);
+        // Cold ones first, so that none hides a warm one.
+        for cache in [Cache::Cold, Cache::Warm] {
+            for ((row, _), place) in self.points.iter().zip(&places).filter(|((row, _), _)| row.cache == cache) {
+                let look = look(&row.name);
+                let style = if cache == Cache::Warm { filled(look.colour) } else { hollow(look.colour) };
+                mark(out, *place, look, &style);
+            }
         }
-        self.labels(out, &places, &front, &colour);
+        self.labels(out, &places, &front, &look);
         if self.points.is_empty() {
             let middle = (self.corner.0 + PANEL.0 / 2.0, self.corner.1 + PANEL.1 / 2.0);
             text(out, middle, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "nothing passed");
@@ -130,7 +133,7 @@ impl<'a> Panel<'a> {
             let name = &self.points[at].0.name;
             // A label that finds no room is left out: the legend names its point too.
             if let Some(area) = self.room(places[at], width_of(name, LETTERS), &taken) {
-                let fill = colour(name);
+                let fill = look(name).colour;
                 let style = format!(
                     "font-size=\"{LETTERS}\" fill=\"{fill}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
                 );
@@ -176,12 +179,25 @@ fn hollow(colour: &str) -> String {
     format!("fill=\"#fafafa\" stroke=\"{colour}\" stroke-width=\"1.8\"")
 }
 
-/// The mark of a backend around a point.
-pub(super) fn mark(out: &mut String, (x, y): (f64, f64), backend: Backend, style: &str) {
-    let shape = match backend {
-        Backend::Cpu => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {style}/>"),
-        Backend::Cuda => format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"9\" height=\"9\" {style}/>", x - 4.5, y - 4.5),
-        Backend::Reference => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {style}/>", y - 6.0),
+/// A colour and a shape: no two variants of a report share both.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Look {
+    pub(super) colour: &'static str,
+    pub(super) backend: Backend,
+    /// How many times all colours were used before.
+    pub(super) round: usize,
+}
+
+/// The mark of a variant around a point.
+pub(super) fn mark(out: &mut String, (x, y): (f64, f64), look: Look, style: &str) {
+    let shape = match (look.backend, look.round % 3) {
+        (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {style}/>"),
+        (Backend::Reference, _) => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {style}/>", y - 6.0),
+        (Backend::Cuda, 0) => {
+            format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"9\" height=\"9\" {style}/>", x - 4.5, y - 4.5)
+        }
+        (Backend::Cuda, 1) => format!("<path d=\"M{x:.1} {:.1}l6 10h-12z\" {style}/>", y - 6.0),
+        (Backend::Cuda, _) => format!("<path d=\"M{x:.1} {:.1}l6 -10h-12z\" {style}/>", y + 6.0),
     };
     out.push_str(&shape);
     out.push('\n');
@@ -203,7 +219,7 @@ mod tests {
         let panel = Panel::new((0.0, 0.0), "a", &rows.iter().collect::<Vec<_>>());
         assert_eq!(panel.front(), [1, 2]);
         let mut out = String::new();
-        panel.draw(&mut out, |_| "#0072b2");
+        panel.draw(&mut out, |_| Look { colour: "#0072b2", backend: Backend::Cpu, round: 0 });
         for name in ["first", "second", "beaten"] {
             assert!(out.contains(&format!(">{name}</text>")), "{name}");
         }
