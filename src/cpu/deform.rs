@@ -1,70 +1,156 @@
 //! x = T (x0 + U q) in f32. Twin: `reference/deform.rs`.
 
-use rayon::prelude::*;
+use pulp::NullaryFnOnce;
 
-use super::tile::{self, TILE, Tile};
-use crate::scene::{Bounds, Scene, State};
+use super::extent::Extent;
+use super::kept::Kept;
+use super::simd::vectorized;
+use super::sum::{Coordinates, Scratch, Summed, sum};
+use super::tile::{self, Packed, PerTile, Tile};
+use crate::domain::Transform;
+use crate::scene::{Scene, State};
+use crate::storage::{QUAD, TILE_QUADS, Tiles};
 
-/// Writes three f32 per vertex into `positions` and returns their bounds, which are not finite when a sum overflowed.
-pub(super) fn deform(scene: &Scene, state: &State, tiles: &[Tile], positions: &mut [f32]) -> Bounds {
-    let simd = pulp::Arch::new();
-    let one = |(tile, out): (Tile, &mut [f32])| simd.dispatch(|| deform_tile(scene, state, tile, out));
-    let parts = tile::share(tiles, positions, 3);
-    parts.into_par_iter().with_min_len(16).map(one).reduce(|| Bounds::EMPTY, Bounds::union)
+/// The most vertices of a tile.
+pub(super) const TILE: usize = QUAD * TILE_QUADS;
+
+/// All that a step reads.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Inputs<'a> {
+    pub(super) scene: &'a Scene,
+    pub(super) state: &'a State,
+    /// Per shape.
+    pub(super) shapes: &'a [Tiles],
+    pub(super) kept: Option<&'a Kept>,
+    /// 0, 1, 2 and so on: the chunks of a domain that leaves nothing out.
+    pub(super) every_chunk: &'a [u16],
 }
 
-#[inline(always)]
-fn deform_tile(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) -> Bounds {
-    let shape = scene.shape_of(tile.domain);
-    let rest = &shape.mesh.rest().as_flattened()[3 * tile.first..][..3 * tile.count];
-    let mut bent = [0.0_f32; 3 * TILE];
-    let bent = &mut bent[..3 * tile.count];
-    let q = state.q_of(scene, tile.domain);
-    // Four modes at a time keep the sums in registers four times as long; the order of the sum stays that of the modes.
-    let column = |mode: usize| &shape.modes.column(mode)[3 * tile.first..][..3 * tile.count];
-    let mut quads = q.chunks_exact(4);
-    for (quad, four) in quads.by_ref().enumerate() {
-        add_four(bent, [0, 1, 2, 3].map(|lane| column(4 * quad + lane)), [four[0], four[1], four[2], four[3]]);
-    }
-    for (lane, amount) in quads.remainder().iter().enumerate() {
-        add_one(bent, column(q.len() / 4 * 4 + lane), *amount);
-    }
-    for (sum, rest) in bent.iter_mut().zip(rest) {
-        *sum += *rest;
-    }
-    place(&state.transforms[tile.domain].0, bent, out)
-}
+/// Three f32 per vertex, and the extent of each tile.
+pub(super) type Outputs<'a> = (Packed<'a>, PerTile<'a, Extent>);
 
-#[inline(always)]
-fn add_four(sums: &mut [f32], columns: [&[f32]; 4], q: [f32; 4]) {
-    let [a, b, c, d] = columns;
-    for ((((sum, a), b), c), d) in sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-        *sum = d.mul_add(q[3], c.mul_add(q[2], b.mul_add(q[1], a.mul_add(q[0], *sum))));
+/// Writes positions and extents of these tiles. A tile's extent is not finite when one of its positions is not.
+pub(super) fn deform(inputs: Inputs, tiles: &[Tile], outputs: Outputs) {
+    if inputs.scene.needs.compensated {
+        tile::spread(tiles, outputs, &|tiles, outputs| vectorized(Run::<true> { inputs, tiles, outputs }));
+    } else {
+        tile::spread(tiles, outputs, &|tiles, outputs| vectorized(Run::<false> { inputs, tiles, outputs }));
     }
 }
 
-#[inline(always)]
-fn add_one(sums: &mut [f32], column: &[f32], q: f32) {
-    for (sum, entry) in sums.iter_mut().zip(column) {
-        *sum = entry.mul_add(q, *sum);
-    }
+/// Neighbouring tiles on one core.
+struct Run<'a, const COMPENSATED: bool> {
+    inputs: Inputs<'a>,
+    tiles: &'a [Tile],
+    outputs: Outputs<'a>,
 }
 
-/// World positions of a tile, and their bounds.
-#[inline(always)]
-fn place(world_from_domain: &[f32; 12], bent: &[f32], out: &mut [f32]) -> Bounds {
-    let (mut min, mut max, mut poison) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3], 0.0_f32);
-    for (point, world) in bent.chunks_exact(3).zip(out.chunks_exact_mut(3)) {
-        for axis in 0..3 {
-            let [x, y, z, offset] = [0, 1, 2, 3].map(|column| world_from_domain[4 * axis + column]);
-            let value = z.mul_add(point[2], y.mul_add(point[1], x.mul_add(point[0], offset)));
-            world[axis] = value;
-            min[axis] = min[axis].min(value);
-            max[axis] = max[axis].max(value);
-            // Infinity times zero is NaN, and NaN stays: one number tells whether all were finite.
-            poison += value * 0.0;
+impl<const COMPENSATED: bool> NullaryFnOnce for Run<'_, COMPENSATED> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(mut self) {
+        let mut scratch = Scratch::new();
+        for tile in self.tiles {
+            let out = self.outputs.0.of(tile);
+            *self.outputs.1.of(tile) = deform_tile::<COMPENSATED>(&self.inputs, tile, &mut scratch, out);
         }
     }
-    let poison = f64::from(poison);
-    Bounds { min: min.map(|number| f64::from(number) + poison), max: max.map(|number| f64::from(number) + poison) }
+}
+
+#[inline(always)]
+fn deform_tile<const COMPENSATED: bool>(
+    inputs: &Inputs,
+    tile: &Tile,
+    scratch: &mut Scratch,
+    out: &mut [f32],
+) -> Extent {
+    let tiles = inputs.tiles_of(tile);
+    let place = tiles.tile(tile.first() / TILE);
+    if tiles.rank() > 0 {
+        sum::<COMPENSATED>(tiles, &place, inputs.summed(tile), scratch);
+    } else {
+        scratch.sums[..12 * place.quads].fill(0.0);
+    }
+    add_rest(&tiles.rest()[place.first_quad..][..place.quads], &mut scratch.sums);
+    let transform = &inputs.state.transforms[tile.domain()];
+    let extent = put(transform, &mut scratch.sums, 4 * place.quads, out);
+    if extent.is_finite() { extent } else { rescue(inputs, tile, out) }
+}
+
+impl<'a> Inputs<'a> {
+    #[inline(always)]
+    fn tiles_of(&self, tile: &Tile) -> &'a Tiles {
+        &self.shapes[self.scene.domains[tile.domain()].shape]
+    }
+
+    #[inline(always)]
+    fn summed(&self, tile: &Tile) -> Summed<'a> {
+        let chunks = self.tiles_of(tile).chunks();
+        match self.kept {
+            Some(kept) => kept.of(tile.domain()),
+            None => Summed { q: self.state.q_of(self.scene, tile.domain()), chunks: &self.every_chunk[..chunks] },
+        }
+    }
+}
+
+#[inline(always)]
+fn add_rest(rest: &[[f32; 12]], sums: &mut Coordinates) {
+    let width = QUAD * rest.len();
+    for (axis, sums) in sums[..3 * width].chunks_exact_mut(width).enumerate() {
+        for (sums, quad) in sums.chunks_exact_mut(QUAD).zip(rest) {
+            for (sum, rest) in sums.iter_mut().zip(&quad[QUAD * axis..][..QUAD]) {
+                *sum += *rest;
+            }
+        }
+    }
+}
+
+/// World positions of a tile from `[axis][vertex]`, `width` vertices an axis, which are overwritten.
+#[inline(always)]
+fn put(transform: &Transform, bent: &mut Coordinates, width: usize, out: &mut [f32]) -> Extent {
+    let t = transform.0;
+    let (x, yz) = bent[..3 * width].split_at_mut(width);
+    let (y, z) = yz.split_at_mut(width);
+    for ((x, y), z) in x.iter_mut().zip(y.iter_mut()).zip(z.iter_mut()) {
+        // No closure here: it would be compiled without fused multiply-adds.
+        let [a, b, c] = [*x, *y, *z];
+        *x = c.mul_add(t[2], b.mul_add(t[1], a.mul_add(t[0], t[3])));
+        *y = c.mul_add(t[6], b.mul_add(t[5], a.mul_add(t[4], t[7])));
+        *z = c.mul_add(t[10], b.mul_add(t[9], a.mul_add(t[8], t[11])));
+    }
+    let count = out.len() / 3;
+    for (((out, x), y), z) in out.chunks_exact_mut(3).zip(&*x).zip(&*y).zip(&*z) {
+        out.copy_from_slice(&[*x, *y, *z]);
+    }
+    Extent::of([&x[..count], &y[..count], &z[..count]])
+}
+
+/// Vertices that are not finite, once more in f64: a finite sum may have had terms or partial sums that are none in f32.
+#[cold]
+#[inline(never)]
+fn rescue(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> Extent {
+    let tiles = inputs.tiles_of(tile);
+    let transform = &inputs.state.transforms[tile.domain()].0;
+    let q = if tiles.rank() > 0 { inputs.summed(tile).q } else { &[] };
+    let mut extent = Extent::EMPTY;
+    for (at, out) in out.chunks_exact_mut(3).enumerate() {
+        if !out.iter().all(|number| number.is_finite()) {
+            let bent = bent_in_f64(tiles, q, tile.first() + at);
+            for (row, out) in out.iter_mut().enumerate() {
+                let [x, y, z, offset] = [0, 1, 2, 3].map(|column| f64::from(transform[4 * row + column]));
+                *out = (x * bent[0] + y * bent[1] + z * bent[2] + offset) as f32;
+            }
+        }
+        extent = extent.union(Extent::of([&out[..1], &out[1..2], &out[2..]]));
+    }
+    extent
+}
+
+fn bent_in_f64(tiles: &Tiles, q: &[f32], vertex: usize) -> [f64; 3] {
+    [0, 1, 2].map(|axis| {
+        let rest = tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD];
+        let part = |(mode, q): (usize, &f32)| tiles.decoded(vertex, axis, mode) * f64::from(*q);
+        q.iter().enumerate().map(part).sum::<f64>() + f64::from(rest)
+    })
 }

@@ -5,10 +5,9 @@
 //! so that no input needs scaling, and gathering costs more than adding.
 
 use nalgebra::{Matrix3, Vector3};
-use rayon::prelude::*;
 
 use super::orient::{self, cofactors};
-use super::tile::{self, Tile};
+use super::tile::{self, Packed, Tile};
 use crate::deform::Surface;
 use crate::domain::{RING_START, Smoothing};
 use crate::scene::{Scene, State};
@@ -19,19 +18,22 @@ const RESOLUTION: f64 = 1.0 / 262_144.0;
 /// As in the twin: squared length of the sum of two opposite unit vectors.
 const OPPOSITE: f64 = 1e-10;
 
-/// Writes three f32 per corner into the normals and, where the scene has normal maps, four into the tangents, from the
-/// surface's positions.
+/// Writes three f32 per corner of these tiles into the normals and, where the scene has normal maps, four into the
+/// tangents, from the surface's positions.
 pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
     let Surface { positions, normals, tangents } = surface;
     let positions = positions.as_slice();
-    let normals = tile::share(tiles, normals, 3);
-    let tangents = tile::share(tiles, tangents, if scene.needs.normal_maps { 4 } else { 0 });
-    normals.into_par_iter().zip(tangents).with_min_len(16).for_each(|((tile, normals), (_, tangents))| {
-        orient::orient_normals(scene, state, tile, normals);
-        if !tangents.is_empty() {
-            orient::orient_tangents(scene, state, tile, tangents);
+    // A tile of a scene without tangents has 0 numbers of them.
+    let tangents = Packed::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);
+    tile::spread(tiles, (Packed::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
+        for tile in tiles {
+            let (normals, tangents) = (normals.of(tile), tangents.of(tile));
+            orient::orient_normals(scene, state, tile, normals);
+            if !tangents.is_empty() {
+                orient::orient_tangents(scene, state, tile, tangents);
+            }
+            follow(&Bent::new(scene, state, tile.domain(), positions), tile.first(), normals, tangents);
         }
-        follow(&Bent::new(scene, state, tile.domain, positions), tile.first, normals, tangents);
     });
 }
 

@@ -1,44 +1,45 @@
 //! Normals by the inverse transpose of A, tangents by A, in f32. Twin: `reference/orient.rs`.
 
 use nalgebra::{Matrix3, Vector3};
-use rayon::prelude::*;
 
-use super::tile::{self, Tile};
+use super::tile::{self, Packed, Tile};
 use crate::deform::Surface;
 use crate::scene::{Scene, State};
 
 /// Writes three f32 per corner into the normals and, where the scene has normal maps, four into the tangents.
 pub(super) fn orient(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
-    let parts = tile::share(tiles, &mut surface.normals, 3);
-    parts.into_par_iter().with_min_len(16).for_each(|(tile, out)| orient_normals(scene, state, tile, out));
+    tile::spread(tiles, Packed::new(3, &mut surface.normals), &|tiles, mut out| {
+        tiles.iter().for_each(|tile| orient_normals(scene, state, tile, out.of(tile)));
+    });
     if scene.needs.normal_maps {
-        let parts = tile::share(tiles, &mut surface.tangents, 4);
-        parts.into_par_iter().with_min_len(16).for_each(|(tile, out)| orient_tangents(scene, state, tile, out));
+        tile::spread(tiles, Packed::new(4, &mut surface.tangents), &|tiles, mut out| {
+            tiles.iter().for_each(|tile| orient_tangents(scene, state, tile, out.of(tile)));
+        });
     }
 }
 
 /// World normals of a tile.
-pub(super) fn orient_normals(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
-    let linear = state.transforms[tile.domain].linear();
+pub(super) fn orient_normals(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
+    let linear = state.transforms[tile.domain()].linear();
     // Without shear A itself turns normals, up to a mirror's sign, which the cofactors carry.
     let turn = if scene.needs.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
     let turn = scaled(turn);
-    let normals = &scene.shape_of(tile.domain).mesh.corners().normals[tile.first..][..tile.count];
+    let normals = &scene.shape_of(tile.domain()).mesh.corners().normals[tile.first()..][..tile.count()];
     for (normal, out) in normals.iter().zip(out.chunks_exact_mut(3)) {
         out.copy_from_slice(unit(turn * Vector3::from(*normal)).as_slice());
     }
 }
 
 /// World tangents of a tile; left as they are where the shape has none.
-pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: Tile, out: &mut [f32]) {
-    let tangents = scene.shape_of(tile.domain).tangents();
+pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
+    let tangents = scene.shape_of(tile.domain()).tangents();
     if tangents.is_empty() {
         return;
     }
-    let linear = state.transforms[tile.domain].linear();
+    let linear = state.transforms[tile.domain()].linear();
     let hand = linear.determinant().signum() as f32;
     let turn = scaled(linear);
-    for ([x, y, z, sign], out) in tangents[tile.first..][..tile.count].iter().zip(out.chunks_exact_mut(4)) {
+    for ([x, y, z, sign], out) in tangents[tile.first()..][..tile.count()].iter().zip(out.chunks_exact_mut(4)) {
         out[..3].copy_from_slice(unit(turn * Vector3::new(*x, *y, *z)).as_slice());
         out[3] = sign * hand;
     }

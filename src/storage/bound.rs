@@ -10,6 +10,8 @@
 //! A bound is a length: that of the error of a vertex's position, in scene units. It holds for sums without overflow, and
 //! is infinite where q times a factor overflows f32.
 
+use rayon::prelude::*;
+
 use super::Tiles;
 use crate::domain::{Shape, Transform};
 use crate::scene::Storage;
@@ -88,36 +90,31 @@ pub struct Reaches {
 impl Reaches {
     /// Looks at every entry of `shape`, which `tiles` were made of.
     pub fn new(shape: &Shape, tiles: &Tiles) -> Self {
-        let mut reaches = Self { rank: tiles.rank(), modes: Vec::new(), rest: Vec::new() };
-        for tile in 0..tiles.count() {
+        let modes = |tile: usize| (0..tiles.rank()).map(move |mode| reach(shape, tiles, tile, mode));
+        let rest = |tile: usize| {
             let place = tiles.tile(tile);
-            let vertices = || place.first_vertex..place.first_vertex + place.vertices;
-            let rest = vertices().map(|vertex| length(shape.mesh.rest()[vertex].map(f64::from)));
-            reaches.rest.push(rest.fold(0.0, f64::max) * ROUND_UP);
-            for mode in 0..tiles.rank() {
-                let row = |vertex| [0, 1, 2].map(|axis| tiles.decoded(vertex, axis, mode));
-                let longest = vertices().map(|vertex| length(row(vertex))).fold(0.0, f64::max);
-                let entries = &shape.modes.column(mode)[3 * place.first_vertex..][..3 * place.vertices];
-                let largest = entries.iter().fold(0.0, |largest: f32, entry| largest.max(entry.abs()));
-                reaches.modes.push(Reach {
-                    length: longest * ROUND_UP,
-                    half_step: half_step(tiles, tile, mode, largest),
-                    factor: factor(tiles, tile, mode),
-                });
-            }
+            let rest = &shape.mesh.rest()[place.first_vertex..][..place.vertices];
+            rest.iter().map(|vertex| length(vertex.map(f64::from))).fold(0.0, f64::max) * ROUND_UP
+        };
+        Self {
+            rank: tiles.rank(),
+            modes: (0..tiles.count()).into_par_iter().flat_map_iter(modes).collect(),
+            rest: (0..tiles.count()).map(rest).collect(),
         }
-        reaches
     }
 
     /// Bounds of the vertices of tile `tile`.
     pub fn tile(&self, tile: usize, step: &Step) -> Bound {
         let modes = &self.modes[self.rank * tile..][..self.rank];
         let (mut storage, mut lost, mut moved, mut terms) = (0.0, 0.0, 0.0, 0.0);
-        for (reach, q) in modes.iter().zip(step.q).filter(|(reach, q)| **q != 0.0 && reach.length > 0.0) {
+        for (reach, q) in modes.iter().zip(step.q) {
             let amount = f64::from(q.abs());
+            storage += amount * reach.half_step;
+            if amount == 0.0 || reach.length == 0.0 {
+                continue;
+            }
             // The product of two f32 is exact in f64, so what its rounding loses is known.
             let (exact, rounded) = (amount * f64::from(reach.factor), f64::from(q.abs() * reach.factor));
-            storage += amount * reach.half_step;
             lost += stored_length(reach) * (exact - rounded).abs();
             moved += stored_length(reach) * rounded;
             terms += 1.0;
@@ -178,6 +175,19 @@ fn gamma(roundings: f64) -> f64 {
 
 fn length(vector: [f64; 3]) -> f64 {
     vector.iter().map(|number| number * number).sum::<f64>().sqrt()
+}
+
+fn reach(shape: &Shape, tiles: &Tiles, tile: usize, mode: usize) -> Reach {
+    let place = tiles.tile(tile);
+    let row = |vertex| length([0, 1, 2].map(|axis| tiles.decoded(vertex, axis, mode)));
+    let longest = (place.first_vertex..place.first_vertex + place.vertices).map(row).fold(0.0, f64::max);
+    let entries = &shape.modes.column(mode)[3 * place.first_vertex..][..3 * place.vertices];
+    let largest = entries.iter().fold(0.0, |largest: f32, entry| largest.max(entry.abs()));
+    Reach {
+        length: longest * ROUND_UP,
+        half_step: half_step(tiles, tile, mode, largest),
+        factor: factor(tiles, tile, mode),
+    }
 }
 
 /// The longest row in units of the factor; 0 for a mode of zeros.

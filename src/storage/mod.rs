@@ -8,7 +8,7 @@
 //! from the first byte of a shape to its last.
 //!
 //! Element e of the 48 bytes is that of mode e / 12 of the chunk, axis e / 4 % 3, vertex e % 4 of the quad. Vertices
-//! and modes that fill up a quad or a chunk are zeros.
+//! and modes that fill up a quad or a chunk are zeros. Numbers have the machine's byte order.
 
 pub mod bound;
 mod pack;

@@ -36,13 +36,13 @@ pub(super) fn fill_floats(modes: &Modes, tiles: &[Tile], storage: (Storage, &[f3
     let (storage, factors) = storage;
     let inverse = |mode: usize| 1.0 / f64::from(factors[mode]);
     each_tile(modes, storage, tiles, planes).for_each(|(tile, planes)| match storage {
-        Storage::F32 => write(modes, tile, storage, planes, |_, entry| entry.to_le_bytes()),
+        Storage::F32 => write(modes, tile, storage, planes, |_, entry| entry.to_ne_bytes()),
         // The quotient is exact in f64, and in f32 unless it is far below what the type can hold.
         Storage::F16 => write(modes, tile, storage, planes, |mode, entry| {
-            f16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_le_bytes()
+            f16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_ne_bytes()
         }),
         Storage::Bf16 => write(modes, tile, storage, planes, |mode, entry| {
-            bf16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_le_bytes()
+            bf16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_ne_bytes()
         }),
         Storage::Int8 => {}
     });

@@ -1,6 +1,9 @@
-//! Shapes of noise for this module's tests.
+//! Shapes and scenes of noise for tests.
 
-use crate::domain::{Mesh, Modes, Shape};
+use std::sync::Arc;
+
+use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use crate::scene::{Deformation, Parts, Scene};
 
 /// Deterministic numbers in -1 to 1.
 pub(crate) struct Noise(pub(crate) u64);
@@ -26,4 +29,26 @@ pub(crate) fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, nois
     let modes =
         if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, columns).expect("modes") };
     Shape::new(mesh, modes).expect("a shape")
+}
+
+/// A scene of shapes of noise, one domain each per (n, r).
+pub(crate) fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &mut Noise) -> Arc<Scene> {
+    let mut parts = Parts::named("noise");
+    parts.deformation = deformation;
+    parts.materials = vec![Material::default()];
+    for (at, (vertices, rank)) in sizes.iter().enumerate() {
+        parts.shapes.push(shape(*vertices, *rank, noise));
+        parts.domains.push(Domain {
+            name: format!("noise {at}"),
+            shape: at,
+            material: 0,
+            runs: vec![],
+            placement: Transform::IDENTITY,
+            attachment: None,
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: Metadata::default(),
+        });
+    }
+    Scene::new(parts).expect("a scene")
 }

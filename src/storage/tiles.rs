@@ -160,8 +160,8 @@ impl Tiles {
         let bytes = &self.planes[at].0[within..within + size];
         match self.storage {
             Storage::F32 => f64::from(bytemuck::pod_read_unaligned::<f32>(bytes)),
-            Storage::F16 => f16::from_le_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
-            Storage::Bf16 => bf16::from_le_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
+            Storage::F16 => f16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
+            Storage::Bf16 => bf16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
             Storage::Int8 => (f64::from(bytes[0]) - 128.0) * f64::from(self.scales[place.first_scale + mode]),
         }
     }
@@ -256,7 +256,7 @@ mod tests {
     fn bytes_lie_where_the_page_says() {
         let shape = shape(9, 5, &mut Noise(3));
         let tiles = Tiles::new(&shape, Storage::F32);
-        let float = |at: usize| f32::from_le_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
+        let float = |at: usize| f32::from_ne_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
         // Three quads: mode 2, axis 1, vertex 6 is quad 1, place 2.
         assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.at(6, 1, 2));
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest()[6][1]);
@@ -269,7 +269,7 @@ mod tests {
         let tiles = Tiles::new(&shape, Storage::F16);
         // Chunk 1, mode 3 is its second: group 4 is plane 2, bytes 0 to 7.
         let bytes = &tiles.planes()[9 + 2 * 3 + 1].0[4..6];
-        let stored = f16::from_le_bytes([bytes[0], bytes[1]]).to_f32();
+        let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
         assert_eq!(f16::from_f32(shape.modes.at(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);
     }
 }

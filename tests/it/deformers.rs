@@ -20,7 +20,7 @@ impl Noise {
     }
 }
 
-fn strip(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
+pub(crate) fn strip(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
     let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let normals = rest.iter().map(|_| [noise.next(), noise.next(), noise.next() + 2.0]).collect();
     let uvs = rest.iter().map(|_| [noise.next(), noise.next()]).collect();
@@ -34,7 +34,7 @@ fn strip(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
     Shape::new(mesh, modes).expect("a shape")
 }
 
-fn domain(shape: usize, name: String) -> Domain {
+pub(crate) fn domain(shape: usize, name: String) -> Domain {
     Domain {
         name,
         shape,
@@ -62,7 +62,7 @@ fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
 }
 
 /// Coordinates and sheared, mirrored transforms.
-fn shaken(scene: &Scene) -> State {
+pub(crate) fn shaken(scene: &Scene) -> State {
     let mut noise = Noise(7);
     let mut state = State::rest(scene);
     state.q.iter_mut().for_each(|number| *number = noise.next());

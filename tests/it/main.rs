@@ -14,4 +14,5 @@ mod service_faults;
 mod service_files;
 mod service_harness;
 mod steps;
+mod storages;
 mod tolerance;

@@ -125,7 +125,7 @@ impl<'a> Panel<'a> {
     }
 
     /// Names beside the points of the front, and beside all warm points when there are few.
-    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], colour: &impl Fn(&str) -> &'static str) {
+    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], look: &impl Fn(&str) -> Look) {
         let mut taken: Vec<Area> = places.iter().map(|(x, y)| (x - 7.0, y - 7.0, 14.0, 14.0)).collect();
         let few = self.points.len() <= 8;
         let warm = |at: &usize| front.contains(at) || (few && self.points[*at].0.cache == Cache::Warm);

@@ -102,17 +102,25 @@ fn columns_that_differ_by_a_factor_of_1e12_keep_their_digits_in_f16_and_would_ov
 #[test]
 fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
     let mut noise = Noise(11);
-    // Mode 0 is denormal, mode 1 zero in the first tile, mode 2 zero everywhere, mode 3 has one entry far below the rest.
+    // Mode 0 is denormal, mode 1 zero in the first tile, mode 2 zero everywhere; mode 3 has one entry far below the rest,
+    // and all of its second tile is too small for f16.
     let entry = |mode: usize, row: usize, value: f32| match mode {
         0 => value * 1e-41,
         1 if row < 3 * 128 => 0.0,
         2 => 0.0,
         3 if row == 5 => value * 1e-30,
+        3 if row >= 3 * 128 => value * 5e-13,
         _ => value,
     };
     let columns = (0..4 * 600).map(|at| entry(at / 600, at % 600, noise.next())).collect();
     let shape = with_columns(200, 4, columns, &mut noise);
-    for q in [[1.0, 1.0, 1.0, 1.0], [1e38, 0.0, 1e38, 1e-38], [1e-38, 1e-45, 0.0, 1e-40], [3e38, 1e30, 1.0, -1e30]] {
+    for q in [
+        [1.0, 1.0, 1.0, 1.0],
+        [0.0, 0.0, 0.0, 1e8],
+        [1e38, 0.0, 1e38, 1e-38],
+        [1e-38, 1e-45, 0.0, 1e-40],
+        [3e38, 1e30, 1.0, -1e30],
+    ] {
         let step = Step { q: &q, transform: transform(&mut noise), compensated: false };
         for storage in Storage::ALL {
             let [right, wrong] = judge(&shape, storage, &step);

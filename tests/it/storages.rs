@@ -1,0 +1,277 @@
+//! The cpu deformer stays within its a-priori bounds in every storage type, and its results depend on nothing else than
+//! the step.
+
+use std::sync::Arc;
+
+use modalcast::cpu::CpuDeformer;
+use modalcast::deform::{Deformed, Deformer};
+use modalcast::domain::{Material, Modes, Shape, Transform};
+use modalcast::reference;
+use modalcast::scene::{Deformation, Parts, Scene, State, Storage};
+use modalcast::storage::bound::{Reaches, Step};
+use modalcast::storage::{QUAD, TILE_QUADS, Tiles};
+
+use crate::deformers::{Noise, domain, shaken, strip};
+
+const SIZES: [(usize, usize); 9] =
+    [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
+
+/// Strips of these sizes; the last two domains are instances of the first and of the fourth shape, and the very last one
+/// shares its coordinates too.
+fn scene_of(deformation: Deformation) -> Arc<Scene> {
+    let mut noise = Noise(42);
+    let mut parts = Parts::named("storages");
+    parts.deformation = deformation;
+    parts.materials = vec![Material::default()];
+    for (at, (vertices, rank)) in SIZES.iter().enumerate() {
+        parts.shapes.push(strip(*vertices, *rank, &mut noise));
+        parts.domains.push(domain(at, format!("strip {at}")));
+    }
+    parts.domains.push(domain(0, "instance of 0".into()));
+    let mut twin = domain(3, "instance of 3".into());
+    twin.shares_q_with = Some(3);
+    parts.domains.push(twin);
+    Scene::new(parts).expect("a scene")
+}
+
+/// One domain with these columns and no rest positions besides 0.
+fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> Arc<Scene> {
+    let mut parts = Parts::named("columns");
+    parts.deformation = deformation;
+    parts.materials = vec![Material::default()];
+    let flat = strip(vertices, 0, &mut Noise(1)).mesh;
+    let mesh =
+        modalcast::domain::Mesh::new(vec![[0.0; 3]; vertices], flat.corners().clone(), flat.triangles().to_vec());
+    let rank = columns.len() / (3 * vertices);
+    let modes = Modes::from_columns(3 * vertices, rank, columns).expect("modes");
+    parts.shapes = vec![Shape::new(mesh.expect("a mesh"), modes).expect("a shape")];
+    parts.domains = vec![domain(0, "columns".into())];
+    Scene::new(parts).expect("a scene")
+}
+
+fn run(deformer: &mut CpuDeformer, state: &State) -> (Deformed, Vec<f32>) {
+    let told = deformer.deform(state).expect("deforms");
+    (told, deformer.surface().expect("a surface").positions.clone())
+}
+
+/// The bounds of the tiles of a domain. What is left out counts with its own.
+fn bounds_of(scene: &Scene, state: &State, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
+    let shape = scene.shape_of(domain);
+    let tiles = Tiles::new(shape, scene.deformation.storage);
+    let mut q = state.q_of(scene, domain).to_vec();
+    let mut left_out = 0.0;
+    if let Some(truncation) = deformer.truncation(domain) {
+        left_out = truncation.bound();
+        (0..q.len()).filter(|mode| !truncation.kept().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
+    }
+    let step = Step { q: &q, transform: state.transforms[domain], compensated: scene.deformation.compensated };
+    let reaches = Reaches::new(shape, &tiles);
+    (0..tiles.count()).map(|tile| reaches.tile(tile, &step).total() + left_out).collect()
+}
+
+/// Each domain's largest error as a part of the bound of its tile; infinite for a NaN.
+fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
+    let want = reference::deform(scene, state);
+    let part = |domain: usize| {
+        let slot = scene.layout.slots[domain];
+        let bounds = bounds_of(scene, state, deformer, domain);
+        let part = |vertex: usize| {
+            let packed = slot.first_vertex + vertex;
+            let square = |axis: usize| (f64::from(positions[3 * packed + axis]) - want[packed][axis]).powi(2);
+            let part = (0..3).map(square).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
+            if part.is_nan() { f64::INFINITY } else { part }
+        };
+        (0..slot.vertices).map(part).fold(0.0, f64::max)
+    };
+    (0..scene.domains.len()).map(part).collect()
+}
+
+#[test]
+fn errors_stay_within_their_bounds_in_every_storage_and_a_wrong_sign_does_not() {
+    for storage in Storage::ALL {
+        for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
+            let scene = scene_of(Deformation { storage, compensated, truncation, ..Deformation::default() });
+            let mut state = shaken(&scene);
+            // Modes of ever smaller amounts, so that some may be left out.
+            let count = state.q.len() as f32;
+            state.q.iter_mut().enumerate().for_each(|(at, number)| *number *= f32::exp2(-12.0 * at as f32 / count));
+            let mut deformer = CpuDeformer::new(&scene);
+            let (_, positions) = run(&mut deformer, &state);
+            for (domain, part) in parts_of_bound(&scene, &state, &positions, &deformer).into_iter().enumerate() {
+                assert!(part <= 1.0, "{storage:?}, domain {domain}: {part} of the bound");
+            }
+            let mut wrong = state.clone();
+            wrong.q.iter_mut().for_each(|number| *number = -*number);
+            let seen = parts_of_bound(&scene, &wrong, &positions, &deformer);
+            // What is within the budget may have any sign.
+            let bends = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
+            for domain in (0..seen.len()).filter(|domain| bends(*domain)) {
+                assert!(
+                    seen[domain] > 1.0,
+                    "{storage:?}, domain {domain}: a wrong sign is {} of the bound",
+                    seen[domain]
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn positions_depend_on_no_count_of_threads_and_on_no_earlier_step() {
+    for storage in Storage::ALL {
+        let scene = scene_of(Deformation { storage, ..Deformation::default() });
+        let mut state = shaken(&scene);
+        let mut kept = CpuDeformer::new(&scene);
+        run(&mut kept, &state);
+        let mut noise = Noise(5);
+        for step in 0..6 {
+            // One domain's q and another one's T; the last step changes nothing, the one before everything.
+            let slot = scene.layout.slots[[0, 4, 8, 3, 0, 0][step]];
+            let moved = if step == 4 { 0..state.q.len() } else { slot.first_q..slot.first_q + slot.rank };
+            if step < 5 {
+                state.q[moved].iter_mut().for_each(|number| *number = noise.next());
+                state.transforms[[1, 6, 10, 3, 5][step]].0[3] += 0.5;
+            }
+            let (told, positions) = run(&mut kept, &state);
+            for threads in [1, 2, 5] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+                let mut fresh = CpuDeformer::new(&scene);
+                let (fresh_told, fresh_positions) = pool.install(|| run(&mut fresh, &state));
+                assert_eq!(bits(&positions), bits(&fresh_positions), "{storage:?}, step {step}, {threads} threads");
+                assert_eq!(told.bounds, fresh_told.bounds);
+                let (kept, fresh) = (kept.surface().expect("one"), fresh.surface().expect("one"));
+                assert_eq!(kept.normals, fresh.normals);
+            }
+        }
+    }
+}
+
+fn bits(numbers: &[f32]) -> Vec<u32> {
+    numbers.iter().map(|number| number.to_bits()).collect()
+}
+
+#[test]
+fn vertices_of_an_instance_and_of_a_larger_shape_are_those_of_the_shape_alone() {
+    // The first 129 vertices of a shape of 1500 rows, alone and together, fall into tiles of other sizes.
+    let mut noise = Noise(8);
+    let columns: Vec<f32> = (0..4500 * 9).map(|_| noise.next()).collect();
+    let few: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
+    for storage in [Storage::F32, Storage::F16, Storage::Bf16] {
+        let deformation = Deformation { storage, ..Deformation::default() };
+        let (large, small) =
+            (columns_of(1500, columns.clone(), deformation), columns_of(129, few.clone(), deformation));
+        let state = shaken(&large);
+        let [large, small] = [&large, &small].map(|scene| run(&mut CpuDeformer::new(scene), &state).1);
+        assert_eq!(bits(&large[..387]), bits(&small), "{storage:?}");
+    }
+}
+
+#[test]
+fn huge_tiny_and_denormal_coordinates_stay_within_the_bound() {
+    for storage in Storage::ALL {
+        for compensated in [false, true] {
+            let scene = scene_of(Deformation { storage, compensated, ..Deformation::default() });
+            let mut deformer = CpuDeformer::new(&scene);
+            for amount in [1e30, 1e-38, 1e-42, 1e-45, 0.0] {
+                let mut state = shaken(&scene);
+                state.q.iter_mut().for_each(|number| *number *= amount);
+                let (told, positions) = run(&mut deformer, &state);
+                assert!(told.bounds.is_finite());
+                for (domain, part) in parts_of_bound(&scene, &state, &positions, &deformer).into_iter().enumerate() {
+                    assert!(part <= 1.0, "{storage:?}, {amount}, domain {domain}: {part} of the bound");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_finite_sum_survives_terms_that_overflow_and_a_sum_that_overflows_is_told() {
+    let mode = |entry: f32| vec![entry; 3 * 5];
+    let columns = [mode(2.0), mode(2.0), mode(1.0)].concat();
+    for storage in Storage::ALL {
+        for compensated in [false, true] {
+            let deformation = Deformation { storage, compensated, ..Deformation::default() };
+            let scene = columns_of(5, columns.clone(), deformation);
+            let mut deformer = CpuDeformer::new(&scene);
+            let mut state = State::rest(&scene);
+            // Infinite in the plain chain of f32, infinity minus infinity in the compensated one.
+            state.q = vec![3e38, -3e38, 0.75];
+            assert!(2.0_f32.mul_add(state.q[1], 2.0_f32.mul_add(state.q[0], 0.0)).is_infinite());
+            let (told, positions) = run(&mut deformer, &state);
+            assert!(told.bounds.is_finite());
+            // The third mode is off by what its storage loses; the first two are the same and cancel.
+            assert!(positions.iter().all(|number| (number - 0.75).abs() <= 0.75 / 254.0), "{positions:?}");
+            state.q = vec![3e38, 0.0, 1.0];
+            assert!(!run(&mut deformer, &state).0.bounds.is_finite());
+            state.q = vec![1.0, 0.0, 1.0];
+            assert!(run(&mut deformer, &state).0.bounds.is_finite(), "and forgotten");
+        }
+    }
+}
+
+#[test]
+fn modes_that_nearly_cancel_keep_their_digits_with_compensation_and_lose_them_without() {
+    let mut noise = Noise(17);
+    let (vertices, rank) = (200, 64);
+    let half: Vec<f32> = (0..3 * vertices * rank / 2).map(|_| noise.next()).collect();
+    // The second half of the modes is the first one, nearly, and enters with the other sign.
+    let almost: Vec<f32> = half.iter().map(|entry| entry * (1.0 + 1e-5 * noise.next())).collect();
+    let columns = [half, almost].concat();
+    let q: Vec<f32> = (0..rank).map(|mode| if mode < rank / 2 { 1000.0 } else { -1000.0 }).collect();
+    let error = |compensated: bool| {
+        let scene = columns_of(vertices, columns.clone(), Deformation { compensated, ..Deformation::default() });
+        let mut state = State::rest(&scene);
+        state.q.copy_from_slice(&q);
+        let (_, positions) = run(&mut CpuDeformer::new(&scene), &state);
+        let want = reference::deform(&scene, &state).into_flattened();
+        let modes = &scene.shape_of(0).modes;
+        let excess = |(row, (got, want)): (usize, (&f32, &f64))| {
+            let terms = (0..rank).map(|mode| f64::from(modes.at(row / 3, row % 3, mode) * q[mode]).abs()).sum::<f64>();
+            // Dot2: half a unit in the last place of the sum, and gamma squared of the terms; then three roundings.
+            let bound = f64::exp2(-24.0) * 5.0 * want.abs() + (65.0 * f64::exp2(-24.0)).powi(2) * terms;
+            (f64::from(*got) - want).abs() / bound
+        };
+        positions.iter().zip(&want).enumerate().map(excess).fold(0.0, f64::max)
+    };
+    assert!(error(true) <= 1.0, "{} of the bound of a compensated sum", error(true));
+    assert!(error(false) > 50.0, "a plain sum is {} of that bound", error(false));
+}
+
+#[test]
+fn a_budget_in_metres_leaves_modes_out_and_is_kept_in_scene_units() {
+    for unit in [1.0, 0.01] {
+        let mut parts = Parts::named("millimetres");
+        parts.unit = unit;
+        parts.deformation.truncation = Some(1e-3);
+        parts.materials = vec![Material::default()];
+        parts.shapes = vec![strip(300, 24, &mut Noise(2))];
+        parts.domains = vec![domain(0, "strip".into())];
+        let scene = Scene::new(parts).expect("a scene");
+        let mut state = State::rest(&scene);
+        state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
+        state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+        let mut deformer = CpuDeformer::new(&scene);
+        let (_, positions) = run(&mut deformer, &state);
+        let truncation = deformer.truncation(0).expect("a budget");
+        let kept = truncation.kept().to_vec();
+        assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
+        assert!(kept.len() > 2 && kept.len() < 20, "{kept:?}");
+        assert!(parts_of_bound(&scene, &state, &positions, &deformer)[0] <= 1.0);
+        // What is left out adds nothing: the same as zeros there, bit by bit.
+        let mut zeroed = state.clone();
+        (0..24).filter(|mode| !kept.contains(&(*mode as u16))).for_each(|mode| zeroed.q[mode] = 0.0);
+        let plain = columns_and_rest(&scene);
+        assert_eq!(bits(&run(&mut CpuDeformer::new(&plain), &zeroed).1), bits(&positions));
+        assert_ne!(bits(&run(&mut CpuDeformer::new(&plain), &state).1), bits(&positions));
+    }
+}
+
+/// The same scene without a budget.
+fn columns_and_rest(scene: &Scene) -> Arc<Scene> {
+    let mut parts = Parts::named("plain");
+    parts.materials = scene.materials.clone();
+    parts.shapes = scene.shapes.clone();
+    parts.domains = scene.domains.clone();
+    Scene::new(parts).expect("a scene")
+}
