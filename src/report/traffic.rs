@@ -15,7 +15,7 @@ pub struct Part {
 }
 
 /// What a step moves at least, in the scene's storage type and with its normals: every operand once, shapes that
-/// instances share once.
+/// instances share once, all modes also where some may be left out.
 pub fn of_scene(scene: &Scene) -> Vec<Part> {
     let layout = &scene.layout;
     let [mut entries, mut stored, mut scales, mut vertices, mut corners, mut triangles, mut tangents] = [0; 7];
