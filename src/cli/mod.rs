@@ -5,6 +5,7 @@ mod doctor;
 mod inspect;
 mod options;
 mod render;
+mod report;
 mod serve;
 
 use std::io::Write as _;
@@ -26,6 +27,7 @@ enum Command {
     Serve(serve::Args),
     Demo(demo::Args),
     Render(render::Args),
+    Report(report::Args),
     Inspect(inspect::Args),
     Doctor(doctor::Args),
 }
@@ -33,7 +35,8 @@ enum Command {
 const EXIT_CODES: &str = "\
 Exit codes:
   0  done
-  1  the check that the command makes did not pass (doctor: no frame can be drawn; demo: a promise was not kept)
+  1  the check that the command makes did not pass (doctor: no frame can be drawn; demo: a promise was not kept; report: a
+     variant exceeds its error bound)
   2  the command line is wrong
   3  the input is wrong: the message names field, expected and given
   4  not found
@@ -51,6 +54,7 @@ pub fn run() -> u8 {
         Command::Serve(args) => serve::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Render(args) => render::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Doctor(args) => doctor::run(&args),
     };

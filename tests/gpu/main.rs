@@ -7,6 +7,7 @@ mod interop;
 mod judge;
 mod normals;
 mod real;
+mod report;
 mod scenes;
 mod trials;
 mod twins;

@@ -1,0 +1,68 @@
+//! Sums of products in twice the precision of f64, for sums that cancel.
+//!
+//! Error-free transformations after Ogita, Rump and Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26
+//! (2005): the result is as if computed with 106 bits and rounded once.
+
+/// a + b as a rounded sum and its exact error (Knuth).
+pub(super) fn two_sum(a: f64, b: f64) -> (f64, f64) {
+    let sum = a + b;
+    let from_b = sum - a;
+    (sum, (a - (sum - from_b)) + (b - from_b))
+}
+
+/// a b as a rounded product and its exact error.
+pub(super) fn two_prod(a: f64, b: f64) -> (f64, f64) {
+    let product = a * b;
+    (product, a.mul_add(b, -product))
+}
+
+/// A running sum of products.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Double {
+    high: f64,
+    low: f64,
+}
+
+impl Double {
+    /// Adds a b.
+    pub(super) fn add(&mut self, a: f64, b: f64) {
+        let (product, product_error) = two_prod(a, b);
+        let (high, sum_error) = two_sum(self.high, product);
+        self.high = high;
+        self.low += sum_error + product_error;
+    }
+
+    /// The sum, rounded once.
+    pub(super) fn value(self) -> f64 {
+        self.high + self.low
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sum(terms: &[(f64, f64)]) -> (f64, f64) {
+        let mut double = Double::default();
+        terms.iter().for_each(|(a, b)| double.add(*a, *b));
+        (double.value(), terms.iter().map(|(a, b)| a * b).sum())
+    }
+
+    #[test]
+    fn a_cancelling_sum_that_f64_loses_is_exact() {
+        let (double, plain) = sum(&[(1e20, 1.0), (3.0, 1.0), (-1e20, 1.0)]);
+        assert_eq!((double, plain), (3.0, 0.0));
+        // (1 + e)(1 - e) - 1 is -e^2, which the rounded product has lost.
+        let small = f64::EPSILON;
+        let (double, plain) = sum(&[(1.0 + small, 1.0 - small), (-1.0, 1.0)]);
+        assert_eq!(double, -small * small);
+        assert_ne!(plain, double);
+    }
+
+    #[test]
+    fn the_parts_of_a_sum_and_of_a_product_add_up() {
+        assert_eq!(two_sum(1.0, 2f64.powi(-60)), (1.0, 2f64.powi(-60)));
+        let (product, error) = two_prod(1.0 + f64::EPSILON, 1.0 + f64::EPSILON);
+        assert_eq!((product, error), (1.0 + 2.0 * f64::EPSILON, f64::EPSILON * f64::EPSILON));
+    }
+}

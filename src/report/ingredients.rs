@@ -1,0 +1,189 @@
+//! What a deformer replaces in x = T (x0 + U q) before it computes, and how far off that may be.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use crate::scene::{Scene, State, Storage};
+use crate::storage::bound::{Reaches, Step, norm};
+use crate::storage::{Amounts, QUAD, TILE_QUADS, Tiles, Truncation, reaches};
+
+/// Vertices of a tile of U as it is stored.
+const TILE: usize = QUAD * TILE_QUADS;
+
+/// The replacements of one scene, as its deformation says.
+#[derive(Debug)]
+pub struct Ingredients {
+    scene: Arc<Scene>,
+    /// Per shape; empty when U is stored in f32.
+    stored: Vec<(Tiles, Reaches)>,
+    truncation: Option<Budget>,
+}
+
+#[derive(Debug)]
+struct Budget {
+    /// Scene units.
+    most: f64,
+    /// Per shape.
+    reaches: Vec<Vec<f64>>,
+    /// Per domain.
+    domains: Vec<Truncation>,
+}
+
+impl Ingredients {
+    /// What a deformer of this scene replaces that does as its deformation says.
+    pub fn of(scene: &Arc<Scene>) -> Self {
+        let storage = scene.deformation.storage;
+        let store = |shape| {
+            let tiles = Tiles::new(shape, storage);
+            let reaches = Reaches::new(shape, &tiles);
+            (tiles, reaches)
+        };
+        let truncation = scene.deformation.truncation.filter(|_| scene.needs.truncation).map(|metres| Budget {
+            most: metres / scene.unit,
+            reaches: scene.shapes.par_iter().map(|shape| reaches(&shape.modes)).collect(),
+            domains: (0..scene.domains.len()).map(|domain| Truncation::new(scene.rank_of(domain))).collect(),
+        });
+        let stored = match storage {
+            Storage::F32 => Vec::new(),
+            _ => scene.shapes.par_iter().map(store).collect(),
+        };
+        Self { scene: Arc::clone(scene), stored, truncation }
+    }
+
+    /// Whether nothing is replaced, so that all such deformers share their bounds.
+    pub fn is_exact(&self) -> bool {
+        !self.stores() && !self.truncates()
+    }
+
+    /// Whether U is not stored as it is.
+    pub fn stores(&self) -> bool {
+        !self.stored.is_empty()
+    }
+
+    /// Whether modes may be left out.
+    pub fn truncates(&self) -> bool {
+        self.truncation.is_some()
+    }
+
+    /// Decides which modes are left out at a state, from those of the state before, as a deformer does.
+    pub fn follow(&mut self, state: &State) {
+        let Self { scene, truncation, .. } = self;
+        if let Some(Budget { most, reaches, domains }) = truncation {
+            domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
+                let reaches = &reaches[scene.domains[domain].shape];
+                let norm = norm(&state.transforms[domain]);
+                truncation.update(Amounts { q: state.q_of(scene, domain), reaches, norm }, *most);
+            });
+        }
+    }
+
+    /// U of a shape as it is stored; `None` when that is U.
+    pub(super) fn tiles(&self, shape: usize) -> Option<&Tiles> {
+        self.stored.get(shape).map(|(tiles, _)| tiles)
+    }
+
+    /// Zeroes the coordinates of the modes that a domain leaves out.
+    pub(super) fn truncate<T: Default + Copy>(&self, domain: usize, q: &mut [T]) {
+        if let Some(budget) = &self.truncation {
+            let mut kept = vec![false; q.len()];
+            budget.domains[domain].kept().iter().for_each(|mode| kept[usize::from(*mode)] = true);
+            q.iter_mut().zip(kept).filter(|(_, kept)| !kept).for_each(|(q, _)| *q = T::default());
+        }
+    }
+
+    /// Bounds of a domain at a state.
+    pub(super) fn bounds(&self, domain: usize, state: &State) -> Bounds<'_> {
+        let mut q = state.q_of(&self.scene, domain).to_vec();
+        self.truncate(domain, &mut q);
+        let truncation = self.truncation.as_ref().map_or(0.0, |budget| budget.domains[domain].bound());
+        let reaches = self.stored.get(self.scene.domains[domain].shape).map(|(_, reaches)| reaches);
+        Bounds {
+            reaches,
+            q,
+            transform: state.transforms[domain],
+            compensated: self.scene.deformation.compensated,
+            truncation,
+        }
+    }
+}
+
+/// What the replacements may move the vertices of one domain by, in scene units.
+pub(super) struct Bounds<'a> {
+    reaches: Option<&'a Reaches>,
+    q: Vec<f32>,
+    transform: crate::domain::Transform,
+    compensated: bool,
+    truncation: f64,
+}
+
+impl Bounds<'_> {
+    /// The bound of one vertex after another, from `arithmetic`: that of a sum of all modes in f32.
+    pub(super) fn widen(&self, first: usize, arithmetic: &mut [f64]) {
+        let step = Step { q: &self.q, transform: self.transform, compensated: self.compensated };
+        let mut known = None;
+        for (vertex, bound) in arithmetic.iter_mut().enumerate() {
+            if let Some(reaches) = self.reaches {
+                let tile = (first + vertex) / TILE;
+                let (_, own) = known.filter(|(at, _)| *at == tile).unwrap_or_else(|| (tile, reaches.tile(tile, &step)));
+                known = Some((tile, own));
+                // Sums of stored entries are longer by what storing them added, and round that much more.
+                let stored = (own.storage + own.coordinates) * (1.0 + 1e-4);
+                *bound = (*bound + stored).min(own.total());
+            }
+            *bound += self.truncation;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::loads::{Kind, Size, restated};
+    use crate::report::motion::Motion;
+    use crate::scene::Deformation;
+
+    fn ingredients(deformation: Deformation) -> (Ingredients, State) {
+        let load = Kind::Single { power: 8, rank: 20 }.build(Size::Full).expect("built");
+        let scene = restated(&load.scene, deformation).expect("restated");
+        (Ingredients::of(&scene), Motion::new(&load, None).seed(0).state())
+    }
+
+    #[test]
+    fn the_default_replaces_nothing() {
+        let (exact, state) = ingredients(Deformation::default());
+        assert!(exact.is_exact() && exact.tiles(0).is_none());
+        let mut bounds = [1.0, 2.0];
+        exact.bounds(0, &state).widen(0, &mut bounds);
+        assert_eq!(bounds, [1.0, 2.0]);
+    }
+
+    #[test]
+    fn stored_entries_widen_bounds_by_what_their_type_loses() {
+        let widened = |storage| {
+            let (stored, state) = ingredients(Deformation { storage, ..Deformation::default() });
+            assert!(!stored.is_exact() && stored.tiles(0).is_some());
+            let mut bounds = [1e-6; 256];
+            stored.bounds(0, &state).widen(0, &mut bounds);
+            bounds[200]
+        };
+        let [half, brain, eighth] = [Storage::F16, Storage::Bf16, Storage::Int8].map(widened);
+        assert!(1e-5 < half && half < brain && half < eighth, "{half} {brain} {eighth}");
+    }
+
+    #[test]
+    fn small_modes_are_left_out_within_the_budget_and_none_before_the_first_state() {
+        let (mut truncated, state) = ingredients(Deformation { truncation: Some(0.01), ..Deformation::default() });
+        let count = |ingredients: &Ingredients| {
+            let mut q = state.q.clone();
+            ingredients.truncate(0, &mut q);
+            q.iter().filter(|q| **q != 0.0).count()
+        };
+        assert_eq!(count(&truncated), 20);
+        truncated.follow(&state);
+        assert!((1..20).contains(&count(&truncated)), "{}", count(&truncated));
+        let mut bounds = [0.0];
+        truncated.bounds(0, &state).widen(0, &mut bounds);
+        assert!(bounds[0] > 0.0 && bounds[0] <= 0.01, "{bounds:?}");
+    }
+}

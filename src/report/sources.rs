@@ -1,0 +1,154 @@
+//! Where an error comes from: each ingredient of x = T (x0 + U q) exchanged alone, all else exact in f64.
+
+use serde::Serialize;
+
+use super::errors::{Collect, Spread};
+use super::exact::{Take, positions};
+use super::ingredients::Ingredients;
+use super::motion::Truth;
+use crate::scene::{Scene, State};
+
+/// What each source alone moves a vertex by, metres.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Sources {
+    /// U as it is stored, decoded, instead of U.
+    pub storage: Spread,
+    /// q rounded to f32 instead of the f64 of the physics process.
+    pub q: Spread,
+    /// What the deformer's own arithmetic adds: the sum over the modes, x0 and T, all in f32, beyond one rounding.
+    pub accumulation: Spread,
+    /// T rounded to f32.
+    pub transform: Spread,
+    /// The one rounding of the position itself, which grows with its distance from the scene's origin.
+    pub origin: Spread,
+    /// The modes that are left out.
+    pub truncation: Spread,
+}
+
+/// The six sources while they are collected, in the order of [`Sources`].
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Split([Collect; 6]);
+
+/// What the sources of one truth have in common, whatever the variant.
+#[derive(Debug)]
+pub(super) struct Origin {
+    truth: Truth,
+    given: Truth,
+    exact: Vec<[f64; 3]>,
+    q: Collect,
+    transform: Collect,
+    /// With q and T as given, U exact and no mode left out.
+    plain: Vec<[f64; 3]>,
+}
+
+impl Origin {
+    /// What a truth and its rounding give in f64.
+    pub(super) fn new(scene: &Scene, truth: Truth, state: &State) -> Self {
+        let given = Truth::of(state);
+        let at = |q: &[f64], transforms: &[[f64; 12]]| {
+            positions(scene, &Truth { q: q.to_vec(), transforms: transforms.to_vec() }, Take::default())
+        };
+        let exact = at(&truth.q, &truth.transforms);
+        let q = apart(&exact, &at(&given.q, &truth.transforms));
+        let transform = apart(&exact, &at(&truth.q, &given.transforms));
+        let plain = at(&given.q, &given.transforms);
+        Self { truth, given, exact, q, transform, plain }
+    }
+
+    /// Adds what a variant made of it.
+    pub(super) fn split(&self, scene: &Scene, ingredients: &Ingredients, got: &[f32], split: &mut Split) {
+        let storage = Some(ingredients).filter(|ingredients| ingredients.stores());
+        let truncation = Some(ingredients).filter(|ingredients| ingredients.truncates());
+        // Which modes are left out depends on what the deformer was given; their sizes hardly do.
+        let alone = |take: Take<'_>| match take.storage.or(take.truncation) {
+            Some(_) => apart(&self.exact, &positions(scene, &self.truth, take)),
+            None => apart(&self.exact, &self.exact),
+        };
+        let from_storage = alone(Take { storage, truncation: None });
+        let from_truncation = alone(Take { storage: None, truncation });
+        let own = (!ingredients.is_exact()).then(|| positions(scene, &self.given, Take { storage, truncation }));
+        let own = own.as_deref().unwrap_or(&self.plain);
+        let rounded: Vec<[f64; 3]> = own.iter().map(|at| at.map(|number| f64::from(number as f32))).collect();
+        let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.iter().map(|at| at.map(f64::from)).collect();
+        let parts =
+            [from_storage, self.q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
+        split.0.iter_mut().zip(parts).for_each(|(sum, part)| *sum = sum.join(part));
+    }
+}
+
+impl Split {
+    /// What was collected, in metres.
+    pub(super) fn sources(&self, unit: f64) -> Sources {
+        let [storage, q, accumulation, transform, origin, truncation] =
+            self.0.map(|collect| collect.spread(unit).unwrap_or_default());
+        Sources { storage, q, accumulation, transform, origin, truncation }
+    }
+}
+
+fn apart(one: &[[f64; 3]], other: &[[f64; 3]]) -> Collect {
+    let mut collect = Collect::default();
+    for (one, other) in one.iter().zip(other) {
+        let square: f64 = one.iter().zip(other).map(|(one, other)| (one - other).powi(2)).sum();
+        collect.add(square.sqrt());
+    }
+    collect
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::loads::{Kind, Load, Size, restated};
+    use crate::report::motion::Motion;
+    use crate::scene::{Deformation, Storage};
+
+    fn load() -> Load {
+        Kind::Single { power: 8, rank: 2 }.build(Size::Full).expect("built")
+    }
+
+    fn split(deformation: Deformation, truth: &Truth, got: Option<&[f32]>) -> Sources {
+        let (scene, state) = (restated(&load().scene, deformation).expect("restated"), truth.state());
+        let mut ingredients = Ingredients::of(&scene);
+        ingredients.follow(&state);
+        let all = Take { storage: Some(&ingredients), truncation: Some(&ingredients) };
+        let perfect = positions(&scene, &Truth::of(&state), all);
+        let perfect: Vec<f32> = perfect.as_flattened().iter().map(|number| *number as f32).collect();
+        let mut split = Split::default();
+        Origin::new(&scene, truth.clone(), &state).split(&scene, &ingredients, got.unwrap_or(&perfect), &mut split);
+        split.sources(1.0)
+    }
+
+    /// Numbers that f32 holds, so that rounding them moves nothing.
+    fn even() -> Truth {
+        let identity = crate::domain::Transform::IDENTITY.0.map(f64::from);
+        Truth { q: vec![1.0, 0.5], transforms: vec![identity] }
+    }
+
+    #[test]
+    fn each_source_is_seen_alone() {
+        let plain = Deformation::default;
+        let none = split(plain(), &even(), None);
+        assert!([none.storage, none.q, none.accumulation, none.transform, none.truncation] == [Spread::default(); 5]);
+        assert!(none.origin.largest > 0.0 && none.origin.largest < 1e-6);
+        let found = split(plain(), &Truth { q: vec![1.0 + 2f64.powi(-30), 0.5], ..even() }, None);
+        assert!(found.q.largest > 1e-10 && found.q.largest < 2e-9 && found.transform.largest == 0.0, "{found:?}");
+        let turned = Truth { transforms: Motion::new(&load(), None).seed(0).transforms, ..even() };
+        let found = split(plain(), &turned, None);
+        assert!(found.transform.largest > 1e-9 && found.q.largest == 0.0, "{found:?}");
+        let found = split(Deformation { storage: Storage::Int8, ..plain() }, &even(), None);
+        // Half a step of 1/127 on each axis for coordinates of 1.5 together, at most.
+        assert!(found.storage.largest > 1e-3 && found.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{found:?}");
+        assert_eq!([found.accumulation, found.truncation], [Spread::default(); 2]);
+        // Mode 1 moves vertices by up to 0.5 sqrt(3); a mode goes when it moves none by half the budget.
+        let found = split(Deformation { truncation: Some(1.75), ..plain() }, &even(), None);
+        assert!(found.truncation.largest > 0.5 && found.truncation.largest <= 0.87, "{found:?}");
+        assert_eq!([found.accumulation, found.storage], [Spread::default(); 2]);
+    }
+
+    #[test]
+    fn what_no_other_source_explains_is_accumulation() {
+        let got = vec![1e3_f32; 3 * 256];
+        let found = split(Deformation::default(), &Motion::new(&load(), None).seed(0), Some(&got));
+        assert!(found.accumulation.largest > 1e3, "{found:?}");
+        assert!(found.origin.largest < 1e-6);
+    }
+}

@@ -1,0 +1,113 @@
+//! What the thesis printed of its own runs: the figures that stand beside ours.
+//!
+//! Source: chapter 4, tables 4.4 to 4.7. Its GPU was a GeForce GTX 680, its CPU code `OpenMP` with 16 threads.
+
+use serde::Serialize;
+
+/// Powers of two of the vertex counts of table 4.4, in the order of its columns.
+pub const POWERS: [u32; 5] = [14, 16, 18, 20, 22];
+
+/// Modes of table 4.4, in the order of its rows.
+pub const RANKS: [usize; 3] = [10, 20, 30];
+
+/// Table 4.4: CPU time over GPU time of u = U q of one domain; a row per rank, a column per power of two.
+pub const CPU_OVER_GPU: [[f64; 5]; 3] =
+    [[2.53, 0.68, 1.44, 1.6, 1.77], [6.47, 2.76, 5.01, 6.54, 7.04], [5.32, 3.67, 6.60, 8.02, 9.69]];
+
+/// One plant of tables 4.5 to 4.7. Times are milliseconds, occupations are fractions of the frame time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Species {
+    pub name: &'static str,
+    /// Table 4.5, v: render vertices.
+    pub vertices: usize,
+    /// Table 4.5, f: triangles.
+    pub faces: usize,
+    /// Table 4.5, v': vertices after unfolding the triangles.
+    pub unfolded: usize,
+    /// Table 4.5, d and d': domains, and those with modes.
+    pub domains: usize,
+    pub deformable: usize,
+    /// Table 4.5, r: modes of all domains.
+    pub modes: usize,
+    /// Table 4.5, u: rows of all matrices U. Not three times v.
+    pub rows: usize,
+    /// Table 4.6, `t_uq` of the CPU.
+    pub cpu_uq_ms: f64,
+    /// Table 4.6, `t_uq` of the GPU.
+    pub gpu_uq_ms: f64,
+    /// Table 4.6, `t_vb` of the GPU: vertex updating without rendering.
+    pub gpu_update_ms: f64,
+    /// Table 4.6, `n_uqk`: kernels of the Uq computation.
+    pub kernels: usize,
+    /// Table 4.7, `k_uq`: `t_uq` of the CPU over that of the GPU.
+    pub speedup_uq: f64,
+    /// Table 4.7, `O_uq` of the CPU.
+    pub cpu_occupation: f64,
+    /// Table 4.7, `O_uq` of the GPU.
+    pub gpu_occupation: f64,
+}
+
+/// The columns v, f, v', d, d', r and u of table 4.5.
+type Counts = [usize; 7];
+/// `t_uq` of CPU and GPU, `t_vb` (table 4.6), `k_uq`, `O_uq` of CPU and GPU in per cent (table 4.7).
+type Times = [f64; 6];
+
+const fn species(name: &'static str, counts: Counts, kernels: usize, times: Times) -> Species {
+    let [vertices, faces, unfolded, domains, deformable, modes, rows] = counts;
+    let [cpu_uq_ms, gpu_uq_ms, gpu_update_ms, speedup_uq, cpu_percent, gpu_percent] = times;
+    Species {
+        name,
+        vertices,
+        faces,
+        unfolded,
+        domains,
+        deformable,
+        modes,
+        rows,
+        cpu_uq_ms,
+        gpu_uq_ms,
+        gpu_update_ms,
+        kernels,
+        speedup_uq,
+        cpu_occupation: cpu_percent / 100.0,
+        gpu_occupation: gpu_percent / 100.0,
+    }
+}
+
+/// The twelve plants, in the order of the tables.
+#[rustfmt::skip]
+pub const PLANTS: [Species; 12] = [
+    species("Pansy", [7_987, 15_372, 46_476, 22, 22, 324, 106_882], 2, [0.323, 0.189, 1.73, 1.71, 9.37, 1.42]),
+    species("Conifer", [7_543, 7_517, 22_551, 644, 43, 360, 41_652], 1, [0.261, 0.165, 1.059, 1.58, 1.57, 0.91]),
+    species("Weed willow", [291_914, 313_230, 939_690, 32_623, 98, 958, 362_084], 2, [8.066, 1.12, 5.766, 7.20, 2.42, 1.79]),
+    species("Peach tree", [273_003, 299_707, 899_121, 22_659, 237, 2_950, 230_528], 2, [1.978, 0.713, 6.949, 2.77, 0.99, 0.71]),
+    species("Broad-leaved tree", [288_542, 339_111, 1_017_333, 7_003, 402, 3_613, 443_022], 2, [3.341, 0.391, 6.417, 8.54, 3.34, 0.98]),
+    species("Fir", [64_824, 75_953, 227_859, 9_077, 585, 4_912, 181_524], 2, [1.949, 0.329, 1.776, 5.92, 1.95, 0.92]),
+    species("Western red cedar", [40_480, 55_810, 167_430, 4_408, 800, 5_987, 205_112], 2, [1.434, 0.283, 1.727, 5.07, 2.44, 0.91]),
+    species("Incense cedar", [102_115, 133_545, 400_635, 11_938, 1_054, 6_853, 405_258], 1, [3.299, 0.476, 4.132, 6.93, 2.31, 0.95]),
+    species("Quercus Garryana", [586_668, 224_926, 674_778, 120_871, 871, 9_520, 1_000_860], 2, [22.837, 4.768, 39.822, 4.79, 2.28, 1.43]),
+    species("Blue spruce", [1_421_810, 1_070_963, 3_212_889, 219_476, 1_582, 10_680, 524_640], 1, [12.152, 6.997, 15.86, 1.74, 1.22, 1.40]),
+    species("Three firs", [194_472, 227_859, 683_577, 27_232, 1_755, 14_736, 544_572], 2, [3.268, 0.714, 4.978, 4.58, 0.98, 1.07]),
+    species("Eastern hemlock", [190_466, 262_794, 788_382, 27_778, 2_537, 16_793, 1_051_414], 2, [8.703, 0.833, 11.457, 10.45, 2.61, 0.92]),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_printed_speed_ups_are_the_quotients_of_the_printed_times() {
+        for plant in PLANTS {
+            let quotient = plant.cpu_uq_ms / plant.gpu_uq_ms;
+            assert!((quotient - plant.speedup_uq).abs() <= 0.011, "{}: {quotient}", plant.name);
+        }
+    }
+
+    #[test]
+    fn unfolding_gives_three_vertices_a_triangle_but_for_the_one_misprint() {
+        let odd: Vec<&str> =
+            PLANTS.iter().filter(|plant| plant.unfolded != 3 * plant.faces).map(|plant| plant.name).collect();
+        assert_eq!(odd, ["Pansy"]);
+        assert!(PLANTS.iter().all(|plant| plant.rows != 3 * plant.vertices), "u is not 3 v");
+    }
+}

@@ -1,0 +1,176 @@
+//! Trials on the CUDA device as variants, and the list of those that a load gets.
+
+use std::sync::Arc;
+
+use super::bench::{Offer, offer};
+use super::ingredients::Ingredients;
+use super::loads::restated;
+use super::timing::{Cache, Timing};
+use super::traffic::Part;
+use super::variant::{Label, Variant};
+use crate::deform::{Backend, Surface};
+use crate::error::{Error, Result};
+use crate::gpu::{self, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
+use crate::scene::{Deformation, Scene, State, Storage};
+
+/// Makes a trial of a scene for some states.
+type Make = Box<dyn Fn(&Device, &Arc<Scene>, &[State]) -> Result<Box<dyn Trial>>>;
+
+/// The parts of a step that peers launch, and how their names tell.
+const PARTS: [(gpu::Part, &str); 2] = [(gpu::Part::Uq, " Uq"), (gpu::Part::Whole, "")];
+
+/// A trial as a variant. It is made once, when its states are known.
+struct Tried {
+    label: Label,
+    scene: Arc<Scene>,
+    ingredients: Ingredients,
+    device: Arc<Device>,
+    make: Make,
+    trial: Option<Box<dyn Trial>>,
+    surface: Surface,
+}
+
+/// All trials for a scene: ours in every storage type, and the thesis's kernels where they apply.
+pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+    let ours = |storage: Storage, extent: Extent| -> Offer {
+        let deformation = Deformation { storage, ..scene.deformation };
+        let suffix = match extent {
+            Extent::Uq => " Uq",
+            Extent::Positions => " positions",
+            Extent::Whole => "",
+        };
+        let label = Label { name: format!("cuda {}{suffix}", storage.name()), backend: Backend::Cuda, deformation };
+        offer(label, |label| {
+            let scene =
+                if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
+            let make: Make =
+                Box::new(move |device, scene, states| Ok(Box::new(Ours::new(device, scene, states, extent)?)));
+            Ok(Tried::new(label, &scene, device, make))
+        })
+    };
+    let storages: &[Storage] = if scene.needs.modes { &Storage::ALL } else { &[Storage::F32] };
+    let mut offers: Vec<Offer> = storages.iter().map(|storage| ours(*storage, Extent::Positions)).collect();
+    if has_normals(scene) {
+        offers.extend(storages.iter().map(|storage| ours(*storage, Extent::Whole)));
+    }
+    if scene.needs.modes {
+        offers.push(ours(Storage::F32, Extent::Uq));
+        offers.extend(thesis(device, scene));
+        offers.extend(cublas(device, scene));
+    }
+    offers
+}
+
+/// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.
+fn cublas(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+    let shared = scene.domains.len() > 1 && scene.shapes.len() == 1;
+    let fits = |peer: &Peer| match peer {
+        Peer::SgemvColumns | Peer::SgemvRows => scene.domains.len() == 1,
+        Peer::Instances => shared,
+        _ => scene.domains.len() > 1,
+    };
+    let made = |peer: Peer, (part, suffix): (gpu::Part, &str)| {
+        let label = Label::new(format!("{}{suffix}", peer.name().replace('_', " ")), Backend::Cuda, scene);
+        let make: Make =
+            Box::new(move |device, scene, states| Ok(Box::new(Cublas::new(device, scene, states, (peer, part))?)));
+        offer(label, |label| Ok(Tried::new(label, scene, device, make)))
+    };
+    let both = |peer: Peer| PARTS.map(|part| made(peer, part));
+    Peer::ALL.into_iter().filter(fits).flat_map(both).collect()
+}
+
+/// The thesis's kernels: those for one domain, else the grouped ones in all their splits. They take up to 32 modes.
+fn thesis(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+    let made = |name: String, make: Make| {
+        let label = Label::new(name, Backend::Cuda, scene);
+        offer(label, |label| Ok(Tried::new(label, scene, device, make)))
+    };
+    let single = |(part, suffix): (gpu::Part, &str)| {
+        let make: Make =
+            Box::new(move |device, scene, states| Ok(Box::new(Thesis::single(device, scene, states, part)?)));
+        made(format!("thesis single{suffix}"), make)
+    };
+    let multi = |split: Split, (part, suffix): (gpu::Part, &str)| {
+        let make: Make =
+            Box::new(move |device, scene, states| Ok(Box::new(Thesis::multi(device, scene, states, (split, part))?)));
+        made(format!("thesis {} kernels{suffix}", split.widths().len()), make)
+    };
+    let largest = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
+    match (scene.domains.len(), largest) {
+        (1, _) => PARTS.into_iter().map(single).collect(),
+        (_, 0..=32) => Split::ALL.into_iter().flat_map(|split| PARTS.map(|part| multi(split, part))).collect(),
+        _ => Vec::new(),
+    }
+}
+
+/// Whether some shape has more corners than the least that a mesh must have.
+pub(super) fn has_normals(scene: &Scene) -> bool {
+    scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
+}
+
+/// The formula of a part of a trial's bytes, where its name says which.
+fn formula(name: &str) -> &'static str {
+    match name {
+        "U" => "as packed: entries of all modes and vertices, filled up to tiles",
+        "q" => "4 x sum r",
+        "T" => "48 x d",
+        "x0" | "u or x" | "x" => "12 x sum n",
+        _ => "as packed",
+    }
+}
+
+impl Tried {
+    fn new(label: Label, scene: &Arc<Scene>, device: &Arc<Device>, make: Make) -> Self {
+        let (scene, device, ingredients) = (Arc::clone(scene), Arc::clone(device), Ingredients::of(scene));
+        Self { label, scene, ingredients, device, make, trial: None, surface: Surface::default() }
+    }
+
+    fn trial(&self) -> Result<&dyn Trial> {
+        let missing = || Error::Fault { stage: "trial", reason: format!("{} was not prepared", self.label.name) };
+        self.trial.as_deref().ok_or_else(missing)
+    }
+}
+
+impl Variant for Tried {
+    fn label(&self) -> &Label {
+        &self.label
+    }
+
+    fn scene(&self) -> &Arc<Scene> {
+        &self.scene
+    }
+
+    fn ingredients(&self) -> &Ingredients {
+        &self.ingredients
+    }
+
+    fn traffic(&self) -> Vec<Part> {
+        let parts = self.trial.as_ref().map_or_else(Vec::new, |trial| trial.bytes());
+        parts.into_iter().map(|(name, bytes)| Part { name, formula: formula(name), bytes }).collect()
+    }
+
+    fn prepare(&mut self, states: &[State]) -> Result<()> {
+        self.trial = Some((self.make)(&self.device, &self.scene, states)?);
+        Ok(())
+    }
+
+    fn surface(&mut self, at: usize, _state: &State) -> Result<&Surface> {
+        let trial = self.trial()?;
+        trial.launch(&self.device, at)?;
+        self.surface.positions = trial.positions(&self.device)?;
+        Ok(&self.surface)
+    }
+
+    fn time(&mut self, _states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>> {
+        let cache = match cache {
+            Cache::Warm => gpu::Cache::Warm,
+            Cache::Cold => gpu::Cache::Cold,
+        };
+        let gpu::Timing { median_us, q1_us, q3_us, replays } = gpu::time(&self.device, self.trial()?, cache, replays)?;
+        Ok(Some(Timing { median_us, q1_us, q3_us, replays }))
+    }
+
+    fn kernels(&self) -> (usize, Vec<KernelFacts>) {
+        self.trial.as_ref().map_or((0, Vec::new()), |trial| (trial.launches(), trial.kernels()))
+    }
+}
