@@ -30,8 +30,11 @@ constexpr unsigned VECTORS = 16;
 #endif
 constexpr unsigned MOST = 16;
 // Blocks that a multiprocessor is to hold: as many as registers allow, where shared memory is as large as that.
-#if __CUDA_ARCH__ == 800 || __CUDA_ARCH__ == 900 || __CUDA_ARCH__ == 1000
+#if __CUDA_ARCH__ == 900
 constexpr unsigned RESIDENT = VECTORS == 16 ? 8 : 10;
+#elif __CUDA_ARCH__ == 800 || __CUDA_ARCH__ == 1000
+// Three warps a scheduler: its compiler needs more registers.
+constexpr unsigned RESIDENT = 6;
 #else
 constexpr unsigned RESIDENT = 4;
 #endif
@@ -175,19 +178,23 @@ struct Pair {
 __device__ __forceinline__ Pair pair_at(const char* chunk, unsigned group) {
     const unsigned byte = 4 * ENTRY_BYTES * group;
     const char* at = chunk + byte / 16 * (16 * QUADS) + byte % 16;
-    Pair pair;
+    unsigned words[12] = {};
 #if defined(STORE_INT8)
-    const unsigned bits = *(const unsigned short*)at;
-    pair.of[0] = number_of(bits);
-    pair.of[1] = number_of(bits >> 8);
+    words[0] = *(const unsigned short*)at;
 #elif defined(STORE_F16) || defined(STORE_BF16)
-    const unsigned bits = *(const unsigned*)at;
-    pair.of[0] = number_of(bits);
-    pair.of[1] = number_of(bits >> 16);
+    words[0] = *(const unsigned*)at;
 #else
-    const float2 both = *(const float2*)at;
-    pair.of[0] = both.x;
-    pair.of[1] = both.y;
+    const uint2 both = *(const uint2*)at;
+    words[0] = both.x;
+    words[1] = both.y;
+#endif
+    Pair pair;
+    pair.of[0] = entry_of(words, 0);
+#if defined(STORE_F16)
+    // Straight from the upper half, without a shift.
+    asm("{ .reg .b16 low, high; mov.b32 {low, high}, %1; cvt.f32.f16 %0, high; }" : "=f"(pair.of[1]) : "r"(words[0]));
+#else
+    pair.of[1] = entry_of(words, 1);
 #endif
     return pair;
 }
