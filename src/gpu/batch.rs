@@ -96,8 +96,12 @@ impl Batch {
         let modes = tiles.chunks() * modes_per_chunk(storage);
         let shared = shared_bytes(vectors.0, modes);
         let compiled = Compiled::new(device, &CODE, &defines)?;
+        // As many blocks as registers allow, so nothing is left to the L1 cache.
+        let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
         let most = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
-        compiled.function.set_attribute(most, shared as i32).map_err(during("batch"))?;
+        for (attribute, value) in [(carveout, 100), (most, shared as i32)] {
+            compiled.function.set_attribute(attribute, value).map_err(during("batch"))?;
+        }
         Ok(Self {
             name: format!("batch{}_{}", scene.domains.len(), storage.name()),
             compiled,
