@@ -5,6 +5,7 @@
 //! straight into OpenGL's buffers when the driver shares them.
 
 mod apply;
+mod batch;
 mod bounds;
 mod cache;
 mod cublas;
@@ -32,6 +33,7 @@ mod trial;
 mod turns;
 mod work;
 
+pub use batch::Batch;
 pub use cublas::{Cublas, Peer, cublas_version};
 pub use deformer::CudaDeformer;
 pub use device::Device;

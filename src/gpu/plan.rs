@@ -191,7 +191,7 @@ pub fn plan(scene: &Scene) -> Plan {
 }
 
 /// The macro of a storage type.
-const fn storage_define(storage: Storage) -> Option<&'static str> {
+pub(super) const fn storage_define(storage: Storage) -> Option<&'static str> {
     match storage {
         Storage::F32 => None,
         Storage::F16 => Some(STORAGES[0]),

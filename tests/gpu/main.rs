@@ -1,6 +1,7 @@
 //! The CUDA deformer against its f64 twin, on a real device. Everything that needs one is ignored without it; run with
 //! `--include-ignored --test-threads=1`. The binary needs no build tree: real inputs come from MODALCAST_DATA.
 
+mod batch;
 mod device;
 mod extremes;
 mod interop;
