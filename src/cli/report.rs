@@ -28,6 +28,7 @@ const EXAMPLES: &str = "Examples:
   modalcast report deform --out report
   modalcast report deform --out report --quick
   modalcast report deform --out report --load single-22-30 --load plants
+  modalcast report deform --out report --load c --variant 'cuda*' --variant 'cpu f32'
   modalcast report deform --out report --scene path/to/finger
   modalcast report deform --out report --scene tree --trajectory path/to/record";
 
@@ -67,6 +68,12 @@ struct DeformArgs {
     /// Repetitions per median, at least 20; 100 without it, 20 with --quick.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
+    /// The most steps of a trajectory to look at; all without it.
+    #[arg(long)]
+    steps: Option<usize>,
+    /// Only this variant, or all whose names begin so: "cuda*"; may be repeated.
+    #[arg(long = "variant", value_name = "NAME")]
+    variants: Vec<String>,
     /// Build every load at a fraction of its size, for machines without a GPU; the report says which.
     #[arg(long)]
     quick: bool,
@@ -101,7 +108,14 @@ fn request(args: &DeformArgs) -> Result<Request> {
     }
     let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
     let number = |given: Option<u32>, usual: usize| given.map_or(usual, |given| given as usize);
-    Ok(Request { sources, seeds: number(args.seeds, seeds), replays: number(args.replays, replays), size })
+    Ok(Request {
+        sources,
+        seeds: number(args.seeds, seeds),
+        replays: number(args.replays, replays),
+        steps: args.steps.unwrap_or(usize::MAX),
+        variants: args.variants.clone(),
+        size,
+    })
 }
 
 fn lines(report: &Report) -> Vec<String> {
@@ -140,7 +154,17 @@ mod tests {
 
     fn args() -> DeformArgs {
         let out = PathBuf::from("out");
-        DeformArgs { out, scene: None, trajectory: None, loads: vec![], seeds: None, replays: None, quick: false }
+        DeformArgs {
+            out,
+            scene: None,
+            trajectory: None,
+            loads: vec![],
+            seeds: None,
+            replays: None,
+            steps: None,
+            variants: vec![],
+            quick: false,
+        }
     }
 
     #[test]

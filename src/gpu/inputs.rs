@@ -142,6 +142,11 @@ impl Inputs {
         sent.map_err(fail)
     }
 
+    /// Bytes that a whole step copies.
+    pub(super) const fn bytes(&self) -> u64 {
+        self.sizes.total()
+    }
+
     /// How far leaving modes out may move a vertex at the last step, scene units.
     pub(super) fn truncation_bound(&self) -> f64 {
         self.truncation.as_ref().map_or(0.0, |choice| choice.bound)

@@ -20,6 +20,14 @@ pub trait Trial {
     /// `Fault` when the device refuses.
     fn launch(&self, device: &Device, turn: usize) -> Result<()>;
 
+    /// Brings up to date what a launch of this turn passes over; for the judge, before the launch.
+    ///
+    /// # Errors
+    /// `Fault` when the device refuses.
+    fn complete(&self, _device: &Device, _turn: usize) -> Result<()> {
+        Ok(())
+    }
+
     /// World positions of the last launch, 3 f32 per vertex, packed as the scene's layout says, for the judge. Empty
     /// when the trial deforms nothing.
     ///

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
+use super::Ingest;
 use super::loads::{Load, restated};
 use super::trials;
 use super::variant::{Driven, Label, Variant};
@@ -12,7 +13,7 @@ use crate::deform::{Backend, Deformer};
 use crate::error::{Error, Result};
 use crate::gpu::{self, CudaDeformer, Device};
 use crate::reference::ReferenceDeformer;
-use crate::scene::{Deformation, Normals, Scene, Storage};
+use crate::scene::{Deformation, Normals, Scene, State, Storage};
 
 /// Rates measured in the same run, in 10^9 bytes a second; `None` where nothing measured them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -28,17 +29,25 @@ pub struct Roofs {
     pub pinned_d2h_gbs: Option<f64>,
 }
 
+/// Whether a variant of that name is asked for.
+pub type Wanted<'a> = &'a dyn Fn(&str) -> bool;
+
 /// A variant, or why it could not be made.
 pub type Offer = (Label, Result<Box<dyn Variant>>);
 
 /// What can be measured.
 pub trait Bench {
-    /// The variants for a load.
-    fn variants(&self, load: &Load) -> Vec<Offer>;
+    /// The variants for a load; those that are not wanted need not be made.
+    fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer>;
 
     /// The rates of a backend's memory.
     fn roofs(&self, _backend: Backend) -> Roofs {
         Roofs::default()
+    }
+
+    /// How long a step's values take to the device.
+    fn ingest(&self, _load: &Load, _replays: usize) -> Option<Ingest> {
+        None
     }
 
     /// What is missing here and why, in words.
@@ -84,11 +93,11 @@ impl Machine {
 }
 
 impl Bench for Machine {
-    fn variants(&self, load: &Load) -> Vec<Offer> {
+    fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
         let scene = &load.scene;
         let driven = |name: &str, backend: Backend, deformation: Deformation, make: &dyn Fn(&Arc<Scene>) -> Made| {
             let label = Label { name: name.into(), backend, deformation };
-            offer(label, |label| {
+            offer(wanted, label, |label| {
                 let scene =
                     if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
                 Ok(Driven::new(label, &scene, make(&scene)?))
@@ -111,13 +120,20 @@ impl Bench for Machine {
             if let Some(exact) = exact_normals(scene) {
                 offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            offers.extend(trials::trials(device, scene));
+            offers.extend(trials::trials(device, scene, wanted));
         }
         offers
     }
 
     fn roofs(&self, backend: Backend) -> Roofs {
         if backend == Backend::Cuda { self.cuda } else { self.cpu }
+    }
+
+    fn ingest(&self, load: &Load, replays: usize) -> Option<Ingest> {
+        let device = self.device.as_ref().ok()?;
+        let (bytes, timing) = gpu::ingest(device, &load.scene, &State::rest(&load.scene), replays).ok()?;
+        let expected = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
+        Some(Ingest { bytes, median_us: timing.median_us, of_pinned: timing.median_us / expected })
     }
 
     fn remarks(&self) -> Vec<String> {
@@ -152,8 +168,12 @@ fn exact_normals(scene: &Scene) -> Option<Deformation> {
     rigid.then_some(Deformation { normals: Normals::Exact, ..scene.deformation })
 }
 
-/// Makes a variant, or keeps why it could not be made.
-pub fn offer<V: Variant + 'static>(label: Label, make: impl FnOnce(Label) -> Result<V>) -> Offer {
+/// Makes a variant if it is wanted, or keeps why it could not be made.
+pub fn offer<V: Variant + 'static>(wanted: Wanted<'_>, label: Label, make: impl FnOnce(Label) -> Result<V>) -> Offer {
+    if !wanted(&label.name) {
+        let given = label.name.clone();
+        return (label, Err(Error::NotFound { what: "variant that is asked for", given }));
+    }
     (label.clone(), make(label).map(|variant| Box::new(variant) as Box<dyn Variant>))
 }
 
@@ -170,7 +190,7 @@ mod tests {
     fn every_machine_offers_the_cpu_and_says_why_it_has_no_cuda() {
         let machine = Machine::open();
         let load = Kind::C.build(Size::Quick).expect("built");
-        let names: Vec<String> = machine.variants(&load).into_iter().map(|(label, _)| label.name).collect();
+        let names: Vec<String> = machine.variants(&load, &|_| true).into_iter().map(|(label, _)| label.name).collect();
         for name in
             ["cpu f32", "cpu f16", "cpu int8", "cpu f32 truncated 1e-5", "cpu f32 exact normals", "reference f64"]
         {
@@ -185,6 +205,6 @@ mod tests {
     #[test]
     fn the_reference_is_left_out_where_it_would_take_minutes() {
         let large = Kind::Single { power: 18, rank: 20 }.build(Size::Full).expect("built");
-        assert!(Machine::open().variants(&large).iter().all(|(label, _)| label.name != "reference f64"));
+        assert!(Machine::open().variants(&large, &|_| true).iter().all(|(label, _)| label.name != "reference f64"));
     }
 }

@@ -62,7 +62,18 @@ pub struct Request {
     pub seeds: usize,
     /// Repetitions per median.
     pub replays: usize,
+    /// The most steps of a trajectory.
+    pub steps: usize,
+    /// Which variants, by name or by its beginning and a `*`; empty: all.
+    pub variants: Vec<String>,
     pub size: Size,
+}
+
+impl Request {
+    fn wants(&self, name: &str) -> bool {
+        let fits = |wanted: &String| wanted.strip_suffix('*').map_or(name == wanted, |begin| name.starts_with(begin));
+        self.variants.is_empty() || self.variants.iter().any(fits)
+    }
 }
 
 /// Where a scene comes from.
@@ -93,6 +104,17 @@ pub struct Entry {
     pub steps: usize,
     pub recorded: bool,
     pub condition: Condition,
+    /// What a whole step brings to the CUDA device, and how long that takes.
+    pub ingest: Option<Ingest>,
+}
+
+/// The way in of a step, by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Ingest {
+    pub bytes: u64,
+    pub median_us: f64,
+    /// Of the time that the bytes take at the pinned copy rate of this run.
+    pub of_pinned: f64,
 }
 
 /// A whole report.
@@ -127,7 +149,8 @@ pub fn deform(request: &Request, bench: &dyn Bench, mut progress: impl FnMut(&st
         let (condition, measured) = measure(request, bench, &load, &motion);
         rows.extend(measured);
         let full = request.size == Size::Full && matches!(source, Source::Synthetic(_));
-        loads.push(entry(&load, &motion, condition, full));
+        let entry = entry(&load, &motion, condition, full);
+        loads.push(Entry { ingest: bench.ingest(&load, request.replays), ..entry });
     }
     let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
     let thesis = Peers::of(&rows, full);
@@ -176,19 +199,21 @@ fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entr
         steps: motion.steps(),
         recorded: motion.is_recorded(),
         condition,
+        ingest: None,
     }
 }
 
 /// Validates all variants of a load together, then times those that passed, one after the other.
 fn measure(request: &Request, bench: &dyn Bench, load: &Load, motion: &Motion) -> (Condition, Vec<Row>) {
     let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<Row>) = (Vec::new(), Vec::new());
-    for (label, made) in bench.variants(load) {
+    let wanted = |name: &str| request.wants(name);
+    for (label, made) in bench.variants(load, &wanted).into_iter().filter(|(label, _)| wanted(&label.name)) {
         match made {
             Ok(variant) => variants.push(variant),
             Err(error) => rows.push(Row::unmade(&load.name, &label, &error)),
         }
     }
-    let (found, condition) = validate::validate(load, motion, &mut variants, request.seeds);
+    let (found, condition) = validate::validate(load, motion, &mut variants, (request.seeds, request.steps));
     let states: Vec<_> = (0..ROTATING).map(|seed| motion.seed(seed).state()).collect();
     for (variant, found) in variants.iter_mut().zip(found) {
         for cache in [Cache::Warm, Cache::Cold] {
@@ -242,7 +267,7 @@ mod tests {
     use super::*;
     use crate::cpu::CpuDeformer;
     use crate::error::invalid;
-    use bench::{Offer, offer};
+    use bench::{Offer, Wanted, offer};
     use testing::Damaged;
     use variant::{Driven, Label};
 
@@ -252,11 +277,11 @@ mod tests {
     }
 
     impl Bench for Mixed {
-        fn variants(&self, load: &Load) -> Vec<Offer> {
+        fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
             let label = |name: &str| Label::new(name, Backend::Cpu, &load.scene);
             let cpu = |label: Label| Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
             let bad = |label: Label| Ok(Damaged::new(cpu(label), self.damage));
-            vec![offer(label("good"), |label| Ok(cpu(label))), offer(label("bad"), bad)]
+            vec![offer(wanted, label("good"), |label| Ok(cpu(label))), offer(wanted, label("bad"), bad)]
         }
 
         fn roofs(&self, _backend: Backend) -> Roofs {
@@ -265,7 +290,7 @@ mod tests {
     }
 
     fn request(sources: Vec<Source>) -> Request {
-        Request { sources, seeds: 3, replays: 20, size: Size::Quick }
+        Request { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
     }
 
     fn report(damage: f32) -> Report {
@@ -314,7 +339,7 @@ mod tests {
     fn a_variant_that_cannot_be_made_fails_the_report_by_name() {
         struct Broken;
         impl Bench for Broken {
-            fn variants(&self, load: &Load) -> Vec<Offer> {
+            fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
                 let label = Label::new("lost", Backend::Cuda, &load.scene);
                 vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
             }
@@ -328,7 +353,7 @@ mod tests {
     fn a_variant_that_lacks_what_is_not_here_is_left_out_with_the_reason_and_fails_nothing() {
         struct Lacking;
         impl Bench for Lacking {
-            fn variants(&self, load: &Load) -> Vec<Offer> {
+            fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
                 let label = Label::new("peer", Backend::Cuda, &load.scene);
                 let (reason, remedy) = ("not found".into(), "install it".into());
                 vec![(label, Err(crate::error::Error::Unavailable { what: "a library", reason, remedy }))]

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::bench::{Offer, offer};
+use super::bench::{Offer, Wanted, offer};
 use super::ingredients::Ingredients;
 use super::loads::restated;
 use super::timing::{Cache, Timing};
@@ -10,7 +10,7 @@ use super::traffic::Part;
 use super::variant::{Label, Variant};
 use crate::deform::{Backend, Surface};
 use crate::error::{Error, Result};
-use crate::gpu::{self, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
+use crate::gpu::{self, Batch, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
 use crate::scene::{Deformation, Scene, State, Storage};
 
 /// Makes a trial of a scene for some states.
@@ -31,7 +31,7 @@ struct Tried {
 }
 
 /// All trials for a scene: ours in every storage type, and the thesis's kernels where they apply.
-pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let ours = |storage: Storage, extent: Extent| -> Offer {
         let deformation = Deformation { storage, ..scene.deformation };
         let suffix = match extent {
@@ -40,7 +40,7 @@ pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
             Extent::Whole => "",
         };
         let label = Label { name: format!("cuda {}{suffix}", storage.name()), backend: Backend::Cuda, deformation };
-        offer(label, |label| {
+        offer(wanted, label, |label| {
             let scene =
                 if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
             let make: Make =
@@ -53,16 +53,52 @@ pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
     if has_normals(scene) {
         offers.extend(storages.iter().map(|storage| ours(*storage, Extent::Whole)));
     }
+    if scene.domains.len() >= MANY {
+        offers.push(changed(device, scene, wanted));
+    }
     if scene.needs.modes {
         offers.push(ours(Storage::F32, Extent::Uq));
-        offers.extend(thesis(device, scene));
-        offers.extend(cublas(device, scene));
+        offers.extend(batch(device, scene, wanted));
+        offers.extend(thesis(device, scene, wanted));
+        offers.extend(cublas(device, scene, wanted));
     }
     offers
 }
 
+/// Domains from which on a step that changes one in a hundred is measured.
+const MANY: usize = 400;
+
+/// A step that changes one domain in a hundred, spread over the list.
+fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offer {
+    let list: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
+    let label = Label::new("cuda f32 positions, 1 % changed", Backend::Cuda, scene);
+    let make: Make = Box::new(move |device, scene, states| {
+        Ok(Box::new(Ours::of_changed(device, scene, states, (Extent::Positions, Some(&list)))?))
+    });
+    offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
+}
+
+/// Many q of one shape at once, in every storage type.
+fn batch(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
+    if scene.shapes.len() > 1 || scene.domains.len() < 2 {
+        return Vec::new();
+    }
+    let one = |storage: Storage| {
+        let deformation = Deformation { storage, ..scene.deformation };
+        let name = format!("cuda batch of {} {}", scene.domains.len(), storage.name());
+        let label = Label { name, backend: Backend::Cuda, deformation };
+        offer(wanted, label, |label| {
+            let scene =
+                if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
+            let make: Make = Box::new(|device, scene, states| Ok(Box::new(Batch::new(device, scene, states)?)));
+            Ok(Tried::new(label, &scene, device, make))
+        })
+    };
+    Storage::ALL.into_iter().map(one).collect()
+}
+
 /// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.
-fn cublas(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+fn cublas(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let shared = scene.domains.len() > 1 && scene.shapes.len() == 1;
     let fits = |peer: &Peer| match peer {
         Peer::SgemvColumns | Peer::SgemvRows => scene.domains.len() == 1,
@@ -73,17 +109,17 @@ fn cublas(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
         let label = Label::new(format!("{}{suffix}", peer.name().replace('_', " ")), Backend::Cuda, scene);
         let make: Make =
             Box::new(move |device, scene, states| Ok(Box::new(Cublas::new(device, scene, states, (peer, part))?)));
-        offer(label, |label| Ok(Tried::new(label, scene, device, make)))
+        offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
     };
     let both = |peer: Peer| PARTS.map(|part| made(peer, part));
     Peer::ALL.into_iter().filter(fits).flat_map(both).collect()
 }
 
 /// The thesis's kernels: those for one domain, else the grouped ones in all their splits. They take up to 32 modes.
-fn thesis(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
+fn thesis(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let made = |name: String, make: Make| {
         let label = Label::new(name, Backend::Cuda, scene);
-        offer(label, |label| Ok(Tried::new(label, scene, device, make)))
+        offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
     };
     let single = |(part, suffix): (gpu::Part, &str)| {
         let make: Make =
@@ -96,11 +132,28 @@ fn thesis(device: &Arc<Device>, scene: &Arc<Scene>) -> Vec<Offer> {
         made(format!("thesis {} kernels{suffix}", split.widths().len()), make)
     };
     let largest = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
+    // Unfolded triangles have no place for a vertex that no triangle names.
+    let parts = if names_all(scene) { &PARTS[..] } else { &PARTS[..1] };
     match (scene.domains.len(), largest) {
-        (1, _) => PARTS.into_iter().map(single).collect(),
-        (_, 0..=32) => Split::ALL.into_iter().flat_map(|split| PARTS.map(|part| multi(split, part))).collect(),
+        (1, _) => parts.iter().copied().map(single).collect(),
+        (_, 0..=32) => Split::ALL
+            .into_iter()
+            .flat_map(|split| parts.iter().map(move |part| (split, *part)))
+            .map(|(split, part)| multi(split, part))
+            .collect(),
         _ => Vec::new(),
     }
+}
+
+/// Whether every vertex of every shape is a corner of some triangle.
+fn names_all(scene: &Scene) -> bool {
+    scene.shapes.iter().all(|shape| {
+        let mut named = vec![false; shape.mesh.rest().len()];
+        for corner in shape.mesh.triangles().as_flattened() {
+            named[shape.mesh.corners().vertices[*corner as usize] as usize] = true;
+        }
+        named.into_iter().all(|named| named)
+    })
 }
 
 /// Whether some shape has more corners than the least that a mesh must have.
@@ -156,6 +209,7 @@ impl Variant for Tried {
 
     fn surface(&mut self, at: usize, _state: &State) -> Result<&Surface> {
         let trial = self.trial()?;
+        trial.complete(&self.device, at)?;
         trial.launch(&self.device, at)?;
         self.surface.positions = trial.positions(&self.device)?;
         Ok(&self.surface)

@@ -80,17 +80,17 @@ struct Look<'a> {
     along: bool,
 }
 
-/// Looks at `seeds` random states and the whole trajectory.
+/// Looks at `seeds` random states and at most `steps` of the trajectory.
 pub fn validate(
     load: &Load,
     motion: &Motion,
     variants: &mut [Box<dyn Variant>],
-    seeds: usize,
+    (seeds, steps): (usize, usize),
 ) -> (Vec<Found>, Condition) {
     let camera = Camera::framing(&load.scene, IMAGE.0, IMAGE.1);
     let yardstick = Yardstick::new(&load.scene, &camera);
     let truth = |at: usize| if at < seeds { motion.seed(at) } else { motion.step(at - seeds) };
-    let states: Vec<State> = (0..seeds + motion.steps()).map(|at| truth(at).state()).collect();
+    let states: Vec<State> = (0..seeds + motion.steps().min(steps)).map(|at| truth(at).state()).collect();
     let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut(), &states)).collect();
     // The scene whose normals are those of the deformed surface, where that bends and has any.
     let exact_normals = Deformation { normals: Normals::Exact, ..load.scene.deformation };
@@ -274,7 +274,7 @@ mod tests {
         let cpu = Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(Damaged::new(cpu, damage))];
         let motion = Motion::new(&load, None);
-        let (mut found, condition) = validate(&load, &motion, &mut variants, 4);
+        let (mut found, condition) = validate(&load, &motion, &mut variants, (4, usize::MAX));
         (found.remove(0), condition)
     }
 
@@ -317,7 +317,7 @@ mod tests {
         let (does, says) = (Ingredients::of(&done), Ingredients::of(&said));
         let emulated = Emulated { label, scene: said, does, says, surface: Surface::default() };
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
-        validate(&load, &Motion::new(&load, None), &mut variants, 3).0.remove(0)
+        validate(&load, &Motion::new(&load, None), &mut variants, (3, usize::MAX)).0.remove(0)
     }
 
     #[test]

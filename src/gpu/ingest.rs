@@ -1,0 +1,62 @@
+//! The way in by itself: how long a step's header, transforms and q take from pinned memory to the device.
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use super::device::Device;
+use super::inputs::{Inputs, Packing};
+use super::layout::Header;
+use super::measure::{Cache, Timing, time};
+use super::trial::{KernelFacts, Trial};
+use super::work::Coordinates;
+use crate::error::Result;
+use crate::scene::{Scene, State};
+
+/// The copy of whole steps.
+struct Ingest(RefCell<Inputs>);
+
+impl Trial for Ingest {
+    fn name(&self) -> String {
+        "ingest".into()
+    }
+
+    fn turns(&self) -> usize {
+        1
+    }
+
+    fn launch(&self, device: &Device, _turn: usize) -> Result<()> {
+        self.0.borrow_mut().send(device, None)
+    }
+
+    fn positions(&self, _device: &Device) -> Result<Vec<f32>> {
+        Ok(Vec::new())
+    }
+
+    fn bytes(&self) -> Vec<(&'static str, u64)> {
+        Vec::new()
+    }
+
+    fn launches(&self) -> usize {
+        0
+    }
+
+    fn kernels(&self) -> Vec<KernelFacts> {
+        Vec::new()
+    }
+}
+
+/// Bytes of a whole step's values of a scene, and how long their copy takes, as a graph of it alone.
+///
+/// # Errors
+/// `Fault` when the device refuses; `Invalid` when `replays` is 0.
+pub fn ingest(device: &Device, scene: &Arc<Scene>, state: &State, replays: usize) -> Result<(u64, Timing)> {
+    let coordinates = Coordinates::new(scene);
+    // Only the amount counts here: factors and tiles are left empty.
+    let factors = vec![Vec::new(); scene.shapes.len()];
+    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, spans: Vec::new(), tiles: 0 };
+    let mut inputs = Inputs::new(device, &Arc::new(packing))?;
+    inputs.write(&Header::default(), state)?;
+    let bytes = inputs.bytes();
+    let ingest = Ingest(RefCell::new(inputs));
+    Ok((bytes, time(device, &ingest, Cache::Warm, replays)?))
+}
