@@ -1,25 +1,26 @@
 //! CUDA: one launcher per kernel, with the kernel's name.
 //!
 //! Kernels live in `kernels/*.cu`; NVRTC compiles them for the device that is there, with the parts that the scene
-//! needs ([`plan`]), and a cache on disk keeps the machine code. A step is one graph of a copy and at most four launches,
-//! whatever the number of domains, straight into OpenGL's buffers when the driver shares them:
+//! needs ([`plan`]), and a cache on disk keeps the machine code. A step is one graph: a copy to the device, at most four
+//! launches whatever the number of domains, straight into OpenGL's buffers when the driver shares them, and the bounds
+//! on their way back.
 //!
 //! ```text
 //! inputs -> [apply] -> deform -> bounds -> [normals] -> answer
 //! ```
-//! `apply` is there in steps that change few domains, `normals` where normals follow the surface.
+//! `apply` is there in steps that change few domains, `normals` where normals follow the deformed surface.
 //!
 //! | file | what |
 //! |---|---|
-//! | [`mod@plan`] | scene to kernels with their macros, buffers and launches |
-//! | [`work`], [`pack`], [`rings`], [`layout`] | scene to the tables that kernels read; pure |
-//! | [`inputs`] | the values of a step on their way to the device |
-//! | [`apply`], [`mod@deform`], [`bounds`], [`normals`] | the launchers |
-//! | [`deformer`] | the graph of a step, and its answer |
-//! | [`output`], [`interop`] | where the vertices go |
-//! | [`device`], [`memory`], [`compile`] | the device, its buffers, its machine code |
-//! | [`mod@probe`], [`report`] | what is there, and whether the device agrees on layouts |
-//! | [`trials`] | what only measures |
+//! | `plan` | scene to kernels with their macros, buffers and launches |
+//! | `work`, `pack`, `rings`, `layout` | scene to the tables that kernels read; pure |
+//! | `inputs` | the values of a step on their way to the device |
+//! | `apply`, `deform`, `bounds`, `normals` | the launchers |
+//! | `deformer` | the graph of a step, and its answer |
+//! | `output`, `interop` | where the vertices go |
+//! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
+//! | `probe`, `report` | what is there, and whether the device agrees on layouts |
+//! | `trials` | what only measures |
 
 mod apply;
 mod bounds;
