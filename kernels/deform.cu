@@ -33,16 +33,24 @@
 #define AHEAD 4
 #endif
 // Warps of a block, and blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill
-// registers. Tiles of modes read long runs and do best in blocks of one warp.
+// registers, so that what takes more registers has fewer. Tiles of modes read long runs and do best in blocks of one warp.
 #if defined(NARROW) && defined(MODES)
 constexpr unsigned WARPS = 1;
+#if defined(TRUNCATED) && defined(LISTED)
+constexpr unsigned RESIDENT = 8;
+#else
 constexpr unsigned RESIDENT = 10;
+#endif
 #elif defined(SHEAR) || defined(LISTED)
 constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 16;
 #elif defined(MODES)
 constexpr unsigned WARPS = 1;
-#ifdef NORMAL_MAPS
+#if defined(COMPENSATED) && defined(STORE_INT8)
+constexpr unsigned RESIDENT = 16;
+#elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || (defined(NORMAL_MAPS) && defined(TRUNCATED))
+constexpr unsigned RESIDENT = 20;
+#elif defined(NORMAL_MAPS) || (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16))) || __CUDA_ARCH__ < 900
 constexpr unsigned RESIDENT = 24;
 #else
 constexpr unsigned RESIDENT = 28;

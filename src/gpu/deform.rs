@@ -10,7 +10,6 @@ use super::inputs::{Packing, Values};
 use super::layout::DeformArgs;
 use super::memory::{address, room, upload};
 use super::plan::Kernel;
-use super::trial::KernelFacts;
 use super::work::{Coordinates, Source, Work, corner_shifts, rest_directions, rest_positions, side_by_side};
 use crate::error::{Error, Result, during};
 use crate::scene::Scene;
@@ -22,7 +21,7 @@ const PIECE: usize = 1 << 22;
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
 pub(super) struct Deform {
-    function: CudaFunction,
+    pub(super) function: CudaFunction,
     config: LaunchConfig,
     /// The same for a list of tiles.
     listed: CudaFunction,
@@ -109,11 +108,6 @@ impl Deform {
         let grid_dim = ((4 * self.count).min(LISTED_BLOCKS), 1, 1);
         let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
         self.launch_as(device, values, (&self.listed, config))
-    }
-
-    /// What the driver says of the kernel.
-    pub(super) fn facts(&self) -> Result<KernelFacts> {
-        KernelFacts::of("deform", &self.function)
     }
 
     fn launch_as(

@@ -5,8 +5,7 @@ use std::sync::Arc;
 use cudarc::driver::{CudaContext, CudaFunction, CudaStream, DriverError, result, sys};
 use cudarc::nvrtc::Ptx;
 
-use super::cache::{Cache, key_of};
-use super::nvrtc::{Job, nvrtc};
+use super::compile::{cubin, nvrtc};
 use crate::error::{Error, Result, during};
 
 /// The oldest CUDA driver interface that is used here, as cuDriverGetVersion counts (12.0).
@@ -95,20 +94,7 @@ impl Device {
     /// `Unavailable` when NVRTC is missing or does not fit the driver; `Fault` when compiling or loading fails.
     pub(super) fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
         self.check_compiler()?;
-        let nvrtc = nvrtc()?;
-        let job = Job::new(name, source, defines, self.capability);
-        let version = format!("{}.{}", nvrtc.version.0, nvrtc.version.1);
-        let mut ingredients = job.ingredients();
-        ingredients.push(&version);
-        let (cache, key) = (Cache::of_environment(), key_of(&ingredients));
-        let cubin = match cache.get(&key) {
-            Some(cubin) => cubin,
-            None => {
-                let cubin = nvrtc.compile(&job)?;
-                cache.put(&key, &cubin);
-                cubin
-            }
-        };
+        let cubin = cubin(name, source, defines, self.capability)?;
         let module = self.context.load_module(Ptx::from_binary(cubin)).map_err(during("load kernel"))?;
         module.load_function(name).map_err(during("load kernel"))
     }

@@ -1,54 +1,57 @@
 //! CUDA: one launcher per kernel, with the kernel's name.
 //!
 //! Kernels live in `kernels/*.cu`; NVRTC compiles them for the device that is there, with the parts that the scene
-//! needs ([`plan`]), and a cache on disk keeps the machine code. All domains of a scene go through two launches a step,
-//! straight into OpenGL's buffers when the driver shares them.
+//! needs ([`plan`]), and a cache on disk keeps the machine code. A step is one graph: a copy to the device, at most four
+//! launches whatever the number of domains, straight into OpenGL's buffers when the driver shares them, and the bounds
+//! on their way back.
+//!
+//! ```text
+//! inputs -> [apply] -> deform -> bounds -> [normals] -> answer
+//! ```
+//! `apply` is there in steps that change few domains, `normals` where normals follow the deformed surface.
+//!
+//! | file | what |
+//! |---|---|
+//! | `plan` | scene to kernels with their macros, buffers and launches |
+//! | `work`, `pack`, `rings`, `layout` | scene to the tables that kernels read; pure |
+//! | `inputs` | the values of a step on their way to the device |
+//! | `apply`, `deform`, `bounds`, `normals` | the launchers |
+//! | `deformer` | the graph of a step, and its answer |
+//! | `output`, `interop` | where the vertices go |
+//! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
+//! | `probe`, `report` | what is there, and whether the device agrees on layouts |
+//! | `trials` | what only measures |
 
 mod apply;
-mod batch;
 mod bounds;
-mod cache;
-mod cublas;
+mod compile;
 mod deform;
 mod deformer;
 mod device;
-mod ingest;
 mod inputs;
 mod interop;
 mod layout;
-mod measure;
 mod memory;
 mod normals;
-mod nvrtc;
-mod ours;
 mod output;
 mod pack;
-mod plain_update;
 mod plan;
 mod probe;
 mod report;
 mod rings;
-mod roof;
-mod thesis;
-mod trial;
-mod turns;
+mod trials;
 mod work;
 
-pub use batch::Batch;
-pub use cublas::{Cublas, Peer, cublas_version};
 pub use deformer::CudaDeformer;
 pub use device::Device;
-pub use ingest::ingest;
 pub use layout::{Agreement, agreements};
-pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
-pub use ours::{Extent, Ours};
 pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
-pub use roof::{Roofs, roofs};
-pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
-pub use trial::{KernelFacts, Trial};
-pub use turns::Part;
+pub use trials::{
+    Batch, Cache, Cublas, Extent, KernelFacts, Lanes, Ours, Part, Peer, Roofs, Split, Thesis, Timing, Trial,
+    cublas_version, empty_replay, gigabytes_per_second, idle_in_warp, ingest, lanes, roofs, time,
+};
 
 /// OpenGL buffers to write into, by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

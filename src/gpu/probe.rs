@@ -4,9 +4,8 @@ use cudarc::driver::sys::CUdevice_attribute as Attribute;
 use cudarc::driver::{CudaContext, DriverError, result};
 use serde::Serialize;
 
-use super::cache::Cache;
+use super::compile::{self, nvrtc};
 use super::device::driver_version;
-use super::nvrtc::nvrtc;
 
 /// One CUDA device.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -47,7 +46,7 @@ pub fn probe() -> Probe {
         nvrtc: None,
         nvrtc_version: None,
         nvrtc_problem: None,
-        kernel_cache: Cache::of_environment().folder().map(|folder| folder.display().to_string()),
+        kernel_cache: compile::folder().map(|folder| folder.display().to_string()),
     };
     match driver_version() {
         Ok(version) => {

@@ -6,7 +6,7 @@
 //! - [`loads`] and [`motion`]: seeded scenes, coordinates and transforms; [`record`]: recorded ones.
 //! - [`exact`], [`ingredients`] and `double`: positions in f64 with any ingredient exchanged, and bounds; [`errors`] and
 //!   [`sources`] measure against them.
-//! - [`variant`] and [`bench`]: what is measured. A new variant implements [`variant::Variant`] and is offered by a
+//! - [`variant`] and [`mod@bench`]: what is measured. A new variant implements [`variant::Variant`] and is offered by a
 //!   [`bench::Bench`].
 //! - [`table`], [`peers`], [`plot`]: what comes out.
 

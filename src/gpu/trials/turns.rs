@@ -6,8 +6,8 @@ use std::sync::Arc;
 use cudarc::driver::CudaSlice;
 use serde::Serialize;
 
-use super::device::Device;
-use super::memory::{address, upload};
+use super::super::device::Device;
+use super::super::memory::{address, upload};
 use crate::error::{Result, invalid};
 use crate::scene::{Scene, State};
 

@@ -3,7 +3,7 @@
 use cudarc::driver::CudaFunction;
 use serde::Serialize;
 
-use super::device::Device;
+use super::super::device::Device;
 use crate::error::{Result, during};
 
 /// One way to deform on the device, prepared for measuring: the coordinates of several turns lie on the device.
@@ -104,23 +104,18 @@ impl Compiled {
 
 #[cfg(test)]
 pub(super) mod tests {
-    use super::super::nvrtc::{Job, nvrtc};
     use super::*;
+    use crate::gpu::compile::tests::Assembled;
 
     /// Compiles every function with every list of macros for several architectures; nothing may spill.
     pub(in super::super) fn compile_all(code: &Code) {
-        let nvrtc = nvrtc().expect("NVRTC");
         for capability in [(7, 5), (8, 0), (9, 0), (12, 0)] {
             for defines in code.variants {
-                let mut job = Job::new(code.functions[0], code.source, defines, capability);
-                job.options.push("--ptxas-options=-v".into());
-                let (cubin, log) = nvrtc.compile_with_log(&job).expect("compiles");
+                let compiled = Assembled::new(code.functions[0], code.source, defines, capability);
                 for function in code.functions {
-                    assert!(log.contains(&format!("'{function}'")), "{function} is not in: {log}");
+                    assert!(compiled.log.contains(&format!("'{function}'")), "{function} is not in: {}", compiled.log);
                 }
-                let spilled = log.matches("bytes spill stores").count() - log.matches(" 0 bytes spill stores").count();
-                assert_eq!(spilled, 0, "{defines:?} {capability:?}: {log}");
-                assert!(cubin.starts_with(b"\x7fELF"), "machine code is an ELF file");
+                assert_eq!(compiled.spilled(), 0, "{defines:?} {capability:?}: {}", compiled.log);
             }
         }
     }

@@ -5,9 +5,9 @@
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PinnedHostSlice, PushKernelArg as _, result};
 use serde::Serialize;
 
-use super::device::Device;
+use super::super::device::Device;
+use super::super::memory::{address, download, room};
 use super::measure::{Cache, Span, Timing, empty_replay, gigabytes_per_second, time};
-use super::memory::{address, download, room};
 use super::trial::{Code, KernelFacts, Trial};
 use crate::error::{Error, Result, during};
 
@@ -30,7 +30,7 @@ pub(super) const SWEEP_LOADS: u64 = 8;
 
 /// The kernels.
 pub(super) const CODE: Code = Code {
-    source: include_str!("../../kernels/roof.cu"),
+    source: include_str!("../../../kernels/roof.cu"),
     functions: &["copy", "read", "fill", "hold", "nothing"],
     variants: &[
         &[],

@@ -3,15 +3,15 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::super::device::Device;
-use super::super::memory::{address, download, room, upload};
 use super::super::trial::{Code, Compiled, KernelFacts};
 use super::group::{BLOCK, places_of_u};
 use crate::error::{Result, during};
+use crate::gpu::device::Device;
+use crate::gpu::memory::{address, download, room, upload};
 use crate::scene::{Scene, State};
 
 pub(super) const CODE: Code = Code {
-    source: include_str!("../../../kernels/thesis_update.cu"),
+    source: include_str!("../../../../kernels/thesis_update.cu"),
     functions: &["thesis_update"],
     variants: &[&[], &["TANGENTS"]],
 };

@@ -7,9 +7,9 @@ use bytemuck::{Pod, Zeroable};
 use cudarc::driver::sys::CUfunction_attribute;
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::device::Device;
-use super::memory::{address, download, room, upload};
-use super::plan::storage_define;
+use super::super::device::Device;
+use super::super::memory::{address, download, room, upload};
+use super::super::plan::storage_define;
 use super::trial::{Code, Compiled, KernelFacts, Trial};
 use super::turns::{Turns, Values};
 use crate::error::{Result, during, invalid};
@@ -17,7 +17,7 @@ use crate::scene::{Scene, State};
 use crate::storage::{QUAD, Tiles, modes_per_chunk};
 
 pub(super) const CODE: Code = Code {
-    source: include_str!("../../kernels/batch.cu"),
+    source: include_str!("../../../kernels/batch.cu"),
     functions: &["batch"],
     variants: &[
         &[],

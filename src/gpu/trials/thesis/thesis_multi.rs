@@ -4,15 +4,15 @@
 
 use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
 
-use super::super::device::Device;
-use super::super::memory::{address, upload};
 use super::super::trial::{Code, Compiled, KernelFacts};
 use super::group::{BLOCK, LARGEST_RANK, Split, pack};
 use crate::error::{Result, during, invalid};
+use crate::gpu::device::Device;
+use crate::gpu::memory::{address, upload};
 use crate::scene::Scene;
 
 pub(super) const CODE: Code = Code {
-    source: include_str!("../../../kernels/thesis_multi.cu"),
+    source: include_str!("../../../../kernels/thesis_multi.cu"),
     functions: &["thesis_multi"],
     variants: &[&["WIDTH=5"], &["WIDTH=6"], &["WIDTH=7"], &["WIDTH=8"]],
 };

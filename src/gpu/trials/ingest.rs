@@ -3,12 +3,12 @@
 use std::cell::RefCell;
 use std::sync::Arc;
 
-use super::device::Device;
-use super::inputs::{Inputs, Packing};
-use super::layout::Header;
+use super::super::device::Device;
+use super::super::inputs::{Inputs, Packing};
+use super::super::layout::Header;
+use super::super::work::Coordinates;
 use super::measure::{Cache, Timing, time};
 use super::trial::{KernelFacts, Trial};
-use super::work::Coordinates;
 use crate::error::Result;
 use crate::scene::{Scene, State};
 

@@ -6,8 +6,8 @@ use cudarc::driver::sys::{CUdevice_attribute, CUevent_flags, CUgraphInstantiate_
 use cudarc::driver::{CudaEvent, CudaFunction, CudaGraph, CudaSlice, LaunchConfig, PushKernelArg as _};
 use serde::Serialize;
 
-use super::device::Device;
-use super::memory::{address, room};
+use super::super::device::Device;
+use super::super::memory::{address, room};
 use super::roof;
 use super::trial::{KernelFacts, Trial};
 use crate::error::{Error, Result, during, invalid};

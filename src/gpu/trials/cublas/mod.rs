@@ -11,8 +11,8 @@ use std::sync::Arc;
 
 use cudarc::driver::CudaSlice;
 
-use super::device::Device;
-use super::memory::{address, download, room, upload};
+use super::super::device::Device;
+use super::super::memory::{address, download, room, upload};
 use super::plain_update::PlainUpdate;
 use super::trial::{KernelFacts, Trial};
 use super::turns::{Part, Turns};

@@ -20,8 +20,8 @@ use std::sync::Arc;
 
 use cudarc::driver::CudaSlice;
 
-use super::device::Device;
-use super::memory::{address, download, room};
+use super::super::device::Device;
+use super::super::memory::{address, download, room};
 use super::trial::{KernelFacts, Trial};
 use super::turns::{Part, Turns};
 use crate::error::{Result, invalid};

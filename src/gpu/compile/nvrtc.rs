@@ -14,12 +14,12 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
 
 /// Headers that kernels may include, by name.
 const HEADERS: [(&str, &str); 6] = [
-    ("layout.cuh", include_str!("../../kernels/layout.cuh")),
-    ("chunk.cuh", include_str!("../../kernels/chunk.cuh")),
-    ("ordered.cuh", include_str!("../../kernels/ordered.cuh")),
-    ("tile.cuh", include_str!("../../kernels/tile.cuh")),
-    ("orient.cuh", include_str!("../../kernels/orient.cuh")),
-    ("turn.cuh", include_str!("../../kernels/turn.cuh")),
+    ("layout.cuh", include_str!("../../../kernels/layout.cuh")),
+    ("chunk.cuh", include_str!("../../../kernels/chunk.cuh")),
+    ("ordered.cuh", include_str!("../../../kernels/ordered.cuh")),
+    ("tile.cuh", include_str!("../../../kernels/tile.cuh")),
+    ("orient.cuh", include_str!("../../../kernels/orient.cuh")),
+    ("turn.cuh", include_str!("../../../kernels/turn.cuh")),
 ];
 
 /// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not know.
@@ -49,7 +49,7 @@ struct Functions {
 }
 
 /// A loaded NVRTC.
-pub(super) struct Nvrtc {
+pub(in super::super) struct Nvrtc {
     functions: Functions,
     /// Where it was found: a path, or a name that the loader resolved.
     pub path: PathBuf,
@@ -96,7 +96,7 @@ impl<'a> Job<'a> {
 ///
 /// # Errors
 /// `Unavailable` naming what was tried and the wheel that brings it.
-pub(super) fn nvrtc() -> Result<&'static Nvrtc> {
+pub(in super::super) fn nvrtc() -> Result<&'static Nvrtc> {
     static LOADED: OnceLock<Result<Nvrtc>> = OnceLock::new();
     LOADED.get_or_init(|| Nvrtc::find(&candidates())).as_ref().map_err(Clone::clone)
 }
@@ -294,61 +294,7 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{layout, plan};
     use super::*;
-
-    fn all_subsets<'a>(of: &[&'a str]) -> Vec<Vec<&'a str>> {
-        let chosen = |set: usize| (0..of.len()).filter(move |bit| set >> bit & 1 == 1);
-        (0..1 << of.len()).map(|set| chosen(set).map(|bit| of[bit]).collect()).collect()
-    }
-
-    #[test]
-    #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_compiles_every_kernel_with_every_combination_of_defines_without_spilling() {
-        let nvrtc = nvrtc().expect("NVRTC");
-        for capability in [(7, 5), (8, 0), (9, 0), (12, 0)] {
-            for kernel in plan::KERNELS {
-                let mut sizes = Vec::new();
-                for defines in all_subsets(kernel.features) {
-                    let mut job = Job::new(kernel.name, kernel.source, &defines, capability);
-                    job.options.push("--ptxas-options=-v".into());
-                    let (cubin, log) = nvrtc.compile_with_log(&job).expect("compiles");
-                    eprintln!("{} {defines:?} {capability:?}: {} bytes, {log}", kernel.name, cubin.len());
-                    assert!(cubin.starts_with(b"\x7fELF"), "machine code is an ELF file");
-                    assert!(log.contains("0 bytes spill stores, 0 bytes spill loads"), "{log}");
-                    sizes.push(cubin);
-                }
-                // Leaving a feature out must leave code out.
-                let grows = sizes[0].len() < sizes[sizes.len() - 1].len();
-                assert_eq!(grows, !kernel.features.is_empty(), "{}: a define changes nothing", kernel.name);
-            }
-        }
-    }
-
-    #[test]
-    #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_agrees_with_the_host_on_every_size_and_offset_and_would_notice() {
-        let nvrtc = nvrtc().expect("NVRTC");
-        let check = |agreement: &layout::Agreement, host: u32| {
-            let source = format!("{}static_assert(({}) == {host}u, \"\");", layout::PRELUDE, agreement.expression);
-            nvrtc.compile(&Job::new("layout", &source, &[], (8, 0)))
-        };
-        for agreement in layout::agreements() {
-            check(&agreement, agreement.host).expect("host and device agree");
-            check(&agreement, agreement.host ^ 4).expect_err("the judge can fail");
-        }
-        nvrtc.compile(&Job::new("report", &layout::report_source(), &[], (9, 0))).expect("the report compiles");
-    }
-
-    #[test]
-    #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_refusals_carry_the_log() {
-        let nvrtc = nvrtc().expect("NVRTC");
-        let broken = nvrtc.compile(&Job::new("broken", "__global__ void f() { wrong; }", &[], (8, 0)));
-        assert!(broken.expect_err("no C++").to_string().contains("wrong"), "the log names the culprit");
-        let ancient = nvrtc.compile(&Job::new("empty", "", &[], (1, 0))).expect_err("sm_10 is gone");
-        assert!(matches!(ancient, Error::Unavailable { .. }), "{ancient}");
-    }
 
     #[test]
     fn a_missing_or_broken_nvrtc_is_refused_with_the_wheel_that_brings_it() {

@@ -2,15 +2,18 @@
 
 use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
 
-use super::super::device::Device;
-use super::super::memory::{address, upload};
 use super::super::trial::{Code, Compiled, KernelFacts};
 use super::group::{BLOCK, WARP, entry, fours};
 use crate::error::{Result, during, invalid};
+use crate::gpu::device::Device;
+use crate::gpu::memory::{address, upload};
 use crate::scene::Scene;
 
-pub(super) const CODE: Code =
-    Code { source: include_str!("../../../kernels/thesis_single.cu"), functions: &["thesis_single"], variants: &[&[]] };
+pub(super) const CODE: Code = Code {
+    source: include_str!("../../../../kernels/thesis_single.cu"),
+    functions: &["thesis_single"],
+    variants: &[&[]],
+};
 
 /// How rows of U are laid out in lines of 32 float4 (figure 3.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

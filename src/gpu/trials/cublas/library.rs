@@ -7,9 +7,9 @@ use std::sync::OnceLock;
 use cudarc::driver::CudaSlice;
 use libloading::Library;
 
-use super::super::device::Device;
-use super::super::memory::{address, room};
 use crate::error::{Error, Result, during};
+use crate::gpu::device::Device;
+use crate::gpu::memory::{address, room};
 
 /// What brings cuBLAS to a machine without it.
 const REMEDY: &str = "Install the PyPI wheel nvidia-cublas==13.* and set MODALCAST_CUBLAS to the path of its \

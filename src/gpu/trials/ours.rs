@@ -5,15 +5,15 @@ use std::sync::Arc;
 use cudarc::driver::CudaSlice;
 use serde::Serialize;
 
-use super::apply::{Apply, Lengths};
-use super::bounds::Bounds;
-use super::deform::Deform;
-use super::device::Device;
-use super::inputs::{Inputs, Values};
-use super::layout::Header;
-use super::memory::{address, download, room};
-use super::normals::Normals;
-use super::plan::{Kernel, Launch, Plan, Role, plan};
+use super::super::apply::{Apply, Lengths};
+use super::super::bounds::Bounds;
+use super::super::deform::Deform;
+use super::super::device::Device;
+use super::super::inputs::{Inputs, Values};
+use super::super::layout::Header;
+use super::super::memory::{address, download, room};
+use super::super::normals::Normals;
+use super::super::plan::{Kernel, Launch, Plan, Role, plan};
 use super::trial::{KernelFacts, Trial};
 use super::turns::Turns;
 use crate::error::{Result, during, invalid};
@@ -255,10 +255,8 @@ impl Trial for Ours {
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
-        let mut facts: Vec<KernelFacts> = self.deform.facts().into_iter().collect();
-        let functions = std::iter::once(("bounds", &self.bounds.function));
+        let functions = [("deform", &self.deform.function), ("bounds", &self.bounds.function)].into_iter();
         let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
-        facts.extend(functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()));
-        facts
+        functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
     }
 }

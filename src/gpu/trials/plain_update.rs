@@ -3,14 +3,14 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::device::Device;
-use super::memory::{address, download, room, upload};
+use super::super::device::Device;
+use super::super::memory::{address, download, room, upload};
 use super::trial::{Code, Compiled, KernelFacts};
 use crate::error::{Result, during};
 use crate::scene::Scene;
 
 pub(super) const CODE: Code = Code {
-    source: include_str!("../../kernels/plain_update.cu"),
+    source: include_str!("../../../kernels/plain_update.cu"),
     functions: &["plain_update"],
     variants: &[&[], &["SINGLE"]],
 };

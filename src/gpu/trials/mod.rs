@@ -1,0 +1,35 @@
+//! What only measures: no server runs any of it. A [`Trial`] is one way to deform, timed as kernels alone and judged by
+//! its positions.
+//!
+//! | file | what |
+//! |---|---|
+//! | [`trial`] | what a trial is, and what the driver says of its kernels |
+//! | [`turns`] | values of several steps that lie on the device before the clock starts |
+//! | [`measure`] | the stopwatch |
+//! | [`roof`] | the best rates of the device, to compare with |
+//! | [`ours`] | the deformer's own kernels as a trial |
+//! | [`mod@batch`] | many vectors q of one U at once |
+//! | [`mod@ingest`] | the way of a step's values to the device |
+//! | [`cublas`], [`plain_update`] | a library's products, and the vertex update behind them |
+//! | [`thesis`] | the kernels of the thesis |
+
+mod batch;
+mod cublas;
+mod ingest;
+mod measure;
+mod ours;
+mod plain_update;
+mod roof;
+mod thesis;
+mod trial;
+mod turns;
+
+pub use batch::Batch;
+pub use cublas::{Cublas, Peer, cublas_version};
+pub use ingest::ingest;
+pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
+pub use ours::{Extent, Ours};
+pub use roof::{Roofs, roofs};
+pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
+pub use trial::{KernelFacts, Trial};
+pub use turns::Part;

@@ -1,0 +1,103 @@
+//! Where x0, normals and tangents at rest lie on the device, in quads as `deform` reads them. Pure.
+
+use super::{QUAD, Work, has_own_tiles, is_alike, orients, own_tiles};
+use crate::domain::Shape;
+use crate::scene::Scene;
+use crate::storage::TILE_QUADS;
+
+/// Where quads of x0, normals and tangents lie: first x0 of shapes whose corners are others than their vertices, then
+/// x0, normals and tangents of those whose corner i is vertex i, then normals and tangents of the others.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in super::super) struct Quads {
+    /// Of each shape, its first quad of x0.
+    pub vertices: Vec<u32>,
+    /// Of each shape, its first quad of normals and tangents.
+    pub corners: Vec<u32>,
+    /// Quads of x0, and the first that has normals.
+    pub rest: u64,
+    pub directed: u64,
+    /// The end of all quads.
+    pub end: u64,
+}
+
+impl Quads {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let orients = orients(scene);
+        let places = |own: &dyn Fn(&Shape) -> Option<usize>, next: &mut u64| -> Vec<u32> {
+            let place = |shape| {
+                let first = *next;
+                *next += own(shape).map_or(0, |items| items.div_ceil(QUAD)) as u64;
+                first as u32
+            };
+            scene.shapes.iter().map(place).collect()
+        };
+        let (mut next, unlike) = (0, |shape: &Shape| !is_alike(shape));
+        let vertices = |shape: &Shape| shape.mesh.rest().len();
+        let before = places(&|shape| unlike(shape).then(|| vertices(shape)), &mut next);
+        let directed = next;
+        let alike = places(&|shape| is_alike(shape).then(|| vertices(shape)), &mut next);
+        let rest = next;
+        let corners = |shape: &Shape| shape.mesh.corners().vertices.len();
+        let behind = places(&|shape| (orients && unlike(shape)).then(|| corners(shape)), &mut next);
+        let choose = |others: &[u32]| {
+            let each = scene.shapes.iter().zip(&alike).zip(others);
+            each.map(|((shape, alike), other)| if is_alike(shape) { *alike } else { *other }).collect()
+        };
+        Self { vertices: choose(&before), corners: choose(&behind), rest, directed, end: next }
+    }
+}
+
+/// x0 of all shapes, three fours a quad.
+pub(in super::super) fn rest_positions(scene: &Scene, work: &Work) -> Vec<[f32; 4]> {
+    let mut all = vec![[0.0; 4]; 3 * work.quads.rest as usize];
+    let own = own_tiles(scene);
+    for (index, shape) in scene.shapes.iter().enumerate() {
+        let fours = arranged(&quads_of_items(shape.mesh.rest()), own[index]);
+        all[3 * work.quads.vertices[index] as usize..][..fours.len()].copy_from_slice(&fours);
+    }
+    all
+}
+
+/// Normals and tangents at rest of all shapes, three and four fours a quad from the first that has any; none where a
+/// scene needs none.
+pub(in super::super) fn rest_directions(scene: &Scene, work: &Work) -> [Vec<[f32; 4]>; 2] {
+    if !orients(scene) {
+        return [Vec::new(), Vec::new()];
+    }
+    let count = (work.quads.end - work.quads.directed) as usize;
+    let mut normals = vec![[0.0; 4]; 3 * count];
+    let mut tangents = vec![[0.0; 4]; if scene.needs.normal_maps { 4 * count } else { 0 }];
+    let vertices = own_tiles(scene);
+    for (index, shape) in scene.shapes.iter().enumerate() {
+        let corners = &shape.mesh.corners().normals;
+        let own = if is_alike(shape) { vertices[index] } else { has_own_tiles(corners.len()) };
+        let first = (u64::from(work.quads.corners[index]) - work.quads.directed) as usize;
+        let fours = arranged(&quads_of_items(corners), own);
+        normals[3 * first..][..fours.len()].copy_from_slice(&fours);
+        if !shape.tangents().is_empty() {
+            let fours = arranged(&quads_of_items(shape.tangents()), own);
+            tangents[4 * first..][..fours.len()].copy_from_slice(&fours);
+        }
+    }
+    [normals, tangents]
+}
+
+/// Quads of N numbers as the kernel reads them: per tile of its own `[N][width]` fours, else `[N]` fours a quad.
+fn arranged<const N: usize>(quads: &[[[f32; 4]; N]], own: bool) -> Vec<[f32; 4]> {
+    if !own {
+        return quads.as_flattened().to_vec();
+    }
+    let tile = |tile: &[[[f32; 4]; N]]| -> Vec<[f32; 4]> {
+        (0..N).flat_map(|number| tile.iter().map(move |quad| quad[number])).collect()
+    };
+    quads.chunks(TILE_QUADS).flat_map(tile).collect()
+}
+
+/// Numbers of items, as quads: what fills up is zero.
+fn quads_of_items<const N: usize>(items: &[[f32; N]]) -> Vec<[[f32; 4]; N]> {
+    let mut quads = vec![[[0.0; 4]; N]; items.len().div_ceil(QUAD)];
+    for (at, item) in items.iter().enumerate() {
+        (0..N).for_each(|number| quads[at / QUAD][number][at % QUAD] = item[number]);
+    }
+    quads
+}
