@@ -1,6 +1,8 @@
 //! The CUDA deformer against its f64 twin, on a real device. Everything that needs one is ignored without it; run with
 //! `--include-ignored --test-threads=1`. The binary needs no build tree: real inputs come from MODALCAST_DATA.
 
+#[path = "../both/mod.rs"]
+mod both;
 mod device;
 mod extremes;
 mod interop;
@@ -9,5 +11,6 @@ mod normals;
 mod real;
 mod report;
 mod scenes;
+mod stability;
 mod trials;
 mod twins;
