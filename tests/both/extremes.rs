@@ -87,7 +87,7 @@ pub(crate) fn columns_of_every_scale<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
 }
 
 /// The plain sum of modes that nearly cancel is worse than the compensated one's bound by this.
-const WORSE: f64 = 50.0;
+const WORSE: f64 = 1000.0;
 
 /// Modes in pairs that nearly cancel: compensation keeps the digits that the plain sum loses.
 pub(crate) fn modes_that_nearly_cancel<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {

@@ -1,7 +1,6 @@
 //! The checks of any deformer, on the device, and scenes that only it is for.
 
 use modalcast::config::BackendChoice;
-use modalcast::deform::Deformer;
 use modalcast::gpu::{CudaDeformer, Launch};
 use modalcast::scene::{Deformation, Scene};
 
