@@ -50,13 +50,17 @@ pub(crate) fn shears_and_mirrors<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     assert!(normal > 0.1 && tangent > 0.1);
 }
 
+/// Where a vertex is, what a triangle names, and the uvs of so many corners.
+type Place = fn(usize) -> [f32; 3];
+type Fan = fn(u32) -> [u32; 3];
+type Uvs = fn(usize) -> Vec<[f32; 2]>;
+
 /// Meshes whose triangles have no area, with and without uvs.
 fn flat_meshes() -> Vec<Mesh> {
-    let places: [&dyn Fn(usize) -> [f32; 3]; 3] =
-        [&|_| [0.5, -0.25, 1.0], &|at| [at as f32, 0.0, 0.0], &|at| [at as f32, (at * at) as f32, 1.0]];
-    let fans: [fn(u32) -> [u32; 3]; 3] =
-        [|at| [at, at + 1, at + 2], |at| [at, at + 1, at + 2], |at| [at, at, at + at % 2]];
-    let uvs: [fn(usize) -> Vec<[f32; 2]>; 3] =
+    let places: [Place; 3] =
+        [|_| [0.5, -0.25, 1.0], |at| [at as f32, 0.0, 0.0], |at| [at as f32, (at * at) as f32, 1.0]];
+    let fans: [Fan; 3] = [|at| [at, at + 1, at + 2], |at| [at, at + 1, at + 2], |at| [at, at, at + at % 2]];
+    let uvs: [Uvs; 3] =
         [|_| vec![], |count| vec![[0.5, 0.5]; count], |count| (0..count).map(|at| [at as f32, 0.0]).collect()];
     let mut meshes = Vec::new();
     for (place, fan) in places.into_iter().zip(fans) {
