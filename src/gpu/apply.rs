@@ -65,9 +65,10 @@ impl Apply {
         })
     }
 
-    /// Writes the lists; the caller has waited for the last launch. None when there are too many changes for a list.
+    /// Writes the lists; the caller has waited for the last launch. None when there are too many changes for a list, or
+    /// modes to be left out: which ones depends on q, and goes to the device with the whole state alone.
     pub(super) fn write(&mut self, packing: &Packing, state: &State, changed: &[u32]) -> Result<Option<Lengths>> {
-        if changed.len() > self.most {
+        if changed.len() > self.most || packing.scene.needs.truncation {
             return Ok(None);
         }
         let words = self.pinned.as_mut_slice().map_err(during("upload"))?;

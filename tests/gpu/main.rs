@@ -2,6 +2,8 @@
 //! `--include-ignored --test-threads=1`. The binary needs no build tree: real inputs come from MODALCAST_DATA.
 
 mod batch;
+#[path = "../both/mod.rs"]
+mod both;
 mod device;
 mod extremes;
 mod interop;
@@ -10,5 +12,6 @@ mod normals;
 mod real;
 mod report;
 mod scenes;
+mod stability;
 mod trials;
 mod twins;

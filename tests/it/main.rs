@@ -1,5 +1,7 @@
 //! Claims that need no GPU. One binary.
 
+#[path = "../both/mod.rs"]
+mod both;
 mod deformers;
 mod far;
 mod frames;
@@ -9,10 +11,13 @@ mod normals;
 mod pixels;
 mod real;
 mod restart;
+#[path = "../gpu/scenes.rs"]
+mod scenes;
 mod service;
 mod service_faults;
 mod service_files;
 mod service_harness;
+mod stability;
 mod steps;
 mod storages;
 mod tolerance;

@@ -211,34 +211,6 @@ fn a_finite_sum_survives_terms_that_overflow_and_a_sum_that_overflows_is_told() 
 }
 
 #[test]
-fn modes_that_nearly_cancel_keep_their_digits_with_compensation_and_lose_them_without() {
-    let mut noise = Noise(17);
-    let (vertices, rank) = (200, 64);
-    let half: Vec<f32> = (0..3 * vertices * rank / 2).map(|_| noise.next()).collect();
-    // The second half of the modes is the first one, nearly, and enters with the other sign.
-    let almost: Vec<f32> = half.iter().map(|entry| entry * (1.0 + 1e-5 * noise.next())).collect();
-    let columns = [half, almost].concat();
-    let q: Vec<f32> = (0..rank).map(|mode| if mode < rank / 2 { 1000.0 } else { -1000.0 }).collect();
-    let error = |compensated: bool| {
-        let scene = columns_of(vertices, columns.clone(), Deformation { compensated, ..Deformation::default() });
-        let mut state = State::rest(&scene);
-        state.q.copy_from_slice(&q);
-        let (_, positions) = run(&mut CpuDeformer::new(&scene), &state);
-        let want = reference::deform(&scene, &state).into_flattened();
-        let modes = &scene.shape_of(0).modes;
-        let excess = |(row, (got, want)): (usize, (&f32, &f64))| {
-            let terms = (0..rank).map(|mode| f64::from(modes.at(row / 3, row % 3, mode) * q[mode]).abs()).sum::<f64>();
-            // Dot2: half a unit in the last place of the sum, and gamma squared of the terms; then three roundings.
-            let bound = f64::exp2(-24.0) * 5.0 * want.abs() + (65.0 * f64::exp2(-24.0)).powi(2) * terms;
-            (f64::from(*got) - want).abs() / bound
-        };
-        positions.iter().zip(&want).enumerate().map(excess).fold(0.0, f64::max)
-    };
-    assert!(error(true) <= 1.0, "{} of the bound of a compensated sum", error(true));
-    assert!(error(false) > 50.0, "a plain sum is {} of that bound", error(false));
-}
-
-#[test]
 fn a_budget_in_metres_leaves_modes_out_and_is_kept_in_scene_units() {
     for unit in [1.0, 0.01] {
         let mut parts = Parts::named("millimetres");

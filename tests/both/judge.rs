@@ -1,0 +1,70 @@
+//! The judge of positions: errors against the f64 twin as parts of their a-priori bounds.
+
+use modalcast::reference;
+use modalcast::scene::{Scene, State};
+use modalcast::storage::bound::{Reaches, Step};
+use modalcast::storage::{QUAD, TILE_QUADS, Tiles};
+
+const TILE: usize = QUAD * TILE_QUADS;
+
+/// Of each domain the largest error of a vertex as a part of the bound of its tile; infinite for what is not finite.
+/// Modes that were left out may move a vertex by `left_out` more, in scene units.
+fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], left_out: f64) -> Vec<f64> {
+    let want = reference::deform(scene, state);
+    assert_eq!(positions.len(), 3 * want.len(), "as many vertices");
+    let storage = scene.deformation.storage;
+    let reaches = |shape| Reaches::new(shape, &Tiles::new(shape, storage));
+    let reaches: Vec<Reaches> = scene.shapes.iter().map(reaches).collect();
+    let error = |packed: usize| {
+        let square = |axis: usize| (f64::from(positions[3 * packed + axis]) - want[packed][axis]).powi(2);
+        (0..3).map(square).sum::<f64>().sqrt()
+    };
+    let part = |domain: usize| {
+        let (slot, compensated) = (scene.layout.slots[domain], scene.deformation.compensated);
+        let step = Step { q: state.q_of(scene, domain), transform: state.transforms[domain], compensated };
+        let tile = |first: usize| {
+            let bound = reaches[scene.domains[domain].shape].tile(first / TILE, &step).total() + left_out;
+            let vertices = first..slot.vertices.min(first + TILE);
+            vertices.map(|vertex| finite(error(slot.first_vertex + vertex) / bound)).fold(0.0, f64::max)
+        };
+        (0..slot.vertices).step_by(TILE).map(tile).fold(0.0, f64::max)
+    };
+    (0..scene.domains.len()).map(part).collect()
+}
+
+fn finite(part: f64) -> f64 {
+    if part.is_nan() { f64::INFINITY } else { part }
+}
+
+/// Prints the largest part of its bound that an error takes up, and refuses more than all of it.
+pub(crate) fn within(name: &str, (scene, state): (&Scene, &State), positions: &[f32], left_out: f64) {
+    let parts = parts_of_bound(scene, state, positions, left_out);
+    let worst = (0..parts.len()).max_by(|a, b| parts[*a].total_cmp(&parts[*b])).expect("a domain");
+    eprintln!("{name}: an error takes up at most {:.3} of its bound", parts[worst]);
+    assert!(parts[worst] <= 1.0, "{name}: '{}' is {} of its bound off", scene.domains[worst].name, parts[worst]);
+}
+
+/// The domains with an error beyond its bound.
+pub(crate) fn beyond((scene, state): (&Scene, &State), positions: &[f32], left_out: f64) -> Vec<usize> {
+    let parts = parts_of_bound(scene, state, positions, left_out);
+    (0..parts.len()).filter(|domain| parts[*domain] > 1.0).collect()
+}
+
+#[test]
+fn the_judge_of_bounds_refuses_a_wrong_vertex_and_what_is_not_finite() {
+    let mut random = crate::scenes::Random(1);
+    let shapes = vec![super::strip(&mut random, 130, 3), super::strip(&mut random, 7, 0)];
+    let scene = super::scene_of(shapes, 1, Default::default(), false);
+    let state = crate::scenes::state(&scene, 2);
+    let right: Vec<f32> = reference::deform(&scene, &state).as_flattened().iter().map(|x| *x as f32).collect();
+    assert_eq!(beyond((&scene, &state), &right, 0.0), [0; 0]);
+    for (at, number) in [(3 * 129, f32::NAN), (3 * 129, f32::INFINITY), (3 * 129 + 2, 0.125), (0, 7.0)] {
+        let mut wrong = right.clone();
+        wrong[at] = number;
+        assert_eq!(beyond((&scene, &state), &wrong, 0.0), [0], "{number}");
+    }
+    let mut wrong = right;
+    wrong[3 * 136] += 1e-3;
+    assert_eq!(beyond((&scene, &state), &wrong, 0.0), [1]);
+    assert_eq!(beyond((&scene, &state), &wrong, 2e-3), [0; 0]);
+}

@@ -1,0 +1,93 @@
+//! What any deformer must do at the edges of f32 and from step to step. A check takes a function that makes the deformer
+//! of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
+
+pub(crate) mod changes;
+pub(crate) mod extremes;
+mod judge;
+pub(crate) mod neighbours;
+pub(crate) mod refusal;
+pub(crate) mod surfaces;
+pub(crate) mod truncation;
+
+use std::sync::Arc;
+
+use modalcast::deform::{Deformer, Surface};
+use modalcast::domain::{Domain, Mesh, Shape};
+use modalcast::scene::{Bounds, Deformation, Scene, State};
+
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+pub(crate) use judge::{beyond, within};
+
+/// All that a step gives.
+#[derive(Debug, Clone)]
+pub(crate) struct Shown {
+    pub(crate) bounds: Bounds,
+    pub(crate) surface: Surface,
+}
+
+pub(crate) fn run(deformer: &mut dyn Deformer, state: &State) -> Shown {
+    let bounds = deformer.deform(state).expect("deforms").bounds;
+    Shown { bounds, surface: deformer.surface().expect("a surface").clone() }
+}
+
+impl Shown {
+    /// The first number that differs in a bit, in words.
+    pub(crate) fn difference(&self, other: &Self) -> Option<String> {
+        let lists = |shown: &Self| {
+            let Surface { positions, normals, tangents } = shown.surface.clone();
+            [("position", positions), ("normal", normals), ("tangent", tangents)]
+        };
+        for ((name, own), (_, other)) in lists(self).into_iter().zip(lists(other)) {
+            if own.len() != other.len() {
+                return Some(format!("{} and {} numbers of {name}s", own.len(), other.len()));
+            }
+            if let Some(at) = (0..own.len()).find(|at| own[*at].to_bits() != other[*at].to_bits()) {
+                return Some(format!("number {at} of {name}s is {} and {}", own[at], other[at]));
+            }
+        }
+        (self.bounds != other.bounds).then(|| format!("bounds {:?} and {:?}", self.bounds, other.bounds))
+    }
+}
+
+/// A shape whose corner i is its vertex i, in the unit cube.
+pub(crate) fn strip(random: &mut Random, vertices: usize, rank: usize) -> Shape {
+    let other = scenes::shape(random, vertices, rank);
+    let normals = (0..vertices).map(|_| random.triple()).collect();
+    let last = vertices as u32 - 1;
+    let triangles = (0..=last).map(|at| [at, (at + 1).min(last), (at + 2).min(last)]).collect();
+    let uvs = other.mesh.corners().uvs[..vertices].to_vec();
+    let mesh = Mesh::indexed(other.mesh.rest().to_vec(), normals, uvs, triangles).expect("a strip");
+    Shape::new(mesh, other.modes).expect("a shape")
+}
+
+/// Domains called by their index, `instances` of each shape.
+pub(crate) fn scene_of(
+    shapes: Vec<Shape>,
+    instances: usize,
+    deformation: Deformation,
+    normal_maps: bool,
+) -> Arc<Scene> {
+    let count = shapes.len();
+    let mut parts = scenes::parts(shapes);
+    parts.deformation = deformation;
+    let material = if normal_maps { NORMAL_MAPPED } else { 0 };
+    let domain = |at: usize| Domain { name: format!("domain {at}"), ..scenes::domain(at % count, material) };
+    parts.domains = (0..instances * count).map(domain).collect();
+    Scene::new(parts).expect("a scene")
+}
+
+#[test]
+fn a_bit_a_length_and_a_bound_are_differences() {
+    let surface = Surface { positions: vec![0.0; 3], normals: vec![1.0; 3], tangents: vec![] };
+    let shown = Shown { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, surface };
+    assert_eq!(shown.difference(&shown), None);
+    let spoilt = |spoil: &dyn Fn(&mut Shown)| {
+        let mut other = shown.clone();
+        spoil(&mut other);
+        shown.difference(&other)
+    };
+    assert!(spoilt(&|other| other.surface.positions[1] = -0.0).is_some());
+    assert!(spoilt(&|other| other.surface.normals[2] = 1.000_000_1).is_some());
+    assert!(spoilt(&|other| other.surface.tangents.push(0.0)).is_some());
+    assert!(spoilt(&|other| other.bounds.max[0] = f64::NAN).is_some());
+}

@@ -1,0 +1,95 @@
+//! The same domain has the same bits alone, among a thousand others, and in a scene large enough for other kernels.
+
+use std::sync::Arc;
+
+use modalcast::deform::Deformer;
+use modalcast::domain::{Domain, Shape};
+use modalcast::gpu::{Launch, plan};
+use modalcast::scene::{Deformation, Scene, State, Storage};
+
+use super::{Shown, run, strip};
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+
+/// Shapes that are looked at: smaller than a quad's multiple, in mixed tiles and in tiles of their own.
+fn looked_at() -> Vec<Shape> {
+    let mut random = Random(61);
+    vec![
+        strip(&mut random, 7, 5),
+        scenes::shape(&mut random, 33, 3),
+        strip(&mut random, 129, 33),
+        scenes::shape(&mut random, 9, 0),
+    ]
+}
+
+/// A scene with one domain of each of these between `before` and `after` domains of other shapes, and `instances` domains
+/// of a shape of four tiles; and where the first of these is.
+fn among(deformation: Deformation, (before, after): (usize, usize), instances: usize) -> (Arc<Scene>, usize) {
+    let mut random = Random(62);
+    let mut shapes: Vec<Shape> = (0..before + after).map(|at| strip(&mut random, 3 + at % 6, at % 6)).collect();
+    let own = looked_at();
+    let count = own.len();
+    shapes.splice(before..before, own);
+    shapes.push(strip(&mut random, 500, 2));
+    let many = shapes.len() - 1;
+    let mut parts = scenes::parts(shapes);
+    parts.deformation = deformation;
+    let name = |(at, shape): (usize, usize)| Domain { name: format!("{at}"), ..scenes::domain(shape, NORMAL_MAPPED) };
+    parts.domains = (0..many).chain(std::iter::repeat_n(many, instances)).enumerate().map(name).collect();
+    assert!(before + count <= parts.domains.len());
+    (Scene::new(parts).expect("a scene"), before)
+}
+
+/// The values of the looked at domains, wherever they are, amidst random others.
+fn state_of(scene: &Scene, first: usize, own: &State) -> State {
+    let mut state = scenes::state(scene, 63);
+    let mut q = own.q.iter();
+    for at in 0..own.transforms.len() {
+        state.transforms[first + at] = own.transforms[at];
+        let slot = scene.layout.slots[first + at];
+        state.q[slot.first_q..][..slot.rank].iter_mut().zip(q.by_ref()).for_each(|(to, from)| *to = *from);
+    }
+    state
+}
+
+/// Positions, normals and tangents of a domain, as bits.
+fn bits_of(shown: &Shown, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
+    let (slot, surface) = (scene.layout.slots[domain], &shown.surface);
+    [
+        &surface.positions[3 * slot.first_vertex..][..3 * slot.vertices],
+        &surface.normals[3 * slot.first_corner..][..3 * slot.corners],
+        &surface.tangents[4 * slot.first_corner..][..4 * slot.corners],
+    ]
+    .map(|numbers| numbers.iter().map(|number| number.to_bits()).collect())
+}
+
+/// Whether the GPU has so few tiles that a lane takes one vertex instead of four.
+fn is_narrow(scene: &Scene) -> bool {
+    plan(scene).kernel(Launch::Deform).expect("every scene has it").defines.contains(&"NARROW")
+}
+
+/// Alone, among a thousand, among a thousand and 270 instances; and run again after another state.
+pub(crate) fn alone_and_among_others<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    for (storage, compensated) in Storage::ALL.map(|storage| (storage, storage == Storage::Bf16)) {
+        let deformation = Deformation { storage, compensated, ..Deformation::default() };
+        let (alone, _) = among(deformation, (0, 0), 0);
+        let own = scenes::state(&alone, 64);
+        let want = run(&mut make(&alone), &own);
+        let name = storage.name();
+        for (others, instances, narrow) in [((500, 500), 0, true), ((501, 499), 270, false)] {
+            let (scene, first) = among(deformation, others, instances);
+            assert_eq!((is_narrow(&alone), is_narrow(&scene)), (true, narrow));
+            let (mut deformer, state) = (make(&scene), state_of(&scene, first, &own));
+            let got = run(&mut deformer, &state);
+            for at in 0..own.transforms.len() {
+                let (got, want) = (bits_of(&got, &scene, first + at), bits_of(&want, &alone, at));
+                assert!(got == want, "{name}, shape {at} among {} others", scene.domains.len());
+            }
+            // The judge can fail, and the run in between leaves nothing behind.
+            let other = run(&mut deformer, &scenes::state(&scene, 65));
+            assert!(bits_of(&other, &scene, first) != bits_of(&want, &alone, 0));
+            assert_eq!(run(&mut deformer, &state).difference(&got), None, "{name}: again");
+            assert_eq!(run(&mut make(&scene), &state).difference(&got), None, "{name}: anew");
+            eprintln!("{name}: alone and among {} domains the bits are the same", scene.domains.len());
+        }
+    }
+}

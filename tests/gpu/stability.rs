@@ -1,0 +1,147 @@
+//! The checks of any deformer, on the device, and scenes that only it is for.
+
+use modalcast::config::BackendChoice;
+use modalcast::gpu::{CudaDeformer, Launch};
+use modalcast::scene::{Deformation, Scene};
+
+use crate::both::{self, changes, extremes, neighbours, refusal, surfaces, truncation};
+use crate::scenes::{self, Random};
+use crate::twins::deformer;
+
+fn left_out(deformer: &CudaDeformer, _: &Scene) -> f64 {
+    deformer.truncation_bound()
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_q_of_1e30_1e_minus_38_and_denormals_stay_within_the_bound() {
+    extremes::huge_and_tiny_amounts(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_columns_that_differ_by_1e12_stay_within_the_bound() {
+    extremes::columns_of_every_scale(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_modes_that_nearly_cancel_keep_their_digits_with_compensation_and_lose_them_without() {
+    extremes::modes_that_nearly_cancel(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_finite_sums_survive_overflow_on_their_way_and_infinity_less_infinity() {
+    extremes::finite_sums_that_overflow_on_their_way(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_tiles_of_zeros_stay_where_q_of_zero_puts_them() {
+    extremes::tiles_of_zeros(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_every_rank_in_every_storage_stays_within_its_bound_down_to_one_vertex() {
+    extremes::ranks_of_all_sizes(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_shears_and_mirrors_equal_the_twin() {
+    surfaces::shears_and_mirrors(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_triangles_without_area_and_missing_uvs_give_directions_of_unit_length() {
+    surfaces::no_area_and_no_uvs(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_overflow_is_told_and_forgotten() {
+    refusal::overflow_is_told_and_forgotten(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_overflow_is_refused_by_the_name_of_its_domain() {
+    refusal::overflow_is_refused_by_name(BackendChoice::Cuda);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_errors_of_twenty_truncated_states_stay_within_the_budget() {
+    truncation::errors_within_the_budget(deformer, left_out);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_mode_that_swings_about_the_limit_does_not_flicker() {
+    truncation::no_flicker(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
+    changes::steps_of_a_few_domains(deformer);
+}
+
+/// The control of the test above: steps do go by their lists.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_domain_that_a_list_leaves_out_stays_where_it_was() {
+    assert!(changes::believes_lists(deformer));
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_domain_has_the_same_bits_alone_and_among_a_thousand() {
+    neighbours::alone_and_among_others(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_one_domain_of_four_million_vertices_stays_within_its_bound() {
+    let scene = scenes::scene(&[(4_000_000, 2)], 1, false, false);
+    let mut state = scenes::state(&scene, 91);
+    let mut deformer = deformer(&scene);
+    let positions = both::run(&mut deformer, &state).surface.positions;
+    both::within("n 4,000,000 r 2", (&scene, &state), &positions, 0.0);
+    state.q[1] = -state.q[1];
+    assert_eq!(both::beyond((&scene, &state), &positions, 0.0), [0], "the judge can fail");
+}
+
+/// Each its own shape, so that a tile holds quads of many.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_two_hundred_thousand_domains_of_seven_take_three_launches_and_stay_within_their_bounds() {
+    let mut random = Random(92);
+    let shapes: Vec<_> = (0..200_000).map(|at| both::strip(&mut random, 7, at % 5)).collect();
+    let scene = both::scene_of(shapes, 1, Deformation::default(), false);
+    let mut deformer = deformer(&scene);
+    let plan = deformer.plan();
+    eprintln!("200,000 domains of 7: at most {} launches a step, {:?}", plan.launches(), plan.kernel(Launch::Deform));
+    assert_eq!(plan.launches(), 3);
+    let mut state = scenes::state(&scene, 93);
+    let shown = both::run(&mut deformer, &state);
+    both::within("200,000 domains of 7", (&scene, &state), &shown.surface.positions, 0.0);
+    // A thousand of them change: the bits are those of the whole, and no other domain moves.
+    let few: Vec<u32> = (0..1000).map(|at| at * 199 + 7).collect();
+    changes::apply(&scene, &mut state, &mut random, (&few, &few[..500]));
+    let after = both::run(&mut deformer, &state);
+    let mut whole = state.clone();
+    whole.touch();
+    assert_eq!(after.difference(&both::run(&mut deformer, &whole)), None);
+    let moves = |domain: usize| {
+        let first = 3 * scene.layout.slots[domain].first_vertex;
+        shown.surface.positions[first..first + 21] != after.surface.positions[first..first + 21]
+    };
+    let moved = (0..scene.domains.len()).filter(|domain| moves(*domain)).count();
+    eprintln!("a thousand named: {moved} move");
+    // A fifth has no modes, and of the named ones half have a new transform.
+    assert!(moved > 800 && moved <= 1000, "{moved}");
+}

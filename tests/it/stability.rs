@@ -1,0 +1,91 @@
+//! The checks of any deformer, on the cpu.
+
+use std::sync::Arc;
+
+use modalcast::config::BackendChoice;
+use modalcast::cpu::CpuDeformer;
+use modalcast::scene::Scene;
+use modalcast::storage::Truncation;
+
+use crate::both::{changes, extremes, neighbours, refusal, surfaces, truncation};
+
+fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
+    CpuDeformer::new(scene)
+}
+
+/// How far a vertex may be off for the modes that were left out.
+fn left_out(deformer: &CpuDeformer, scene: &Scene) -> f64 {
+    let bound = |domain| deformer.truncation(domain).map_or(0.0, Truncation::bound);
+    (0..scene.domains.len()).map(bound).fold(0.0, f64::max)
+}
+
+#[test]
+fn q_of_1e30_1e_minus_38_and_denormals_stay_within_the_bound() {
+    extremes::huge_and_tiny_amounts(deformer);
+}
+
+#[test]
+fn columns_that_differ_by_1e12_stay_within_the_bound() {
+    extremes::columns_of_every_scale(deformer);
+}
+
+#[test]
+fn modes_that_nearly_cancel_keep_their_digits_with_compensation_and_lose_them_without() {
+    extremes::modes_that_nearly_cancel(deformer);
+}
+
+#[test]
+fn finite_sums_survive_overflow_on_their_way_and_infinity_less_infinity() {
+    extremes::finite_sums_that_overflow_on_their_way(deformer);
+}
+
+#[test]
+fn tiles_of_zeros_stay_where_q_of_zero_puts_them() {
+    extremes::tiles_of_zeros(deformer);
+}
+
+#[test]
+fn every_rank_in_every_storage_stays_within_its_bound_down_to_one_vertex() {
+    extremes::ranks_of_all_sizes(deformer);
+}
+
+#[test]
+fn shears_and_mirrors_equal_the_twin() {
+    surfaces::shears_and_mirrors(deformer);
+}
+
+#[test]
+fn triangles_without_area_and_missing_uvs_give_directions_of_unit_length() {
+    surfaces::no_area_and_no_uvs(deformer);
+}
+
+#[test]
+fn overflow_is_told_and_forgotten() {
+    refusal::overflow_is_told_and_forgotten(deformer);
+}
+
+#[test]
+fn overflow_is_refused_by_the_name_of_its_domain() {
+    refusal::overflow_is_refused_by_name(BackendChoice::Cpu);
+}
+
+#[test]
+fn errors_of_twenty_truncated_states_stay_within_the_budget() {
+    truncation::errors_within_the_budget(deformer, left_out);
+}
+
+#[test]
+fn a_mode_that_swings_about_the_limit_does_not_flicker() {
+    truncation::no_flicker(deformer);
+}
+
+#[test]
+fn twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
+    changes::steps_of_a_few_domains(deformer);
+    assert!(!changes::believes_lists(deformer), "the cpu compares values");
+}
+
+#[test]
+fn a_domain_has_the_same_bits_alone_and_among_a_thousand() {
+    neighbours::alone_and_among_others(deformer);
+}
