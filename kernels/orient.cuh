@@ -56,15 +56,15 @@ __device__ __forceinline__ Rows normal_rows(const Rows& m) {
 #endif
 
 
-// Turns `count` directions again, in f64: normals of three numbers, tangents of four. `from` is the first number of the
-// first, `row` leads from its x to its y; `to` is staged.
+// Turns the directions whose bits are set again, in f64: normals of three numbers, tangents of four. Only those, so that
+// a corner has the same bits whichever corners share its lane. `from` is the first number of the first, `row` leads from
+// its x to its y; `to` is staged.
 __device__ __noinline__ void turn_again(const float4* transforms, unsigned domain, const float* from, unsigned row,
-                                        float* to, unsigned count, unsigned numbers) {
+                                        float* to, unsigned set, unsigned numbers) {
     const Rows m = linear_of(transforms, domain);
-    for (unsigned i = 0; i < count; ++i) {
-        const double3 v = make_double3(from[i], from[row + i], from[2 * row + i]);
-        // Zeros are the tangents of a shape without any, and stay.
-        if (numbers == 3 || v.x != 0.0 || v.y != 0.0 || v.z != 0.0) {
+    for (unsigned i = 0; i < SPAN; ++i) {
+        if (set >> i & 1) {
+            const double3 v = make_double3(from[i], from[row + i], from[2 * row + i]);
             const float3 turned = numbers == 3 ? turn_normal(m, v) : turn(m, v);
             to[numbers * i] = turned.x;
             to[numbers * i + 1] = turned.y;
@@ -73,13 +73,13 @@ __device__ __noinline__ void turn_again(const float4* transforms, unsigned domai
     }
 }
 
-// A direction turned and of unit length; `shortest` remembers the least square of a length of those that count.
-__device__ __forceinline__ float3 turned(const Matrix& m, float x, float y, float z, bool counts, float& shortest) {
+// A direction turned and of unit length; `bit` is set in `set` when it counts and was turned with too much cancellation.
+__device__ __forceinline__ float3 turned(const Matrix& m, float x, float y, float z, unsigned bit, unsigned& set) {
     const float3 v = make_float3(fmaf(m.a.x, x, fmaf(m.a.y, y, m.a.z * z)), fmaf(m.b.x, x, fmaf(m.b.y, y, m.b.z * z)),
                                  fmaf(m.c.x, x, fmaf(m.c.y, y, m.c.z * z)));
     const float square = fmaf(v.x, v.x, fmaf(v.y, v.y, v.z * v.z));
-    // Not fminf, which would pass over a NaN.
-    shortest = counts && !(square >= shortest) ? square : shortest;
+    // A NaN counts as short.
+    set |= square > SHORT ? 0 : bit;
     // Within two units in the last place.
     const float inverse = rsqrtf(square);
     return make_float3(v.x * inverse, v.y * inverse, v.z * inverse);
@@ -97,19 +97,20 @@ struct Normals {
 
 __device__ __forceinline__ void orient_normals(const DeformArgs& args, Stage& stage, const Part& part,
                                                const Normals& rest, const Matrix& matrix, unsigned corner) {
-    float normals[FLOATS], shortest = 1.0f;
+    float normals[FLOATS];
+    unsigned set = 0;
 #pragma unroll
     for (unsigned i = 0; i < SPAN; ++i) {
-        const bool is_there = i < part.count;
-        const float3 normal = turned(matrix, rest.x.of[i], rest.y.of[i], rest.z.of[i], is_there, shortest);
+        const unsigned bit = i < part.count ? 1u << i : 0;
+        const float3 normal = turned(matrix, rest.x.of[i], rest.y.of[i], rest.z.of[i], bit, set);
         normals[3 * i] = normal.x;
         normals[3 * i + 1] = normal.y;
         normals[3 * i + 2] = normal.z;
     }
     put(stage, part, corner, normals);
-    if (!(shortest > SHORT)) {
+    if (set != 0) {
         turn_again(args.transforms, part.domain, first_of(args.rest_normals, part, 3), 4 * part.stride,
-                   staged(stage) + FLOATS * lane_of(), part.count, 3);
+                   staged(stage) + FLOATS * lane_of(), set, 3);
     }
     store(args.header->normals, stage, part);
 }
@@ -119,19 +120,20 @@ __device__ __forceinline__ void orient_tangents(const DeformArgs& args, Stage& s
                                                 const Matrix& matrix, float hand) {
     const Items x = items_of(args.rest_tangents, part, 4, 0), y = items_of(args.rest_tangents, part, 4, 1),
                 z = items_of(args.rest_tangents, part, 4, 2), sign = items_of(args.rest_tangents, part, 4, 3);
-    float shortest = 1.0f;
+    unsigned set = 0;
 #pragma unroll
     for (unsigned i = 0; i < SPAN; ++i) {
         // A shape without tangents has zeros, which stay zeros.
         const bool is_there = sign.of[i] != 0.0f;
-        const float3 tangent = turned(matrix, x.of[i], y.of[i], z.of[i], is_there, shortest);
+        const unsigned bit = is_there ? 1u << i : 0;
+        const float3 tangent = turned(matrix, x.of[i], y.of[i], z.of[i], bit, set);
         stage.numbers[SPAN * lane_of() + i] = is_there
                                                   ? make_float4(tangent.x, tangent.y, tangent.z, sign.of[i] * hand)
                                                   : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
-    if (!(shortest > SHORT)) {
+    if (set != 0) {
         turn_again(args.transforms, part.domain, first_of(args.rest_tangents, part, 4), 4 * part.stride,
-                   staged(stage) + 4 * SPAN * lane_of(), part.count, 4);
+                   staged(stage) + 4 * SPAN * lane_of(), set, 4);
     }
     store_quadruples(args.header->tangents, stage);
 }
