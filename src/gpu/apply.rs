@@ -53,7 +53,7 @@ impl Apply {
             device.context().alloc_pinned_with_flags(words.max(4), flags)
         };
         let pinned = pinned.map_err(during("allocate"))?;
-        let function = device.function(kernel.name, kernel.source, &kernel.defines)?;
+        let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
         Ok(Self {
             function,
             config: config(kernel),

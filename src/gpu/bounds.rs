@@ -18,7 +18,7 @@ pub(super) struct Bounds {
 
 impl Bounds {
     pub(super) fn new(device: &Device, kernel: &Kernel) -> Result<Self> {
-        Ok(Self { function: device.function(kernel.name, kernel.source, &kernel.defines)?, config: config(kernel) })
+        Ok(Self { function: device.function(kernel.name, kernel.source.0, &kernel.defines)?, config: config(kernel) })
     }
 
     /// Starts the kernel on `count` boxes; the result goes into the header among the values.

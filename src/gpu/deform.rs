@@ -59,7 +59,7 @@ impl Deform {
         Ok(Self {
             function: function(device, kernel)?,
             config: config(kernel),
-            listed: device.function(kernel.name, kernel.source, &listed)?,
+            listed: device.function(kernel.name, kernel.source.0, &listed)?,
             tiles: upload(device, &work.tiles)?,
             lanes: upload(device, &work.lanes)?,
             lane_scales: upload(device, &work.lane_scales)?,
@@ -150,7 +150,7 @@ impl Deform {
 
 /// The function of a kernel, refused when it is made for other blocks than were planned.
 fn function(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
-    let function = device.function(kernel.name, kernel.source, &kernel.defines)?;
+    let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
     let most = function.max_threads_per_block().map_err(during("deform"))?;
     if most == kernel.threads as i32 {
         return Ok(function);

@@ -38,7 +38,7 @@ impl Normals {
         let tangents = || upload(device, &pack::rest_tangents(scene));
         let tables = Rings::new(scene);
         Ok(Self {
-            function: device.function(kernel.name, kernel.source, &kernel.defines)?,
+            function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
             config: config(kernel),
             slots: upload(device, &slots)?,
             first_domains: upload(device, &firsts)?,

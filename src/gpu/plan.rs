@@ -65,7 +65,17 @@ pub struct Kernel {
     pub blocks: u32,
     pub threads: u32,
     #[serde(skip)]
-    pub(super) source: &'static str,
+    pub(super) source: Source,
+}
+
+/// The text of a kernel file; its name says enough where a kernel is shown.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) struct Source(pub(super) &'static str);
+
+impl std::fmt::Debug for Source {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "{} bytes", self.0.len())
+    }
 }
 
 /// What a device buffer holds.
@@ -219,12 +229,13 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     let warps = work.tiles.len() * if is_narrow(work) { 4 } else { 1 };
     let blocks_of_tiles = warps.div_ceil(threads as usize / TILE_QUADS) as u32;
     let launch = Launch::Deform;
-    let deform = Kernel { launch, name: deform.name, defines, blocks: blocks_of_tiles, threads, source: deform.source };
+    let deform =
+        Kernel { launch, name: deform.name, defines, blocks: blocks_of_tiles, threads, source: Source(deform.source) };
     let walk = |launch, kernel: &KernelSource, blocks: usize| {
         let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear)];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
         let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
-        Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: kernel.source }
+        Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: Source(kernel.source) }
     };
     let boxes = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
     let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);

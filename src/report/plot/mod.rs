@@ -20,7 +20,7 @@ const SCALE: f32 = 2.0;
 const PANEL: (f64, f64) = (440.0, 320.0);
 const MARGIN: f64 = 24.0;
 /// Height of title, subtitle and the explanation of the marks.
-const HEAD: f64 = 78.0;
+const HEAD: f64 = 94.0;
 /// Height of a line of the legend.
 const LEGEND: f64 = 22.0;
 
@@ -56,9 +56,14 @@ pub fn svg(report: &Report) -> String {
         "Error against run time",
     );
     text(&mut out, (MARGIN + 8.0, MARGIN + 40.0), "font-size=\"12\" fill=\"#555555\"", &report.made.line());
-    let marks = "filled: warm caches, hollow: cold; ringed and joined: Pareto front of the warm ones; circle: CPU, \
-                 square and triangle: CUDA, diamond: reference";
-    text(&mut out, (MARGIN + 8.0, MARGIN + 59.0), "font-size=\"12\" fill=\"#555555\"", marks);
+    let marks = [
+        "filled: warm caches, hollow: cold; ringed and joined: Pareto front",
+        "circle: CPU, square and triangle: CUDA, diamond: reference",
+    ];
+    for (line, mark) in marks.into_iter().enumerate() {
+        let at = (MARGIN + 8.0, MARGIN + 57.0 + 15.0 * line as f64);
+        text(&mut out, at, "font-size=\"12\" fill=\"#555555\"", mark);
+    }
     out.push_str(&legend);
     for (index, load) in loads.iter().enumerate() {
         let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
