@@ -50,7 +50,8 @@ constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 16;
 #elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || (defined(NORMAL_MAPS) && defined(TRUNCATED))
 constexpr unsigned RESIDENT = 20;
-#elif defined(NORMAL_MAPS) || (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16))) || __CUDA_ARCH__ < 900
+#elif defined(NORMAL_MAPS) || (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16))) || \
+    (defined(TRUNCATED) && defined(STORE_INT8)) || __CUDA_ARCH__ < 900
 constexpr unsigned RESIDENT = 24;
 #else
 constexpr unsigned RESIDENT = 28;

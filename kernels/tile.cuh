@@ -60,15 +60,16 @@ __device__ __forceinline__ Part part_of(const DeformArgs& args, unsigned tile, u
         part.rest = head.w;
         part.first_q = tail.y;
         part.first_scale = tail.z;
-    } else if (part.quad < part.width) {
-        const uint4 lane = __ldg((const uint4*)(args.lanes + head.z + part.quad));
-        items = 1 + lane.z % 4;
+    } else {
+        const unsigned at = head.z + (part.quad < part.width ? part.quad : 0);
+        const uint4 lane = __ldg((const uint4*)(args.lanes + at));
+        items = part.quad < part.width ? 1 + lane.z % 4 : 0;
         part.item = lane.x;
         part.domain = lane.z / 4;
         part.rest = lane.y;
         part.first_q = lane.w;
 #ifdef STORE_INT8
-        part.first_scale = __ldg(args.lane_scales + head.z + part.quad);
+        part.first_scale = __ldg(args.lane_scales + at);
 #endif
     }
     part.item += part.within;

@@ -97,7 +97,11 @@ impl Apply {
             };
             changes[CHANGE * index..][..CHANGE].copy_from_slice(bytemuck::cast_slice(&[change]));
         }
-        self.lists = self.lists.wrapping_add(1).max(1);
+        if self.lists == u32::MAX {
+            self.named.fill(0);
+            self.lists = 0;
+        }
+        self.lists += 1;
         let stale = list_tiles(packing, changed, (&mut self.named, self.lists), tiles);
         Ok(Some(Lengths { changed: changed.len() as u32, stale }))
     }

@@ -123,7 +123,7 @@ impl Deform {
             lanes: at(&self.lanes),
             words: at(&self.words),
             rest: at(&self.rest),
-            // Quads without normals come first and have no room; nobody reads them.
+            // Quads without normals come first and have no room; no tile of corners names them.
             rest_normals: at(&self.normals).wrapping_sub(48 * self.directed),
             rest_tangents: at(&self.tangents).wrapping_sub(64 * self.directed),
             corner_shifts: at(&self.corner_shifts),

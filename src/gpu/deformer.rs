@@ -150,7 +150,11 @@ impl CudaDeformer {
             Changed::Some(list) if state.serial == steps.serial + 1 => Some(list.as_slice()),
             _ => None,
         };
-        steps.begun = steps.begun.wrapping_add(1).max(1);
+        if steps.begun == u32::MAX {
+            // Old stamps then look new, which costs work once and is never wrong.
+            *steps = Steps::default();
+        }
+        steps.begun += 1;
         let some: Option<Lengths> = match changed {
             Some(list) if steps.shown > 0 => self.kernels.apply.write(self.kernels.deform.packing(), state, list)?,
             _ => None,
