@@ -16,12 +16,12 @@ pub(super) fn rest_quad(vertices: &[[f32; 3]]) -> [f32; 12] {
     quad
 }
 
-/// 2^s per mode such that the largest stored entry lies in [2^14, 2^15); 1 for a mode
+/// 2^s per mode such that the largest stored entry lies in [2^14, 2^15) for `F16`, in [1, 2) for `Bf16`; 1 for a mode
 /// of zeros. s is at least -149, where 2^s is the smallest f32: columns below 2^-135 are stored smaller, as exactly.
 pub(super) fn factors(modes: &Modes, storage: Storage) -> Vec<f32> {
     let top = match storage {
-        // The largest that f16 holds. Also for bf16, so that q times the factor leaves f32 no sooner than q times U does.
-        Storage::F16 | Storage::Bf16 => 14,
+        Storage::F16 => 14,
+        Storage::Bf16 => 0,
         Storage::F32 | Storage::Int8 => return Vec::new(),
     };
     let factor = |mode: usize| match largest(modes.column(mode)) {

@@ -43,8 +43,8 @@ pub struct Tiles {
 impl Tiles {
     /// Rounds a shape's U to the storage type.
     ///
-    /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15);
-    /// `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
+    /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15) or in
+    /// [1, 2); `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
     pub fn new(shape: &Shape, storage: Storage) -> Self {
         let rest = shape.mesh.rest();
         let rank = shape.modes.rank();
