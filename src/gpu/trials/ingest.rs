@@ -8,7 +8,7 @@ use super::super::inputs::{Inputs, Packing};
 use super::super::layout::Header;
 use super::super::work::Coordinates;
 use super::measure::{Cache, Timing, time};
-use super::trial::{KernelFacts, Trial};
+use super::trial::Trial;
 use crate::error::Result;
 use crate::scene::{Scene, State};
 
@@ -28,20 +28,8 @@ impl Trial for Ingest {
         self.0.borrow_mut().send(device, None)
     }
 
-    fn positions(&self, _device: &Device) -> Result<Vec<f32>> {
-        Ok(Vec::new())
-    }
-
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
-        Vec::new()
-    }
-
     fn launches(&self) -> usize {
         0
-    }
-
-    fn kernels(&self) -> Vec<KernelFacts> {
-        Vec::new()
     }
 }
 

@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::super::device::Device;
 use super::super::memory::{address, room};
 use super::roof;
-use super::trial::{KernelFacts, Trial};
+use super::trial::Trial;
 use crate::error::{Error, Result, during, invalid};
 
 /// Replays that are put into the stream at once, behind a kernel that holds it up meanwhile: the host's own pace stays
@@ -126,17 +126,8 @@ pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
             unsafe { launch.launch(SINGLE) }.map_err(during("replay"))?;
             Ok(())
         }
-        fn positions(&self, _: &Device) -> Result<Vec<f32>> {
-            Ok(Vec::new())
-        }
-        fn bytes(&self) -> Vec<(&'static str, u64)> {
-            Vec::new()
-        }
         fn launches(&self) -> usize {
             1
-        }
-        fn kernels(&self) -> Vec<KernelFacts> {
-            Vec::new()
         }
     }
     let nothing = Nothing(device.function("nothing", roof::CODE.source, &[])?);

@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::super::device::Device;
 use super::super::memory::{address, download, room};
 use super::measure::{Cache, Span, Timing, empty_replay, gigabytes_per_second, time};
-use super::trial::{Code, KernelFacts, Trial};
+use super::trial::{Code, Trial};
 use crate::error::{Error, Result, during};
 
 /// Threads of a block, and bytes of a word.
@@ -185,20 +185,8 @@ impl Trial for Stream {
         launch(device, &self.function, self.blocks, self.buffers)
     }
 
-    fn positions(&self, _: &Device) -> Result<Vec<f32>> {
-        Ok(Vec::new())
-    }
-
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
-        Vec::new()
-    }
-
     fn launches(&self) -> usize {
         1
-    }
-
-    fn kernels(&self) -> Vec<KernelFacts> {
-        Vec::new()
     }
 }
 
