@@ -182,7 +182,8 @@ impl CudaDeformer {
                 Some(_) => inputs.write_header(&header)?,
                 None => inputs.write(&header, state)?,
             }
-            graph.as_ref().map_or(Ok(()), |graph| graph.launch().map_err(during("deform")))
+            let missing = || Error::Fault { stage: "deform", reason: "no graph was captured".into() };
+            graph.as_ref().ok_or_else(missing)?.launch().map_err(during("deform"))
         })?;
         self.device.stream().synchronize().map_err(during("deform"))?;
         self.steps.shown = self.steps.begun;

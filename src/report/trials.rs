@@ -17,7 +17,16 @@ use crate::scene::{Deformation, Scene, State, Storage};
 type Make = Box<dyn Fn(&Device, &Arc<Scene>, &[State]) -> Result<Box<dyn Trial>>>;
 
 /// The parts of a step that peers launch, and how their names tell.
-const PARTS: [(gpu::Part, &str); 2] = [(gpu::Part::Uq, " Uq"), (gpu::Part::Whole, "")];
+const PARTS: [(gpu::Part, &str); 2] = [(gpu::Part::Uq, UQ), (gpu::Part::Whole, "")];
+
+/// How the names of variants end that do less than all vertices of a step: such a time is no rival of a whole one.
+const UQ: &str = " Uq";
+const CHANGED: &str = ", 1 % changed";
+
+/// Whether a variant of that name does only a part of the vertices' work.
+pub(super) fn is_partial(name: &str) -> bool {
+    [UQ, CHANGED].iter().any(|ending| name.ends_with(ending))
+}
 
 /// A trial as a variant. It is made once, when its states are known.
 struct Tried {
@@ -35,7 +44,7 @@ pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_
     let ours = |storage: Storage, extent: Extent| -> Offer {
         let deformation = Deformation { storage, ..scene.deformation };
         let suffix = match extent {
-            Extent::Uq => " Uq",
+            Extent::Uq => UQ,
             Extent::Positions => " positions",
             Extent::Whole => "",
         };
@@ -71,7 +80,7 @@ const MANY: usize = 400;
 /// A step that changes one domain in a hundred, spread over the list.
 fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offer {
     let list: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
-    let label = Label::new("cuda f32 positions, 1 % changed", Backend::Cuda, scene);
+    let label = Label::new(format!("cuda f32 positions{CHANGED}"), Backend::Cuda, scene);
     let make: Make = Box::new(move |device, scene, states| {
         Ok(Box::new(Ours::of_changed(device, scene, states, (Extent::Positions, Some(&list)))?))
     });

@@ -57,7 +57,7 @@ pub fn svg(report: &Report) -> String {
     );
     text(&mut out, (MARGIN + 8.0, MARGIN + 40.0), "font-size=\"12\" fill=\"#555555\"", &report.made.line());
     let marks = [
-        "filled: warm caches, hollow: cold; ringed and joined: Pareto front",
+        "filled: warm, hollow: cold; ringed: Pareto front (partial work aside)",
         "circle: CPU, square and triangle: CUDA, diamond: reference",
     ];
     for (line, mark) in marks.into_iter().enumerate() {

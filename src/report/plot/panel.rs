@@ -7,6 +7,7 @@ use super::{PANEL, text};
 use crate::deform::Backend;
 use crate::report::table::{Row, pareto};
 use crate::report::timing::Cache;
+use crate::report::trials::is_partial;
 
 /// Space for labels left, right, above and below the plotted area.
 const LEFT: f64 = 66.0;
@@ -78,9 +79,10 @@ impl<'a> Panel<'a> {
         (self.time.place(us), self.error.place(error))
     }
 
-    /// Indices of the warm points on the Pareto front.
+    /// Indices of the warm points on the Pareto front of variants that compute all vertices.
     fn front(&self) -> Vec<usize> {
-        let warm: Vec<usize> = (0..self.points.len()).filter(|at| self.points[*at].0.cache == Cache::Warm).collect();
+        let rivals = |row: &Row| row.cache == Cache::Warm && !is_partial(&row.name);
+        let warm: Vec<usize> = (0..self.points.len()).filter(|at| rivals(self.points[*at].0)).collect();
         let points: Vec<(f64, f64)> = warm.iter().map(|at| self.points[*at].1).collect();
         pareto(&points).into_iter().map(|at| warm[at]).collect()
     }
@@ -215,6 +217,7 @@ mod tests {
             row("a", "first", Cache::Warm, (1.0, 1e-6)),
             row("a", "second", Cache::Warm, (1.05, 9e-7)),
             row("a", "beaten", Cache::Warm, (2.0, 1e-5)),
+            row("a", "does less Uq", Cache::Warm, (0.5, 1e-8)),
         ];
         let panel = Panel::new((0.0, 0.0), "a", &rows.iter().collect::<Vec<_>>());
         assert_eq!(panel.front(), [1, 2]);
