@@ -2,10 +2,13 @@
 //   boxes   [count][6] u32: `ordered` maxima of -x, -y, -z, x, y, z  (in)
 //   bounds  in the header: the maxima of all; zeros before the launch (in, out)
 // Launch: BLOCK threads a block, any number of blocks. CPU twin: Bounds::union.
+#include "chain.cuh"
 #include "layout.cuh"
 #include "ordered.cuh"
 
 extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant__ BoundsArgs args) {
+    await_previous();
+    admit_next();
     __shared__ unsigned most[6];
     if (threadIdx.x < 6) {
         most[threadIdx.x] = 0;

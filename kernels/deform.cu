@@ -22,6 +22,7 @@
 //
 // The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
 // agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost.
+#include "chain.cuh"
 #include "chunk.cuh"
 #include "ordered.cuh"
 #include "orient.cuh"
@@ -414,6 +415,7 @@ __device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, 
 }
 
 extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) deform(const __grid_constant__ DeformArgs args) {
+    admit_next();
     __shared__ Shared shared[WARPS];
     const unsigned warp = blockIdx.x * WARPS + threadIdx.x / 32;
 #ifdef LISTED

@@ -20,6 +20,7 @@
 // Each thread gathers for itself, without atomics, in the order of the ring: runs agree bit by bit. Sums are f64:
 // differences and products of two f32 are exact there or nearly so, and neither over- nor underflow, so that nothing
 // needs scaling, however large, small or far away a domain is.
+#include "chain.cuh"
 #include "turn.cuh"
 
 // The part of B that an area must exceed, and the squared length of the sum of two opposite unit vectors; as the twin's.
@@ -139,6 +140,7 @@ __device__ float3 beside(const float3& tangent, const float3& normal) {
 }
 
 extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constant__ NormalsArgs args) {
+    await_previous();
     __shared__ float staged[3 * BLOCK];
     const unsigned corner = blockIdx.x * BLOCK + threadIdx.x;
     const unsigned domain = domain_of(args.slots, args.first_domains, min(corner, args.corners - 1));

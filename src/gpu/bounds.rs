@@ -1,13 +1,14 @@
 //! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`.
 
-use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{CudaFunction, LaunchConfig};
 
+use super::chain;
 use super::deform::config;
 use super::device::Device;
 use super::inputs::Values;
 use super::layout::BoundsArgs;
 use super::plan::Kernel;
-use crate::error::{Result, during};
+use crate::error::Result;
 
 /// The kernel.
 #[derive(Debug)]
@@ -24,11 +25,9 @@ impl Bounds {
     /// Starts the kernel on `count` boxes; the result goes into the header among the values.
     pub(super) fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
         let args = BoundsArgs { header: values.header, boxes, count, reserved: 0 };
-        let mut launch = device.stream().launch_builder(&self.function);
         // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
-        // allocated them.
-        unsafe { launch.arg(&args).launch(self.config) }.map_err(during("bounds"))?;
-        Ok(())
+        // allocated them. The kernel waits first.
+        unsafe { chain::launch(device, &self.function, self.config, &args) }
     }
 }
 

@@ -16,6 +16,7 @@
 //! | `work`, `pack`, `rings`, `layout` | scene to the tables that kernels read; pure |
 //! | `inputs` | the values of a step on their way to the device |
 //! | `apply`, `deform`, `bounds`, `normals` | the launchers |
+//! | `chain` | a launch that begins while the kernel before it ends |
 //! | `deformer` | the graph of a step, and its answer |
 //! | `output`, `interop` | where the vertices go |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
@@ -24,6 +25,7 @@
 
 mod apply;
 mod bounds;
+mod chain;
 mod compile;
 mod deform;
 mod deformer;

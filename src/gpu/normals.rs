@@ -1,7 +1,8 @@
 //! Launches `kernels/normals.cu`: world normals and tangents that follow the deformed triangles, of all corners at once.
 
-use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig};
 
+use super::chain;
 use super::deform::config;
 use super::device::Device;
 use super::inputs::Values;
@@ -10,7 +11,7 @@ use super::memory::{address, upload};
 use super::pack;
 use super::plan::Kernel;
 use super::rings::{self, Rings};
-use crate::error::{Result, during};
+use crate::error::Result;
 use crate::scene::Scene;
 
 /// The kernel and what it reads of a scene.
@@ -74,12 +75,10 @@ impl Normals {
             groups: self.groups,
             reserved: 0,
         };
-        let mut launch = device.stream().launch_builder(&self.function);
-        // SAFETY: `NormalsArgs` is the kernel's only argument. The tables come from `pack` and `rings`: members name
+        // SAFETY: `NormalsArgs` is the kernel's only argument, and the kernel waits first. The tables come from `pack` and `rings`: members name
         // groups, rings name vertices of their shape, and slots lie inside the rest normals, tangents, positions and
         // transforms of the same scene. The header's outputs have the sizes that `Output` checked, and tangents are
         // read and written only by a kernel that was compiled for a scene with normal maps.
-        unsafe { launch.arg(&args).launch(self.config) }.map_err(during("normals"))?;
-        Ok(())
+        unsafe { chain::launch(device, &self.function, self.config, &args) }
     }
 }
