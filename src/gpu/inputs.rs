@@ -238,7 +238,7 @@ impl Choice {
             let amounts = Amounts {
                 q: state.q_of(scene, domain),
                 reaches: &self.reaches[scene.domains[domain].shape],
-                norm: bound::norm(&state.transforms[domain]),
+                norm: bound::norm(&state.composed(scene, domain)),
             };
             truncation.update(amounts, self.budget);
             self.bound = self.bound.max(truncation.bound());

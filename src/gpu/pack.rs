@@ -96,6 +96,7 @@ pub(super) mod tests {
             material,
             placement: Transform::IDENTITY,
             attachment: None::<Attachment>,
+            follows: None,
             runs: vec![],
             rest_q: Vec::new(),
             shares_q_with: None,

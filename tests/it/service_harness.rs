@@ -103,6 +103,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
+        follows: None,
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),

@@ -104,6 +104,7 @@ impl Plant<'_> {
             runs: piece.runs,
             placement: moved(base),
             attachment,
+            follows: None,
             rest_q: Vec::new(),
             shares_q_with: None,
             metadata: Metadata { eigenvalues: Vec::new(), notes: [("plant.kind".into(), kind.into())].into() },

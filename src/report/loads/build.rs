@@ -188,6 +188,7 @@ pub(super) fn scene(name: String, shapes: Vec<Shape>, count: usize, dressed: boo
             runs: Vec::new(),
             placement: Transform::from_parts(&turn.into_inner(), &Vector3::from(place)),
             attachment: None,
+            follows: None,
             rest_q: Vec::new(),
             shares_q_with: None,
             metadata: Metadata::default(),
