@@ -13,9 +13,10 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
 /// Headers that kernels may include, by name.
-const HEADERS: [(&str, &str); 6] = [
+const HEADERS: [(&str, &str); 7] = [
     ("layout.cuh", include_str!("../../../kernels/layout.cuh")),
     ("chunk.cuh", include_str!("../../../kernels/chunk.cuh")),
+    ("follow.cuh", include_str!("../../../kernels/follow.cuh")),
     ("ordered.cuh", include_str!("../../../kernels/ordered.cuh")),
     ("tile.cuh", include_str!("../../../kernels/tile.cuh")),
     ("orient.cuh", include_str!("../../../kernels/orient.cuh")),
