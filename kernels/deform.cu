@@ -50,9 +50,11 @@ constexpr unsigned RESIDENT = 16;
 constexpr unsigned WARPS = 1;
 #if defined(COMPENSATED) && defined(STORE_INT8)
 constexpr unsigned RESIDENT = 16;
-#elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || (defined(NORMAL_MAPS) && defined(TRUNCATED))
+#elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || \
+    (defined(NORMAL_MAPS) && (defined(TRUNCATED) || defined(FOLLOWERS)))
 constexpr unsigned RESIDENT = 20;
-#elif defined(NORMAL_MAPS) || (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16))) || \
+#elif defined(NORMAL_MAPS) || \
+    (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16) || defined(FOLLOWERS))) || \
     (defined(TRUNCATED) && defined(STORE_INT8)) || __CUDA_ARCH__ < 900
 constexpr unsigned RESIDENT = 24;
 #else
@@ -60,7 +62,11 @@ constexpr unsigned RESIDENT = 28;
 #endif
 #else
 constexpr unsigned WARPS = 2;
+#if defined(ORIENT) && defined(FOLLOWERS)
+constexpr unsigned RESIDENT = 12;
+#else
 constexpr unsigned RESIDENT = 16;
+#endif
 #endif
 
 #ifdef MODES

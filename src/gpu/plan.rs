@@ -341,7 +341,7 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pack::tests::{exact, scene, stored};
+    use super::super::pack::tests::{exact, on_the_first, scene, stored};
     use super::super::rings::Rings;
     use super::*;
 
@@ -375,6 +375,18 @@ mod tests {
         assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
         assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
         assert_eq!(full.left_out.len(), 4);
+    }
+
+    #[test]
+    fn followers_need_no_room_in_a_step_and_cost_frames_and_a_macro_once() {
+        let (own, on_others) = (scene(&[(7, 2), (300, 0)], false, true), on_the_first(&[(7, 2), (300, 0)]));
+        let (alone, follows) = (plan(&own), plan(&on_others));
+        assert_eq!((alone.bytes_in, follows.bytes_in), (80 + 48 * 4 + 4 * 4, 80 + 48 + 4 * 4), "three of four follow");
+        assert_eq!(follows.bytes(Role::Frames), 8 * 4 + 48 * 3);
+        assert_eq!(alone.bytes(Role::Frames), 0);
+        let with = |plan: &Plan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
+        assert_eq!((with(&alone), with(&follows)), (0, 2), "in `deform` and `apply`");
+        assert_eq!(follows.launches(), alone.launches());
     }
 
     #[test]
