@@ -3,7 +3,8 @@
 //   changes         [changed]                                            (in)
 //   new_transforms  [changed][3] float4                                  (in)
 //   new_q           the coordinates of the changed domains, packed       (in)
-//   transforms, q   of all domains                                       (out)
+//   following       with FOLLOWERS: per domain its mover, and whether it has a frame in it  (in)
+//   transforms, q   of all movers, and of all domains                    (out)
 //   stale           [stale] u32: the tiles that hold a changed domain    (in)
 //   stamps          [domains] u32: the step that last changed a domain   (out)
 //   list            [stale] u32, on the device                           (out)
@@ -15,8 +16,17 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
     const unsigned changed = args.header->changed;
     for (unsigned index = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; index < changed; index += warps) {
         const Change change = args.changes[index];
-        if (lane < 3) {
-            args.transforms[3 * (size_t)change.domain + lane] = args.new_transforms[3 * (size_t)index + lane];
+#ifdef FOLLOWERS
+        // A follower is in the list for its coordinates, or for its stamp.
+        const Following own = args.following[change.domain];
+        const unsigned mover = own.mover;
+        const bool moves = own.frame == NO_FRAME;
+#else
+        const unsigned mover = change.domain;
+        const bool moves = true;
+#endif
+        if (moves && lane < 3) {
+            args.transforms[3 * (size_t)mover + lane] = args.new_transforms[3 * (size_t)index + lane];
         }
         if (lane == 3) {
             args.stamps[change.domain] = args.header->step;

@@ -6,7 +6,9 @@
 //   rest_normals  likewise; with ORIENT                                                                     (in)
 //   rest_tangents likewise, x, y, z and the sign of the bitangent; with ORIENT and NORMAL_MAPS              (in)
 //   corner_shifts with SHIFTED: per domain, from a vertex to its corner                                     (in)
-//   transforms    [domains][3] float4: the rows of world_from_domain, relative to the state's origin        (in)
+//   transforms    [movers][3] float4: the rows of world_from_domain, relative to the state's origin         (in)
+//   following     with FOLLOWERS: per domain its mover, and its frame among                                 (in)
+//   frames        [followers][3] float4: the rows of mover_from_domain; else every domain is a mover        (in)
 //   q             packed coordinates, times the factor of their mode with STORE_F16 and STORE_BF16          (in)
 //   scales        with STORE_INT8: per tile of U and mode                                                   (in)
 //   kept          with TRUNCATED: per domain the chunks that are summed, ascending                          (in)
@@ -49,9 +51,11 @@ constexpr unsigned RESIDENT = 16;
 constexpr unsigned WARPS = 1;
 #if defined(COMPENSATED) && defined(STORE_INT8)
 constexpr unsigned RESIDENT = 16;
-#elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || (defined(NORMAL_MAPS) && defined(TRUNCATED))
+#elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || \
+    (defined(NORMAL_MAPS) && (defined(TRUNCATED) || defined(FOLLOWERS)))
 constexpr unsigned RESIDENT = 20;
-#elif defined(NORMAL_MAPS) || (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16))) || \
+#elif defined(NORMAL_MAPS) || \
+    (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16) || defined(FOLLOWERS))) || \
     (defined(TRUNCATED) && defined(STORE_INT8)) || __CUDA_ARCH__ < 900
 constexpr unsigned RESIDENT = 24;
 #else
@@ -59,7 +63,11 @@ constexpr unsigned RESIDENT = 28;
 #endif
 #else
 constexpr unsigned WARPS = 2;
+#if defined(ORIENT) && defined(FOLLOWERS)
+constexpr unsigned RESIDENT = 12;
+#else
 constexpr unsigned RESIDENT = 16;
+#endif
 #endif
 
 #ifdef MODES
@@ -251,7 +259,23 @@ __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned t
 #endif
         bent[axis] = (double)rest[4 * axis * part.stride + vertex] + sum;
     }
+#ifdef FOLLOWERS
+    // One after the other: the product of both may overflow f32.
+    const Following own = following_of(transforms_of(args), part.domain);
+    const float4* rows = args.transforms + 3 * (size_t)own.mover;
+    if (own.frame != NO_FRAME) {
+        double framed[3];
+        for (unsigned axis = 0; axis < 3; ++axis) {
+            const float4 row = args.frames[3 * (size_t)own.frame + axis];
+            framed[axis] = row.x * bent[0] + row.y * bent[1] + row.z * bent[2] + row.w;
+        }
+        for (unsigned axis = 0; axis < 3; ++axis) {
+            bent[axis] = framed[axis];
+        }
+    }
+#else
     const float4* rows = args.transforms + 3 * (size_t)part.domain;
+#endif
     float placed[3];
     for (unsigned axis = 0; axis < 3; ++axis) {
         const float4 row = rows[axis];
@@ -306,15 +330,12 @@ struct Shared {
 // What a vertex has besides its modes: x0 and T.
 struct Base {
     Items x, y, z;
-    float4 a, b, c;
+    Affine t;
     __device__ __forceinline__ void load(const DeformArgs& args, const Part& part) {
         x = items_of(args.rest, part, 3, 0);
         y = items_of(args.rest, part, 3, 1);
         z = items_of(args.rest, part, 3, 2);
-        const float4* rows = args.transforms + 3 * (size_t)part.domain;
-        a = __ldg(rows);
-        b = __ldg(rows + 1);
-        c = __ldg(rows + 2);
+        t = place_of(transforms_of(args), part.domain);
     }
 };
 
@@ -326,9 +347,9 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
     for (unsigned i = 0; i < SPAN; ++i) {
         const float px = base.x.of[i] + bent[i], py = base.y.of[i] + bent[SPAN + i],
                     pz = base.z.of[i] + bent[2 * SPAN + i];
-        world[3 * i] = placed(base.a, px, py, pz);
-        world[3 * i + 1] = placed(base.b, px, py, pz);
-        world[3 * i + 2] = placed(base.c, px, py, pz);
+        world[3 * i] = placed(base.t.a, px, py, pz);
+        world[3 * i + 1] = placed(base.t.b, px, py, pz);
+        world[3 * i + 2] = placed(base.t.c, px, py, pz);
         // Zero, unless one of them is not finite.
         total = fmaf(0.0f, world[3 * i] + world[3 * i + 1] + world[3 * i + 2], total);
     }

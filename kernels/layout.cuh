@@ -12,6 +12,9 @@ constexpr unsigned NO_GROUPS = 0xffffffffu;
 // Marks the first vertex of each fan of a ring.
 constexpr unsigned RING_START = 0x80000000u;
 
+// In place of the frame of a domain that follows no other.
+constexpr unsigned NO_FRAME = 0xffffffffu;
+
 // The start of a step's inputs, copied with them: where to write, and what is to be computed anew.
 struct Header {
     float* positions;
@@ -76,6 +79,13 @@ struct Change {
 };
 static_assert(sizeof(Change) == 16, "Change differs from src/gpu/layout.rs");
 
+// Whose transform a domain has, and which frame it has in it; with FOLLOWERS.
+struct Following {
+    unsigned mover; // in the transforms
+    unsigned frame;
+};
+static_assert(sizeof(Following) == 8, "Following differs from src/gpu/layout.rs");
+
 struct DeformArgs {
     const Header* header;
     const Tile* tiles;
@@ -88,6 +98,8 @@ struct DeformArgs {
     const float* scales;
     const unsigned* lane_scales;
     const float4* transforms;
+    const Following* following;
+    const float4* frames;
     const float* q;
     const unsigned* list;
     const unsigned* kept_counts;
@@ -96,7 +108,7 @@ struct DeformArgs {
     unsigned count; // of tiles
     unsigned reserved;
 };
-static_assert(sizeof(DeformArgs) == 136, "DeformArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/gpu/layout.rs");
 
 struct BoundsArgs {
     Header* header;
@@ -112,12 +124,13 @@ struct ApplyArgs {
     const float4* new_transforms;
     const float* new_q;
     const unsigned* stale;
+    const Following* following;
     float4* transforms;
     float* q;
     unsigned* stamps;
     unsigned* list;
 };
-static_assert(sizeof(ApplyArgs) == 72, "ApplyArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/gpu/layout.rs");
 
 struct NormalsArgs {
     const Header* header;
@@ -126,6 +139,8 @@ struct NormalsArgs {
     const float* rest_normals;
     const float4* rest_tangents;
     const float4* transforms;
+    const Following* following;
+    const float4* frames;
     const unsigned* stamps;
     const unsigned* members;
     const unsigned* begins;
@@ -136,7 +151,7 @@ struct NormalsArgs {
     unsigned groups;
     unsigned reserved;
 };
-static_assert(sizeof(NormalsArgs) == 104, "NormalsArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/gpu/layout.rs");
 
 // Whether a domain changed after this output was last written.
 __device__ inline bool is_stale(const Header* header, const unsigned* stamps, unsigned domain) {

@@ -1,7 +1,8 @@
 // Unit normals and tangents that follow the deformed triangles, for every corner of every domain, in one launch.
 //   rest_normals   [3][rest_corners] f32, one plane per axis                                            (in)
 //   rest_tangents  [..] float4: unit tangent, sign of the bitangent; read only with NORMAL_MAPS         (in)
-//   transforms     [domains][3] float4: the rows of world_from_domain; A is their first three columns  (in)
+//   transforms     [movers][3] float4: the rows of world_from_domain; A is their first three columns   (in)
+//   following, frames  with FOLLOWERS, as `deform` has them                                             (in)
 //   members        [..] u32: the smoothing group of each corner of a shape that has any                 (in)
 //   begins, rings  [groups + 1] u32 and what they point into: src/domain/smoothing.rs                   (in)
 //   group_normals  [3][groups] f32: geometric unit normals at rest, zeros where there is none           (in)
@@ -149,7 +150,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
     }
     if (corner < args.corners) {
         const NormalSlot slot = args.slots[domain];
-        const Rows linear = linear_of(args.transforms, domain);
+        const Rows linear = linear_of(transforms_of(args), domain);
         const Turn followed = turn_of(args, slot, linear, corner);
         const float* rest = args.rest_normals + slot.first_normal + (corner - slot.first);
         const size_t plane = args.rest_corners;

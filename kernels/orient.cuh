@@ -26,13 +26,34 @@ __device__ __forceinline__ float largest_of(float a, float b, float c) {
 }
 
 // The linear part of a transform, its largest entry about 1: a power of two changes no digit.
-__device__ __forceinline__ Matrix matrix_of(const float4* transforms, unsigned domain) {
-    const float4* rows = transforms + 3 * (size_t)domain;
-    const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
+__device__ __forceinline__ Matrix scaled(const Affine& t) {
+    const float4 a = t.a, b = t.b, c = t.c;
     const float largest = fmaxf(fmaxf(largest_of(a.x, a.y, a.z), largest_of(b.x, b.y, b.z)), largest_of(c.x, c.y, c.z));
     const float scale = scale_of(largest);
     return {make_float3(a.x * scale, a.y * scale, a.z * scale), make_float3(b.x * scale, b.y * scale, b.z * scale),
             make_float3(c.x * scale, c.y * scale, c.z * scale)};
+}
+
+#ifdef FOLLOWERS
+__device__ __forceinline__ float4 linear_row_of(const float3& t, const Matrix& f) {
+    return make_float4(fmaf(t.x, f.a.x, fmaf(t.y, f.b.x, t.z * f.c.x)), fmaf(t.x, f.a.y, fmaf(t.y, f.b.y, t.z * f.c.y)),
+                       fmaf(t.x, f.a.z, fmaf(t.y, f.b.z, t.z * f.c.z)), 0.0f);
+}
+#endif
+
+// That of a domain. Both parts of a follower's are scaled before they are multiplied, so that nothing overflows.
+__device__ __forceinline__ Matrix matrix_of(const Transforms& transforms, unsigned domain) {
+#ifdef FOLLOWERS
+    const Following own = following_of(transforms, domain);
+    const Matrix t = scaled(affine_at(transforms.rows, own.mover));
+    if (own.frame == NO_FRAME) {
+        return t;
+    }
+    const Matrix f = scaled(affine_at(transforms.frames, own.frame));
+    return scaled(Affine{linear_row_of(t.a, f), linear_row_of(t.b, f), linear_row_of(t.c, f)});
+#else
+    return scaled(affine_at(transforms.rows, domain));
+#endif
 }
 
 #ifdef SHEAR
@@ -59,7 +80,7 @@ __device__ __forceinline__ Rows normal_rows(const Rows& m) {
 // Turns the directions whose bits are set again, in f64: normals of three numbers, tangents of four. Only those, so that
 // a corner has the same bits whichever corners share its lane. `from` is the first number of the first, `row` leads from
 // its x to its y; `to` is staged.
-__device__ __noinline__ void turn_again(const float4* transforms, unsigned domain, const float* from, unsigned row,
+__device__ __noinline__ void turn_again(Transforms transforms, unsigned domain, const float* from, unsigned row,
                                         float* to, unsigned set, unsigned numbers) {
     const Rows m = linear_of(transforms, domain);
     for (unsigned i = 0; i < SPAN; ++i) {
@@ -109,7 +130,7 @@ __device__ __forceinline__ void orient_normals(const DeformArgs& args, Stage& st
     }
     put(stage, part, corner, normals);
     if (set != 0) {
-        turn_again(args.transforms, part.domain, first_of(args.rest_normals, part, 3), 4 * part.stride,
+        turn_again(transforms_of(args), part.domain, first_of(args.rest_normals, part, 3), 4 * part.stride,
                    staged(stage) + FLOATS * lane_of(), set, 3);
     }
     store(args.header->normals, stage, part);
@@ -132,7 +153,7 @@ __device__ __forceinline__ void orient_tangents(const DeformArgs& args, Stage& s
                                                   : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
     if (set != 0) {
-        turn_again(args.transforms, part.domain, first_of(args.rest_tangents, part, 4), 4 * part.stride,
+        turn_again(transforms_of(args), part.domain, first_of(args.rest_tangents, part, 4), 4 * part.stride,
                    staged(stage) + 4 * SPAN * lane_of(), set, 4);
     }
     store_quadruples(args.header->tangents, stage);
@@ -147,12 +168,12 @@ __device__ __forceinline__ void orient(const DeformArgs& args, Stage& stage, con
     }
 #endif
 #ifdef SHEAR
-    orient_normals(args, stage, part, rest, rounded(normal_rows(linear_of(args.transforms, part.domain))), corner);
+    orient_normals(args, stage, part, rest, rounded(normal_rows(linear_of(transforms_of(args), part.domain))), corner);
 #else
-    orient_normals(args, stage, part, rest, matrix_of(args.transforms, part.domain), corner);
+    orient_normals(args, stage, part, rest, matrix_of(transforms_of(args), part.domain), corner);
 #endif
 #ifdef NORMAL_MAPS
-    const float hand = (float)hand_of(linear_of(args.transforms, part.domain));
-    orient_tangents(args, stage, part, matrix_of(args.transforms, part.domain), hand);
+    const float hand = (float)hand_of(linear_of(transforms_of(args), part.domain));
+    orient_tangents(args, stage, part, matrix_of(transforms_of(args), part.domain), hand);
 #endif
 }

@@ -3,19 +3,14 @@
 //
 // A is handled in f64: cofactors and determinant of a nearly singular A cancel, and the sign of the determinant decides
 // which way a surface faces. Products of two f32 are exact in f64, and every other step is rounded as the twin rounds
-// it (no fused multiply-add), so that what vanishes there vanishes here. Nothing over- or underflows.
+// it (no fused multiply-add), so that what vanishes there vanishes here. Nothing over- or underflows. A of a follower is
+// the product of two, in f64 too.
 #pragma once
-#include "layout.cuh"
+#include "follow.cuh"
 
 struct Rows {
     double3 a, b, c;
 };
-
-__device__ inline Rows linear_of(const float4* transforms, unsigned domain) {
-    const float4* rows = transforms + 3 * (size_t)domain;
-    const float4 a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
-    return {make_double3(a.x, a.y, a.z), make_double3(b.x, b.y, b.z), make_double3(c.x, c.y, c.z)};
-}
 
 __device__ inline double minor_of(double a, double b, double c, double d) {
     return __dsub_rn(__dmul_rn(a, d), __dmul_rn(b, c));
@@ -23,6 +18,32 @@ __device__ inline double minor_of(double a, double b, double c, double d) {
 
 __device__ inline double dot(const double3& row, const double3& v) {
     return __dadd_rn(__dadd_rn(__dmul_rn(row.x, v.x), __dmul_rn(row.y, v.y)), __dmul_rn(row.z, v.z));
+}
+
+__device__ inline double3 linear_row(const float4& row) {
+    return make_double3(row.x, row.y, row.z);
+}
+
+#ifdef FOLLOWERS
+__device__ inline double3 linear_row(const float4& row, const Affine& f) {
+    const double3 t = linear_row(row);
+    return make_double3(dot(t, make_double3(f.a.x, f.b.x, f.c.x)), dot(t, make_double3(f.a.y, f.b.y, f.c.y)),
+                        dot(t, make_double3(f.a.z, f.b.z, f.c.z)));
+}
+#endif
+
+__device__ inline Rows linear_of(const Transforms& transforms, unsigned domain) {
+#ifdef FOLLOWERS
+    const Following own = following_of(transforms, domain);
+    const Affine t = affine_at(transforms.rows, own.mover);
+    if (own.frame != NO_FRAME) {
+        const Affine f = affine_at(transforms.frames, own.frame);
+        return {linear_row(t.a, f), linear_row(t.b, f), linear_row(t.c, f)};
+    }
+#else
+    const Affine t = affine_at(transforms.rows, domain);
+#endif
+    return {linear_row(t.a), linear_row(t.b), linear_row(t.c)};
 }
 
 // +1 or -1; of a zero determinant its sign bit decides, as in the twin.

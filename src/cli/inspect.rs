@@ -59,6 +59,7 @@ fn json(scene: &Scene) -> Value {
             "bytes": bytes_of(scene, index),
             "shape": domain.shape,
             "parent": domain.attachment.as_ref().map(|attachment| attachment.parent),
+            "follows": domain.follows.map(|follow| follow.parent),
             "material": scene.materials[domain.material].name,
         })
     };

@@ -21,7 +21,7 @@ pub(super) struct Changes {
 impl Changes {
     /// Compares a step with the one before and remembers it.
     pub(super) fn follow(&mut self, scene: &Scene, state: &State) {
-        let count = state.transforms.len();
+        let count = scene.domains.len();
         let Some((q, transforms)) = &mut self.last else {
             self.last = Some((state.q.clone(), state.transforms.clone()));
             (self.flags, self.every) = (vec![true; count], true);
@@ -32,7 +32,8 @@ impl Changes {
         self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
             let slot = &scene.layout.slots[domain];
             let range = slot.first_q..slot.first_q + slot.rank;
-            *flag = bits(&last_transforms[domain].0) != bits(&state.transforms[domain].0)
+            let mover = scene.movers.of(domain);
+            *flag = bits(&last_transforms[mover].0) != bits(&state.transforms[mover].0)
                 || bits(&last_q[range.clone()]) != bits(&state.q[range]);
         });
         self.domains.clear();

@@ -73,8 +73,8 @@ fn deform_tile<const COMPENSATED: bool>(
         scratch.sums[..12 * place.quads].fill(0.0);
     }
     add_rest(&tiles.rest()[place.first_quad..][..place.quads], &mut scratch.sums);
-    let transform = &inputs.state.transforms[tile.domain()];
-    let extent = put(transform, &mut scratch.sums, 4 * place.quads, out);
+    let transform = inputs.state.transform_of(inputs.scene, tile.domain());
+    let extent = put(&transform, &mut scratch.sums, 4 * place.quads, out);
     if extent.is_finite() { extent } else { rescue(inputs, tile, out) }
 }
 
@@ -131,14 +131,14 @@ fn put(transform: &Transform, bent: &mut Coordinates, width: usize, out: &mut [f
 #[inline(never)]
 fn rescue(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> Extent {
     let tiles = inputs.tiles_of(tile);
-    let transform = &inputs.state.transforms[tile.domain()].0;
+    let transform = inputs.state.composed(inputs.scene, tile.domain()).exact();
     let q = if tiles.rank() > 0 { inputs.summed(tile).q } else { &[] };
     let mut extent = Extent::EMPTY;
     for (at, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
             let bent = bent_in_f64(tiles, q, tile.first() + at);
             for (row, out) in out.iter_mut().enumerate() {
-                let [x, y, z, offset] = [0, 1, 2, 3].map(|column| f64::from(transform[4 * row + column]));
+                let [x, y, z, offset] = [0, 1, 2, 3].map(|column| transform[4 * row + column]);
                 *out = (x * bent[0] + y * bent[1] + z * bent[2] + offset) as f32;
             }
         }

@@ -49,7 +49,7 @@ impl Kept {
             }
             let q = state.q_of(scene, domain);
             let reaches = &reaches[scene.domains[domain].shape];
-            list.truncation.update(Amounts { q, reaches, norm: bound::norm(&state.transforms[domain]) }, *budget);
+            list.truncation.update(Amounts { q, reaches, norm: bound::norm(&state.composed(scene, domain)) }, *budget);
             list.q.fill(0.0);
             list.chunks.clear();
             for mode in list.truncation.kept() {

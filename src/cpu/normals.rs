@@ -68,7 +68,7 @@ impl<'a> Bent<'a> {
         Self {
             smoothing: scene.shape_of(domain).smoothing(),
             positions: &positions[3 * slot.first_vertex..][..3 * slot.vertices],
-            area_turn: cofactors(&state.transforms[domain].linear()),
+            area_turn: cofactors(&state.composed(scene, domain).linear()),
         }
     }
 

@@ -20,7 +20,7 @@ pub(super) fn orient(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut
 
 /// World normals of a tile.
 pub(super) fn orient_normals(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
-    let linear = state.transforms[tile.domain()].linear();
+    let linear = state.composed(scene, tile.domain()).linear();
     // Without shear A itself turns normals, up to a mirror's sign, which the cofactors carry.
     let turn = if scene.needs.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
     let turn = scaled(turn);
@@ -36,7 +36,7 @@ pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: &Tile, out: &m
     if tangents.is_empty() {
         return;
     }
-    let linear = state.transforms[tile.domain()].linear();
+    let linear = state.composed(scene, tile.domain()).linear();
     let hand = linear.determinant().signum() as f32;
     let turn = scaled(linear);
     for ([x, y, z, sign], out) in tangents[tile.first()..][..tile.count()].iter().zip(out.chunks_exact_mut(4)) {

@@ -3,6 +3,7 @@
 //! Positions are metres times the scene's unit. Behind the constructors of this module no length, index or float is
 //! checked again.
 
+mod composed;
 mod material;
 mod mesh;
 mod modes;
@@ -11,6 +12,7 @@ mod tangents;
 mod texture;
 mod transform;
 
+pub use composed::Composed;
 pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};
@@ -91,6 +93,15 @@ pub struct Attachment {
     pub rows: Vec<u32>,
 }
 
+/// A constant place on another domain: T = T_parent F. The parent's modes do not move it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Follow {
+    /// Index of the domain that is followed: smaller than that of the follower. It may follow another one itself.
+    pub parent: usize,
+    /// F, `parent_from_child`.
+    pub frame: Transform,
+}
+
 /// Where a material begins in a domain's triangles; it holds until the next run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Run {
@@ -110,9 +121,11 @@ pub struct Domain {
     /// Several materials by runs of triangles, the first at triangle 0, ascending; empty when all triangles have
     /// `material`.
     pub runs: Vec<Run>,
-    /// `world_from_domain` until a step says otherwise.
+    /// `world_from_domain` until a step says otherwise. That of a follower is computed, whatever was given.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
+    /// Steps name no transform of a domain that follows another one.
+    pub follows: Option<Follow>,
     /// The coordinates until a step says otherwise; its length is the rank, or 0 for all zeros.
     pub rest_q: Vec<f32>,
     /// A domain with a smaller index and the same rank whose coordinates this one shares (glTF node weights).

@@ -150,7 +150,7 @@ fn push_origins(selection: &Selection, cells: Option<&Cells>, bytes: &mut Vec<u8
     let scene = &selection.scene;
     let metres = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
     let Some(cells) = cells else { return scene.origin };
-    let own = || selection.domains.iter().map(|domain| cells.cell_of(*domain as usize));
+    let own = || selection.domains.iter().map(|domain| cells.cell_of(scene.movers.of(*domain as usize)));
     if own().any(|cell| cell != cells.shared()) {
         bytes.extend(own().map(metres).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
     }

@@ -102,7 +102,7 @@ impl Staged {
         };
         let view = nearest_cell(camera.eye().into());
         let positions = &self.deformer.surface()?.positions;
-        let (positions, bounds) = apart.seen_from(view, &self.scene.layout.slots, positions);
+        let (positions, bounds) = apart.seen_from(view, &self.scene, positions);
         renderer.upload_apart(buffers, &positions, view)?;
         Ok((bounds, true))
     }

@@ -18,6 +18,7 @@ pub(super) fn two_strips() -> Arc<Scene> {
         runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
+        follows: None,
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),

@@ -8,7 +8,7 @@ use super::inputs::{Packing, Values};
 use super::layout::{ApplyArgs, Change};
 use super::plan::Kernel;
 use crate::error::{Result, during};
-use crate::scene::State;
+use crate::scene::{Scene, State};
 
 /// A list pays while it has at most this part of the domains; else the whole state is copied.
 const MOST: usize = 4;
@@ -19,6 +19,7 @@ pub(super) struct Apply {
     function: CudaFunction,
     config: LaunchConfig,
     pinned: PinnedHostSlice<u32>,
+    /// Entries.
     most: usize,
     coordinates: usize,
     /// Per tile, the list that named it last, and how many lists there were.
@@ -37,14 +38,29 @@ pub(super) struct Lengths {
 const CHANGE: usize = size_of::<Change>() / 4;
 const TRANSFORM: usize = 12;
 
-/// The longest list for so many domains.
-pub(super) const fn most_changes(domains: usize) -> usize {
-    domains / MOST
+/// The most domains that a list may be about.
+const fn most_domains(scene: &Scene) -> usize {
+    scene.domains.len() / MOST
+}
+
+/// The most entries that it has then: silent domains have none.
+pub(super) fn most_changes(scene: &Scene) -> usize {
+    let silent = (0..scene.domains.len()).filter(|domain| is_silent(scene, *domain)).count();
+    most_domains(scene).min(scene.domains.len() - silent)
+}
+
+/// Whether all that a step changes of a domain is known from its mover: it has neither a transform nor coordinates, and
+/// nobody asks for its stamp, which only normals that follow the surface do. Its tiles are computed anew all the same.
+fn is_silent(scene: &Scene, domain: usize) -> bool {
+    scene.needs.followers
+        && !scene.needs.exact_normals
+        && scene.layout.slots[domain].rank == 0
+        && scene.movers.frame_of(domain).is_some()
 }
 
 impl Apply {
     pub(super) fn new(device: &Device, packing: &Packing, kernel: &Kernel) -> Result<Self> {
-        let most = most_changes(packing.scene.domains.len());
+        let most = most_changes(&packing.scene);
         let coordinates = packing.coordinates.total;
         let words = (CHANGE + TRANSFORM) * most + coordinates + packing.tiles;
         // SAFETY: the kernel reads only what `write` wrote.
@@ -68,19 +84,22 @@ impl Apply {
     /// Writes the lists; the caller has waited for the last launch. None when there are too many changes for a list, or
     /// modes to be left out: which ones depends on q, and goes to the device with the whole state alone.
     pub(super) fn write(&mut self, packing: &Packing, state: &State, changed: &[u32]) -> Result<Option<Lengths>> {
-        if changed.len() > self.most || packing.scene.needs.truncation {
+        let scene = &packing.scene;
+        if changed.len() > most_domains(scene) || scene.needs.truncation {
             return Ok(None);
         }
         let words = self.pinned.as_mut_slice().map_err(during("upload"))?;
         let (changes, rest) = words.split_at_mut(CHANGE * self.most);
         let (transforms, rest) = rest.split_at_mut(TRANSFORM * self.most);
         let (q, tiles) = rest.split_at_mut(self.coordinates);
-        let mut source = 0;
-        for (index, domain) in changed.iter().enumerate() {
+        let (mut source, mut count) = (0, 0);
+        let told = changed.iter().filter(|domain| !is_silent(scene, **domain as usize));
+        for (index, domain) in told.enumerate() {
             let (at, first) = (*domain as usize, source);
-            let transform: [u32; TRANSFORM] = bytemuck::cast(state.transforms[at].0);
+            // Of a follower it is not read.
+            let transform: [u32; TRANSFORM] = bytemuck::cast(state.transforms[scene.movers.of(at)].0);
             transforms[TRANSFORM * index..][..TRANSFORM].copy_from_slice(&transform);
-            let own = state.q_of(&packing.scene, at);
+            let own = state.q_of(scene, at);
             if source + own.len().next_multiple_of(4) > self.coordinates {
                 // Domains that share coordinates may name them more often than there is room.
                 return Ok(None);
@@ -96,6 +115,7 @@ impl Apply {
                 source: first as u32,
             };
             changes[CHANGE * index..][..CHANGE].copy_from_slice(bytemuck::cast_slice(&[change]));
+            count += 1;
         }
         if self.lists == u32::MAX {
             self.named.fill(0);
@@ -103,7 +123,7 @@ impl Apply {
         }
         self.lists += 1;
         let stale = list_tiles(packing, changed, (&mut self.named, self.lists), tiles);
-        Ok(Some(Lengths { changed: changed.len() as u32, stale }))
+        Ok(Some(Lengths { changed: count, stale }))
     }
 
     /// Starts the kernel; the header among the values says how long the lists are. That of tiles goes to `tiles`.
@@ -118,6 +138,7 @@ impl Apply {
             new_transforms,
             new_q,
             stale: new_q + 4 * self.coordinates as u64,
+            following: values.following,
             transforms: values.transforms,
             q: values.q,
             stamps: values.stamps,

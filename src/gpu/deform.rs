@@ -130,6 +130,8 @@ impl Deform {
             scales: at(&self.scales),
             lane_scales: at(&self.lane_scales),
             transforms: values.transforms,
+            following: values.following,
+            frames: values.frames,
             q: values.q,
             list: at(&self.list),
             kept_counts: values.kept_counts,

@@ -1,7 +1,7 @@
 //! The values of a step on their way to the device: written to pinned memory once, in the order in which they lie there.
 //!
 //! ```text
-//! [header][transforms: 12 f32 a domain][q, whole chunks of modes][with truncation: kept chunks of each domain]
+//! [header][transforms: 12 f32 a mover][q, whole chunks of modes][with truncation: kept chunks of each domain]
 //! ```
 //! The pinned memory is write-combined: it is written from front to back and never read here.
 
@@ -11,8 +11,8 @@ use bytemuck::Pod;
 use cudarc::driver::{CudaSlice, PinnedHostSlice, result};
 
 use super::device::Device;
-use super::layout::Header;
-use super::memory::{address, room};
+use super::layout::{Following, Header};
+use super::memory::{address, room, upload};
 use super::work::Coordinates;
 use crate::error::{Result, during};
 use crate::scene::{Scene, State};
@@ -36,6 +36,9 @@ pub(super) struct Packing {
 pub(super) struct Values {
     pub header: u64,
     pub transforms: u64,
+    /// Constant: who follows whom, and by which frame. Of a scene with followers.
+    pub following: u64,
+    pub frames: u64,
     pub q: u64,
     /// Per domain, the step that last changed it.
     pub stamps: u64,
@@ -58,7 +61,7 @@ impl Sizes {
         let domains = scene.domains.len() as u64;
         let (truncation, per_chunk) = (scene.needs.truncation, modes_per_chunk(scene.deformation.storage));
         Self {
-            transforms: 48 * domains,
+            transforms: 48 * scene.movers.count() as u64,
             q: 4 * coordinates.total as u64,
             kept_counts: if truncation { 4 * domains.next_multiple_of(4) } else { 0 },
             kept: if truncation { 2 * (coordinates.total / per_chunk).next_multiple_of(8) as u64 } else { 0 },
@@ -77,6 +80,8 @@ pub(super) struct Inputs {
     pinned: PinnedHostSlice<f32>,
     buffer: CudaSlice<u8>,
     stamps: CudaSlice<u8>,
+    following: CudaSlice<u8>,
+    frames: CudaSlice<u8>,
     sizes: Sizes,
     truncation: Option<Choice>,
 }
@@ -92,6 +97,8 @@ impl Inputs {
             pinned,
             buffer: room(device, sizes.total())?,
             stamps: room(device, 4 * packing.scene.domains.len() as u64)?,
+            following: upload(device, &following(&packing.scene))?,
+            frames: upload(device, packing.scene.movers.frames())?,
             sizes,
             truncation: packing.scene.needs.truncation.then(|| Choice::new(&packing.scene)),
         })
@@ -103,7 +110,9 @@ impl Inputs {
         let q = transforms + self.sizes.transforms;
         let kept_counts = q + self.sizes.q;
         let kept = kept_counts + self.sizes.kept_counts;
-        Values { header, transforms, q, stamps: address(device, &self.stamps), kept_counts, kept }
+        let [stamps, following, frames] =
+            [&self.stamps, &self.following, &self.frames].map(|buffer| address(device, buffer));
+        Values { header, transforms, following, frames, q, stamps, kept_counts, kept }
     }
 
     /// Writes a whole step. Nothing may be reading the pinned memory: the caller has waited for the last copy.
@@ -151,6 +160,11 @@ impl Inputs {
     pub(super) fn truncation_bound(&self) -> f64 {
         self.truncation.as_ref().map_or(0.0, |choice| choice.bound)
     }
+}
+
+/// Who follows whom; empty where nobody does.
+pub(super) fn following(scene: &Scene) -> Vec<Following> {
+    scene.movers.following().iter().map(|[mover, frame]| Following { mover: *mover, frame: *frame }).collect()
 }
 
 impl Packing {
@@ -238,7 +252,7 @@ impl Choice {
             let amounts = Amounts {
                 q: state.q_of(scene, domain),
                 reaches: &self.reaches[scene.domains[domain].shape],
-                norm: bound::norm(&state.transforms[domain]),
+                norm: bound::norm(&state.composed(scene, domain)),
             };
             truncation.update(amounts, self.budget);
             self.bound = self.bound.max(truncation.bound());

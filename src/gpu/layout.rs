@@ -4,6 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use cudarc::driver::DeviceRepr;
 
 use crate::domain::RING_START;
+use crate::scene::Movers;
 use crate::storage::TILE_QUADS;
 
 /// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
@@ -14,6 +15,9 @@ pub(super) const NO_TANGENTS: u32 = u32::MAX;
 
 /// `first_member` of a shape without smoothing groups.
 pub(super) const NO_GROUPS: u32 = u32::MAX;
+
+/// `frame` of a domain that follows no other.
+pub(super) const NO_FRAME: u32 = Movers::NO_FRAME;
 
 /// Parts of [`Tile`]'s kind: the items of the last quad, or 0 in a mixed tile; what is computed of the items.
 pub(super) const TILE_LAST: u8 = 7;
@@ -72,6 +76,14 @@ pub(super) struct Change {
     pub source: u32,
 }
 
+/// Whose transform a domain has, and which frame it has in it; in scenes with followers.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Following {
+    pub mover: u32,
+    pub frame: u32,
+}
+
 /// Arguments of `deform`; pointers are device addresses, as in all arguments below.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
@@ -87,6 +99,8 @@ pub(super) struct DeformArgs {
     pub scales: u64,
     pub lane_scales: u64,
     pub transforms: u64,
+    pub following: u64,
+    pub frames: u64,
     pub q: u64,
     pub list: u64,
     pub kept_counts: u64,
@@ -115,6 +129,7 @@ pub(super) struct ApplyArgs {
     pub new_transforms: u64,
     pub new_q: u64,
     pub stale: u64,
+    pub following: u64,
     pub transforms: u64,
     pub q: u64,
     pub stamps: u64,
@@ -142,6 +157,8 @@ pub(super) struct NormalsArgs {
     pub rest_normals: u64,
     pub rest_tangents: u64,
     pub transforms: u64,
+    pub following: u64,
+    pub frames: u64,
     pub stamps: u64,
     pub members: u64,
     pub begins: u64,
@@ -157,11 +174,12 @@ const _: () = assert!(size_of::<Header>() == 80, "Header differs from kernels/la
 const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<DeformArgs>() == 136, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Following>() == 8, "Following differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BoundsArgs>() == 24, "BoundsArgs differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<ApplyArgs>() == 72, "ApplyArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<NormalsArgs>() == 104, "NormalsArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from kernels/layout.cuh");
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in kernels/layout.cuh.
 unsafe impl DeviceRepr for DeformArgs {}
@@ -202,16 +220,17 @@ pub fn agreements() -> Vec<Agreement> {
         Tile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
         Lane { item, rest, domain, first_q }
         Change { domain, first_q, count, source }
+        Following { mover, frame }
         DeformArgs {
             header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
-            transforms, q, list, kept_counts, kept, boxes, count, reserved
+            transforms, following, frames, q, list, kept_counts, kept, boxes, count, reserved
         }
         BoundsArgs { header, boxes, count, reserved }
-        ApplyArgs { header, changes, new_transforms, new_q, stale, transforms, q, stamps, list }
+        ApplyArgs { header, changes, new_transforms, new_q, stale, following, transforms, q, stamps, list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {
-            header, slots, first_domains, rest_normals, rest_tangents, transforms, stamps, members, begins, rings,
-            group_normals, corners, rest_corners, groups, reserved
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, following, frames, stamps, members,
+            begins, rings, group_normals, corners, rest_corners, groups, reserved
         }
     };
     for (name, host) in [("TILE_LAST", TILE_LAST), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)] {
@@ -221,6 +240,7 @@ pub fn agreements() -> Vec<Agreement> {
     list.push(Agreement { expression: "BLOCK".into(), host: BLOCK });
     list.push(Agreement { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
     list.push(Agreement { expression: "NO_GROUPS".into(), host: NO_GROUPS });
+    list.push(Agreement { expression: "NO_FRAME".into(), host: NO_FRAME });
     list.push(Agreement { expression: "RING_START".into(), host: RING_START });
     list
 }

@@ -65,6 +65,8 @@ impl Normals {
             rest_normals: address(device, &self.rest_normals),
             rest_tangents: self.rest_tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
             transforms: values.transforms,
+            following: values.following,
+            frames: values.frames,
             stamps: values.stamps,
             members: address(device, &self.members),
             begins: address(device, &self.begins),

@@ -72,7 +72,9 @@ pub(super) fn tangent_count(scene: &Scene) -> usize {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::domain::{Attachment, Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+    use crate::domain::{
+        Attachment, Corners, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Texture, Transform,
+    };
     use crate::scene::{Normals, Parts, Storage};
     use std::sync::Arc;
 
@@ -96,6 +98,7 @@ pub(super) mod tests {
             material,
             placement: Transform::IDENTITY,
             attachment: None::<Attachment>,
+            follows: None,
             runs: vec![],
             rest_q: Vec::new(),
             shares_q_with: None,
@@ -106,6 +109,14 @@ pub(super) mod tests {
     /// A scene whose shapes have these vertices and ranks, each used by two domains.
     pub(in super::super) fn scene(shapes: &[(usize, usize)], normal_maps: bool, rigid: bool) -> Arc<Scene> {
         Scene::new(parts(shapes, normal_maps, rigid)).expect("a scene")
+    }
+
+    /// The same without normal maps, all but the first domain following it.
+    pub(in super::super) fn on_the_first(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, true);
+        let follow = Follow { parent: 0, frame: Transform::IDENTITY };
+        parts.domains.iter_mut().skip(1).for_each(|domain| domain.follows = Some(follow));
+        Scene::new(parts).expect("a scene")
     }
 
     /// The same without normal maps, U stored so.

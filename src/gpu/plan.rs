@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::apply::most_changes;
-use super::inputs::Sizes;
+use super::inputs::{Sizes, following};
 use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
 use super::pack;
 use super::rings::Counts;
@@ -25,14 +25,24 @@ pub(super) const KERNELS: [KernelSource; 4] = [
     KernelSource {
         name: "deform",
         source: include_str!("../../kernels/deform.cu"),
-        features: &["MODES", "NARROW", "TRUNCATED", "COMPENSATED", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"],
+        features: &[
+            "MODES",
+            "NARROW",
+            "TRUNCATED",
+            "COMPENSATED",
+            "ORIENT",
+            "SHIFTED",
+            "NORMAL_MAPS",
+            "SHEAR",
+            "FOLLOWERS",
+        ],
     },
     KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &[] },
-    KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &[] },
+    KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &["FOLLOWERS"] },
     KernelSource {
         name: "normals",
         source: include_str!("../../kernels/normals.cu"),
-        features: &["NORMAL_MAPS", "SHEAR"],
+        features: &["NORMAL_MAPS", "SHEAR", "FOLLOWERS"],
     },
 ];
 
@@ -97,6 +107,8 @@ pub enum Role {
     Boxes,
     /// The step that last changed each domain.
     Stamps,
+    /// Who follows whom, and the frames of those who do.
+    Frames,
     RestNormals,
     RestTangents,
     /// The smoothing group of each corner, where normals follow the surface.
@@ -188,8 +200,11 @@ pub fn plan(scene: &Scene) -> Plan {
         buffers.push((Role::Rings, 4 * (counts.groups + 1 + counts.rings)));
         buffers.push((Role::GroupNormals, 12 * counts.groups));
     }
-    let changes =
-        (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * (coordinates.total + work.tiles.len());
+    if needs.followers {
+        let frames = size_of_val(scene.movers.frames()) + size_of_val(following(scene).as_slice());
+        buffers.push((Role::Frames, frames as u64));
+    }
+    let changes = (size_of::<Change>() + 48) * most_changes(scene) + 4 * (coordinates.total + work.tiles.len());
     Plan {
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
@@ -232,13 +247,13 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     let deform =
         Kernel { launch, name: deform.name, defines, blocks: blocks_of_tiles, threads, source: Source(deform.source) };
     let walk = |launch, kernel: &KernelSource, blocks: usize| {
-        let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear)];
+        let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear), ("FOLLOWERS", needs.followers)];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
         let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
         Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: Source(kernel.source) }
     };
     let boxes = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
-    let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
+    let changes = most_changes(scene).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
     let mut kernels = vec![deform, walk(Launch::Bounds, &bounds, boxes)];
     if needs.exact_normals {
         kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
@@ -259,6 +274,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
         ("SHIFTED", !corner_shifts(scene).is_empty()),
         ("NORMAL_MAPS", orients && needs.normal_maps),
         ("SHEAR", orients && needs.shear),
+        ("FOLLOWERS", needs.followers),
     ];
     let on = flags.iter().filter(|(_, on)| *on).map(|(name, _)| *name);
     on.chain(storage_define(scene.deformation.storage).filter(|_| needs.modes)).collect()
@@ -285,6 +301,7 @@ fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
         (needs.truncation, LeftOut { feature: "truncation", what: "lists of modes in `deform`", bytes: 0 }),
         (needs.exact_normals, exact_normals),
         (needs.compensated, LeftOut { feature: "compensated", what: "the compensation in `deform`", bytes: 0 }),
+        (needs.followers, LeftOut { feature: "followers", what: "frames, and products of transforms", bytes: 0 }),
     ];
     all.into_iter().filter(|(needed, _)| !needed).map(|(_, part)| part).collect()
 }
@@ -324,7 +341,7 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pack::tests::{exact, scene, stored};
+    use super::super::pack::tests::{exact, on_the_first, scene, stored};
     use super::super::rings::Rings;
     use super::*;
 
@@ -343,7 +360,10 @@ mod tests {
         assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
         assert_eq!(bare.bytes_in, 80 + 48 * 4, "a header and four transforms, no q");
         let left_out: Vec<_> = bare.left_out.iter().map(|part| part.feature).collect();
-        assert_eq!(left_out, ["modes", "normal_maps", "shear", "truncation", "exact_normals", "compensated"]);
+        assert_eq!(
+            left_out,
+            ["modes", "normal_maps", "shear", "truncation", "exact_normals", "compensated", "followers"]
+        );
         assert_eq!(bare.left_out[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
     }
 
@@ -354,7 +374,19 @@ mod tests {
         assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
         assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
         assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
-        assert_eq!(full.left_out.len(), 3);
+        assert_eq!(full.left_out.len(), 4);
+    }
+
+    #[test]
+    fn followers_need_no_room_in_a_step_and_cost_frames_and_a_macro_once() {
+        let (own, on_others) = (scene(&[(7, 2), (300, 0)], false, true), on_the_first(&[(7, 2), (300, 0)]));
+        let (alone, follows) = (plan(&own), plan(&on_others));
+        assert_eq!((alone.bytes_in, follows.bytes_in), (80 + 48 * 4 + 4 * 4, 80 + 48 + 4 * 4), "three of four follow");
+        assert_eq!(follows.bytes(Role::Frames), 8 * 4 + 48 * 3);
+        assert_eq!(alone.bytes(Role::Frames), 0);
+        let with = |plan: &Plan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
+        assert_eq!((with(&alone), with(&follows)), (0, 2), "in `deform` and `apply`");
+        assert_eq!(follows.launches(), alone.launches());
     }
 
     #[test]

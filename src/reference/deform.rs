@@ -8,7 +8,7 @@ pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     for domain in 0..scene.domains.len() {
         let shape = scene.shape_of(domain);
         let q = state.q_of(scene, domain);
-        let world_from_domain = state.transforms[domain].0.map(f64::from);
+        let world_from_domain = state.composed(scene, domain).exact();
         for (vertex, rest) in shape.mesh.rest().iter().enumerate() {
             let mut bent = rest.map(f64::from);
             for (component, coordinate) in bent.iter_mut().enumerate() {

@@ -105,7 +105,7 @@ fn for_each_turned(scene: &Scene, state: &State, positions: &[[f64; 3]], mut act
         let Some(smoothing) = shape.smoothing() else { continue };
         let rest = areas(&shape.mesh, smoothing.members(), |vertex| shape.mesh.rest()[vertex].map(f64::from));
         let now = areas(&shape.mesh, smoothing.members(), |vertex| positions[slot.first_vertex + vertex]);
-        let area_turn = cofactors(&state.transforms[domain].linear());
+        let area_turn = cofactors(&state.composed(scene, domain).linear());
         for (corner, group) in smoothing.members().iter().enumerate() {
             let group = *group as usize;
             let has_normal = smoothing.normals()[group] != [0.0; 3];

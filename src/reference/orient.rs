@@ -9,7 +9,7 @@ use crate::scene::{Scene, State};
 pub fn orient_normals(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     let mut normals = Vec::with_capacity(scene.layout.corners);
     for domain in 0..scene.domains.len() {
-        let linear = state.transforms[domain].linear();
+        let linear = state.composed(scene, domain).linear();
         // The inverse transpose is the cofactor matrix over the determinant; only its sign survives normalising.
         let turn = cofactors(&linear) * linear.determinant().signum();
         for normal in &scene.shape_of(domain).mesh.corners().normals {
@@ -28,7 +28,7 @@ pub fn orient_tangents(scene: &Scene, state: &State) -> Vec<[f64; 4]> {
     let mut tangents = Vec::with_capacity(scene.layout.corners);
     for domain in 0..scene.domains.len() {
         let shape = scene.shape_of(domain);
-        let linear = state.transforms[domain].linear();
+        let linear = state.composed(scene, domain).linear();
         let hand = linear.determinant().signum();
         for corner in 0..shape.mesh.corners().vertices.len() {
             let Some([x, y, z, sign]) = shape.tangents().get(corner) else {

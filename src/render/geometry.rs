@@ -196,6 +196,7 @@ pub(super) mod tests {
             runs: vec![],
             placement,
             attachment: None,
+            follows: None,
             rest_q: vec![],
             shares_q_with: None,
             metadata: Metadata::default(),

@@ -56,10 +56,10 @@ pub fn positions(scene: &Scene, truth: &Truth, take: Take<'_>) -> Vec<[f64; 3]> 
         let stored = take.storage.and_then(|ingredients| ingredients.tiles(shape));
         let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
         let sums = sum(vertices.clone(), entries, &q);
-        let rest = &scene.shapes[shape].mesh.rest()[vertices];
+        let (rest, transform) = (&scene.shapes[shape].mesh.rest()[vertices], truth.transform_of(scene, domain));
         for (rest, sum) in rest.iter().zip(&sums) {
             let bent = std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]);
-            out.push(placed(&truth.transforms[domain], bent));
+            out.push(placed(&transform, bent));
         }
     })
 }
@@ -71,15 +71,16 @@ pub fn judge(scene: &Scene, state: &State, ingredients: &Ingredients) -> Vec<Jud
         let shape = &scene.shapes[scene.domains[domain].shape];
         let q = own(scene, domain, &truth);
         let sums = sum(vertices.clone(), Entries::Exact(&shape.modes), q);
-        let (transform, roundings) = (&truth.transforms[domain], q.len() + EXTRA);
+        let (transform, size) = (truth.transform_of(scene, domain), truth.size_of(scene, domain));
+        let (roundings, follows) = (q.len() + EXTRA, scene.movers.frame_of(domain).is_some());
         let rest = shape.mesh.rest()[vertices.clone()].iter().map(|rest| rest.map(f64::from));
         let mut bounds: Vec<f64> =
-            rest.clone().zip(&sums).map(|(rest, sum)| bound(transform, &rest, sum, roundings)).collect();
+            rest.clone().zip(&sums).map(|(rest, sum)| bound((&size, follows), &rest, sum, roundings)).collect();
         if !ingredients.is_exact() {
             ingredients.bounds(domain, state).widen(vertices.start, &mut bounds);
         }
         for ((rest, sum), bound) in rest.zip(&sums).zip(bounds) {
-            let at = placed(transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
+            let at = placed(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
             out.push(Judged { at, bound, condition: condition(sum) });
         }
     })
@@ -163,14 +164,17 @@ fn gamma(roundings: usize) -> f64 {
     sum / (1.0 - sum)
 }
 
-fn bound(transform: &[f64; 12], rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
+/// `size`: that of T; the entries of a follower's are products, which rounds each three times more.
+fn bound((size, follows): (&[f64; 12], bool), rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
+    let of_t = if follows { 3 } else { 0 };
     let bent: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis]);
     let off = bent.map(|bent| gamma(roundings) * bent + roundings as f64 * TINY);
     let row = |row: usize| {
-        let entry = |axis: usize| transform[4 * row + axis].abs();
+        let entry = |axis: usize| size[4 * row + axis] * (1.0 + gamma(of_t));
         let carried: f64 = (0..3).map(|axis| entry(axis) * off[axis]).sum();
         let whole: f64 = (0..3).map(|axis| entry(axis) * (bent[axis] + off[axis])).sum();
-        carried + gamma(4) * (whole + transform[4 * row + 3].abs()) + 4.0 * TINY
+        let tiny: f64 = bent.iter().map(|bent| of_t as f64 * TINY * (1.0 + bent)).sum();
+        carried + gamma(4 + of_t) * (whole + size[4 * row + 3]) + 4.0 * TINY + tiny
     };
     (0..3).map(|axis| row(axis).powi(2)).sum::<f64>().sqrt()
 }

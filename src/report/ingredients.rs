@@ -72,7 +72,7 @@ impl Ingredients {
         if let Some(Budget { most, reaches, domains }) = truncation {
             domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
                 let reaches = &reaches[scene.domains[domain].shape];
-                let norm = norm(&state.transforms[domain]);
+                let norm = norm(&state.composed(scene, domain));
                 truncation.update(Amounts { q: state.q_of(scene, domain), reaches, norm }, *most);
             });
         }
@@ -101,7 +101,7 @@ impl Ingredients {
         Bounds {
             reaches,
             q,
-            transform: state.transforms[domain],
+            transform: state.composed(&self.scene, domain),
             compensated: self.scene.deformation.compensated,
             truncation,
         }
@@ -112,7 +112,7 @@ impl Ingredients {
 pub(super) struct Bounds<'a> {
     reaches: Option<&'a Reaches>,
     q: Vec<f32>,
-    transform: crate::domain::Transform,
+    transform: crate::domain::Composed,
     compensated: bool,
     truncation: f64,
 }

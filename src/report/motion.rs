@@ -29,7 +29,7 @@ const SLOWEST: f64 = 1.0;
 pub struct Truth {
     /// Packed coordinates.
     pub q: Vec<f64>,
-    /// `world_from_domain` of each domain, 3x4 row-major.
+    /// `world_from_domain` of each mover ([`crate::scene::Movers`]), 3x4 row-major.
     pub transforms: Vec<[f64; 12]>,
 }
 
@@ -49,6 +49,33 @@ impl Truth {
             transforms: state.transforms.iter().map(|transform| transform.0.map(f64::from)).collect(),
         }
     }
+
+    /// `world_from_domain` of a domain: of a follower the product of its mover's and its frame.
+    pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+        let mover = &self.transforms[scene.movers.of(domain)];
+        match scene.movers.frame_of(domain) {
+            None => *mover,
+            Some(frame) => product(mover, &frame.0.map(f64::from)),
+        }
+    }
+
+    /// The same of absolute values: no entry of the product, however it is rounded, is larger by more than that.
+    pub(super) fn size_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+        let mover = self.transforms[scene.movers.of(domain)].map(f64::abs);
+        match scene.movers.frame_of(domain) {
+            None => mover,
+            Some(frame) => product(&mover, &frame.0.map(|entry| f64::from(entry.abs()))),
+        }
+    }
+}
+
+/// The product of two affine transforms, 3x4 row-major.
+fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
+    std::array::from_fn(|at| {
+        let (row, column) = (&t[at / 4 * 4..][..4], at % 4);
+        let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];
+        if column == 3 { sum + row[3] } else { sum }
+    })
 }
 
 /// All motions of one load.
@@ -82,7 +109,8 @@ impl Motion {
         if seed % 2 == 1 {
             self.cancel(&mut q, &mut rng);
         }
-        let transforms = (0..self.scene.domains.len()).map(|domain| self.moved(domain, &mut rng)).collect();
+        let movers = self.scene.movers.domains();
+        let transforms = movers.map(|domain| self.moved(domain as usize, &mut rng)).collect();
         Truth { q, transforms }
     }
 
@@ -108,12 +136,12 @@ impl Motion {
             size * (TAU * SLOWEST * ratio * time + phase).cos()
         };
         let q = self.spread.iter().map(&mut swing).collect();
-        let turn = |domain: usize| {
-            let phase = domain as f64;
+        let turn = |domain: u32| {
+            let (phase, domain) = (f64::from(domain), domain as usize);
             let axis = Vector3::new(phase.sin(), 1.0, phase.cos()) * (TURN * (TAU * SLOWEST * time + phase).sin());
             place(&self.scene, domain, &Rotation3::new(axis * 0.5).into_inner(), &Vector3::zeros())
         };
-        Truth { q, transforms: (0..self.scene.domains.len()).map(turn).collect() }
+        Truth { q, transforms: self.scene.movers.domains().map(turn).collect() }
     }
 
     fn moved(&self, domain: usize, rng: &mut Rng) -> [f64; 12] {

@@ -63,7 +63,7 @@ impl Record {
             return Err(invalid("steps", "at least one", 0));
         }
         fits("q", &self.q, scene.layout.coordinates)?;
-        fits("transforms", &self.transforms, 12 * scene.domains.len())?;
+        fits("transforms", &self.transforms, 12 * scene.movers.count())?;
         if !self.transforms.is_empty() && self.transforms.len() != self.q.len() {
             return Err(invalid("transforms", format!("{} steps", self.q.len()), self.transforms.len()));
         }
@@ -78,7 +78,8 @@ impl Record {
     }
 
     pub(super) fn step(&self, scene: &Scene, step: usize) -> Truth {
-        let still = || scene.domains.iter().map(|domain| domain.placement.0.map(f64::from)).collect();
+        let placement = |domain: u32| scene.domains[domain as usize].placement.0.map(f64::from);
+        let still = || scene.movers.domains().map(placement).collect();
         let moved = |row: &Vec<f64>| row.as_chunks().0.to_vec();
         Truth { q: self.q[step].clone(), transforms: self.transforms.get(step).map_or_else(still, moved) }
     }

@@ -304,6 +304,7 @@ mod tests {
             material: 0,
             placement: Transform::IDENTITY,
             attachment: None,
+            follows: None,
             runs: vec![],
             rest_q: vec![],
             shares_q_with: None,

@@ -11,11 +11,13 @@
 //! is 0.86 mm in a scene of metres. In a cell of its own a translation is at most 512 units long, and a vertex within
 //! 1024 units of it is off by at most 0.11 mm. What f32 costs A and p themselves comes on top, wherever the domain is.
 //!
+//! A domain that follows another one by a constant frame has no translation of its own: it is in the cell of that mover,
+//! and what is said of domains here holds of movers, in the order of their transforms.
+//!
 //! Cells exist once a step with f64 translations has come. A scene that never sees one has none, and its origin is the
 //! cell of all.
 
-use super::Bounds;
-use super::layout::Slot;
+use super::{Bounds, Scene};
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
@@ -26,13 +28,13 @@ pub const GRID: f64 = 1024.0;
 /// of its own.
 pub const REACH: f64 = 4096.0;
 
-/// The cells of all domains of one state.
+/// The cells of all movers of one state.
 #[derive(Debug, Clone)]
 pub struct Cells {
-    /// Translation of each domain in scene units from the scene's origin.
+    /// Translation of each mover in scene units from the scene's origin.
     translations: Vec<[f64; 3]>,
     shared: [f64; 3],
-    /// How many domains have a cell of their own.
+    /// How many movers have a cell of their own.
     away: usize,
     /// How many translations were set since a shared cell was last looked for: looking costs a pass over all domains,
     /// so it is done at most once per that many.
@@ -76,7 +78,7 @@ impl Cells {
         self.shared
     }
 
-    /// Translation of each domain in scene units from the scene's origin.
+    /// Translation of each mover in scene units from the scene's origin.
     pub fn translations(&self) -> &[[f64; 3]] {
         &self.translations
     }
@@ -86,24 +88,24 @@ impl Cells {
         self.away == 0
     }
 
-    /// The cell of a domain, in scene units from the scene's origin.
-    pub fn cell_of(&self, domain: usize) -> [f64; 3] {
-        let translation = self.translations[domain];
+    /// The cell of a mover and its followers, in scene units from the scene's origin.
+    pub fn cell_of(&self, mover: usize) -> [f64; 3] {
+        let translation = self.translations[mover];
         if is_beyond(self.shared, translation) { nearest_cell(translation) } else { self.shared }
     }
 
-    /// A transform with the translation that the domain has in its cell, rounded once.
-    pub(super) fn express(&self, domain: usize, mut transform: Transform) -> Transform {
-        let own = difference(self.translations[domain], self.cell_of(domain));
+    /// A transform with the translation that the mover has in its cell, rounded once.
+    pub(super) fn express(&self, mover: usize, mut transform: Transform) -> Transform {
+        let own = difference(self.translations[mover], self.cell_of(mover));
         for (row, along) in transform.0.chunks_exact_mut(4).zip(own) {
             row[3] = along as f32;
         }
         transform
     }
 
-    /// Moves a domain.
-    pub(super) fn set(&mut self, domain: usize, translation: [f64; 3]) {
-        let (shared, kept) = (self.shared, &mut self.translations[domain]);
+    /// Moves a mover.
+    pub(super) fn set(&mut self, mover: usize, translation: [f64; 3]) {
+        let (shared, kept) = (self.shared, &mut self.translations[mover]);
         self.away -= usize::from(is_beyond(shared, *kept));
         *kept = translation;
         self.away += usize::from(is_beyond(shared, translation));
@@ -133,11 +135,13 @@ impl Cells {
     }
 
     /// Positions relative to their domains' cells as positions relative to `view`, a point in scene units from the
-    /// scene's origin: f64 in between, f32 in the end. Three numbers per vertex, packed as `slots` say. Also the bounds
+    /// scene's origin: f64 in between, f32 in the end. Three numbers per vertex, packed as the layout says. Also the bounds
     /// of the domains that are near `view` when measured by the nearest one; those of a domain that is a thousand times
     /// as far would tell nothing about what can be seen.
-    pub fn seen_from(&self, view: [f64; 3], slots: &[Slot], positions: &[f32]) -> (Vec<f32>, Bounds) {
-        let offsets: Vec<[f64; 3]> = (0..slots.len()).map(|domain| difference(self.cell_of(domain), view)).collect();
+    pub fn seen_from(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, Bounds) {
+        let slots = &scene.layout.slots;
+        let offset = |domain| difference(self.cell_of(scene.movers.of(domain)), view);
+        let offsets: Vec<[f64; 3]> = (0..slots.len()).map(offset).collect();
         let distance = |offset: &[f64; 3]| offset.iter().fold(0.0, |most: f64, along| most.max(along.abs()));
         let nearest = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);
         let mut seen = Vec::with_capacity(positions.len());

@@ -8,6 +8,7 @@ mod cells;
 mod deformation;
 mod layout;
 mod look;
+mod movers;
 mod needs;
 mod rigid;
 mod state;
@@ -18,6 +19,7 @@ pub use cells::{Cells, GRID, REACH, nearest_cell};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
 pub use look::{Ground, Look, Shadow, UpAxis};
+pub use movers::Movers;
 pub use needs::Needs;
 pub use rigid::TransformFormat;
 pub use state::{Changed, State};
@@ -76,6 +78,7 @@ pub struct Scene {
     pub rigid_transforms: bool,
     pub remarks: Vec<String>,
     pub layout: Layout,
+    pub movers: Movers,
     pub needs: Needs,
     /// Bounds of the rest state, in scene units.
     pub rest_bounds: Bounds,
@@ -101,6 +104,7 @@ impl Scene {
         for index in 0..parts.domains.len() {
             check_domain(&parts, index).map_err(|error| error.within(&format!("domain {index}")))?;
         }
+        let movers = Movers::new(&mut parts.domains)?;
         parts.look.check()?;
         parts.deformation.check()?;
         leave_out_unplaced_textures(&mut parts);
@@ -124,6 +128,7 @@ impl Scene {
             rigid_transforms: parts.rigid_transforms,
             remarks: parts.remarks,
             layout,
+            movers,
             needs,
             rest_bounds: Bounds::EMPTY,
         };
@@ -181,6 +186,10 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
     below("material", domain.material, parts.materials.len())?;
     check_runs(parts, domain)?;
     check_texts(domain)?;
+    if let Some(follow) = &domain.follows {
+        below("follows.parent", follow.parent, index)?;
+        crate::domain::Transform::new(follow.frame.0).map_err(|error| error.within("follows.frame"))?;
+    }
     let rank = parts.shapes[domain.shape].modes.rank();
     crate::domain::Transform::new(domain.placement.0).map_err(|error| error.within("placement"))?;
     if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
@@ -327,6 +336,7 @@ mod tests {
             runs,
             placement: Transform::IDENTITY,
             attachment: None,
+            follows: None,
             rest_q: vec![],
             shares_q_with: None,
             metadata: crate::domain::Metadata::default(),

@@ -1,6 +1,7 @@
 //! What a scene needs, computed once at load; kernels, shaders, passes and buffers follow it and nothing else.
 
 use super::{Normals, Parts};
+use crate::domain::Domain;
 
 /// A feature is compiled, allocated and run only when its flag is set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
@@ -25,6 +26,8 @@ pub struct Needs {
     pub truncation: bool,
     /// Sums carry their rounding errors along.
     pub compensated: bool,
+    /// Some domain follows another one by a constant frame: products of transforms exist.
+    pub followers: bool,
 }
 
 impl Needs {
@@ -41,15 +44,16 @@ impl Needs {
             mask: parts.any_mask(),
             blend: parts.any_material(|material| material.alpha_mode == crate::domain::AlphaMode::Blend),
             shadows: parts.look.shadow.is_some(),
-            shear: !parts.rigid_transforms || !parts.domains.iter().all(|domain| domain.placement.is_similarity()),
+            shear: !parts.rigid_transforms || !parts.domains.iter().all(is_similar),
             exact_normals: modes && parts.deformation.normals == Normals::Exact,
             truncation: modes && parts.deformation.truncation.is_some(),
             compensated: modes && parts.deformation.compensated,
+            followers: parts.domains.iter().any(|domain| domain.follows.is_some()),
         }
     }
 
     /// Each flag with its name, in a fixed order.
-    pub fn flags(&self) -> [(&'static str, bool); 10] {
+    pub fn flags(&self) -> [(&'static str, bool); 11] {
         [
             ("modes", self.modes),
             ("textures", self.textures),
@@ -61,6 +65,12 @@ impl Needs {
             ("exact_normals", self.exact_normals),
             ("truncation", self.truncation),
             ("compensated", self.compensated),
+            ("followers", self.followers),
         ]
     }
+}
+
+/// Whether neither the placement of a domain nor the frame that it has in another one shears.
+fn is_similar(domain: &Domain) -> bool {
+    domain.placement.is_similarity() && domain.follows.is_none_or(|follow| follow.frame.is_similarity())
 }

@@ -1,9 +1,10 @@
-//! The values of one step: packed coordinates q and one transform per domain.
+//! The values of one step: packed coordinates q, and one transform per domain that follows no other.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
-use super::{Cells, Scene, Update};
-use crate::domain::Transform;
+use super::{Cells, Movers, Scene, Update};
+use crate::domain::{Composed, Transform};
 
 /// Which domains differ from the state one serial number before.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -11,7 +12,8 @@ pub enum Changed {
     /// Possibly all.
     #[default]
     All,
-    /// These at most, ascending, each once: those whose q or T the last update named, and those that share a named q.
+    /// These at most, ascending, each once: those whose q or T the last update named, those that share a named q, and
+    /// those that follow a named T.
     Some(Vec<u32>),
 }
 
@@ -26,10 +28,10 @@ pub struct State {
     pub time: f64,
     /// All coordinates, packed as [`super::Layout`] says.
     pub q: Vec<f32>,
-    /// `world_from_domain` of each domain, relative to the domain's cell ([`Self::cell_of`]): the scene's origin unless a
-    /// step with f64 translations took the domain far from it.
+    /// `world_from_domain` of each mover ([`super::Movers`]), which is each domain where nobody follows; relative to its
+    /// cell ([`Self::cell_of`]): the scene's origin unless a step with f64 translations took it far from it.
     pub transforms: Vec<Transform>,
-    /// Where domains are in f64, once a step with f64 translations has come.
+    /// Where movers are in f64, once a step with f64 translations has come.
     pub cells: Option<Arc<Cells>>,
     /// Counts the updates of this state; 0 at rest. A deformer that has computed serial s and is given s + 1 need compute
     /// only the domains in `changed`. Any other pair of numbers, equal ones included, means all, and so does a deformer's
@@ -56,12 +58,12 @@ impl State {
         for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
             q[slot.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
         }
-        let transforms = scene.domains.iter().map(|domain| domain.placement).collect();
+        let transforms = scene.movers.domains().map(|domain| scene.domains[domain as usize].placement).collect();
         Self { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
     }
 
-    /// Applies a whole step. What it does not name keeps its value. The work is that of the named domains, but for the
-    /// rare step after which the shared cell follows its domains.
+    /// Applies a whole step. What it does not name keeps its value. The work is that of the named domains and of the
+    /// lists of those that share their q or follow them, but for the rare step after which the shared cell follows its domains.
     pub fn apply(&mut self, scene: &Scene, update: &Update) {
         self.step = update.number;
         self.time = update.time;
@@ -75,15 +77,18 @@ impl State {
                 _ => changed.push(domain as u32),
             }
         }
-        changed.extend(update.transforms.iter().map(|(domain, _)| *domain));
+        for (domain, _) in &update.transforms {
+            changed.push(*domain);
+            changed.extend_from_slice(scene.movers.followers_of(*domain as usize));
+        }
         changed.sort_unstable();
         changed.dedup();
-        let anew = self.place(update);
+        let anew = self.place(&scene.movers, update);
         self.changed = if anew { Changed::All } else { Changed::Some(changed) };
     }
 
     /// Sets the named transforms. True when others were expressed anew.
-    fn place(&mut self, update: &Update) -> bool {
+    fn place(&mut self, movers: &Movers, update: &Update) -> bool {
         let begins = self.cells.is_none() && update.has_f64();
         if begins {
             self.cells = Some(Arc::new(Cells::of(&self.transforms)));
@@ -93,27 +98,47 @@ impl State {
         }
         let Some(cells) = self.cells.as_mut().map(Arc::make_mut) else {
             for (domain, transform) in &update.transforms {
-                self.transforms[*domain as usize] = *transform;
+                self.transforms[movers.of(*domain as usize)] = *transform;
             }
             return false;
         };
         let anew = begins && !cells.is_one();
         for (domain, transform, translation) in update.placements() {
-            cells.set(domain, translation);
-            self.transforms[domain] = cells.express(domain, transform);
+            let mover = movers.of(domain);
+            cells.set(mover, translation);
+            self.transforms[mover] = cells.express(mover, transform);
         }
         let anew = cells.follow() || anew;
         if anew {
-            for (domain, transform) in self.transforms.iter_mut().enumerate() {
-                *transform = cells.express(domain, *transform);
+            for (mover, transform) in self.transforms.iter_mut().enumerate() {
+                *transform = cells.express(mover, *transform);
             }
         }
         anew
     }
 
-    /// The f64 point that a domain's transform and vertices are relative to, in scene units from the scene's origin.
-    pub fn cell_of(&self, domain: usize) -> [f64; 3] {
-        self.cells.as_ref().map_or([0.0; 3], |cells| cells.cell_of(domain))
+    /// The f64 point that the transform of a mover, its vertices and those of its followers are relative to, in scene
+    /// units from the scene's origin. `mover` is an index in `transforms`.
+    pub fn cell_of(&self, mover: usize) -> [f64; 3] {
+        self.cells.as_ref().map_or([0.0; 3], |cells| cells.cell_of(mover))
+    }
+
+    /// The transform of a domain and, of a follower, its frame; relative to the cell of its mover.
+    pub fn composed(&self, scene: &Scene, domain: usize) -> Composed {
+        Composed { mover: self.transforms[scene.movers.of(domain)], frame: scene.movers.frame_of(domain) }
+    }
+
+    /// `world_from_domain` of a domain in f32, as deformers have it ([`Composed::rounded`]).
+    pub fn transform_of(&self, scene: &Scene, domain: usize) -> Transform {
+        self.composed(scene, domain).rounded()
+    }
+
+    /// That of every domain; `transforms` itself where nobody follows.
+    pub fn world_transforms(&self, scene: &Scene) -> Cow<'_, [Transform]> {
+        match scene.needs.followers {
+            false => Cow::Borrowed(&self.transforms),
+            true => (0..scene.domains.len()).map(|domain| self.transform_of(scene, domain)).collect(),
+        }
     }
 
     /// To be called after `q` or `transforms` were written by hand, so that no deformer takes the change list for whole.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::movers::check_moves;
 use super::rigid::{self, Parsed};
 use super::{Scene, TransformFormat};
 use crate::domain::Transform;
@@ -16,7 +17,8 @@ pub struct RawUpdate {
     pub q_domains: Vec<u32>,
     /// r little-endian f32 per named domain, concatenated. Any alignment.
     pub q: bytes::Bytes,
-    /// Domains whose transforms follow; empty with bytes in `transforms` means all domains in order.
+    /// Domains whose transforms follow; empty with bytes in `transforms` means all domains in order, but for those that
+    /// follow another one.
     pub transform_domains: Vec<u32>,
     /// One transform per named domain in `transform_format`, little-endian, concatenated. Any alignment.
     pub transforms: bytes::Bytes,
@@ -108,7 +110,10 @@ impl Update {
 
 fn parse_q(scene: &Scene, raw: &RawUpdate) -> Result<(Vec<Part>, Vec<f32>)> {
     let everyone = raw.q_domains.is_empty() && !raw.q.is_empty();
-    let domains = named(scene, "step.q_domains", &raw.q_domains, everyone)?;
+    let domains = match everyone {
+        true => (0..scene.domains.len() as u32).collect(),
+        false => named(scene, "step.q_domains", &raw.q_domains)?,
+    };
     let mut expected = 0;
     let mut places = Vec::with_capacity(domains.len());
     for domain in domains {
@@ -139,7 +144,11 @@ type Transforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
 
 fn parse_transforms(scene: &Scene, raw: &RawUpdate) -> Result<Transforms> {
     let everyone = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
-    let domains = named(scene, "step.transform_domains", &raw.transform_domains, everyone)?;
+    let domains = match everyone {
+        true => scene.movers.domains().collect(),
+        false => named(scene, "step.transform_domains", &raw.transform_domains)?,
+    };
+    check_moves(&scene.movers, &scene.domains, ("step.transform_domains", &domains))?;
     let size = raw.transform_format.bytes();
     if raw.transforms.len() != size * domains.len() {
         let wanted = format!("{} bytes ({} transforms of {size})", size * domains.len(), domains.len());
@@ -171,12 +180,9 @@ fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<Parsed> {
     Ok((transform, kept))
 }
 
-/// The domains that a list names, each once, or all of them.
-fn named(scene: &Scene, field: &str, list: &[u32], everyone: bool) -> Result<Vec<u32>, Error> {
+/// The domains that a list names, each once.
+fn named(scene: &Scene, field: &str, list: &[u32]) -> Result<Vec<u32>, Error> {
     let count = scene.domains.len();
-    if everyone {
-        return Ok((0..count as u32).collect());
-    }
     if list.len() > count {
         return Err(invalid(field, format!("at most {count} indices"), list.len()));
     }

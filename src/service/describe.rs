@@ -136,6 +136,8 @@ fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
         shape: domain.shape as u32,
         eigenvalues: domain.metadata.eigenvalues.clone(),
         notes: domain.metadata.notes.clone().into_iter().collect(),
+        follows: domain.follows.map(|follow| follow.parent as u32),
+        follow_frame: domain.follows.map(|follow| numbers(&follow.frame)).unwrap_or_default(),
     }
 }
 

@@ -7,13 +7,16 @@
 //! compensated sum is off by u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot Product, 2005,
 //! proposition 5.5), plus 5 k 2^-149.
 //!
+//! T of a follower is a product T_m F, rounded as [`Composed::rounded`] says: three roundings an entry, so that entry by
+//! entry it is off by at most gamma_3 |T_m| |F|, and its translation by gamma_3 (|T_m| |f| + |t_m|).
+//!
 //! A bound is a length: that of the error of a vertex's position, in scene units. It holds for sums without overflow, and
 //! is infinite where q times a factor overflows f32.
 
 use rayon::prelude::*;
 
 use super::Tiles;
-use crate::domain::{Shape, Transform};
+use crate::domain::{Composed, Shape, Transform};
 use crate::scene::Storage;
 
 /// A little more than what the few thousand f64 operations of a bound can lose.
@@ -37,12 +40,14 @@ pub struct Bound {
     pub rest: f64,
     /// Multiplying with A and adding the translation.
     pub transform: f64,
+    /// Multiplying the transform of a mover with the frame of its follower; 0 of a mover.
+    pub frame: f64,
 }
 
 impl Bound {
     /// All sources together.
     pub fn total(&self) -> f64 {
-        (self.storage + self.coordinates + self.accumulation + self.rest + self.transform) * ROUND_UP
+        (self.storage + self.coordinates + self.accumulation + self.rest + self.transform + self.frame) * ROUND_UP
     }
 
     /// Source by source the larger one.
@@ -53,6 +58,7 @@ impl Bound {
             accumulation: self.accumulation.max(other.accumulation),
             rest: self.rest.max(other.rest),
             transform: self.transform.max(other.transform),
+            frame: self.frame.max(other.frame),
         }
     }
 }
@@ -62,7 +68,8 @@ impl Bound {
 pub struct Step<'a> {
     /// Coordinates of the domain; zero where a mode is left out.
     pub q: &'a [f32],
-    pub transform: Transform,
+    /// As [`crate::scene::State::composed`] has it.
+    pub transform: Composed,
     pub compensated: bool,
 }
 
@@ -135,19 +142,44 @@ impl Reaches {
         };
         let bent = self.rest[tile] + moved + accumulation;
         let rest = if terms > 0.0 { UNIT * bent } else { 0.0 };
-        let stretch = norm(&step.transform);
-        let entries = step.transform.linear().norm() * ROUND_UP;
-        let offset = step.transform.translation().norm() * ROUND_UP;
+        let (own, stretch) = (step.transform.rounded(), norm(&step.transform));
+        let entries = own.linear().norm() * ROUND_UP;
+        let offset = own.translation().norm() * ROUND_UP;
+        let [turned, moved] = rounding(&step.transform);
+        let frame = (turned * (bent + rest) + moved) * ROUND_UP;
         let transform = gamma(3.0) * (entries * (bent + rest) + offset) + 6.0 * SQRT_3 * UNDERFLOW;
         let [storage, coordinates, accumulation, rest] =
             [storage, lost, accumulation, rest].map(|part| part * stretch * ROUND_UP);
-        Bound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP }
+        Bound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP, frame }
     }
+}
+
+/// How far the linear part (in the Frobenius norm) and the translation of [`Composed::rounded`] may be from the exact
+/// product; zeros of a mover.
+fn rounding(transform: &Composed) -> [f64; 2] {
+    let Some(frame) = transform.frame else { return [0.0; 2] };
+    let sizes =
+        Composed { mover: Transform(transform.mover.0.map(f32::abs)), frame: Some(Transform(frame.0.map(f32::abs))) };
+    let entries = sizes.exact();
+    let length = |of: &mut dyn Iterator<Item = f64>| {
+        of.map(|entry| (gamma(3.0) * entry + 3.0 * UNDERFLOW).powi(2)).sum::<f64>().sqrt() * ROUND_UP
+    };
+    let is_linear = |at: &usize| at % 4 != 3;
+    let all = 0..entries.len();
+    let linear = length(&mut all.clone().filter(is_linear).map(|at| entries[at]));
+    [linear, length(&mut all.filter(|at| !is_linear(at)).map(|at| entries[at]))]
+}
+
+/// At least `||A||_2` of the linear part, as it is and as deformers round it. By at most 1e-7 of itself too large, and
+/// for a follower by what rounding the product of its frame may add.
+pub fn norm(transform: &Composed) -> f64 {
+    let [turned, _] = rounding(transform);
+    (norm_of(&transform.rounded()) + turned) * ROUND_UP
 }
 
 /// At least `||A||_2`, by at most 1e-7 of itself too large. The root of the largest eigenvalue of A^T A, by the
 /// trigonometric formula for 3x3 matrices (Smith, Eigenvalues of a symmetric 3x3 matrix, 1961).
-pub fn norm(transform: &Transform) -> f64 {
+fn norm_of(transform: &Transform) -> f64 {
     let linear = transform.linear();
     let largest = linear.abs().max();
     if largest == 0.0 {

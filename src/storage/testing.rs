@@ -33,8 +33,12 @@ pub(crate) fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, nois
 
 /// A scene of shapes of noise, one domain each per (n, r).
 pub(crate) fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &mut Noise) -> Arc<Scene> {
+    Scene::new(Parts { deformation, ..parts(sizes, noise) }).expect("a scene")
+}
+
+/// The parts of such a scene.
+pub(crate) fn parts(sizes: &[(usize, usize)], noise: &mut Noise) -> Parts {
     let mut parts = Parts::named("noise");
-    parts.deformation = deformation;
     parts.materials = vec![Material::default()];
     for (at, (vertices, rank)) in sizes.iter().enumerate() {
         parts.shapes.push(shape(*vertices, *rank, noise));
@@ -45,10 +49,11 @@ pub(crate) fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &
             runs: vec![],
             placement: Transform::IDENTITY,
             attachment: None,
+            follows: None,
             rest_q: vec![],
             shares_q_with: None,
             metadata: Metadata::default(),
         });
     }
-    Scene::new(parts).expect("a scene")
+    parts
 }

@@ -159,6 +159,7 @@ impl Planter<'_> {
             material,
             placement,
             attachment: None,
+            follows: None,
             runs: vec![],
             rest_q: vec![],
             shares_q_with: None,

@@ -21,7 +21,7 @@ fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], left_out: f64
     };
     let part = |domain: usize| {
         let (slot, compensated) = (scene.layout.slots[domain], scene.deformation.compensated);
-        let step = Step { q: state.q_of(scene, domain), transform: state.transforms[domain], compensated };
+        let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated };
         let tile = |first: usize| {
             let bound = reaches[scene.domains[domain].shape].tile(first / TILE, &step).total() + left_out;
             let vertices = first..slot.vertices.min(first + TILE);

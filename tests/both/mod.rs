@@ -3,6 +3,7 @@
 
 pub(crate) mod changes;
 pub(crate) mod extremes;
+pub(crate) mod following;
 mod judge;
 pub(crate) mod neighbours;
 pub(crate) mod refusal;

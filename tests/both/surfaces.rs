@@ -14,7 +14,7 @@ use crate::scenes::{self, Random};
 const DIRECTION: f64 = 2e-5;
 
 /// The largest error; infinite for a NaN or another length.
-fn largest_error(got: &[f32], want: &[f64]) -> f64 {
+pub(crate) fn largest_error(got: &[f32], want: &[f64]) -> f64 {
     let error = |(got, want): (&f32, &f64)| {
         let error = (f64::from(*got) - want).abs();
         if error.is_nan() { f64::INFINITY } else { error }

@@ -64,6 +64,7 @@ pub(crate) fn domain(shape: usize, material: usize) -> Domain {
         placement: Transform::IDENTITY,
         runs: vec![],
         attachment: None,
+        follows: None,
         rest_q: Vec::new(),
         shares_q_with: None,
         metadata: Metadata::default(),

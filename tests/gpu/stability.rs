@@ -4,7 +4,7 @@ use modalcast::config::BackendChoice;
 use modalcast::gpu::{CudaDeformer, Launch};
 use modalcast::scene::{Deformation, Scene};
 
-use crate::both::{self, changes, extremes, neighbours, refusal, surfaces, truncation};
+use crate::both::{self, changes, extremes, following, neighbours, refusal, surfaces, truncation};
 use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
@@ -144,4 +144,28 @@ fn gpu_two_hundred_thousand_domains_of_seven_take_three_launches_and_stay_within
     eprintln!("a thousand named: {moved} move");
     // A fifth has no modes, and of the named ones half have a new transform.
     assert!(moved > 800 && moved <= 1000, "{moved}");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_followers_stay_within_their_bounds_and_have_the_bits_of_movers_in_their_places() {
+    following::frames_of_all_sizes(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_steps_of_movers_give_the_bits_of_whole_ones_and_move_their_followers() {
+    following::steps_of_movers(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_followers_ten_thousand_kilometres_away_keep_the_millimetre() {
+    following::far_away(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_products_of_frames_that_overflow_do_no_harm_where_the_vertices_do_not() {
+    following::products_that_overflow(deformer);
 }

@@ -41,6 +41,7 @@ pub(crate) fn domain(shape: usize, name: String) -> Domain {
         material: 0,
         placement: Transform::IDENTITY,
         attachment: None,
+        follows: None,
         runs: vec![],
         rest_q: vec![],
         shares_q_with: None,

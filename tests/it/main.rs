@@ -4,6 +4,7 @@
 mod both;
 mod deformers;
 mod far;
+mod following;
 mod frames;
 mod hostile;
 mod layering;

@@ -135,6 +135,17 @@ async fn a_client_that_holds_nothing_learns_the_whole_scene() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_description_says_who_follows_whom_and_where() {
+    let server = Server::fresh().await;
+    server.open("twig").await;
+    let (domains, _) = describe(&server, "twig", &[]).await;
+    assert_eq!(domains.iter().map(|domain| domain.follows).collect::<Vec<_>>(), [None, None, Some(1), Some(2)]);
+    assert_eq!(domains.iter().map(|domain| domain.follow_frame.len()).collect::<Vec<_>>(), [0, 0, 48, 48]);
+    assert_eq!(domains[2].placement, domains[2].follow_frame, "on a branch that is where it was made");
+    assert_ne!(domains[3].placement, domains[3].follow_frame, "the placement is that in the world");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn replies_of_many_megabytes_pass_a_client_with_default_limits() {
     let server = Server::fresh().await;
     server.open("sheet").await;

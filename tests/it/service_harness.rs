@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast::domain::{Attachment, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast::engine::{Engine, SceneSource};
 use modalcast::error::{Error, Result, invalid};
 use modalcast::scene::{Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
@@ -37,6 +37,7 @@ impl SceneSource for InCode {
         match source {
             "strips" => Ok(strips()),
             "far" => Ok(far_strips()),
+            "twig" => Ok(twig()),
             "sheet" => Ok(sheet()),
             "panic" => panic!("a planted panic of a loader"),
             _ => Err(Error::NotFound { what: "scene", given: source.into() }),
@@ -58,6 +59,16 @@ impl SceneSource for InCode {
 pub(crate) fn strips() -> Arc<Scene> {
     let (shape, domains) = two_strips();
     scene("strips", shape, domains)
+}
+
+/// Two strips, the second of which has two leaves: one follows it, and the other follows that leaf.
+pub(crate) fn twig() -> Arc<Scene> {
+    let (shape, mut domains) = two_strips();
+    let frame = Transform([0.0, -1.0, 0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -0.25]);
+    for (name, parent) in [("leaf", 1), ("leaflet", 2)] {
+        domains.push(Domain { follows: Some(Follow { parent, frame }), ..domain(name, None) });
+    }
+    scene("twig", shape, domains)
 }
 
 /// The same in half metres, 17,000 km from the world's origin.
@@ -103,6 +114,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         runs: vec![],
         placement: Transform::IDENTITY,
         attachment,
+        follows: None,
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),

@@ -7,7 +7,7 @@ use modalcast::cpu::CpuDeformer;
 use modalcast::scene::Scene;
 use modalcast::storage::Truncation;
 
-use crate::both::{changes, extremes, neighbours, refusal, surfaces, truncation};
+use crate::both::{changes, extremes, following, neighbours, refusal, surfaces, truncation};
 
 fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene)
@@ -88,4 +88,24 @@ fn twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
 #[test]
 fn a_domain_has_the_same_bits_alone_and_among_a_thousand() {
     neighbours::alone_and_among_others(deformer);
+}
+
+#[test]
+fn followers_stay_within_their_bounds_and_have_the_bits_of_movers_in_their_places() {
+    following::frames_of_all_sizes(deformer);
+}
+
+#[test]
+fn steps_of_movers_give_the_bits_of_whole_ones_and_move_their_followers() {
+    following::steps_of_movers(deformer);
+}
+
+#[test]
+fn followers_ten_thousand_kilometres_away_keep_the_millimetre() {
+    following::far_away(deformer);
+}
+
+#[test]
+fn products_of_frames_that_overflow_do_no_harm_where_the_vertices_do_not() {
+    following::products_that_overflow(deformer);
 }

@@ -64,7 +64,7 @@ fn bounds_of(scene: &Scene, state: &State, deformer: &CpuDeformer, domain: usize
         left_out = truncation.bound();
         (0..q.len()).filter(|mode| !truncation.kept().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
     }
-    let step = Step { q: &q, transform: state.transforms[domain], compensated: scene.deformation.compensated };
+    let step = Step { q: &q, transform: state.composed(scene, domain), compensated: scene.deformation.compensated };
     let reaches = Reaches::new(shape, &tiles);
     (0..tiles.count()).map(|tile| reaches.tile(tile, &step).total() + left_out).collect()
 }

@@ -176,7 +176,8 @@ impl Least {
 
 /// A child on the ring of a deforming parent.
 struct Joint {
-    child: usize,
+    /// Index of the child's transform.
+    mover: usize,
     /// Vertices of the ring in the packed positions.
     ring: Vec<usize>,
 }
@@ -188,8 +189,9 @@ impl Joint {
         let diagonal = scene.rest_bounds.diagonal();
         let joint = |(child, domain): (usize, &crate::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
+            let mover = scene.movers.frame_of(child).is_none().then(|| scene.movers.of(child))?;
             let first = scene.layout.slots[attachment.parent].first_vertex;
-            let joint = Self { child, ring: attachment.rows.iter().map(|row| first + *row as usize).collect() };
+            let joint = Self { mover, ring: attachment.rows.iter().map(|row| first + *row as usize).collect() };
             let centre = centre(joint.ring.iter().map(|vertex| rest[*vertex]));
             (distance(centre, joint.origin(&state)) <= 1e-5 * diagonal).then_some(joint)
         };
@@ -197,7 +199,7 @@ impl Joint {
     }
 
     fn origin(&self, state: &State) -> [f64; 3] {
-        state.transforms[self.child].translation().into()
+        state.transforms[self.mover].translation().into()
     }
 
     /// Distance of the child's origin, as sent, from the centre of the ring, as received.

@@ -17,6 +17,7 @@ const HEADERS: [(&str, &str); 7] = [
     ("layout.cuh", include_str!("../../../kernels/layout.cuh")),
     ("chain.cuh", include_str!("../../../kernels/chain.cuh")),
     ("chunk.cuh", include_str!("../../../kernels/chunk.cuh")),
+    ("follow.cuh", include_str!("../../../kernels/follow.cuh")),
     ("ordered.cuh", include_str!("../../../kernels/ordered.cuh")),
     ("tile.cuh", include_str!("../../../kernels/tile.cuh")),
     ("orient.cuh", include_str!("../../../kernels/orient.cuh")),

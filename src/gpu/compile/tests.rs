@@ -70,7 +70,8 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
         [&[], &["ORIENT"], &["ORIENT", "NORMAL_MAPS"], &["ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]];
     let mut with = |sum: &[&'static str]| {
         let ends = shapes.into_iter().flat_map(|shape| orient.map(|orient| [sum, shape, orient].concat()));
-        list.extend(ends.map(|defines| (defines, large)));
+        let both = ends.flat_map(|defines| [defines.clone(), [defines, vec!["FOLLOWERS"]].concat()]);
+        list.extend(both.map(|defines| (defines, large)));
     };
     with(&[]);
     for storage in storages() {
@@ -121,15 +122,18 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
 }
 
 /// Macros that add code, each with the macro that it builds on; the others choose among code of about the same length.
-const ADD: [(&str, &str, &[&str]); 8] = [
+const ADD: [(&str, &str, &[&str]); 11] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED", &["MODES"]),
     ("deform", "ORIENT", &[]),
     ("deform", "SHIFTED", &["ORIENT"]),
     ("deform", "NORMAL_MAPS", &["ORIENT"]),
     ("deform", "SHEAR", &["ORIENT"]),
+    ("deform", "FOLLOWERS", &[]),
     ("normals", "NORMAL_MAPS", &[]),
     ("normals", "SHEAR", &[]),
+    ("normals", "FOLLOWERS", &[]),
+    ("apply", "FOLLOWERS", &[]),
 ];
 const CHOOSE: [&str; 2] = ["NARROW", "TRUNCATED"];
 

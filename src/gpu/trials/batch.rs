@@ -110,7 +110,7 @@ impl Batch {
             scales: upload(device, tiles.scales())?,
             positions: room(device, 12 * scene.layout.vertices as u64)?,
             turns: Turns::new(device, scene, states, |state| {
-                [amounts(scene, state, tiles.factors(), (vectors.0, modes)), transforms(state, vectors.0)]
+                [amounts(scene, state, tiles.factors(), (vectors.0, modes)), transforms(scene, state, vectors.0)]
             })?,
             args: args(scene, tiles.chunks()),
             config: LaunchConfig {
@@ -220,8 +220,8 @@ fn amounts(scene: &Scene, state: &State, factors: &[f32], (vectors, modes): (usi
 }
 
 /// The transforms; zeros where there is no domain.
-fn transforms(state: &State, vectors: usize) -> Vec<f32> {
-    let mut rows: Vec<f32> = bytemuck::cast_slice(&state.transforms).to_vec();
+fn transforms(scene: &Scene, state: &State, vectors: usize) -> Vec<f32> {
+    let mut rows: Vec<f32> = bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
     rows.resize(12 * vectors, 0.0);
     rows
 }

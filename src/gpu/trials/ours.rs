@@ -55,14 +55,15 @@ pub struct Ours {
     outputs: CudaSlice<u8>,
     turns: Turns,
     plan: Plan,
-    /// Vertices, domains and coordinates that are computed.
+    /// Vertices and coordinates that are computed, and what is read for them.
     counts: Counts,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Counts {
     vertices: u64,
-    domains: u64,
+    /// Bytes.
+    transforms: u64,
     coordinates: u64,
     words: u64,
     rest: u64,
@@ -170,10 +171,12 @@ fn outputs_of(plan: &Plan) -> [u64; 3] {
 
 fn counts(scene: &Scene, plan: &Plan, changed: Option<&[u32]>) -> Counts {
     let slots = &scene.layout.slots;
+    // With followers every domain reads whom it follows, and its own T or frame.
+    let transform = if scene.needs.followers { 56 } else { 48 };
     match changed {
         None => Counts {
             vertices: scene.layout.vertices as u64,
-            domains: slots.len() as u64,
+            transforms: transform * slots.len() as u64,
             coordinates: scene.layout.coordinates as u64,
             words: plan.bytes(Role::Words),
             rest: plan.bytes(Role::Rest),
@@ -186,7 +189,7 @@ fn counts(scene: &Scene, plan: &Plan, changed: Option<&[u32]>) -> Counts {
             let vertices: u64 = chosen().map(|slot| slot.vertices as u64).sum();
             Counts {
                 vertices,
-                domains: list.len() as u64,
+                transforms: transform * list.len() as u64,
                 coordinates: chosen().map(|slot| slot.rank as u64).sum(),
                 words: plan.bytes(Role::Words) * own / all.max(1),
                 rest: 12 * vertices,
@@ -236,11 +239,11 @@ impl Trial for Ours {
     }
 
     fn bytes(&self) -> Vec<(&'static str, u64)> {
-        let Counts { vertices, domains, coordinates, words, rest } = self.counts;
+        let Counts { vertices, transforms, coordinates, words, rest } = self.counts;
         let mut bytes = vec![("U", words), ("scales", self.plan.bytes(Role::Scales)), ("q", 4 * coordinates)];
         bytes.push(("u or x", 12 * vertices));
         if self.extent != Extent::Uq {
-            bytes.extend([("x0", rest), ("T", 48 * domains)]);
+            bytes.extend([("x0", rest), ("T", transforms)]);
         }
         if self.extent == Extent::Whole {
             let roles = [Role::RestNormals, Role::Normals, Role::RestTangents, Role::Tangents];

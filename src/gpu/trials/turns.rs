@@ -64,10 +64,11 @@ impl Turns {
         if states.is_empty() {
             return Err(invalid("states", "at least 1", 0));
         }
-        let fits =
-            |state: &&State| state.q.len() != scene.layout.coordinates || state.transforms.len() != scene.domains.len();
+        let fits = |state: &&State| {
+            state.q.len() != scene.layout.coordinates || state.transforms.len() != scene.movers.count()
+        };
         if let Some(wrong) = states.iter().find(fits) {
-            let expected = format!("{} coordinates, {} transforms", scene.layout.coordinates, scene.domains.len());
+            let expected = format!("{} coordinates, {} transforms", scene.layout.coordinates, scene.movers.count());
             let given = format!("{} and {}", wrong.q.len(), wrong.transforms.len());
             return Err(invalid("states", expected, given));
         }
@@ -102,8 +103,8 @@ impl Turns {
     pub(super) fn finish_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3]) -> Vec<f32> {
         let state = &self.states[self.last.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
-        for (domain, transform) in state.transforms.iter().enumerate() {
-            let t = transform.0.map(f64::from);
+        for domain in 0..self.scene.domains.len() {
+            let t = state.composed(&self.scene, domain).exact();
             for (vertex, rest) in self.scene.shape_of(domain).mesh.rest().iter().enumerate() {
                 let u = u(domain, vertex);
                 let [x, y, z] = [0, 1, 2].map(|axis| f64::from(rest[axis]) + f64::from(u[axis]));
@@ -159,6 +160,7 @@ pub(super) mod tests {
                 runs: Vec::new(),
                 placement: Transform::IDENTITY,
                 attachment: None,
+                follows: None,
                 rest_q: Vec::new(),
                 shares_q_with: None,
                 metadata: Metadata::default(),

@@ -108,6 +108,7 @@ impl Assembly<'_> {
                 runs: vec![],
                 placement,
                 attachment: attachment.clone(),
+                follows: None,
                 rest_q,
                 shares_q_with: (rank > 0 && twin < self.domains.len()).then_some(twin),
                 metadata: Metadata::default(),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::patch::{Gallery, Patch};
 use super::{Entry, Manifest, Transforms};
-use crate::domain::{Attachment, Domain, Material, Modes, Shape, Texture, Transform};
+use crate::domain::{Attachment, Domain, Follow, Material, Modes, Shape, Texture, Transform};
 use crate::error::{Result, invalid};
 use crate::load::files::Files;
 use crate::load::obj::Source;
@@ -101,6 +101,7 @@ impl Assembly<'_> {
             return Err(invalid("domains", format!("at most {MAX_DOMAINS} in a scene"), first + domains.len()));
         }
         self.place(entry, &mut domains)?;
+        follow(entry, &mut domains)?;
         self.paint(entry, &mut domains)?;
         self.annotate(entry, &mut domains)?;
         for domain in &mut domains {
@@ -180,7 +181,10 @@ impl Assembly<'_> {
         for domain in domains {
             domain.placement = world_from_model.then(domain.placement);
             match (&mut domain.attachment, parent) {
-                (Some(attachment), _) => attachment.parent += first,
+                (Some(attachment), _) => {
+                    attachment.parent += first;
+                    domain.follows.iter_mut().for_each(|follow| follow.parent += first);
+                }
                 (None, Some(parent)) => domain.attachment = Some(self.attach(entry, parent, domain.placement)?),
                 (None, None) => {}
             }
@@ -276,6 +280,21 @@ impl Assembly<'_> {
             self.by_name.entry(name.clone()).or_insert(self.parts.domains.len());
         }
         Ok(())
+    }
+}
+
+/// Lets the domains that the entry says follow what they hang on, from where they are at rest.
+fn follow(entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+    let Some(start) = &entry.follows else { return Ok(()) };
+    let mut any = false;
+    for domain in domains.iter_mut().filter(|domain| domain.name.starts_with(start.as_str())) {
+        let follow = |on: &Attachment| Follow { parent: on.parent, frame: on.frame };
+        domain.follows = domain.attachment.as_ref().map(follow).or(domain.follows);
+        any |= domain.follows.is_some();
+    }
+    match any {
+        true => Ok(()),
+        false => Err(invalid("follows", "how the names of domains begin that hang on others", start)),
     }
 }
 

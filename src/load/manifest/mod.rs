@@ -14,6 +14,8 @@
 //!
 //! model = "fern_02.glb"      # a scene of one model, or a [[domain]] for each of several
 //! modes = "fern.npy"         # U of a model of one domain; "" for none
+//! follows = "leaf"           # domains of the model called so, or "leaf ...", keep their place on what they hang on: no
+//!                            # step names a transform of theirs; "" for all that hang on something
 //! placement = { translation = [0, 0, 0], axis = [0, 1, 0], degrees = 90, scale = 2.0 }
 //!
 //! [material."*"]             # a material's name, or * for all; what is missing stays as the model has it
@@ -70,6 +72,7 @@ struct Manifest {
     material: BTreeMap<String, Patch>,
     model: Option<String>,
     modes: Option<String>,
+    follows: Option<String>,
     placement: Option<Placement>,
     #[serde(default)]
     domain: Vec<Entry>,
@@ -96,6 +99,8 @@ struct Entry {
     parent: Option<String>,
     frame: Option<Placement>,
     rows: Option<Vec<u32>>,
+    /// How the names begin of those domains that keep their place on what they hang on.
+    follows: Option<String>,
     material: Option<Patch>,
     /// (rad/s)^2, one per mode; kept for clients.
     eigenvalues: Option<Vec<f64>>,
@@ -130,12 +135,13 @@ fn entries(manifest: &mut Manifest) -> Result<Vec<Entry>> {
     match (manifest.model.take(), entries.is_empty()) {
         (Some(model), true) => {
             let (modes, placement) = (manifest.modes.take(), manifest.placement.take());
-            Ok(vec![Entry { model, modes, placement, ..Entry::default() }])
+            let follows = manifest.follows.take();
+            Ok(vec![Entry { model, modes, placement, follows, ..Entry::default() }])
         }
         (Some(_), false) => Err(invalid("model", "either one model or [[domain]] entries", "both")),
         (None, true) => Err(invalid("model", "a model, or [[domain]] entries", "neither")),
-        (None, false) if manifest.modes.is_some() || manifest.placement.is_some() => {
-            Err(invalid("modes, placement", "none beside [[domain]] entries, which have their own", "some"))
+        (None, false) if manifest.modes.is_some() || manifest.placement.is_some() || manifest.follows.is_some() => {
+            Err(invalid("modes, placement, follows", "none beside [[domain]] entries, which have their own", "some"))
         }
         (None, false) => Ok(entries),
     }

@@ -82,6 +82,27 @@ fn a_child_hangs_on_its_parent_by_frame_or_by_placement() {
 }
 
 #[test]
+fn an_entry_may_follow_what_it_hangs_on_and_says_so_by_how_names_begin() {
+    let child = |follows: &str| {
+        scene(&format!(
+            "[[domain]]\nname = 'trunk'\nmodel = 'a.obj'\nplacement = {{ translation = [10, 0, 0], axis = [0, 0, 1], degrees = 90 }}\n\
+             [[domain]]\nname = 'leaf'\nmodel = 'b.obj'\nparent = 'trunk'\nframe.translation = [1, 0, 0]\n{follows}"
+        ))
+    };
+    assert!(child("").expect("good").domains[1].follows.is_none());
+    let parts = child("follows = ''\n").expect("good");
+    let (follow, attachment) = (parts.domains[1].follows.expect("follows"), parts.domains[1].attachment.clone());
+    assert_eq!((follow.parent, Some(follow.frame)), (0, attachment.map(|attachment| attachment.frame)));
+    let before = parts.domains[1].placement;
+    let scene = crate::scene::Scene::new(parts).expect("a scene");
+    assert_eq!(scene.movers.count(), 1);
+    let apart = scene.domains[1].placement.0.iter().zip(before.0).map(|(new, old)| (new - old).abs());
+    assert!(apart.fold(0.0, f32::max) < 1e-5, "it stays where it was");
+    let refusal = child("follows = 'nobody'\n").map(drop).expect_err("no such name").to_string();
+    assert!(refusal.contains("follows: expected how the names of domains begin that hang on others"), "{refusal}");
+}
+
+#[test]
 fn materials_are_changed_by_name_for_all_and_for_one_entry_and_replaced_textures_are_dropped() {
     let parts = scene(
         "[material.red]\ncolour_texture = 'leaf.png'\n[material.'*']\nshininess = 9\n\

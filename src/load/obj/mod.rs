@@ -52,6 +52,7 @@ pub(super) fn read(files: &Files, name: &str, source: Source) -> Result<Parts> {
         runs: piece.runs,
         placement: Transform::IDENTITY,
         attachment: None,
+        follows: None,
         rest_q: Vec::new(),
         shares_q_with: None,
         metadata: Metadata { eigenvalues: Vec::new(), notes: super::vega::notes(files, name)? },

@@ -1,5 +1,6 @@
 //! A plant folder (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`) to a scene: each shoot and each leaf is a
-//! rigid domain. Lengths are metres, Z is up.
+//! rigid domain. Lengths are metres, Z is up. Every domain may be moved by itself; a `scene.toml` with `follows = "leaf"`
+//! keeps leaves on their shoots.
 
 mod assign;
 mod structure;
@@ -104,6 +105,7 @@ impl Plant<'_> {
             runs: piece.runs,
             placement: moved(base),
             attachment,
+            follows: None,
             rest_q: Vec::new(),
             shares_q_with: None,
             metadata: Metadata { eigenvalues: Vec::new(), notes: [("plant.kind".into(), kind.into())].into() },

@@ -58,6 +58,7 @@ pub(super) fn build(kind: Kind, size: Size) -> Result<Load> {
         Kind::B => (many(kind, cut(1_000), |rng| (1_500, mixed_rank(rng))), false),
         Kind::C => (many(kind, cut(200_000), |rng| (7, rare_rank(rng))), false),
         Kind::Plant(index) => return plant::grow(index, size),
+        Kind::Follows(index) => return plant::grow_on_branches(index, size),
     };
     let mut remarks = Vec::new();
     if size == Size::Quick {
@@ -188,6 +189,7 @@ pub(super) fn scene(name: String, shapes: Vec<Shape>, count: usize, dressed: boo
             runs: Vec::new(),
             placement: Transform::from_parts(&turn.into_inner(), &Vector3::from(place)),
             attachment: None,
+            follows: None,
             rest_q: Vec::new(),
             shares_q_with: None,
             metadata: Metadata::default(),

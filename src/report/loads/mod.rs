@@ -9,8 +9,9 @@
 //! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
 //! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q for one U, beside `single-18-32` |
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
+//! | `plant-1-follows` to `plant-12-follows` | the same, each leaf on a branch by a constant frame: T for branches alone |
 //!
-//! `single` and `plants` name whole groups, `all` everything.
+//! `single`, `plants` and `follows` name whole groups, `all` everything, but of the last group the largest plant alone.
 
 mod build;
 mod plant;
@@ -46,6 +47,8 @@ pub enum Kind {
     Batch,
     /// Index into the thesis's plants.
     Plant(usize),
+    /// The same, but its leaves follow its branches.
+    Follows(usize),
 }
 
 /// A scene to measure on.
@@ -74,6 +77,8 @@ impl Kind {
             Self::Batch,
         ]);
         kinds.extend((0..PLANTS.len()).map(Self::Plant));
+        let largest = (0..PLANTS.len()).max_by_key(|index| PLANTS[*index].domains);
+        kinds.extend(largest.map(Self::Follows));
         kinds
     }
 
@@ -87,6 +92,8 @@ impl Kind {
     /// `Invalid` when there is no such load.
     pub fn named(name: &str) -> Result<Vec<Self>> {
         let number = |text: &str| text.parse::<usize>().ok();
+        let plant =
+            |index: &str| number(index).filter(|index| (1..=PLANTS.len()).contains(index)).map(|index| index - 1);
         let found = match name.split('-').collect::<Vec<_>>()[..] {
             ["all"] => Some(Self::all()),
             ["single"] => Some(Self::singles()),
@@ -102,14 +109,13 @@ impl Kind {
             ["cancel"] => Some(vec![Self::Cancelling]),
             ["batch"] => Some(vec![Self::Batch]),
             ["plants"] => Some((0..PLANTS.len()).map(Self::Plant).collect()),
-            ["plant", index] => {
-                let index = number(index).filter(|index| (1..=PLANTS.len()).contains(index));
-                index.map(|index| vec![Self::Plant(index - 1)])
-            }
+            ["follows"] => Some((0..PLANTS.len()).map(Self::Follows).collect()),
+            ["plant", index] => plant(index).map(|index| vec![Self::Plant(index)]),
+            ["plant", index, "follows"] => plant(index).map(|index| vec![Self::Follows(index)]),
             _ => None,
         };
         let expected = "single-P-R (2^P vertices, P 2 to 22, R modes), a, a-positions, b, c, cancel, batch, plant-1 to \
-                        plant-12, or one of the groups single, plants, all";
+                        plant-12, each also with -follows, or one of the groups single, plants, follows, all";
         found.ok_or_else(|| invalid("load", expected, name))
     }
 
@@ -124,6 +130,7 @@ impl Kind {
             Self::Cancelling => "cancel".into(),
             Self::Batch => "batch".into(),
             Self::Plant(index) => format!("plant-{}", index + 1),
+            Self::Follows(index) => format!("plant-{}-follows", index + 1),
         }
     }
 
@@ -141,7 +148,12 @@ impl Kind {
 /// # Errors
 /// `Invalid` when the choices make no sense.
 pub fn restated(scene: &Scene, deformation: Deformation) -> Result<Arc<Scene>> {
-    Scene::new(Parts {
+    Scene::new(parts_of(scene, deformation))
+}
+
+/// The parts that a scene would be built of again.
+fn parts_of(scene: &Scene, deformation: Deformation) -> Parts {
+    Parts {
         name: scene.name.clone(),
         shapes: scene.shapes.clone(),
         materials: scene.materials.clone(),
@@ -154,7 +166,7 @@ pub fn restated(scene: &Scene, deformation: Deformation) -> Result<Arc<Scene>> {
         deformation,
         rigid_transforms: scene.rigid_transforms,
         remarks: scene.remarks.clone(),
-    })
+    }
 }
 
 #[cfg(test)]
@@ -168,8 +180,22 @@ mod tests {
             assert_eq!(Kind::named(&kind.name()), Ok(vec![kind]));
         }
         assert_eq!(Kind::named("plants").map(|list| list.len()), Ok(12));
+        assert_eq!(Kind::named("follows").map(|list| list.len()), Ok(12));
         assert_eq!(Kind::named("single").map(|list| list.len()), Ok(15));
-        for wrong in ["", "d", "plant-0", "plant-13", "single-23-10", "single-14", "single-14-513", "a-b", "b-"] {
+        for wrong in [
+            "",
+            "d",
+            "plant-0",
+            "plant-13",
+            "single-23-10",
+            "single-14",
+            "single-14-513",
+            "a-b",
+            "b-",
+            "plant-13-follows",
+            "plant-1-",
+            "b-follows",
+        ] {
             assert!(Kind::named(wrong).is_err(), "{wrong}");
         }
     }

@@ -8,9 +8,11 @@ use fastrand::Rng;
 use rayon::prelude::*;
 
 use super::build::{Patch, QUICK, Triangles, scene, seed_of, shape};
-use super::{Load, Size};
+use super::{Kind, Load, Size, parts_of};
+use crate::domain::Follow;
 use crate::error::Result;
 use crate::report::thesis::{PLANTS, Species};
+use crate::scene::Scene;
 
 /// The most render vertices and triangles of a leaf; fewer where the table has too few of them.
 const LEAF: (usize, usize) = (4, 2);
@@ -24,6 +26,28 @@ pub(super) fn grow(index: usize, size: Size) -> Result<Load> {
     let name = format!("plant-{}", index + 1);
     let scene = scene(name.clone(), shapes, counts.domains, false)?;
     Ok(Load { name, scene, paired: false, species: Some(index), remarks: remarks(&printed, &counts) })
+}
+
+/// The same plant with its leaves on its branches in turn, each by the frame that keeps it where it is: a step then brings
+/// transforms for the branches alone, and the device multiplies.
+pub(super) fn grow_on_branches(index: usize, size: Size) -> Result<Load> {
+    let grown = grow(index, size)?;
+    let branches =
+        grown.scene.domains.iter().filter(|domain| grown.scene.shapes[domain.shape].modes.rank() > 0).count();
+    let name = Kind::Follows(index).name();
+    let mut parts = parts_of(&grown.scene, grown.scene.deformation);
+    parts.name.clone_from(&name);
+    for leaf in branches..parts.domains.len() {
+        let parent = leaf % branches;
+        let own = parts.domains[leaf].placement;
+        let frame = parts.domains[parent].placement.inverse().map(|parent_from_world| parent_from_world.then(own));
+        parts.domains[leaf].follows = frame.map(|frame| Follow { parent, frame });
+    }
+    let leaves = parts.domains.len() - branches;
+    let mut remarks = grown.remarks;
+    remarks.push(format!("{leaves} leaves follow {branches} branches: {} bytes of T a step", 48 * branches));
+    // Not a row of the thesis, which sends a transform for every leaf.
+    Ok(Load { name, scene: Scene::new(parts)?, species: None, remarks, ..grown })
 }
 
 /// All counts divided by [`QUICK`], but at least what the domains need.
@@ -135,6 +159,22 @@ mod tests {
             assert_eq!(census(&load), printed, "{}", plant.name);
             let rounded = load.remarks.iter().any(|remark| remark.contains("rounded up"));
             assert_eq!(rounded, !rows.is_multiple_of(3), "{}: every rounding is on record", plant.name);
+        }
+    }
+
+    #[test]
+    fn leaves_that_follow_leave_the_plant_as_it_is_and_need_no_transforms() {
+        for (index, plant) in PLANTS.iter().enumerate() {
+            let (own, follows) = (grow(index, Size::Quick), grow_on_branches(index, Size::Quick));
+            let (own, follows) = (own.expect("grown"), follows.expect("grown"));
+            assert_eq!(census(&own), census(&follows), "{}", plant.name);
+            let [_, _, domains, branches, ..] = census(&own);
+            assert_eq!((own.scene.movers.count(), follows.scene.movers.count()), (domains, branches));
+            for (own, follows) in own.scene.domains.iter().zip(&follows.scene.domains) {
+                let apart = own.placement.0.iter().zip(follows.placement.0).map(|(own, other)| (own - other).abs());
+                assert!(apart.fold(0.0, f32::max) < 1e-5, "{}", own.name);
+            }
+            assert!(!follows.scene.needs.shear && follows.species.is_none());
         }
     }
 

@@ -19,6 +19,7 @@ fn scene(count: usize) -> Arc<Scene> {
         runs: vec![],
         placement: Transform::IDENTITY,
         attachment: None,
+        follows: None,
         rest_q: vec![],
         shares_q_with: [(2, 1), (4, 2)].into_iter().find(|(own, _)| *own == index).map(|(_, twin)| twin),
         metadata: Metadata::default(),

@@ -2,13 +2,13 @@ use super::*;
 use crate::storage::testing::{Noise, shape, with_columns};
 
 /// Random coordinates and a sheared, perhaps mirroring transform.
-fn transform(noise: &mut Noise) -> Transform {
-    Transform(std::array::from_fn(|_| 2.0 * noise.next()))
+fn transform(noise: &mut Noise) -> Composed {
+    Transform(std::array::from_fn(|_| 2.0 * noise.next())).into()
 }
 
 /// What the page describes, in f32 on stored entries, with axis `axis + turn` read for `axis`.
 fn chained(shape: &Shape, tiles: &Tiles, step: &Step, turn: usize) -> Vec<[f32; 3]> {
-    let t = step.transform.0;
+    let t = step.transform.rounded().0;
     let position = |vertex: usize| {
         let place = vertex / crate::storage::QUAD / crate::storage::TILE_QUADS;
         let bent: [f32; 3] = std::array::from_fn(|axis| {
@@ -31,13 +31,13 @@ fn chained(shape: &Shape, tiles: &Tiles, step: &Step, turn: usize) -> Vec<[f32; 
 }
 
 fn exact(shape: &Shape, step: &Step) -> Vec<[f64; 3]> {
-    let place = step.transform.to_matrix();
+    let t = step.transform.exact();
     let position = |vertex: usize| {
         let bent = [0, 1, 2].map(|axis| {
             let part = |(mode, q): (usize, &f32)| f64::from(*q) * f64::from(shape.modes.at(vertex, axis, mode));
             f64::from(shape.mesh.rest()[vertex][axis]) + step.q.iter().enumerate().map(part).sum::<f64>()
         });
-        place.transform_point(&nalgebra::Point3::from(bent)).coords.into()
+        [0, 4, 8].map(|row| t[row] * bent[0] + t[row + 1] * bent[1] + t[row + 2] * bent[2] + t[row + 3])
     };
     (0..shape.mesh.rest().len()).map(position).collect()
 }
@@ -83,6 +83,53 @@ fn the_bound_holds_for_every_storage_size_and_seed_and_mistaken_axes_break_it() 
 }
 
 #[test]
+fn the_bound_of_a_follower_holds_for_every_seed_and_breaks_where_its_frame_is_left_out_or_rounds_more() {
+    let (mut largest, mut coarser) = (0.0_f64, 0);
+    for seed in 0..120_u64 {
+        let mut noise = Noise(500 + seed);
+        let shape = shape(40, 3, &mut noise);
+        let q: Vec<f32> = (0..3).map(|_| noise.next()).collect();
+        let (mover, frame) = (transform(&mut noise).mover, transform(&mut noise).mover);
+        let step = |transform| Step { q: &q, transform, compensated: false };
+        let follows = Composed { mover, frame: Some(frame) };
+        let tiles = Tiles::new(&shape, Storage::F32);
+        let bound = Reaches::new(&shape, &tiles).domain(&step(follows));
+        let want = exact(&shape, &step(follows));
+        let part = |transform: Composed| worst(&chained(&shape, &tiles, &step(transform), 0), &want, |_| bound.total());
+        largest = largest.max(part(follows));
+        assert!(part(follows) <= 1.0, "seed {seed}: {} of the bound", part(follows));
+        assert!(part(mover.into()) > 1.0, "seed {seed}: without its frame at {}", part(mover.into()));
+        // A frame of ten bits, as if products were rounded to bf16.
+        let coarse = Transform(frame.0.map(|entry| f32::from_bits(entry.to_bits() & 0xffff_e000)));
+        coarser += usize::from(part(Composed { mover, frame: Some(coarse) }) > 1.0);
+    }
+    assert!(largest > 0.01, "{largest} of the bound at most: it would be of no use");
+    assert_eq!(coarser, 120);
+}
+
+#[test]
+fn rounding_the_product_of_a_frame_is_within_its_part_of_the_bound_and_the_norm_covers_both() {
+    for seed in 0..200_u64 {
+        let mut noise = Noise(900 + seed);
+        let scale = f32::exp2(40.0 * noise.next());
+        let mover = Transform(transform(&mut noise).mover.0.map(|entry| entry * scale));
+        let follows = Composed { mover, frame: Some(transform(&mut noise).mover) };
+        let (got, want, [turned, moved]) = (follows.rounded(), follows.exact(), rounding(&follows));
+        let error = |linear: bool| {
+            let entries = (0..12).filter(|at| (at % 4 != 3) == linear);
+            entries.map(|at| (f64::from(got.0[at]) - want[at]).powi(2)).sum::<f64>().sqrt()
+        };
+        assert!(error(true) <= turned && error(false) <= moved, "seed {seed}");
+        assert!(error(true) > 1e-3 * turned, "seed {seed}: {} of {turned}", error(true));
+        for linear in [follows.linear(), got.linear()] {
+            let (singular, norm) = (linear.singular_values().max(), norm(&follows));
+            assert!(norm >= singular && norm <= singular * (1.0 + 1e-5), "{norm} for {singular}");
+        }
+    }
+    assert_eq!(rounding(&Transform::IDENTITY.into()), [0.0; 2]);
+}
+
+#[test]
 fn columns_that_differ_by_a_factor_of_1e12_keep_their_digits_in_f16_and_would_overflow_unscaled() {
     let mut noise = Noise(9);
     let scale = |mode: usize| 10_f32.powi(6 - 4 * mode as i32);
@@ -93,7 +140,7 @@ fn columns_that_differ_by_a_factor_of_1e12_keep_their_digits_in_f16_and_would_ov
     let tiles = Tiles::new(&shape, Storage::F16);
     for mode in 0..4 {
         let alone: Vec<f32> = (0..4).map(|other| if other == mode { 1.0 / scale(mode) } else { 0.0 }).collect();
-        let step = Step { q: &alone, transform: Transform::IDENTITY, compensated: false };
+        let step = Step { q: &alone, transform: Transform::IDENTITY.into(), compensated: false };
         assert!(judge(&shape, Storage::F16, &step)[0] <= 1.0);
         assert!(Reaches::new(&shape, &tiles).domain(&step).storage <= 1e-3, "mode {mode}");
     }
@@ -137,7 +184,7 @@ fn sources_are_zero_where_there_is_no_such_error() {
     let q = [0.3; 6];
     let bound = |storage, q: &[f32]| {
         let reaches = Reaches::new(&shape, &Tiles::new(&shape, storage));
-        reaches.domain(&Step { q, transform: Transform::IDENTITY, compensated: false })
+        reaches.domain(&Step { q, transform: Transform::IDENTITY.into(), compensated: false })
     };
     let plain = bound(Storage::F32, &q);
     assert_eq!((plain.storage, plain.coordinates), (0.0, 0.0));
@@ -156,7 +203,7 @@ fn the_norm_is_not_below_the_largest_singular_value_and_hardly_above_it() {
     let judge = |linear: nalgebra::Matrix3<f64>| {
         let transform = Transform::from_parts(&linear, &nalgebra::Vector3::zeros());
         let exact = transform.linear().singular_values().max();
-        let norm = norm(&transform);
+        let norm = norm(&transform.into());
         assert!(norm >= exact * (1.0 - 1e-15) && norm <= exact * (1.0 + 2e-7), "{norm} for {exact} of {linear}");
     };
     let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
@@ -166,5 +213,5 @@ fn the_norm_is_not_below_the_largest_singular_value_and_hardly_above_it() {
         judge(nalgebra::Matrix3::from_element(scale));
     }
     (0..1000).for_each(|_| judge(nalgebra::Matrix3::from_fn(|_, _| f64::from(noise.next()))));
-    assert_eq!(norm(&Transform([0.0; 12])), 0.0);
+    assert_eq!(norm(&Transform([0.0; 12]).into()), 0.0);
 }

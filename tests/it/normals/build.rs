@@ -121,6 +121,7 @@ fn domain(shape: usize) -> Domain {
         material: 0,
         placement: Transform::IDENTITY,
         attachment: None,
+        follows: None,
         runs: vec![],
         rest_q: vec![],
         shares_q_with: None,

@@ -47,6 +47,7 @@ impl Stage {
             runs: vec![],
             placement: Transform::IDENTITY,
             attachment: None,
+            follows: None,
             rest_q: vec![],
             shares_q_with: None,
             metadata: Metadata::default(),

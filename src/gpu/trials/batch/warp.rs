@@ -25,7 +25,7 @@ impl Tables {
         let tiles = Tiles::new(scene.shape_of(0), scene.deformation.storage);
         let (vectors, modes) = (vectors_for(scene.domains.len()).0, tiles.chunks() * modes_per_chunk(tiles.storage()));
         let q = amounts(scene, state, tiles.factors(), (vectors, modes));
-        Self { transforms: transforms(state, vectors), q, vectors, tiles }
+        Self { transforms: transforms(scene, state, vectors), q, vectors, tiles }
     }
 }
 

@@ -61,7 +61,7 @@ impl Cublas {
         let places = batches.places_of_u(scene.domains.len());
         let u_matrices = upload_matrices(device, scene, &batches, peer)?;
         let u = room(device, 4 * batches.floats[2])?;
-        let transforms = |state: &State| bytemuck::cast_slice(&state.transforms).to_vec();
+        let transforms = |state: &State| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
         let turns = Turns::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
         let pointers = (peer == Peer::Grouped).then(|| Pointers::new(device, &batches, [&u_matrices, &u], &turns));
         let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &places)).transpose()?;

@@ -92,7 +92,7 @@ impl Thesis {
             update,
             u: room(device, 16 * places.1 as u64)?,
             places,
-            turns: Turns::new(device, scene, states, |state| [packed_q(scene, state), matrices(state)])?,
+            turns: Turns::new(device, scene, states, |state| [packed_q(scene, state), matrices(scene, state)])?,
             vertices: scene.layout.vertices,
             q_bytes: scene.layout.slots.iter().map(|slot| 4 * slot.rank.next_multiple_of(4) as u64).sum(),
         })

@@ -103,9 +103,10 @@ const fn four([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
     [x, y, z, w]
 }
 
-/// T as four rows of four.
-pub(super) fn matrices(state: &State) -> Vec<f32> {
-    state.transforms.iter().flat_map(|transform| transform.0.into_iter().chain([0.0, 0.0, 0.0, 1.0])).collect()
+/// T of every domain as four rows of four.
+pub(super) fn matrices(scene: &Scene, state: &State) -> Vec<f32> {
+    let transforms = state.world_transforms(scene);
+    transforms.iter().flat_map(|transform| transform.0.into_iter().chain([0.0, 0.0, 0.0, 1.0])).collect()
 }
 
 /// The kernel, what it reads and what it writes.
@@ -246,7 +247,7 @@ mod tests {
                     four(u_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
             }
         }
-        let positions = twin_of_thesis_update(&unfolded, &matrices(&state), &u);
+        let positions = twin_of_thesis_update(&unfolded, &matrices(&scene, &state), &u);
         let folded = fold(&positions, &unfolded.targets, scene.layout.vertices);
         let mut left_out = 0;
         for (domain, slot) in scene.layout.slots.iter().enumerate() {

@@ -1,0 +1,63 @@
+// T of a domain: its own or, with FOLLOWERS, that of the domain that it follows times a constant frame. CPU twin:
+// src/domain/composed.rs, bit by bit: the order of operations is stated there.
+#pragma once
+#include "layout.cuh"
+
+// The three rows of a transform.
+struct Affine {
+    float4 a, b, c;
+};
+
+// Where transforms are found.
+struct Transforms {
+    const float4* rows; // [movers][3]
+#ifdef FOLLOWERS
+    const Following* following;
+    const float4* frames; // [followers][3]
+#endif
+};
+
+template <typename Args>
+__device__ __forceinline__ Transforms transforms_of(const Args& args) {
+#ifdef FOLLOWERS
+    return {args.transforms, args.following, args.frames};
+#else
+    return {args.transforms};
+#endif
+}
+
+__device__ __forceinline__ Affine affine_at(const float4* list, unsigned index) {
+    const float4* rows = list + 3 * (size_t)index;
+    return {__ldg(rows), __ldg(rows + 1), __ldg(rows + 2)};
+}
+
+#ifdef FOLLOWERS
+__device__ __forceinline__ Following following_of(const Transforms& transforms, unsigned domain) {
+    const uint2 own = __ldg((const uint2*)(transforms.following + domain));
+    return {own.x, own.y};
+}
+
+// A row of T times a column of F.
+__device__ __forceinline__ float product_of(const float4& t, float x, float y, float z) {
+    return fmaf(t.x, x, fmaf(t.y, y, __fmul_rn(t.z, z)));
+}
+
+__device__ __forceinline__ float4 row_of(const float4& t, const Affine& f) {
+    return make_float4(product_of(t, f.a.x, f.b.x, f.c.x), product_of(t, f.a.y, f.b.y, f.c.y),
+                       product_of(t, f.a.z, f.b.z, f.c.z), fmaf(t.x, f.a.w, fmaf(t.y, f.b.w, fmaf(t.z, f.c.w, t.w))));
+}
+#endif
+
+__device__ __forceinline__ Affine place_of(const Transforms& transforms, unsigned domain) {
+#ifdef FOLLOWERS
+    const Following own = following_of(transforms, domain);
+    const Affine t = affine_at(transforms.rows, own.mover);
+    if (own.frame == NO_FRAME) {
+        return t;
+    }
+    const Affine f = affine_at(transforms.frames, own.frame);
+    return {row_of(t.a, f), row_of(t.b, f), row_of(t.c, f)};
+#else
+    return affine_at(transforms.rows, domain);
+#endif
+}

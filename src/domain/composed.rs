@@ -1,0 +1,92 @@
+//! T = T_mover F: the transform of a domain that follows another one by a constant frame.
+
+use nalgebra::Matrix3;
+
+use super::Transform;
+
+/// A domain's transform as what it is made of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Composed {
+    /// The domain's own transform, or that of the domain that it follows.
+    pub mover: Transform,
+    /// `mover_from_domain`; `None` for a domain with a transform of its own.
+    pub frame: Option<Transform>,
+}
+
+impl From<Transform> for Composed {
+    fn from(mover: Transform) -> Self {
+        Self { mover, frame: None }
+    }
+}
+
+impl Composed {
+    /// `world_from_domain` in f32, as deformers multiply positions with it. With row t of the mover and column f of the
+    /// frame an entry is `fma(t0, f0, fma(t1, f1, t2 f2))`, a translation `fma(t0, f0, fma(t1, f1, fma(t2, f2, t3)))`:
+    /// three roundings each. Twin of `place_of` in `kernels/follow.cuh`, bit by bit.
+    pub fn rounded(&self) -> Transform {
+        let Some(Transform(f)) = self.frame else { return self.mover };
+        let mut product = [0.0; 12];
+        for (t, out) in self.mover.0.chunks_exact(4).zip(product.chunks_exact_mut(4)) {
+            for (column, out) in out.iter_mut().enumerate() {
+                let last = if column == 3 { t[2].mul_add(f[11], t[3]) } else { t[2] * f[8 + column] };
+                *out = t[0].mul_add(f[column], t[1].mul_add(f[4 + column], last));
+            }
+        }
+        Transform(product)
+    }
+
+    /// The same in f64, 3x4 row-major. Products of two f32 are exact there and cannot overflow; sums go from left to
+    /// right, so that an entry that vanishes here vanishes on the device.
+    pub fn exact(&self) -> [f64; 12] {
+        let t = self.mover.0.map(f64::from);
+        let Some(frame) = self.frame else { return t };
+        let f = frame.0.map(f64::from);
+        std::array::from_fn(|at| {
+            let (row, column) = (&t[at / 4 * 4..][..4], at % 4);
+            let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];
+            if column == 3 { sum + row[3] } else { sum }
+        })
+    }
+
+    /// The linear part A of [`Self::exact`], which turns normals and tangents.
+    pub fn linear(&self) -> Matrix3<f64> {
+        let entries = self.exact();
+        Matrix3::from_fn(|row, column| entries[4 * row + column])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const T: Transform = Transform([0.0, -2.0, 0.5, 10.0, 2.0, 0.0, 0.25, -20.0, 0.0, 0.5, 2.0, 30.0]);
+    const F: Transform = Transform([1.0, 0.5, 0.0, 3.0, 0.0, 4.0, 0.0, -1.0, 2.0, 0.0, 1.0, 0.5]);
+
+    #[test]
+    fn a_follower_is_where_its_mover_takes_its_frame_and_the_other_order_is_elsewhere() {
+        let composed = Composed { mover: T, frame: Some(F) };
+        // Small whole numbers and halves: every product and sum is exact in f32.
+        assert_eq!(composed.rounded(), T.then(F));
+        assert_eq!(composed.exact(), T.then(F).0.map(f64::from));
+        assert_eq!(composed.linear(), T.linear() * F.linear());
+        assert_ne!(composed.rounded(), F.then(T), "the judge can fail");
+        let own = Composed::from(T);
+        assert_eq!((own.rounded(), own.linear()), (T, T.linear()));
+    }
+
+    #[test]
+    fn a_product_that_leaves_f32_is_kept_in_f64_and_one_that_cancels_vanishes() {
+        let scaled = |scale: f32| Transform(Transform::IDENTITY.0.map(|entry| entry * scale));
+        let huge = Composed { mover: scaled(1e30), frame: Some(scaled(1e30)) };
+        assert_eq!(huge.rounded().0[0], f32::INFINITY);
+        assert!((huge.exact()[0] / 1e60 - 1.0).abs() < 1e-6);
+        let tiny = Composed { mover: scaled(1e-30), frame: Some(scaled(1e-30)) };
+        assert_eq!(tiny.rounded().0[0], 0.0);
+        assert!(tiny.linear().determinant() > 0.0);
+        let mut flat = Transform::IDENTITY;
+        (flat.0[0], flat.0[1]) = (0.1, -0.1);
+        let mut ones = Transform::IDENTITY;
+        (ones.0[0], ones.0[4]) = (1.0, 1.0);
+        assert_eq!(Composed { mover: flat, frame: Some(ones) }.exact()[0], 0.0);
+    }
+}

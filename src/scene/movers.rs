@@ -1,0 +1,240 @@
+//! Which domains have a transform of their own in a step, and how the others follow them.
+
+use nalgebra::Matrix4;
+
+use crate::domain::{Composed, Domain, Transform};
+use crate::error::{Result, invalid};
+
+/// Transforms of a state lie in the order of the movers, the domains that follow no other.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Movers {
+    count: usize,
+    /// `None` where nobody follows: every domain then is its own mover.
+    table: Option<Table>,
+}
+
+#[derive(Debug, Clone, PartialEq, Default)]
+struct Table {
+    /// Per mover, its domain.
+    domains: Vec<u32>,
+    /// Per domain, its mover, and its frame or [`Movers::NO_FRAME`].
+    following: Vec<[u32; 2]>,
+    /// `mover_from_domain` of each follower.
+    frames: Vec<Transform>,
+    /// Per domain, where its followers begin in `followers`, and where the last ones end. None of a follower.
+    begins: Vec<u32>,
+    followers: Vec<u32>,
+}
+
+impl Movers {
+    /// In place of the frame of a domain that follows no other.
+    pub const NO_FRAME: u32 = u32::MAX;
+
+    /// Looks at checked domains, whose parents come first, and puts followers where they follow to. Frames of frames are
+    /// multiplied in f64 and rounded once.
+    ///
+    /// # Errors
+    /// `Invalid` naming the domain whose frame or place leaves f32.
+    pub(super) fn new(domains: &mut [Domain]) -> Result<Self> {
+        if domains.iter().all(|domain| domain.follows.is_none()) {
+            return Ok(Self { count: domains.len(), table: None });
+        }
+        let mut table = Table::default();
+        // Of followers alone: many domains need no memory here.
+        let mut exact: Vec<Matrix4<f64>> = Vec::new();
+        for index in 0..domains.len() {
+            let Some(follow) = domains[index].follows else {
+                table.following.push([table.domains.len() as u32, Self::NO_FRAME]);
+                table.domains.push(index as u32);
+                continue;
+            };
+            let [mover, above] = table.following[follow.parent];
+            let frame = follow.frame.to_matrix();
+            let frame = exact.get(above as usize).map_or(frame, |above| above * frame);
+            let rounded = Transform::from_matrix(&frame);
+            let placement = domains[table.domains[mover as usize] as usize].placement;
+            let placement = Composed { mover: placement, frame: Some(rounded) }.rounded();
+            for (field, transform) in [("follows.frame", rounded), ("placement", placement)] {
+                Transform::new(transform.0).map_err(|error| error.within(&format!("domain {index}: {field}")))?;
+            }
+            domains[index].placement = placement;
+            table.following.push([mover, exact.len() as u32]);
+            table.frames.push(rounded);
+            exact.push(frame);
+        }
+        table.list_followers();
+        Ok(Self { count: table.domains.len(), table: Some(table) })
+    }
+
+    /// How many there are: the length of [`super::State::transforms`].
+    pub const fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Index in [`super::State::transforms`] of a domain's own transform, or of that which it follows.
+    pub fn of(&self, domain: usize) -> usize {
+        self.table.as_ref().map_or(domain, |table| table.following[domain][0] as usize)
+    }
+
+    /// `mover_from_domain` of a follower; `None` of a mover.
+    pub fn frame_of(&self, domain: usize) -> Option<Transform> {
+        self.table.as_ref().and_then(|table| table.frames.get(table.following[domain][1] as usize).copied())
+    }
+
+    /// The domain of each mover, in the order of [`super::State::transforms`].
+    pub fn domains(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
+        (0..self.count).map(|mover| self.domain(mover))
+    }
+
+    /// The domain of a mover.
+    pub fn domain(&self, mover: usize) -> u32 {
+        self.table.as_ref().map_or(mover as u32, |table| table.domains[mover])
+    }
+
+    /// The domains that move with a domain, ascending; itself is not among them, and none are of a follower.
+    pub fn followers_of(&self, domain: usize) -> &[u32] {
+        self.table
+            .as_ref()
+            .map_or(&[], |table| &table.followers[table.begins[domain] as usize..table.begins[domain + 1] as usize])
+    }
+
+    /// Per domain its mover and the index of its frame, or [`Self::NO_FRAME`]; empty where nobody follows.
+    pub fn following(&self) -> &[[u32; 2]] {
+        self.table.as_ref().map_or(&[], |table| &table.following)
+    }
+
+    /// `mover_from_domain` of every follower; empty where nobody follows.
+    pub fn frames(&self) -> &[Transform] {
+        self.table.as_ref().map_or(&[], |table| &table.frames)
+    }
+}
+
+impl Table {
+    /// Sorts followers by their movers; those of one stay ascending.
+    fn list_followers(&mut self) {
+        let mut begins = vec![0_u32; self.following.len() + 1];
+        let followers = || self.following.iter().enumerate().filter(|(_, [_, frame])| *frame != Movers::NO_FRAME);
+        for (_, [mover, _]) in followers() {
+            begins[self.domains[*mover as usize] as usize + 1] += 1;
+        }
+        for at in 1..begins.len() {
+            begins[at] += begins[at - 1];
+        }
+        let mut next = begins.clone();
+        let mut list = vec![0; self.frames.len()];
+        for (index, [mover, _]) in followers() {
+            let place = &mut next[self.domains[*mover as usize] as usize];
+            list[*place as usize] = index as u32;
+            *place += 1;
+        }
+        (self.begins, self.followers) = (begins, list);
+    }
+}
+
+/// Refuses a step that moves a follower.
+pub(super) fn check_moves(movers: &Movers, domains: &[Domain], (field, list): (&str, &[u32])) -> Result<()> {
+    if movers.table.is_none() {
+        return Ok(());
+    }
+    match list.iter().position(|domain| domains[*domain as usize].follows.is_some()) {
+        None => Ok(()),
+        Some(at) => {
+            let name = |domain: u32| &domains[domain as usize].name;
+            let mover = movers.domain(movers.of(list[at] as usize));
+            let given = format!("{} ('{}'), which follows '{}'", list[at], name(list[at]), name(mover));
+            Err(invalid(format!("{field}[{at}]"), "a domain with a transform of its own", given))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::Follow;
+    use crate::scene::{Parts, Scene};
+    use crate::storage::testing::{Noise, parts};
+
+    fn moved(x: f32) -> Transform {
+        let mut transform = Transform::IDENTITY;
+        transform.0[3] = x;
+        transform
+    }
+
+    /// Five domains; the pairs say who follows whom, at x = 1, 2, 3, ...
+    fn following(pairs: &[(usize, usize)]) -> Parts {
+        let mut parts = parts(&[(4, 2), (5, 0), (6, 0), (4, 1), (3, 0)], &mut Noise(3));
+        for (at, (child, parent)) in pairs.iter().enumerate() {
+            parts.domains[*child].follows = Some(Follow { parent: *parent, frame: moved(1.0 + at as f32) });
+        }
+        parts
+    }
+
+    #[test]
+    fn chains_are_flattened_to_their_mover_and_placements_follow() {
+        let mut parts = following(&[(1, 0), (2, 1), (4, 3)]);
+        parts.domains[0].placement = moved(10.0);
+        let scene = Scene::new(parts).expect("a scene");
+        let movers = &scene.movers;
+        assert_eq!((movers.count(), movers.domains().collect::<Vec<_>>()), (2, vec![0, 3]));
+        assert_eq!([0, 1, 2, 3, 4].map(|domain| movers.of(domain)), [0, 0, 0, 1, 1]);
+        let frames = [0, 1, 2, 3, 4].map(|domain| movers.frame_of(domain));
+        assert_eq!(frames, [None, Some(moved(1.0)), Some(moved(3.0)), None, Some(moved(3.0))]);
+        assert_eq!(
+            [0, 1, 2, 3, 4].map(|domain| movers.followers_of(domain).to_vec()),
+            [vec![1, 2], vec![], vec![], vec![4], vec![]]
+        );
+        assert_eq!((scene.domains[1].placement, scene.domains[2].placement), (moved(11.0), moved(13.0)));
+        assert!(scene.needs.followers);
+    }
+
+    #[test]
+    fn frames_of_frames_are_rounded_once() {
+        let mut parts = following(&[(1, 0), (2, 1)]);
+        let third = Transform(Transform::IDENTITY.0.map(|entry| entry / 3.0));
+        for child in [1, 2] {
+            parts.domains[child].follows = Some(Follow { parent: child - 1, frame: third });
+        }
+        let scene = Scene::new(parts).expect("a scene");
+        let once = (f64::from(1.0_f32 / 3.0) * f64::from(1.0_f32 / 3.0)) as f32;
+        assert_eq!(scene.movers.frame_of(2).expect("follows").0[0], once);
+    }
+
+    #[test]
+    fn where_nobody_follows_there_is_no_table() {
+        let scene = Scene::new(following(&[])).expect("a scene");
+        assert_eq!((scene.movers.table.as_ref(), scene.movers.count()), (None, 5));
+        assert_eq!((scene.movers.of(3), scene.movers.frame_of(3), scene.movers.domain(3)), (3, None, 3));
+        assert!(scene.movers.followers_of(3).is_empty() && !scene.needs.followers);
+    }
+
+    #[test]
+    fn later_parents_and_frames_that_leave_f32_are_refused_by_name() {
+        let with = |child: usize, parent: usize, scale: f32| {
+            let mut parts = following(&[(1, 0)]);
+            let frame = Transform(Transform::IDENTITY.0.map(|entry| entry * scale));
+            parts.domains[1].follows = Some(Follow { parent: 0, frame });
+            parts.domains[child].follows = Some(Follow { parent, frame });
+            Scene::new(parts).map(drop).expect_err("refused").to_string()
+        };
+        for (child, parent) in [(2, 2), (2, 4), (2, 9)] {
+            let refusal = with(child, parent, 1.0);
+            assert!(refusal.starts_with("domain 2: follows.parent: expected an index below 2"), "{refusal}");
+        }
+        assert!(with(2, 1, 1e30).starts_with("domain 2: follows.frame: transform[0]"), "{}", with(2, 1, 1e30));
+        assert!(with(2, 1, f32::NAN).starts_with("domain 1: follows.frame: transform[0]"));
+    }
+
+    #[test]
+    fn a_sheared_frame_makes_the_scene_need_the_inverse_transpose() {
+        let scene = |frame: Transform| {
+            let mut parts = following(&[(1, 0)]);
+            parts.rigid_transforms = true;
+            parts.domains[1].follows = Some(Follow { parent: 0, frame });
+            Scene::new(parts).expect("a scene")
+        };
+        let (mut sheared, mut mirrored) = (Transform::IDENTITY, Transform::IDENTITY);
+        (sheared.0[1], mirrored.0[0]) = (0.5, -1.0);
+        assert!(scene(sheared).needs.shear);
+        assert!(!scene(mirrored).needs.shear);
+    }
+}
