@@ -18,12 +18,14 @@
 //! | `apply`, `deform`, `bounds`, `normals` | the launchers |
 //! | `deformer` | the graph of a step, and its answer |
 //! | `output`, `interop` | where the vertices go |
+//! | `boxes` | a box of each domain, where the scene keeps them |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
 //! | `probe`, `report` | what is there, and whether the device agrees on layouts |
 //! | `trials` | what only measures |
 
 mod apply;
 mod bounds;
+mod boxes;
 mod compile;
 mod deform;
 mod deformer;

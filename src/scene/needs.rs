@@ -25,6 +25,10 @@ pub struct Needs {
     pub truncation: bool,
     /// Sums carry their rounding errors along.
     pub compensated: bool,
+    /// Displacements are kept, those of domains without modes too: they are 0.
+    pub displacements: bool,
+    /// A box of each domain is kept.
+    pub boxes: bool,
 }
 
 impl Needs {
@@ -45,11 +49,13 @@ impl Needs {
             exact_normals: modes && parts.deformation.normals == Normals::Exact,
             truncation: modes && parts.deformation.truncation.is_some(),
             compensated: modes && parts.deformation.compensated,
+            displacements: parts.deformation.displacements,
+            boxes: parts.deformation.boxes,
         }
     }
 
     /// Each flag with its name, in a fixed order.
-    pub fn flags(&self) -> [(&'static str, bool); 10] {
+    pub fn flags(&self) -> [(&'static str, bool); 12] {
         [
             ("modes", self.modes),
             ("textures", self.textures),
@@ -61,6 +67,8 @@ impl Needs {
             ("exact_normals", self.exact_normals),
             ("truncation", self.truncation),
             ("compensated", self.compensated),
+            ("displacements", self.displacements),
+            ("boxes", self.boxes),
         ]
     }
 }
