@@ -51,6 +51,10 @@ constexpr unsigned WARPS = 1;
 constexpr unsigned RESIDENT = 16;
 #elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || (defined(NORMAL_MAPS) && defined(TRUNCATED))
 constexpr unsigned RESIDENT = 20;
+#elif defined(DISPLACEMENTS) && (defined(STORE_F16) || defined(STORE_BF16) || defined(STORE_INT8))
+constexpr unsigned RESIDENT = 20;
+#elif defined(DISPLACEMENTS) && defined(ORIENT)
+constexpr unsigned RESIDENT = 24;
 #elif defined(NORMAL_MAPS) || (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16))) || \
     (defined(TRUNCATED) && defined(STORE_INT8)) || __CUDA_ARCH__ < 900
 constexpr unsigned RESIDENT = 24;
@@ -59,7 +63,11 @@ constexpr unsigned RESIDENT = 28;
 #endif
 #else
 constexpr unsigned WARPS = 2;
+#ifdef DISPLACEMENTS
+constexpr unsigned RESIDENT = 12;
+#else
 constexpr unsigned RESIDENT = 16;
+#endif
 #endif
 
 #ifdef MODES

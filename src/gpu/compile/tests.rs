@@ -73,6 +73,7 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
         list.extend(ends.map(|defines| (defines, large)));
     };
     with(&[]);
+    with(&["DISPLACEMENTS"]);
     for storage in storages() {
         for more in subsets(&["TRUNCATED", "COMPENSATED", "DISPLACEMENTS"]) {
             with(&[&["MODES"], storage.as_slice(), &more].concat());
