@@ -17,13 +17,14 @@
 //   normals       [corners][3] f32, in the header                                                           (out)
 //   tangents      [corners] float4, in the header                                                           (out)
 //   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
-//                 WITHOUT_POSITIONS, for measuring                                                          (out)
+//                 WITHOUT_POSITIONS, for measuring, where u is not mended                                   (out)
 //   boxes         [tiles][4][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                (out)
 // Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles, or any number of blocks with LISTED.
 // CPU twin: src/reference/deform.rs.
 //
 // The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
-// agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost.
+// agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost; a u
+// that is lost counts in the boxes like an x.
 #include "chain.cuh"
 #include "chunk.cuh"
 #include "ordered.cuh"
@@ -54,6 +55,10 @@ constexpr unsigned RESIDENT = 16;
 #elif defined(COMPENSATED) || (defined(ORIENT) && defined(STORE_INT8)) || \
     (defined(NORMAL_MAPS) && (defined(TRUNCATED) || defined(FOLLOWERS)))
 constexpr unsigned RESIDENT = 20;
+#elif defined(DISPLACEMENTS) && (defined(STORE_F16) || defined(STORE_BF16) || defined(STORE_INT8))
+constexpr unsigned RESIDENT = 20;
+#elif defined(DISPLACEMENTS) && defined(ORIENT)
+constexpr unsigned RESIDENT = 24;
 #elif defined(NORMAL_MAPS) || \
     (defined(ORIENT) && (defined(STORE_F16) || defined(STORE_BF16) || defined(FOLLOWERS))) || \
     (defined(TRUNCATED) && defined(STORE_INT8)) || __CUDA_ARCH__ < 900
@@ -63,7 +68,7 @@ constexpr unsigned RESIDENT = 28;
 #endif
 #else
 constexpr unsigned WARPS = 2;
-#if defined(ORIENT) && defined(FOLLOWERS)
+#if defined(DISPLACEMENTS) || (defined(ORIENT) && defined(FOLLOWERS))
 constexpr unsigned RESIDENT = 12;
 #else
 constexpr unsigned RESIDENT = 16;
@@ -239,25 +244,32 @@ __device__ __forceinline__ float placed(const float4& row, float x, float y, flo
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
-// The x of one vertex of this lane in f64, rounded once: for what overflowed on its way in f32 although it need not.
-__device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
-    const Part part = part_of(args, tile, share);
-    const unsigned within = part.within + vertex;
-    const float* rest = first_of(args.rest, part, 3);
-    double bent[3];
+// The u of one vertex of this lane in f64.
+__device__ __forceinline__ void sum_exactly(const DeformArgs& args, const Part& part, unsigned vertex, double (&u)[3]) {
     for (unsigned axis = 0; axis < 3; ++axis) {
-        double sum = 0.0;
+        u[axis] = 0.0;
 #ifdef MODES
         const Chosen chosen(args, part);
         for (unsigned i = 0; i < chosen.count; ++i) {
             const Amounts amounts = amounts_of(args, part, chosen[i]);
             const uint4* words = args.words + part.first_word + part.quad + chosen[i] * 3 * (size_t)part.width;
             for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
-                sum += (double)entry_at(words, part.width, mode, axis, within) * (double)amounts.of[mode];
+                const double entry = entry_at(words, part.width, mode, axis, part.within + vertex);
+                u[axis] += entry * (double)amounts.of[mode];
             }
         }
 #endif
-        bent[axis] = (double)rest[4 * axis * part.stride + vertex] + sum;
+    }
+}
+
+// The x of one vertex of this lane in f64, rounded once: for what overflowed on its way in f32 although it need not.
+__device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
+    const Part part = part_of(args, tile, share);
+    const float* rest = first_of(args.rest, part, 3);
+    double bent[3];
+    sum_exactly(args, part, vertex, bent);
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        bent[axis] = (double)rest[4 * axis * part.stride + vertex] + bent[axis];
     }
 #ifdef FOLLOWERS
     // One after the other: the product of both may overflow f32.
@@ -283,6 +295,27 @@ __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned t
     }
     return make_float3(placed[0], placed[1], placed[2]);
 }
+
+#if defined(DISPLACEMENTS) && defined(MODES)
+// The u of one vertex likewise, in its place, where the warp stored it before its last barrier. One that is lost counts
+// in the box as a NaN: x may be finite all the same.
+__device__ __noinline__ void mend_displacement(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex,
+                                               unsigned (&keys)[6]) {
+    const Part part = part_of(args, tile, share);
+    float* u = args.header->displacements + 3 * (size_t)(part.item + vertex);
+    if (isfinite(u[0]) && isfinite(u[1]) && isfinite(u[2])) {
+        return;
+    }
+    double exact[3];
+    sum_exactly(args, part, vertex, exact);
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        u[axis] = (float)exact[axis];
+        if (!isfinite(u[axis])) {
+            keys[axis] = keys[3 + axis] = 0xffffffffu;
+        }
+    }
+}
+#endif
 
 // The six sides of what a lane staged, as keys. Vertices that are not there count as the first.
 __device__ __forceinline__ void box_of(const float (&world)[FLOATS], unsigned count, unsigned (&keys)[6]) {
@@ -310,6 +343,10 @@ __device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigne
         float* at = numbers + 3 * vertex;
         if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
             const float3 exact = placed_exactly(args, tile, share, vertex);
+#if defined(DISPLACEMENTS) && defined(MODES)
+            // A u that is not finite makes no x that is.
+            mend_displacement(args, tile, share, vertex, keys);
+#endif
             at[0] = exact.x;
             at[1] = exact.y;
             at[2] = exact.z;

@@ -110,13 +110,25 @@ struct DeformArgs {
 };
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/gpu/layout.rs");
 
+// A part of a domain of which `bounds` makes a box.
+struct Piece {
+    unsigned first; // packed vertex, or box of `deform`
+    unsigned count;
+    unsigned domain;
+    unsigned of_vertices; // not of boxes
+};
+static_assert(sizeof(Piece) == 16, "Piece differs from src/gpu/layout.rs");
+
 struct BoundsArgs {
     Header* header;
     const unsigned* boxes;
+    const Piece* pieces;
+    const unsigned* stamps;
+    unsigned* piece_boxes;
     unsigned count;
-    unsigned reserved;
+    unsigned piece_count;
 };
-static_assert(sizeof(BoundsArgs) == 24, "BoundsArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(BoundsArgs) == 48, "BoundsArgs differs from src/gpu/layout.rs");
 
 struct ApplyArgs {
     const Header* header;

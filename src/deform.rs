@@ -15,6 +15,45 @@ pub struct Surface {
     pub normals: Vec<f32>,
     /// World unit tangents and bitangent signs, four numbers per corner; empty when the scene has no normal map.
     pub tangents: Vec<f32>,
+    /// u = U q, three numbers per vertex in the frame of its domain, scene units; empty unless the scene keeps them
+    /// (`deform.displacements`).
+    pub displacements: Vec<f32>,
+    /// Per domain the smallest box that holds its `positions`, relative to the same cell; empty unless the scene keeps
+    /// them (`deform.boxes`).
+    pub boxes: Vec<Bounds>,
+}
+
+/// What of a [`Surface`] a reader wants; nothing by default.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Wanted {
+    pub positions: bool,
+    /// And tangents.
+    pub normals: bool,
+    pub displacements: bool,
+    pub boxes: bool,
+}
+
+impl Wanted {
+    /// What there is to draw.
+    pub const VERTICES: Self = Self { positions: true, normals: true, displacements: false, boxes: false };
+    /// Everything.
+    pub const ALL: Self = Self { positions: true, normals: true, displacements: true, boxes: true };
+
+    /// What either of two wants.
+    #[must_use]
+    pub const fn or(self, other: Self) -> Self {
+        Self {
+            positions: self.positions || other.positions,
+            normals: self.normals || other.normals,
+            displacements: self.displacements || other.displacements,
+            boxes: self.boxes || other.boxes,
+        }
+    }
+
+    /// Whether all that `other` wants is wanted.
+    pub fn covers(self, other: Self) -> bool {
+        self.or(other) == self
+    }
 }
 
 /// The backends by name.
@@ -40,7 +79,8 @@ impl Backend {
 /// What a deformation tells besides the vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Deformed {
-    /// Bounds of all deformed positions as they are in [`Surface`]. Not finite when f32 overflowed somewhere.
+    /// Bounds of all deformed positions as they are in [`Surface`]. Not finite when f32 overflowed somewhere, in a
+    /// displacement that is kept too.
     pub bounds: Bounds,
     /// Milliseconds from the call until the vertices were there.
     pub ms: f64,
@@ -67,4 +107,26 @@ pub trait Deformer {
     /// # Errors
     /// `Fault` when copying from the device failed.
     fn surface(&mut self) -> Result<&Surface>;
+
+    /// The same, of which only what is wanted need be there: the rest may be missing or that of an earlier step. Output
+    /// that lies in host memory is there anyway.
+    ///
+    /// # Errors
+    /// As [`Self::surface`].
+    fn read(&mut self, _wanted: Wanted) -> Result<&Surface> {
+        self.surface()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_reader_is_served_by_what_holds_all_that_it_wants() {
+        let boxes = Wanted { boxes: true, ..Wanted::default() };
+        assert!(Wanted::ALL.covers(Wanted::VERTICES.or(boxes)) && Wanted::VERTICES.or(boxes).covers(boxes));
+        assert!(!Wanted::VERTICES.covers(boxes) && !boxes.covers(Wanted::VERTICES));
+        assert!(boxes.covers(Wanted::default()) && !Wanted::default().covers(boxes));
+    }
 }

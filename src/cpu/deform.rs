@@ -26,10 +26,11 @@ pub(super) struct Inputs<'a> {
     pub(super) every_chunk: &'a [u16],
 }
 
-/// Three f32 per vertex, and the extent of each tile.
-pub(super) type Outputs<'a> = (Packed<'a>, PerTile<'a, Extent>);
+/// Three f32 per vertex, the extent of each tile, and three more f32 per vertex where displacements are kept.
+pub(super) type Outputs<'a> = (Packed<'a>, PerTile<'a, Extent>, Option<Packed<'a>>);
 
-/// Writes positions and extents of these tiles. A tile's extent is not finite when one of its positions is not.
+/// Writes positions, extents and displacements of these tiles. A tile's extent is not finite when one of its positions
+/// or of the displacements that are kept is not.
 pub(super) fn deform(inputs: Inputs, tiles: &[Tile], outputs: Outputs) {
     if inputs.scene.needs.compensated {
         tile::spread(tiles, outputs, &|tiles, outputs| vectorized(Run::<true> { inputs, tiles, outputs }));
@@ -52,19 +53,22 @@ impl<const COMPENSATED: bool> NullaryFnOnce for Run<'_, COMPENSATED> {
     fn call(mut self) {
         let mut scratch = Scratch::new();
         for tile in self.tiles {
-            let out = self.outputs.0.of(tile);
-            *self.outputs.1.of(tile) = deform_tile::<COMPENSATED>(&self.inputs, tile, &mut scratch, out);
+            let (positions, extents, displacements) = &mut self.outputs;
+            let out =
+                Out { positions: positions.of(tile), displacements: displacements.as_mut().map(|all| all.of(tile)) };
+            *extents.of(tile) = deform_tile::<COMPENSATED>(&self.inputs, tile, &mut scratch, out);
         }
     }
 }
 
+/// A tile's part of the outputs.
+struct Out<'a> {
+    positions: &'a mut [f32],
+    displacements: Option<&'a mut [f32]>,
+}
+
 #[inline(always)]
-fn deform_tile<const COMPENSATED: bool>(
-    inputs: &Inputs,
-    tile: &Tile,
-    scratch: &mut Scratch,
-    out: &mut [f32],
-) -> Extent {
+fn deform_tile<const COMPENSATED: bool>(inputs: &Inputs, tile: &Tile, scratch: &mut Scratch, out: Out) -> Extent {
     let tiles = inputs.tiles_of(tile);
     let place = tiles.tile(tile.first() / TILE);
     if tiles.rank() > 0 {
@@ -72,10 +76,40 @@ fn deform_tile<const COMPENSATED: bool>(
     } else {
         scratch.sums[..12 * place.quads].fill(0.0);
     }
+    let spoil = out.displacements.map_or(0.0, |displacements| keep(inputs, tile, &scratch.sums, displacements));
     add_rest(&tiles.rest()[place.first_quad..][..place.quads], &mut scratch.sums);
     let transform = inputs.state.transform_of(inputs.scene, tile.domain());
-    let extent = put(&transform, &mut scratch.sums, 4 * place.quads, out);
-    if extent.is_finite() { extent } else { rescue(inputs, tile, out) }
+    let extent = put(&transform, &mut scratch.sums, 4 * place.quads, out.positions);
+    let extent = if extent.is_finite() { extent } else { rescue(inputs, tile, out.positions) };
+    extent.spoilt_by(spoil)
+}
+
+/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices. What is not finite is summed once
+/// more in f64, so that only what f32 cannot hold is lost; then the answer is not finite.
+#[inline(always)]
+fn keep(inputs: &Inputs, tile: &Tile, sums: &Coordinates, out: &mut [f32]) -> f32 {
+    let width = tile.count().next_multiple_of(QUAD);
+    let mut spoil = 0.0;
+    for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
+        out.copy_from_slice(&[sums[vertex], sums[width + vertex], sums[2 * width + vertex]]);
+        spoil += (out[0] + out[1] + out[2]) * 0.0;
+    }
+    if spoil == 0.0 { spoil } else { rescue_displacements(inputs, tile, out) }
+}
+
+#[cold]
+#[inline(never)]
+fn rescue_displacements(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> f32 {
+    let (tiles, q) = (inputs.tiles_of(tile), inputs.q_of(tile));
+    let mut spoil = 0.0;
+    for (at, out) in out.chunks_exact_mut(3).enumerate() {
+        if !out.iter().all(|number| number.is_finite()) {
+            let exact = displacement_in_f64(tiles, q, tile.first() + at).map(|number| number as f32);
+            out.copy_from_slice(&exact);
+        }
+        out.iter().for_each(|number| spoil += number * 0.0);
+    }
+    spoil
 }
 
 impl<'a> Inputs<'a> {
@@ -91,6 +125,11 @@ impl<'a> Inputs<'a> {
             Some(kept) => kept.of(tile.domain()),
             None => Summed { q: self.state.q_of(self.scene, tile.domain()), chunks: &self.every_chunk[..chunks] },
         }
+    }
+
+    /// The coordinates that a tile's domain sums.
+    fn q_of(&self, tile: &Tile) -> &'a [f32] {
+        if self.tiles_of(tile).rank() > 0 { self.summed(tile).q } else { &[] }
     }
 }
 
@@ -132,7 +171,7 @@ fn put(transform: &Transform, bent: &mut Coordinates, width: usize, out: &mut [f
 fn rescue(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> Extent {
     let tiles = inputs.tiles_of(tile);
     let transform = inputs.state.composed(inputs.scene, tile.domain()).exact();
-    let q = if tiles.rank() > 0 { inputs.summed(tile).q } else { &[] };
+    let q = inputs.q_of(tile);
     let mut extent = Extent::EMPTY;
     for (at, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
@@ -148,9 +187,13 @@ fn rescue(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> Extent {
 }
 
 fn bent_in_f64(tiles: &Tiles, q: &[f32], vertex: usize) -> [f64; 3] {
+    let moved = displacement_in_f64(tiles, q, vertex);
+    [0, 1, 2].map(|axis| moved[axis] + f64::from(tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD]))
+}
+
+fn displacement_in_f64(tiles: &Tiles, q: &[f32], vertex: usize) -> [f64; 3] {
     [0, 1, 2].map(|axis| {
-        let rest = tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD];
         let part = |(mode, q): (usize, &f32)| tiles.decoded(vertex, axis, mode) * f64::from(*q);
-        q.iter().enumerate().map(part).sum::<f64>() + f64::from(rest)
+        q.iter().enumerate().map(part).sum::<f64>()
     })
 }

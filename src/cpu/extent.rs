@@ -63,8 +63,22 @@ impl Extent {
 
     /// Bounds of all tiles.
     pub(super) fn all(extents: &[Self]) -> Bounds {
-        let extent = extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union);
-        Bounds { min: extent.min.map(f64::from), max: extent.max.map(f64::from) }
+        extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
+    }
+
+    /// Bounds of the tiles of one domain.
+    pub(super) fn of_domain(extents: &[Self]) -> Bounds {
+        extents.iter().copied().fold(Self::EMPTY, Self::union).to_bounds()
+    }
+
+    fn to_bounds(self) -> Bounds {
+        Bounds { min: self.min.map(f64::from), max: self.max.map(f64::from) }
+    }
+
+    /// The same, not finite when `number` is not.
+    #[inline(always)]
+    pub(super) fn spoilt_by(self, number: f32) -> Self {
+        self.poisoned(number * 0.0)
     }
 
     /// Unchanged by 0, all NaN by NaN.

@@ -30,7 +30,7 @@ pub use rate::read_rate;
 
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::Result;
-use crate::scene::{Scene, State};
+use crate::scene::{Bounds, Scene, State};
 use crate::storage::{Tiles, Truncation};
 use changes::Changes;
 use deform::{Inputs, TILE};
@@ -79,6 +79,8 @@ impl CpuDeformer {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],
                 tangents: vec![0.0; tangents],
+                displacements: vec![0.0; if scene.needs.displacements { 3 * layout.vertices } else { 0 }],
+                boxes: vec![Bounds::EMPTY; if scene.needs.boxes { layout.slots.len() } else { 0 }],
             },
         }
     }
@@ -101,8 +103,20 @@ impl CpuDeformer {
             kept: self.kept.as_ref(),
             every_chunk: &self.every_chunk,
         };
-        let outputs = (Packed::new(3, &mut self.surface.positions), PerTile::new(&mut self.extents));
+        let Surface { positions, displacements, .. } = &mut self.surface;
+        let displacements = self.scene.needs.displacements.then(|| Packed::new(3, displacements));
+        let outputs = (Packed::new(3, positions), PerTile::new(&mut self.extents), displacements);
         deform::deform(inputs, self.vertex_work.of(&self.changes), outputs);
+    }
+
+    /// Boxes of the domains that changed, from those of their tiles; none where the scene keeps none.
+    fn keep_boxes(&mut self) {
+        let (changes, work, extents) = (&self.changes, &self.vertex_work, &self.extents);
+        self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, all)| {
+            if changes.is(domain) {
+                *all = Extent::of_domain(&extents[work.tiles_of(domain)]);
+            }
+        });
     }
 }
 
@@ -118,6 +132,7 @@ impl Deformer for CpuDeformer {
             kept.follow(&self.scene, state, &self.changes);
         }
         self.deform_positions(state);
+        self.keep_boxes();
         // Either kind of normals depends on the domain's own positions and T alone.
         let corners = self.corner_work.of(&self.changes);
         if self.scene.needs.exact_normals {

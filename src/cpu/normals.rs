@@ -21,7 +21,7 @@ const OPPOSITE: f64 = 1e-10;
 /// Writes three f32 per corner of these tiles into the normals and, where the scene has normal maps, four into the
 /// tangents, from the surface's positions.
 pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
-    let Surface { positions, normals, tangents } = surface;
+    let Surface { positions, normals, tangents, .. } = surface;
     let positions = positions.as_slice();
     // A tile of a scene without tangents has 0 numbers of them.
     let tangents = Packed::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);

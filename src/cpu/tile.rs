@@ -59,13 +59,18 @@ impl Work {
         self.all.len()
     }
 
+    /// The places of a domain's tiles among all.
+    pub(super) fn tiles_of(&self, domain: usize) -> std::ops::Range<usize> {
+        self.first_tiles[domain]..self.first_tiles[domain + 1]
+    }
+
     /// The tiles of the domains that changed, in packed order.
     pub(super) fn of(&mut self, changes: &Changes) -> &[Tile] {
         let Some(domains) = changes.some() else { return &self.all };
         self.active.clear();
         for domain in domains {
-            let domain = *domain as usize;
-            self.active.extend_from_slice(&self.all[self.first_tiles[domain]..self.first_tiles[domain + 1]]);
+            let tiles = self.tiles_of(*domain as usize);
+            self.active.extend_from_slice(&self.all[tiles]);
         }
         &self.active
     }
@@ -130,6 +135,20 @@ impl<T: Send> Output for PerTile<'_, T> {
         let first = at.index as usize;
         let (left, right) = self.values.split_at_mut(first - self.first);
         (Self { first: self.first, values: left }, Self { first, values: right })
+    }
+}
+
+/// An output that a scene may do without.
+impl<O: Output> Output for Option<O> {
+    fn cut(self, at: &Tile) -> (Self, Self) {
+        self.map(|output| output.cut(at)).map_or((None, None), |(left, right)| (Some(left), Some(right)))
+    }
+}
+
+impl<A: Output, B: Output, C: Output> Output for (A, B, C) {
+    fn cut(self, at: &Tile) -> (Self, Self) {
+        let ((a, b), c) = (((self.0, self.1)).cut(at), self.2.cut(at));
+        ((a.0, a.1, c.0), (b.0, b.1, c.1))
     }
 }
 

@@ -11,7 +11,7 @@ use super::lane::{Lane, Place, Policy, Waiting};
 use super::viewer::{Delivery, Shown, StepName, View, Viewer};
 use super::worker::{SceneId, Worker};
 use crate::config::Config;
-use crate::deform::Surface;
+use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result};
 use crate::scene::{Scene, State};
 use crate::telemetry::{Stage, StageTimes};
@@ -73,10 +73,20 @@ pub(super) struct Conductor {
     pending: Option<(Arc<Lane>, u64)>,
     /// Times of the current step until its vertices were there.
     pub(super) stages: StageTimes,
-    /// The current vertices, once somebody has asked for them, and the milliseconds of copying them.
-    pub(super) surface: Option<(Arc<Surface>, f64)>,
+    /// What somebody has asked for of the current vertices.
+    pub(super) surface: Option<Copied>,
     last_step: watch::Sender<Option<StepName>>,
     wake: Arc<Notify>,
+}
+
+/// Vertices in host memory.
+#[derive(Debug, Clone)]
+pub(super) struct Copied {
+    pub surface: Arc<Surface>,
+    /// What of them is there.
+    pub parts: Wanted,
+    /// Milliseconds of copying.
+    pub ms: f64,
 }
 
 /// How a scene begins.

@@ -6,10 +6,10 @@ use std::time::Instant;
 use bytes::Bytes;
 
 use super::viewer::{Body, Shown, StepName};
-use crate::deform::Surface;
+use crate::deform::{Surface, Wanted};
 use crate::error::{Result, during, invalid};
 use crate::frame;
-use crate::scene::{Cells, Layout, Scene};
+use crate::scene::{Bounds, Cells, Layout, Scene, Slot};
 use crate::telemetry::{Stage, StageTimes, ms_since};
 
 // Vertices are copied as they lie in memory, and the wire is little-endian.
@@ -45,30 +45,50 @@ pub struct Packed {
     pub origin_bytes: u64,
 }
 
+/// Bytes of a domain's box.
+const BOX_BYTES: u64 = 24;
+
 /// Which vertices of a scene.
 #[derive(Debug, Clone)]
 pub struct Selection {
     scene: Arc<Scene>,
     /// Domains by index, in the order of the reply.
     pub domains: Vec<u32>,
-    pub positions_only: bool,
+    pub wanted: Wanted,
 }
 
 impl Selection {
-    /// The chosen domains of a scene, or all when none is named.
+    /// What is wanted of the chosen domains of a scene, or of all when none is named.
     ///
     /// # Errors
-    /// `Invalid` when an index is out of range or the list is longer than the scene.
-    pub fn new(scene: &Arc<Scene>, domains: Vec<u32>, positions_only: bool) -> Result<Self> {
+    /// `Invalid` when an index is out of range, the list is longer than the scene, nothing is wanted or the scene does not
+    /// keep what is.
+    pub fn new(scene: &Arc<Scene>, domains: Vec<u32>, wanted: Wanted) -> Result<Self> {
+        check_kept(scene, wanted)?;
         let domains = checked_domains("selection.domains", scene, domains)?;
         if domains.len() > MOST_DOMAINS {
             return Err(invalid("selection.domains", format!("at most {MOST_DOMAINS} per reply"), domains.len()));
         }
-        Ok(Self { scene: Arc::clone(scene), domains, positions_only })
+        Ok(Self { scene: Arc::clone(scene), domains, wanted })
     }
 
     /// Bytes of the positions.
     pub fn position_bytes(&self) -> u64 {
+        if self.wanted.positions { self.triples() } else { 0 }
+    }
+
+    /// Bytes of the displacements.
+    pub fn displacement_bytes(&self) -> u64 {
+        if self.wanted.displacements { self.triples() } else { 0 }
+    }
+
+    /// Bytes of the boxes.
+    pub fn box_bytes(&self) -> u64 {
+        if self.wanted.boxes { BOX_BYTES * self.domains.len() as u64 } else { 0 }
+    }
+
+    /// Bytes of three numbers for each vertex.
+    fn triples(&self) -> u64 {
         self.vertices().map(|count| 12 * u64::from(count)).sum()
     }
 
@@ -82,6 +102,24 @@ impl Selection {
     pub fn corners(&self) -> impl Iterator<Item = u32> {
         let slots = &self.scene.layout.slots;
         self.domains.iter().map(|domain| slots[*domain as usize].corners as u32)
+    }
+}
+
+/// Refuses what the scene does not keep, by the scene's option.
+fn check_kept(scene: &Scene, wanted: Wanted) -> Result<()> {
+    if wanted == Wanted::default() {
+        return Err(invalid("selection.without_vertices", "displacements or boxes instead", "neither"));
+    }
+    let options = [
+        ("displacements", wanted.displacements, scene.needs.displacements),
+        ("boxes", wanted.boxes, scene.needs.boxes),
+    ];
+    match options.into_iter().find(|(_, wanted, kept)| *wanted && !kept) {
+        None => Ok(()),
+        Some((name, ..)) => {
+            let expected = format!("a scene that keeps them (deform.{name} = true in its scene.toml)");
+            Err(invalid(format!("selection.{name}"), expected, format!("'{}', which does not", scene.name)))
+        }
     }
 }
 
@@ -123,8 +161,8 @@ pub async fn encode_frame(shown: Shown, format: Format) -> Result<Encoded> {
     Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, bytes: bytes.into() })
 }
 
-/// Packs the chosen vertices: all positions in row order of U, then all normals, then the origins of the domains when
-/// they are not all the same.
+/// Packs what is wanted of the chosen domains: all positions in row order of U, then all normals, displacements and
+/// boxes, then the origins of the domains when they are not all the same.
 ///
 /// # Errors
 /// `Fault` when it was a picture that was shown.
@@ -158,20 +196,26 @@ fn push_origins(selection: &Selection, cells: Option<&Cells>, bytes: &mut Vec<u8
 }
 
 fn pack(surface: &Surface, selection: &Selection) -> Vec<u8> {
-    let layout: &Layout = &selection.scene.layout;
-    let slots = || selection.domains.iter().map(|domain| layout.slots[*domain as usize]);
-    let corners: usize = if selection.positions_only { 0 } else { slots().map(|slot| slot.corners).sum() };
-    let vertices: usize = slots().map(|slot| slot.vertices).sum();
-    let mut bytes = Vec::with_capacity(12 * (vertices + corners));
-    for slot in slots() {
-        let positions = &surface.positions[3 * slot.first_vertex..][..3 * slot.vertices];
-        bytes.extend_from_slice(bytemuck::cast_slice(positions));
-    }
-    if !selection.positions_only {
-        for slot in slots() {
-            let normals = &surface.normals[3 * slot.first_corner..][..3 * slot.corners];
-            bytes.extend_from_slice(bytemuck::cast_slice(normals));
+    let (layout, wanted): (&Layout, Wanted) = (&selection.scene.layout, selection.wanted);
+    let corners: usize = if wanted.normals { selection.corners().map(|count| count as usize).sum() } else { 0 };
+    let others = selection.position_bytes() + selection.displacement_bytes() + selection.box_bytes();
+    let mut bytes = Vec::with_capacity(12 * corners + others as usize);
+    let mut put = |wanted: bool, numbers: &[f32], range: &dyn Fn(&Slot) -> (usize, usize)| {
+        for domain in selection.domains.iter().filter(|_| wanted) {
+            let (first, count) = range(&layout.slots[*domain as usize]);
+            bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first..][..3 * count]));
         }
+    };
+    let (vertices, corners) =
+        (|slot: &Slot| (slot.first_vertex, slot.vertices), |slot: &Slot| (slot.first_corner, slot.corners));
+    put(wanted.positions, &surface.positions, &vertices);
+    put(wanted.normals, &surface.normals, &corners);
+    put(wanted.displacements, &surface.displacements, &vertices);
+    for domain in selection.domains.iter().filter(|_| wanted.boxes) {
+        let Bounds { min, max } = surface.boxes[*domain as usize];
+        // They are f32 numbers, so that nothing is rounded here.
+        let sides = [min, max].map(|corner| corner.map(|number| number as f32));
+        bytes.extend_from_slice(bytemuck::cast_slice(&sides));
     }
     bytes
 }
@@ -193,12 +237,13 @@ mod tests {
     fn a_selection_packs_positions_then_normals_of_its_domains_in_order() {
         let scene = testing::two_strips();
         let count = |from: f32, len: usize| (0..len).map(|at| from + at as f32).collect::<Vec<_>>();
-        let surface = Surface { positions: count(0.0, 24), normals: count(100.0, 24), tangents: vec![] };
-        let selection = Selection::new(&scene, vec![1], false).expect("in range");
+        let surface = Surface { positions: count(0.0, 24), normals: count(100.0, 24), ..Surface::default() };
+        let selection = Selection::new(&scene, vec![1], Wanted::VERTICES).expect("in range");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));
         assert_eq!(floats, [count(12.0, 12), count(112.0, 12)].concat());
         assert_eq!(selection.position_bytes(), 48);
-        let bare = Selection::new(&scene, vec![1, 0], true).expect("in range");
+        let positions = Wanted { positions: true, ..Wanted::default() };
+        let bare = Selection::new(&scene, vec![1, 0], positions).expect("in range");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &bare));
         assert_eq!(floats, [count(12.0, 12), count(0.0, 12)].concat());
     }
@@ -206,8 +251,37 @@ mod tests {
     #[test]
     fn indices_out_of_range_and_lists_longer_than_the_scene_are_refused() {
         let scene = testing::two_strips();
-        let refusal = Selection::new(&scene, vec![0, 2], false).expect_err("out of range").to_string();
+        let refusal = Selection::new(&scene, vec![0, 2], Wanted::VERTICES).expect_err("out of range").to_string();
         assert!(refusal.starts_with("selection.domains[1]: expected an index below 2, given 2"), "{refusal}");
-        assert!(Selection::new(&scene, vec![0; 3], false).is_err());
+        assert!(Selection::new(&scene, vec![0; 3], Wanted::VERTICES).is_err());
+    }
+
+    #[test]
+    fn displacements_and_boxes_follow_the_normals_and_are_refused_where_the_scene_keeps_none() {
+        let (bare, kept) = (testing::two_strips(), testing::kept_strips());
+        let count = |from: f32, len: usize| (0..len).map(|at| from + at as f32).collect::<Vec<_>>();
+        let side = |from: f64| Bounds { min: [from; 3], max: [from + 1.0, from + 2.0, from + 3.0] };
+        let surface = Surface {
+            displacements: count(50.0, 24),
+            boxes: vec![side(7.0), side(-3.5)],
+            positions: count(0.0, 24),
+            ..Surface::default()
+        };
+        let wanted = Wanted { normals: false, ..Wanted::ALL };
+        let selection = Selection::new(&kept, vec![1], wanted).expect("kept");
+        let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));
+        let sides = vec![-3.5, -3.5, -3.5, -2.5, -1.5, -0.5];
+        assert_eq!(floats, [count(12.0, 12), count(62.0, 12), sides.clone()].concat());
+        assert_eq!((selection.displacement_bytes(), selection.box_bytes()), (48, 24));
+        let boxes = Wanted { boxes: true, ..Wanted::default() };
+        let alone = Selection::new(&kept, vec![1], boxes).expect("kept");
+        assert_eq!(bytemuck::pod_collect_to_vec::<u8, f32>(&pack(&surface, &alone)), sides);
+        assert_eq!((alone.position_bytes(), alone.displacement_bytes()), (0, 0));
+        for (wanted, field) in [(boxes, "boxes"), (Wanted { displacements: true, ..boxes }, "displacements")] {
+            let refusal = Selection::new(&bare, vec![1], wanted).expect_err("not kept").to_string();
+            assert!(refusal.starts_with(&format!("selection.{field}: ")), "{refusal}");
+            assert!(refusal.contains(&format!("deform.{field} = true")), "{refusal}");
+        }
+        assert!(Selection::new(&kept, vec![1], Wanted::default()).is_err());
     }
 }

@@ -4,9 +4,9 @@ use std::mem;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::conductor::Conductor;
+use super::conductor::{Conductor, Copied};
 use super::viewer::{Body, Delivery, Shown, StepName, View, Viewer};
-use crate::deform::Surface;
+use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result};
 use crate::telemetry::{Stage, StageTimes};
 
@@ -74,8 +74,8 @@ impl Conductor {
                 stages.extend(known(&image.passes));
                 Body::Frame(image)
             }
-            View::Vertices => {
-                let (surface, copy_ms) = self.vertices().await?;
+            View::Vertices(wanted) => {
+                let (surface, copy_ms) = self.vertices(wanted).await?;
                 stages.push((Stage::Copy, copy_ms));
                 Body::Vertices(surface)
             }
@@ -83,14 +83,17 @@ impl Conductor {
         Ok(Shown { step: StepName::of(&self.state), skipped, stages, cells: self.state.cells.clone(), body })
     }
 
-    /// The current vertices, copied from the device at most once per step.
-    async fn vertices(&mut self) -> Result<(Arc<Surface>, f64)> {
-        if let Some((surface, copy_ms)) = &self.surface {
-            return Ok((Arc::clone(surface), *copy_ms));
+    /// What is wanted of the current vertices, each part of them copied from the device at most once per step.
+    async fn vertices(&mut self, wanted: Wanted) -> Result<(Arc<Surface>, f64)> {
+        let there = self.surface.as_ref().map_or(Wanted::default(), |copy| copy.parts);
+        if let Some(copy) = self.surface.as_ref().filter(|_| there.covers(wanted)) {
+            return Ok((Arc::clone(&copy.surface), copy.ms));
         }
-        let copied = self.means.worker.copy(self.id).await?;
-        self.surface = Some(copied.clone());
-        Ok(copied)
+        // The device's own copy in host memory has what was there before, so taking it again costs no transfer.
+        let parts = there.or(wanted);
+        let (surface, ms) = self.means.worker.copy(self.id, parts).await?;
+        self.surface = Some(Copied { surface: Arc::clone(&surface), parts, ms });
+        Ok((surface, ms))
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::deform::{Deformed, Deformer, Surface};
+use crate::deform::{Deformed, Deformer, Surface, Wanted};
 use crate::error::{Error, Result, during, invalid};
 use crate::render::{Renderer, SceneBuffers};
 use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
@@ -87,6 +87,11 @@ impl Staged {
         self.deformer.surface()
     }
 
+    /// The same, of which only what is wanted need be there.
+    pub(super) fn read(&mut self, wanted: Wanted) -> Result<&Surface> {
+        self.deformer.read(wanted)
+    }
+
     /// Makes the buffers if need be and brings the last deformation into them, in a frame that suits the camera. Returns
     /// the bounds in that frame, and whether an upload was needed.
     pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<(Bounds, bool)> {
@@ -101,7 +106,7 @@ impl Staged {
             }
         };
         let view = nearest_cell(camera.eye().into());
-        let positions = &self.deformer.surface()?.positions;
+        let positions = &self.deformer.read(Wanted::VERTICES)?.positions;
         let (positions, bounds) = apart.seen_from(view, &self.scene, positions);
         renderer.upload_apart(buffers, &positions, view)?;
         Ok((bounds, true))
@@ -118,7 +123,7 @@ impl Staged {
         if self.filled || shares {
             return Ok(false);
         }
-        renderer.upload(buffers, self.deformer.surface()?)?;
+        renderer.upload(buffers, self.deformer.read(Wanted::VERTICES)?)?;
         self.filled = true;
         Ok(true)
     }
@@ -136,9 +141,11 @@ impl Staged {
     /// Names the first domain with a vertex out of range.
     fn overflow(&mut self, state: &State) -> Result<Error> {
         let scene = Arc::clone(&self.scene);
-        let surface = self.deformer.surface()?;
+        let surface = self.deformer.read(Wanted { positions: true, displacements: true, ..Wanted::default() })?;
         let is_far = |number: &f32| number.is_nan() || f64::from(*number).abs() > FARTHEST;
-        let at = surface.positions.iter().position(is_far).unwrap_or(0);
+        let far = surface.positions.iter().position(is_far);
+        // A position may be in range whose displacement is not.
+        let at = far.or_else(|| surface.displacements.iter().position(|number| !number.is_finite())).unwrap_or(0);
         let domain = scene.layout.slots.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
         let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));
         let given = format!("vertex {} out of range, largest |q| {largest:e}", at / 3);

@@ -3,10 +3,19 @@
 use std::sync::Arc;
 
 use crate::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
-use crate::scene::{Parts, Scene};
+use crate::scene::{Deformation, Parts, Scene};
 
 /// Two strips of two triangles with two modes each; the second hangs on the first.
 pub(super) fn two_strips() -> Arc<Scene> {
+    strips(Deformation::default())
+}
+
+/// The same, with displacements and boxes for readers.
+pub(super) fn kept_strips() -> Arc<Scene> {
+    strips(Deformation { displacements: true, boxes: true, ..Deformation::default() })
+}
+
+fn strips(deformation: Deformation) -> Arc<Scene> {
     let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
     let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
     let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.0 }).collect();
@@ -25,6 +34,6 @@ pub(super) fn two_strips() -> Arc<Scene> {
     };
     let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 2] };
     let domains = vec![domain("left", None), domain("right", Some(joint))];
-    let parts = Parts { shapes: vec![shape], materials: vec![Material::default()], domains, ..Parts::named("strips") };
-    Scene::new(parts).expect("a scene")
+    let (shapes, materials) = (vec![shape], vec![Material::default()]);
+    Scene::new(Parts { shapes, materials, domains, deformation, ..Parts::named("strips") }).expect("a scene")
 }

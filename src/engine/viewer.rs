@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, watch};
 
-use crate::deform::Surface;
+use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::render::Image;
 use crate::scene::{Camera, Cells, State};
@@ -29,7 +29,7 @@ pub enum Delivery {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum View {
     Frame { camera: Camera, width: u32, height: u32 },
-    Vertices,
+    Vertices(Wanted),
 }
 
 /// A step by name: numbers belong to one run of one writer.
@@ -198,7 +198,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_lossless_viewer_has_room_for_two_and_gets_more_as_it_reads() {
-        let (viewer, mut feed) = Feed::new(View::Vertices, Delivery::Lossless, Arc::default());
+        let (viewer, mut feed) = Feed::new(View::Vertices(Wanted::VERTICES), Delivery::Lossless, Arc::default());
         for number in 1..=2 {
             assert!(viewer.has_room() && viewer.deliver(shown(number)));
         }
@@ -209,7 +209,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_latest_viewer_has_room_only_while_it_asks_and_asks_once() {
-        let (viewer, mut feed) = Feed::new(View::Vertices, Delivery::Latest, Arc::default());
+        let (viewer, mut feed) = Feed::new(View::Vertices(Wanted::VERTICES), Delivery::Latest, Arc::default());
         assert!(!viewer.has_room());
         for _ in 0..3 {
             let given_up = tokio::time::timeout(std::time::Duration::ZERO, feed.next()).await;
@@ -221,7 +221,7 @@ mod tests {
 
     #[tokio::test]
     async fn an_end_is_told_after_what_is_held_and_a_cut_at_once() {
-        let (viewer, mut feed) = Feed::new(View::Vertices, Delivery::Lossless, Arc::default());
+        let (viewer, mut feed) = Feed::new(View::Vertices(Wanted::VERTICES), Delivery::Lossless, Arc::default());
         viewer.deliver(shown(1));
         let error = Error::NotFound { what: "scene", given: "gone".into() };
         viewer.end(error.clone());
@@ -229,7 +229,7 @@ mod tests {
         assert!(feed.next().await.is_ok());
         assert_eq!(feed.next().await.expect_err("the end"), error);
 
-        let (viewer, feed) = Feed::new(View::Vertices, Delivery::Lossless, Arc::default());
+        let (viewer, feed) = Feed::new(View::Vertices(Wanted::VERTICES), Delivery::Lossless, Arc::default());
         viewer.cut_off(error.clone());
         drop(viewer);
         assert_eq!(feed.cut_off().await, error);

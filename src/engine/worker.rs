@@ -12,7 +12,7 @@ use tokio::sync::{mpsc, oneshot};
 use super::staged::Staged;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
-use crate::deform::{Deformed, Surface};
+use crate::deform::{Deformed, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::render::Image;
 use crate::scene::{Camera, Scene, State};
@@ -41,9 +41,10 @@ pub(super) enum Command {
         size: (u32, u32),
         reply: Reply<Image>,
     },
-    /// Copies positions and normals out; the second value is its milliseconds.
+    /// Copies what is wanted out; the second value is its milliseconds.
     Copy {
         id: SceneId,
+        wanted: Wanted,
         reply: Reply<(Arc<Surface>, f64)>,
     },
     Unstage {
@@ -100,8 +101,8 @@ impl Worker {
         self.ask(|reply| Command::Draw { id, camera, size, reply }).await
     }
 
-    pub(super) async fn copy(&self, id: SceneId) -> Result<(Arc<Surface>, f64)> {
-        self.ask(|reply| Command::Copy { id, reply }).await
+    pub(super) async fn copy(&self, id: SceneId, wanted: Wanted) -> Result<(Arc<Surface>, f64)> {
+        self.ask(|reply| Command::Copy { id, wanted, reply }).await
     }
 
     /// Waits for room: a scene must never stay on the device because the queue was full.
@@ -168,8 +169,8 @@ fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, comman
             let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
             reply.send(drawn).ok();
         }
-        Command::Copy { id, reply } if !reply.is_closed() => {
-            reply.send(find(scenes, id).and_then(copy)).ok();
+        Command::Copy { id, wanted, reply } if !reply.is_closed() => {
+            reply.send(find(scenes, id).and_then(|staged| copy(staged, wanted))).ok();
         }
         // Whoever asked has given up waiting: the picture is not made.
         Command::Draw { .. } | Command::Copy { .. } | Command::Quit => {}
@@ -182,11 +183,18 @@ fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, comman
     }
 }
 
-fn copy(staged: &mut Staged) -> Result<(Arc<Surface>, f64)> {
+fn copy(staged: &mut Staged, wanted: Wanted) -> Result<(Arc<Surface>, f64)> {
     let begin = Instant::now();
-    let surface = staged.surface()?;
-    // Tangents are for the renderer alone and stay here.
-    let copy = Surface { positions: surface.positions.clone(), normals: surface.normals.clone(), tangents: Vec::new() };
+    let surface = staged.read(wanted)?;
+    let list = |wanted: bool, list: &Vec<f32>| if wanted { list.clone() } else { Vec::new() };
+    let copy = Surface {
+        positions: list(wanted.positions, &surface.positions),
+        normals: list(wanted.normals, &surface.normals),
+        displacements: list(wanted.displacements, &surface.displacements),
+        boxes: if wanted.boxes { surface.boxes.clone() } else { Vec::new() },
+        // Tangents are for the renderer alone and stay here.
+        tangents: Vec::new(),
+    };
     Ok((Arc::new(copy), ms_since(begin)))
 }
 

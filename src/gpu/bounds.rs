@@ -1,12 +1,14 @@
-//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`.
+//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`, and of each domain where the
+//! scene keeps boxes.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
+use super::boxes::Boxes;
 use super::chain;
 use super::deform::config;
 use super::device::Device;
 use super::inputs::Values;
-use super::layout::BoundsArgs;
+use super::layout::{BoundsArgs, Piece};
 use super::plan::Kernel;
 use crate::error::Result;
 
@@ -15,18 +17,28 @@ use crate::error::Result;
 pub(super) struct Bounds {
     pub(super) function: CudaFunction,
     config: LaunchConfig,
+    /// Of a scene that keeps them.
+    pub(super) boxes: Option<Boxes>,
 }
 
 impl Bounds {
-    pub(super) fn new(device: &Device, kernel: &Kernel) -> Result<Self> {
-        Ok(Self { function: device.function(kernel.name, kernel.source.0, &kernel.defines)?, config: config(kernel) })
+    /// With `pieces`, a box of each domain is made too.
+    pub(super) fn new(device: &Device, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
+        Ok(Self {
+            function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
+            config: config(kernel),
+            boxes: pieces.map(|pieces| Boxes::new(device, pieces)).transpose()?,
+        })
     }
 
     /// Starts the kernel on `count` boxes; the result goes into the header among the values.
     pub(super) fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
-        let args = BoundsArgs { header: values.header, boxes, count, reserved: 0 };
+        let (pieces, piece_boxes, piece_count) = self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
+        let Values { header, stamps, .. } = values;
+        let args = BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count };
         // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
-        // allocated them. The kernel waits first.
+        // allocated them, and `piece_boxes` for each piece. Pieces name boxes, vertices and domains of the same scene.
+        // The kernel waits first.
         unsafe { chain::launch(device, &self.function, self.config, &args) }
     }
 }

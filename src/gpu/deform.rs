@@ -5,9 +5,10 @@ use std::sync::Arc;
 
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
 
+use super::boxes::pieces;
 use super::device::Device;
 use super::inputs::{Packing, Values};
-use super::layout::DeformArgs;
+use super::layout::{DeformArgs, Piece};
 use super::memory::{address, room, upload};
 use super::plan::Kernel;
 use super::work::{Coordinates, Source, Work, corner_shifts, rest_directions, rest_positions, side_by_side};
@@ -42,6 +43,8 @@ pub(super) struct Deform {
     /// Quads before the first that has normals.
     directed: u64,
     packing: Arc<Packing>,
+    /// Of which `bounds` makes boxes, where the scene keeps them.
+    pieces: Option<Vec<Piece>>,
 }
 
 impl Deform {
@@ -73,6 +76,7 @@ impl Deform {
             boxes: room(device, 96 * work.tiles.len() as u64)?,
             count: work.tiles.len() as u32,
             directed: work.quads.directed,
+            pieces: scene.needs.boxes.then(|| pieces(scene, &work)),
             packing: Arc::new(Packing {
                 scene: Arc::clone(scene),
                 coordinates,
@@ -86,6 +90,11 @@ impl Deform {
     /// How coordinates are to be laid out for it.
     pub(super) const fn packing(&self) -> &Arc<Packing> {
         &self.packing
+    }
+
+    /// What boxes of domains are made of, where the scene keeps them.
+    pub(super) fn pieces(&self) -> Option<&[Piece]> {
+        self.pieces.as_deref()
     }
 
     /// The address of its boxes, and how many there are.
@@ -143,7 +152,7 @@ impl Deform {
         let mut launch = device.stream().launch_builder(function);
         // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
         // words, x0, normals, transforms and q of the same scene, and the list names such tiles; there are as many boxes
-        // as warps; and the header's outputs have the sizes that `Output` checked. Tangents and shifts are read only by
+        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are read only by
         // a kernel that was compiled for a scene that has them.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
         Ok(())

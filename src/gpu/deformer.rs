@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use cudarc::driver::sys::{CUgraphInstantiate_flags, CUstreamCaptureMode};
-use cudarc::driver::{CudaGraph, PinnedHostSlice, result};
+use cudarc::driver::{CudaGraph, CudaSlice, PinnedHostSlice, result};
 
 use super::GlBuffers;
 use super::apply::{Apply, Lengths};
@@ -13,11 +13,11 @@ use super::deform::Deform;
 use super::device::Device;
 use super::inputs::Inputs;
 use super::layout::Header;
-use super::memory::PageLock;
+use super::memory::{PageLock, address, download, room};
 use super::normals::Normals;
 use super::output::{Output, sizes};
-use super::plan::{Launch, Plan, plan};
-use crate::deform::{Backend, Deformed, Deformer, Surface};
+use super::plan::{Launch, Plan, Role, plan};
+use crate::deform::{Backend, Deformed, Deformer, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::scene::{Changed, Scene, State};
 
@@ -33,12 +33,14 @@ pub struct CudaDeformer {
     inputs: Inputs,
     answer: PinnedHostSlice<u32>,
     output: Output,
+    /// u, of a scene that keeps it.
+    displacements: Option<CudaSlice<u8>>,
     steps: Steps,
     // Declared before `surface`, so dropped before it: the locks are on its memory.
     locks: Vec<PageLock>,
     surface: Surface,
-    /// Whether `surface` holds what the device holds.
-    fresh: bool,
+    /// What of `surface` is what the device holds.
+    fresh: Wanted,
 }
 
 #[derive(Debug)]
@@ -73,7 +75,7 @@ impl CudaDeformer {
         check_memory(device, &plan)?;
         let deform = Deform::new(device, scene, plan.needed(Launch::Deform)?)?;
         let kernels = Kernels {
-            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
+            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?, deform.pieces())?,
             normals: plan.kernel(Launch::Normals).map(|normals| Normals::new(device, scene, normals)).transpose()?,
             apply: Apply::new(device, deform.packing(), plan.needed(Launch::Apply)?)?,
             deform,
@@ -87,10 +89,14 @@ impl CudaDeformer {
             kernels,
             answer,
             output: Output::new(device, &plan, gl)?,
+            displacements: match plan.bytes(Role::Displacements) {
+                0 => None,
+                bytes => Some(room(device, bytes)?),
+            },
             steps: Steps::default(),
             locks: Vec::new(),
             surface: Surface::default(),
-            fresh: true,
+            fresh: Wanted::ALL,
             device: Arc::clone(device),
             plan,
         };
@@ -174,8 +180,10 @@ impl CudaDeformer {
         steps.shown = 0;
         let graph = if some.is_some() { &self.some } else { &self.whole };
         let inputs = &mut self.inputs;
-        // Normals that follow the surface read its positions again.
-        let keep = some.is_some() || self.kernels.normals.is_some();
+        // Normals that follow the surface read its positions again, and so do boxes.
+        let keep = some.is_some() || self.kernels.normals.is_some() || self.kernels.bounds.boxes.is_some();
+        let displacements = self.displacements.as_ref().map_or(0, |buffer| address(&self.device, buffer));
+        let header = Header { displacements, ..header };
         self.output.write(&self.device, keep, |to| {
             let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
             match some {
@@ -191,10 +199,42 @@ impl CudaDeformer {
         Ok(bounds_of(self.answer.as_slice().map_err(during("deform"))?))
     }
 
-    fn fetch(&mut self) -> Result<()> {
+    /// Copies what of the output is wanted and not there yet.
+    fn fetch(&mut self, wanted: Wanted) -> Result<()> {
+        let fresh = self.fresh;
+        if (wanted.positions || wanted.normals) && !fresh.covers(Wanted::VERTICES) {
+            self.fetch_vertices()?;
+            self.fresh = self.fresh.or(Wanted::VERTICES);
+        }
+        if wanted.displacements && !fresh.displacements {
+            self.fetch_displacements()?;
+            self.fresh.displacements = true;
+        }
+        if wanted.boxes && !fresh.boxes {
+            if let Some(boxes) = &mut self.kernels.bounds.boxes {
+                boxes.read(&self.device, &mut self.surface.boxes)?;
+            }
+            self.fresh.boxes = true;
+        }
+        Ok(())
+    }
+
+    fn fetch_displacements(&mut self) -> Result<()> {
+        let Some(buffer) = &self.displacements else { return Ok(()) };
+        let list = &mut self.surface.displacements;
+        if list.is_empty() {
+            list.resize(self.plan.bytes(Role::Displacements) as usize / 4, 0.0);
+            // SAFETY: the list never changes its length again, and the locks are dropped before it.
+            self.locks.extend(unsafe { PageLock::new(&self.device, list) });
+        }
+        // SAFETY: the buffer has the bytes of the plan, and the list was made from the same number.
+        unsafe { download(&self.device, address(&self.device, buffer), list) }
+    }
+
+    fn fetch_vertices(&mut self) -> Result<()> {
         let [positions, normals, tangents] = sizes(&self.plan).map(|bytes| bytes as usize / 4);
         if self.surface.positions.is_empty() {
-            let Surface { positions: first, normals: second, tangents: third } = &mut self.surface;
+            let Surface { positions: first, normals: second, tangents: third, .. } = &mut self.surface;
             for (list, length) in [(first, positions), (second, normals), (third, tangents)] {
                 list.resize(length, 0.0);
                 // SAFETY: the list never changes its length again, and the locks are dropped before it.
@@ -212,7 +252,7 @@ impl Deformer for CudaDeformer {
 
     fn deform(&mut self, state: &State) -> Result<Deformed> {
         let begin = Instant::now();
-        self.fresh = false;
+        self.fresh = Wanted::default();
         let bounds = self.run(state).inspect_err(|_| {
             // Copies may be in flight that read what the next step overwrites. Their own failure adds nothing.
             self.device.stream().synchronize().ok();
@@ -225,10 +265,11 @@ impl Deformer for CudaDeformer {
     }
 
     fn surface(&mut self) -> Result<&Surface> {
-        if !self.fresh {
-            self.fetch()?;
-            self.fresh = true;
-        }
+        self.read(Wanted::ALL)
+    }
+
+    fn read(&mut self, wanted: Wanted) -> Result<&Surface> {
+        self.fetch(wanted)?;
         Ok(&self.surface)
     }
 }

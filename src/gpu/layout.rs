@@ -110,14 +110,27 @@ pub(super) struct DeformArgs {
     pub reserved: u32,
 }
 
+/// A part of a domain of which `bounds` makes a box.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Piece {
+    pub first: u32,
+    pub count: u32,
+    pub domain: u32,
+    pub of_vertices: u32,
+}
+
 /// Arguments of `bounds`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct BoundsArgs {
     pub header: u64,
     pub boxes: u64,
+    pub pieces: u64,
+    pub stamps: u64,
+    pub piece_boxes: u64,
     pub count: u32,
-    pub reserved: u32,
+    pub piece_count: u32,
 }
 
 /// Arguments of `apply`.
@@ -176,7 +189,8 @@ const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Following>() == 8, "Following differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<BoundsArgs>() == 24, "BoundsArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Piece>() == 16, "Piece differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoundsArgs>() == 48, "BoundsArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from kernels/layout.cuh");
@@ -225,7 +239,8 @@ pub fn agreements() -> Vec<Agreement> {
             header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
             transforms, following, frames, q, list, kept_counts, kept, boxes, count, reserved
         }
-        BoundsArgs { header, boxes, count, reserved }
+        Piece { first, count, domain, of_vertices }
+        BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count }
         ApplyArgs { header, changes, new_transforms, new_q, stale, following, transforms, q, stamps, list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {

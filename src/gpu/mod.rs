@@ -19,12 +19,14 @@
 //! | `chain` | a launch that begins while the kernel before it ends |
 //! | `deformer` | the graph of a step, and its answer |
 //! | `output`, `interop` | where the vertices go |
+//! | `boxes` | a box of each domain, where the scene keeps them |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
 //! | `probe`, `report` | what is there, and whether the device agrees on layouts |
 //! | `trials` | what only measures |
 
 mod apply;
 mod bounds;
+mod boxes;
 mod chain;
 mod compile;
 mod deform;

@@ -133,6 +133,13 @@ pub(super) mod tests {
         Scene::new(parts).expect("a scene")
     }
 
+    /// The same without normal maps, with displacements and boxes.
+    pub(in super::super) fn kept(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        (parts.deformation.displacements, parts.deformation.boxes) = (true, true);
+        Scene::new(parts).expect("a scene")
+    }
+
     /// Every shape used by two domains, corner i being vertex i.
     pub(in super::super) fn alike(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::apply::most_changes;
+use super::boxes;
 use super::inputs::{Sizes, following};
 use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
 use super::pack;
@@ -30,6 +31,7 @@ pub(super) const KERNELS: [KernelSource; 4] = [
             "NARROW",
             "TRUNCATED",
             "COMPENSATED",
+            "DISPLACEMENTS",
             "ORIENT",
             "SHIFTED",
             "NORMAL_MAPS",
@@ -37,7 +39,7 @@ pub(super) const KERNELS: [KernelSource; 4] = [
             "FOLLOWERS",
         ],
     },
-    KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &[] },
+    KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &["BOXES"] },
     KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &["FOLLOWERS"] },
     KernelSource {
         name: "normals",
@@ -126,6 +128,11 @@ pub enum Role {
     Positions,
     Normals,
     Tangents,
+    /// u, where the scene keeps it.
+    Displacements,
+    /// The parts of domains that boxes are made of, and their boxes, where the scene keeps them.
+    Pieces,
+    DomainBoxes,
 }
 
 /// One device buffer.
@@ -192,6 +199,13 @@ pub fn plan(scene: &Scene) -> Plan {
         buffers.push((Role::RestTangents, bytes));
         buffers.push((Role::Tangents, 16 * corners));
     }
+    if needs.displacements {
+        buffers.push((Role::Displacements, 12 * vertices));
+    }
+    let (pieces, domain_boxes) = boxes::bytes(boxes::pieces(scene, &work).len());
+    if needs.boxes {
+        buffers.extend([(Role::Pieces, pieces), (Role::DomainBoxes, domain_boxes)]);
+    }
     if needs.exact_normals {
         let counts = Counts::of(scene);
         buffers.push((Role::CornerSlots, domains * size_of::<NormalSlot>() as u64));
@@ -211,7 +225,7 @@ pub fn plan(scene: &Scene) -> Plan {
         bytes_in: inputs,
         bytes_out: 24,
         bytes_of_changes: changes as u64,
-        left_out: left_out(scene, 16 * (rest_corners + corners)),
+        left_out: left_out(scene, [16 * (rest_corners + corners), 12 * vertices, pieces + domain_boxes]),
     }
 }
 
@@ -247,12 +261,20 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     let deform =
         Kernel { launch, name: deform.name, defines, blocks: blocks_of_tiles, threads, source: Source(deform.source) };
     let walk = |launch, kernel: &KernelSource, blocks: usize| {
-        let defines = [("NORMAL_MAPS", needs.normal_maps), ("SHEAR", needs.shear), ("FOLLOWERS", needs.followers)];
+        let defines = [
+            ("NORMAL_MAPS", needs.normal_maps),
+            ("SHEAR", needs.shear),
+            ("FOLLOWERS", needs.followers),
+            ("BOXES", needs.boxes),
+        ];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
         let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
         Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: Source(kernel.source) }
     };
-    let boxes = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
+    let few = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
+    // Eight threads make a box of a domain, and wait for the memory most of the time.
+    let many = || boxes::pieces(scene, work).len().div_ceil(BLOCK as usize / 8).min(4 * MOST_BLOCKS);
+    let boxes = if needs.boxes { few.max(many()) } else { few };
     let changes = most_changes(scene).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
     let mut kernels = vec![deform, walk(Launch::Bounds, &bounds, boxes)];
     if needs.exact_normals {
@@ -270,6 +292,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
         ("NARROW", is_narrow(work)),
         ("TRUNCATED", needs.truncation),
         ("COMPENSATED", needs.compensated),
+        ("DISPLACEMENTS", needs.displacements),
         ("ORIENT", orients),
         ("SHIFTED", !corner_shifts(scene).is_empty()),
         ("NORMAL_MAPS", orients && needs.normal_maps),
@@ -283,7 +306,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
 /// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
 const MOST_BLOCKS: usize = 264;
 
-fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
+fn left_out(scene: &Scene, [tangents, displacements, boxes]: [u64; 3]) -> Vec<LeftOut> {
     let needs = scene.needs;
     let more = size_of::<NormalSlot>() * scene.domains.len();
     let exact_normals = LeftOut {
@@ -295,13 +318,18 @@ fn left_out(scene: &Scene, tangent_bytes: u64) -> Vec<LeftOut> {
         (needs.modes, LeftOut { feature: "modes", what: "the sum U q in `deform`", bytes: 0 }),
         (
             needs.normal_maps,
-            LeftOut { feature: "normal_maps", what: "tangents and their two buffers", bytes: tangent_bytes },
+            LeftOut { feature: "normal_maps", what: "tangents and their two buffers", bytes: tangents },
         ),
         (needs.shear, LeftOut { feature: "shear", what: "the inverse transpose", bytes: 0 }),
         (needs.truncation, LeftOut { feature: "truncation", what: "lists of modes in `deform`", bytes: 0 }),
         (needs.exact_normals, exact_normals),
         (needs.compensated, LeftOut { feature: "compensated", what: "the compensation in `deform`", bytes: 0 }),
         (needs.followers, LeftOut { feature: "followers", what: "frames, and products of transforms", bytes: 0 }),
+        (
+            needs.displacements,
+            LeftOut { feature: "displacements", what: "u as an output of `deform`", bytes: displacements },
+        ),
+        (needs.boxes, LeftOut { feature: "boxes", what: "a box of each domain in `bounds`", bytes: boxes }),
     ];
     all.into_iter().filter(|(needed, _)| !needed).map(|(_, part)| part).collect()
 }
@@ -341,7 +369,7 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pack::tests::{exact, on_the_first, scene, stored};
+    use super::super::pack::tests::{exact, kept, on_the_first, scene, stored};
     use super::super::rings::Rings;
     use super::*;
 
@@ -360,10 +388,8 @@ mod tests {
         assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
         assert_eq!(bare.bytes_in, 80 + 48 * 4, "a header and four transforms, no q");
         let left_out: Vec<_> = bare.left_out.iter().map(|part| part.feature).collect();
-        assert_eq!(
-            left_out,
-            ["modes", "normal_maps", "shear", "truncation", "exact_normals", "compensated", "followers"]
-        );
+        let last = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes"];
+        assert_eq!(left_out, [&["modes", "normal_maps", "shear"][..], &last].concat());
         assert_eq!(bare.left_out[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
     }
 
@@ -374,7 +400,7 @@ mod tests {
         assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
         assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
         assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
-        assert_eq!(full.left_out.len(), 4);
+        assert_eq!(full.left_out.len(), 6);
     }
 
     #[test]
@@ -421,6 +447,27 @@ mod tests {
         let left_out = rigid.left_out.iter().find(|part| part.feature == "exact_normals").expect("left out");
         assert_eq!(left_out.bytes, 4 * (9 + 515) + 20 * 6, "members and slots");
     }
+
+    #[test]
+    fn displacements_and_boxes_are_outputs_and_macros_of_kernels_that_are_there_and_cost_nothing_unless_kept() {
+        let sizes = [(7, 2), (300, 0)];
+        let bare = plan(&stored(&sizes, Storage::F32));
+        let kept = plan(&kept(&sizes));
+        let roles = [Role::Displacements, Role::Pieces, Role::DomainBoxes];
+        // Two domains of each shape, in one piece each.
+        assert_eq!(roles.map(|role| bare.bytes(role)), [0; 3]);
+        assert_eq!(roles.map(|role| kept.bytes(role)), [12 * 2 * (7 + 300), 16 * 4, 24 * 4]);
+        assert_eq!(kept.total_bytes() - bare.total_bytes(), 12 * 2 * (7 + 300) + 40 * 4);
+        assert!(bare.kernels.iter().all(|kernel| !kernel.defines.iter().any(|name| KEPT.contains(name))));
+        let with = |kernel: usize| kept.kernels[kernel].defines.iter().filter(|name| KEPT.contains(name)).count();
+        assert_eq!([with(0), with(1), with(2)], [1, 1, 0]);
+        assert_eq!((kept.launches(), kept.bytes_in, kept.bytes_out), (bare.launches(), bare.bytes_in, bare.bytes_out));
+        let bytes = |name: &str| bare.left_out.iter().find(|part| part.feature == name).map(|part| part.bytes);
+        assert_eq!([bytes("displacements"), bytes("boxes")], [Some(12 * 2 * (7 + 300)), Some(40 * 4)]);
+    }
+
+    /// The macros of what is kept for readers.
+    const KEPT: [&str; 2] = ["DISPLACEMENTS", "BOXES"];
 
     #[test]
     fn launches_do_not_grow_with_the_number_of_domains() {

@@ -7,13 +7,13 @@ mod orient;
 use std::sync::Arc;
 use std::time::Instant;
 
-pub use deform::deform;
+pub use deform::{deform, displacements};
 pub use normals::{exact_normals, exact_tangents};
 pub use orient::{orient_normals, orient_tangents};
 
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::Result;
-use crate::scene::{Scene, State};
+use crate::scene::{Bounds, Scene, Slot, State};
 
 /// The deformer `reference`: computes in f64 and rounds once.
 #[derive(Debug)]
@@ -27,6 +27,21 @@ impl ReferenceDeformer {
     pub fn new(scene: &Arc<Scene>) -> Self {
         Self { scene: Arc::clone(scene), surface: Surface::default() }
     }
+
+    /// What readers want besides vertices. A displacement that f32 does not hold spoils the bounds.
+    fn keep(&mut self, state: &State, bounds: &mut Bounds) {
+        let (scene, surface) = (&self.scene, &mut self.surface);
+        if scene.needs.displacements {
+            surface.displacements = round(displacements(scene, state));
+            if !surface.displacements.iter().all(|number| number.is_finite()) {
+                bounds.include([f64::NAN; 3]);
+            }
+        }
+        if scene.needs.boxes {
+            let box_of = |slot: &Slot| Bounds::of(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
+            surface.boxes = scene.layout.slots.iter().map(box_of).collect();
+        }
+    }
 }
 
 impl Deformer for ReferenceDeformer {
@@ -37,16 +52,17 @@ impl Deformer for ReferenceDeformer {
     fn deform(&mut self, state: &State) -> Result<Deformed> {
         let begin = Instant::now();
         let positions = deform(&self.scene, state);
-        let mut bounds = crate::scene::Bounds::EMPTY;
+        let mut bounds = Bounds::EMPTY;
         positions.iter().for_each(|position| bounds.include(*position));
         let (normals, tangents) = if self.scene.needs.exact_normals {
             (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
         } else {
             (orient_normals(&self.scene, state), orient_tangents(&self.scene, state))
         };
-        self.surface.positions = positions.into_flattened().into_iter().map(|number| number as f32).collect();
+        self.surface.positions = round(positions);
         self.surface.normals = round(normals);
         self.surface.tangents = round(tangents);
+        self.keep(state, &mut bounds);
         Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 

@@ -15,6 +15,14 @@ pub struct Bounds {
 impl Bounds {
     pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
 
+    /// The smallest bounds of packed positions, three numbers each.
+    pub fn of(positions: &[f32]) -> Self {
+        let mut bounds = Self::EMPTY;
+        let points = positions.chunks_exact(3);
+        points.for_each(|point| bounds.include([0, 1, 2].map(|axis| f64::from(point[axis]))));
+        bounds
+    }
+
     /// Grows to hold a point. A NaN stays, so that nobody mistakes the bounds for finite ones.
     pub fn include(&mut self, point: [f64; 3]) {
         *self = self.union(Self { min: point, max: point });

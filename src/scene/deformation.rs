@@ -53,6 +53,10 @@ pub struct Deformation {
     pub truncation: Option<f64>,
     /// Sum the modes with compensation, for modes that nearly cancel.
     pub compensated: bool,
+    /// Keep u = U q of every vertex beside its position, in the domain's own frame, for a reader such as a collision test.
+    pub displacements: bool,
+    /// Keep an axis-aligned box of each domain's deformed positions.
+    pub boxes: bool,
 }
 
 impl Deformation {

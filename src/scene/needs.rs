@@ -28,6 +28,10 @@ pub struct Needs {
     pub compensated: bool,
     /// Some domain follows another one by a constant frame: products of transforms exist.
     pub followers: bool,
+    /// Displacements are kept, those of domains without modes too: they are 0.
+    pub displacements: bool,
+    /// A box of each domain is kept.
+    pub boxes: bool,
 }
 
 impl Needs {
@@ -49,11 +53,13 @@ impl Needs {
             truncation: modes && parts.deformation.truncation.is_some(),
             compensated: modes && parts.deformation.compensated,
             followers: parts.domains.iter().any(|domain| domain.follows.is_some()),
+            displacements: parts.deformation.displacements,
+            boxes: parts.deformation.boxes,
         }
     }
 
     /// Each flag with its name, in a fixed order.
-    pub fn flags(&self) -> [(&'static str, bool); 11] {
+    pub fn flags(&self) -> [(&'static str, bool); 13] {
         [
             ("modes", self.modes),
             ("textures", self.textures),
@@ -66,6 +72,8 @@ impl Needs {
             ("truncation", self.truncation),
             ("compensated", self.compensated),
             ("followers", self.followers),
+            ("displacements", self.displacements),
+            ("boxes", self.boxes),
         ]
     }
 }

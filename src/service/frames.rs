@@ -91,7 +91,7 @@ impl Show {
 fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iterator<Item = v1::FrameChunk> {
     let (width, height) = match view {
         View::Frame { width, height, .. } => (width, height),
-        View::Vertices => (0, 0),
+        View::Vertices(_) => (0, 0),
     };
     let head = v1::FrameHead {
         step: Some(step_id(frame.step)),

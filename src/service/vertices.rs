@@ -1,4 +1,5 @@
-//! Deformed vertices: those of one step with a deadline, or of every step. Positions in row order of U, then normals.
+//! Deformed vertices: those of one step with a deadline, or of every step. Positions in row order of U, then normals, and
+//! what else a reader wants and the scene keeps: displacements, boxes.
 
 use std::sync::Arc;
 
@@ -9,6 +10,7 @@ use tonic::{Request, Response, Status};
 use super::convert::{delivery, said, stages, step_id, which_of_vertices};
 use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
+use crate::deform::Wanted;
 use crate::engine::{Engine, Feed, Host, Packed, Selection, View, pack_vertices};
 
 /// `VertexService`.
@@ -31,7 +33,7 @@ impl v1::vertex_service_server::VertexService for Vertices {
         let most = config.chunk_bytes;
         Ok(respond(move |outlet| async move {
             let work = async {
-                let shown = host.show(which, View::Vertices).await.map_err(status)?;
+                let shown = host.show(which, View::Vertices(selection.wanted)).await.map_err(status)?;
                 let vertices = pack_vertices(shown, &selection).await.map_err(status)?;
                 for chunk in chunks(&vertices, &selection, most) {
                     outlet.send(v1::GetVerticesResponse { chunk: Some(chunk) }).await?;
@@ -54,7 +56,7 @@ impl v1::vertex_service_server::VertexService for Vertices {
         let selection = select(&host, request.selection)?;
         let delivery = delivery(request.delivery).map_err(status)?;
         // The subscription holds before the reply's head is sent, so that a client may count on the next step.
-        let feed = host.watch(View::Vertices, delivery).await.map_err(status)?;
+        let feed = host.watch(View::Vertices(selection.wanted), delivery).await.map_err(status)?;
         let show = Show { selection, most: self.0.config().chunk_bytes, steps: request.steps };
         Ok(respond(move |outlet| deadline.hold("the end of the vertex stream", show.run(feed, outlet))))
     }
@@ -90,8 +92,11 @@ impl Show {
 }
 
 fn select(host: &Host, selection: Option<v1::VertexSelection>) -> Result<Arc<Selection>, Status> {
-    let v1::VertexSelection { domains, positions_only } = selection.unwrap_or_default();
-    Selection::new(&host.scene, domains, positions_only).map(Arc::new).map_err(status)
+    let v1::VertexSelection { domains, positions_only, displacements, boxes, without_vertices } =
+        selection.unwrap_or_default();
+    let positions = !without_vertices;
+    let wanted = Wanted { positions, normals: positions && !positions_only, displacements, boxes };
+    Selection::new(&host.scene, domains, wanted).map(Arc::new).map_err(status)
 }
 
 fn chunks(packed: &Packed, selection: &Selection, most: usize) -> impl Iterator<Item = v1::VertexChunk> + use<> {
@@ -107,6 +112,8 @@ fn chunks(packed: &Packed, selection: &Selection, most: usize) -> impl Iterator<
         skipped: vertices.skipped,
         stages: stages(&vertices.stages),
         origin_bytes: packed.origin_bytes,
+        displacement_bytes: selection.displacement_bytes(),
+        box_bytes: selection.box_bytes(),
     };
     let mut head = Some(head);
     let cut = move |(offset, data): (u64, Bytes)| v1::VertexChunk { head: head.take(), offset, data };

@@ -134,6 +134,13 @@ impl Reaches {
         (0..self.rest.len()).map(|tile| self.tile(tile, step)).fold(Bound::default(), Bound::max)
     }
 
+    /// How far u may be off at the vertices of a tile, in scene units of the domain: neither x0 nor T has a part in it.
+    pub fn displacement(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
+        let step = Step { q, transform: Transform::IDENTITY.into(), compensated };
+        let Bound { storage, coordinates, accumulation, .. } = self.tile(tile, &step);
+        (storage + coordinates + accumulation) * ROUND_UP
+    }
+
     fn finish(&self, tile: usize, step: &Step, parts: [f64; 4]) -> Bound {
         let [storage, lost, moved, terms] = parts.map(|part| part * ROUND_UP);
         let accumulation = match step.compensated {

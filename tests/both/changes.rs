@@ -6,6 +6,7 @@ use modalcast::deform::Deformer;
 use modalcast::domain::{Domain, Shape};
 use modalcast::scene::{Changed, Deformation, Normals, RawUpdate, Scene, State, Storage, Update};
 
+use super::readers::{kept, wrong_box};
 use super::{Shown, run, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
@@ -113,6 +114,7 @@ fn script() -> Vec<(Vec<u32>, Vec<u32>, Between)> {
 struct Both<D> {
     listed: D,
     whole: D,
+    scene: Arc<Scene>,
     shows: usize,
 }
 
@@ -123,6 +125,9 @@ impl<D: Deformer> Both<D> {
         let (listed, whole) = (run(&mut self.listed, state), run(&mut self.whole, &whole));
         // A refused state is not shown; its bounds are not finite, and NaNs equal nothing.
         if listed.bounds.is_finite() {
+            if !listed.surface.boxes.is_empty() {
+                assert_eq!(wrong_box(&self.scene, &listed), None, "{name}, show {}", self.shows);
+            }
             assert_eq!(listed.difference(&whole), None, "{name}, show {}", self.shows);
         }
         assert_eq!(listed.bounds.is_finite(), whole.bounds.is_finite(), "{name}");
@@ -133,7 +138,7 @@ impl<D: Deformer> Both<D> {
 
 fn follow<D: Deformer>(name: &str, scene: &Arc<Scene>, make: &impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(51);
-    let mut both = Both { listed: make(scene), whole: make(scene), shows: 0 };
+    let mut both = Both { listed: make(scene), whole: make(scene), scene: Arc::clone(scene), shows: 0 };
     let (mut state, mut other) = (scenes::state(scene, 52), scenes::state(scene, 53));
     let (mut last, mut moved) = (both.show(&state, name), 0);
     for (q, transforms, between) in script() {
@@ -184,6 +189,9 @@ pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
         (exact(Storage::Bf16), true),
         (plain(Storage::Int8), true),
         (compensated(exact(Storage::Int8)), false),
+        (kept(plain(Storage::F32)), true),
+        (kept(truncated(Storage::F16)), false),
+        (kept(compensated(exact(Storage::Int8))), false),
     ] {
         follow(&format!("{deformation:?}, normal maps {normal_maps}"), &crowd(deformation, normal_maps), &make);
     }

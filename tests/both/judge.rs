@@ -10,29 +10,46 @@ const TILE: usize = QUAD * TILE_QUADS;
 /// Of each domain the largest error of a vertex as a part of the bound of its tile; infinite for what is not finite.
 /// Modes that were left out may move a vertex by `left_out` more, in scene units.
 fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], left_out: f64) -> Vec<f64> {
-    let want = reference::deform(scene, state);
-    assert_eq!(positions.len(), 3 * want.len(), "as many vertices");
+    let bound = |reaches: &Reaches, tile: usize, step: &Step| reaches.tile(tile, step).total() + left_out;
+    parts((scene, state), positions, &reference::deform(scene, state), bound)
+}
+
+/// The same of displacements.
+fn parts_of_displacement_bound(scene: &Scene, state: &State, displacements: &[f32]) -> Vec<f64> {
+    let bound = |reaches: &Reaches, tile: usize, step: &Step| reaches.displacement(tile, step.q, step.compensated);
+    parts((scene, state), displacements, &reference::displacements(scene, state), bound)
+}
+
+fn parts(
+    (scene, state): (&Scene, &State),
+    got: &[f32],
+    want: &[[f64; 3]],
+    bound: impl Fn(&Reaches, usize, &Step) -> f64,
+) -> Vec<f64> {
+    assert_eq!(got.len(), 3 * want.len(), "as many vertices");
     let storage = scene.deformation.storage;
     let reaches = |shape| Reaches::new(shape, &Tiles::new(shape, storage));
     let reaches: Vec<Reaches> = scene.shapes.iter().map(reaches).collect();
     let error = |packed: usize| {
-        let square = |axis: usize| (f64::from(positions[3 * packed + axis]) - want[packed][axis]).powi(2);
+        let square = |axis: usize| (f64::from(got[3 * packed + axis]) - want[packed][axis]).powi(2);
         (0..3).map(square).sum::<f64>().sqrt()
     };
     let part = |domain: usize| {
         let (slot, compensated) = (scene.layout.slots[domain], scene.deformation.compensated);
         let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated };
         let tile = |first: usize| {
-            let bound = reaches[scene.domains[domain].shape].tile(first / TILE, &step).total() + left_out;
+            let bound = bound(&reaches[scene.domains[domain].shape], first / TILE, &step);
             let vertices = first..slot.vertices.min(first + TILE);
-            vertices.map(|vertex| finite(error(slot.first_vertex + vertex) / bound)).fold(0.0, f64::max)
+            vertices.map(|vertex| part_of(error(slot.first_vertex + vertex), bound)).fold(0.0, f64::max)
         };
         (0..slot.vertices).step_by(TILE).map(tile).fold(0.0, f64::max)
     };
     (0..scene.domains.len()).map(part).collect()
 }
 
-fn finite(part: f64) -> f64 {
+/// Of a bound of 0, as that of a domain without modes, no error is no part.
+fn part_of(error: f64, bound: f64) -> f64 {
+    let part = if error == 0.0 { 0.0 } else { error / bound };
     if part.is_nan() { f64::INFINITY } else { part }
 }
 
@@ -42,6 +59,20 @@ pub(crate) fn within(name: &str, (scene, state): (&Scene, &State), positions: &[
     let worst = (0..parts.len()).max_by(|a, b| parts[*a].total_cmp(&parts[*b])).expect("a domain");
     eprintln!("{name}: an error takes up at most {:.3} of its bound", parts[worst]);
     assert!(parts[worst] <= 1.0, "{name}: '{}' is {} of its bound off", scene.domains[worst].name, parts[worst]);
+}
+
+/// [`within`] of displacements.
+pub(crate) fn displacements_within(name: &str, (scene, state): (&Scene, &State), displacements: &[f32]) {
+    let parts = parts_of_displacement_bound(scene, state, displacements);
+    let worst = (0..parts.len()).max_by(|a, b| parts[*a].total_cmp(&parts[*b])).expect("a domain");
+    eprintln!("{name}: an error of u takes up at most {:.3} of its bound", parts[worst]);
+    assert!(parts[worst] <= 1.0, "{name}: u of '{}' is {} of its bound off", scene.domains[worst].name, parts[worst]);
+}
+
+/// The domains with a displacement beyond its bound.
+pub(crate) fn displacements_beyond((scene, state): (&Scene, &State), displacements: &[f32]) -> Vec<usize> {
+    let parts = parts_of_displacement_bound(scene, state, displacements);
+    (0..parts.len()).filter(|domain| parts[*domain] > 1.0).collect()
 }
 
 /// The domains with an error beyond its bound.
@@ -66,5 +97,12 @@ fn the_judge_of_bounds_refuses_a_wrong_vertex_and_what_is_not_finite() {
     let mut wrong = right;
     wrong[3 * 136] += 1e-3;
     assert_eq!(beyond((&scene, &state), &wrong, 0.0), [1]);
+    let right_u: Vec<f32> = reference::displacements(&scene, &state).as_flattened().iter().map(|x| *x as f32).collect();
+    assert_eq!(displacements_beyond((&scene, &state), &right_u), [0; 0]);
+    for (at, number, domain) in [(5, f32::NAN, 0), (3 * 129, 0.125, 0), (3 * 136, 1e-30, 1)] {
+        let mut wrong = right_u.clone();
+        wrong[at] = number;
+        assert_eq!(displacements_beyond((&scene, &state), &wrong), [domain], "{number}");
+    }
     assert_eq!(beyond((&scene, &state), &wrong, 2e-3), [0; 0]);
 }

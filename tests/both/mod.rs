@@ -6,6 +6,7 @@ pub(crate) mod extremes;
 pub(crate) mod following;
 mod judge;
 pub(crate) mod neighbours;
+pub(crate) mod readers;
 pub(crate) mod refusal;
 pub(crate) mod surfaces;
 pub(crate) mod truncation;
@@ -17,7 +18,7 @@ use modalcast::domain::{Domain, Mesh, Shape};
 use modalcast::scene::{Bounds, Deformation, Scene, State};
 
 use crate::scenes::{self, NORMAL_MAPPED, Random};
-pub(crate) use judge::{beyond, within};
+pub(crate) use judge::{beyond, displacements_beyond, displacements_within, within};
 
 /// All that a step gives.
 #[derive(Debug, Clone)]
@@ -35,8 +36,8 @@ impl Shown {
     /// The first number that differs in a bit, in words.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         let lists = |shown: &Self| {
-            let Surface { positions, normals, tangents } = shown.surface.clone();
-            [("position", positions), ("normal", normals), ("tangent", tangents)]
+            let Surface { positions, normals, tangents, displacements, .. } = shown.surface.clone();
+            [("position", positions), ("normal", normals), ("tangent", tangents), ("displacement", displacements)]
         };
         for ((name, own), (_, other)) in lists(self).into_iter().zip(lists(other)) {
             if own.len() != other.len() {
@@ -45,6 +46,9 @@ impl Shown {
             if let Some(at) = (0..own.len()).find(|at| own[*at].to_bits() != other[*at].to_bits()) {
                 return Some(format!("number {at} of {name}s is {} and {}", own[at], other[at]));
             }
+        }
+        if self.surface.boxes != other.surface.boxes {
+            return Some("boxes".into());
         }
         (self.bounds != other.bounds).then(|| format!("bounds {:?} and {:?}", self.bounds, other.bounds))
     }
@@ -79,7 +83,7 @@ pub(crate) fn scene_of(
 
 #[test]
 fn a_bit_a_length_and_a_bound_are_differences() {
-    let surface = Surface { positions: vec![0.0; 3], normals: vec![1.0; 3], tangents: vec![] };
+    let surface = Surface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..Surface::default() };
     let shown = Shown { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, surface };
     assert_eq!(shown.difference(&shown), None);
     let spoilt = |spoil: &dyn Fn(&mut Shown)| {
@@ -90,5 +94,7 @@ fn a_bit_a_length_and_a_bound_are_differences() {
     assert!(spoilt(&|other| other.surface.positions[1] = -0.0).is_some());
     assert!(spoilt(&|other| other.surface.normals[2] = 1.000_000_1).is_some());
     assert!(spoilt(&|other| other.surface.tangents.push(0.0)).is_some());
+    assert!(spoilt(&|other| other.surface.displacements.push(0.0)).is_some());
+    assert!(spoilt(&|other| other.surface.boxes.push(Bounds::EMPTY)).is_some());
     assert!(spoilt(&|other| other.bounds.max[0] = f64::NAN).is_some());
 }

@@ -63,7 +63,7 @@ fn bits_of(shown: &Shown, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
 }
 
 /// Whether the GPU has so few tiles that a lane takes one vertex instead of four.
-fn is_narrow(scene: &Scene) -> bool {
+pub(crate) fn is_narrow(scene: &Scene) -> bool {
     plan(scene).kernel(Launch::Deform).expect("every scene has it").defines.contains(&"NARROW")
 }
 

@@ -4,7 +4,7 @@ use modalcast::config::BackendChoice;
 use modalcast::gpu::{CudaDeformer, Launch};
 use modalcast::scene::{Deformation, Scene};
 
-use crate::both::{self, changes, extremes, following, neighbours, refusal, surfaces, truncation};
+use crate::both::{self, changes, extremes, following, neighbours, readers, refusal, surfaces, truncation};
 use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
@@ -95,6 +95,36 @@ fn gpu_twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_a_domain_that_a_list_leaves_out_stays_where_it_was() {
     assert!(changes::believes_lists(deformer));
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_displacements_and_boxes_equal_their_twins_and_change_no_vertex() {
+    readers::displacements_and_boxes_equal_their_twins(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_scene_without_modes_has_displacements_of_zero() {
+    readers::a_scene_without_modes_has_zeros(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_displacements_and_boxes_are_read_alone_and_are_those_of_the_last_step() {
+    readers::parts_are_read_alone(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_displacements_that_no_f32_holds_are_told_and_others_survive() {
+    readers::lost_displacements_are_told_and_others_survive(deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_lost_displacement_is_refused_by_the_name_of_its_domain() {
+    readers::lost_displacements_are_refused_by_name(BackendChoice::Cuda);
 }
 
 #[test]

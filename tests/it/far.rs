@@ -14,7 +14,7 @@ use crate::service_harness::{
 type Place = ([f32; 4], [f64; 3]);
 
 fn ask(scene: &str, domains: &[u32]) -> v1::GetVerticesRequest {
-    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), positions_only: false });
+    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), ..Default::default() });
     v1::GetVerticesRequest { scene: scene.into(), selection, ..v1::GetVerticesRequest::default() }
 }
 
@@ -120,7 +120,7 @@ async fn a_far_scene_and_a_domain_far_from_it_keep_the_millimetre() {
     let rounded = away.1[0] - home[0] - f64::from((away.1[0] - home[0]) as f32);
     assert!(scene.unit * rounded.abs() > 1e-2, "{rounded}");
     // Each alone, in any order, and without normals.
-    let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true });
+    let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true, ..Default::default() });
     let swapped = get_vertices(&server, v1::GetVerticesRequest { selection, ..ask("far", &[]) }).await.expect("both");
     let want = [truth(&scene, 1, &q[2..], away), truth(&scene, 0, &q[..2], near)].concat();
     assert!(swapped.normals.is_empty() && largest(&told(&scene, &swapped), &want) <= 1e-3);

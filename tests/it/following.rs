@@ -15,7 +15,7 @@ fn moved(number: u64, domains: &[u32], rows: &[[f32; 12]]) -> v1::Step {
 }
 
 fn ask(domains: &[u32]) -> v1::GetVerticesRequest {
-    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), positions_only: true });
+    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), positions_only: true, ..Default::default() });
     v1::GetVerticesRequest { scene: "twig".into(), selection, ..v1::GetVerticesRequest::default() }
 }
 

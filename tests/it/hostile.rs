@@ -203,7 +203,7 @@ async fn bad_questions_are_refused_with_code_field_expected_and_given() {
     server.open("strips").await;
     let mut scenes = server.scenes().await;
     let mut refuse = Vec::new();
-    let selection = Some(v1::VertexSelection { domains: vec![0, 5], positions_only: false });
+    let selection = Some(v1::VertexSelection { domains: vec![0, 5], ..Default::default() });
     let ask = v1::GetVerticesRequest { scene: "strips".into(), selection, ..v1::GetVerticesRequest::default() };
     let status = get_vertices(&server, ask).await.expect_err("no such domain");
     refuse.push((status, Code::InvalidArgument, ["selection.domains[1]", "an index below 2", "5"]));

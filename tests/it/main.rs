@@ -10,6 +10,7 @@ mod hostile;
 mod layering;
 mod normals;
 mod pixels;
+mod readers;
 mod real;
 mod restart;
 #[path = "../gpu/scenes.rs"]

@@ -8,7 +8,7 @@ use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::domain::{Attachment, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast::engine::{Engine, SceneSource};
 use modalcast::error::{Error, Result, invalid};
-use modalcast::scene::{Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
+use modalcast::scene::{Deformation, Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
 use modalcast::{reference, service};
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -28,8 +28,8 @@ use v1::vertex_service_client::VertexServiceClient;
 /// The longest that any answer may take before a test gives up.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Scenes made in code: `strips` (two small domains), `far` (the same elsewhere), `sheet` (more than 1 MiB of everything),
-/// `panic`.
+/// Scenes made in code: `strips` (two small domains), `far` (the same elsewhere), `kept` (the same for readers), `sheet`
+/// (more than 1 MiB of everything), `panic`.
 pub(crate) struct InCode;
 
 impl SceneSource for InCode {
@@ -38,6 +38,7 @@ impl SceneSource for InCode {
             "strips" => Ok(strips()),
             "far" => Ok(far_strips()),
             "twig" => Ok(twig()),
+            "kept" => Ok(kept_strips()),
             "sheet" => Ok(sheet()),
             "panic" => panic!("a planted panic of a loader"),
             _ => Err(Error::NotFound { what: "scene", given: source.into() }),
@@ -57,13 +58,13 @@ impl SceneSource for InCode {
 
 /// Two squares of four vertices and two modes; `right` hangs on `left`.
 pub(crate) fn strips() -> Arc<Scene> {
-    let (shape, domains) = two_strips();
+    let (shape, domains) = two_strips(1.0);
     scene("strips", shape, domains)
 }
 
 /// Two strips, the second of which has two leaves: one follows it, and the other follows that leaf.
 pub(crate) fn twig() -> Arc<Scene> {
-    let (shape, mut domains) = two_strips();
+    let (shape, mut domains) = two_strips(1.0);
     let frame = Transform([0.0, -1.0, 0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -0.25]);
     for (name, parent) in [("leaf", 1), ("leaflet", 2)] {
         domains.push(Domain { follows: Some(Follow { parent, frame }), ..domain(name, None) });
@@ -73,14 +74,23 @@ pub(crate) fn twig() -> Arc<Scene> {
 
 /// The same in half metres, 17,000 km from the world's origin.
 pub(crate) fn far_strips() -> Arc<Scene> {
-    let (shape, domains) = two_strips();
+    let (shape, domains) = two_strips(1.0);
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
     let parts = Parts { shapes, materials, domains, unit: 0.5, origin: [1e7, -1e7, 1e7 + 0.25], ..Parts::named("far") };
     Scene::new(parts).expect("a scene")
 }
 
-fn two_strips() -> (Shape, Vec<Domain>) {
-    let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.125 * (entry % 3) as f32 }).collect();
+/// The same as [`strips`] with larger modes, displacements and boxes.
+pub(crate) fn kept_strips() -> Arc<Scene> {
+    let (shape, domains) = two_strips(4.0);
+    let deformation = Deformation { displacements: true, boxes: true, ..Deformation::default() };
+    let (shapes, materials) = (vec![shape], vec![Material::default()]);
+    Scene::new(Parts { shapes, materials, domains, deformation, ..Parts::named("kept") }).expect("a scene")
+}
+
+fn two_strips(size: f32) -> (Shape, Vec<Domain>) {
+    let entry = |entry: u32| if entry % 5 == 0 { 0.5 } else { 0.125 * (entry % 3) as f32 };
+    let columns = (0..24).map(|at| size * entry(at)).collect();
     let shape = Shape::new(grid(2), Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
     let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
     let notes = [("species".to_owned(), "none".to_owned())].into();
@@ -351,6 +361,9 @@ pub(crate) struct Got {
     pub(crate) head: v1::VertexHead,
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
+    pub(crate) displacements: Vec<f32>,
+    /// Six numbers per chosen domain.
+    pub(crate) boxes: Vec<f32>,
     /// Three numbers per chosen domain; empty when the head's origin holds for all.
     pub(crate) origins: Vec<f64>,
 }
@@ -398,10 +411,13 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> Got {
     }
     assert_eq!(head.total, bytes.len() as u64);
     let (positions, rest) = bytes.split_at(head.position_bytes as usize);
-    let (normals, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
+    let (rest, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
+    let (rest, boxes) = rest.split_at(rest.len() - head.box_bytes as usize);
+    let (normals, displacements) = rest.split_at(rest.len() - head.displacement_bytes as usize);
     let floats = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, f32>(bytes);
     let origins = bytemuck::pod_collect_to_vec::<u8, f64>(origins);
-    Got { positions: floats(positions), normals: floats(normals), origins, head }
+    let [positions, normals, displacements, boxes] = [positions, normals, displacements, boxes].map(floats);
+    Got { positions, normals, displacements, boxes, origins, head }
 }
 
 /// The refusal inside a status.

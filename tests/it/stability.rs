@@ -7,7 +7,7 @@ use modalcast::cpu::CpuDeformer;
 use modalcast::scene::Scene;
 use modalcast::storage::Truncation;
 
-use crate::both::{changes, extremes, following, neighbours, refusal, surfaces, truncation};
+use crate::both::{changes, extremes, following, neighbours, readers, refusal, surfaces, truncation};
 
 fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene)
@@ -83,6 +83,31 @@ fn a_mode_that_swings_about_the_limit_does_not_flicker() {
 fn twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
     changes::steps_of_a_few_domains(deformer);
     assert!(!changes::believes_lists(deformer), "the cpu compares values");
+}
+
+#[test]
+fn displacements_and_boxes_equal_their_twins_and_change_no_vertex() {
+    readers::displacements_and_boxes_equal_their_twins(deformer);
+}
+
+#[test]
+fn a_scene_without_modes_has_displacements_of_zero() {
+    readers::a_scene_without_modes_has_zeros(deformer);
+}
+
+#[test]
+fn displacements_and_boxes_are_read_alone_and_are_those_of_the_last_step() {
+    readers::parts_are_read_alone(deformer);
+}
+
+#[test]
+fn displacements_that_no_f32_holds_are_told_and_others_survive() {
+    readers::lost_displacements_are_told_and_others_survive(deformer);
+}
+
+#[test]
+fn a_lost_displacement_is_refused_by_the_name_of_its_domain() {
+    readers::lost_displacements_are_refused_by_name(BackendChoice::Cpu);
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Steps over the wire: what is acknowledged is what the scene shows, in both policies.
 
+use modalcast::deform::Wanted;
 use modalcast::engine::{Delivery, View, Which};
 use modalcast_proto::v1;
 use v1::Policy;
@@ -41,7 +42,7 @@ async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_str
     server.open("strips").await;
     let request = v1::StreamVerticesRequest {
         scene: "strips".into(),
-        selection: Some(v1::VertexSelection { domains: vec![1], positions_only: true }),
+        selection: Some(v1::VertexSelection { domains: vec![1], positions_only: true, ..Default::default() }),
         delivery: v1::Delivery::Lossless.into(),
         steps: 30,
     };
@@ -70,8 +71,13 @@ async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_str
 async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is_refused_by_name() {
     let server = Server::fresh().await;
     server.open("strips").await;
-    let mut feed =
-        server.engine.find("strips").expect("open").watch(View::Vertices, Delivery::Lossless).await.expect("a feed");
+    let mut feed = server
+        .engine
+        .find("strips")
+        .expect("open")
+        .watch(View::Vertices(Wanted::VERTICES), Delivery::Lossless)
+        .await
+        .expect("a feed");
     let mut driver = server.drive("strips", Policy::Lossless, 2).await;
     // Two steps wait in the feed; the third is done but not acknowledged, the fourth waits, the fifth is too many.
     driver.acked(step(1, &[0], &[0.1, 0.0])).await;
@@ -98,8 +104,13 @@ async fn a_subscriber_that_never_reads_is_cut_off_and_the_writer_goes_on() {
     let stall = std::time::Duration::from_millis(50);
     let server = Server::with(|config| modalcast::config::Config { stall, ..config }).await;
     server.open("strips").await;
-    let mut feed =
-        server.engine.find("strips").expect("open").watch(View::Vertices, Delivery::Lossless).await.expect("a feed");
+    let mut feed = server
+        .engine
+        .find("strips")
+        .expect("open")
+        .watch(View::Vertices(Wanted::VERTICES), Delivery::Lossless)
+        .await
+        .expect("a feed");
     let mut driver = server.drive("strips", Policy::Lossless, 1).await;
     for number in 1..=6 {
         driver.acked(step(number, &[0], &[0.1, 0.0])).await;
@@ -147,7 +158,7 @@ async fn a_latest_subscriber_gets_the_current_step_at_once_and_counts_what_it_mi
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     driver.acked(step(3, &[0], &[0.1, 0.0])).await;
     let host = server.engine.find("strips").expect("open");
-    let mut feed = host.watch(View::Vertices, Delivery::Latest).await.expect("a feed");
+    let mut feed = host.watch(View::Vertices(Wanted::VERTICES), Delivery::Latest).await.expect("a feed");
     let first = within(feed.next()).await.expect("the current step");
     assert_eq!((first.step.number, first.skipped), (3, 0));
     for number in 4..=8 {
@@ -219,8 +230,8 @@ async fn exact_and_minimum_steps_are_waited_for_and_a_step_that_has_passed_is_na
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let host = server.engine.find("strips").expect("open");
-    let mut waiting =
-        [Which::Exact(2), Which::Minimum(3), Which::Exact(5)].map(|which| Box::pin(host.show(which, View::Vertices)));
+    let mut waiting = [Which::Exact(2), Which::Minimum(3), Which::Exact(5)]
+        .map(|which| Box::pin(host.show(which, View::Vertices(Wanted::VERTICES))));
     for request in &mut waiting {
         // One poll puts the request in place.
         assert!(tokio::time::timeout(std::time::Duration::ZERO, request).await.is_err(), "there is no step yet");

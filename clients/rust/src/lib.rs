@@ -21,7 +21,7 @@ pub use modalcast_proto::v1::{SceneInfo, StepId};
 pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
 pub use step::{Step, Transforms};
 pub use tonic::Code;
-pub use vertices::{VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
+pub use vertices::{Readings, VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
 
 /// The project's README shows a client; here it is compiled.
 #[cfg(doctest)]

@@ -1,5 +1,5 @@
 //! Deformed vertices: positions per row of U and normals per corner, world relative to an origin that the set names, one
-//! set per step.
+//! set per step; and what else a reader wants of them.
 
 use std::ops::Range;
 use std::pin::Pin;
@@ -14,6 +14,18 @@ use crate::client::Client;
 use crate::error::{Error, Result, malformed};
 use crate::frames::{Delivery, Stages, Wanted, stages};
 
+/// What a reader, for example one that looks for collisions, wants of a step besides its vertices. The server refuses what
+/// the scene does not keep.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Readings {
+    /// u = U q of each vertex; of a scene with `deform.displacements`.
+    pub displacements: bool,
+    /// A box of each chosen domain; of a scene with `deform.boxes`.
+    pub boxes: bool,
+    /// Leave out positions and normals.
+    pub alone: bool,
+}
+
 /// A request for one step's vertices.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct VertexRequest {
@@ -21,6 +33,7 @@ pub struct VertexRequest {
     /// Domains by index; empty means all.
     pub domains: Vec<u32>,
     pub positions_only: bool,
+    pub readings: Readings,
     at: Wanted,
     deadline_ms: u32,
 }
@@ -59,6 +72,7 @@ pub struct VertexStreamRequest {
     pub scene: String,
     pub domains: Vec<u32>,
     pub positions_only: bool,
+    pub readings: Readings,
     pub delivery: Delivery,
     pub steps: u64,
 }
@@ -74,16 +88,20 @@ pub struct VertexSet {
     pub origins: Vec<[f64; 3]>,
     /// Per chosen domain: its index, its vertices and its corners.
     pub domains: Vec<(u32, u32, u32)>,
-    /// Three per vertex, all chosen domains after each other.
+    /// Three per vertex, all chosen domains after each other; empty when they were left out.
     pub positions: Vec<f32>,
     /// Three per corner; empty when they were left out.
     pub normals: Vec<f32>,
+    /// u = U q, three per vertex in the frame of its domain; empty unless asked for.
+    pub displacements: Vec<f32>,
+    /// Per chosen domain the smallest and the largest x, y, z of its positions; empty unless asked for.
+    pub boxes: Vec<[[f32; 3]; 2]>,
     pub skipped: u64,
     pub stages: Stages,
 }
 
 impl VertexSet {
-    /// Where the positions of the `place`-th chosen domain are.
+    /// Where the positions of the `place`-th chosen domain are, and its displacements.
     pub fn range(&self, place: usize) -> Range<usize> {
         let before: usize = self.domains[..place].iter().map(|(_, vertices, _)| 3 * *vertices as usize).sum();
         before..before + 3 * self.domains[place].1 as usize
@@ -101,12 +119,13 @@ impl Client {
     /// The vertices of one step.
     ///
     /// # Errors
-    /// `Refused` when scene, domain or step do not exist or the deadline passed; `Malformed`; `Connect`.
+    /// `Refused` when scene, domain or step do not exist, the scene does not keep what is wanted or the deadline passed;
+    /// `Malformed`; `Connect`.
     pub async fn vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
         use v1::get_vertices_request::Step;
         let wire = v1::GetVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(selection(&request.domains, request.positions_only)),
+            selection: Some(selection(&request.domains, request.positions_only, request.readings)),
             step: match request.at {
                 Wanted::Newest => None,
                 Wanted::Exactly(step) => Some(Step::ExactStep(step)),
@@ -122,11 +141,11 @@ impl Client {
     /// Subscribes to the vertices of every step. When this returns, the server has accepted.
     ///
     /// # Errors
-    /// `Refused` when scene or domain do not exist; `Connect`.
+    /// `Refused` when scene or domain do not exist or the scene does not keep what is wanted; `Connect`.
     pub async fn vertex_sets(&self, request: &VertexStreamRequest) -> Result<VertexSets> {
         let wire = v1::StreamVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(selection(&request.domains, request.positions_only)),
+            selection: Some(selection(&request.domains, request.positions_only, request.readings)),
             delivery: v1::Delivery::from(request.delivery).into(),
             steps: request.steps,
         };
@@ -181,8 +200,9 @@ impl Part for v1::StreamVerticesResponse {
     }
 }
 
-fn selection(domains: &[u32], positions_only: bool) -> v1::VertexSelection {
-    v1::VertexSelection { domains: domains.to_vec(), positions_only }
+fn selection(domains: &[u32], positions_only: bool, readings: Readings) -> v1::VertexSelection {
+    let Readings { displacements, boxes, alone } = readings;
+    v1::VertexSelection { domains: domains.to_vec(), positions_only, displacements, boxes, without_vertices: alone }
 }
 
 fn piece(chunk: Option<v1::VertexChunk>) -> Result<Piece<v1::VertexHead>> {
@@ -196,33 +216,61 @@ fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
     if counts.0 != counts.1 || counts.0 != counts.2 {
         return Err(malformed("vertices.domains", "one count of vertices and corners each", format!("{counts:?}")));
     }
+    let parts = parts(&head, bytes)?;
+    let domains = head.domains.iter().zip(&head.vertices).zip(&head.corners);
+    Ok(VertexSet {
+        step: head.step.ok_or_else(|| malformed("vertices.step", "a step", "none"))?,
+        origin: head.origin,
+        origins: points(parts.origins),
+        domains: domains.map(|((domain, vertices), corners)| (*domain, *vertices, *corners)).collect(),
+        positions: floats(parts.positions),
+        normals: floats(parts.normals),
+        displacements: floats(parts.displacements),
+        boxes: boxes(&floats(parts.boxes)),
+        skipped: head.skipped,
+        stages: stages(head.stages),
+    })
+}
+
+/// The bytes of a reply, cut as its head says.
+struct Parts<'a> {
+    positions: &'a [u8],
+    normals: &'a [u8],
+    displacements: &'a [u8],
+    boxes: &'a [u8],
+    origins: &'a [u8],
+}
+
+fn parts<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<Parts<'a>> {
     let sum = |list: &[u32]| 12 * list.iter().map(|count| u64::from(*count)).sum::<u64>();
-    if sum(&head.vertices) != head.position_bytes {
-        return Err(malformed("vertices.position_bytes", sum(&head.vertices), head.position_bytes));
-    }
-    let own = 24 * head.domains.len() as u64;
-    if head.origin_bytes != 0 && head.origin_bytes != own {
-        return Err(malformed("vertices.origin_bytes", format!("0 or {own}"), head.origin_bytes));
+    let (vertices, domains) = (sum(&head.vertices), 24 * head.domains.len() as u64);
+    for (field, given, whole) in [
+        ("vertices.position_bytes", head.position_bytes, vertices),
+        ("vertices.displacement_bytes", head.displacement_bytes, vertices),
+        ("vertices.box_bytes", head.box_bytes, domains),
+        ("vertices.origin_bytes", head.origin_bytes, domains),
+    ] {
+        if given != 0 && given != whole {
+            return Err(malformed(field, format!("0 or {whole}"), given));
+        }
     }
     let total = bytes.len() as u64;
-    let bare = head.position_bytes + head.origin_bytes;
+    let bare = head.position_bytes + head.displacement_bytes + head.box_bytes + head.origin_bytes;
     if total != bare && total != bare + sum(&head.corners) {
         let expected = format!("{bare} or {}", bare + sum(&head.corners));
         return Err(malformed("vertices.total", expected, total));
     }
     let (positions, rest) = bytes.split_at(head.position_bytes as usize);
-    let (normals, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
-    let domains = head.domains.iter().zip(&head.vertices).zip(&head.corners);
-    Ok(VertexSet {
-        step: head.step.ok_or_else(|| malformed("vertices.step", "a step", "none"))?,
-        origin: head.origin,
-        origins: points(origins),
-        domains: domains.map(|((domain, vertices), corners)| (*domain, *vertices, *corners)).collect(),
-        positions: floats(positions),
-        normals: floats(normals),
-        skipped: head.skipped,
-        stages: stages(head.stages),
-    })
+    let (normals, rest) = rest.split_at((total - bare) as usize);
+    let (displacements, rest) = rest.split_at(head.displacement_bytes as usize);
+    let (boxes, origins) = rest.split_at(head.box_bytes as usize);
+    Ok(Parts { positions, normals, displacements, boxes, origins })
+}
+
+/// Six numbers a box.
+fn boxes(numbers: &[f32]) -> Vec<[[f32; 3]; 2]> {
+    let corner = |six: &[f32], first: usize| [0, 1, 2].map(|axis| six[first + axis]);
+    numbers.chunks_exact(6).map(|six| [corner(six, 0), corner(six, 3)]).collect()
 }
 
 /// Little-endian f64 at any alignment, three per point.
@@ -272,6 +320,37 @@ mod tests {
             [(24, 48, "origin_bytes"), (u64::MAX, 72, "origin_bytes"), (48, 24, "total"), (0, 72, "total")]
         {
             let refusal = set(head(origin_bytes), &vec![0; length]).expect_err(field).to_string();
+            assert!(refusal.contains(field), "{refusal}");
+        }
+    }
+
+    #[test]
+    fn displacements_and_boxes_are_found_behind_what_is_there_or_left_out() {
+        let bytes = |from: u16, count: u16| (from..from + count).flat_map(|at| f32::from(at).to_le_bytes());
+        let readings = |positions: bool| v1::VertexHead {
+            position_bytes: if positions { 12 } else { 0 },
+            displacement_bytes: 12,
+            box_bytes: 48,
+            ..head(0)
+        };
+        let with_all: Vec<u8> = bytes(0, 3).chain(bytes(10, 3)).chain(bytes(20, 3)).chain(bytes(30, 12)).collect();
+        let all = set(readings(true), &with_all).expect("fits");
+        assert_eq!((all.positions.as_slice(), all.normals.as_slice()), (&[0.0, 1.0, 2.0][..], &[10.0, 11.0, 12.0][..]));
+        assert_eq!(all.displacements, [20.0, 21.0, 22.0]);
+        let want = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
+        assert_eq!(all.boxes, want);
+        let alone = set(readings(false), &with_all[24..]).expect("fits");
+        assert_eq!((alone.displacements, alone.boxes), (all.displacements, all.boxes));
+        assert!(alone.positions.is_empty() && alone.normals.is_empty());
+        for (spoil, field) in [
+            ((0, 12, 24), "box_bytes"),
+            ((0, 24, 48), "displacement_bytes"),
+            ((24, 12, 48), "position_bytes"),
+            ((12, 0, 0), "total"),
+        ] {
+            let (position_bytes, displacement_bytes, box_bytes) = spoil;
+            let head = v1::VertexHead { position_bytes, displacement_bytes, box_bytes, ..head(0) };
+            let refusal = set(head, &with_all).expect_err(field).to_string();
             assert!(refusal.contains(field), "{refusal}");
         }
     }

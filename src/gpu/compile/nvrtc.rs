@@ -13,7 +13,7 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
 /// Headers that kernels may include, by name.
-const HEADERS: [(&str, &str); 7] = [
+const HEADERS: [(&str, &str); 8] = [
     ("layout.cuh", include_str!("../../../kernels/layout.cuh")),
     ("chain.cuh", include_str!("../../../kernels/chain.cuh")),
     ("chunk.cuh", include_str!("../../../kernels/chunk.cuh")),

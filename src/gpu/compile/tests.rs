@@ -46,8 +46,8 @@ fn spills_of_all_functions_are_added_and_a_log_without_them_is_no_proof() {
 /// Macros of a variant, and the architecture.
 type Variant = (Vec<&'static str>, (i32, i32));
 
-/// Macros of `deform` that no scene asks for: those of lists, and of u for its own sake.
-const MORE: [&str; 2] = ["LISTED", "DISPLACEMENTS"];
+/// Macros of `deform` that no scene asks for: those of lists.
+const MORE: [&str; 1] = ["LISTED"];
 
 /// U in f32, and in each type that has a macro.
 fn storages() -> impl Iterator<Item = Vec<&'static str>> {
@@ -74,8 +74,9 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
         list.extend(both.map(|defines| (defines, large)));
     };
     with(&[]);
+    with(&["DISPLACEMENTS"]);
     for storage in storages() {
-        for more in subsets(&["TRUNCATED", "COMPENSATED"]) {
+        for more in subsets(&["TRUNCATED", "COMPENSATED", "DISPLACEMENTS"]) {
             with(&[&["MODES"], storage.as_slice(), &more].concat());
         }
     }
@@ -122,9 +123,11 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
 }
 
 /// Macros that add code, each with the macro that it builds on; the others choose among code of about the same length.
-const ADD: [(&str, &str, &[&str]); 11] = [
+const ADD: [(&str, &str, &[&str]); 13] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED", &["MODES"]),
+    ("deform", "DISPLACEMENTS", &["MODES"]),
+    ("bounds", "BOXES", &[]),
     ("deform", "ORIENT", &[]),
     ("deform", "SHIFTED", &["ORIENT"]),
     ("deform", "NORMAL_MAPS", &["ORIENT"]),

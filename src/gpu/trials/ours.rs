@@ -99,7 +99,7 @@ impl Ours {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
             extent,
             scene: Arc::clone(scene),
-            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?)?,
+            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?, deform.pieces())?,
             normals,
             listed: changed.is_some(),
             inputs: Vec::new(),
@@ -129,14 +129,15 @@ impl Ours {
     }
 
     fn header(&self, device: &Device) -> Header {
-        let [positions, normals, tangents] = outputs_of(&self.plan);
+        let [positions, normals, tangents, _] = outputs_of(&self.plan);
         let begin = address(device, &self.outputs);
         debug_assert!(positions + normals + tangents > 0);
         Header {
             positions: begin,
             normals: begin + positions,
             tangents: begin + positions + normals,
-            displacements: begin,
+            // Alone, u lies where positions would.
+            displacements: if self.extent == Extent::Uq { begin } else { begin + positions + normals + tangents },
             ..Header::default()
         }
     }
@@ -153,6 +154,7 @@ impl Kernel {
             self.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS"].contains(define));
         }
         if extent == Extent::Uq {
+            self.defines.retain(|define| *define != "DISPLACEMENTS");
             self.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
         }
     }
@@ -164,9 +166,10 @@ fn send(device: &Device, inputs: &mut Inputs, header: &Header, state: &State) ->
     device.stream().synchronize().map_err(during("upload"))
 }
 
-/// Bytes of positions, normals and tangents, each filled up so that the next begins where a float4 may.
-fn outputs_of(plan: &Plan) -> [u64; 3] {
-    [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role).next_multiple_of(16))
+/// Bytes of positions, normals, tangents and displacements, each filled up so that the next begins where a float4 may.
+fn outputs_of(plan: &Plan) -> [u64; 4] {
+    [Role::Positions, Role::Normals, Role::Tangents, Role::Displacements]
+        .map(|role| plan.bytes(role).next_multiple_of(16))
 }
 
 fn counts(scene: &Scene, plan: &Plan, changed: Option<&[u32]>) -> Counts {

@@ -11,6 +11,7 @@
 //! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
 //! look.shadow = { size = 2048, blur = 2.0 }   # and least_variance, bleeding, alpha_threshold
 //! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
+//! deform.boxes = true        # keep a box of each domain for readers, and with displacements u = U q of each vertex
 //!
 //! model = "fern_02.glb"      # a scene of one model, or a [[domain]] for each of several
 //! modes = "fern.npy"         # U of a model of one domain; "" for none

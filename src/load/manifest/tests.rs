@@ -29,15 +29,20 @@ fn one_model_with_everything_said_about_the_scene() {
     let parts = scene(
         "name = 'n'\nup = 'z'\nunit = 0.01\norigin = [1.5, 0, 0]\ntransforms = 'rigid'\nshadows = false\n\
          model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n\
-         deform = { storage = 'int8', normals = 'exact', truncation = 1e-4 }\n",
+         deform = { storage = 'int8', normals = 'exact', truncation = 1e-4, displacements = true }\n",
     )
     .expect("good");
     assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
     assert_eq!((parts.origin, parts.rigid_transforms), ([1.5, 0.0, 0.0], true));
     assert!(parts.look.shadow.is_none() && parts.look.ground.is_some());
     assert_eq!(parts.look.sunlight, [2.0; 3]);
-    let deformation =
-        Deformation { storage: Storage::Int8, normals: Normals::Exact, truncation: Some(1e-4), compensated: false };
+    let deformation = Deformation {
+        storage: Storage::Int8,
+        normals: Normals::Exact,
+        truncation: Some(1e-4),
+        ..Deformation::default()
+    };
+    let deformation = Deformation { displacements: true, ..deformation };
     assert_eq!(parts.deformation, deformation);
     assert_eq!(parts.shapes[0].modes.rank(), 2);
     assert_eq!(parts.domains[0].placement.translation(), nalgebra::Vector3::new(1.0, 2.0, 3.0));

@@ -133,7 +133,7 @@ fn vertices_that_overflowed_spoil_no_other_pixel_and_blacken_none() {
     for bad in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
         let mut positions: Vec<f32> = scene.shapes[0].mesh.rest().as_flattened().to_vec();
         positions[6..9].fill(bad);
-        let surface = Surface { positions, normals: [0.0, 0.0, 1.0].repeat(4), tangents: vec![] };
+        let surface = Surface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..Surface::default() };
         renderer.upload(&buffers, &surface).expect("uploads");
         let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
         let shot = Shot { camera: camera(64), width: 64, height: 64, bounds };

@@ -184,6 +184,12 @@ pub(crate) struct VerticesOptions {
     /// A NumPy file for the normals, float32, steps x corners x 3.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) normals: Option<PathBuf>,
+    /// A NumPy file for u = U q, float32, steps x vertices x 3; of scenes that keep displacements.
+    #[arg(long, value_name = "FILE.npy")]
+    pub(crate) displacements: Option<PathBuf>,
+    /// A NumPy file for the boxes of domains, float32, steps x domains x 2 x 3; of scenes that keep boxes.
+    #[arg(long, value_name = "FILE.npy")]
+    pub(crate) boxes: Option<PathBuf>,
     /// Domains by index, separated by commas; all without it.
     #[arg(long, value_delimiter = ',')]
     pub(crate) domains: Vec<u32>,

@@ -1,16 +1,17 @@
 //! Vertices to NumPy files: one row of vertices x 3 per step.
 
+use std::path::Path;
 use std::time::Duration;
 
 use modalcast_client::npy::Writer;
-use modalcast_client::{Client, Error, Result, VertexRequest, VertexSet, VertexStreamRequest};
+use modalcast_client::{Client, Error, Readings, Result, VertexRequest, VertexSet, VertexStreamRequest};
 
 use crate::cli::VerticesOptions;
 use crate::output::{Summary, bar, scene};
 
 pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
-    let mut files = Files { options, open: None, origin: vec![], summary: Summary::new() };
+    let mut files = Files { options, open: Vec::new(), origin: vec![], summary: Summary::new() };
     match options.count {
         None => files.add(&single(client, options, &name).await?)?,
         Some(count) => stream(client, &name, count, &mut files).await?,
@@ -22,6 +23,7 @@ async fn single(client: &Client, options: &VerticesOptions, scene: &str) -> Resu
     let mut request = VertexRequest::of(scene).within_ms(options.step.deadline_ms);
     request.domains = options.domains.clone();
     request.positions_only = options.normals.is_none();
+    request.readings = readings(options);
     request = options.step.step.map_or(request.clone(), |step| request.exactly(step));
     request = options.step.min_step.map_or(request.clone(), |step| request.at_least(step));
     client.vertices(&request).await
@@ -33,6 +35,7 @@ async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>)
         scene: scene.to_owned(),
         domains: options.domains.clone(),
         positions_only: options.normals.is_none(),
+        readings: readings(options),
         delivery: options.delivery.into(),
         steps: count,
     };
@@ -50,10 +53,31 @@ async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>)
     Ok(())
 }
 
+fn readings(options: &VerticesOptions) -> Readings {
+    let (displacements, boxes) = (options.displacements.is_some(), options.boxes.is_some());
+    Readings { displacements, boxes, alone: false }
+}
+
+/// A file of one array, the shape of its rows, and the row of a step.
+type Array<'a> = (&'a Path, Vec<usize>, &'a [f32]);
+
+fn arrays<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<Array<'a>> {
+    let triples = |numbers: &'a [f32]| (vec![numbers.len() / 3, 3], numbers);
+    let boxes = set.boxes.as_flattened().as_flattened();
+    let all = [
+        (Some(&options.out), triples(&set.positions)),
+        (options.normals.as_ref(), triples(&set.normals)),
+        (options.displacements.as_ref(), triples(&set.displacements)),
+        (options.boxes.as_ref(), (vec![boxes.len() / 6, 2, 3], boxes)),
+    ];
+    let named = all.into_iter().filter_map(|(path, (shape, row))| Some((path?.as_path(), shape, row)));
+    named.collect()
+}
+
 /// The files, created when the first step says how many vertices there are.
 struct Files<'a> {
     options: &'a VerticesOptions,
-    open: Option<(Writer, Option<Writer>)>,
+    open: Vec<Writer>,
     /// That of the first step. Rows of one array have one.
     origin: Vec<f64>,
     summary: Summary,
@@ -61,11 +85,10 @@ struct Files<'a> {
 
 impl Files<'_> {
     fn add(&mut self, set: &VertexSet) -> Result<()> {
-        if self.open.is_none() {
-            let positions = Writer::create(&self.options.out, &[set.positions.len() / 3, 3])?;
-            let normals = self.options.normals.as_ref();
-            let normals = normals.map(|path| Writer::create(path, &[set.normals.len() / 3, 3])).transpose()?;
-            self.open = Some((positions, normals));
+        let arrays = arrays(self.options, set);
+        if self.open.is_empty() {
+            let create = |(path, shape, _): &Array<'_>| Writer::create(path, shape);
+            self.open = arrays.iter().map(create).collect::<Result<_>>()?;
             self.origin = set.origin.clone();
         }
         if set.origin != self.origin || !set.origins.is_empty() {
@@ -73,22 +96,15 @@ impl Files<'_> {
             let fault = format!("at step {step} positions have another origin than the rows before, or several");
             return Err(Error::file(&self.options.out, fault));
         }
-        if let Some((positions, normals)) = &mut self.open {
-            positions.row(&set.positions)?;
-            if let Some(normals) = normals {
-                normals.row(&set.normals)?;
-            }
-        }
-        let bytes = 4 * (set.positions.len() + set.normals.len()) as u64;
+        let rows = arrays.iter().map(|(_, _, row)| *row);
+        self.open.iter_mut().zip(rows).try_for_each(|(file, row)| file.row(row))?;
+        let bytes = arrays.iter().map(|(_, _, row)| size_of_val(*row) as u64).sum();
         self.summary.add((set.step.run, set.step.number), bytes, set.skipped, &set.stages);
         Ok(())
     }
 
     fn finish(self, json: bool) -> Result<()> {
-        if let Some((positions, normals)) = self.open {
-            positions.finish()?;
-            normals.map(Writer::finish).transpose()?;
-        }
+        self.open.into_iter().try_for_each(|file| file.finish().map(drop))?;
         self.summary.print("steps", &self.options.out, Some(self.origin), json);
         Ok(())
     }

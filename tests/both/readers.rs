@@ -1,0 +1,197 @@
+//! What a scene keeps for readers: displacements, and a box of each domain.
+
+use std::sync::Arc;
+
+use modalcast::config::{BackendChoice, Config, RendererChoice};
+use modalcast::deform::{Deformer, Wanted};
+use modalcast::domain::{Domain, Transform};
+use modalcast::engine::Workbench;
+use modalcast::scene::{Bounds, Deformation, Scene, State, Storage};
+
+use super::extremes::columns_of;
+use super::neighbours::is_narrow;
+use super::{Shown, changes, displacements_beyond, displacements_within, run, scene_of, strip};
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+
+/// The same with displacements and boxes.
+pub(crate) fn kept(deformation: Deformation) -> Deformation {
+    Deformation { displacements: true, boxes: true, ..deformation }
+}
+
+/// The first domain whose box is not that of its positions.
+pub(crate) fn wrong_box(scene: &Scene, shown: &Shown) -> Option<usize> {
+    let slots = &scene.layout.slots;
+    assert_eq!(shown.surface.boxes.len(), slots.len(), "a box of each domain");
+    let of = |domain: usize| {
+        let positions = &shown.surface.positions[3 * slots[domain].first_vertex..][..3 * slots[domain].vertices];
+        Bounds::of(positions)
+    };
+    (0..slots.len()).find(|domain| shown.surface.boxes[*domain] != of(*domain))
+}
+
+/// Vertices and ranks for every kind of tile: shared ones, own ones, several of a domain; with `many`, of so many domains
+/// that a lane takes four vertices.
+fn sizes(many: bool) -> Vec<(usize, usize)> {
+    let few = [(1, 3), (7, 2), (9, 0), (31, 1), (64, 5), (65, 0), (130, 33), (1, 0), (300, 4)];
+    let others = (0..900).map(|at| (3 + at % 9, at % 4)).chain([(4097, 0), (5000, 3)]);
+    if many { others.collect() } else { few.to_vec() }
+}
+
+/// Each twice, or with `many` the last one 30 times.
+fn scene(deformation: Deformation, many: bool) -> Arc<Scene> {
+    let mut random = Random(101);
+    let shape = |(at, (vertices, rank)): (usize, (usize, usize))| match at % 2 {
+        0 => strip(&mut random, vertices, rank),
+        _ => scenes::shape(&mut random, vertices, rank),
+    };
+    let mut parts = scenes::parts(sizes(many).into_iter().enumerate().map(shape).collect());
+    parts.deformation = deformation;
+    let count = parts.shapes.len();
+    let again = if many { vec![count - 1; 29] } else { (0..count).collect() };
+    let domain = |(at, shape): (usize, usize)| Domain {
+        name: format!("domain {at}"),
+        ..scenes::domain(shape, if many { 0 } else { NORMAL_MAPPED })
+    };
+    parts.domains = (0..count).chain(again).enumerate().map(domain).collect();
+    Scene::new(parts).expect("a scene")
+}
+
+/// u within its bound, a box that holds its domain and nothing more, and vertices of the bits that they have without.
+pub(crate) fn displacements_and_boxes_equal_their_twins<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    for (storage, compensated, many) in Storage::ALL.into_iter().flat_map(|storage| {
+        [(storage, false, false), (storage, true, false), (storage, storage == Storage::Bf16, true)]
+    }) {
+        let plain = Deformation { storage, compensated, ..Deformation::default() };
+        let (bare, kept) = (scene(plain, many), scene(kept(plain), many));
+        let state = scenes::state(&kept, 102);
+        let (without, with) = (run(&mut make(&bare), &state), run(&mut make(&kept), &state));
+        assert_eq!(is_narrow(&kept), !many);
+        let name = format!("{}, compensated {compensated}, {} domains", storage.name(), kept.domains.len());
+        assert!(without.surface.displacements.is_empty() && without.surface.boxes.is_empty(), "{name}");
+        let mut vertices = with.clone();
+        (vertices.surface.displacements, vertices.surface.boxes) = (vec![], vec![]);
+        assert_eq!(vertices.difference(&without), None, "{name}: keeping changes no vertex");
+        displacements_within(&name, (&kept, &state), &with.surface.displacements);
+        assert_eq!(wrong_box(&kept, &with), None, "{name}");
+        // The judges can fail, for each domain that has modes; the others have zeros.
+        let mut other = state.clone();
+        other.q.iter_mut().for_each(|number| *number = -*number);
+        let bent: Vec<usize> = (0..kept.domains.len()).filter(|domain| kept.rank_of(*domain) > 0).collect();
+        assert_eq!(displacements_beyond((&kept, &other), &with.surface.displacements), bent, "{name}");
+        let mut spoilt = with.clone();
+        spoilt.surface.positions[3 * kept.layout.slots[3].first_vertex] += 100.0;
+        assert_eq!(wrong_box(&kept, &spoilt), Some(3), "{name}");
+    }
+}
+
+/// A scene none of whose domains has modes has displacements of zero, and boxes.
+pub(crate) fn a_scene_without_modes_has_zeros<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    let mut random = Random(103);
+    let shapes = vec![strip(&mut random, 7, 0), scenes::shape(&mut random, 300, 0)];
+    let scene = scene_of(shapes, 2, kept(Deformation::default()), false);
+    assert!(!scene.needs.modes && scene.needs.displacements);
+    let shown = run(&mut make(&scene), &scenes::state(&scene, 104));
+    assert_eq!(shown.surface.displacements, vec![0.0; 3 * scene.layout.vertices]);
+    assert_eq!(wrong_box(&scene, &shown), None);
+}
+
+/// What is read alone is that of the last step, and so is what is read after it.
+pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    let scene = scene(kept(Deformation::default()), false);
+    let (mut deformer, mut random) = (make(&scene), Random(105));
+    let mut state = scenes::state(&scene, 106);
+    let mut last = run(&mut deformer, &state);
+    let nothing = Wanted::default();
+    for (number, wanted) in [
+        Wanted { boxes: true, ..nothing },
+        Wanted { displacements: true, ..nothing },
+        Wanted { positions: true, ..nothing },
+        Wanted { displacements: true, boxes: true, ..nothing },
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        changes::apply(&scene, &mut state, &mut random, (&[1, 6, number as u32 + 8], &[2, 6]));
+        let want = run(&mut make(&scene), &state);
+        deformer.deform(&state).expect("deforms");
+        let got = deformer.read(wanted).expect("copies").clone();
+        let is = |wanted: bool, same: bool, moved: bool| !wanted || same && moved;
+        let [new, old] = [&want.surface, &last.surface];
+        assert!(is(wanted.boxes, got.boxes == new.boxes, new.boxes != old.boxes), "step {number}");
+        let same = got.displacements == new.displacements;
+        assert!(is(wanted.displacements, same, new.displacements != old.displacements), "step {number}");
+        assert!(is(wanted.positions, got.positions == new.positions, new.positions != old.positions), "step {number}");
+        let whole = Shown { bounds: want.bounds, surface: deformer.surface().expect("copies").clone() };
+        assert_eq!(whole.difference(&want), None, "step {number}: the rest comes after");
+        last = want;
+    }
+}
+
+/// Two modes of ones along x and y, one along z, so that u is known.
+fn ones(deformation: Deformation) -> Arc<Scene> {
+    let column = |row: [f32; 3]| row.repeat(5);
+    let columns = [column([1.0, 1.0, 0.0]), column([1.0, 1.0, 0.0]), column([0.0, 0.0, 1.0])].concat();
+    columns_of(5, columns, deformation)
+}
+
+/// Shrinks so much that x is finite where u is not.
+const TINY: Transform = Transform([1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0]);
+
+/// A displacement that f32 holds survives a sum that overflows on its way; one that it does not hold is told, whatever x.
+pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    for (storage, compensated) in Storage::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
+        let plain = Deformation { storage, compensated, ..Deformation::default() };
+        let name = format!("{}, compensated {compensated}", storage.name());
+        let (bare, kept) = (ones(plain), ones(kept(plain)));
+        let (mut without, mut with) = (make(&bare), make(&kept));
+        let mut state = State::rest(&kept);
+        state.transforms[0] = TINY;
+        // 6e38 is too much.
+        state.q = vec![3e38, 3e38, 0.75];
+        assert!(run(&mut without, &state).bounds.is_finite(), "{name}: x is finite");
+        assert!(!run(&mut with, &state).bounds.is_finite(), "{name}: u is not");
+        state.q = vec![1e38, 2e38, 0.75];
+        let shown = run(&mut with, &state);
+        assert!(shown.bounds.is_finite() && wrong_box(&kept, &shown).is_none(), "{name}: {:?}", shown.bounds);
+        displacements_within(&name, (&kept, &state), &shown.surface.displacements);
+    }
+    // Partial sums that overflow where the whole does not.
+    let row = [1.0_f32, -1.0, 0.5].repeat(5);
+    let scene = columns_of(5, [row.clone(), row.clone(), row.clone(), row].concat(), kept(Deformation::default()));
+    let mut state = State::rest(&scene);
+    (state.transforms[0], state.q) = (TINY, vec![3e38, 3e38, -3e38, -2.5e38]);
+    let shown = run(&mut make(&scene), &state);
+    assert!(shown.bounds.is_finite() && wrong_box(&scene, &shown).is_none(), "{:?}", shown.bounds);
+    for u in shown.surface.displacements.chunks_exact(3) {
+        let off = |got: f32, want: f32| (got - want).abs() / want.abs();
+        let worst = off(u[0], 5e37).max(off(u[1], -5e37)).max(off(u[2], 2.5e37));
+        assert!(worst < 1e-6, "{u:?}");
+    }
+}
+
+/// The workbench refuses a step that loses a displacement by its domain's name, and nobody reads it.
+pub(crate) fn lost_displacements_are_refused_by_name(backend: BackendChoice) {
+    let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
+    let mut bench = Workbench::open(&config).expect("a workbench");
+    let scene = scene(kept(Deformation::default()), false);
+    let (mut staged, mut random) = (bench.stage(&scene).expect("stages"), Random(107));
+    let mut good = State::rest(&scene);
+    changes::apply(&scene, &mut good, &mut random, (&[1, 4], &[4]));
+    staged.deform(&good).expect("a good step");
+    let before = staged.surface().expect("vertices").clone();
+    for domain in [4, 6] {
+        let mut bad = good.clone();
+        changes::apply(&scene, &mut bad, &mut random, (&[domain as u32], &[domain as u32]));
+        bad.transforms[domain] = Transform(TINY.0.map(|number| number * 1e-18));
+        let slot = scene.layout.slots[domain];
+        bad.q[slot.first_q..][..slot.rank].fill(f32::MAX);
+        let refusal = staged.deform(&bad).expect_err("overflows").to_string();
+        eprintln!("{refusal}");
+        assert!(refusal.starts_with(&format!("step.q of domain 'domain {domain}'")), "{refusal}");
+        assert_eq!(staged.surface().expect("vertices"), &before);
+    }
+    changes::apply(&scene, &mut good, &mut random, (&[8], &[]));
+    staged.deform(&good).expect("a good step");
+    assert_ne!(staged.surface().expect("vertices"), &before, "the judge can fail");
+    bench.unstage(staged);
+}

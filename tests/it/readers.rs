@@ -1,0 +1,174 @@
+//! Displacements and boxes over the wire: what the scene keeps is sent, alone if asked; what it does not keep is refused.
+
+use modalcast::config::{BackendChoice, Config};
+use modalcast::deform::Deformer;
+use modalcast::reference::{self, ReferenceDeformer};
+use modalcast::scene::Bounds;
+use modalcast_proto::v1;
+use tonic::Code;
+use v1::Policy;
+
+use crate::both::readers;
+use crate::service_harness::{
+    Got, Server, details, expected, get_vertices, kept_strips, next_vertices, state_after, step,
+};
+
+fn ask(scene: &str, selection: v1::VertexSelection) -> v1::GetVerticesRequest {
+    v1::GetVerticesRequest { scene: scene.into(), selection: Some(selection), ..v1::GetVerticesRequest::default() }
+}
+
+fn all(domains: &[u32]) -> v1::VertexSelection {
+    v1::VertexSelection { domains: domains.to_vec(), displacements: true, boxes: true, ..Default::default() }
+}
+
+fn alone(domains: &[u32]) -> v1::VertexSelection {
+    v1::VertexSelection { without_vertices: true, ..all(domains) }
+}
+
+/// What the twin says u is after some steps.
+fn expected_u(steps: &[v1::Step]) -> Vec<f32> {
+    let scene = kept_strips();
+    let u = reference::displacements(&scene, &state_after(&scene, steps));
+    u.into_flattened().into_iter().map(|number| number as f32).collect()
+}
+
+/// Boxes of packed domains of four vertices each.
+fn boxes_of(positions: &[f32]) -> Vec<f32> {
+    let sides = |positions| {
+        let Bounds { min, max } = Bounds::of(positions);
+        [min, max].concat().into_iter().map(|number| number as f32)
+    };
+    positions.chunks_exact(12).flat_map(sides).collect()
+}
+
+fn largest_error(got: &[f32], want: &[f32]) -> f32 {
+    assert_eq!(got.len(), want.len());
+    got.iter().zip(want).map(|(got, want)| (got - want).abs()).fold(0.0, f32::max)
+}
+
+/// A step that turns and moves the second domain, so that its u is not its x less x0.
+fn turned() -> v1::Step {
+    let turn = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
+    let transforms = turn.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
+    v1::Step { transform_domains: vec![1], transforms, ..step(2, &[0, 1], &[0.25, -0.5, 0.75, 0.125]) }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_reader_gets_displacements_and_boxes_beside_the_vertices_or_alone() {
+    for backend in [BackendChoice::Reference, BackendChoice::Cpu] {
+        let server = Server::with(|config| Config { backend, ..config }).await;
+        server.open("kept").await;
+        let mut driver = server.drive("kept", Policy::Lossless, 0).await;
+        let steps = [step(1, &[1], &[0.5, -0.25]), turned()];
+        for sent in 0..steps.len() {
+            driver.acked(steps[sent].clone()).await;
+            let (x, u) = (expected(&kept_strips(), &steps[..=sent]).0, expected_u(&steps[..=sent]));
+            let check = |got: &Got, domains: std::ops::Range<usize>| {
+                let floats = 12 * domains.start..12 * domains.end;
+                assert!(largest_error(&got.displacements, &u[floats.clone()]) < 1e-6);
+                assert!(largest_error(&got.boxes, &boxes_of(&x[floats])) < 1e-6);
+            };
+            // Alone first, so that vertices come after it from the same step.
+            let reader = get_vertices(&server, ask("kept", alone(&[]))).await.expect("kept");
+            assert!(reader.positions.is_empty() && reader.normals.is_empty());
+            assert_eq!((reader.head.displacement_bytes, reader.head.box_bytes, reader.head.total), (96, 48, 144));
+            check(&reader, 0..2);
+            let both = get_vertices(&server, ask("kept", all(&[]))).await.expect("kept");
+            check(&both, 0..2);
+            assert_eq!((both.normals.len(), both.boxes.clone()), (24, boxes_of(&both.positions)));
+            assert!(largest_error(&both.positions, &x) < 1e-6);
+            let second = get_vertices(&server, ask("kept", alone(&[1]))).await.expect("kept");
+            check(&second, 1..2);
+            let vertices = get_vertices(&server, ask("kept", Default::default())).await.expect("vertices");
+            assert!(vertices.displacements.is_empty() && vertices.boxes.is_empty());
+            assert_eq!(vertices.positions, both.positions);
+        }
+        // The control: other steps give others.
+        assert!(largest_error(&expected_u(&steps[..1]), &expected_u(&steps)) > 0.1);
+        driver.finish().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stream_of_boxes_has_one_of_each_step() {
+    let server = Server::fresh().await;
+    server.open("kept").await;
+    let boxes = v1::VertexSelection { boxes: true, without_vertices: true, ..Default::default() };
+    let request = v1::StreamVerticesRequest {
+        scene: "kept".into(),
+        selection: Some(boxes),
+        delivery: v1::Delivery::Lossless.into(),
+        steps: 2,
+    };
+    let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
+    let mut driver = server.drive("kept", Policy::Lossless, 0).await;
+    let steps = [step(1, &[1], &[0.5, -0.25]), turned()];
+    for sent in 0..steps.len() {
+        driver.acked(steps[sent].clone()).await;
+        let got = next_vertices(&mut stream).await.expect("goes on").expect("a step");
+        assert_eq!(got.step().number, steps[sent].number);
+        assert_eq!(got.boxes, boxes_of(&expected(&kept_strips(), &steps[..=sent]).0));
+        assert!(got.displacements.is_empty() && got.positions.is_empty());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_scene_does_not_keep_is_refused_by_its_option() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    for (selection, field, option) in [
+        (
+            v1::VertexSelection { displacements: true, ..Default::default() },
+            "displacements",
+            "deform.displacements = true",
+        ),
+        (v1::VertexSelection { boxes: true, ..Default::default() }, "boxes", "deform.boxes = true"),
+        (
+            v1::VertexSelection { without_vertices: true, ..Default::default() },
+            "without_vertices",
+            "displacements or boxes",
+        ),
+    ] {
+        let refusal = get_vertices(&server, ask("strips", selection.clone())).await.expect_err("not kept");
+        let why = details(&refusal);
+        assert_eq!(
+            (refusal.code(), why.field.as_str()),
+            (Code::InvalidArgument, format!("selection.{field}").as_str())
+        );
+        assert!(why.expected.contains(option), "{why:?}");
+        let request = v1::StreamVerticesRequest {
+            scene: "strips".into(),
+            selection: Some(selection),
+            ..v1::StreamVerticesRequest::default()
+        };
+        let refusal = server.vertices().await.stream_vertices(request).await.expect_err("not kept");
+        assert_eq!(details(&refusal), why);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_displacement_that_no_f32_holds_refuses_the_step_and_reaches_no_reader() {
+    let server = Server::with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
+    server.open("kept").await;
+    let mut driver = server.drive("kept", Policy::Lossless, 0).await;
+    driver.acked(step(1, &[1], &[0.5, -0.25])).await;
+    let before = get_vertices(&server, ask("kept", alone(&[]))).await.expect("kept");
+    // x shrinks to what is in range; u of up to 3 q is not.
+    let tiny = [1e-24_f32, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0];
+    let transforms = tiny.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
+    let lost = v1::Step { transform_domains: vec![1], transforms, ..step(2, &[1], &[f32::MAX; 2]) };
+    driver.step(lost).await;
+    let why = driver.rejection().await;
+    assert!(why.field.contains("domain 'right'"), "{why:?}");
+    let after = get_vertices(&server, ask("kept", alone(&[]))).await.expect("kept");
+    assert_eq!((after.displacements, after.boxes), (before.displacements, before.boxes));
+    assert_eq!(after.head.step, before.head.step);
+}
+
+#[test]
+fn the_reference_keeps_displacements_and_boxes_too() {
+    let reference = |scene: &std::sync::Arc<_>| ReferenceDeformer::new(scene);
+    readers::displacements_and_boxes_equal_their_twins(reference);
+    readers::a_scene_without_modes_has_zeros(reference);
+    assert!(!reference(&kept_strips()).shares_buffers());
+}
