@@ -150,9 +150,8 @@ pub(super) fn check_moves(movers: &Movers, domains: &[Domain], (field, list): (&
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::Follow;
+    use crate::domain::{Follow, Material, Mesh, Metadata, Modes, Shape};
     use crate::scene::{Parts, Scene};
-    use crate::storage::testing::{Noise, parts};
 
     fn moved(x: f32) -> Transform {
         let mut transform = Transform::IDENTITY;
@@ -160,9 +159,28 @@ mod tests {
         transform
     }
 
-    /// Five domains; the pairs say who follows whom, at x = 1, 2, 3, ...
+    fn point(at: usize) -> Domain {
+        Domain {
+            name: format!("point {at}"),
+            shape: 0,
+            material: 0,
+            runs: vec![],
+            placement: Transform::IDENTITY,
+            attachment: None,
+            follows: None,
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: Metadata::default(),
+        }
+    }
+
+    /// Five domains of one vertex; the pairs say who follows whom, at x = 1, 2, 3, ...
     fn following(pairs: &[(usize, usize)]) -> Parts {
-        let mut parts = parts(&[(4, 2), (5, 0), (6, 0), (4, 1), (3, 0)], &mut Noise(3));
+        let mut parts = Parts::named("points");
+        let mesh = Mesh::indexed(vec![[0.5, 0.25, 1.0]], vec![[0.0, 0.0, 1.0]], vec![], vec![[0; 3]]).expect("a point");
+        parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
+        parts.materials.push(Material::default());
+        parts.domains = (0..5).map(point).collect();
         for (at, (child, parent)) in pairs.iter().enumerate() {
             parts.domains[*child].follows = Some(Follow { parent: *parent, frame: moved(1.0 + at as f32) });
         }

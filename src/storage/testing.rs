@@ -33,12 +33,8 @@ pub(crate) fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, nois
 
 /// A scene of shapes of noise, one domain each per (n, r).
 pub(crate) fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &mut Noise) -> Arc<Scene> {
-    Scene::new(Parts { deformation, ..parts(sizes, noise) }).expect("a scene")
-}
-
-/// The parts of such a scene.
-pub(crate) fn parts(sizes: &[(usize, usize)], noise: &mut Noise) -> Parts {
     let mut parts = Parts::named("noise");
+    parts.deformation = deformation;
     parts.materials = vec![Material::default()];
     for (at, (vertices, rank)) in sizes.iter().enumerate() {
         parts.shapes.push(shape(*vertices, *rank, noise));
@@ -55,5 +51,5 @@ pub(crate) fn parts(sizes: &[(usize, usize)], noise: &mut Noise) -> Parts {
             metadata: Metadata::default(),
         });
     }
-    parts
+    Scene::new(parts).expect("a scene")
 }

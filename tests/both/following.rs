@@ -42,7 +42,7 @@ fn grove(count: usize, deformation: Deformation, rigid: bool) -> Parts {
     (parts.deformation, parts.rigid_transforms) = (deformation, rigid);
     for at in 0..count {
         let follows = (at % 3 != 0).then(|| {
-            let parent = (at * 7 + 5) % at;
+            let parent = ((random.number().abs() * at as f32) as usize).min(at - 1);
             Follow { parent, frame: frame(&mut random, at, rigid) }
         });
         let material = if at % 4 == 0 { NORMAL_MAPPED } else { 0 };

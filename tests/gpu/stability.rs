@@ -1,7 +1,8 @@
 //! The checks of any deformer, on the device, and scenes that only it is for.
 
 use modalcast::config::BackendChoice;
-use modalcast::gpu::{CudaDeformer, Launch};
+use modalcast::domain::{Domain, Follow};
+use modalcast::gpu::{CudaDeformer, Launch, Role};
 use modalcast::scene::{Deformation, Scene};
 
 use crate::both::{self, changes, extremes, following, neighbours, readers, refusal, surfaces, truncation};
@@ -198,4 +199,42 @@ fn gpu_followers_ten_thousand_kilometres_away_keep_the_millimetre() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_products_of_frames_that_overflow_do_no_harm_where_the_vertices_do_not() {
     following::products_that_overflow(deformer);
+}
+
+/// A step copies a thousand transforms instead of two hundred thousand, and a branch that moves takes its leaves along.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_two_hundred_thousand_leaves_follow_a_thousand_branches_within_their_bounds() {
+    let mut random = Random(94);
+    let shapes = vec![both::strip(&mut random, 60, 6), both::strip(&mut random, 4, 0), both::strip(&mut random, 7, 0)];
+    let mut parts = scenes::parts(shapes);
+    parts.rigid_transforms = true;
+    for at in 0..201_000 {
+        let parent = at % 1000;
+        let frame = random.similarity(at % 5 == 0);
+        let follows = (at >= 1000).then_some(Follow { parent, frame });
+        let shape = if at < 1000 { 0 } else { 1 + at % 2 };
+        parts.domains.push(Domain { name: format!("domain {at}"), follows, ..scenes::domain(shape, 0) });
+    }
+    let scene = Scene::new(parts).expect("a scene");
+    let mut deformer = deformer(&scene);
+    let plan = deformer.plan();
+    eprintln!("201,000 domains: {} bytes a step, {} bytes of frames", plan.bytes_in, plan.bytes(Role::Frames));
+    assert_eq!((plan.launches(), plan.bytes_in), (3, 80 + 48 * 1000 + 4 * 6000));
+    let mut state = scenes::state(&scene, 95);
+    let before = both::run(&mut deformer, &state);
+    both::within("200,000 leaves", (&scene, &state), &before.surface.positions, 0.0);
+    changes::apply(&scene, &mut state, &mut random, (&[7], &[3, 999]));
+    let after = both::run(&mut deformer, &state);
+    both::within("200,000 leaves, some moved", (&scene, &state), &after.surface.positions, 0.0);
+    let mut whole = state.clone();
+    whole.touch();
+    assert_eq!(after.difference(&both::run(&mut deformer, &whole)), None);
+    let moves = |domain: usize| {
+        let slot = scene.layout.slots[domain];
+        let range = 3 * slot.first_vertex..3 * (slot.first_vertex + slot.vertices);
+        before.surface.positions[range.clone()] != after.surface.positions[range]
+    };
+    let moved = (0..scene.domains.len()).filter(|domain| moves(*domain)).count();
+    assert_eq!(moved, 2 * 201 + 1, "two branches with two hundred leaves each, and one that bends alone");
 }

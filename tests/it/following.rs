@@ -60,6 +60,7 @@ async fn transforms_of_all_are_those_of_movers_and_one_of_a_follower_is_refused_
         ("step.transform_domains[1]", "a domain with a transform of its own", "3 ('leaflet'), which follows 'right'")
     );
     assert_eq!(get_vertices(&server, ask(&[])).await.expect("vertices").positions, got, "nothing was applied");
+    driver.finish().await;
     // Coordinates of a follower are its own.
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
     driver.acked(step(2, &[LEAF], &[0.5, -0.25])).await;

@@ -148,7 +148,7 @@ fn what_a_manifest_cannot_mean_is_refused_by_line_or_entry() {
         ("model = \n", "line 1: expected the keys and values of a scene"),
         ("model = 'a.obj'\n[look]\nsky = 1\n", "line 3: expected the keys and values of a scene, given unknown field"),
         ("model = 'a.obj'\n[[domain]]\nmodel = 'b.obj'\n", "model: expected either one model"),
-        ("modes = 'u.txt'\n[[domain]]\nmodel = 'b.obj'\n", "modes, placement: expected none beside"),
+        ("modes = 'u.txt'\n[[domain]]\nmodel = 'b.obj'\n", "modes, placement, follows: expected none beside"),
         ("[[domain]]\nname = 'x'\n", "line 1: expected the keys and values of a scene, given missing field `model`"),
         ("model = 'c.obj'\n", "domain 0 ('c.obj'): file 'c.obj': expected a file that is there"),
         ("model = 'a.mtl'\n", "domain 0 ('a.mtl'): file 'a.mtl': expected a file ending in .glb"),
