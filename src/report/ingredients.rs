@@ -1,10 +1,12 @@
 //! What a deformer replaces in x = T (x0 + U q) before it computes, and how far off that may be.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use crate::scene::{Scene, State, Storage};
+use super::loads::restated;
+use crate::error::Result;
+use crate::scene::{Deformation, Scene, State, Storage};
 use crate::storage::bound::{Reaches, Step, norm};
 use crate::storage::{Amounts, QUAD, TILE_QUADS, Tiles, Truncation, reaches};
 
@@ -16,9 +18,12 @@ const TILE: usize = QUAD * TILE_QUADS;
 pub struct Ingredients {
     scene: Arc<Scene>,
     /// Per shape; empty when U is stored in f32.
-    stored: Vec<(Tiles, Reaches)>,
+    stored: Arc<Vec<Stored>>,
     truncation: Option<Budget>,
 }
+
+/// U of one shape as it is stored, and what its bounds need to know.
+type Stored = (Tiles, Reaches);
 
 #[derive(Debug)]
 struct Budget {
@@ -33,21 +38,15 @@ struct Budget {
 impl Ingredients {
     /// What a deformer of this scene replaces that does as its deformation says.
     pub fn of(scene: &Arc<Scene>) -> Self {
-        let storage = scene.deformation.storage;
-        let store = |shape| {
-            let tiles = Tiles::new(shape, storage);
-            let reaches = Reaches::new(shape, &tiles);
-            (tiles, reaches)
-        };
+        Self::with(scene, Arc::new(store(scene)))
+    }
+
+    fn with(scene: &Arc<Scene>, stored: Arc<Vec<Stored>>) -> Self {
         let truncation = scene.deformation.truncation.filter(|_| scene.needs.truncation).map(|metres| Budget {
             most: metres / scene.unit,
             reaches: scene.shapes.par_iter().map(|shape| reaches(&shape.modes)).collect(),
             domains: (0..scene.domains.len()).map(|domain| Truncation::new(scene.rank_of(domain))).collect(),
         });
-        let stored = match storage {
-            Storage::F32 => Vec::new(),
-            _ => scene.shapes.par_iter().map(store).collect(),
-        };
         Self { scene: Arc::clone(scene), stored, truncation }
     }
 
@@ -64,6 +63,13 @@ impl Ingredients {
     /// Whether modes may be left out.
     pub fn truncates(&self) -> bool {
         self.truncation.is_some()
+    }
+
+    /// Forgets the states before, so that the next is decided on its own.
+    pub fn forget(&mut self) {
+        if let Some(Budget { domains, .. }) = &mut self.truncation {
+            domains.iter_mut().for_each(Truncation::forget);
+        }
     }
 
     /// Decides which modes are left out at a state, from those of the state before, as a deformer does.
@@ -108,6 +114,64 @@ impl Ingredients {
     }
 }
 
+/// The shapes of a scene as its storage type says; none when that is f32.
+fn store(scene: &Scene) -> Vec<Stored> {
+    let storage = scene.deformation.storage;
+    let one = |shape| {
+        let tiles = Tiles::new(shape, storage);
+        let reaches = Reaches::new(shape, &tiles);
+        (tiles, reaches)
+    };
+    match storage {
+        Storage::F32 => Vec::new(),
+        _ => scene.shapes.par_iter().map(one).collect(),
+    }
+}
+
+/// One scene deformed in several ways: the variants that store U alike share what is stored, and those that deform
+/// alike share their scene.
+#[derive(Debug)]
+pub struct Stock {
+    scene: Arc<Scene>,
+    scenes: Mutex<Vec<(Deformation, Arc<Scene>)>>,
+    stored: Mutex<Vec<(Storage, Arc<Vec<Stored>>)>>,
+}
+
+impl Stock {
+    /// With nothing in it but the scene.
+    pub fn new(scene: &Arc<Scene>) -> Self {
+        let scenes = Mutex::new(vec![(scene.deformation, Arc::clone(scene))]);
+        Self { scene: Arc::clone(scene), scenes, stored: Mutex::default() }
+    }
+
+    /// The scene, deformed in another way.
+    ///
+    /// # Errors
+    /// `Invalid` when the choices make no sense.
+    pub fn scene(&self, deformation: Deformation) -> Result<Arc<Scene>> {
+        let mut scenes = self.scenes.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, known)) = scenes.iter().find(|(known, _)| *known == deformation) {
+            return Ok(Arc::clone(known));
+        }
+        let made = restated(&self.scene, deformation)?;
+        scenes.push((deformation, Arc::clone(&made)));
+        Ok(made)
+    }
+
+    /// What a deformer of one of these scenes replaces.
+    pub fn ingredients(&self, scene: &Arc<Scene>) -> Ingredients {
+        let storage = scene.deformation.storage;
+        let mut known = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = known.iter().find(|(known, _)| *known == storage).map(|(_, stored)| Arc::clone(stored));
+        let stored = own.unwrap_or_else(|| {
+            let made = Arc::new(store(scene));
+            known.push((storage, Arc::clone(&made)));
+            made
+        });
+        Ingredients::with(scene, stored)
+    }
+}
+
 /// What the replacements may move the vertices of one domain by, in scene units.
 pub(super) struct Bounds<'a> {
     reaches: Option<&'a Reaches>,
@@ -119,10 +183,10 @@ pub(super) struct Bounds<'a> {
 
 impl Bounds<'_> {
     /// The bound of one vertex after another, from `arithmetic`: that of a sum of all modes in f32.
-    pub(super) fn widen(&self, first: usize, arithmetic: &mut [f64]) {
+    pub(super) fn widen<'b>(&self, first: usize, arithmetic: impl Iterator<Item = &'b mut f64>) {
         let step = Step { q: &self.q, transform: self.transform, compensated: self.compensated };
         let mut known = None;
-        for (vertex, bound) in arithmetic.iter_mut().enumerate() {
+        for (vertex, bound) in arithmetic.enumerate() {
             if let Some(reaches) = self.reaches {
                 let tile = (first + vertex) / TILE;
                 let (_, own) = known.filter(|(at, _)| *at == tile).unwrap_or_else(|| (tile, reaches.tile(tile, &step)));
@@ -139,9 +203,8 @@ impl Bounds<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::loads::{Kind, Size, restated};
+    use crate::report::loads::{Kind, Size};
     use crate::report::motion::Motion;
-    use crate::scene::Deformation;
 
     fn ingredients(deformation: Deformation) -> (Ingredients, State) {
         let load = Kind::Single { power: 8, rank: 20 }.build(Size::Full).expect("built");
@@ -154,8 +217,23 @@ mod tests {
         let (exact, state) = ingredients(Deformation::default());
         assert!(exact.is_exact() && exact.tiles(0).is_none());
         let mut bounds = [1.0, 2.0];
-        exact.bounds(0, &state).widen(0, &mut bounds);
+        exact.bounds(0, &state).widen(0, bounds.iter_mut());
         assert_eq!(bounds, [1.0, 2.0]);
+    }
+
+    #[test]
+    fn variants_that_store_alike_share_what_is_stored_and_others_do_not() {
+        let load = Kind::Single { power: 8, rank: 4 }.build(Size::Full).expect("built");
+        let stock = Stock::new(&load.scene);
+        let half = Deformation { storage: Storage::F16, ..Deformation::default() };
+        let [one, two] = [half, half].map(|half| stock.scene(half).expect("restated"));
+        assert!(Arc::ptr_eq(&one, &two) && !Arc::ptr_eq(&one, &load.scene));
+        assert!(Arc::ptr_eq(&stock.scene(load.scene.deformation).expect("its own"), &load.scene));
+        let short = stock.scene(Deformation { truncation: Some(0.01), ..half }).expect("restated");
+        let made = [&one, &short].map(|scene| stock.ingredients(scene));
+        assert!(Arc::ptr_eq(&made[0].stored, &made[1].stored) && made[0].stores());
+        assert!(made[1].truncates() && !made[0].truncates());
+        assert!(stock.ingredients(&load.scene).is_exact());
     }
 
     #[test]
@@ -164,7 +242,7 @@ mod tests {
             let (stored, state) = ingredients(Deformation { storage, ..Deformation::default() });
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
             let mut bounds = [1e-6; 256];
-            stored.bounds(0, &state).widen(0, &mut bounds);
+            stored.bounds(0, &state).widen(0, bounds.iter_mut());
             bounds[200]
         };
         let [half, brain, eighth] = [Storage::F16, Storage::Bf16, Storage::Int8].map(widened);
@@ -183,7 +261,7 @@ mod tests {
         truncated.follow(&state);
         assert!((1..20).contains(&count(&truncated)), "{}", count(&truncated));
         let mut bounds = [0.0];
-        truncated.bounds(0, &state).widen(0, &mut bounds);
+        truncated.bounds(0, &state).widen(0, bounds.iter_mut());
         assert!(bounds[0] > 0.0 && bounds[0] <= 0.01, "{bounds:?}");
     }
 }
