@@ -6,9 +6,9 @@ use rayon::prelude::*;
 
 use super::loads::restated;
 use crate::error::Result;
-use crate::scene::{Deformation, Scene, State, Storage};
-use crate::storage::bound::{Reaches, Step, norm};
-use crate::storage::{Amounts, QUAD, TILE_QUADS, Tiles, Truncation, reaches};
+use crate::scene::{Deformation, Scene, Slot, State, Storage};
+use crate::storage::bound::{Bound, Reaches, Step, norm};
+use crate::storage::{Amounts, Halves, Products, QUAD, TILE_QUADS, Tiles, Truncation, reaches};
 
 /// Vertices of a tile of U as it is stored.
 const TILE: usize = QUAD * TILE_QUADS;
@@ -20,6 +20,8 @@ pub struct Ingredients {
     /// Per shape; empty when U is stored in f32.
     stored: Arc<Vec<Stored>>,
     truncation: Option<Budget>,
+    /// Whether tensor cores multiply: q is then two numbers of 16 bits.
+    halves: bool,
 }
 
 /// U of one shape as it is stored, and what its bounds need to know.
@@ -47,7 +49,12 @@ impl Ingredients {
             reaches: scene.shapes.par_iter().map(|shape| reaches(&shape.modes)).collect(),
             domains: (0..scene.domains.len()).map(|domain| Truncation::new(scene.rank_of(domain))).collect(),
         });
-        Self { scene: Arc::clone(scene), stored, truncation }
+        Self { scene: Arc::clone(scene), stored, truncation, halves: false }
+    }
+
+    /// The same with sums from tensor cores. U is stored in 16 bits.
+    pub fn with_products(self) -> Self {
+        Self { halves: true, ..self }
     }
 
     /// Whether nothing is replaced, so that all such deformers share their bounds.
@@ -110,7 +117,23 @@ impl Ingredients {
             transform: state.transforms[domain],
             compensated: self.scene.deformation.compensated,
             truncation,
+            products: self.halves.then(|| Products::of(self.scene.deformation.storage, self.scene.rank_of(domain))),
         }
+    }
+
+    /// Coordinates, packed as the scene says, as tensor cores take them; `None` when they are taken as they are.
+    pub(super) fn halved(&self, q: &[f64]) -> Option<Vec<f64>> {
+        let own = |(domain, slot): (usize, &Slot)| -> Vec<f64> {
+            let factors = self.stored[self.scene.domains[domain].shape].0.factors();
+            let amounts = q[slot.first_q..][..slot.rank].iter().zip(factors).map(|(q, factor)| *q as f32 * factor);
+            let halves = Halves::new(&amounts.collect::<Vec<_>>(), self.scene.deformation.storage);
+            factors.iter().enumerate().map(|(mode, factor)| halves.worth(mode) / f64::from(*factor)).collect()
+        };
+        let mut halved = q.to_vec();
+        for (domain, slot) in self.scene.layout.slots.iter().enumerate().filter(|_| self.halves) {
+            halved[slot.first_q..][..slot.rank].copy_from_slice(&own((domain, slot)));
+        }
+        self.halves.then_some(halved)
     }
 }
 
@@ -179,21 +202,26 @@ pub(super) struct Bounds<'a> {
     transform: crate::domain::Transform,
     compensated: bool,
     truncation: f64,
+    products: Option<Products>,
 }
 
 impl Bounds<'_> {
     /// The bound of one vertex after another, from `arithmetic`: that of a sum of all modes in f32.
     pub(super) fn widen<'b>(&self, first: usize, arithmetic: impl Iterator<Item = &'b mut f64>) {
         let step = Step { q: &self.q, transform: self.transform, compensated: self.compensated };
-        let mut known = None;
+        let mut known: Option<(usize, Bound, f64)> = None;
         for (vertex, bound) in arithmetic.enumerate() {
             if let Some(reaches) = self.reaches {
                 let tile = (first + vertex) / TILE;
-                let (_, own) = known.filter(|(at, _)| *at == tile).unwrap_or_else(|| (tile, reaches.tile(tile, &step)));
-                known = Some((tile, own));
+                let look = || {
+                    let products = self.products.map_or(0.0, |products| reaches.products(tile, &step, products));
+                    (tile, reaches.tile(tile, &step), products)
+                };
+                let (_, own, products) = known.filter(|(at, ..)| *at == tile).unwrap_or_else(look);
+                known = Some((tile, own, products));
                 // Sums of stored entries are longer by what storing them added, and round that much more.
                 let stored = (own.storage + own.coordinates) * (1.0 + 1e-4);
-                *bound = (*bound + stored).min(own.total());
+                *bound = (*bound + stored).min(own.total()) + products;
             }
             *bound += self.truncation;
         }

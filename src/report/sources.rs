@@ -16,7 +16,7 @@ use crate::scene::{Scene, State, Storage};
 pub struct Sources {
     /// U as it is stored, decoded, instead of U.
     pub storage: Spread,
-    /// q rounded to f32 instead of the f64 of the physics process.
+    /// q rounded to f32 instead of the f64 of the physics process, and to what tensor cores take where they multiply.
     pub q: Spread,
     /// What the deformer's own arithmetic adds: the sum over the modes, x0 and T, all in f32, beyond one rounding.
     pub accumulation: Spread,
@@ -92,12 +92,20 @@ impl Origin {
         // Which modes are left out depends on what the deformer was given; their sizes hardly do.
         let cut = Take { storage: None, truncation };
         let from_truncation = truncation.map_or(none, |_| apart(&self.exact, &positions(scene, &self.truth, cut)));
-        let truncated = truncation.map(|_| positions(scene, &self.given, Take { storage, truncation }));
-        let own = truncated.as_ref().or(stored.as_ref().map(|stored| &stored.own)).unwrap_or(&self.plain);
+        let halved = ingredients.halved(&self.given.q);
+        let with = |q: &[f64], transforms: &[[f64; 12]], take: Take<'_>| {
+            positions(scene, &Truth { q: q.to_vec(), transforms: transforms.to_vec() }, take)
+        };
+        let exact_but = |q: &Vec<f64>| apart(&self.exact, &with(q, &self.truth.transforms, Take::default()));
+        let from_q = halved.as_ref().map_or(self.q, exact_but);
+        let q = halved.as_ref().unwrap_or(&self.given.q);
+        let otherwise = truncation.is_some() || halved.is_some();
+        let other = otherwise.then(|| with(q, &self.given.transforms, Take { storage, truncation }));
+        let own = other.as_ref().or(stored.as_ref().map(|stored| &stored.own)).unwrap_or(&self.plain);
         let rounded: Vec<[f64; 3]> = own.par_iter().map(|at| at.map(|number| f64::from(number as f32))).collect();
         let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|at| at.map(f64::from)).collect();
         let parts =
-            [from_storage, self.q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
+            [from_storage, from_q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
         split.0.iter_mut().zip(parts).for_each(|(sum, part)| *sum = sum.join(part));
     }
 }

@@ -9,7 +9,7 @@ use super::traffic::Part;
 use super::variant::{Label, Variant};
 use crate::deform::{Backend, Surface};
 use crate::error::{Error, Result};
-use crate::gpu::{self, Batch, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
+use crate::gpu::{self, Batch, BatchMma, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
 use crate::scene::{Deformation, Scene, State, Storage};
 
 /// Makes a trial of a scene for some states.
@@ -109,7 +109,7 @@ fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offe
     offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
 }
 
-/// Many q of one shape at once, in every storage type.
+/// Many q of one shape at once, in every storage type; and by tensor cores where U has 16 bits.
 fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     if scene.shapes.len() > 1 || scene.domains.len() < 2 {
         return Vec::new();
@@ -124,7 +124,17 @@ fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted
             Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene), make)))
         })
     };
-    Storage::ALL.into_iter().map(one).collect()
+    let products = |storage: Storage| {
+        let deformation = Deformation { storage, ..scene.deformation };
+        // Another order and rounding than the deformer's: its name says so.
+        let name = format!("cuda batch of {} {} mma", scene.domains.len(), storage.name());
+        offer(wanted, Label { name, backend: Backend::Cuda, deformation }, |label| {
+            let scene = stock.scene(deformation)?;
+            let make: Make = Box::new(|device, scene, states| Ok(Box::new(BatchMma::new(device, scene, states)?)));
+            Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene).with_products(), make)))
+        })
+    };
+    Storage::ALL.into_iter().map(one).chain([Storage::F16, Storage::Bf16].map(products)).collect()
 }
 
 /// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.
