@@ -354,8 +354,8 @@ mod tests {
     fn staged(tables: &Tables, sums: &Sums, (tile, warp): (usize, usize), pass: usize) -> Vec<[f32; 4]> {
         let mut staged = vec![[f32::NAN; 4]; 4 * STRIDE];
         let place = tables.tiles.tile(tile);
-        for lane in 0..32 {
-            let (quad, pair, of_pair) = (lane / 4, lane % 4, pass % 2);
+        for (quad, pair) in (0..QUADS).flat_map(|quad| (0..4).map(move |pair| (quad, pair))) {
+            let (lane, of_pair) = (4 * quad + pair, pass % 2);
             let domain = 8 * (pass / 2) + of_pair + 2 * pair;
             let rest = tables.tiles.rest()[place.first_quad + (QUADS * warp + quad).min(place.quads - 1)];
             let rows = &tables.placements[12 * domain..][..12];

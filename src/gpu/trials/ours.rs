@@ -247,8 +247,9 @@ impl Trial for Ours {
         if self.extent != Extent::Uq {
             return Ok(numbers);
         }
+        let slots = &self.scene.layout.slots;
         Ok(self.turns.finish_on_host(|domain, vertex| {
-            let at = 3 * (self.scene.layout.slots[domain].first_vertex + vertex);
+            let at = 3 * (slots[domain].first_vertex + vertex);
             [numbers[at], numbers[at + 1], numbers[at + 2]]
         }))
     }
