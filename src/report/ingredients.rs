@@ -278,6 +278,29 @@ mod tests {
     }
 
     #[test]
+    fn tensor_cores_widen_bounds_a_little_and_round_q_as_they_say() {
+        let (stored, state) = ingredients(Deformation { storage: Storage::Bf16, ..Deformation::default() });
+        let widened = |ingredients: &Ingredients| {
+            let mut bounds = [1e-6];
+            ingredients.bounds(0, &state).widen(0, bounds.iter_mut());
+            bounds[0]
+        };
+        let q: Vec<f64> = state.q.iter().map(|q| f64::from(*q)).collect();
+        let before = widened(&stored);
+        assert_eq!(stored.halved(&q), None);
+        let products = stored.with_products();
+        let after = widened(&products);
+        assert!(before < after && after < 1.1 * before, "{before} {after}");
+        let halved = products.halved(&q).expect("halves");
+        let largest = q.iter().fold(0.0, |largest: f64, q| largest.max(q.abs()));
+        let off = |of_own: f64| {
+            let off = |(half, q): (&f64, &f64)| (half - q).abs() <= of_own * q.abs() + 1e-9 * largest;
+            halved.iter().zip(&q).all(off)
+        };
+        assert!(off(2f64.powi(-16)) && !off(2f64.powi(-24)), "{halved:?} {q:?}");
+    }
+
+    #[test]
     fn small_modes_are_left_out_within_the_budget_and_none_before_the_first_state() {
         let (mut truncated, state) = ingredients(Deformation { truncation: Some(0.01), ..Deformation::default() });
         let count = |ingredients: &Ingredients| {

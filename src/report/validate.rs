@@ -135,7 +135,7 @@ impl<'a> Look<'a> {
     }
 }
 
-/// Vertices and corners of the states that are judged at once, at most: 3 GB.
+/// Vertices and corners of the states that are judged at once, at most: of 40 and up to 112 bytes.
 const AT_ONCE: usize = 1 << 24;
 
 /// Looks at `seeds` random states and at most `steps` of the trajectory: at every vertex and corner of each. What is
