@@ -9,7 +9,7 @@ use super::{Outcome, say};
 use crate::error::Result;
 use crate::report::bench::Machine;
 use crate::report::loads::{Kind, Size};
-use crate::report::{Report, Request, Source, deform};
+use crate::report::{Progress, Report, Request, Source, deform};
 
 /// Measures on this machine and writes tables and plots.
 #[derive(Debug, clap::Args)]
@@ -44,7 +44,8 @@ const LOADS: &str = "Loads:
 
 /// Error against run time of the deformation: validates every variant, then times it.
 ///
-/// Writes report.json, report.csv, report.md, report.svg and report.png. Exit code 1 when a variant exceeds its
+/// Writes report.json, report.csv, report.md, report.svg and report.png, anew after each load: a run that is stopped
+/// keeps what was done, and names what is missing. Exit code 1 when a variant exceeds its
 /// a-priori error bound.
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("{LOADS}\n\n{EXAMPLES}"))]
@@ -87,9 +88,15 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 fn run_deform(args: &DeformArgs) -> Outcome {
     let request = request(args)?;
-    let report =
-        working("measuring", || deform(&request, &Machine::open(), |what| tracing::info!(load = what, "measuring")))?;
-    report.write(&args.out)?;
+    let hear = |told: Progress<'_>| match told {
+        Progress::Begins(what) => {
+            tracing::info!(load = what, "measuring");
+            Ok(())
+        }
+        // After each load, so that a run that is stopped keeps what was done.
+        Progress::Measured(report) => report.write(&args.out),
+    };
+    let report = working("measuring", || deform(&request, &Machine::open(), hear))?;
     lines(&report).into_iter().for_each(say);
     say(format!("written to {}", args.out.display()));
     Ok(report.passed())

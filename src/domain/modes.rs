@@ -1,22 +1,24 @@
 //! The modal matrix U of one shape: 3n x r, column-major f32, so that one mode is one contiguous run.
 
+use std::sync::Arc;
+
 use crate::error::{Result, invalid};
 
 /// The largest number of modes of one domain.
 pub const MAX_RANK: usize = 512;
 
-/// U, 3n rows and r columns. Row 3i + c is component c of vertex i; every entry is finite.
+/// U, 3n rows and r columns. Row 3i + c is component c of vertex i; every entry is finite. Copies share the entries.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Modes {
     vertices: usize,
     rank: usize,
-    columns: Vec<f32>,
+    columns: Arc<Vec<f32>>,
 }
 
 impl Modes {
     /// No modes: the domain is rigid.
-    pub const fn rigid() -> Self {
-        Self { vertices: 0, rank: 0, columns: Vec::new() }
+    pub fn rigid() -> Self {
+        Self { vertices: 0, rank: 0, columns: Arc::default() }
     }
 
     /// U from its entries in column-major order (Vega's order).
@@ -41,7 +43,7 @@ impl Modes {
         if rank == 0 {
             return Ok(Self::rigid());
         }
-        Ok(Self { vertices: rows / 3, rank, columns })
+        Ok(Self { vertices: rows / 3, rank, columns: Arc::new(columns) })
     }
 
     /// U from its entries in row-major order (NumPy's default order).

@@ -156,6 +156,11 @@ impl Inputs {
         self.sizes.total()
     }
 
+    /// Chunks of modes that each domain sums at the last step; `None` when it sums all.
+    pub(super) fn kept_chunks(&self) -> Option<&[u32]> {
+        self.truncation.as_ref().map(|choice| choice.counts.as_slice())
+    }
+
     /// How far leaving modes out may move a vertex at the last step, scene units.
     pub(super) fn truncation_bound(&self) -> f64 {
         self.truncation.as_ref().map_or(0.0, |choice| choice.bound)

@@ -53,7 +53,7 @@ pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use trials::{
-    Batch, Cache, Cublas, Extent, KernelFacts, Lanes, Ours, Part, Peer, Roofs, Split, Thesis, Timing, Trial,
+    Batch, BatchMma, Cache, Cublas, Extent, KernelFacts, Lanes, Ours, Part, Peer, Roofs, Split, Thesis, Timing, Trial,
     cublas_version, empty_replay, gigabytes_per_second, idle_in_warp, ingest, lanes, roofs, time,
 };
 

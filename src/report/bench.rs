@@ -5,7 +5,8 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::Ingest;
-use super::loads::{Load, restated};
+use super::ingredients::Stock;
+use super::loads::Load;
 use super::trials;
 use super::variant::{Driven, Label, Variant};
 use crate::cpu::{CpuDeformer, read_rate};
@@ -95,12 +96,12 @@ impl Machine {
 impl Bench for Machine {
     fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
         let scene = &load.scene;
+        let stock = Stock::new(scene);
         let driven = |name: &str, backend: Backend, deformation: Deformation, make: &dyn Fn(&Arc<Scene>) -> Made| {
             let label = Label { name: name.into(), backend, deformation };
             offer(wanted, label, |label| {
-                let scene =
-                    if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
-                Ok(Driven::new(label, &scene, make(&scene)?))
+                let scene = stock.scene(deformation)?;
+                Ok(Driven::sharing(label, &scene, stock.ingredients(&scene), make(&scene)?))
             })
         };
         let cpu = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CpuDeformer::new(scene))) };
@@ -120,7 +121,11 @@ impl Bench for Machine {
             if let Some(exact) = exact_normals(scene) {
                 offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            offers.extend(trials::trials(device, scene, wanted));
+            for (name, short) in shortcuts(scene).into_iter().filter(|(_, short)| trials::is_summed_otherwise(short)) {
+                offers.push(driven(&format!("cuda {name} step"), Backend::Cuda, short, &cuda));
+                offers.push(trials::positions(device, &stock, wanted, (format!("cuda {name} positions"), short)));
+            }
+            offers.extend(trials::trials(device, &stock, scene, wanted));
         }
         offers
     }

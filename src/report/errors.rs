@@ -117,16 +117,10 @@ pub struct Tally {
 impl Tally {
     /// Adds one state: three f32 per vertex, and what they should be.
     pub fn add(&mut self, yardstick: &Yardstick, got: &[f32], want: &[Judged]) {
-        let part = |(got, want): (&[[f32; 3]], &[Judged])| {
-            let mut tally = Self::default();
-            got.iter().zip(want).for_each(|(got, want)| tally.vertex(yardstick, *got, want));
-            tally
-        };
-        let (got, pieces) = (got.as_chunks().0, 4096);
-        let sum = got.par_chunks(pieces).zip(want.par_chunks(pieces)).map(part).collect::<Vec<_>>();
-        let states = self.states + 1;
-        *self = sum.into_iter().fold(*self, Self::join);
-        self.states = states;
+        let got = got.as_chunks::<3>().0;
+        let vertex = |at: usize, tally: &mut Self| tally.vertex(yardstick, got[at], &want[at]);
+        let sum = in_pieces(got.len().min(want.len()), vertex, Self::join);
+        *self = Self { states: 1, ..sum }.join(*self);
     }
 
     fn vertex(&mut self, yardstick: &Yardstick, got: [f32; 3], want: &Judged) {
@@ -185,14 +179,35 @@ impl Errors {
 
 /// Error of the step from one state to the next: that of x(k + 1) - x(k), scene units.
 pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
-    let mut collect = Collect::default();
-    let pairs = got[0].as_chunks::<3>().0.iter().zip(got[1].as_chunks::<3>().0);
-    for ((before, after), (from, to)) in pairs.zip(want[0].iter().zip(want[1])) {
-        let step = |axis: usize| f64::from(after[axis]) - f64::from(before[axis]) - (to.at[axis] - from.at[axis]);
-        collect.add(norm(std::array::from_fn(step)));
-    }
-    collect
+    let [before, after] = got.map(|got| got.as_chunks::<3>().0);
+    let [from, to] = want;
+    let error = |at: usize| -> f64 {
+        let step = |axis: usize| {
+            f64::from(after[at][axis]) - f64::from(before[at][axis]) - (to[at].at[axis] - from[at].at[axis])
+        };
+        norm(std::array::from_fn(step))
+    };
+    let count = before.len().min(after.len()).min(from.len()).min(to.len());
+    in_pieces(count, |at, collect: &mut Collect| collect.add(error(at)), Collect::join)
 }
+
+/// Items 0 to `count` added on all cores, piece by piece; pieces are joined in their order, so that a sum has one order.
+pub(super) fn in_pieces<T: Default + Send>(
+    count: usize,
+    add: impl Fn(usize, &mut T) + Sync,
+    join: impl Fn(T, T) -> T,
+) -> T {
+    let piece = |piece: usize| {
+        let mut sum = T::default();
+        (PIECE * piece..count.min(PIECE * (piece + 1))).for_each(|at| add(at, &mut sum));
+        sum
+    };
+    let pieces: Vec<T> = (0..count.div_ceil(PIECE)).into_par_iter().map(piece).collect();
+    pieces.into_iter().fold(T::default(), join)
+}
+
+/// Items of a piece of a sum.
+const PIECE: usize = 4096;
 
 /// Errors of directions, in degrees.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -221,34 +236,51 @@ pub struct Turned {
 impl Turned {
     /// Adds normals, three f32 per corner. Does nothing when the variant gives none.
     pub fn add_normals(&mut self, got: &[f32], want: &[[f64; 3]]) {
-        for (got, want) in got.as_chunks::<3>().0.iter().zip(want) {
-            match degrees(got.map(f64::from), *want) {
-                Some(angle) => self.normals.add(angle),
-                None => self.broken += 1,
-            }
-        }
+        let got = got.as_chunks::<3>().0;
+        let corner = |at: usize, sum: &mut Self| match degrees(got[at].map(f64::from), want[at]) {
+            Some(angle) => sum.normals.add(angle),
+            None => sum.broken += 1,
+        };
+        *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
     }
 
     /// Adds how far normals are from those of the deformed surface.
     pub fn add_to_surface(&mut self, got: &[f32], want: &[[f64; 3]]) {
-        let angle = |(got, want): (&[f32; 3], &[f64; 3])| degrees(got.map(f64::from), *want);
-        got.as_chunks().0.iter().zip(want).filter_map(angle).for_each(|angle| self.to_surface.add(angle));
+        let got = got.as_chunks::<3>().0;
+        let corner = |at: usize, sum: &mut Self| {
+            degrees(got[at].map(f64::from), want[at]).into_iter().for_each(|angle| sum.to_surface.add(angle));
+        };
+        *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
     }
 
     /// Adds tangents, four f32 per corner, and what they make with the normals. Shapes without tangents have zeros.
     pub fn add_tangents(&mut self, got: &[f32], want: &[[f64; 4]], normals: &[f32]) {
-        for (at, (got, want)) in got.as_chunks::<4>().0.iter().zip(want).enumerate() {
-            if want[3] == 0.0 {
-                continue;
+        let (got, normals) = (got.as_chunks::<4>().0, normals.as_chunks::<3>().0);
+        let corner = |at: usize, sum: &mut Self| {
+            if want[at][3] != 0.0 {
+                sum.add_tangent(got[at].map(f64::from), want[at], normals.get(at));
             }
-            let [x, y, z, sign] = got.map(f64::from);
-            match degrees([x, y, z], [want[0], want[1], want[2]]) {
-                Some(angle) if sign == want[3] => self.tangents.add(angle),
-                _ => self.broken += 1,
-            }
-            if let Some(normal) = normals.as_chunks::<3>().0.get(at) {
-                self.dots.add(Vector3::from(normal.map(f64::from)).dot(&Vector3::new(x, y, z)).abs());
-            }
+        };
+        *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
+    }
+
+    fn add_tangent(&mut self, [x, y, z, sign]: [f64; 4], want: [f64; 4], normal: Option<&[f32; 3]>) {
+        match degrees([x, y, z], [want[0], want[1], want[2]]) {
+            Some(angle) if sign == want[3] => self.tangents.add(angle),
+            _ => self.broken += 1,
+        }
+        if let Some(normal) = normal {
+            self.dots.add(Vector3::from(normal.map(f64::from)).dot(&Vector3::new(x, y, z)).abs());
+        }
+    }
+
+    fn join(self, other: Self) -> Self {
+        Self {
+            normals: self.normals.join(other.normals),
+            to_surface: self.to_surface.join(other.to_surface),
+            tangents: self.tangents.join(other.tangents),
+            dots: self.dots.join(other.dots),
+            broken: self.broken + other.broken,
         }
     }
 

@@ -25,6 +25,8 @@ pub struct Judged {
     pub condition: f64,
 }
 
+/// The place of a vertex that is still to be judged.
+const NOTHING: Judged = Judged { at: [0.0; 3], bound: 0.0, condition: 0.0 };
 /// Roundings of a sum in f32 beyond one per mode: of x0, and of products and sums of their own in other orders.
 const EXTRA: usize = 3;
 /// Vertices per tile.
@@ -47,7 +49,7 @@ pub struct Take<'a> {
 
 /// Exact positions of a truth, but for what is taken from a deformer.
 pub fn positions(scene: &Scene, truth: &Truth, take: Take<'_>) -> Vec<[f64; 3]> {
-    each_tile(scene, |domain, vertices, out| {
+    each_tile(scene, [0.0; 3], |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
         let mut q = own(scene, domain, truth).to_vec();
         if let Some(ingredients) = take.truncation {
@@ -57,32 +59,37 @@ pub fn positions(scene: &Scene, truth: &Truth, take: Take<'_>) -> Vec<[f64; 3]> 
         let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
         let sums = sum(vertices.clone(), entries, &q);
         let (rest, transform) = (&scene.shapes[shape].mesh.rest()[vertices], truth.transform_of(scene, domain));
-        for (rest, sum) in rest.iter().zip(&sums) {
+        for ((rest, sum), out) in rest.iter().zip(&sums).zip(out) {
             let bent = std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]);
-            out.push(placed(&transform, bent));
+            *out = placed(&transform, bent);
         }
     })
 }
 
-/// Exact positions at a state, with the bounds of a deformer that has these ingredients.
-pub fn judge(scene: &Scene, state: &State, ingredients: &Ingredients) -> Vec<Judged> {
+/// Exact positions at a state, with the bounds of a deformer that replaces nothing.
+pub fn judge(scene: &Scene, state: &State) -> Vec<Judged> {
     let truth = Truth::of(state);
-    each_tile(scene, |domain, vertices, out| {
+    each_tile(scene, NOTHING, |domain, vertices, out| {
         let shape = &scene.shapes[scene.domains[domain].shape];
         let q = own(scene, domain, &truth);
         let sums = sum(vertices.clone(), Entries::Exact(&shape.modes), q);
         let (transform, size) = (truth.transform_of(scene, domain), truth.size_of(scene, domain));
         let (roundings, follows) = (q.len() + EXTRA, scene.movers.frame_of(domain).is_some());
-        let rest = shape.mesh.rest()[vertices.clone()].iter().map(|rest| rest.map(f64::from));
-        let mut bounds: Vec<f64> =
-            rest.clone().zip(&sums).map(|(rest, sum)| bound((&size, follows), &rest, sum, roundings)).collect();
-        if !ingredients.is_exact() {
-            ingredients.bounds(domain, state).widen(vertices.start, &mut bounds);
-        }
-        for ((rest, sum), bound) in rest.zip(&sums).zip(bounds) {
+        let rest = shape.mesh.rest()[vertices].iter().map(|rest| rest.map(f64::from));
+        for ((rest, sum), out) in rest.zip(&sums).zip(out) {
             let at = placed(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
-            out.push(Judged { at, bound, condition: condition(sum) });
+            let bound = bound((&size, follows), &rest, sum, roundings);
+            *out = Judged { at, bound, condition: condition(sum) };
         }
+    })
+}
+
+/// What [`judge`] said of a state, with the bounds of a deformer that has these ingredients: no sum is computed again.
+pub fn widen(scene: &Scene, state: &State, judged: &[Judged], ingredients: &Ingredients) -> Vec<Judged> {
+    each_tile(scene, NOTHING, |domain, vertices, out| {
+        let first = scene.layout.slots[domain].first_vertex + vertices.start;
+        out.copy_from_slice(&judged[first..][..vertices.len()]);
+        ingredients.bounds(domain, state).widen(vertices.start, out.iter_mut().map(|judged| &mut judged.bound));
     })
 }
 
@@ -108,16 +115,22 @@ impl Entries<'_> {
         }
     }
 
-    /// Hands each entry of a mode at these vertices to `take`, with its index among them.
-    fn each(&self, vertices: &Range<usize>, mode: usize, mut take: impl FnMut(usize, f64)) {
+    /// Adds the terms of a mode to u and sum |U q| of each row of these vertices.
+    fn add(&self, vertices: &Range<usize>, (mode, q): (usize, f64), rows: &mut [(f64, f64)]) {
+        let add = |row: &mut (f64, f64), entry: f64| {
+            let term = entry * q;
+            row.0 += term;
+            row.1 += term.abs();
+        };
         match self {
             Self::Exact(modes) => {
                 let column = &modes.column(mode)[3 * vertices.start..3 * vertices.end];
-                column.iter().enumerate().for_each(|(at, entry)| take(at, f64::from(*entry)));
+                rows.iter_mut().zip(column).for_each(|(row, entry)| add(row, f64::from(*entry)));
             }
             Self::Stored(tiles) => {
-                let rows = 3 * vertices.start..3 * vertices.end;
-                rows.enumerate().for_each(|(at, row)| take(at, tiles.decoded(row / 3, row % 3, mode)));
+                for (vertex, rows) in vertices.clone().zip(rows.as_chunks_mut::<3>().0) {
+                    rows.iter_mut().enumerate().for_each(|(axis, row)| add(row, tiles.decoded(vertex, axis, mode)));
+                }
             }
         }
     }
@@ -132,11 +145,7 @@ fn own<'a>(scene: &Scene, domain: usize, truth: &'a Truth) -> &'a [f64] {
 fn sum(vertices: Range<usize>, entries: Entries<'_>, q: &[f64]) -> Vec<Sum> {
     let mut rows = vec![(0.0_f64, 0.0_f64); 3 * vertices.len()];
     for (mode, q) in q.iter().enumerate().filter(|(_, q)| **q != 0.0) {
-        entries.each(&vertices, mode, |row, entry| {
-            let term = entry * q;
-            rows[row].0 += term;
-            rows[row].1 += term.abs();
-        });
+        entries.add(&vertices, (mode, *q), &mut rows);
     }
     for (row, (u, magnitude)) in rows.iter_mut().enumerate() {
         if *magnitude > CANCELS * u.abs() {
@@ -187,20 +196,29 @@ fn condition(sum: &Sum) -> f64 {
     }
 }
 
-/// Values of all vertices in packed order, computed tile by tile on all cores.
-fn each_tile<T: Send + Clone>(scene: &Scene, work: impl Fn(usize, Range<usize>, &mut Vec<T>) + Sync) -> Vec<T> {
-    let tiles = scene.layout.slots.iter().enumerate().flat_map(|(domain, slot)| {
-        let tile = move |first| (domain, first..slot.vertices.min(first + TILE));
-        (0..slot.vertices).step_by(TILE).map(tile)
-    });
-    let tiles: Vec<_> = tiles.collect();
-    let part = |tiles: &[(usize, Range<usize>)]| {
-        let mut out = Vec::with_capacity(tiles.iter().map(|(_, vertices)| vertices.len()).sum());
-        tiles.iter().for_each(|(domain, vertices)| work(*domain, vertices.clone(), &mut out));
-        out
-    };
+/// One tile of vertices: the domain, its vertices there, and where their values go.
+type Tile<'a, T> = (usize, Range<usize>, &'a mut [T]);
+
+/// Values of all vertices in packed order, computed tile by tile on all cores. `nothing` holds their places until then.
+fn each_tile<T: Copy + Send + Sync>(
+    scene: &Scene,
+    nothing: T,
+    work: impl Fn(usize, Range<usize>, &mut [T]) + Sync,
+) -> Vec<T> {
+    let mut all: Vec<T> = rayon::iter::repeat_n(nothing, scene.layout.vertices).collect();
+    let (mut tiles, mut left): (Vec<Tile<'_, T>>, _) = (Vec::new(), all.as_mut_slice());
+    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+        for first in (0..slot.vertices).step_by(TILE) {
+            let vertices = first..slot.vertices.min(first + TILE);
+            let (own, rest) = std::mem::take(&mut left).split_at_mut(vertices.len());
+            tiles.push((domain, vertices, own));
+            left = rest;
+        }
+    }
     // Small domains share a task: their own would cost more than their vertices.
-    tiles.par_chunks(32).map(part).collect::<Vec<_>>().concat()
+    let each = |(domain, vertices, own): &mut Tile<'_, T>| work(*domain, vertices.clone(), own);
+    tiles.par_chunks_mut(32).for_each(|tiles| tiles.iter_mut().for_each(each));
+    all
 }
 
 #[cfg(test)]
@@ -236,9 +254,7 @@ mod tests {
                 let state = motion.seed(seed).state();
                 cpu.deform(&state).expect("deforms");
                 let surface = &cpu.surface().expect("a surface").positions;
-                for (got, want) in
-                    surface.as_chunks::<3>().0.iter().zip(judge(&load.scene, &state, &Ingredients::of(&load.scene)))
-                {
+                for (got, want) in surface.as_chunks::<3>().0.iter().zip(judge(&load.scene, &state)) {
                     let square: f64 = got.iter().zip(want.at).map(|(got, want)| (f64::from(*got) - want).powi(2)).sum();
                     tightest = tightest.max(square.sqrt() / want.bound);
                 }
@@ -252,7 +268,7 @@ mod tests {
         let load = Kind::Cancelling.build(Size::Quick).expect("built");
         let motion = Motion::new(&load, None);
         let median = |seed: usize| {
-            let judged = judge(&load.scene, &motion.seed(seed).state(), &Ingredients::of(&load.scene));
+            let judged = judge(&load.scene, &motion.seed(seed).state());
             let mut conditions: Vec<f64> = judged.iter().map(|judged| judged.condition).collect();
             conditions.sort_by(f64::total_cmp);
             conditions[conditions.len() / 2]

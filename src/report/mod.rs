@@ -87,6 +87,16 @@ pub enum Source {
     },
 }
 
+impl Source {
+    /// What was asked for, in words.
+    fn name(&self) -> String {
+        match self {
+            Self::Synthetic(kind) => kind.name(),
+            Self::Scene { source, .. } => source.clone(),
+        }
+    }
+}
+
 /// One load of a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Entry {
@@ -126,41 +136,69 @@ pub struct Report {
     pub seeds: usize,
     pub roofs: Vec<(Backend, Roofs)>,
     pub loads: Vec<Entry>,
+    /// Loads that were asked for and are not measured yet; empty when the report is whole.
+    pub missing: Vec<String>,
     pub rows: Vec<Row>,
     pub thesis: Peers,
     /// Variants that did not pass, as load: variant: why.
     pub failed: Vec<String>,
 }
 
-/// Makes a report; `progress` hears what is being done.
+/// What a report tells while it is made.
+#[derive(Debug)]
+pub enum Progress<'a> {
+    /// What is measured next, in words.
+    Begins(&'a str),
+    /// All that is measured so far: a load more than the last time.
+    Measured(&'a Report),
+}
+
+/// Makes a report; `progress` hears what is being done, and what is done after each load.
 ///
 /// # Errors
-/// Those of loading a scene. What a variant does wrong is in the report.
-pub fn deform(request: &Request, bench: &dyn Bench, mut progress: impl FnMut(&str)) -> Result<Report> {
+/// Those of loading a scene and of `progress`. What a variant does wrong is in the report.
+pub fn deform(
+    request: &Request,
+    bench: &dyn Bench,
+    mut progress: impl FnMut(Progress<'_>) -> Result<()>,
+) -> Result<Report> {
     let (mut loads, mut rows) = (Vec::new(), Vec::new());
+    let mut report = gathered(request, bench, (&loads, &rows));
     for source in &request.sources {
         let (load, motion) = open(source, request.size)?;
-        progress(&format!(
-            "{}: {} vertices, {} domains",
-            load.name,
-            load.scene.layout.vertices,
-            load.scene.domains.len()
-        ));
+        let (vertices, domains) = (load.scene.layout.vertices, load.scene.domains.len());
+        progress(Progress::Begins(&format!("{}: {vertices} vertices, {domains} domains", load.name)))?;
         let (condition, measured) = measure(request, bench, &load, &motion);
         rows.extend(measured);
         let full = request.size == Size::Full && matches!(source, Source::Synthetic(_));
         let entry = entry(&load, &motion, condition, full);
         loads.push(Entry { ingest: bench.ingest(&load, request.replays), ..entry });
+        report = gathered(request, bench, (&loads, &rows));
+        progress(Progress::Measured(&report))?;
     }
+    Ok(report)
+}
+
+/// The report of some loads and their rows, the first of those that were asked for.
+fn gathered(request: &Request, bench: &dyn Bench, (loads, rows): (&[Entry], &[Row])) -> Report {
     let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
-    let thesis = Peers::of(&rows, full);
+    let thesis = Peers::of(rows, full);
     let name = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
     let mut failed: Vec<String> = rows.iter().filter(|row| !row.passed && !row.left_out).map(name).collect();
     // The rows of warm and cold caches say the same of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
-    let (made, remarks) = (Provenance::here(), bench.remarks());
-    Ok(Report { made, remarks, seeds: request.seeds, roofs, loads, rows, thesis, failed })
+    Report {
+        made: Provenance::here(),
+        remarks: bench.remarks(),
+        seeds: request.seeds,
+        roofs,
+        loads: loads.to_vec(),
+        missing: request.sources[loads.len()..].iter().map(Source::name).collect(),
+        rows: rows.to_vec(),
+        thesis,
+        failed,
+    }
 }
 
 fn open(source: &Source, size: Size) -> Result<(Load, Motion)> {
@@ -241,7 +279,8 @@ impl Report {
         self.failed.is_empty()
     }
 
-    /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is made.
+    /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is made. Each
+    /// file is written beside its place and renamed, so that whoever stops the run finds whole files.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -256,7 +295,8 @@ impl Report {
             ("report.svg", svg.into_bytes()),
         ];
         for (name, bytes) in files {
-            std::fs::write(folder.join(name), bytes).map_err(during("report"))?;
+            let (place, beside) = (folder.join(name), folder.join(format!("{name}.part")));
+            std::fs::write(&beside, bytes).and_then(|()| std::fs::rename(&beside, place)).map_err(during("report"))?;
         }
         Ok(())
     }
@@ -296,10 +336,39 @@ mod tests {
     fn report(damage: f32) -> Report {
         let sources = vec![Source::Synthetic(Kind::Plant(1)), Source::Synthetic(Kind::Single { power: 14, rank: 10 })];
         let mut heard = Vec::new();
-        let report =
-            deform(&request(sources), &Mixed { damage }, |what| heard.push(what.to_owned())).expect("a report");
-        assert_eq!(heard.len(), 2, "{heard:?}");
+        let hear = |told: Progress<'_>| {
+            heard.push(match told {
+                Progress::Begins(what) => what.to_owned(),
+                Progress::Measured(report) => format!("{} {:?}", report.rows.len(), report.missing),
+            });
+            Ok(())
+        };
+        let report = deform(&request(sources), &Mixed { damage }, hear).expect("a report");
+        assert!(heard[0].starts_with("plant-2: ") && heard[2].starts_with("single-14-10: "), "{heard:?}");
+        assert_eq!([&heard[1], &heard[3]], ["4 [\"single-14-10\"]", "8 []"]);
         report
+    }
+
+    #[test]
+    fn a_run_that_is_cut_short_has_written_what_it_had_and_says_what_is_missing() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let absent = Source::Scene { source: "absent".into(), record: None };
+        let request = request(vec![Source::Synthetic(Kind::C), absent]);
+        let keep = |told: Progress<'_>| match told {
+            Progress::Measured(report) => report.write(folder.path()),
+            Progress::Begins(_) => Ok(()),
+        };
+        deform(&request, &Mixed { damage: 0.0 }, keep).expect_err("no such scene");
+        let json = std::fs::read(folder.path().join("report.json")).expect("written");
+        let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
+        assert_eq!((&json["missing"][0], json["rows"].as_array().map(Vec::len)), (&"absent".into(), Some(4)));
+        let page = std::fs::read_to_string(folder.path().join("report.md")).expect("written");
+        assert!(page.contains("Not measured yet: absent."), "{page}");
+        let mut names = std::fs::read_dir(folder.path()).expect("listed").map(|entry| entry.expect("one").file_name());
+        assert!(
+            names
+                .all(|name| name.to_string_lossy().starts_with("report.") && !name.to_string_lossy().ends_with("part"))
+        );
     }
 
     #[test]
@@ -344,7 +413,7 @@ mod tests {
                 vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
             }
         }
-        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Broken, |_| {}).expect("a report");
+        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Broken, |_| Ok(())).expect("a report");
         assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, given none"]);
         assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
     }
@@ -359,7 +428,7 @@ mod tests {
                 vec![(label, Err(crate::error::Error::Unavailable { what: "a library", reason, remedy }))]
             }
         }
-        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| {}).expect("a report");
+        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| Ok(())).expect("a report");
         assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
         assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
     }
@@ -367,14 +436,14 @@ mod tests {
     #[test]
     fn a_scene_of_the_user_is_measured_under_its_own_name() {
         let source = Source::Scene { source: "tree".into(), record: None };
-        let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| {}).expect("a report");
+        let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| Ok(())).expect("a report");
         assert!(report.passed(), "{:?}", report.failed);
         assert_eq!((report.loads[0].name.as_str(), report.loads[0].recorded), ("tree", false));
         assert!(
             deform(
                 &request(vec![Source::Scene { source: "absent".into(), record: None }]),
                 &Mixed { damage: 0.0 },
-                |_| {}
+                |_| Ok(())
             )
             .is_err()
         );

@@ -12,6 +12,9 @@ pub(super) fn markdown(report: &Report) -> String {
     for remark in &report.remarks {
         text.push_str(&format!("\n{remark}\n"));
     }
+    if !report.missing.is_empty() {
+        text.push_str(&format!("\nNot measured yet: {}.\n", report.missing.join(", ")));
+    }
     let verdict = match report.failed.is_empty() {
         true => "\nEvery variant stays within its a-priori bound.\n".to_owned(),
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),

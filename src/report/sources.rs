@@ -1,19 +1,22 @@
 //! Where an error comes from: each ingredient of x = T (x0 + U q) exchanged alone, all else exact in f64.
 
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rayon::prelude::*;
 use serde::Serialize;
 
-use super::errors::{Collect, Spread};
+use super::errors::{Collect, Spread, in_pieces};
 use super::exact::{Take, positions};
 use super::ingredients::Ingredients;
 use super::motion::Truth;
-use crate::scene::{Scene, State};
+use crate::scene::{Scene, State, Storage};
 
 /// What each source alone moves a vertex by, metres.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Sources {
     /// U as it is stored, decoded, instead of U.
     pub storage: Spread,
-    /// q rounded to f32 instead of the f64 of the physics process.
+    /// q rounded to f32 instead of the f64 of the physics process, and to what tensor cores take where they multiply.
     pub q: Spread,
     /// What the deformer's own arithmetic adds: the sum over the modes, x0 and T, all in f32, beyond one rounding.
     pub accumulation: Spread,
@@ -39,6 +42,16 @@ pub(super) struct Origin {
     transform: Collect,
     /// With q and T as given, U exact and no mode left out.
     plain: Vec<[f64; 3]>,
+    /// Of the storage types that variants have asked for.
+    stored: Mutex<Vec<(Storage, Arc<Stored>)>>,
+}
+
+/// What all variants have in common that store U in one type and leave out no mode.
+#[derive(Debug)]
+struct Stored {
+    alone: Collect,
+    /// With q and T as given.
+    own: Vec<[f64; 3]>,
 }
 
 impl Origin {
@@ -52,26 +65,47 @@ impl Origin {
         let q = apart(&exact, &at(&given.q, &truth.transforms));
         let transform = apart(&exact, &at(&truth.q, &given.transforms));
         let plain = at(&given.q, &given.transforms);
-        Self { truth, given, exact, q, transform, plain }
+        Self { truth, given, exact, q, transform, plain, stored: Mutex::default() }
+    }
+
+    fn stored(&self, scene: &Scene, ingredients: &Ingredients) -> Arc<Stored> {
+        let (storage, mut known) =
+            (scene.deformation.storage, self.stored.lock().unwrap_or_else(PoisonError::into_inner));
+        if let Some((_, stored)) = known.iter().find(|(known, _)| *known == storage) {
+            return Arc::clone(stored);
+        }
+        let take = Take { storage: Some(ingredients), truncation: None };
+        let alone = apart(&self.exact, &positions(scene, &self.truth, take));
+        let stored = Arc::new(Stored { alone, own: positions(scene, &self.given, take) });
+        known.push((storage, Arc::clone(&stored)));
+        stored
     }
 
     /// Adds what a variant made of it.
     pub(super) fn split(&self, scene: &Scene, ingredients: &Ingredients, got: &[f32], split: &mut Split) {
         let storage = Some(ingredients).filter(|ingredients| ingredients.stores());
         let truncation = Some(ingredients).filter(|ingredients| ingredients.truncates());
+        let stored = storage.map(|ingredients| self.stored(scene, ingredients));
+        // Every source counts all vertices, also one that moves none.
+        let none = apart(&self.exact, &self.exact);
+        let from_storage = stored.as_ref().map_or(none, |stored| stored.alone);
         // Which modes are left out depends on what the deformer was given; their sizes hardly do.
-        let alone = |take: Take<'_>| match take.storage.or(take.truncation) {
-            Some(_) => apart(&self.exact, &positions(scene, &self.truth, take)),
-            None => apart(&self.exact, &self.exact),
+        let cut = Take { storage: None, truncation };
+        let from_truncation = truncation.map_or(none, |_| apart(&self.exact, &positions(scene, &self.truth, cut)));
+        let halved = ingredients.halved(&self.given.q);
+        let with = |q: &[f64], transforms: &[[f64; 12]], take: Take<'_>| {
+            positions(scene, &Truth { q: q.to_vec(), transforms: transforms.to_vec() }, take)
         };
-        let from_storage = alone(Take { storage, truncation: None });
-        let from_truncation = alone(Take { storage: None, truncation });
-        let own = (!ingredients.is_exact()).then(|| positions(scene, &self.given, Take { storage, truncation }));
-        let own = own.as_deref().unwrap_or(&self.plain);
-        let rounded: Vec<[f64; 3]> = own.iter().map(|at| at.map(|number| f64::from(number as f32))).collect();
-        let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.iter().map(|at| at.map(f64::from)).collect();
+        let exact_but = |q: &Vec<f64>| apart(&self.exact, &with(q, &self.truth.transforms, Take::default()));
+        let from_q = halved.as_ref().map_or(self.q, exact_but);
+        let q = halved.as_ref().unwrap_or(&self.given.q);
+        let otherwise = truncation.is_some() || halved.is_some();
+        let other = otherwise.then(|| with(q, &self.given.transforms, Take { storage, truncation }));
+        let own = other.as_ref().or(stored.as_ref().map(|stored| &stored.own)).unwrap_or(&self.plain);
+        let rounded: Vec<[f64; 3]> = own.par_iter().map(|at| at.map(|number| f64::from(number as f32))).collect();
+        let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|at| at.map(f64::from)).collect();
         let parts =
-            [from_storage, self.q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
+            [from_storage, from_q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
         split.0.iter_mut().zip(parts).for_each(|(sum, part)| *sum = sum.join(part));
     }
 }
@@ -86,12 +120,11 @@ impl Split {
 }
 
 fn apart(one: &[[f64; 3]], other: &[[f64; 3]]) -> Collect {
-    let mut collect = Collect::default();
-    for (one, other) in one.iter().zip(other) {
-        let square: f64 = one.iter().zip(other).map(|(one, other)| (one - other).powi(2)).sum();
-        collect.add(square.sqrt());
-    }
-    collect
+    let length = |at: usize| {
+        let square: f64 = one[at].iter().zip(other[at]).map(|(one, other)| (one - other).powi(2)).sum();
+        square.sqrt()
+    };
+    in_pieces(one.len().min(other.len()), |at, sum: &mut Collect| sum.add(length(at)), Collect::join)
 }
 
 #[cfg(test)]

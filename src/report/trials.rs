@@ -3,14 +3,13 @@
 use std::sync::Arc;
 
 use super::bench::{Offer, Wanted, offer};
-use super::ingredients::Ingredients;
-use super::loads::restated;
+use super::ingredients::{Ingredients, Stock};
 use super::timing::{Cache, Timing};
 use super::traffic::Part;
 use super::variant::{Label, Variant};
 use crate::deform::{Backend, Surface};
 use crate::error::{Error, Result};
-use crate::gpu::{self, Batch, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
+use crate::gpu::{self, Batch, BatchMma, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
 use crate::scene::{Deformation, Scene, State, Storage};
 
 /// Makes a trial of a scene for some states.
@@ -40,38 +39,61 @@ struct Tried {
 }
 
 /// All trials for a scene: ours in every storage type, and the thesis's kernels where they apply.
-pub(super) fn trials(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
-    let ours = |storage: Storage, extent: Extent| -> Offer {
+pub(super) fn trials(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
+    let stored = |storage: Storage, extent: Extent| -> Offer {
         let deformation = Deformation { storage, ..scene.deformation };
         let suffix = match extent {
             Extent::Uq => UQ,
             Extent::Positions => " positions",
             Extent::Whole => "",
         };
-        let label = Label { name: format!("cuda {}{suffix}", storage.name()), backend: Backend::Cuda, deformation };
-        offer(wanted, label, |label| {
-            let scene =
-                if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
-            let make: Make =
-                Box::new(move |device, scene, states| Ok(Box::new(Ours::new(device, scene, states, extent)?)));
-            Ok(Tried::new(label, &scene, device, make))
-        })
+        ours(device, stock, wanted, (format!("cuda {}{suffix}", storage.name()), deformation, extent))
     };
     let storages: &[Storage] = if scene.needs.modes { &Storage::ALL } else { &[Storage::F32] };
-    let mut offers: Vec<Offer> = storages.iter().map(|storage| ours(*storage, Extent::Positions)).collect();
+    let mut offers: Vec<Offer> = storages.iter().map(|storage| stored(*storage, Extent::Positions)).collect();
     if has_normals(scene) {
-        offers.extend(storages.iter().map(|storage| ours(*storage, Extent::Whole)));
+        offers.extend(storages.iter().map(|storage| stored(*storage, Extent::Whole)));
     }
     if scene.domains.len() >= MANY {
         offers.push(changed(device, scene, wanted));
     }
     if scene.needs.modes {
-        offers.push(ours(Storage::F32, Extent::Uq));
-        offers.extend(batch(device, scene, wanted));
+        offers.push(stored(Storage::F32, Extent::Uq));
+        offers.extend(batch(device, stock, scene, wanted));
         offers.extend(thesis(device, scene, wanted));
         offers.extend(cublas(device, scene, wanted));
     }
     offers
+}
+
+/// Whether a deformation sums other modes than all, or in another way: its kernel then has its own rows.
+pub(super) fn is_summed_otherwise(deformation: &Deformation) -> bool {
+    deformation.truncation.is_some() || deformation.compensated
+}
+
+/// The kernel of positions for a scene that is deformed so. Every state is decided on its own where modes are left out:
+/// no trial remembers the one before.
+pub(super) fn positions(
+    device: &Arc<Device>,
+    stock: &Stock,
+    wanted: Wanted<'_>,
+    (name, deformation): (String, Deformation),
+) -> Offer {
+    ours(device, stock, wanted, (name, deformation, Extent::Positions))
+}
+
+fn ours(
+    device: &Arc<Device>,
+    stock: &Stock,
+    wanted: Wanted<'_>,
+    (name, deformation, extent): (String, Deformation, Extent),
+) -> Offer {
+    let label = Label { name, backend: Backend::Cuda, deformation };
+    offer(wanted, label, |label| {
+        let scene = stock.scene(deformation)?;
+        let make: Make = Box::new(move |device, scene, states| Ok(Box::new(Ours::new(device, scene, states, extent)?)));
+        Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene), make)))
+    })
 }
 
 /// Domains from which on a step that changes one in a hundred is measured.
@@ -87,8 +109,8 @@ fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offe
     offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
 }
 
-/// Many q of one shape at once, in every storage type.
-fn batch(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
+/// Many q of one shape at once, in every storage type; and by tensor cores where U has 16 bits.
+fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     if scene.shapes.len() > 1 || scene.domains.len() < 2 {
         return Vec::new();
     }
@@ -97,13 +119,22 @@ fn batch(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Of
         let name = format!("cuda batch of {} {}", scene.domains.len(), storage.name());
         let label = Label { name, backend: Backend::Cuda, deformation };
         offer(wanted, label, |label| {
-            let scene =
-                if deformation == scene.deformation { Arc::clone(scene) } else { restated(scene, deformation)? };
+            let scene = stock.scene(deformation)?;
             let make: Make = Box::new(|device, scene, states| Ok(Box::new(Batch::new(device, scene, states)?)));
-            Ok(Tried::new(label, &scene, device, make))
+            Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene), make)))
         })
     };
-    Storage::ALL.into_iter().map(one).collect()
+    let products = |storage: Storage| {
+        let deformation = Deformation { storage, ..scene.deformation };
+        // Another order and rounding than the deformer's: its name says so.
+        let name = format!("cuda batch of {} {} mma", scene.domains.len(), storage.name());
+        offer(wanted, Label { name, backend: Backend::Cuda, deformation }, |label| {
+            let scene = stock.scene(deformation)?;
+            let make: Make = Box::new(|device, scene, states| Ok(Box::new(BatchMma::new(device, scene, states)?)));
+            Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene).with_products(), make)))
+        })
+    };
+    Storage::ALL.into_iter().map(one).chain([Storage::F16, Storage::Bf16].map(products)).collect()
 }
 
 /// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.
@@ -174,6 +205,7 @@ pub(super) fn has_normals(scene: &Scene) -> bool {
 fn formula(name: &str) -> &'static str {
     match name {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",
+        "U kept" => "as packed: the share of modes that are kept, mean over the domains and states that are timed",
         "q" => "4 x sum r",
         "T" => "48 x d",
         "x0" | "u or x" | "x" => "12 x sum n",
@@ -183,7 +215,16 @@ fn formula(name: &str) -> &'static str {
 
 impl Tried {
     fn new(label: Label, scene: &Arc<Scene>, device: &Arc<Device>, make: Make) -> Self {
-        let (scene, device, ingredients) = (Arc::clone(scene), Arc::clone(device), Ingredients::of(scene));
+        Self::sharing(label, scene, device, (Ingredients::of(scene), make))
+    }
+
+    fn sharing(
+        label: Label,
+        scene: &Arc<Scene>,
+        device: &Arc<Device>,
+        (ingredients, make): (Ingredients, Make),
+    ) -> Self {
+        let (scene, device) = (Arc::clone(scene), Arc::clone(device));
         Self { label, scene, ingredients, device, make, trial: None, surface: Surface::default() }
     }
 
@@ -216,7 +257,9 @@ impl Variant for Tried {
         Ok(())
     }
 
-    fn surface(&mut self, at: usize, _state: &State) -> Result<&Surface> {
+    fn surface(&mut self, at: usize, state: &State) -> Result<&Surface> {
+        self.ingredients.forget();
+        self.ingredients.follow(state);
         let trial = self.trial()?;
         trial.complete(&self.device, at)?;
         trial.launch(&self.device, at)?;

@@ -1,12 +1,13 @@
 //! Errors of all variants of one load: over random seeds, and step by step along a trajectory.
 
-use std::sync::Arc;
+use std::ops::Range;
+use std::sync::{Arc, OnceLock};
 
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::errors::{Collect, Errors, IMAGE, Orientation, Spread, Tally, Turned, Yardstick, step_errors};
-use super::exact::{Judged, judge};
-use super::ingredients::Ingredients;
+use super::exact::{Judged, judge, widen};
 use super::loads::{Load, restated};
 use super::motion::Motion;
 use super::sources::{Origin, Sources, Split};
@@ -15,7 +16,7 @@ use super::variant::Variant;
 use crate::deform::Surface;
 use crate::error::Error;
 use crate::reference;
-use crate::scene::{Camera, Deformation, Normals, State};
+use crate::scene::{Camera, Deformation, Normals, Scene, State};
 
 /// Of how many seeds the sources of error are split. Each costs five evaluations in f64.
 const SPLIT: usize = 4;
@@ -62,25 +63,83 @@ struct Case<'a> {
     split: Split,
     steps: Collect,
     before: Option<(Vec<f32>, Arc<Vec<Judged>>)>,
+    /// What it gave last, in memory that is used again.
+    held: Surface,
     first: Surface,
     repeatable: bool,
     fault: Option<String>,
     left_out: bool,
 }
 
-/// One state to look at.
+/// One state to look at: what is right there, the same for all variants.
 struct Look<'a> {
     at: usize,
+    scenes: &'a Scenes<'a>,
     state: &'a State,
     /// What exact storage of all modes gives, and its bound.
     judged: Arc<Vec<Judged>>,
+    partial: Partial,
+    /// Of the states whose sources are split.
     origin: Option<Origin>,
-    /// Normals of the deformed surface, of the states whose sources are split.
-    surface: Option<Vec<[f64; 3]>>,
+    rigid: OnceLock<Directions>,
+    exact: OnceLock<Directions>,
     along: bool,
 }
 
-/// Looks at `seeds` random states and at most `steps` of the trajectory.
+/// Normals and tangents in f64.
+struct Directions {
+    normals: Vec<[f64; 3]>,
+    tangents: Vec<[f64; 4]>,
+}
+
+/// Whose directions are right.
+struct Scenes<'a> {
+    rigid: &'a Scene,
+    /// The scene whose normals are those of the deformed surface, where that bends and has any.
+    bent: Option<Arc<Scene>>,
+}
+
+impl<'a> Scenes<'a> {
+    fn new(load: &'a Load) -> Self {
+        let exact_normals = Deformation { normals: Normals::Exact, ..load.scene.deformation };
+        let bends = load.scene.needs.modes && has_normals(&load.scene);
+        let bent = bends.then(|| restated(&load.scene, exact_normals)).and_then(Result::ok);
+        Self { rigid: &load.scene, bent }
+    }
+}
+
+impl<'a> Look<'a> {
+    fn new(scenes: &'a Scenes<'a>, at: usize, state: &'a State, along: bool) -> Self {
+        let judged = Arc::new(judge(scenes.rigid, state));
+        let (rigid, exact) = (OnceLock::new(), OnceLock::new());
+        Self { at, scenes, state, partial: Partial::of(&judged), judged, origin: None, rigid, exact, along }
+    }
+
+    /// The directions by T alone, or those of the deformed surface; computed once, whoever asks.
+    fn directions(&self, exact: bool) -> &Directions {
+        match exact {
+            true => self.exact.get_or_init(|| {
+                let (scene, places) = (self.scenes.bent.as_deref().unwrap_or(self.scenes.rigid), places(&self.judged));
+                let normals = || reference::exact_normals(scene, self.state, &places);
+                let tangents = || reference::exact_tangents(scene, self.state, &places);
+                let (normals, tangents) = rayon::join(normals, tangents);
+                Directions { normals, tangents }
+            }),
+            false => self.rigid.get_or_init(|| {
+                let normals = || reference::orient_normals(self.scenes.rigid, self.state);
+                let (normals, tangents) =
+                    rayon::join(normals, || reference::orient_tangents(self.scenes.rigid, self.state));
+                Directions { normals, tangents }
+            }),
+        }
+    }
+}
+
+/// Vertices and corners of the states that are judged at once, at most: of 40 and up to 112 bytes.
+const AT_ONCE: usize = 1 << 24;
+
+/// Looks at `seeds` random states and at most `steps` of the trajectory: at every vertex and corner of each. What is
+/// right is computed once for all variants, of several states at once on all cores.
 pub fn validate(
     load: &Load,
     motion: &Motion,
@@ -90,25 +149,40 @@ pub fn validate(
     let camera = Camera::framing(&load.scene, IMAGE.0, IMAGE.1);
     let yardstick = Yardstick::new(&load.scene, &camera);
     let truth = |at: usize| if at < seeds { motion.seed(at) } else { motion.step(at - seeds) };
-    let states: Vec<State> = (0..seeds + motion.steps().min(steps)).map(|at| truth(at).state()).collect();
+    let count = seeds + motion.steps().min(steps);
+    let states: Vec<State> = (0..count).into_par_iter().map(|at| truth(at).state()).collect();
     let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut(), &states)).collect();
-    // The scene whose normals are those of the deformed surface, where that bends and has any.
-    let exact_normals = Deformation { normals: Normals::Exact, ..load.scene.deformation };
-    let bends = load.scene.needs.modes && has_normals(&load.scene);
-    let bent = bends.then(|| restated(&load.scene, exact_normals)).and_then(Result::ok);
-    let (exact, mut conditions) = (Ingredients::of(&load.scene), Conditions::default());
-    for (at, state) in states.iter().enumerate() {
-        let judged = Arc::new(judge(&load.scene, state, &exact));
-        conditions.add(&judged);
-        let split = at < SPLIT.min(seeds);
-        let origin = split.then(|| Origin::new(&load.scene, truth(at), state));
-        let bent = bent.as_ref().filter(|_| split);
-        let surface = bent.map(|scene| reference::exact_normals(scene, state, &places(&judged)));
-        let look = Look { at, state, judged, origin, surface, along: at >= seeds };
-        cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
+    let (scenes, mut conditions) = (Scenes::new(load), Conditions::default());
+    // Which directions the variants were held to at the first state: of the others they are computed beforehand.
+    let mut asked = [false; 2];
+    for group in groups(count, load.scene.layout.vertices + load.scene.layout.corners) {
+        let look = |at: usize| {
+            let look = Look::new(&scenes, at, &states[at], at >= seeds);
+            for exact in [false, true].into_iter().filter(|exact| asked[usize::from(*exact)]) {
+                look.directions(exact);
+            }
+            let split = at < SPLIT.min(seeds);
+            Look { origin: split.then(|| Origin::new(&load.scene, truth(at), &states[at])), ..look }
+        };
+        let looks: Vec<Look<'_>> = group.into_par_iter().map(look).collect();
+        for look in looks {
+            conditions.add(&look.partial);
+            cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
+            if look.at == 0 {
+                let exact = cases.iter().any(|case| case.is_held_to_surface());
+                asked = [look.rigid.get().is_some(), exact];
+            }
+        }
     }
     cases.iter_mut().for_each(|case| case.repeat(&states));
     (cases.into_iter().map(|case| case.found(&yardstick)).collect(), conditions.condition())
+}
+
+/// States 0 to `count` in groups that are judged at once: the first alone, for it tells what the others need.
+fn groups(count: usize, items: usize) -> impl Iterator<Item = Range<usize>> {
+    let together = (AT_ONCE / items.max(1)).clamp(1, rayon::current_num_threads());
+    let rest = (1..count).step_by(together).map(move |first| first..count.min(first + together));
+    std::iter::once(0..count.min(1)).chain(rest)
 }
 
 impl<'a> Case<'a> {
@@ -123,6 +197,7 @@ impl<'a> Case<'a> {
             split: Split::default(),
             steps: Collect::default(),
             before: None,
+            held: Surface::default(),
             first: Surface::default(),
             repeatable: true,
             fault,
@@ -134,32 +209,45 @@ impl<'a> Case<'a> {
         if self.fault.is_some() {
             return;
         }
-        let surface = match self.variant.surface(look.at, look.state) {
-            Ok(surface) => surface.clone(),
+        match self.variant.surface(look.at, look.state) {
+            Ok(surface) => copy(&mut self.held, surface),
             Err(error) => {
                 self.fault = Some(error.to_string());
                 return;
             }
-        };
-        if surface.positions.len() != 3 * look.judged.len() {
-            self.fault = Some(format!("{} coordinates for {} vertices", surface.positions.len(), look.judged.len()));
+        }
+        if self.held.positions.len() != 3 * look.judged.len() {
+            let (given, wanted) = (self.held.positions.len(), look.judged.len());
+            self.fault = Some(format!("{given} coordinates for {wanted} vertices"));
             return;
         }
-        let judged = self.judged(look);
-        self.tally.add(yardstick, &surface.positions, &judged);
-        self.orient(look, &surface);
+        self.tally.add(yardstick, &self.held.positions, &self.judged(look));
+        self.orient(look);
         if let Some(origin) = &look.origin {
-            origin.split(self.variant.scene(), self.variant.ingredients(), &surface.positions, &mut self.split);
+            let (scene, ingredients) = (self.variant.scene(), self.variant.ingredients());
+            origin.split(scene, ingredients, &self.held.positions, &mut self.split);
         }
         if look.at == 0 {
-            self.first = surface.clone();
+            copy(&mut self.first, &self.held);
         }
         if look.along {
-            if let Some((positions, before)) = &self.before {
-                self.steps = self.steps.join(step_errors([positions, &surface.positions], [before, &judged]));
-            }
-            self.before = Some((surface.positions, judged));
+            self.step(look);
         }
+    }
+
+    /// Error of the step from the state before.
+    fn step(&mut self, look: &Look<'_>) {
+        if let Some((positions, before)) = &self.before {
+            self.steps = self.steps.join(step_errors([positions, &self.held.positions], [before, &look.judged]));
+        }
+        let (mut positions, _) = self.before.take().unwrap_or_default();
+        std::mem::swap(&mut positions, &mut self.held.positions);
+        self.before = Some((positions, Arc::clone(&look.judged)));
+    }
+
+    /// Whether the normals that it gives are to follow the surface.
+    fn is_held_to_surface(&self) -> bool {
+        !self.held.normals.is_empty() && self.variant.scene().needs.exact_normals
     }
 
     /// Asks for the first state again, after all others. A deformer that leaves out modes may remember what it was given
@@ -172,31 +260,25 @@ impl<'a> Case<'a> {
     }
 
     /// The exact positions with this variant's own bound.
-    fn judged(&self, look: &Look) -> Arc<Vec<Judged>> {
+    fn judged(&self, look: &Look<'_>) -> Arc<Vec<Judged>> {
         let ingredients = self.variant.ingredients();
         match ingredients.is_exact() {
             true => Arc::clone(&look.judged),
-            false => Arc::new(judge(self.variant.scene(), look.state, ingredients)),
+            false => Arc::new(widen(self.variant.scene(), look.state, &look.judged, ingredients)),
         }
     }
 
-    fn orient(&mut self, look: &Look<'_>, surface: &Surface) {
-        if surface.normals.is_empty() {
+    fn orient(&mut self, look: &Look<'_>) {
+        let Surface { normals, tangents, .. } = &self.held;
+        if normals.is_empty() {
             return;
         }
-        let (scene, state) = (self.variant.scene(), look.state);
-        let exact = || places(&look.judged);
-        let (normals, tangents) = match scene.needs.exact_normals {
-            true => {
-                (reference::exact_normals(scene, state, &exact()), reference::exact_tangents(scene, state, &exact()))
-            }
-            false => (reference::orient_normals(scene, state), reference::orient_tangents(scene, state)),
-        };
-        self.turned.add_normals(&surface.normals, &normals);
-        if let Some(want) = &look.surface {
-            self.turned.add_to_surface(&surface.normals, want);
+        let want = look.directions(self.variant.scene().needs.exact_normals);
+        self.turned.add_normals(normals, &want.normals);
+        if look.origin.is_some() && look.scenes.bent.is_some() {
+            self.turned.add_to_surface(normals, &look.directions(true).normals);
         }
-        self.turned.add_tangents(&surface.tangents, &tangents, &surface.normals);
+        self.turned.add_tangents(tangents, &want.tangents, normals);
     }
 
     fn found(self, yardstick: &Yardstick) -> Found {
@@ -221,13 +303,39 @@ impl<'a> Case<'a> {
     }
 }
 
+/// Copies a surface into the memory of another.
+fn copy(to: &mut Surface, from: &Surface) {
+    to.positions.clone_from(&from.positions);
+    to.normals.clone_from(&from.normals);
+    to.tangents.clone_from(&from.tangents);
+}
+
 fn places(judged: &[Judged]) -> Vec<[f64; 3]> {
-    judged.iter().map(|judged| judged.at).collect()
+    judged.par_iter().map(|judged| judged.at).collect()
 }
 
 fn bits(surface: &Surface) -> impl Iterator<Item = u32> + '_ {
     let lists = [&surface.positions, &surface.normals, &surface.tangents];
     lists.into_iter().flatten().map(|number| number.to_bits())
+}
+
+/// Of one state: the largest finite condition, the median, and how many are infinite.
+#[derive(Debug, Default)]
+struct Partial {
+    largest: f64,
+    median: Option<f64>,
+    infinite: u64,
+}
+
+impl Partial {
+    fn of(judged: &[Judged]) -> Self {
+        let all = judged.iter().map(|judged| judged.condition).filter(|condition| *condition > 0.0);
+        let mut all: Vec<f64> = all.collect();
+        let count = all.len();
+        all.retain(|condition| condition.is_finite());
+        let largest = all.iter().copied().fold(0.0, f64::max);
+        Self { largest, infinite: (count - all.len()) as u64, median: median(&mut all) }
+    }
 }
 
 /// [`Condition`] while it is collected.
@@ -239,12 +347,10 @@ struct Conditions {
 }
 
 impl Conditions {
-    fn add(&mut self, judged: &[Judged]) {
-        let all = || judged.iter().map(|judged| judged.condition).filter(|condition| *condition > 0.0);
-        let (mut finite, count) = (all().filter(|condition| condition.is_finite()).collect::<Vec<_>>(), all().count());
-        self.infinite += (count - finite.len()) as u64;
-        self.largest = finite.iter().copied().fold(self.largest, f64::max);
-        self.medians.extend(median(&mut finite));
+    fn add(&mut self, state: &Partial) {
+        self.infinite += state.infinite;
+        self.largest = self.largest.max(state.largest);
+        self.medians.extend(state.median);
     }
 
     fn condition(mut self) -> Condition {
@@ -263,6 +369,7 @@ mod tests {
     use super::*;
     use crate::cpu::CpuDeformer;
     use crate::deform::Backend;
+    use crate::report::ingredients::Ingredients;
     use crate::report::loads::{Kind, Size};
     use crate::report::testing::{Damaged, Emulated};
     use crate::report::variant::{Driven, Label};

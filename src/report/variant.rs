@@ -77,7 +77,12 @@ pub struct Driven {
 impl Driven {
     /// A deformer of this scene.
     pub fn new(label: Label, scene: &Arc<Scene>, deformer: Box<dyn Deformer>) -> Self {
-        Self { label, scene: Arc::clone(scene), ingredients: Ingredients::of(scene), deformer }
+        Self::sharing(label, scene, Ingredients::of(scene), deformer)
+    }
+
+    /// The same, with what it replaces made already.
+    pub fn sharing(label: Label, scene: &Arc<Scene>, ingredients: Ingredients, deformer: Box<dyn Deformer>) -> Self {
+        Self { label, scene: Arc::clone(scene), ingredients, deformer }
     }
 }
 

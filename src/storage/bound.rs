@@ -15,7 +15,7 @@
 
 use rayon::prelude::*;
 
-use super::Tiles;
+use super::{Products, Tiles};
 use crate::domain::{Composed, Shape, Transform};
 use crate::scene::Storage;
 
@@ -127,6 +127,18 @@ impl Reaches {
             terms += 1.0;
         }
         self.finish(tile, step, [SQRT_3 * storage, lost, moved, terms])
+    }
+
+    /// What taking its sums from tensor cores adds to the bounds of tile `tile`, scene units.
+    pub fn products(&self, tile: usize, step: &Step, products: Products) -> f64 {
+        let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(step.q);
+        let amount = |(reach, q): (&Reach, &f32)| f64::from(q.abs() * reach.factor);
+        let largest = modes().map(amount).fold(Products::least(), f64::max);
+        let one = |(reach, q): (&Reach, &f32)| {
+            let own = amount((reach, q)) * (products.coordinate + products.sum);
+            stored_length(reach) * (own + products.floor * largest)
+        };
+        modes().map(one).sum::<f64>() * norm(&step.transform) * ROUND_UP
     }
 
     /// Bounds of all vertices.

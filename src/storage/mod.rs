@@ -11,12 +11,14 @@
 //! and modes that fill up a quad or a chunk are zeros. Numbers have the machine's byte order.
 
 pub mod bound;
+mod halves;
 mod pack;
 #[cfg(test)]
 pub(crate) mod testing;
 mod tiles;
 mod truncation;
 
+pub use halves::{Halves, Products};
 pub use tiles::{Plane, Tile, Tiles};
 pub use truncation::{Amounts, Truncation, reaches};
 

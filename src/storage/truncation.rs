@@ -45,6 +45,11 @@ impl Truncation {
         Self { out: vec![false; rank], costs: vec![0.0; rank], ascending: all.clone(), kept: all, bound: 0.0 }
     }
 
+    /// Keeps all modes until the next step is decided, as if none had been before.
+    pub fn forget(&mut self) {
+        *self = Self::new(self.out.len());
+    }
+
     /// Decides for a step. `budget` is the farthest that a vertex may be off, in scene units.
     pub fn update(&mut self, amounts: Amounts, budget: f64) {
         for (cost, (q, reach)) in self.costs.iter_mut().zip(amounts.q.iter().zip(amounts.reaches)) {

@@ -5,8 +5,10 @@ use std::sync::Arc;
 use modalcast::deform::Deformer;
 use modalcast::domain::Transform;
 use modalcast::error::Error;
-use modalcast::gpu::{Batch, Cache, Device, Extent, Ours, Trial, gigabytes_per_second, time};
+use modalcast::gpu::{Batch, BatchMma, Cache, Device, Extent, Ours, Trial, gigabytes_per_second, time};
 use modalcast::scene::{Bounds, Scene, State, Storage};
+use modalcast::storage::bound::{Reaches, Step};
+use modalcast::storage::{Products, QUAD, TILE_QUADS, Tiles};
 
 use crate::judge::{POSITION, largest_error, same_bits};
 use crate::scenes::{self, Random};
@@ -74,6 +76,65 @@ fn judge(scene: &Scene, state: &State, positions: &[f32]) -> Result<f64, String>
     largest_error(positions, &want, POSITION * bounds.diagonal().max(1.0))
 }
 
+/// The largest error of a vertex over the bound of its tile: of U in 16 bits, of q in two numbers of 16 bits, and of the
+/// tensor cores' own sums.
+fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
+    let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
+    let tiles = Tiles::new(shape, storage);
+    let (reaches, products) = (Reaches::new(shape, &tiles), Products::of(storage, tiles.rank()));
+    let vertices = shape.mesh.rest().len();
+    let want = modalcast::reference::deform(scene, state);
+    let share = |(packed, got): (usize, &[f32; 3])| {
+        let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));
+        let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated: false };
+        let bound = reaches.tile(tile, &step).total() + reaches.products(tile, &step, products);
+        let square = |axis: usize| (f64::from(got[axis]) - want[packed][axis]).powi(2);
+        let error = (0..3).map(square).sum::<f64>().sqrt();
+        if error.is_nan() { f64::INFINITY } else { error / bound }
+    };
+    positions.as_chunks::<3>().0.iter().enumerate().map(share).fold(0.0, f64::max)
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_count() {
+    let device = Device::open(0).expect("a CUDA device");
+    for storage in [Storage::F16, Storage::Bf16] {
+        for (vertices, rank, count) in [
+            (1, 3, 1),
+            (33, 0, 2),
+            (64, 1, 16),
+            (127, 4, 5),
+            (128, 33, 16),
+            (129, 16, 8),
+            (261, 31, 32),
+            (2000, 32, 16),
+            (5003, 512, 13),
+        ] {
+            let scene = ensemble(vertices, rank, count, storage);
+            let states = states(&scene);
+            let batch = BatchMma::new(&device, &scene, &states).expect("a trial");
+            let name = format!("{} n {vertices} r {rank}", batch.name());
+            for (turn, state) in states.iter().enumerate() {
+                batch.launch(&device, turn).expect("launches");
+                let got = batch.positions(&device).expect("copies");
+                let share = of_bound(&scene, state, &got);
+                assert!(share <= 1.0, "{name} turn {turn}: {share} of the bound");
+                let other = of_bound(&scene, &states[(turn + 1) % states.len()], &got);
+                assert!(other > 1.0, "{name}: the judge can fail");
+                batch.launch(&device, turn).expect("launches");
+                assert!(same_bits(&got, &batch.positions(&device).expect("copies")), "{name}: run after run");
+            }
+            for facts in batch.kernels() {
+                assert!(facts.spilled_bytes == 0, "{name}: {facts:?}");
+            }
+        }
+    }
+    let refused = |scene: &Arc<Scene>| BatchMma::new(&device, scene, &states(scene)).expect_err("refused");
+    assert!(refused(&ensemble(9, 2, 2, Storage::F32)).to_string().contains("f16 or bf16"));
+    assert!(refused(&ensemble(9, 2, 33, Storage::F16)).to_string().contains("at most 32"));
+}
+
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_what_overflows_on_its_way_in_f32_is_mended_in_a_batch_too() {
@@ -125,8 +186,13 @@ fn gpu_sixteen_vectors_at_once_take_less_than_four_times_as_long_as_one() {
         let one = measure(&Ours::new(&device, &scene, &[state], Extent::Positions).expect("a trial"));
         let scene = ensemble(1_500_000, 32, 16, storage);
         let state = scenes::state(&scene, 1);
-        let sixteen = measure(&Batch::new(&device, &scene, &[state]).expect("a trial"));
+        let sixteen = measure(&Batch::new(&device, &scene, std::slice::from_ref(&state)).expect("a trial"));
         eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
         assert!(sixteen < 4.0 * one, "{storage:?} {one} {sixteen}");
+        if matches!(storage, Storage::F16 | Storage::Bf16) {
+            let products = measure(&BatchMma::new(&device, &scene, &[state]).expect("a trial"));
+            eprintln!("{} by tensor cores: {:.2} times as long as one", storage.name(), products / one);
+            assert!(products < 4.0 * one, "{storage:?} {one} {products}");
+        }
     }
 }

@@ -131,7 +131,7 @@ fn provoked_faults_are_seen() {
 
 /// A kernel that no deformer launches, only trials that are measured: its twin is a test of its launcher.
 fn is_only_measured(name: &str) -> bool {
-    name.starts_with("thesis_") || ["roof", "plain_update", "batch"].contains(&name)
+    name.starts_with("thesis_") || ["roof", "plain_update", "batch", "batch_mma"].contains(&name)
 }
 
 /// Kernels that put into one place what deformers on the host find there: their twin is a method of the scene's values.

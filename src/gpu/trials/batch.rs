@@ -88,7 +88,7 @@ impl Batch {
     /// `Invalid` when the scene is not 1 to 16 domains of one shape, or asks for compensated sums, or there is no state;
     /// `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State]) -> Result<Self> {
-        check(scene)?;
+        check(scene, MOST)?;
         let (storage, shape) = (scene.deformation.storage, scene.shape_of(0));
         let vectors = vectors_for(scene.domains.len());
         let defines: Vec<&str> = storage_define(storage).into_iter().chain(vectors.1).collect();
@@ -176,11 +176,11 @@ impl Trial for Batch {
     }
 }
 
-/// Refuses scenes that are not one shape, used by at most [`MOST`] domains.
-fn check(scene: &Scene) -> Result<()> {
+/// Refuses scenes that are not one shape, used by at most `most` domains.
+pub(super) fn check(scene: &Scene, most: usize) -> Result<()> {
     let (count, shape) = (scene.domains.len(), scene.domains[0].shape);
-    if count > MOST {
-        return Err(invalid("scene.domains", format!("at most {MOST}"), count));
+    if count > most {
+        return Err(invalid("scene.domains", format!("at most {most}"), count));
     }
     if let Some(other) = scene.domains.iter().position(|domain| domain.shape != shape) {
         return Err(invalid(
@@ -240,7 +240,8 @@ fn args(scene: &Scene, chunks: usize) -> BatchArgs {
     args
 }
 
-fn bytes(scene: &Scene, tiles: &Tiles) -> Vec<(&'static str, u64)> {
+/// What a launch must move, whichever kernel.
+pub(super) fn bytes(scene: &Scene, tiles: &Tiles) -> Vec<(&'static str, u64)> {
     let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
     vec![
         ("U", tiles.bytes().len() as u64),
@@ -256,14 +257,20 @@ fn bytes(scene: &Scene, tiles: &Tiles) -> Vec<(&'static str, u64)> {
 mod warp;
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::trial::tests::compile_all;
     use super::super::turns::tests::{Random, scene as trial_scene};
-    use super::warp::{Tables, Warp, placed};
+    pub(in super::super) use super::warp::placed;
+    use super::warp::{Tables, Warp};
     use super::*;
     use crate::scene::{Parts, Storage};
 
-    fn ensemble(vertices: usize, rank: usize, domains: usize, storage: Storage) -> (Arc<Scene>, State) {
+    pub(in super::super) fn ensemble(
+        vertices: usize,
+        rank: usize,
+        domains: usize,
+        storage: Storage,
+    ) -> (Arc<Scene>, State) {
         let (one, _) = trial_scene(&[(vertices, rank, 1)]);
         let mut parts = Parts::named("ensemble");
         parts.shapes = vec![one.shapes[0].clone()];
@@ -303,7 +310,7 @@ mod tests {
         [0, 1, 2].map(|row| placed(&state.transforms[domain].0[4 * row..], bent))
     }
 
-    const SIZES: [(usize, usize, usize); 12] = [
+    pub(in super::super) const SIZES: [(usize, usize, usize); 12] = [
         (1, 3, 1),
         (4, 1, 16),
         (63, 13, 2),
@@ -360,10 +367,10 @@ mod tests {
         // 64 KiB is what the smallest device has.
         assert!(shared_bytes(MOST, crate::domain::MAX_RANK) <= 64 << 10);
         let (scene, _) = ensemble(9, 2, 17, Storage::F32);
-        assert!(check(&scene).expect_err("17 domains").to_string().contains("at most 16"));
+        assert!(check(&scene, MOST).expect_err("17 domains").to_string().contains("at most 16"));
         let (scene, _) = trial_scene(&[(9, 2, 1), (9, 2, 1)]);
-        check(&scene).expect_err("two shapes");
-        check(&ensemble(9, 2, 16, Storage::F32).0).expect("16 of one shape");
+        check(&scene, MOST).expect_err("two shapes");
+        check(&ensemble(9, 2, 16, Storage::F32).0, MOST).expect("16 of one shape");
     }
 
     #[test]

@@ -20,7 +20,7 @@ const BATCH: usize = 25;
 const HOLD_US: u64 = 40;
 
 /// The most turns that are rotated: enough that no replay finds the q of the one before.
-const MOST_GRAPHS: usize = 8;
+pub(super) const MOST_GRAPHS: usize = 8;
 
 /// How long a trial runs before it is timed, so that the clocks are up.
 const WARM_UP: Duration = Duration::from_millis(30);

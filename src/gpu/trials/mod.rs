@@ -9,11 +9,13 @@
 //! | [`roof`] | the best rates of the device, to compare with |
 //! | [`ours`] | the deformer's own kernels as a trial |
 //! | [`mod@batch`] | many vectors q of one U at once |
+//! | [`mod@batch_mma`] | the same by tensor cores, with an order and a rounding of its own |
 //! | [`mod@ingest`] | the way of a step's values to the device |
 //! | [`cublas`], [`plain_update`] | a library's products, and the vertex update behind them |
 //! | [`thesis`] | the kernels of the thesis |
 
 mod batch;
+mod batch_mma;
 mod cublas;
 mod ingest;
 mod measure;
@@ -25,6 +27,7 @@ mod trial;
 mod turns;
 
 pub use batch::Batch;
+pub use batch_mma::BatchMma;
 pub use cublas::{Cublas, Peer, cublas_version};
 pub use ingest::ingest;
 pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};

@@ -14,10 +14,12 @@ use super::super::layout::Header;
 use super::super::memory::{address, download, room};
 use super::super::normals::Normals;
 use super::super::plan::{Kernel, Launch, Plan, Role, plan};
+use super::measure::MOST_GRAPHS;
 use super::trial::{KernelFacts, Trial};
 use super::turns::Turns;
 use crate::error::{Result, during, invalid};
 use crate::scene::{Scene, State};
+use crate::storage::modes_per_chunk;
 
 /// Which part of a step is launched.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -142,6 +144,22 @@ impl Ours {
         }
     }
 
+    /// Of the chunks of modes of all domains that have any, those that are summed, mean over the turns that are timed.
+    fn kept(&self) -> Option<f64> {
+        let per_chunk = modes_per_chunk(self.scene.deformation.storage);
+        let weigh = |chunks: &dyn Fn(usize) -> usize| -> f64 {
+            let slots = self.scene.layout.slots.iter().enumerate();
+            slots.map(|(domain, slot)| slot.vertices as f64 * chunks(domain) as f64).sum()
+        };
+        let all = weigh(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
+        let shares = self.inputs.iter().take(MOST_GRAPHS).map(|inputs| {
+            let kept = inputs.kept_chunks()?;
+            Some(weigh(&|domain| kept[domain] as usize) / all.max(1.0))
+        });
+        let shares: Vec<f64> = shares.collect::<Option<_>>()?;
+        Some(shares.iter().sum::<f64>() / shares.len().max(1) as f64)
+    }
+
     fn values(&self, device: &Device, turn: usize) -> Values {
         self.inputs[turn % self.inputs.len()].values(device)
     }
@@ -235,15 +253,17 @@ impl Trial for Ours {
         if self.extent != Extent::Uq {
             return Ok(numbers);
         }
+        let slots = &self.scene.layout.slots;
         Ok(self.turns.finish_on_host(|domain, vertex| {
-            let at = 3 * (self.scene.layout.slots[domain].first_vertex + vertex);
+            let at = 3 * (slots[domain].first_vertex + vertex);
             [numbers[at], numbers[at + 1], numbers[at + 2]]
         }))
     }
 
     fn bytes(&self) -> Vec<(&'static str, u64)> {
         let Counts { vertices, transforms, coordinates, words, rest } = self.counts;
-        let mut bytes = vec![("U", words), ("scales", self.plan.bytes(Role::Scales)), ("q", 4 * coordinates)];
+        let words = self.kept().map_or(("U", words), |share| ("U kept", (share * words as f64) as u64));
+        let mut bytes = vec![words, ("scales", self.plan.bytes(Role::Scales)), ("q", 4 * coordinates)];
         bytes.push(("u or x", 12 * vertices));
         if self.extent != Extent::Uq {
             bytes.extend([("x0", rest), ("T", transforms)]);

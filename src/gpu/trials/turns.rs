@@ -4,6 +4,7 @@ use std::cell::Cell;
 use std::sync::Arc;
 
 use cudarc::driver::CudaSlice;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::super::device::Device;
@@ -30,6 +31,9 @@ impl Part {
         }
     }
 }
+
+/// The fewest vertices that a core places on the host at a time.
+const SHARE: usize = 4096;
 
 /// The values of one turn, as addresses on the device.
 #[derive(Debug, Clone, Copy)]
@@ -100,17 +104,21 @@ impl Turns {
     }
 
     /// x = T (x0 + u) of the last turn, in f64 and rounded once, so that the error of u alone is left.
-    pub(super) fn finish_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3]) -> Vec<f32> {
+    pub(super) fn finish_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
         let state = &self.states[self.last.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
+        let mut placed: Vec<[f32; 3]> = Vec::new();
         for domain in 0..self.scene.domains.len() {
             let t = state.composed(&self.scene, domain).exact();
-            for (vertex, rest) in self.scene.shape_of(domain).mesh.rest().iter().enumerate() {
+            let place = |(vertex, rest): (usize, &[f32; 3])| {
                 let u = u(domain, vertex);
                 let [x, y, z] = [0, 1, 2].map(|axis| f64::from(rest[axis]) + f64::from(u[axis]));
                 let row = |row: usize| t[4 * row] * x + t[4 * row + 1] * y + t[4 * row + 2] * z + t[4 * row + 3];
-                positions.extend([0, 1, 2].map(|axis| row(axis) as f32));
-            }
+                [0, 1, 2].map(|axis| row(axis) as f32)
+            };
+            let rest = self.scene.shape_of(domain).mesh.rest().par_iter().enumerate();
+            rest.with_min_len(SHARE).map(place).collect_into_vec(&mut placed);
+            positions.extend_from_slice(placed.as_flattened());
         }
         positions
     }

@@ -153,6 +153,6 @@ impl<'a> Warp<'a> {
     }
 }
 
-pub(super) fn placed(row: &[f32], [x, y, z]: [f32; 3]) -> f32 {
+pub(in super::super) fn placed(row: &[f32], [x, y, z]: [f32; 3]) -> f32 {
     row[0].mul_add(x, row[1].mul_add(y, row[2].mul_add(z, row[3])))
 }

@@ -119,9 +119,10 @@ impl Trial for Cublas {
         let mut u = vec![0.0_f32; self.batches.floats[2] as usize];
         // SAFETY: the buffer has as many floats.
         unsafe { download(device, address(device, &self.u), &mut u) }?;
+        let places = &self.places;
         Ok(self.turns.finish_on_host(|domain, vertex| {
             let of = |first: u64| [0, 1, 2].map(|axis| u[first as usize + 3 * vertex + axis]);
-            self.places[domain].map_or([0.0; 3], of)
+            places[domain].map_or([0.0; 3], of)
         }))
     }
 
