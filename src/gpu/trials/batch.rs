@@ -192,6 +192,9 @@ pub(super) fn check(scene: &Scene, most: usize) -> Result<()> {
     if scene.deformation.compensated {
         return Err(invalid("deform.compensated", "false for the batched kernel", true));
     }
+    if scene.needs.followers {
+        return Err(invalid("follows", "no followers for the batched kernel", true));
+    }
     Ok(())
 }
 

@@ -169,7 +169,7 @@ impl Kernel {
     /// Leaves out what the part of the step does without.
     fn shape_for(&mut self, extent: Extent) {
         if extent != Extent::Whole {
-            self.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS"].contains(define));
+            self.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"].contains(define));
         }
         if extent == Extent::Uq {
             self.defines.retain(|define| *define != "DISPLACEMENTS");
