@@ -1,6 +1,11 @@
 //! What every deformer does: x = T (x0 + U q) for all vertices of a scene, and the normals that go with it.
 //!
+//! Vertices are asked for: by [`Deformer::surface`], which waits for them, or by [`Deformer::fetch`], after which the
+//! next step can be deformed while they are on their way.
+//!
 //! Three deformers implement it: `reference` (f64, the definition), `cpu` (f32, rayon and SIMD) and `gpu` (CUDA).
+
+use std::sync::Arc;
 
 use crate::error::Result;
 use crate::scene::{Bounds, State};
@@ -15,6 +20,26 @@ pub struct Surface {
     pub normals: Vec<f32>,
     /// World unit tangents and bitangent signs, four numbers per corner; empty when the scene has no normal map.
     pub tangents: Vec<f32>,
+}
+
+/// Vertices on their way to host memory, or there already. Each is of one step, whatever is deformed later; it can be
+/// waited for late, more than once, or not at all. Its memory is kept while this or what [`Deformer::fetched`] returned
+/// is held.
+#[derive(Debug, Clone)]
+pub struct Fetch {
+    surface: Arc<Surface>,
+}
+
+impl Fetch {
+    /// Of vertices that [`Deformer::fetched`] waits for.
+    pub const fn new(surface: Arc<Surface>) -> Self {
+        Self { surface }
+    }
+
+    /// Where they go; not to be looked into before they are there.
+    pub(crate) const fn surface(&self) -> &Arc<Surface> {
+        &self.surface
+    }
 }
 
 /// The backends by name.
@@ -67,4 +92,23 @@ pub trait Deformer {
     /// # Errors
     /// `Fault` when copying from the device failed.
     fn surface(&mut self) -> Result<&Surface>;
+
+    /// Begins to bring the positions and normals of the last [`Self::deform`] to the host. Tangents are for the renderer
+    /// alone and stay.
+    ///
+    /// # Errors
+    /// `Fault` when nothing was deformed or copying from the device failed.
+    fn fetch(&mut self) -> Result<Fetch> {
+        let surface = self.surface()?;
+        let (positions, normals) = (surface.positions.clone(), surface.normals.clone());
+        Ok(Fetch::new(Arc::new(Surface { positions, normals, ..Surface::default() })))
+    }
+
+    /// Waits until they are there.
+    ///
+    /// # Errors
+    /// `Fault` when copying from the device failed, or when they are another deformer's.
+    fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
+        Ok(Arc::clone(&fetch.surface))
+    }
 }

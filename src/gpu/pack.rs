@@ -73,7 +73,7 @@ pub(super) fn tangent_count(scene: &Scene) -> usize {
 pub(super) mod tests {
     use super::*;
     use crate::domain::{Attachment, Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-    use crate::scene::{Normals, Parts, Storage};
+    use crate::scene::{Deformation, Normals, Parts, Storage};
     use std::sync::Arc;
 
     fn shape(vertices: usize, rank: usize) -> Shape {
@@ -112,6 +112,13 @@ pub(super) mod tests {
     pub(in super::super) fn stored(shapes: &[(usize, usize)], storage: Storage) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.storage = storage;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// The same without normal maps, deformed so.
+    pub(in super::super) fn deformed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.deformation = deformation;
         Scene::new(parts).expect("a scene")
     }
 

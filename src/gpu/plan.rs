@@ -7,7 +7,7 @@ use super::inputs::Sizes;
 use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
 use super::pack;
 use super::rings::Counts;
-use super::work::{Coordinates, Work, corner_shifts, orients};
+use super::work::{Coordinates, Work, orients};
 use crate::error::{Error, Result};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
@@ -51,7 +51,7 @@ pub enum Launch {
     Bounds,
     /// Normals that follow the surface.
     Normals,
-    /// In steps that change few domains, before all others.
+    /// In steps that change few domains, before all others; in scenes where there can be such steps.
     Apply,
 }
 
@@ -88,7 +88,7 @@ pub enum Role {
     Rest,
     /// Scales of U, with `Int8`.
     Scales,
-    /// The work of each warp, and a list of some of it.
+    /// The work of each warp, and a list of some of it where there can be lists.
     Tiles,
     Lanes,
     /// From vertices to corners, per domain; where they differ.
@@ -143,30 +143,48 @@ pub struct Plan {
     /// Bytes to the device and from it in each step, besides the vertices themselves.
     pub bytes_in: u64,
     pub bytes_out: u64,
-    /// Pinned bytes of the list of changed domains.
+    /// Pinned bytes of the list of changed domains; 0 for a scene whose steps are always whole.
     pub bytes_of_changes: u64,
     pub left_out: Vec<LeftOut>,
 }
 
+/// Where everything lies: made once, planned from and then uploaded.
+#[derive(Debug)]
+pub(super) struct Tables {
+    pub coordinates: Coordinates,
+    pub work: Work,
+}
+
+impl Tables {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let coordinates = Coordinates::new(scene);
+        Self { work: Work::new(scene, &coordinates), coordinates }
+    }
+}
+
 /// What a scene costs.
 pub fn plan(scene: &Scene) -> Plan {
+    plan_of(scene, &Tables::new(scene))
+}
+
+/// The same from tables that are there.
+pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work }: &Tables) -> Plan {
     let needs = scene.needs;
     let layout = &scene.layout;
-    let coordinates = Coordinates::new(scene);
-    let work = Work::new(scene, &coordinates);
-    let kernels = kernels(scene, &work);
+    let kernels = kernels(scene, work);
+    let lists = most_changes(scene) > 0;
     let rest_corners = pack::rest_corners(scene) as u64;
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let domains = scene.domains.len() as u64;
-    let inputs = Sizes::of(scene, &coordinates).total();
+    let inputs = Sizes::of(scene, coordinates).total();
     let directed = if orients(scene) { work.quads.end - work.quads.directed } else { 0 };
     let mut buffers = vec![
         (Role::Words, 16 * work.words),
         (Role::Rest, 48 * work.quads.rest),
         (Role::Scales, 4 * work.scales),
-        (Role::Tiles, ((size_of::<Tile>() + 4) * work.tiles.len()) as u64),
+        (Role::Tiles, ((size_of::<Tile>() + if lists { 4 } else { 0 }) * work.tiles.len()) as u64),
         (Role::Lanes, (work.lanes.len() * size_of::<Lane>() + 4 * work.lane_scales.len()) as u64),
-        (Role::CornerShifts, 4 * corner_shifts(scene).len() as u64),
+        (Role::CornerShifts, 4 * work.corner_shifts.len() as u64),
         (Role::Boxes, 96 * work.tiles.len() as u64),
         (Role::Stamps, 4 * domains),
         (Role::RestNormals, if needs.exact_normals { 12 * rest_corners } else { 48 * directed }),
@@ -188,8 +206,10 @@ pub fn plan(scene: &Scene) -> Plan {
         buffers.push((Role::Rings, 4 * (counts.groups + 1 + counts.rings)));
         buffers.push((Role::GroupNormals, 12 * counts.groups));
     }
-    let changes =
-        (size_of::<Change>() + 48) * most_changes(scene.domains.len()) + 4 * (coordinates.total + work.tiles.len());
+    let changes = match most_changes(scene) {
+        0 => 0,
+        most => (size_of::<Change>() + 48) * most + 4 * (coordinates.total + work.tiles.len()),
+    };
     Plan {
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
@@ -238,12 +258,14 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
         Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: Source(kernel.source) }
     };
     let boxes = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
-    let changes = most_changes(scene.domains.len()).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
     let mut kernels = vec![deform, walk(Launch::Bounds, &bounds, boxes)];
     if needs.exact_normals {
         kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
     }
-    kernels.push(walk(Launch::Apply, &apply, changes));
+    let changes = most_changes(scene);
+    if changes > 0 {
+        kernels.push(walk(Launch::Apply, &apply, changes.div_ceil(BLOCK as usize / 32).min(MOST_BLOCKS)));
+    }
     kernels
 }
 
@@ -256,7 +278,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
         ("TRUNCATED", needs.truncation),
         ("COMPENSATED", needs.compensated),
         ("ORIENT", orients),
-        ("SHIFTED", !corner_shifts(scene).is_empty()),
+        ("SHIFTED", !work.corner_shifts.is_empty()),
         ("NORMAL_MAPS", orients && needs.normal_maps),
         ("SHEAR", orients && needs.shear),
     ];
@@ -324,9 +346,10 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
-    use super::super::pack::tests::{exact, scene, stored};
+    use super::super::pack::tests::{deformed, exact, scene, stored};
     use super::super::rings::Rings;
     use super::*;
+    use crate::scene::Deformation;
 
     fn defines(plan: &Plan) -> Vec<(&str, Vec<&str>)> {
         plan.kernels.iter().map(|kernel| (kernel.name, kernel.defines.clone())).collect()
@@ -393,7 +416,21 @@ mod tests {
     #[test]
     fn launches_do_not_grow_with_the_number_of_domains() {
         let (few, many) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
-        assert_eq!((plan(&few).launches(), plan(&many).launches()), (3, 3));
+        assert_eq!((plan(&few).launches(), plan(&many).launches()), (2, 3));
+    }
+
+    #[test]
+    fn a_scene_whose_steps_are_always_whole_plans_nothing_for_lists() {
+        let lists = |scene: &Scene| {
+            let plan = plan(scene);
+            assert_eq!(plan.kernel(Launch::Apply).is_some(), plan.bytes_of_changes > 0);
+            plan.bytes_of_changes > 0
+        };
+        // Two instances of each shape.
+        assert!(!lists(&scene(&[(7, 1)], false, false)), "a quarter of two domains is none");
+        assert!(lists(&scene(&[(7, 1), (7, 1)], false, false)));
+        let truncated = Deformation { truncation: Some(0.1), ..Deformation::default() };
+        assert!(!lists(&deformed(&[(7, 1), (7, 1)], truncated)), "the kept modes go with the whole state");
     }
 
     #[test]
@@ -404,7 +441,7 @@ mod tests {
         for (role, bytes) in [
             (Role::Tiles, size_of_val(work.tiles.as_slice()) + 4 * work.tiles.len()),
             (Role::Lanes, size_of_val(work.lanes.as_slice())),
-            (Role::CornerShifts, size_of_val(corner_shifts(&scene).as_slice())),
+            (Role::CornerShifts, size_of_val(work.corner_shifts.as_slice())),
         ] {
             assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
         }
