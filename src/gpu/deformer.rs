@@ -100,6 +100,11 @@ impl CudaDeformer {
         &self.plan
     }
 
+    /// Outputs that there are: two once vertices were fetched beside a step.
+    pub fn outputs(&self) -> usize {
+        self.output.count()
+    }
+
     /// How far the modes that were left out may have moved a vertex in the last step, scene units.
     pub fn truncation_bound(&self) -> f64 {
         self.inputs.truncation_bound()
@@ -132,6 +137,11 @@ impl CudaDeformer {
         let (flight, begin) = self.under_way.pop_front().ok_or_else(none)?;
         let bounds = self.flights[flight].wait().inspect_err(|_| self.forget())?;
         Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+    }
+
+    /// Starts the whole graph of the last step once more, for measuring it alone: outputs of our own stay where they are.
+    pub(super) fn replay(&self) -> Result<()> {
+        self.flights[self.last].launch(false)
     }
 
     /// Writes a step's values and starts its graph; the flight that it took.
@@ -181,13 +191,14 @@ impl CudaDeformer {
         Ok(self.flights.len() - 1)
     }
 
-    /// After a fault: waits for what is in flight, because the next step overwrites what it reads, and takes no output
-    /// and no value on the device for whole.
-    fn forget(&mut self) {
+    /// Waits for what is under way, because the next step overwrites what it reads, and takes no output and no value on
+    /// the device for whole. So does every step that fails.
+    pub fn forget(&mut self) {
         // Failures of their own add nothing.
         self.device.stream().synchronize().ok();
         self.fetches.synchronize();
         self.under_way.clear();
+        self.fetch = None;
         self.rotation.forget();
     }
 

@@ -55,8 +55,9 @@ pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use trials::{
-    Batch, Cache, Cublas, Extent, KernelFacts, Lanes, Ours, Part, Peer, Roofs, Split, Thesis, Timing, Trial,
-    cublas_version, empty_replay, gigabytes_per_second, idle_in_warp, ingest, lanes, roofs, time,
+    Batch, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Roofs, Split, Thesis,
+    Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes, idle_in_warp, ingest, lanes,
+    overlap, roofs, time,
 };
 
 /// OpenGL buffers to write into, by name.

@@ -86,6 +86,14 @@ impl Output {
         if self.is_shared() { 1 } else { 2 }
     }
 
+    /// Sets that there are.
+    pub(super) fn count(&self) -> usize {
+        match self {
+            Self::Own(sets) => sets.len(),
+            Self::Shared(_) => 1,
+        }
+    }
+
     /// Makes a set if it is not there.
     ///
     /// # Errors

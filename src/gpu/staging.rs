@@ -8,7 +8,7 @@ use rayon::prelude::*;
 /// Bytes from which several cores write: below, waking them takes as long as the writing.
 pub(super) const PARALLEL: usize = 1 << 20;
 /// Words of one core's part: long runs, of which there are enough for many cores.
-pub(super) const PART: usize = 1 << 15;
+const PART: usize = 1 << 15;
 
 /// The unwritten rest of a list, written from its front.
 pub(super) struct Front<'a>(&'a mut [f32]);
@@ -33,10 +33,11 @@ impl<'a> Front<'a> {
 
 /// Copies on as many cores as pay.
 fn copy(to: &mut [f32], from: &[f32]) {
-    if size_of_val(from) < PARALLEL {
-        to.copy_from_slice(from);
-        return;
-    }
+    if size_of_val(from) < PARALLEL { to.copy_from_slice(from) } else { copy_on_all_cores(to, from) }
+}
+
+/// Copies part by part; both lists have one length.
+pub(super) fn copy_on_all_cores(to: &mut [f32], from: &[f32]) {
     to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| to.copy_from_slice(from));
 }
 
