@@ -28,12 +28,23 @@ pub struct Surface {
 #[derive(Debug, Clone)]
 pub struct Fetch {
     surface: Arc<Surface>,
+    there: bool,
 }
 
 impl Fetch {
     /// Of vertices that [`Deformer::fetched`] waits for.
-    pub const fn new(surface: Arc<Surface>) -> Self {
-        Self { surface }
+    pub const fn under_way(surface: Arc<Surface>) -> Self {
+        Self { surface, there: false }
+    }
+
+    /// Of vertices that are there.
+    pub const fn there(surface: Arc<Surface>) -> Self {
+        Self { surface, there: true }
+    }
+
+    /// Whether they were there from the beginning, so that [`Deformer::fetched`] has nothing to wait for.
+    pub const fn is_there(&self) -> bool {
+        self.there
     }
 
     /// Where they go; not to be looked into before they are there.
@@ -101,7 +112,7 @@ pub trait Deformer {
     fn fetch(&mut self) -> Result<Fetch> {
         let surface = self.surface()?;
         let (positions, normals) = (surface.positions.clone(), surface.normals.clone());
-        Ok(Fetch::new(Arc::new(Surface { positions, normals, ..Surface::default() })))
+        Ok(Fetch::there(Arc::new(Surface { positions, normals, ..Surface::default() })))
     }
 
     /// Waits until they are there.

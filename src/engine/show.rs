@@ -4,11 +4,26 @@ use std::mem;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::conductor::Conductor;
+use super::conductor::{Conductor, Done};
 use super::viewer::{Body, Delivery, Shown, StepName, View, Viewer};
+use super::worker::{Asked, Copied};
 use crate::deform::Surface;
 use crate::error::{Error, Result};
+use crate::scene::Cells;
 use crate::telemetry::{Stage, StageTimes};
+
+/// Vertices of a step that leave the device while the next step is computed, and who waits for them.
+pub(super) struct Late {
+    copying: Asked<Copied>,
+    /// What is shown with them; `skipped` is each viewer's own.
+    step: StepName,
+    stages: StageTimes,
+    cells: Option<Arc<Cells>>,
+    /// With the steps that each has missed.
+    viewers: Vec<(Viewer, u64)>,
+    /// The step's acknowledgement, which comes after its vertices.
+    pub done: Option<Done>,
+}
 
 impl Conductor {
     /// Answers every request whose step is there or gone; forgets those that nobody waits for.
@@ -30,13 +45,55 @@ impl Conductor {
     }
 
     /// Gives the current step to every viewer that has room for it. A lossless viewer without room holds back the
-    /// writer while `holds_back`, and is cut off when it does so for too long.
-    pub(super) async fn serve_viewers(&mut self, holds_back: bool) {
+    /// writer while `holds_back`, and is cut off when it does so for too long. While a next step waits, vertices are only
+    /// begun: they are returned, and come to [`Self::deliver`] once that step is under way.
+    pub(super) async fn serve_viewers(&mut self, holds_back: bool) -> Option<Late> {
+        let mut late: Vec<(Viewer, u64)> = Vec::new();
+        let beside = self.has_next() && self.surface.is_none();
         for mut viewer in mem::take(&mut self.viewers) {
-            if !viewer.is_gone() && self.serve(&mut viewer, holds_back).await {
+            if viewer.is_gone() {
+                continue;
+            }
+            if beside && viewer.view == View::Vertices && viewer.seen < self.count && viewer.has_room() {
+                let skipped = self.see(&mut viewer);
+                late.push((viewer, skipped));
+            } else if self.serve(&mut viewer, holds_back).await {
                 self.viewers.push(viewer);
             }
         }
+        (!late.is_empty()).then(|| Late {
+            copying: self.means.worker.copy(self.id),
+            step: StepName::of(&self.state),
+            stages: self.stages.clone(),
+            cells: self.state.cells.clone(),
+            viewers: late,
+            done: None,
+        })
+    }
+
+    /// Waits for vertices that were begun and hands them over; returns what is to be acknowledged then.
+    pub(super) async fn deliver(&mut self, late: Late) -> Option<Done> {
+        let Late { copying, step, mut stages, cells, viewers, done } = late;
+        let copied = copying.wait().await.map(|(surface, copy_ms)| {
+            stages.push((Stage::Copy, copy_ms));
+            surface
+        });
+        for (viewer, skipped) in viewers {
+            let body = copied.clone().map(Body::Vertices);
+            let (stages, cells) = (stages.clone(), cells.clone());
+            if viewer.deliver(body.map(|body| Shown { step, skipped, stages, cells, body })) {
+                self.viewers.push(viewer);
+            }
+        }
+        done
+    }
+
+    /// Notes that a viewer gets the current step; how many it has missed.
+    fn see(&self, viewer: &mut Viewer) -> u64 {
+        let skipped = self.count - viewer.seen - 1;
+        viewer.seen = self.count;
+        viewer.stalled = None;
+        skipped
     }
 
     /// False when the viewer is to be dropped.
@@ -45,9 +102,7 @@ impl Conductor {
             return true;
         }
         if viewer.has_room() {
-            let skipped = self.count - viewer.seen - 1;
-            viewer.seen = self.count;
-            viewer.stalled = None;
+            let skipped = self.see(viewer);
             let shown = self.show(&viewer.view, skipped).await;
             return viewer.deliver(shown);
         }
@@ -88,7 +143,7 @@ impl Conductor {
         if let Some((surface, copy_ms)) = &self.surface {
             return Ok((Arc::clone(surface), *copy_ms));
         }
-        let copied = self.means.worker.copy(self.id).await?;
+        let copied = self.means.worker.copy(self.id).wait().await?;
         self.surface = Some(copied.clone());
         Ok(copied)
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::deform::{Deformed, Deformer, Surface};
+use crate::deform::{Deformed, Deformer, Fetch, Surface};
 use crate::error::{Error, Result, during, invalid};
 use crate::render::{Renderer, SceneBuffers};
 use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
@@ -105,6 +105,16 @@ impl Staged {
         let (positions, bounds) = apart.seen_from(view, &self.scene.layout.slots, positions);
         renderer.upload_apart(buffers, &positions, view)?;
         Ok((bounds, true))
+    }
+
+    /// Begins to bring positions and normals of the last deformation to host memory, beside what is deformed next.
+    pub(super) fn fetch(&mut self) -> Result<Fetch> {
+        self.deformer.fetch()
+    }
+
+    /// Waits until they are there.
+    pub(super) fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
+        self.deformer.fetched(fetch)
     }
 
     /// Makes the buffers if need be and fills those that the deformer does not write itself.

@@ -91,7 +91,7 @@ impl Fetches {
         slot.there.record(&own).map_err(&fail)?;
         self.ends[order.set].record(&own).map_err(&fail)?;
         slot.number = order.number;
-        Ok(Fetch::new(Arc::clone(&slot.surface)))
+        Ok(Fetch::under_way(Arc::clone(&slot.surface)))
     }
 
     /// Waits for a copy; its surface and its number.
