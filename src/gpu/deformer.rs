@@ -162,7 +162,8 @@ impl CudaDeformer {
             _ => None,
         };
         let header = header(&turn, some, self.rotation.everything(some.is_none()));
-        if turn.is_read {
+        // OpenGL's buffers were copied aside on this very stream.
+        if turn.is_read && !self.output.is_shared() {
             self.fetches.let_pass(&self.device, turn.output)?;
         }
         // Normals that follow the surface read its positions again.

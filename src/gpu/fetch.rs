@@ -5,15 +5,18 @@
 //! copy k                     [copy out      ]
 //! step k+1                   [copy in][kernels]      into the other output
 //! ```
+//! OpenGL's buffers cannot take turns: they are copied to a back buffer on the device first, which takes a small part of
+//! the time of the way out, and the next step may overwrite them then.
+//!
 //! Nothing here is made for a scene whose vertices nobody fetches.
 
 use std::sync::Arc;
 
-use cudarc::driver::{CudaEvent, CudaStream, result};
+use cudarc::driver::{CudaEvent, CudaSlice, CudaStream, result};
 
 use super::device::Device;
 use super::interop::Access;
-use super::memory::PageLock;
+use super::memory::{PageLock, address, room};
 use super::output::{Output, Use};
 use crate::deform::{Fetch, Surface};
 use crate::error::{Error, Result, during};
@@ -28,8 +31,19 @@ const SPARE: usize = 3;
 pub(super) struct Fetches {
     stream: Option<Arc<CudaStream>>,
     slots: Vec<Slot>,
-    /// Per output set, the end of the last copy from it.
-    ends: Vec<Arc<CudaEvent>>,
+    /// Per output set, or of the back buffer, the end of the last copy from it.
+    ends: Vec<CudaEvent>,
+    /// With OpenGL's buffers.
+    back: Option<Back>,
+}
+
+/// A copy of OpenGL's buffers on the device.
+#[derive(Debug)]
+struct Back {
+    positions: CudaSlice<u8>,
+    normals: CudaSlice<u8>,
+    /// The end of the last copy into it.
+    filled: CudaEvent,
 }
 
 /// One surface on the host.
@@ -62,36 +76,67 @@ impl Fetches {
     /// Starts the copy of positions and normals.
     pub(super) fn start(&mut self, device: &Device, output: &mut Output, order: Order<'_>) -> Result<Fetch> {
         let fail = during(STAGE);
-        let own = match (output.is_shared(), &self.stream) {
-            // OpenGL's buffers are mapped on the device's stream, and copied there.
-            (true, _) => Arc::clone(device.stream()),
-            (false, Some(stream)) => Arc::clone(stream),
-            (false, None) => {
-                let stream = device.context().new_stream().map_err(&fail)?;
-                Arc::clone(self.stream.insert(stream))
-            }
+        let own = match &self.stream {
+            Some(stream) => Arc::clone(stream),
+            None => Arc::clone(self.stream.insert(device.context().new_stream().map_err(&fail)?)),
         };
         while self.ends.len() <= order.set {
-            self.ends.push(Arc::new(device.context().new_event(None).map_err(&fail)?));
+            self.ends.push(device.context().new_event(None).map_err(&fail)?);
         }
         let at = self.free_slot(device, order.lengths)?;
+        let from = if output.is_shared() {
+            self.fill_back(device, output, &order, &own)?
+        } else {
+            own.wait(order.after).map_err(&fail)?;
+            addresses(device, output, order.set)?
+        };
         let slot = &mut self.slots[at];
-        own.wait(order.after).map_err(&fail)?;
-        output.with(device, Use { set: order.set, access: Access::Read }, |from| {
-            let taken = || Error::Fault { stage: STAGE, reason: "the memory is in use".into() };
-            let surface = Arc::get_mut(&mut slot.surface).ok_or_else(taken)?;
-            for (from, to) in [(from.positions, &mut surface.positions), (from.normals, &mut surface.normals)] {
-                // SAFETY: the outputs have the bytes of the plan, from which the lists have their lengths. Nobody looks
-                // at the lists before the copy's event was waited for, the slot keeps them, and it goes after the
-                // stream was waited for.
-                unsafe { copy(from, to, &own) }?;
-            }
-            Ok(())
-        })?;
+        let taken = || Error::Fault { stage: STAGE, reason: "the memory is in use".into() };
+        let surface = Arc::get_mut(&mut slot.surface).ok_or_else(taken)?;
+        for (from, to) in from.into_iter().zip([&mut surface.positions, &mut surface.normals]) {
+            // SAFETY: the outputs have the bytes of the plan, from which the lists have their lengths. Nobody looks at the
+            // lists before the copy's event was waited for, the slot keeps them, and it goes after the stream was waited
+            // for.
+            unsafe { copy(from, to, &own) }?;
+        }
         slot.there.record(&own).map_err(&fail)?;
         self.ends[order.set].record(&own).map_err(&fail)?;
         slot.number = order.number;
         Ok(Fetch::under_way(Arc::clone(&slot.surface)))
+    }
+
+    /// Copies OpenGL's buffers aside, and lets `own` wait for that; where the copies lie.
+    fn fill_back(
+        &mut self,
+        device: &Device,
+        output: &mut Output,
+        order: &Order<'_>,
+        own: &CudaStream,
+    ) -> Result<[u64; 2]> {
+        let bytes = order.lengths.map(|length| 4 * length);
+        self.let_pass(device, order.set)?;
+        let back = match &mut self.back {
+            Some(back) => back,
+            none => none.insert(Back {
+                positions: room(device, bytes[0] as u64)?,
+                normals: room(device, bytes[1] as u64)?,
+                filled: device.context().new_event(None).map_err(during(STAGE))?,
+            }),
+        };
+        let to = [address(device, &back.positions), address(device, &back.normals)];
+        output.with(device, Use { set: order.set, access: Access::Read }, |from| {
+            let copies = [from.positions, from.normals].into_iter().zip(to).zip(bytes);
+            for ((from, to), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
+                // SAFETY: the outputs have the bytes of the plan, and the back buffer was made of the same numbers. Both
+                // live until the stream was waited for.
+                unsafe { result::memcpy_dtod_async(to, from, bytes, device.stream().cu_stream()) }
+                    .map_err(during(STAGE))?;
+            }
+            Ok(())
+        })?;
+        back.filled.record(device.stream()).map_err(during(STAGE))?;
+        own.wait(&back.filled).map_err(during(STAGE))?;
+        Ok(to)
     }
 
     /// Waits for a copy; its surface and its number.
@@ -135,6 +180,16 @@ impl Fetches {
         self.slots.push(Slot::new(device, lengths)?);
         Ok(self.slots.len() - 1)
     }
+}
+
+/// Where positions and normals of a set of our own lie.
+fn addresses(device: &Device, output: &mut Output, set: usize) -> Result<[u64; 2]> {
+    let mut found = [0; 2];
+    output.with(device, Use { set, access: Access::Read }, |from| {
+        found = [from.positions, from.normals];
+        Ok(())
+    })?;
+    Ok(found)
 }
 
 impl Slot {

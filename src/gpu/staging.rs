@@ -5,7 +5,7 @@ use std::ops::Range;
 use bytemuck::Pod;
 use rayon::prelude::*;
 
-/// Bytes from which several cores write: below, waking them takes as long as the writing.
+/// Bytes from which several cores write. `report deform` measures both ways on either side of it (`host_writes`).
 pub(super) const PARALLEL: usize = 1 << 20;
 /// Words of one core's part: long runs, of which there are enough for many cores.
 const PART: usize = 1 << 15;

@@ -46,6 +46,34 @@ fn gpu_vertices_in_shared_buffers_equal_the_twin_and_the_copied_ones_bit_by_bit(
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
+fn gpu_shared_buffers_are_fetched_beside_the_step_that_overwrites_them() {
+    let (mut renderer, device, scene) = stage();
+    let buffers = renderer.load(&scene).expect("loads");
+    let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&buffers))).expect("a deformer");
+    let mut plain = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    assert!(direct.shares_buffers(), "interop was refused");
+    let mut before = None;
+    for seed in 0..50 {
+        let state = scenes::state(&scene, seed);
+        direct.deform(&state).expect("deforms");
+        plain.deform(&state).expect("deforms");
+        let want = plain.surface().expect("copies").clone();
+        let next = (direct.fetch().expect("begins"), want);
+        if let Some((fetch, want)) = before.replace(next) {
+            let got = direct.fetched(&fetch).expect("arrives");
+            assert!(same_bits(&got.positions, &want.positions), "step {seed}");
+            assert!(same_bits(&got.normals, &want.normals), "step {seed}");
+            let now = &before.as_ref().expect("there").1;
+            assert!(!same_bits(&got.positions, &now.positions), "the judge can fail");
+        }
+    }
+    assert_eq!(direct.outputs(), 1, "OpenGL draws from the one there is");
+    drop(direct);
+    renderer.unload(buffers);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
 fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
     let (mut renderer, device, scene) = stage();
     let (state, other) = (scenes::state(&scene, 1), scenes::state(&scene, 2));
