@@ -402,6 +402,52 @@ mod tests {
     }
 
     #[test]
+    fn steps_that_differ_when_they_are_read_beside_the_next_fail_the_report_and_equal_ones_are_shown() {
+        struct Beside(usize);
+        impl Bench for Beside {
+            fn variants(&self, _load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
+                Vec::new()
+            }
+
+            fn overlap(&self, _load: &Load, states: &[crate::scene::State], steps: usize) -> Option<Result<Overlap>> {
+                assert_eq!(states.len(), ROTATING);
+                let us = 12.5;
+                let (cores, [bytes_in, bytes_out]) = (2, [1, 2]);
+                let [write_one_core_us, write_us, graph_us, copy_out_us, step_us, ideal_us] = [us; 6];
+                let [serial_us, fetched_us, overlapped_us, gain] = [4.0 * us, 3.0 * us, 2.0 * us, 2.0];
+                let differing = self.0;
+                Some(Ok(Overlap {
+                    steps,
+                    cores,
+                    bytes_in,
+                    bytes_out,
+                    write_one_core_us,
+                    write_us,
+                    graph_us,
+                    copy_out_us,
+                    step_us,
+                    serial_us,
+                    fetched_us,
+                    overlapped_us,
+                    gain,
+                    ideal_us,
+                    differing,
+                }))
+            }
+        }
+        let made = |differing, variants: &[&str]| {
+            let variants = variants.iter().map(|name| (*name).to_owned()).collect();
+            let request = Request { variants, ..request(vec![Source::Synthetic(Kind::C)]) };
+            deform(&request, &Beside(differing), |_| {}).expect("a report")
+        };
+        assert_eq!(made(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
+        let good = made(0, &["cuda overlap"]);
+        assert!(good.passed());
+        assert!(page::markdown(&good).contains("50.0 one after the other, 37.5"));
+        assert_eq!(made(3, &["cpu*"]).loads[0].overlap, None, "not asked for");
+    }
+
+    #[test]
     fn a_scene_of_the_user_is_measured_under_its_own_name() {
         let source = Source::Scene { source: "tree".into(), record: None };
         let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| {}).expect("a report");
