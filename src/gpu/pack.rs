@@ -75,7 +75,7 @@ pub(super) mod tests {
     use crate::domain::{
         Attachment, Corners, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Texture, Transform,
     };
-    use crate::scene::{Normals, Parts, Storage};
+    use crate::scene::{Deformation, Normals, Parts, Storage};
     use std::sync::Arc;
 
     fn shape(vertices: usize, rank: usize) -> Shape {
@@ -123,6 +123,13 @@ pub(super) mod tests {
     pub(in super::super) fn stored(shapes: &[(usize, usize)], storage: Storage) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.storage = storage;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// The same without normal maps, deformed so.
+    pub(in super::super) fn deformed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.deformation = deformation;
         Scene::new(parts).expect("a scene")
     }
 

@@ -39,6 +39,7 @@ use serde::Serialize;
 
 use crate::deform::Backend;
 use crate::error::{Result, during};
+use crate::gpu::{HostWrite, Overlap};
 use crate::load;
 use bench::{Bench, Roofs};
 use loads::{Kind, Load, Size};
@@ -50,6 +51,9 @@ use table::Row;
 use timing::Cache;
 use validate::Condition;
 use variant::Variant;
+
+/// What the request calls steps that the host reads beside the next.
+const OVERLAP: &str = "cuda overlap";
 
 /// States over which timed steps rotate.
 const ROTATING: usize = 8;
@@ -106,6 +110,8 @@ pub struct Entry {
     pub condition: Condition,
     /// What a whole step brings to the CUDA device, and how long that takes.
     pub ingest: Option<Ingest>,
+    /// Steps whose vertices the host reads, on the CUDA device.
+    pub overlap: Option<Overlap>,
 }
 
 /// The way in of a step, by itself.
@@ -125,6 +131,8 @@ pub struct Report {
     pub remarks: Vec<String>,
     pub seeds: usize,
     pub roofs: Vec<(Backend, Roofs)>,
+    /// Copies to the pinned memory from which the CUDA device takes a step's values.
+    pub host_writes: Vec<HostWrite>,
     pub loads: Vec<Entry>,
     pub rows: Vec<Row>,
     pub thesis: Peers,
@@ -137,7 +145,7 @@ pub struct Report {
 /// # Errors
 /// Those of loading a scene. What a variant does wrong is in the report.
 pub fn deform(request: &Request, bench: &dyn Bench, mut progress: impl FnMut(&str)) -> Result<Report> {
-    let (mut loads, mut rows) = (Vec::new(), Vec::new());
+    let (mut loads, mut rows, mut failed) = (Vec::new(), Vec::new(), Vec::new());
     for source in &request.sources {
         let (load, motion) = open(source, request.size)?;
         progress(&format!(
@@ -150,17 +158,45 @@ pub fn deform(request: &Request, bench: &dyn Bench, mut progress: impl FnMut(&st
         rows.extend(measured);
         let full = request.size == Size::Full && matches!(source, Source::Synthetic(_));
         let entry = entry(&load, &motion, condition, full);
-        loads.push(Entry { ingest: bench.ingest(&load, request.replays), ..entry });
+        let overlap = overlap(request, bench, &load, &motion, &mut failed);
+        loads.push(Entry { ingest: bench.ingest(&load, request.replays), overlap, ..entry });
     }
     let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
     let thesis = Peers::of(&rows, full);
     let name = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
-    let mut failed: Vec<String> = rows.iter().filter(|row| !row.passed && !row.left_out).map(name).collect();
+    failed.extend(rows.iter().filter(|row| !row.passed && !row.left_out).map(name));
     // The rows of warm and cold caches say the same of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
     let (made, remarks) = (Provenance::here(), bench.remarks());
-    Ok(Report { made, remarks, seeds: request.seeds, roofs, loads, rows, thesis, failed })
+    let host_writes = if request.wants(OVERLAP) { bench.host_writes(request.replays) } else { Vec::new() };
+    Ok(Report { made, remarks, seeds: request.seeds, roofs, host_writes, loads, rows, thesis, failed })
+}
+
+/// Measures the overlap if it is asked for. Vertices that differ from those of the serial way fail the report.
+fn overlap(
+    request: &Request,
+    bench: &dyn Bench,
+    load: &Load,
+    motion: &Motion,
+    failed: &mut Vec<String>,
+) -> Option<Overlap> {
+    if !request.wants(OVERLAP) {
+        return None;
+    }
+    let states: Vec<_> = (0..ROTATING).map(|seed| motion.seed(seed).state()).collect();
+    match bench.overlap(load, &states, request.replays)? {
+        Ok(overlap) => {
+            let differing = overlap.differing;
+            let wrong = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", load.name));
+            failed.extend(wrong);
+            Some(overlap)
+        }
+        Err(error) => {
+            failed.push(format!("{}: {OVERLAP}: {error}", load.name));
+            None
+        }
+    }
 }
 
 fn open(source: &Source, size: Size) -> Result<(Load, Motion)> {
@@ -200,6 +236,7 @@ fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entr
         recorded: motion.is_recorded(),
         condition,
         ingest: None,
+        overlap: None,
     }
 }
 
@@ -362,6 +399,52 @@ mod tests {
         let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| {}).expect("a report");
         assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
         assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
+    }
+
+    #[test]
+    fn steps_that_differ_when_they_are_read_beside_the_next_fail_the_report_and_equal_ones_are_shown() {
+        struct Beside(usize);
+        impl Bench for Beside {
+            fn variants(&self, _load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
+                Vec::new()
+            }
+
+            fn overlap(&self, _load: &Load, states: &[crate::scene::State], steps: usize) -> Option<Result<Overlap>> {
+                assert_eq!(states.len(), ROTATING);
+                let us = 12.5;
+                let (cores, [bytes_in, bytes_out]) = (2, [1, 2]);
+                let [write_one_core_us, write_us, graph_us, copy_out_us, step_us, ideal_us] = [us; 6];
+                let [serial_us, fetched_us, overlapped_us, gain] = [4.0 * us, 3.0 * us, 2.0 * us, 2.0];
+                let differing = self.0;
+                Some(Ok(Overlap {
+                    steps,
+                    cores,
+                    bytes_in,
+                    bytes_out,
+                    write_one_core_us,
+                    write_us,
+                    graph_us,
+                    copy_out_us,
+                    step_us,
+                    serial_us,
+                    fetched_us,
+                    overlapped_us,
+                    gain,
+                    ideal_us,
+                    differing,
+                }))
+            }
+        }
+        let made = |differing, variants: &[&str]| {
+            let variants = variants.iter().map(|name| (*name).to_owned()).collect();
+            let request = Request { variants, ..request(vec![Source::Synthetic(Kind::C)]) };
+            deform(&request, &Beside(differing), |_| {}).expect("a report")
+        };
+        assert_eq!(made(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
+        let good = made(0, &["cuda overlap"]);
+        assert!(good.passed());
+        assert!(page::markdown(&good).contains("50.0 one after the other, 37.5"));
+        assert_eq!(made(3, &["cpu*"]).loads[0].overlap, None, "not asked for");
     }
 
     #[test]
