@@ -184,3 +184,26 @@ fn list_tiles<'a>(
     }
     count as u32
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::pack::tests::{deformed, followed};
+    use super::*;
+    use crate::scene::{Deformation, Normals};
+
+    #[test]
+    fn followers_without_coordinates_have_entries_where_somebody_asks_for_their_stamps_alone() {
+        let plain = Deformation::default();
+        let exact = Deformation { normals: Normals::Exact, ..plain };
+        let boxes = Deformation { boxes: true, ..plain };
+        let displacements = Deformation { displacements: true, ..plain };
+        let sizes = [(7, 0); 8];
+        let entries = |deformation| most_changes(&followed(&sizes, deformation));
+        // Of sixteen domains a quarter may change; all but one follow it.
+        assert_eq!([plain, exact, boxes, displacements].map(entries), [1, 4, 4, 1]);
+        assert_eq!(most_changes(&deformed(&sizes, plain)), 4, "nobody follows");
+        assert_eq!(most_domains(&followed(&sizes, plain)), 4, "followers count among what changes");
+        let truncated = Deformation { truncation: Some(0.1), ..plain };
+        assert_eq!(most_changes(&followed(&sizes, truncated)), 0);
+    }
+}

@@ -113,7 +113,13 @@ pub(super) mod tests {
 
     /// The same without normal maps, all but the first domain following it.
     pub(in super::super) fn on_the_first(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        followed(shapes, Deformation::default())
+    }
+
+    /// The same, deformed so.
+    pub(in super::super) fn followed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
         let mut parts = parts(shapes, false, true);
+        parts.deformation = deformation;
         let follow = Follow { parent: 0, frame: Transform::IDENTITY };
         parts.domains.iter_mut().skip(1).for_each(|domain| domain.follows = Some(follow));
         Scene::new(parts).expect("a scene")

@@ -4,10 +4,12 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use modalcast::deform::{Deformer, Fetch, Surface, Wanted};
+use modalcast::domain::{Domain, Follow};
 use modalcast::error::Error;
 use modalcast::gpu::{CudaDeformer, Device, MOST_UNDER_WAY, host_writes, overlap};
 use modalcast::scene::{Deformation, Normals, Scene, State, Storage};
 
+use crate::both::readers::kept;
 use crate::both::{self, changes};
 use crate::judge::{check, same_bits};
 use crate::scenes::{self, Random};
@@ -24,6 +26,21 @@ fn crowd(deformation: Deformation) -> Arc<Scene> {
     both::scene_of(shapes, 3, deformation, false)
 }
 
+/// The same, of which two of three domains follow one of the others, which come first.
+fn following(deformation: Deformation) -> Arc<Scene> {
+    let mut random = Random(73);
+    let mut parts = scenes::parts((0..20).map(|at| both::strip(&mut random, 5 + 20 * at, at % 3)).collect());
+    parts.deformation = deformation;
+    let follow = |at: usize, random: &mut Random| Follow { parent: at % 20, frame: random.similarity(at % 2 == 0) };
+    let domain = |at: usize| Domain {
+        name: format!("domain {at}"),
+        follows: (at >= 20).then(|| follow(at, &mut random)),
+        ..scenes::domain(at * 3 % 20, 0)
+    };
+    parts.domains = (0..60).map(domain).collect();
+    Scene::new(parts).expect("a scene")
+}
+
 /// Some domains, none of them twice, ascending.
 fn some(scene: &Scene, random: &mut Random) -> Vec<u32> {
     let share = random.number().abs() / 10.0;
@@ -35,7 +52,12 @@ fn states(scene: &Scene) -> Vec<State> {
     let mut random = Random(71);
     let mut state = scenes::state(scene, 72);
     let next = |at: usize| {
-        let (q, transforms) = (some(scene, &mut random), some(scene, &mut random));
+        let (q, mut transforms) = (some(scene, &mut random), some(scene, &mut random));
+        if scene.needs.followers {
+            // Those follow one of the others each, so that few of these are many domains.
+            transforms.retain(|domain| *domain < 20);
+            transforms.truncate(2);
+        }
         changes::apply(scene, &mut state, &mut random, (&q, &transforms));
         if at % 17 == 16 {
             state.touch();
@@ -58,7 +80,11 @@ fn plainly(scene: &Arc<Scene>, states: &[State]) -> Vec<Surface> {
 }
 
 fn is(got: &Surface, want: &Surface) -> bool {
-    same_bits(&got.positions, &want.positions) && same_bits(&got.normals, &want.normals) && got.tangents.is_empty()
+    same_bits(&got.positions, &want.positions)
+        && same_bits(&got.normals, &want.normals)
+        && same_bits(&got.displacements, &want.displacements)
+        && got.boxes == want.boxes
+        && got.tangents.is_empty()
 }
 
 /// Compares every fetch that is waited for with the step that it was begun in.
@@ -87,14 +113,20 @@ fn deformations() -> Vec<Deformation> {
     let plain = |storage| Deformation { storage, ..Deformation::default() };
     let exact = Deformation { normals: Normals::Exact, ..plain(Storage::F32) };
     let truncated = Deformation { truncation: Some(1e-9), ..plain(Storage::F32) };
-    vec![plain(Storage::F32), exact, plain(Storage::Int8), truncated]
+    vec![plain(Storage::F32), exact, plain(Storage::Int8), truncated, kept(plain(Storage::F32))]
+}
+
+/// Of all deformations, and some of them with followers.
+fn all_scenes() -> Vec<Arc<Scene>> {
+    let exact = Deformation { normals: Normals::Exact, ..Deformation::default() };
+    let followed = [Deformation::default(), exact, kept(Deformation::default())].map(following);
+    deformations().into_iter().map(crowd).chain(followed).collect()
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_fifty_steps_of_random_lists_read_beside_the_next_are_those_read_one_by_one() {
-    for deformation in deformations() {
-        let scene = crowd(deformation);
+    for scene in all_scenes() {
         let states = states(&scene);
         let want = plainly(&scene, &states);
         // How many fetches are behind when the oldest is waited for.
@@ -105,9 +137,9 @@ fn gpu_fifty_steps_of_random_lists_read_beside_the_next_are_those_read_one_by_on
                 deformer.deform(state).expect("deforms");
                 // Some are fetched and never read, some are not fetched.
                 match step % 7 {
-                    3 => drop(deformer.fetch(Wanted::VERTICES).expect("begins")),
+                    3 => drop(deformer.fetch(Wanted::ALL).expect("begins")),
                     5 => {}
-                    _ => reader.waiting.push_back((step, deformer.fetch(Wanted::VERTICES).expect("begins"))),
+                    _ => reader.waiting.push_back((step, deformer.fetch(Wanted::ALL).expect("begins"))),
                 }
                 reader.read(&mut deformer, late);
             }
@@ -116,7 +148,10 @@ fn gpu_fifty_steps_of_random_lists_read_beside_the_next_are_those_read_one_by_on
             assert_eq!(deformer.outputs(), 2, "steps were fetched beside steps");
             assert!(is(&without_tangents(deformer.surface().expect("copies")), &want[STEPS - 1]));
         }
-        eprintln!("{deformation:?}: {STEPS} steps agree bit by bit, read at once and up to five steps late");
+        let (deformation, followers) = (scene.deformation, scene.needs.followers);
+        eprintln!(
+            "{deformation:?}, followers {followers}: {STEPS} steps agree bit by bit, read at once and up to five steps late"
+        );
     }
 }
 
@@ -127,8 +162,7 @@ fn without_tangents(surface: &Surface) -> Surface {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_two_steps_under_way_give_the_bounds_and_vertices_of_each() {
-    for deformation in deformations() {
-        let scene = crowd(deformation);
+    for scene in all_scenes() {
         let states = states(&scene);
         let want = plainly(&scene, &states);
         let bounds: Vec<_> = {
@@ -145,13 +179,13 @@ fn gpu_two_steps_under_way_give_the_bounds_and_vertices_of_each() {
             }
             if step < STEPS {
                 deformer.submit(&states[step]).expect("starts");
-                reader.waiting.push_back((step, deformer.fetch(Wanted::VERTICES).expect("begins")));
+                reader.waiting.push_back((step, deformer.fetch(Wanted::ALL).expect("begins")));
             }
             reader.read(&mut deformer, MOST_UNDER_WAY);
         }
         reader.read(&mut deformer, 0);
         assert_eq!(reader.read, STEPS);
-        if deformation == Deformation::default() {
+        if scene.deformation == Deformation::default() && !scene.needs.followers {
             check("after it all", &scene, &scenes::state(&scene, 5), &mut deformer);
         }
     }
@@ -166,11 +200,11 @@ fn gpu_after_a_fault_in_the_middle_the_next_step_is_whole_and_readings_go_on() {
     let mut deformer = deformer(&scene);
     for step in 0..STEPS {
         deformer.submit(&states[step]).expect("starts");
-        let fetch = deformer.fetch(Wanted::VERTICES).expect("begins");
+        let fetch = deformer.fetch(Wanted::ALL).expect("begins");
         if step % 5 == 4 {
             // What a failed step leaves behind: nothing that counts as whole.
             deformer.forget();
-            assert!(matches!(deformer.fetch(Wanted::VERTICES), Err(Error::Fault { .. })), "nothing is whole");
+            assert!(matches!(deformer.fetch(Wanted::ALL), Err(Error::Fault { .. })), "nothing is whole");
             assert!(matches!(deformer.finish(), Err(Error::Fault { .. })), "nothing is under way");
         } else {
             deformer.finish().expect("ends");
@@ -216,19 +250,53 @@ fn gpu_a_second_output_is_made_for_those_alone_who_read_beside_steps() {
     assert_eq!(deformer.outputs(), 1, "nobody reads");
     for state in &states[10..20] {
         deformer.deform(state).expect("deforms");
-        let fetch = deformer.fetch(Wanted::VERTICES).expect("begins");
+        let fetch = deformer.fetch(Wanted::ALL).expect("begins");
         deformer.fetched(&fetch).expect("arrives");
         deformer.surface().expect("copies");
     }
     assert_eq!(deformer.outputs(), 1, "every step is read before the next");
-    let fetch = deformer.fetch(Wanted::VERTICES).expect("begins");
+    let fetch = deformer.fetch(Wanted::ALL).expect("begins");
     deformer.deform(&states[20]).expect("deforms");
     assert_eq!(deformer.outputs(), 1, "it was waited for already");
     deformer.fetched(&fetch).expect("is there");
-    let fetch = deformer.fetch(Wanted::VERTICES).expect("begins");
+    let fetch = deformer.fetch(Wanted::ALL).expect("begins");
     deformer.deform(&states[21]).expect("deforms");
     assert_eq!(deformer.outputs(), 2);
     deformer.fetched(&fetch).expect("arrives");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_step() {
+    let scene = following(kept(Deformation::default()));
+    let states = states(&scene);
+    let want = plainly(&scene, &states);
+    let mut deformer = deformer(&scene);
+    let wanted = Wanted { displacements: true, boxes: true, ..Wanted::default() };
+    let mut before: Option<(usize, Fetch)> = None;
+    for (step, state) in states.iter().enumerate() {
+        deformer.deform(state).expect("deforms");
+        let fetch = deformer.fetch(wanted).expect("begins");
+        assert!(fetch.is_there());
+        if let Some((step, fetch)) = before.replace((step, fetch)) {
+            let got = deformer.fetched(&fetch).expect("is there");
+            let alone = Surface {
+                displacements: want[step].displacements.clone(),
+                boxes: want[step].boxes.clone(),
+                ..Surface::default()
+            };
+            assert!(is(&got, &alone), "step {step}");
+            assert!(got.boxes != want[(step + STEPS / 2) % STEPS].boxes, "the judge can fail");
+        }
+        assert_eq!(deformer.outputs(), 1, "nobody reads an output");
+    }
+    // Positions alone are all that travels, and wait for nothing else.
+    let positions = Wanted { positions: true, ..Wanted::default() };
+    let fetch = deformer.fetch(positions).expect("begins");
+    deformer.deform(&states[0]).expect("deforms");
+    assert_eq!(deformer.outputs(), 2);
+    let got = deformer.fetched(&fetch).expect("arrives");
+    assert!(same_bits(&got.positions, &want[STEPS - 1].positions) && got.normals.is_empty() && got.boxes.is_empty());
 }
 
 #[test]
