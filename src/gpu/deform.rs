@@ -151,8 +151,8 @@ impl Deform {
         let mut launch = device.stream().launch_builder(function);
         // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
         // words, x0, normals, transforms and q of the same scene, and the list names such tiles; there are as many boxes
-        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are read only by
-        // a kernel that was compiled for a scene that has them.
+        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are
+        // read only by a kernel that was compiled for a scene that has them.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
         Ok(())
     }

@@ -168,7 +168,8 @@ impl Fetches {
         output.with(device, Use { set: order.set, access: Access::Read }, |from| {
             let copies = [from.positions, from.normals].into_iter().zip(to).zip(bytes);
             for ((from, to), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
-                // SAFETY: the outputs have the bytes of the plan, and so has what of the back buffer is wanted. Both live until the stream was waited for.
+                // SAFETY: the outputs have the bytes of the plan, and so has what of the back buffer is wanted. Both live
+                // until the stream was waited for.
                 unsafe { result::memcpy_dtod_async(to, from, bytes, device.stream().cu_stream()) }
                     .map_err(during(STAGE))?;
             }

@@ -31,7 +31,8 @@ fn following(deformation: Deformation) -> Arc<Scene> {
     let mut random = Random(73);
     let mut parts = scenes::parts((0..20).map(|at| both::strip(&mut random, 5 + 20 * at, at % 3)).collect());
     parts.deformation = deformation;
-    let follow = |at: usize, random: &mut Random| Follow { parent: at % 20, frame: random.similarity(at % 2 == 0) };
+    let follow =
+        |at: usize, random: &mut Random| Follow { parent: at % 20, frame: random.similarity(at.is_multiple_of(2)) };
     let domain = |at: usize| Domain {
         name: format!("domain {at}"),
         follows: (at >= 20).then(|| follow(at, &mut random)),
