@@ -1,6 +1,11 @@
 //! What every deformer does: x = T (x0 + U q) for all vertices of a scene, and the normals that go with it.
 //!
+//! Vertices are asked for: by [`Deformer::surface`], which waits for them, or by [`Deformer::fetch`], after which the
+//! next step can be deformed while they are on their way.
+//!
 //! Three deformers implement it: `reference` (f64, the definition), `cpu` (f32, rayon and SIMD) and `gpu` (CUDA).
+
+use std::sync::Arc;
 
 use crate::error::Result;
 use crate::scene::{Bounds, State};
@@ -21,6 +26,20 @@ pub struct Surface {
     /// Per domain the smallest box that holds its `positions`, relative to the same cell; empty unless the scene keeps
     /// them (`deform.boxes`).
     pub boxes: Vec<Bounds>,
+}
+
+impl Surface {
+    /// A copy of what is wanted, without tangents, which are for the renderer alone.
+    fn only(&self, wanted: Wanted) -> Self {
+        let list = |wanted: bool, list: &Vec<f32>| if wanted { list.clone() } else { Vec::new() };
+        Self {
+            positions: list(wanted.positions, &self.positions),
+            normals: list(wanted.normals, &self.normals),
+            tangents: Vec::new(),
+            displacements: list(wanted.displacements, &self.displacements),
+            boxes: if wanted.boxes { self.boxes.clone() } else { Vec::new() },
+        }
+    }
 }
 
 /// What of a [`Surface`] a reader wants; nothing by default.
@@ -53,6 +72,37 @@ impl Wanted {
     /// Whether all that `other` wants is wanted.
     pub fn covers(self, other: Self) -> bool {
         self.or(other) == self
+    }
+}
+
+/// Vertices on their way to host memory, or there already. Each is of one step, whatever is deformed later; it can be
+/// waited for late, more than once, or not at all. Its memory is kept while this or what [`Deformer::fetched`] returned
+/// is held.
+#[derive(Debug, Clone)]
+pub struct Fetch {
+    surface: Arc<Surface>,
+    there: bool,
+}
+
+impl Fetch {
+    /// Of vertices that [`Deformer::fetched`] waits for.
+    pub const fn under_way(surface: Arc<Surface>) -> Self {
+        Self { surface, there: false }
+    }
+
+    /// Of vertices that are there.
+    pub const fn there(surface: Arc<Surface>) -> Self {
+        Self { surface, there: true }
+    }
+
+    /// Whether they were there from the beginning, so that [`Deformer::fetched`] has nothing to wait for.
+    pub const fn is_there(&self) -> bool {
+        self.there
+    }
+
+    /// Where they go; not to be looked into before they are there.
+    pub(crate) const fn surface(&self) -> &Arc<Surface> {
+        &self.surface
     }
 }
 
@@ -116,6 +166,24 @@ pub trait Deformer {
     fn read(&mut self, _wanted: Wanted) -> Result<&Surface> {
         self.surface()
     }
+
+    /// Begins to bring what is wanted of the last [`Self::deform`] to the host, and nothing else: the other lists of the
+    /// [`Surface`] are empty. Tangents are for the renderer alone and stay. Positions and normals may be on their way
+    /// while the next step is deformed; displacements and boxes are there when this returns.
+    ///
+    /// # Errors
+    /// `Fault` when nothing was deformed or copying from the device failed.
+    fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
+        Ok(Fetch::there(Arc::new(self.read(wanted)?.only(wanted))))
+    }
+
+    /// Waits until all of it is there.
+    ///
+    /// # Errors
+    /// `Fault` when copying from the device failed, or when it is another deformer's.
+    fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
+        Ok(Arc::clone(&fetch.surface))
+    }
 }
 
 #[cfg(test)]
@@ -128,5 +196,20 @@ mod tests {
         assert!(Wanted::ALL.covers(Wanted::VERTICES.or(boxes)) && Wanted::VERTICES.or(boxes).covers(boxes));
         assert!(!Wanted::VERTICES.covers(boxes) && !boxes.covers(Wanted::VERTICES));
         assert!(boxes.covers(Wanted::default()) && !Wanted::default().covers(boxes));
+    }
+
+    #[test]
+    fn a_copy_has_what_is_wanted_and_never_tangents() {
+        let whole = Surface {
+            positions: vec![1.0],
+            normals: vec![2.0],
+            tangents: vec![3.0],
+            displacements: vec![4.0],
+            boxes: vec![Bounds::EMPTY],
+        };
+        assert_eq!(whole.only(Wanted::ALL), Surface { tangents: vec![], ..whole.clone() });
+        assert_eq!(whole.only(Wanted::default()), Surface::default());
+        let normals = Wanted { normals: true, ..Wanted::default() };
+        assert_eq!(whole.only(normals), Surface { normals: vec![2.0], ..Surface::default() });
     }
 }

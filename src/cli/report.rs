@@ -29,6 +29,7 @@ const EXAMPLES: &str = "Examples:
   modalcast report deform --out report --quick
   modalcast report deform --out report --load single-22-30 --load plants
   modalcast report deform --out report --load c --variant 'cuda*' --variant 'cpu f32'
+  modalcast report deform --out report --load c --load plants --variant 'cuda overlap'
   modalcast report deform --out report --scene path/to/finger
   modalcast report deform --out report --scene tree --trajectory path/to/record";
 

@@ -147,7 +147,7 @@ impl<O: Output> Output for Option<O> {
 
 impl<A: Output, B: Output, C: Output> Output for (A, B, C) {
     fn cut(self, at: &Tile) -> (Self, Self) {
-        let ((a, b), c) = (((self.0, self.1)).cut(at), self.2.cut(at));
+        let ((a, b), c) = ((self.0, self.1).cut(at), self.2.cut(at));
         ((a.0, a.1, c.0), (b.0, b.1, c.1))
     }
 }

@@ -1,5 +1,6 @@
-//! One task per scene. It alone orders what happens to the scene: a step is deformed, shown to whoever waits for it,
-//! then acknowledged, and only then comes the next. It waits for the device, never for a client.
+//! One task per scene. It alone orders what happens to the scene: a step is deformed, shown to whoever waits for it, and
+//! then acknowledged. The next comes after that, but for one thing: while vertices leave the device, it is computed. It
+//! waits for the device, never for a client.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -8,6 +9,7 @@ use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::keep::Keeper;
 use super::lane::{Lane, Place, Policy, Waiting};
+use super::show::Late;
 use super::viewer::{Delivery, Shown, StepName, View, Viewer};
 use super::worker::{SceneId, Worker};
 use crate::config::Config;
@@ -55,6 +57,13 @@ struct Writer {
     since: Instant,
 }
 
+/// A step that is done and not yet acknowledged.
+pub(super) struct Done {
+    lane: Arc<Lane>,
+    step: u64,
+    stages: StageTimes,
+}
+
 /// A scene in play.
 pub(super) struct Conductor {
     pub(super) name: String,
@@ -74,14 +83,14 @@ pub(super) struct Conductor {
     /// Times of the current step until its vertices were there.
     pub(super) stages: StageTimes,
     /// What somebody has asked for of the current vertices.
-    pub(super) surface: Option<Copied>,
+    pub(super) surface: Option<Held>,
     last_step: watch::Sender<Option<StepName>>,
     wake: Arc<Notify>,
 }
 
 /// Vertices in host memory.
 #[derive(Debug, Clone)]
-pub(super) struct Copied {
+pub(super) struct Held {
     pub surface: Arc<Surface>,
     /// What of them is there.
     pub parts: Wanted,
@@ -153,32 +162,48 @@ impl Conductor {
     async fn tend(&mut self) {
         self.answer_asks().await;
         let holds_back = self.holds_back();
-        self.serve_viewers(holds_back).await;
+        let mut late = self.serve_viewers(holds_back).await;
         if self.is_held() {
-            return;
+            return self.settle(late).await;
         }
-        if let Some((lane, step)) = self.pending.take() {
-            lane.report(step, Ok(self.stages.clone()));
+        let done = self.pending.take().map(|(lane, step)| Done { lane, step, stages: self.stages.clone() });
+        match &mut late {
+            // Acknowledged after what is late of it.
+            Some(late) => late.done = done,
+            None => acknowledge(done),
         }
         if self.writer.as_ref().is_some_and(|writer| writer.lane.is_closed()) {
             self.writer = None;
         }
-        let next = self.writer.as_ref().and_then(|writer| Some((Arc::clone(&writer.lane), writer.lane.take()?)));
-        if let Some((lane, waiting)) = next {
-            self.step(lane, waiting).await;
-            // There may be more to do; messages get their turn first.
-            self.wake.notify_one();
+        let lane = self.writer.as_ref().map(|writer| Arc::clone(&writer.lane));
+        match lane.and_then(|lane| Some((lane.take()?, lane))) {
+            Some((waiting, lane)) => {
+                self.step(lane, waiting, late).await;
+                // There may be more to do; messages get their turn first.
+                self.wake.notify_one();
+            }
+            None => self.settle(late).await,
         }
     }
 
-    async fn step(&mut self, lane: Arc<Lane>, waiting: Waiting) {
+    /// Hands over the vertices that are late, and then acknowledges their step.
+    async fn settle(&mut self, late: Option<Late>) {
+        if let Some(late) = late {
+            acknowledge(self.deliver(late).await);
+        }
+    }
+
+    /// Computes the next step while what is late of the one before arrives.
+    async fn step(&mut self, lane: Arc<Lane>, waiting: Waiting, late: Option<Late>) {
         let mut stages = waiting.stages();
         let number = waiting.update.number;
         let mut next = State::clone(&self.state);
         next.run = self.run;
         next.apply(&self.scene, &waiting.update);
         let next = Arc::new(next);
-        match self.means.worker.deform(self.id, &next).await {
+        let deforming = self.means.worker.deform(self.id, &next);
+        self.settle(late).await;
+        match deforming.wait().await {
             Ok(deformed) => {
                 stages.push((Stage::Deform, deformed.ms));
                 self.stages = stages;
@@ -241,6 +266,11 @@ impl Conductor {
         Ok(())
     }
 
+    /// Whether a step waits, so that it can be computed while the vertices of this one leave the device.
+    pub(super) fn has_next(&self) -> bool {
+        self.writer.as_ref().is_some_and(|writer| !writer.lane.is_closed() && writer.lane.has_waiting())
+    }
+
     /// Whether lossless viewers hold the step back: only under a lossless writer that still lives.
     fn holds_back(&self) -> bool {
         self.pending.as_ref().is_some_and(|(lane, _)| lane.policy() == Policy::Lossless && !lane.is_closed())
@@ -288,6 +318,12 @@ impl Conductor {
         }
         // The device thread may be gone already; then so is the scene.
         self.means.worker.unstage(self.id).await.ok();
+    }
+}
+
+fn acknowledge(done: Option<Done>) {
+    if let Some(Done { lane, step, stages }) = done {
+        lane.report(step, Ok(stages));
     }
 }
 

@@ -51,7 +51,7 @@ impl Host {
         let Opening { name, origin, scene, id, state, no_frames } = opening;
         means.worker.stage(id, &scene).await?;
         let state = match state.map(Arc::new) {
-            Some(state) => match means.worker.deform(id, &state).await {
+            Some(state) => match means.worker.deform(id, &state).wait().await {
                 Ok(_) => state,
                 Err(error) => {
                     tracing::warn!(scene = name, %error, "the kept step is not usable; the scene begins at rest");

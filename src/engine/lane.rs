@@ -76,7 +76,8 @@ impl Drop for Place {
 #[derive(Debug, Default)]
 struct Inner {
     waiting: VecDeque<Waiting>,
-    in_work: bool,
+    /// Steps taken and not yet reported: two while the one's vertices leave the device beside the other.
+    in_work: usize,
     reports: VecDeque<Report>,
     skipped: u64,
     /// The writer has gone.
@@ -123,14 +124,19 @@ impl Lane {
     pub(super) fn take(&self) -> Option<Waiting> {
         let mut inner = self.lock();
         let step = inner.waiting.pop_front()?;
-        inner.in_work = true;
+        inner.in_work += 1;
         Some(step)
     }
 
-    /// Tells what became of the step in work.
+    /// Whether a step waits.
+    pub(super) fn has_waiting(&self) -> bool {
+        !self.lock().waiting.is_empty()
+    }
+
+    /// Tells what became of the oldest step in work.
     pub(super) fn report(&self, step: u64, outcome: Result<StageTimes>) {
         let mut inner = self.lock();
-        inner.in_work = false;
+        inner.in_work = inner.in_work.saturating_sub(1);
         let skipped = inner.skipped;
         let report = match outcome {
             Ok(stages) => Report::Done { step, skipped, stages },
@@ -172,7 +178,7 @@ impl Lane {
     /// Whether every accepted step has been reported and the report been taken.
     pub(super) fn is_drained(&self) -> bool {
         let inner = self.lock();
-        !inner.in_work && inner.waiting.is_empty() && inner.reports.is_empty()
+        inner.in_work == 0 && inner.waiting.is_empty() && inner.reports.is_empty()
     }
 
     /// The writer has gone: steps that still wait are dropped.
@@ -197,7 +203,7 @@ impl Lane {
     }
 
     fn check_window(&self, inner: &Inner, number: u64) -> Result<()> {
-        let open = inner.waiting.len() + usize::from(inner.in_work) + inner.reports.len();
+        let open = inner.waiting.len() + inner.in_work + inner.reports.len();
         if self.policy == Policy::Lossless && open >= self.window {
             let expected = format!("at most {} steps without acknowledgement", self.window);
             return Err(invalid("window", expected, format!("step {number} as number {}", open + 1)));

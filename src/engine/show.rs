@@ -4,11 +4,26 @@ use std::mem;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::conductor::{Conductor, Copied};
+use super::conductor::{Conductor, Done, Held};
 use super::viewer::{Body, Delivery, Shown, StepName, View, Viewer};
+use super::worker::{Asked, Copied};
 use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result};
+use crate::scene::Cells;
 use crate::telemetry::{Stage, StageTimes};
+
+/// Vertices of a step that leave the device while the next step is computed, and who waits for them.
+pub(super) struct Late {
+    copying: Asked<Copied>,
+    /// What is shown with them; `skipped` is each viewer's own.
+    step: StepName,
+    stages: StageTimes,
+    cells: Option<Arc<Cells>>,
+    /// With the steps that each has missed.
+    viewers: Vec<(Viewer, u64)>,
+    /// The step's acknowledgement, which comes after its vertices.
+    pub done: Option<Done>,
+}
 
 impl Conductor {
     /// Answers every request whose step is there or gone; forgets those that nobody waits for.
@@ -18,7 +33,7 @@ impl Conductor {
                 continue;
             }
             let answer = match self.is_ready(ask.which) {
-                Ok(true) => self.show(&ask.view, 0).await,
+                Ok(true) => self.show(&ask.view, 0, Wanted::default()).await,
                 Ok(false) => {
                     self.asks.push(ask);
                     continue;
@@ -30,25 +45,82 @@ impl Conductor {
     }
 
     /// Gives the current step to every viewer that has room for it. A lossless viewer without room holds back the
-    /// writer while `holds_back`, and is cut off when it does so for too long.
-    pub(super) async fn serve_viewers(&mut self, holds_back: bool) {
-        for mut viewer in mem::take(&mut self.viewers) {
-            if !viewer.is_gone() && self.serve(&mut viewer, holds_back).await {
+    /// writer while `holds_back`, and is cut off when it does so for too long. While a next step waits, vertices are only
+    /// begun: they are returned, and come to [`Self::deliver`] once that step is under way.
+    pub(super) async fn serve_viewers(&mut self, holds_back: bool) -> Option<Late> {
+        let mut late: Vec<(Viewer, u64)> = Vec::new();
+        let viewers = mem::take(&mut self.viewers);
+        let wanted = self.wanted(&viewers);
+        let beside = self.has_next() && !self.there().covers(wanted);
+        for mut viewer in viewers {
+            if viewer.is_gone() {
+                continue;
+            }
+            // Room may have come only now.
+            if beside && self.wants(&viewer).is_some_and(|own| wanted.covers(own)) {
+                let skipped = self.see(&mut viewer);
+                late.push((viewer, skipped));
+            } else if self.serve(&mut viewer, holds_back, wanted).await {
                 self.viewers.push(viewer);
             }
         }
+        (!late.is_empty()).then(|| Late {
+            copying: self.means.worker.copy(self.id, wanted),
+            step: StepName::of(&self.state),
+            stages: self.stages.clone(),
+            cells: self.state.cells.clone(),
+            viewers: late,
+            done: None,
+        })
     }
 
-    /// False when the viewer is to be dropped.
-    async fn serve(&mut self, viewer: &mut Viewer, holds_back: bool) -> bool {
+    /// What a viewer that has room for the current step wants of its vertices.
+    fn wants(&self, viewer: &Viewer) -> Option<Wanted> {
+        match viewer.view {
+            View::Vertices(wanted) if viewer.seen < self.count && viewer.has_room() => Some(wanted),
+            _ => None,
+        }
+    }
+
+    /// What all of them together want, so that one copy serves them.
+    fn wanted(&self, viewers: &[Viewer]) -> Wanted {
+        let there = viewers.iter().filter(|viewer| !viewer.is_gone());
+        there.filter_map(|viewer| self.wants(viewer)).fold(Wanted::default(), Wanted::or)
+    }
+
+    /// Waits for vertices that were begun and hands them over; returns what is to be acknowledged then.
+    pub(super) async fn deliver(&mut self, late: Late) -> Option<Done> {
+        let Late { copying, step, mut stages, cells, viewers, done } = late;
+        let copied = copying.wait().await.map(|(surface, copy_ms)| {
+            stages.push((Stage::Copy, copy_ms));
+            surface
+        });
+        for (viewer, skipped) in viewers {
+            let body = copied.clone().map(Body::Vertices);
+            let (stages, cells) = (stages.clone(), cells.clone());
+            if viewer.deliver(body.map(|body| Shown { step, skipped, stages, cells, body })) {
+                self.viewers.push(viewer);
+            }
+        }
+        done
+    }
+
+    /// Notes that a viewer gets the current step; how many it has missed.
+    fn see(&self, viewer: &mut Viewer) -> u64 {
+        let skipped = self.count - viewer.seen - 1;
+        viewer.seen = self.count;
+        viewer.stalled = None;
+        skipped
+    }
+
+    /// False when the viewer is to be dropped. `others`: what all viewers want of the vertices.
+    async fn serve(&mut self, viewer: &mut Viewer, holds_back: bool, others: Wanted) -> bool {
         if viewer.seen == self.count {
             return true;
         }
         if viewer.has_room() {
-            let skipped = self.count - viewer.seen - 1;
-            viewer.seen = self.count;
-            viewer.stalled = None;
-            let shown = self.show(&viewer.view, skipped).await;
+            let skipped = self.see(viewer);
+            let shown = self.show(&viewer.view, skipped, others).await;
             return viewer.deliver(shown);
         }
         if !(holds_back && viewer.delivery == Delivery::Lossless) {
@@ -65,8 +137,8 @@ impl Conductor {
         is_patient
     }
 
-    /// Draws or copies the current step.
-    async fn show(&mut self, view: &View, skipped: u64) -> Result<Shown> {
+    /// Draws or copies the current step; a copy is of what others want too.
+    async fn show(&mut self, view: &View, skipped: u64, others: Wanted) -> Result<Shown> {
         let mut stages = self.stages.clone();
         let body = match *view {
             View::Frame { camera, width, height } => {
@@ -75,7 +147,7 @@ impl Conductor {
                 Body::Frame(image)
             }
             View::Vertices(wanted) => {
-                let (surface, copy_ms) = self.vertices(wanted).await?;
+                let (surface, copy_ms) = self.vertices((wanted, others)).await?;
                 stages.push((Stage::Copy, copy_ms));
                 Body::Vertices(surface)
             }
@@ -83,16 +155,21 @@ impl Conductor {
         Ok(Shown { step: StepName::of(&self.state), skipped, stages, cells: self.state.cells.clone(), body })
     }
 
-    /// What is wanted of the current vertices, each part of them copied from the device at most once per step.
-    async fn vertices(&mut self, wanted: Wanted) -> Result<(Arc<Surface>, f64)> {
-        let there = self.surface.as_ref().map_or(Wanted::default(), |copy| copy.parts);
-        if let Some(copy) = self.surface.as_ref().filter(|_| there.covers(wanted)) {
-            return Ok((Arc::clone(&copy.surface), copy.ms));
+    /// What of the current vertices was copied.
+    fn there(&self) -> Wanted {
+        self.surface.as_ref().map_or(Wanted::default(), |held| held.parts)
+    }
+
+    /// What is wanted of the current vertices, copied from the device once per step unless somebody then asks for more.
+    async fn vertices(&mut self, (wanted, others): (Wanted, Wanted)) -> Result<(Arc<Surface>, f64)> {
+        let there = self.there();
+        if let Some(held) = self.surface.as_ref().filter(|_| there.covers(wanted)) {
+            return Ok((Arc::clone(&held.surface), held.ms));
         }
-        // The device's own copy in host memory has what was there before, so taking it again costs no transfer.
-        let parts = there.or(wanted);
-        let (surface, ms) = self.means.worker.copy(self.id, parts).await?;
-        self.surface = Some(Copied { surface: Arc::clone(&surface), parts, ms });
+        // What was there before comes again, so that readers in turn do not drive each other out.
+        let parts = there.or(wanted).or(others);
+        let (surface, ms) = self.means.worker.copy(self.id, parts).wait().await?;
+        self.surface = Some(Held { surface: Arc::clone(&surface), parts, ms });
         Ok((surface, ms))
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::deform::{Deformed, Deformer, Surface, Wanted};
+use crate::deform::{Deformed, Deformer, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during, invalid};
 use crate::render::{Renderer, SceneBuffers};
 use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
@@ -87,11 +87,6 @@ impl Staged {
         self.deformer.surface()
     }
 
-    /// The same, of which only what is wanted need be there.
-    pub(super) fn read(&mut self, wanted: Wanted) -> Result<&Surface> {
-        self.deformer.read(wanted)
-    }
-
     /// Makes the buffers if need be and brings the last deformation into them, in a frame that suits the camera. Returns
     /// the bounds in that frame, and whether an upload was needed.
     pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<(Bounds, bool)> {
@@ -110,6 +105,16 @@ impl Staged {
         let (positions, bounds) = apart.seen_from(view, &self.scene, positions);
         renderer.upload_apart(buffers, &positions, view)?;
         Ok((bounds, true))
+    }
+
+    /// Begins to bring what is wanted of the last deformation to host memory, beside what is deformed next.
+    pub(super) fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
+        self.deformer.fetch(wanted)
+    }
+
+    /// Waits until all of it is there.
+    pub(super) fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
+        self.deformer.fetched(fetch)
     }
 
     /// Makes the buffers if need be and fills those that the deformer does not write itself.

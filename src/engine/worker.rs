@@ -1,7 +1,7 @@
 //! The device thread: takes commands from a bounded queue, owns the workbench and every staged scene, answers each
-//! command once.
+//! command once. Vertices are answered late: they leave the device while the command after theirs is obeyed.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::Instant;
@@ -12,7 +12,7 @@ use tokio::sync::{mpsc, oneshot};
 use super::staged::Staged;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
-use crate::deform::{Deformed, Surface, Wanted};
+use crate::deform::{Deformed, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::render::Image;
 use crate::scene::{Camera, Scene, State};
@@ -41,11 +41,12 @@ pub(super) enum Command {
         size: (u32, u32),
         reply: Reply<Image>,
     },
-    /// Copies what is wanted out; the second value is its milliseconds.
+    /// Brings what is wanted to the host, beside the command after it; the second value is the milliseconds until it was
+    /// there.
     Copy {
         id: SceneId,
         wanted: Wanted,
-        reply: Reply<(Arc<Surface>, f64)>,
+        reply: Reply<Copied>,
     },
     Unstage {
         id: SceneId,
@@ -65,9 +66,9 @@ pub(super) struct Worker {
 impl Worker {
     /// Starts the thread and waits until it has opened its devices.
     pub(super) async fn start(config: &Arc<Config>) -> Result<(Self, Info, std::thread::JoinHandle<()>)> {
-        // Each scene has at most one command under way, and each opening one more; so nobody is turned away by a full
-        // queue unless scenes are opened faster than the limit of open scenes allows.
-        let limit = 2 * config.open_scenes + 8;
+        // Each scene has at most two commands under way, a copy and the step after it, and each opening one more; so
+        // nobody is turned away by a full queue unless scenes are opened faster than the limit of open scenes allows.
+        let limit = 3 * config.open_scenes + 8;
         let (commands, inbox) = mpsc::channel(limit);
         let (tell, told) = oneshot::channel();
         let config = Arc::clone(config);
@@ -92,17 +93,19 @@ impl Worker {
         self.ask(|reply| Command::Stage { id, scene, reply }).await
     }
 
-    pub(super) async fn deform(&self, id: SceneId, state: &Arc<State>) -> Result<Deformed> {
+    /// Begins to deform.
+    pub(super) fn deform(&self, id: SceneId, state: &Arc<State>) -> Asked<Deformed> {
         let state = Arc::clone(state);
-        self.ask(|reply| Command::Deform { id, state, reply }).await
+        self.begin(|reply| Command::Deform { id, state, reply })
     }
 
     pub(super) async fn draw(&self, id: SceneId, camera: Camera, size: (u32, u32)) -> Result<Image> {
         self.ask(|reply| Command::Draw { id, camera, size, reply }).await
     }
 
-    pub(super) async fn copy(&self, id: SceneId, wanted: Wanted) -> Result<(Arc<Surface>, f64)> {
-        self.ask(|reply| Command::Copy { id, wanted, reply }).await
+    /// Begins to copy what is wanted of the last deformation, whatever is asked of the scene next.
+    pub(super) fn copy(&self, id: SceneId, wanted: Wanted) -> Asked<Copied> {
+        self.begin(|reply| Command::Copy { id, wanted, reply })
     }
 
     /// Waits for room: a scene must never stay on the device because the queue was full.
@@ -119,12 +122,30 @@ impl Worker {
     }
 
     async fn ask<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
+        self.begin(make).wait().await
+    }
+
+    /// Sends a command whose answer is waited for later.
+    fn begin<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> Asked<T> {
         let (reply, answer) = oneshot::channel();
-        match self.commands.try_send(make(reply)) {
-            Ok(()) => answer.await.map_err(|_| gone())?,
+        Asked(match self.commands.try_send(make(reply)) {
+            Ok(()) => Ok(answer),
             Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "device", limit: self.limit }),
             Err(TrySendError::Closed(_)) => Err(gone()),
-        }
+        })
+    }
+}
+
+/// Vertices and the milliseconds until they were there.
+pub(super) type Copied = (Arc<Surface>, f64);
+
+/// What the device thread was asked for, in the order in which it was asked.
+#[derive(Debug)]
+pub(super) struct Asked<T>(Result<oneshot::Receiver<Result<T>>>);
+
+impl<T> Asked<T> {
+    pub(super) async fn wait(self) -> Result<T> {
+        self.0?.await.map_err(|_| gone())?
     }
 }
 
@@ -133,69 +154,115 @@ fn gone() -> Error {
     during("device")("the device thread gave no answer")
 }
 
-fn work(mut workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
-    let mut scenes = HashMap::new();
-    while let Some(command) = inbox.blocking_recv() {
+/// The device thread's own.
+struct Desk {
+    workbench: Workbench,
+    scenes: HashMap<SceneId, Staged>,
+    /// Vertices on their way, oldest first.
+    arriving: VecDeque<Arriving>,
+}
+
+struct Arriving {
+    id: SceneId,
+    fetch: Fetch,
+    begin: Instant,
+    reply: Reply<Copied>,
+}
+
+fn work(workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
+    let mut desk = Desk { workbench, scenes: HashMap::new(), arriving: VecDeque::new() };
+    while let Some(command) = next(&mut desk, &mut inbox) {
         if matches!(command, Command::Quit) {
             break;
         }
-        // A panic below costs the one command whose reply it drops; the thread and all scenes live on.
-        let outcome = catch_unwind(AssertUnwindSafe(|| obey(&mut workbench, &mut scenes, command)));
-        if outcome.is_err() {
-            tracing::error!("a command panicked on the device thread");
+        // They have had one command's time to arrive in; those that this one begins will have the next one's.
+        let arriving = desk.arriving.len();
+        guarded(|| desk.obey(command));
+        for _ in 0..arriving {
+            guarded(|| desk.hand_over());
         }
     }
-    for (_, staged) in scenes.drain() {
-        workbench.unstage(staged);
-    }
-}
-
-fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, command: Command) {
-    // Every ignored result below means: the asker has gone, and its answer goes with it.
-    match command {
-        Command::Stage { id, scene, reply } => {
-            let staged = workbench.stage(&scene).map(|staged| scenes.insert(id, staged));
-            // Nobody would ever put away a scene that nobody waits for.
-            if reply.send(staged.map(|_| ())).is_err()
-                && let Some(staged) = scenes.remove(&id)
-            {
-                workbench.unstage(staged);
-            }
-        }
-        Command::Deform { id, state, reply } => {
-            reply.send(find(scenes, id).and_then(|staged| staged.deform_shared(&state))).ok();
-        }
-        Command::Draw { id, camera, size: (width, height), reply } if !reply.is_closed() => {
-            let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
-            reply.send(drawn).ok();
-        }
-        Command::Copy { id, wanted, reply } if !reply.is_closed() => {
-            reply.send(find(scenes, id).and_then(|staged| copy(staged, wanted))).ok();
-        }
-        // Whoever asked has given up waiting: the picture is not made.
-        Command::Draw { .. } | Command::Copy { .. } | Command::Quit => {}
-        Command::Unstage { id, reply } => {
-            if let Some(staged) = scenes.remove(&id) {
-                workbench.unstage(staged);
-            }
-            reply.send(Ok(())).ok();
-        }
+    desk.arriving.clear();
+    for (_, staged) in desk.scenes.drain() {
+        desk.workbench.unstage(staged);
     }
 }
 
-fn copy(staged: &mut Staged, wanted: Wanted) -> Result<(Arc<Surface>, f64)> {
-    let begin = Instant::now();
-    let surface = staged.read(wanted)?;
-    let list = |wanted: bool, list: &Vec<f32>| if wanted { list.clone() } else { Vec::new() };
-    let copy = Surface {
-        positions: list(wanted.positions, &surface.positions),
-        normals: list(wanted.normals, &surface.normals),
-        displacements: list(wanted.displacements, &surface.displacements),
-        boxes: if wanted.boxes { surface.boxes.clone() } else { Vec::new() },
-        // Tangents are for the renderer alone and stay here.
-        tangents: Vec::new(),
-    };
-    Ok((Arc::new(copy), ms_since(begin)))
+/// The next command. While there is none, vertices are handed over.
+fn next(desk: &mut Desk, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
+    while !desk.arriving.is_empty() {
+        match inbox.try_recv() {
+            Ok(command) => return Some(command),
+            Err(_) => guarded(|| desk.hand_over()),
+        }
+    }
+    inbox.blocking_recv()
+}
+
+/// A panic costs the one command whose reply it drops; the thread and all scenes live on.
+fn guarded(act: impl FnOnce()) {
+    if catch_unwind(AssertUnwindSafe(act)).is_err() {
+        tracing::error!("a command panicked on the device thread");
+    }
+}
+
+impl Desk {
+    fn obey(&mut self, command: Command) {
+        let Self { workbench, scenes, .. } = self;
+        // Every ignored result below means: the asker has gone, and its answer goes with it.
+        match command {
+            Command::Stage { id, scene, reply } => {
+                let staged = workbench.stage(&scene).map(|staged| scenes.insert(id, staged));
+                // Nobody would ever put away a scene that nobody waits for.
+                if reply.send(staged.map(|_| ())).is_err()
+                    && let Some(staged) = scenes.remove(&id)
+                {
+                    workbench.unstage(staged);
+                }
+            }
+            Command::Deform { id, state, reply } => {
+                reply.send(find(scenes, id).and_then(|staged| staged.deform_shared(&state))).ok();
+            }
+            Command::Draw { id, camera, size: (width, height), reply } if !reply.is_closed() => {
+                let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
+                reply.send(drawn).ok();
+            }
+            Command::Copy { id, wanted, reply } if !reply.is_closed() => self.copy((id, wanted), reply),
+            // Whoever asked has given up waiting: the picture is not made.
+            Command::Draw { .. } | Command::Copy { .. } | Command::Quit => {}
+            Command::Unstage { id, reply } => {
+                if let Some(staged) = scenes.remove(&id) {
+                    workbench.unstage(staged);
+                }
+                reply.send(Ok(())).ok();
+            }
+        }
+    }
+
+    /// Begins to copy; what is there at once is handed over at once.
+    fn copy(&mut self, (id, wanted): (SceneId, Wanted), reply: Reply<Copied>) {
+        let begin = Instant::now();
+        match find(&mut self.scenes, id).and_then(|staged| staged.fetch(wanted)) {
+            Ok(fetch) => {
+                let is_there = fetch.is_there();
+                self.arriving.push_back(Arriving { id, fetch, begin, reply });
+                if is_there {
+                    self.arriving.rotate_right(1);
+                    self.hand_over();
+                }
+            }
+            Err(error) => {
+                reply.send(Err(error)).ok(); // The asker has gone, and its answer goes with it.
+            }
+        }
+    }
+
+    /// Waits for the vertices that have been under way for the longest.
+    fn hand_over(&mut self) {
+        let Some(Arriving { id, fetch, begin, reply }) = self.arriving.pop_front() else { return };
+        let surface = find(&mut self.scenes, id).and_then(|staged| staged.fetched(&fetch));
+        reply.send(surface.map(|surface| (surface, ms_since(begin)))).ok(); // As above.
+    }
 }
 
 fn find(scenes: &mut HashMap<SceneId, Staged>, id: SceneId) -> Result<&mut Staged> {

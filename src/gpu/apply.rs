@@ -13,12 +13,11 @@ use crate::scene::{Scene, State};
 /// A list pays while it has at most this part of the domains; else the whole state is copied.
 const MOST: usize = 4;
 
-/// The kernel, and the lists that it reads over the bus: `[changes][transforms][q][tiles]`.
+/// The kernel, and what writes the lists that it reads over the bus.
 #[derive(Debug)]
 pub(super) struct Apply {
     function: CudaFunction,
     config: LaunchConfig,
-    pinned: PinnedHostSlice<u32>,
     /// Entries.
     most: usize,
     coordinates: usize,
@@ -26,6 +25,9 @@ pub(super) struct Apply {
     named: Vec<u32>,
     lists: u32,
 }
+
+/// Pinned memory for the lists of one step: `[changes][transforms][q][tiles]`.
+pub(super) type List = PinnedHostSlice<u32>;
 
 /// How long the lists of a step are.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -38,9 +40,10 @@ pub(super) struct Lengths {
 const CHANGE: usize = size_of::<Change>() / 4;
 const TRANSFORM: usize = 12;
 
-/// The most domains that a list may be about.
-const fn most_domains(scene: &Scene) -> usize {
-    scene.domains.len() / MOST
+/// The most domains that a list may be about; 0 where steps are always whole: the scene has too few domains, or leaves
+/// modes out. Which ones depends on q, and goes to the device with the whole state alone.
+pub(super) const fn most_domains(scene: &Scene) -> usize {
+    if scene.needs.truncation { 0 } else { scene.domains.len() / MOST }
 }
 
 /// The most entries that it has then: silent domains have none.
@@ -50,45 +53,50 @@ pub(super) fn most_changes(scene: &Scene) -> usize {
 }
 
 /// Whether all that a step changes of a domain is known from its mover: it has neither a transform nor coordinates, and
-/// nobody asks for its stamp, which only normals that follow the surface do. Its tiles are computed anew all the same.
+/// nobody asks for its stamp, as normals that follow the surface and boxes do. Its tiles are computed anew all the same.
 fn is_silent(scene: &Scene, domain: usize) -> bool {
-    scene.needs.followers
-        && !scene.needs.exact_normals
+    let needs = scene.needs;
+    needs.followers
+        && !(needs.exact_normals || needs.boxes)
         && scene.layout.slots[domain].rank == 0
         && scene.movers.frame_of(domain).is_some()
 }
 
 impl Apply {
     pub(super) fn new(device: &Device, packing: &Packing, kernel: &Kernel) -> Result<Self> {
-        let most = most_changes(&packing.scene);
-        let coordinates = packing.coordinates.total;
-        let words = (CHANGE + TRANSFORM) * most + coordinates + packing.tiles;
-        // SAFETY: the kernel reads only what `write` wrote.
-        let pinned = unsafe {
-            let flags = sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP;
-            device.context().alloc_pinned_with_flags(words.max(4), flags)
-        };
-        let pinned = pinned.map_err(during("allocate"))?;
         let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
         Ok(Self {
             function,
             config: config(kernel),
-            pinned,
-            most,
-            coordinates,
+            most: most_changes(&packing.scene),
+            coordinates: packing.coordinates.total,
             named: vec![0; packing.tiles],
             lists: 0,
         })
     }
 
-    /// Writes the lists; the caller has waited for the last launch. None when there are too many changes for a list, or
-    /// modes to be left out: which ones depends on q, and goes to the device with the whole state alone.
-    pub(super) fn write(&mut self, packing: &Packing, state: &State, changed: &[u32]) -> Result<Option<Lengths>> {
+    /// Room for the lists of a step.
+    pub(super) fn list(&self, device: &Device) -> Result<List> {
+        let words = (CHANGE + TRANSFORM) * self.most + self.coordinates + self.named.len();
+        let flags = sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP;
+        // SAFETY: the kernel reads only what `write` wrote.
+        unsafe { device.context().alloc_pinned_with_flags(words, flags) }.map_err(during("allocate"))
+    }
+
+    /// Writes the lists of a step that changes some domains, into an output that lacks others besides; the caller has
+    /// waited for the last launch with `list`. None when there are too many changes for it.
+    pub(super) fn write(
+        &mut self,
+        list: &mut List,
+        packing: &Packing,
+        state: &State,
+        (changed, behind): (&[u32], &[u32]),
+    ) -> Result<Option<Lengths>> {
         let scene = &packing.scene;
-        if changed.len() > most_domains(scene) || scene.needs.truncation {
+        if changed.len() > most_domains(scene) {
             return Ok(None);
         }
-        let words = self.pinned.as_mut_slice().map_err(during("upload"))?;
+        let words = list.as_mut_slice().map_err(during("upload"))?;
         let (changes, rest) = words.split_at_mut(CHANGE * self.most);
         let (transforms, rest) = rest.split_at_mut(TRANSFORM * self.most);
         let (q, tiles) = rest.split_at_mut(self.coordinates);
@@ -122,14 +130,16 @@ impl Apply {
             self.lists = 0;
         }
         self.lists += 1;
-        let stale = list_tiles(packing, changed, (&mut self.named, self.lists), tiles);
+        // What the output lacks has its values and stamps on the device already.
+        let lacking = changed.iter().chain(behind);
+        let stale = list_tiles(packing, lacking, (&mut self.named, self.lists), tiles);
         Ok(Some(Lengths { changed: count, stale }))
     }
 
     /// Starts the kernel; the header among the values says how long the lists are. That of tiles goes to `tiles`.
-    pub(super) fn launch(&mut self, device: &Device, values: Values, tiles: u64) -> Result<()> {
+    pub(super) fn launch(&self, device: &Device, list: &mut List, values: Values, tiles: u64) -> Result<()> {
         let fail = during("apply");
-        let list = self.pinned.as_mut_ptr().map_err(&fail)? as u64;
+        let list = list.as_mut_ptr().map_err(&fail)? as u64;
         let new_transforms = list + 4 * (CHANGE * self.most) as u64;
         let new_q = new_transforms + 4 * (TRANSFORM * self.most) as u64;
         let args = ApplyArgs {
@@ -152,10 +162,15 @@ impl Apply {
     }
 }
 
-/// Lists the tiles of the changed domains, each once, and returns how many there are.
-fn list_tiles(packing: &Packing, changed: &[u32], (named, list): (&mut [u32], u32), tiles: &mut [u32]) -> u32 {
+/// Lists the tiles of these domains, each once, and returns how many there are.
+fn list_tiles<'a>(
+    packing: &Packing,
+    domains: impl Iterator<Item = &'a u32>,
+    (named, list): (&mut [u32], u32),
+    tiles: &mut [u32],
+) -> u32 {
     let mut count = 0;
-    for domain in changed {
+    for domain in domains {
         for (first, length) in packing.spans[*domain as usize] {
             for tile in first..first + length {
                 let mark = &mut named[tile as usize];
@@ -168,4 +183,29 @@ fn list_tiles(packing: &Packing, changed: &[u32], (named, list): (&mut [u32], u3
         }
     }
     count as u32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pack::tests::{deformed, followed};
+    use super::*;
+    use crate::scene::{Deformation, Normals};
+
+    #[test]
+    fn followers_without_coordinates_have_entries_where_somebody_asks_for_their_stamps_alone() {
+        let plain = Deformation::default();
+        let exact = Deformation { normals: Normals::Exact, ..plain };
+        let boxes = Deformation { boxes: true, ..plain };
+        let displacements = Deformation { displacements: true, ..plain };
+        let mut sizes = [(7, 0); 8];
+        // Without modes no normals would follow the surface.
+        sizes[7].1 = 1;
+        let entries = |deformation| most_changes(&followed(&sizes, deformation));
+        // Of sixteen domains a quarter may change; one is the mover, and two have coordinates.
+        assert_eq!([plain, exact, boxes, displacements].map(entries), [3, 4, 4, 3]);
+        assert_eq!(most_changes(&deformed(&sizes, plain)), 4, "nobody follows");
+        assert_eq!(most_domains(&followed(&sizes, plain)), 4, "followers count among what changes");
+        let truncated = Deformation { truncation: Some(0.1), ..plain };
+        assert_eq!(most_changes(&followed(&sizes, truncated)), 0);
+    }
 }

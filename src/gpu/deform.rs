@@ -5,13 +5,13 @@ use std::sync::Arc;
 
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
 
-use super::boxes::pieces;
+use super::apply::most_domains;
 use super::device::Device;
 use super::inputs::{Packing, Values};
 use super::layout::{DeformArgs, Piece};
 use super::memory::{address, room, upload};
-use super::plan::Kernel;
-use super::work::{Coordinates, Source, Work, corner_shifts, rest_directions, rest_positions, side_by_side};
+use super::plan::{Kernel, Tables};
+use super::work::{Source, Work, rest_directions, rest_positions, side_by_side};
 use crate::error::{Error, Result, during};
 use crate::scene::Scene;
 use crate::storage::{Plane, TILE_QUADS, Tiles};
@@ -24,8 +24,8 @@ const PIECE: usize = 1 << 22;
 pub(super) struct Deform {
     pub(super) function: CudaFunction,
     config: LaunchConfig,
-    /// The same for a list of tiles.
-    listed: CudaFunction,
+    /// The same for a list of tiles, and the list, where there can be one.
+    listed: Option<CudaFunction>,
     tiles: CudaSlice<u8>,
     lanes: CudaSlice<u8>,
     lane_scales: CudaSlice<u8>,
@@ -48,21 +48,19 @@ pub(super) struct Deform {
 }
 
 impl Deform {
-    pub(super) fn new(device: &Device, scene: &Arc<Scene>, kernel: &Kernel) -> Result<Self> {
-        let coordinates = Coordinates::new(scene);
-        let work = Work::new(scene, &coordinates);
+    /// Packs what the tables name onto the device.
+    pub(super) fn new(device: &Device, scene: &Arc<Scene>, kernel: &Kernel, tables: Tables) -> Result<Self> {
+        let Tables { coordinates, work, pieces } = tables;
         let mut load = Load::new(device, scene, &work)?;
         work.sources.iter().try_for_each(|source| load.add(source))?;
         let (words, load) = load.finish()?;
         let (scales, factors) = (upload(device, &load.scales)?, load.factors);
         let [normals, tangents] = rest_directions(scene, &work);
-        // A lane for each item: lists are short, and would else leave most of the device without work.
-        let defines = kernel.defines.iter().copied().filter(|define| *define != "NARROW");
-        let listed: Vec<&str> = defines.chain(["NARROW", "LISTED"]).collect();
+        let has_lists = most_domains(scene) > 0;
         Ok(Self {
             function: function(device, kernel)?,
             config: config(kernel),
-            listed: device.function(kernel.name, kernel.source.0, &listed)?,
+            listed: has_lists.then(|| listed(device, kernel)).transpose()?,
             tiles: upload(device, &work.tiles)?,
             lanes: upload(device, &work.lanes)?,
             lane_scales: upload(device, &work.lane_scales)?,
@@ -70,13 +68,13 @@ impl Deform {
             rest: upload(device, &rest_positions(scene, &work))?,
             normals: upload(device, &normals)?,
             tangents: upload(device, &tangents)?,
-            corner_shifts: upload(device, &corner_shifts(scene))?,
+            corner_shifts: upload(device, &work.corner_shifts)?,
             scales,
-            list: room(device, 4 * work.tiles.len() as u64)?,
+            list: room(device, if has_lists { 4 * work.tiles.len() as u64 } else { 0 })?,
             boxes: room(device, 96 * work.tiles.len() as u64)?,
             count: work.tiles.len() as u32,
             directed: work.quads.directed,
-            pieces: scene.needs.boxes.then(|| pieces(scene, &work)),
+            pieces: scene.needs.boxes.then_some(pieces),
             packing: Arc::new(Packing {
                 scene: Arc::clone(scene),
                 coordinates,
@@ -116,7 +114,8 @@ impl Deform {
     pub(super) fn launch_listed(&self, device: &Device, values: Values) -> Result<()> {
         let grid_dim = ((4 * self.count).min(LISTED_BLOCKS), 1, 1);
         let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
-        self.launch_as(device, values, (&self.listed, config))
+        let missing = || Error::Fault { stage: "deform", reason: "the scene has no lists".into() };
+        self.launch_as(device, values, (self.listed.as_ref().ok_or_else(missing)?, config))
     }
 
     fn launch_as(
@@ -152,8 +151,8 @@ impl Deform {
         let mut launch = device.stream().launch_builder(function);
         // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
         // words, x0, normals, transforms and q of the same scene, and the list names such tiles; there are as many boxes
-        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are read only by
-        // a kernel that was compiled for a scene that has them.
+        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are
+        // read only by a kernel that was compiled for a scene that has them.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
         Ok(())
     }
@@ -168,6 +167,14 @@ fn function(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
     }
     let reason = format!("the kernel is made for {most} threads a block, {} were planned", kernel.threads);
     Err(Error::Fault { stage: "deform", reason })
+}
+
+/// The function of the kernel that computes the tiles of a list.
+fn listed(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
+    // A lane for each item: lists are short, and would else leave most of the device without work.
+    let defines = kernel.defines.iter().copied().filter(|define| *define != "NARROW");
+    let listed: Vec<&str> = defines.chain(["NARROW", "LISTED"]).collect();
+    device.function(kernel.name, kernel.source.0, &listed)
 }
 
 /// Blocks that walk over a list of tiles: as many as a large device holds at once.

@@ -1,67 +1,61 @@
 //! The deformer `cuda`: a step is one graph of copies and kernels, and the bounds come back with it.
+//!
+//! A step can be submitted before the one before it has ended: its values are then written while that one runs. And the
+//! host can fetch the vertices of a step while the next runs: that one then writes another output.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Instant;
 
-use cudarc::driver::sys::{CUgraphInstantiate_flags, CUstreamCaptureMode};
-use cudarc::driver::{CudaGraph, CudaSlice, PinnedHostSlice, result};
+use cudarc::driver::CudaSlice;
 
 use super::GlBuffers;
-use super::apply::{Apply, Lengths};
-use super::bounds::{Bounds, bounds_of};
+use super::apply::{Apply, Lengths, most_domains};
+use super::bounds::Bounds;
 use super::deform::Deform;
 use super::device::Device;
+use super::fetch::{Fetches, Lists, Order};
+use super::flight::{Flight, Kernels};
 use super::inputs::Inputs;
+use super::interop::Access;
 use super::layout::Header;
 use super::memory::{PageLock, address, download, room};
 use super::normals::Normals;
-use super::output::{Output, sizes};
-use super::plan::{Launch, Plan, Role, plan};
-use crate::deform::{Backend, Deformed, Deformer, Surface, Wanted};
+use super::output::{Output, Use, sizes};
+use super::plan::{Launch, Plan, Role, Tables, plan_of};
+use super::rotation::{Rotation, Turn};
+use crate::deform::{Backend, Deformed, Deformer, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::scene::{Changed, Scene, State};
+
+/// Steps that may be under way at once.
+pub const MOST_UNDER_WAY: usize = 2;
 
 /// The CUDA deformer of one scene. Lives and dies on the thread that owns the OpenGL context, and before the buffers
 /// that it shares.
 pub struct CudaDeformer {
-    // Graphs first: they name the memory of all that follows.
-    whole: Option<CudaGraph>,
-    some: Option<CudaGraph>,
+    // Their graphs name the memory of all that follows.
+    flights: Vec<Flight>,
     device: Arc<Device>,
     plan: Plan,
     kernels: Kernels,
     inputs: Inputs,
-    answer: PinnedHostSlice<u32>,
     output: Output,
-    /// u, of a scene that keeps it.
+    /// u, of a scene that keeps it. One for all outputs, and so are boxes: both are read before the next step is submitted.
     displacements: Option<CudaSlice<u8>>,
-    steps: Steps,
+    rotation: Rotation,
+    /// Oldest first: the flight, and when its step was submitted.
+    under_way: VecDeque<(usize, Instant)>,
+    /// The flight of the last step.
+    last: usize,
+    fetches: Fetches,
+    /// The last step's and what of it is fetched, until the next is submitted.
+    fetch: Option<(Wanted, Fetch)>,
     // Declared before `surface`, so dropped before it: the locks are on its memory.
     locks: Vec<PageLock>,
     surface: Surface,
     /// What of `surface` is what the device holds.
     fresh: Wanted,
-}
-
-#[derive(Debug)]
-struct Kernels {
-    deform: Deform,
-    bounds: Bounds,
-    /// Of a scene whose normals follow the surface.
-    normals: Option<Normals>,
-    apply: Apply,
-}
-
-/// Which step the output shows.
-#[derive(Debug, Clone, Copy, Default)]
-struct Steps {
-    /// The last step that was begun.
-    begun: u32,
-    /// The last one that ended well, and the state's serial number then; 0 when the output shows nothing whole.
-    shown: u32,
-    serial: u64,
-    /// The last step that changed all domains.
-    everything: u32,
 }
 
 impl CudaDeformer {
@@ -70,46 +64,53 @@ impl CudaDeformer {
     /// # Errors
     /// `Fault` when the device refuses; `Unavailable` when NVRTC is missing or the device's memory is too small.
     pub fn new(device: &Arc<Device>, scene: &Arc<Scene>, gl: Option<GlBuffers>) -> Result<Self> {
-        let plan = plan(scene);
+        let tables = Tables::new(scene);
+        let plan = plan_of(scene, &tables);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let deform = Deform::new(device, scene, plan.needed(Launch::Deform)?)?;
+        let deform = Deform::new(device, scene, plan.needed(Launch::Deform)?, tables)?;
+        let apply = plan.kernel(Launch::Apply);
         let kernels = Kernels {
             bounds: Bounds::new(device, plan.needed(Launch::Bounds)?, deform.pieces())?,
             normals: plan.kernel(Launch::Normals).map(|normals| Normals::new(device, scene, normals)).transpose()?,
-            apply: Apply::new(device, deform.packing(), plan.needed(Launch::Apply)?)?,
+            apply: apply.map(|apply| Apply::new(device, deform.packing(), apply)).transpose()?,
             deform,
         };
-        // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
-        let answer = unsafe { device.context().alloc_pinned_with_flags(6, 0) }.map_err(during("allocate"))?;
-        let mut deformer = Self {
-            whole: None,
-            some: None,
-            inputs: Inputs::new(device, kernels.deform.packing())?,
+        let output = Output::new(device, &plan, gl)?;
+        let inputs = Inputs::new(device, kernels.deform.packing())?;
+        // Tables were copied from memory that is gone by now; wait here, so that a fault of theirs shows here.
+        device.stream().synchronize().map_err(during("upload"))?;
+        Ok(Self {
+            flights: vec![Flight::new(device, &kernels, &inputs)?],
+            rotation: Rotation::new(output.most(), most_domains(scene)),
+            inputs,
             kernels,
-            answer,
-            output: Output::new(device, &plan, gl)?,
+            output,
             displacements: match plan.bytes(Role::Displacements) {
                 0 => None,
                 bytes => Some(room(device, bytes)?),
             },
-            steps: Steps::default(),
+            under_way: VecDeque::new(),
+            last: 0,
+            fetches: Fetches::default(),
+            fetch: None,
             locks: Vec::new(),
             surface: Surface::default(),
             fresh: Wanted::ALL,
             device: Arc::clone(device),
             plan,
-        };
-        // Tables were copied from memory that is gone by now; wait here, so that a fault of theirs shows here.
-        deformer.device.stream().synchronize().map_err(during("upload"))?;
-        deformer.whole = Some(deformer.capture(false)?);
-        deformer.some = Some(deformer.capture(true)?);
-        Ok(deformer)
+        })
     }
 
-    /// What it compiled and allocated.
+    /// What it compiled and allocated. A second output comes once vertices are fetched beside a step, and a second set of
+    /// pinned memory once a step is submitted beside another.
     pub const fn plan(&self) -> &Plan {
         &self.plan
+    }
+
+    /// Outputs that there are: two once vertices were fetched beside a step.
+    pub fn outputs(&self) -> usize {
+        self.output.count()
     }
 
     /// How far the modes that were left out may have moved a vertex in the last step, scene units.
@@ -117,97 +118,137 @@ impl CudaDeformer {
         self.inputs.truncation_bound()
     }
 
-    /// A step as a graph: copies in, kernels, the bounds out. `some`: of a list of changed domains.
-    fn capture(&mut self, some: bool) -> Result<CudaGraph> {
-        let fail = during("capture");
-        let stream = Arc::clone(self.device.stream());
-        // Relaxed: a look at pinned memory asks the driver whether it is in use, which stricter modes refuse.
-        stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
-        let started = self.start(some);
-        // The capture ends whatever happened, or the stream would stay in it.
-        let graph = stream.end_capture(CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH);
-        started?;
-        let empty = || Error::Fault { stage: "capture", reason: "the graph is empty".into() };
-        graph.map_err(&fail)?.ok_or_else(empty)
+    /// Starts a step, whatever is still under way: at most [`MOST_UNDER_WAY`] with it. [`Self::finish`] waits for the
+    /// oldest.
+    ///
+    /// # Errors
+    /// `Busy` when so many are under way; `Fault` of the device, after which none is.
+    pub fn submit(&mut self, state: &State) -> Result<()> {
+        if self.under_way.len() == MOST_UNDER_WAY {
+            return Err(Error::Busy { queue: "steps under way", limit: MOST_UNDER_WAY });
+        }
+        self.fresh = Wanted::default();
+        self.fetch = None;
+        let begin = Instant::now();
+        let started = self.start(state).inspect_err(|_| self.forget())?;
+        self.under_way.push_back((started, begin));
+        self.last = started;
+        Ok(())
     }
 
-    fn start(&mut self, some: bool) -> Result<()> {
-        let Self { device, kernels, inputs, .. } = self;
-        let values = inputs.values(device);
-        inputs.send(device, some.then_some(size_of::<Header>()))?;
-        if some {
-            kernels.apply.launch(device, values, kernels.deform.list(device))?;
-            kernels.deform.launch_listed(device, values)?;
-        } else {
-            kernels.deform.launch(device, values)?;
-        }
-        kernels.bounds.launch(device, values, kernels.deform.boxes(device))?;
-        kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, values))?;
-        let bounds = values.header + std::mem::offset_of!(Header, bounds) as u64;
-        let answer = self.answer.as_mut_slice().map_err(during("capture"))?;
-        // SAFETY: the header has six words of bounds, so has `answer`, and the deformer waits for the stream before it
-        // reads them.
-        unsafe { result::memcpy_dtoh_async(answer, bounds, device.stream().cu_stream()) }.map_err(during("capture"))
+    /// Waits for the oldest step that was submitted.
+    ///
+    /// # Errors
+    /// `Fault` of the device, after which no step is under way; also when none was.
+    pub fn finish(&mut self) -> Result<Deformed> {
+        let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
+        let (flight, begin) = self.under_way.pop_front().ok_or_else(none)?;
+        let bounds = self.flights[flight].wait().inspect_err(|_| self.forget())?;
+        Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
-    fn run(&mut self, state: &State) -> Result<crate::scene::Bounds> {
-        let steps = &mut self.steps;
-        let changed = match &state.changed {
-            Changed::Some(list) if state.serial == steps.serial + 1 => Some(list.as_slice()),
+    /// Starts the whole graph of the last step once more, for measuring it alone: outputs of our own stay where they are.
+    pub(super) fn replay(&self) -> Result<()> {
+        self.flights[self.last].launch(false)
+    }
+
+    /// Writes a step's values and starts its graph; the flight that it took.
+    fn start(&mut self, state: &State) -> Result<usize> {
+        let set = self.rotation.next_output();
+        if let Err(error) = self.output.ensure(&self.device, &self.plan, set) {
+            tracing::warn!(%error, "no room for a second output: steps wait until the vertices before them are read");
+            self.rotation.stay();
+        }
+        let at = self.free_flight()?;
+        let turn = self.rotation.begin(state);
+        let Self { flights, kernels, inputs, .. } = self;
+        let flight = &mut flights[at];
+        let some = match (&turn.behind, &state.changed, &mut flight.list, &mut kernels.apply) {
+            (Some(behind), Changed::Some(changed), Some(list), Some(apply)) => {
+                apply.write(list, kernels.deform.packing(), state, (changed, behind))?
+            }
             _ => None,
         };
-        if steps.begun == u32::MAX {
-            // Old stamps then look new, which costs work once and is never wrong.
-            *steps = Steps::default();
+        let header = header(&turn, some, self.rotation.everything(some.is_none()));
+        // OpenGL's buffers were copied aside on this very stream.
+        if turn.is_read && !self.output.is_shared() {
+            self.fetches.let_pass(&self.device, turn.output)?;
         }
-        steps.begun += 1;
-        let some: Option<Lengths> = match changed {
-            Some(list) if steps.shown > 0 => self.kernels.apply.write(self.kernels.deform.packing(), state, list)?,
-            _ => None,
-        };
-        if some.is_none() {
-            steps.everything = steps.begun;
-        }
-        let lengths = some.unwrap_or_default();
-        let header = Header {
-            since: if some.is_some() { steps.shown } else { 0 },
-            everything: steps.everything,
-            step: steps.begun,
-            changed: lengths.changed,
-            stale: lengths.stale,
-            ..Header::default()
-        };
-        steps.shown = 0;
-        let graph = if some.is_some() { &self.some } else { &self.whole };
-        let inputs = &mut self.inputs;
         // Normals that follow the surface read its positions again, and so do boxes.
-        let keep = some.is_some() || self.kernels.normals.is_some() || self.kernels.bounds.boxes.is_some();
+        let keep = some.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, |buffer| address(&self.device, buffer));
         let header = Header { displacements, ..header };
-        self.output.write(&self.device, keep, |to| {
+        let access = if keep { Access::WriteSome } else { Access::WriteAll };
+        self.output.with(&self.device, Use { set: turn.output, access }, |to| {
             let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
             match some {
-                Some(_) => inputs.write_header(&header)?,
-                None => inputs.write(&header, state)?,
+                Some(_) => Inputs::write_header(&mut flight.values, &header)?,
+                None => inputs.write(&mut flight.values, &header, state)?,
             }
-            let missing = || Error::Fault { stage: "deform", reason: "no graph was captured".into() };
-            graph.as_ref().ok_or_else(missing)?.launch().map_err(during("deform"))
+            flight.launch(some.is_some())
         })?;
-        self.device.stream().synchronize().map_err(during("deform"))?;
-        self.steps.shown = self.steps.begun;
-        self.steps.serial = state.serial;
-        Ok(bounds_of(self.answer.as_slice().map_err(during("deform"))?))
+        flight.done.record(self.device.stream()).map_err(during("deform"))?;
+        self.rotation.end(state);
+        Ok(at)
     }
 
-    /// Copies what of the output is wanted and not there yet.
-    fn fetch(&mut self, wanted: Wanted) -> Result<()> {
+    /// A flight whose step has ended; made if all there are are under way.
+    fn free_flight(&mut self) -> Result<usize> {
+        let is_free = |at: &usize| self.under_way.iter().all(|(flight, _)| flight != at);
+        if let Some(at) = (0..self.flights.len()).find(is_free) {
+            return Ok(at);
+        }
+        self.flights.push(Flight::new(&self.device, &self.kernels, &self.inputs)?);
+        Ok(self.flights.len() - 1)
+    }
+
+    /// Waits for what is under way, because the next step overwrites what it reads, and takes no output and no value on
+    /// the device for whole. So does every step that fails.
+    pub fn forget(&mut self) {
+        // Failures of their own add nothing.
+        self.device.stream().synchronize().ok();
+        self.fetches.synchronize();
+        self.under_way.clear();
+        self.fetch = None;
+        self.rotation.forget();
+    }
+
+    fn order(&mut self, wanted: Wanted) -> Result<Fetch> {
+        let nothing = || Error::Fault { stage: "fetch", reason: "no step was deformed".into() };
+        let set = self.rotation.shown().ok_or_else(nothing)?;
+        let length = |wanted: bool, role: Role| if wanted { self.plan.bytes(role) as usize / 4 } else { 0 };
+        let lengths = Lists {
+            positions: length(wanted.positions, Role::Positions),
+            normals: length(wanted.normals, Role::Normals),
+            displacements: length(wanted.displacements, Role::Displacements),
+        };
+        // What else is wanted leaves the output free for the next step.
+        let reading = lengths.are_of_output().then(|| self.rotation.read());
+        let order = Order { set, lengths, reading, after: &self.flights[self.last].done };
+        let Self { device, kernels, displacements, fetches, output, .. } = self;
+        let copy_kept = |surface: &mut Surface| {
+            if let Some(buffer) = displacements.as_ref() {
+                // SAFETY: the buffer has the bytes of the plan, and the list has that length or none.
+                unsafe { download(device, address(device, buffer), &mut surface.displacements) }?;
+            }
+            match &mut kernels.bounds.boxes {
+                Some(boxes) if wanted.boxes => boxes.read(device, &mut surface.boxes),
+                _ => Ok(()),
+            }
+        };
+        let begun = fetches.start(device, output, order, copy_kept);
+        begun.inspect_err(|_| self.fetches.synchronize())
+    }
+
+    /// Copies what of the output is wanted and not in `surface` yet.
+    fn bring(&mut self, wanted: Wanted) -> Result<()> {
         let fresh = self.fresh;
         if (wanted.positions || wanted.normals) && !fresh.covers(Wanted::VERTICES) {
-            self.fetch_vertices()?;
+            self.bring_vertices()?;
             self.fresh = self.fresh.or(Wanted::VERTICES);
         }
         if wanted.displacements && !fresh.displacements {
-            self.fetch_displacements()?;
+            self.bring_displacements()?;
             self.fresh.displacements = true;
         }
         if wanted.boxes && !fresh.boxes {
@@ -219,7 +260,7 @@ impl CudaDeformer {
         Ok(())
     }
 
-    fn fetch_displacements(&mut self) -> Result<()> {
+    fn bring_displacements(&mut self) -> Result<()> {
         let Some(buffer) = &self.displacements else { return Ok(()) };
         let list = &mut self.surface.displacements;
         if list.is_empty() {
@@ -231,7 +272,9 @@ impl CudaDeformer {
         unsafe { download(&self.device, address(&self.device, buffer), list) }
     }
 
-    fn fetch_vertices(&mut self) -> Result<()> {
+    fn bring_vertices(&mut self) -> Result<()> {
+        let nothing = || Error::Fault { stage: "download", reason: "no step was deformed".into() };
+        let set = self.rotation.shown().ok_or_else(nothing)?;
         let [positions, normals, tangents] = sizes(&self.plan).map(|bytes| bytes as usize / 4);
         if self.surface.positions.is_empty() {
             let Surface { positions: first, normals: second, tangents: third, .. } = &mut self.surface;
@@ -241,7 +284,20 @@ impl CudaDeformer {
                 self.locks.extend(unsafe { PageLock::new(&self.device, list) });
             }
         }
-        self.output.read(&self.device, &mut self.surface)
+        self.output.read(&self.device, set, &mut self.surface)
+    }
+}
+
+/// The header of a step, but for where its outputs lie.
+fn header(turn: &Turn, some: Option<Lengths>, everything: u32) -> Header {
+    let lengths = some.unwrap_or_default();
+    Header {
+        since: if some.is_some() { turn.shown } else { 0 },
+        everything,
+        step: turn.step,
+        changed: lengths.changed,
+        stale: lengths.stale,
+        ..Header::default()
     }
 }
 
@@ -250,14 +306,18 @@ impl Deformer for CudaDeformer {
         Backend::Cuda
     }
 
+    /// Waits for the steps that were submitted before, too.
     fn deform(&mut self, state: &State) -> Result<Deformed> {
-        let begin = Instant::now();
-        self.fresh = Wanted::default();
-        let bounds = self.run(state).inspect_err(|_| {
-            // Copies may be in flight that read what the next step overwrites. Their own failure adds nothing.
-            self.device.stream().synchronize().ok();
-        })?;
-        Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        while self.under_way.len() == MOST_UNDER_WAY {
+            self.finish()?;
+        }
+        self.submit(state)?;
+        loop {
+            let deformed = self.finish()?;
+            if self.under_way.is_empty() {
+                return Ok(deformed);
+            }
+        }
     }
 
     fn shares_buffers(&self) -> bool {
@@ -269,8 +329,27 @@ impl Deformer for CudaDeformer {
     }
 
     fn read(&mut self, wanted: Wanted) -> Result<&Surface> {
-        self.fetch(wanted)?;
+        self.bring(wanted)?;
         Ok(&self.surface)
+    }
+
+    /// Positions and normals travel beside the next step. Displacements and boxes, of which the device has but one, are
+    /// there when this returns.
+    fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
+        if let Some((_, fetch)) = self.fetch.as_ref().filter(|(there, _)| there.covers(wanted)) {
+            return Ok(fetch.clone());
+        }
+        let fetch = self.order(wanted)?;
+        self.fetch = Some((wanted, fetch.clone()));
+        Ok(fetch)
+    }
+
+    fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
+        let (surface, number) = self.fetches.wait(fetch)?;
+        if let Some(number) = number {
+            self.rotation.has_read(number);
+        }
+        Ok(surface)
     }
 }
 
@@ -278,6 +357,7 @@ impl Drop for CudaDeformer {
     fn drop(&mut self) {
         // Nothing may be freed that the device still uses. After a fault the answer is an error, and nothing runs.
         self.device.stream().synchronize().ok();
+        self.fetches.synchronize();
     }
 }
 

@@ -1,4 +1,4 @@
-//! A CUDA device: its context on this thread, its one stream, and compiled kernels.
+//! A CUDA device: its context on this thread, its stream, and compiled kernels.
 
 use std::sync::Arc;
 
@@ -11,7 +11,8 @@ use crate::error::{Error, Result, during};
 /// The oldest CUDA driver interface that is used here, as cuDriverGetVersion counts (12.0).
 const OLDEST_DRIVER: i32 = 12_000;
 
-/// A CUDA device with its context current on this thread. All work on it goes through one stream, in order.
+/// A CUDA device with its context current on this thread. All work on it goes through one stream, in order; only copies
+/// of vertices to the host have a stream of their own, ordered by events.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -41,7 +42,8 @@ impl Device {
 
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
-        // SAFETY: everything on this device goes through the one stream below, whose order is all the ordering needed.
+        // SAFETY: everything on this device goes through the one stream below, whose order is all the ordering needed;
+        // `fetch`, which has another, orders its copies by events of its own.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;

@@ -1,4 +1,5 @@
-//! The values of a step on their way to the device: written to pinned memory once, in the order in which they lie there.
+//! The values of a step on their way to the device: written to pinned memory once, in the order in which they lie there,
+//! large ones by several cores.
 //!
 //! ```text
 //! [header][transforms: 12 f32 a mover][q, whole chunks of modes][with truncation: kept chunks of each domain]
@@ -7,12 +8,12 @@
 
 use std::sync::Arc;
 
-use bytemuck::Pod;
 use cudarc::driver::{CudaSlice, PinnedHostSlice, result};
 
 use super::device::Device;
 use super::layout::{Following, Header};
 use super::memory::{address, room, upload};
+use super::staging::{Front, fill_parts};
 use super::work::Coordinates;
 use crate::error::{Result, during};
 use crate::scene::{Scene, State};
@@ -73,35 +74,37 @@ impl Sizes {
     }
 }
 
-/// Both ends of the way.
+/// Where the values of a step lie on the device, and what writes them.
 #[derive(Debug)]
 pub(super) struct Inputs {
-    packing: Arc<Packing>,
-    pinned: PinnedHostSlice<f32>,
+    writer: Writer,
     buffer: CudaSlice<u8>,
     stamps: CudaSlice<u8>,
     following: CudaSlice<u8>,
     frames: CudaSlice<u8>,
     sizes: Sizes,
-    truncation: Option<Choice>,
 }
+
+/// Pinned memory for the values of one step on their way.
+pub(super) type Pinned = PinnedHostSlice<f32>;
 
 impl Inputs {
     pub(super) fn new(device: &Device, packing: &Arc<Packing>) -> Result<Self> {
         let sizes = Sizes::of(&packing.scene, &packing.coordinates);
-        // SAFETY: the memory is written whole before it is first read, in `write`.
-        let pinned =
-            unsafe { device.context().alloc_pinned(sizes.total() as usize / 4) }.map_err(during("allocate"))?;
         Ok(Self {
-            packing: Arc::clone(packing),
-            pinned,
+            writer: Writer::new(packing),
             buffer: room(device, sizes.total())?,
             stamps: room(device, 4 * packing.scene.domains.len() as u64)?,
             following: upload(device, &following(&packing.scene))?,
             frames: upload(device, packing.scene.movers.frames())?,
             sizes,
-            truncation: packing.scene.needs.truncation.then(|| Choice::new(&packing.scene)),
         })
+    }
+
+    /// Room for the values of a step.
+    pub(super) fn pinned(&self, device: &Device) -> Result<Pinned> {
+        // SAFETY: the memory is written whole before it is first read, in `write`.
+        unsafe { device.context().alloc_pinned(self.sizes.total() as usize / 4) }.map_err(during("allocate"))
     }
 
     pub(super) fn values(&self, device: &Device) -> Values {
@@ -115,35 +118,25 @@ impl Inputs {
         Values { header, transforms, following, frames, q, stamps, kept_counts, kept }
     }
 
-    /// Writes a whole step. Nothing may be reading the pinned memory: the caller has waited for the last copy.
-    pub(super) fn write(&mut self, header: &Header, state: &State) -> Result<()> {
-        let Self { packing, pinned, truncation, .. } = self;
-        let mut to = Front(pinned.as_mut_slice().map_err(during("upload"))?);
-        to.put(std::slice::from_ref(header));
-        to.put(&state.transforms);
-        let before = to.0.len();
-        packing.write_q(state, &mut to);
-        let written = before - to.0.len();
-        to.zeros(packing.coordinates.total - written);
-        if let Some(choice) = truncation {
-            choice.write(packing, state, &mut to);
-        }
+    /// Writes a whole step. Nothing may be reading the pinned memory: the caller has waited for its last copy.
+    pub(super) fn write(&mut self, to: &mut Pinned, header: &Header, state: &State) -> Result<()> {
+        self.writer.write(to.as_mut_slice().map_err(during("upload"))?, header, state);
         Ok(())
     }
 
     /// Writes the header alone.
-    pub(super) fn write_header(&mut self, header: &Header) -> Result<()> {
-        Front(self.pinned.as_mut_slice().map_err(during("upload"))?).put(std::slice::from_ref(header));
+    pub(super) fn write_header(to: &mut Pinned, header: &Header) -> Result<()> {
+        Front::new(to.as_mut_slice().map_err(during("upload"))?).put(std::slice::from_ref(header));
         Ok(())
     }
 
     /// Starts the copy of the first `bytes`; the whole when `None`.
-    pub(super) fn send(&mut self, device: &Device, bytes: Option<usize>) -> Result<()> {
+    pub(super) fn send(&self, device: &Device, from: &mut Pinned, bytes: Option<usize>) -> Result<()> {
         let fail = during("upload");
-        let (to, host) = (address(device, &self.buffer), self.pinned.as_mut_slice().map_err(&fail)?);
+        let (to, host) = (address(device, &self.buffer), from.as_mut_slice().map_err(&fail)?);
         let bytes = bytes.unwrap_or(size_of_val(host));
-        // SAFETY: `pinned` and `buffer` have `bytes` bytes and outlive the copy: the deformer waits for the stream
-        // before it writes here again and before it goes away, and a graph that holds the copy goes before both.
+        // SAFETY: `pinned` and `buffer` have `bytes` bytes and outlive the copy: the deformer waits for it before it
+        // writes there again and before it goes away, and a graph that holds the copy goes before both.
         let sent = unsafe {
             let host = std::slice::from_raw_parts(host.as_ptr().cast::<u8>(), bytes);
             result::memcpy_htod_async(to, host, device.stream().cu_stream())
@@ -158,12 +151,37 @@ impl Inputs {
 
     /// Chunks of modes that each domain sums at the last step; `None` when it sums all.
     pub(super) fn kept_chunks(&self) -> Option<&[u32]> {
-        self.truncation.as_ref().map(|choice| choice.counts.as_slice())
+        self.writer.truncation.as_ref().map(|choice| choice.counts.as_slice())
     }
 
     /// How far leaving modes out may move a vertex at the last step, scene units.
     pub(super) fn truncation_bound(&self) -> f64 {
-        self.truncation.as_ref().map_or(0.0, |choice| choice.bound)
+        self.writer.truncation.as_ref().map_or(0.0, |choice| choice.bound)
+    }
+}
+
+/// Writes the values of steps, in the order of their parts. Pure.
+#[derive(Debug)]
+pub(super) struct Writer {
+    packing: Arc<Packing>,
+    truncation: Option<Choice>,
+}
+
+impl Writer {
+    pub(super) fn new(packing: &Arc<Packing>) -> Self {
+        let truncation = packing.scene.needs.truncation.then(|| Choice::new(&packing.scene));
+        Self { packing: Arc::clone(packing), truncation }
+    }
+
+    /// Writes a whole step; `to` has the words of [`Sizes::total`].
+    pub(super) fn write(&mut self, to: &mut [f32], header: &Header, state: &State) {
+        let mut to = Front::new(to);
+        to.put(std::slice::from_ref(header));
+        to.put(&state.transforms);
+        self.packing.write_q(state, to.take(self.packing.coordinates.total));
+        if let Some(choice) = &mut self.truncation {
+            choice.write(&self.packing, state, &mut to);
+        }
     }
 }
 
@@ -173,15 +191,24 @@ pub(super) fn following(scene: &Scene) -> Vec<Following> {
 }
 
 impl Packing {
-    /// All coordinates as they lie on the device, without the padding at the end.
-    fn write_q(&self, state: &State, to: &mut Front) {
+    /// All coordinates as they lie on the device, and the padding at the end.
+    fn write_q(&self, state: &State, to: &mut [f32]) {
         if self.coordinates.as_packed {
+            let mut to = Front::new(to);
             to.put(&state.q);
+            to.take(self.coordinates.total - state.q.len()).fill(0.0);
             return;
         }
-        for domain in 0..self.scene.domains.len() {
-            self.put_q(domain, state.q_of(&self.scene, domain), |number| to.put(&[number]));
-        }
+        fill_parts(to, &self.coordinates.first, |domains, part| {
+            let mut at = 0;
+            for domain in domains {
+                self.put_q(domain, state.q_of(&self.scene, domain), |number| {
+                    part[at] = number;
+                    at += 1;
+                });
+            }
+            part[at..].fill(0.0);
+        });
     }
 
     /// The coordinates of one domain, times the factors of its modes, filled up to whole chunks.
@@ -195,24 +222,6 @@ impl Packing {
             let whole = q.len().next_multiple_of(modes_per_chunk(self.scene.deformation.storage));
             (q.len()..whole).for_each(|_| put(0.0));
         }
-    }
-}
-
-/// The unwritten rest of a list, written from its front.
-struct Front<'a>(&'a mut [f32]);
-
-impl Front<'_> {
-    fn put<T: Pod>(&mut self, values: &[T]) {
-        let words: &[f32] = bytemuck::cast_slice(values);
-        let (part, rest) = std::mem::take(&mut self.0).split_at_mut(words.len());
-        part.copy_from_slice(words);
-        self.0 = rest;
-    }
-
-    fn zeros(&mut self, count: usize) {
-        let (part, rest) = std::mem::take(&mut self.0).split_at_mut(count);
-        part.fill(0.0);
-        self.0 = rest;
     }
 }
 
@@ -274,5 +283,60 @@ impl Choice {
         }
         to.put(&self.counts);
         to.put(&self.chunks);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pack::tests::{deformed, scene};
+    use super::*;
+    use crate::scene::{Deformation, Storage};
+
+    fn packing(scene: &Arc<Scene>) -> Arc<Packing> {
+        let coordinates = Coordinates::new(scene);
+        let factors = vec![vec![0.5; 64]; scene.shapes.len()];
+        Arc::new(Packing { scene: Arc::clone(scene), coordinates, factors, spans: Vec::new(), tiles: 0 })
+    }
+
+    fn state(scene: &Scene) -> State {
+        let mut state = State::rest(scene);
+        state.q.iter_mut().enumerate().for_each(|(at, amount)| *amount = (at % 1000) as f32);
+        let transforms = state.transforms.iter_mut().enumerate();
+        transforms.for_each(|(at, transform)| transform.0[3] = at as f32);
+        state
+    }
+
+    /// All words of a step, one by one.
+    fn plainly(packing: &Packing, state: &State) -> Vec<f32> {
+        let scene = &packing.scene;
+        let mut words = vec![0.0; size_of::<Header>() / 4];
+        words.extend(state.transforms.iter().flat_map(|transform| transform.0));
+        let begin = words.len();
+        words.resize(begin + packing.coordinates.total, 0.0);
+        for domain in 0..scene.domains.len() {
+            let first = begin + packing.coordinates.first[domain] as usize;
+            for (mode, amount) in state.q_of(scene, domain).iter().enumerate() {
+                words[first + mode] = if packing.coordinates.as_packed { *amount } else { 0.5 * amount };
+            }
+        }
+        words
+    }
+
+    #[test]
+    fn small_and_large_steps_are_written_word_for_word_whatever_the_cores() {
+        let f16 = Deformation { storage: Storage::F16, ..Deformation::default() };
+        for (shapes, cores) in [(3, 1), (3, 4), (20_000, 1), (20_000, 4)] {
+            let ranks: Vec<(usize, usize)> = (0..shapes).map(|at| (7, at % 20)).collect();
+            for scene in [scene(&ranks, false, false), deformed(&ranks, f16)] {
+                let (packing, state) = (packing(&scene), state(&scene));
+                let mut words = vec![f32::NAN; Sizes::of(&scene, &packing.coordinates).total() as usize / 4];
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(cores).build().expect("a pool");
+                pool.install(|| Writer::new(&packing).write(&mut words, &Header::default(), &state));
+                let mut want = plainly(&packing, &state);
+                assert!(words == want, "{shapes} shapes, {cores} cores");
+                want[24] += 1.0;
+                assert!(words != want, "the judge can fail");
+            }
+        }
     }
 }

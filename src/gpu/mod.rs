@@ -14,12 +14,14 @@
 //! |---|---|
 //! | `plan` | scene to kernels with their macros, buffers and launches |
 //! | `work`, `pack`, `rings`, `layout` | scene to the tables that kernels read; pure |
-//! | `inputs` | the values of a step on their way to the device |
+//! | `inputs`, `staging` | the values of a step on their way to the device |
 //! | `apply`, `deform`, `bounds`, `normals` | the launchers |
 //! | `chain` | a launch that begins while the kernel before it ends |
-//! | `deformer` | the graph of a step, and its answer |
+//! | `deformer`, `flight` | the graph of a step, its pinned memory and its answer |
 //! | `output`, `interop` | where the vertices go |
 //! | `boxes` | a box of each domain, where the scene keeps them |
+//! | `rotation` | which of two outputs a step writes while the other is read, and what it lacks; pure |
+//! | `fetch` | vertices on their way to the host, beside the next step |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
 //! | `probe`, `report` | what is there, and whether the device agrees on layouts |
 //! | `trials` | what only measures |
@@ -32,6 +34,8 @@ mod compile;
 mod deform;
 mod deformer;
 mod device;
+mod fetch;
+mod flight;
 mod inputs;
 mod interop;
 mod layout;
@@ -43,18 +47,21 @@ mod plan;
 mod probe;
 mod report;
 mod rings;
+mod rotation;
+mod staging;
 mod trials;
 mod work;
 
-pub use deformer::CudaDeformer;
+pub use deformer::{CudaDeformer, MOST_UNDER_WAY};
 pub use device::Device;
 pub use layout::{Agreement, agreements};
 pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use trials::{
-    Batch, BatchMma, Cache, Cublas, Extent, KernelFacts, Lanes, Ours, Part, Peer, Roofs, Split, Thesis, Timing, Trial,
-    cublas_version, empty_replay, gigabytes_per_second, idle_in_warp, ingest, lanes, roofs, time,
+    Batch, BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Roofs, Split,
+    Thesis, Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes, idle_in_warp, ingest,
+    lanes, overlap, roofs, time,
 };
 
 /// OpenGL buffers to write into, by name.

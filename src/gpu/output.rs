@@ -21,13 +21,49 @@ pub(super) struct Addresses {
 /// The three outputs; each has exactly the bytes that the plan says, or more.
 #[derive(Debug)]
 pub(super) enum Output {
-    Own { positions: CudaSlice<u8>, normals: CudaSlice<u8>, tangents: Option<CudaSlice<u8>> },
+    /// One set, or two once the host reads one while the next step writes the other.
+    Own(Vec<Buffers>),
+    /// OpenGL draws from these, so there is one set.
     Shared(Interop),
+}
+
+/// A set of our own.
+#[derive(Debug)]
+pub(super) struct Buffers {
+    positions: CudaSlice<u8>,
+    normals: CudaSlice<u8>,
+    tangents: Option<CudaSlice<u8>>,
+}
+
+/// What a use of the outputs is for: which set, and how.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Use {
+    pub set: usize,
+    pub access: Access,
 }
 
 /// Bytes of positions, normals and tangents.
 pub(super) fn sizes(plan: &Plan) -> [u64; 3] {
     [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role))
+}
+
+impl Buffers {
+    fn new(device: &Device, plan: &Plan) -> Result<Self> {
+        let [positions, normals, tangents] = sizes(plan);
+        Ok(Self {
+            positions: room(device, positions)?,
+            normals: room(device, normals)?,
+            tangents: (tangents > 0).then(|| room(device, tangents)).transpose()?,
+        })
+    }
+
+    fn addresses(&self, device: &Device) -> Addresses {
+        Addresses {
+            positions: address(device, &self.positions),
+            normals: address(device, &self.normals),
+            tangents: self.tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
+        }
+    }
 }
 
 impl Output {
@@ -38,32 +74,43 @@ impl Output {
             Some(Err(error)) => tracing::warn!(%error, "vertices are copied: CUDA cannot write into OpenGL's buffers"),
             None => {}
         }
-        let [positions, normals, tangents] = sizes(plan);
-        Ok(Self::Own {
-            positions: room(device, positions)?,
-            normals: room(device, normals)?,
-            tangents: (tangents > 0).then(|| room(device, tangents)).transpose()?,
-        })
+        Ok(Self::Own(vec![Buffers::new(device, plan)?]))
     }
 
     pub(super) const fn is_shared(&self) -> bool {
         matches!(self, Self::Shared(_))
     }
 
-    /// Lets `work` write all of the outputs, or with `keep` parts of them, so that the rest stays what it was, and read
-    /// them.
-    pub(super) fn write(
-        &mut self,
-        device: &Device,
-        keep: bool,
-        work: impl FnOnce(Addresses) -> Result<()>,
-    ) -> Result<()> {
-        self.with(device, if keep { Access::WriteSome } else { Access::WriteAll }, work)
+    /// Sets that there may be.
+    pub(super) const fn most(&self) -> usize {
+        if self.is_shared() { 1 } else { 2 }
     }
 
-    /// Copies the outputs into `surface`, whose lists have the right lengths, and waits for it.
-    pub(super) fn read(&mut self, device: &Device, surface: &mut Surface) -> Result<()> {
-        self.with(device, Access::Read, |from| {
+    /// Sets that there are.
+    pub(super) fn count(&self) -> usize {
+        match self {
+            Self::Own(sets) => sets.len(),
+            Self::Shared(_) => 1,
+        }
+    }
+
+    /// Makes a set if it is not there.
+    ///
+    /// # Errors
+    /// `Fault` when the device has no room; the sets that were there stay as they are.
+    pub(super) fn ensure(&mut self, device: &Device, plan: &Plan, set: usize) -> Result<()> {
+        match self {
+            Self::Own(sets) if sets.len() <= set => {
+                sets.push(Buffers::new(device, plan)?);
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Copies a set into `surface`, whose lists have the right lengths, and waits for it.
+    pub(super) fn read(&mut self, device: &Device, set: usize, surface: &mut Surface) -> Result<()> {
+        self.with(device, Use { set, access: Access::Read }, |from| {
             // SAFETY: the outputs have the bytes of the plan, and the lists were made from the same numbers.
             unsafe {
                 download(device, from.positions, &mut surface.positions)?;
@@ -73,14 +120,16 @@ impl Output {
         })
     }
 
-    fn with(&mut self, device: &Device, access: Access, work: impl FnOnce(Addresses) -> Result<()>) -> Result<()> {
+    /// Lets `work` use a set, which is there, on the device's stream.
+    pub(super) fn with(
+        &mut self,
+        device: &Device,
+        Use { set, access }: Use,
+        work: impl FnOnce(Addresses) -> Result<()>,
+    ) -> Result<()> {
         match self {
             Self::Shared(interop) => interop.mapped(device, access, work),
-            Self::Own { positions, normals, tangents } => work(Addresses {
-                positions: address(device, positions),
-                normals: address(device, normals),
-                tangents: tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
-            }),
+            Self::Own(sets) => work(sets[set].addresses(device)),
         }
     }
 }

@@ -75,7 +75,7 @@ pub(super) mod tests {
     use crate::domain::{
         Attachment, Corners, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Texture, Transform,
     };
-    use crate::scene::{Normals, Parts, Storage};
+    use crate::scene::{Deformation, Normals, Parts, Storage};
     use std::sync::Arc;
 
     fn shape(vertices: usize, rank: usize) -> Shape {
@@ -113,7 +113,13 @@ pub(super) mod tests {
 
     /// The same without normal maps, all but the first domain following it.
     pub(in super::super) fn on_the_first(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        followed(shapes, Deformation::default())
+    }
+
+    /// The same, deformed so.
+    pub(in super::super) fn followed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
         let mut parts = parts(shapes, false, true);
+        parts.deformation = deformation;
         let follow = Follow { parent: 0, frame: Transform::IDENTITY };
         parts.domains.iter_mut().skip(1).for_each(|domain| domain.follows = Some(follow));
         Scene::new(parts).expect("a scene")
@@ -123,6 +129,13 @@ pub(super) mod tests {
     pub(in super::super) fn stored(shapes: &[(usize, usize)], storage: Storage) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.storage = storage;
+        Scene::new(parts).expect("a scene")
+    }
+
+    /// The same without normal maps, deformed so.
+    pub(in super::super) fn deformed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.deformation = deformation;
         Scene::new(parts).expect("a scene")
     }
 

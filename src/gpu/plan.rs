@@ -5,10 +5,10 @@ use serde::Serialize;
 use super::apply::most_changes;
 use super::boxes;
 use super::inputs::{Sizes, following};
-use super::layout::{BLOCK, Change, Lane, NormalSlot, Tile};
+use super::layout::{BLOCK, Change, Lane, NormalSlot, Piece, Tile};
 use super::pack;
 use super::rings::Counts;
-use super::work::{Coordinates, Work, corner_shifts, orients};
+use super::work::{Coordinates, Work, orients};
 use crate::error::{Error, Result};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
@@ -63,7 +63,7 @@ pub enum Launch {
     Bounds,
     /// Normals that follow the surface.
     Normals,
-    /// In steps that change few domains, before all others.
+    /// In steps that change few domains, before all others; in scenes where there can be such steps.
     Apply,
 }
 
@@ -100,7 +100,7 @@ pub enum Role {
     Rest,
     /// Scales of U, with `Int8`.
     Scales,
-    /// The work of each warp, and a list of some of it.
+    /// The work of each warp, and a list of some of it where there can be lists.
     Tiles,
     Lanes,
     /// From vertices to corners, per domain; where they differ.
@@ -162,30 +162,51 @@ pub struct Plan {
     /// Bytes to the device and from it in each step, besides the vertices themselves.
     pub bytes_in: u64,
     pub bytes_out: u64,
-    /// Pinned bytes of the list of changed domains.
+    /// Pinned bytes of the list of changed domains; 0 for a scene whose steps are always whole.
     pub bytes_of_changes: u64,
     pub left_out: Vec<LeftOut>,
 }
 
+/// Where everything lies: made once, planned from and then uploaded.
+#[derive(Debug)]
+pub(super) struct Tables {
+    pub coordinates: Coordinates,
+    pub work: Work,
+    /// The parts of domains that boxes are made of.
+    pub pieces: Vec<Piece>,
+}
+
+impl Tables {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let coordinates = Coordinates::new(scene);
+        let work = Work::new(scene, &coordinates);
+        Self { pieces: boxes::pieces(scene, &work), work, coordinates }
+    }
+}
+
 /// What a scene costs.
 pub fn plan(scene: &Scene) -> Plan {
+    plan_of(scene, &Tables::new(scene))
+}
+
+/// The same from tables that are there.
+pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tables) -> Plan {
     let needs = scene.needs;
     let layout = &scene.layout;
-    let coordinates = Coordinates::new(scene);
-    let work = Work::new(scene, &coordinates);
-    let kernels = kernels(scene, &work);
+    let kernels = kernels(scene, work, pieces);
+    let lists = most_changes(scene) > 0;
     let rest_corners = pack::rest_corners(scene) as u64;
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let domains = scene.domains.len() as u64;
-    let inputs = Sizes::of(scene, &coordinates).total();
+    let inputs = Sizes::of(scene, coordinates).total();
     let directed = if orients(scene) { work.quads.end - work.quads.directed } else { 0 };
     let mut buffers = vec![
         (Role::Words, 16 * work.words),
         (Role::Rest, 48 * work.quads.rest),
         (Role::Scales, 4 * work.scales),
-        (Role::Tiles, ((size_of::<Tile>() + 4) * work.tiles.len()) as u64),
+        (Role::Tiles, ((size_of::<Tile>() + if lists { 4 } else { 0 }) * work.tiles.len()) as u64),
         (Role::Lanes, (work.lanes.len() * size_of::<Lane>() + 4 * work.lane_scales.len()) as u64),
-        (Role::CornerShifts, 4 * corner_shifts(scene).len() as u64),
+        (Role::CornerShifts, 4 * work.corner_shifts.len() as u64),
         (Role::Boxes, 96 * work.tiles.len() as u64),
         (Role::Stamps, 4 * domains),
         (Role::RestNormals, if needs.exact_normals { 12 * rest_corners } else { 48 * directed }),
@@ -202,7 +223,7 @@ pub fn plan(scene: &Scene) -> Plan {
     if needs.displacements {
         buffers.push((Role::Displacements, 12 * vertices));
     }
-    let (pieces, domain_boxes) = boxes::bytes(boxes::pieces(scene, &work).len());
+    let (pieces, domain_boxes) = boxes::bytes(pieces.len());
     if needs.boxes {
         buffers.extend([(Role::Pieces, pieces), (Role::DomainBoxes, domain_boxes)]);
     }
@@ -218,7 +239,10 @@ pub fn plan(scene: &Scene) -> Plan {
         let frames = size_of_val(scene.movers.frames()) + size_of_val(following(scene).as_slice());
         buffers.push((Role::Frames, frames as u64));
     }
-    let changes = (size_of::<Change>() + 48) * most_changes(scene) + 4 * (coordinates.total + work.tiles.len());
+    let changes = match most_changes(scene) {
+        0 => 0,
+        most => (size_of::<Change>() + 48) * most + 4 * (coordinates.total + work.tiles.len()),
+    };
     Plan {
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
@@ -250,7 +274,7 @@ fn threads_of(defines: &[&str]) -> u32 {
     TILE_QUADS as u32 * if one { 1 } else { 2 }
 }
 
-fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
+fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
     let needs = scene.needs;
     let [deform, bounds, apply, normals] = KERNELS;
     let defines = deform_defines(scene, work);
@@ -273,14 +297,16 @@ fn kernels(scene: &Scene, work: &Work) -> Vec<Kernel> {
     };
     let few = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
     // Eight threads make a box of a domain, and wait for the memory most of the time.
-    let many = || boxes::pieces(scene, work).len().div_ceil(BLOCK as usize / 8).min(4 * MOST_BLOCKS);
-    let boxes = if needs.boxes { few.max(many()) } else { few };
-    let changes = most_changes(scene).div_ceil(BLOCK as usize / 32).clamp(1, MOST_BLOCKS);
+    let many = pieces.len().div_ceil(BLOCK as usize / 8).min(4 * MOST_BLOCKS);
+    let boxes = if needs.boxes { few.max(many) } else { few };
     let mut kernels = vec![deform, walk(Launch::Bounds, &bounds, boxes)];
     if needs.exact_normals {
         kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
     }
-    kernels.push(walk(Launch::Apply, &apply, changes));
+    let changes = most_changes(scene);
+    if changes > 0 {
+        kernels.push(walk(Launch::Apply, &apply, changes.div_ceil(BLOCK as usize / 32).min(MOST_BLOCKS)));
+    }
     kernels
 }
 
@@ -294,7 +320,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
         ("COMPENSATED", needs.compensated),
         ("DISPLACEMENTS", needs.displacements),
         ("ORIENT", orients),
-        ("SHIFTED", !corner_shifts(scene).is_empty()),
+        ("SHIFTED", !work.corner_shifts.is_empty()),
         ("NORMAL_MAPS", orients && needs.normal_maps),
         ("SHEAR", orients && needs.shear),
         ("FOLLOWERS", needs.followers),
@@ -368,125 +394,4 @@ impl Plan {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::pack::tests::{exact, kept, on_the_first, scene, stored};
-    use super::super::rings::Rings;
-    use super::*;
-
-    fn defines(plan: &Plan) -> Vec<(&str, Vec<&str>)> {
-        plan.kernels.iter().map(|kernel| (kernel.name, kernel.defines.clone())).collect()
-    }
-
-    #[test]
-    fn a_scene_without_modes_normal_maps_and_shear_compiles_none_of_their_branches() {
-        let bare = plan(&scene(&[(7, 0), (300, 0)], false, true));
-        assert_eq!(
-            defines(&bare),
-            [("deform", vec!["NARROW", "ORIENT", "SHIFTED"]), ("bounds", vec![]), ("apply", vec![])]
-        );
-        assert_eq!(bare.bytes(Role::Tangents) + bare.bytes(Role::RestTangents), 0);
-        assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
-        assert_eq!(bare.bytes_in, 80 + 48 * 4, "a header and four transforms, no q");
-        let left_out: Vec<_> = bare.left_out.iter().map(|part| part.feature).collect();
-        let last = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes"];
-        assert_eq!(left_out, [&["modes", "normal_maps", "shear"][..], &last].concat());
-        assert_eq!(bare.left_out[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
-    }
-
-    #[test]
-    fn a_scene_that_needs_more_leaves_less_out() {
-        let full = plan(&scene(&[(7, 2), (300, 0)], true, false));
-        assert_eq!(full.kernels[0].defines, ["MODES", "NARROW", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]);
-        assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
-        assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
-        assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
-        assert_eq!(full.left_out.len(), 6);
-    }
-
-    #[test]
-    fn followers_need_no_room_in_a_step_and_cost_frames_and_a_macro_once() {
-        let (own, on_others) = (scene(&[(7, 2), (300, 0)], false, true), on_the_first(&[(7, 2), (300, 0)]));
-        let (alone, follows) = (plan(&own), plan(&on_others));
-        assert_eq!((alone.bytes_in, follows.bytes_in), (80 + 48 * 4 + 4 * 4, 80 + 48 + 4 * 4), "three of four follow");
-        assert_eq!(follows.bytes(Role::Frames), 8 * 4 + 48 * 3);
-        assert_eq!(alone.bytes(Role::Frames), 0);
-        let with = |plan: &Plan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
-        assert_eq!((with(&alone), with(&follows)), (0, 2), "in `deform` and `apply`");
-        assert_eq!(follows.launches(), alone.launches());
-    }
-
-    #[test]
-    fn storage_decides_the_bytes_of_u_and_the_macro_that_reads_it() {
-        let bytes = |storage| {
-            let plan = plan(&stored(&[(300, 8)], storage));
-            assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("SHEAR")));
-            plan.bytes(Role::Words)
-        };
-        assert_eq!(Storage::ALL.map(bytes), [75 * 48 * 8, 75 * 48 * 4, 75 * 48 * 4, 75 * 48 * 2]);
-    }
-
-    #[test]
-    fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
-        let scene = exact(&[(7, 2), (300, 0), (513, 4)]);
-        let (plan, rings) = (plan(&scene), Rings::new(&scene));
-        let normals = plan.kernel(Launch::Normals).expect("asked for");
-        assert_eq!((normals.name, normals.defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
-        assert_eq!(plan.kernels[0].defines, ["MODES", "NARROW"]);
-        assert_eq!(plan.launches(), 4);
-        for (role, bytes) in [
-            (Role::CornerSlots, size_of_val(super::super::rings::slots(&scene).as_slice())),
-            (Role::Members, size_of_val(rings.members.as_slice())),
-            (Role::Rings, size_of_val(rings.begins.as_slice()) + size_of_val(rings.rings.as_slice())),
-            (Role::GroupNormals, size_of_val(rings.normals.as_slice())),
-        ] {
-            assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
-        }
-        assert_eq!(plan.bytes(Role::Members), 4 * (9 + 515), "the shape without modes has no groups");
-        let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], Storage::F32));
-        assert_eq!(rigid.bytes(Role::Members) + rigid.bytes(Role::Rings) + rigid.bytes(Role::GroupNormals), 0);
-        let left_out = rigid.left_out.iter().find(|part| part.feature == "exact_normals").expect("left out");
-        assert_eq!(left_out.bytes, 4 * (9 + 515) + 20 * 6, "members and slots");
-    }
-
-    #[test]
-    fn displacements_and_boxes_are_outputs_and_macros_of_kernels_that_are_there_and_cost_nothing_unless_kept() {
-        let sizes = [(7, 2), (300, 0)];
-        let bare = plan(&stored(&sizes, Storage::F32));
-        let kept = plan(&kept(&sizes));
-        let roles = [Role::Displacements, Role::Pieces, Role::DomainBoxes];
-        // Two domains of each shape, in one piece each.
-        assert_eq!(roles.map(|role| bare.bytes(role)), [0; 3]);
-        assert_eq!(roles.map(|role| kept.bytes(role)), [12 * 2 * (7 + 300), 16 * 4, 24 * 4]);
-        assert_eq!(kept.total_bytes() - bare.total_bytes(), 12 * 2 * (7 + 300) + 40 * 4);
-        assert!(bare.kernels.iter().all(|kernel| !kernel.defines.iter().any(|name| KEPT.contains(name))));
-        let with = |kernel: usize| kept.kernels[kernel].defines.iter().filter(|name| KEPT.contains(name)).count();
-        assert_eq!([with(0), with(1), with(2)], [1, 1, 0]);
-        assert_eq!((kept.launches(), kept.bytes_in, kept.bytes_out), (bare.launches(), bare.bytes_in, bare.bytes_out));
-        let bytes = |name: &str| bare.left_out.iter().find(|part| part.feature == name).map(|part| part.bytes);
-        assert_eq!([bytes("displacements"), bytes("boxes")], [Some(12 * 2 * (7 + 300)), Some(40 * 4)]);
-    }
-
-    /// The macros of what is kept for readers.
-    const KEPT: [&str; 2] = ["DISPLACEMENTS", "BOXES"];
-
-    #[test]
-    fn launches_do_not_grow_with_the_number_of_domains() {
-        let (few, many) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
-        assert_eq!((plan(&few).launches(), plan(&many).launches()), (3, 3));
-    }
-
-    #[test]
-    fn planned_bytes_are_those_of_the_tables() {
-        let scene = scene(&[(7, 2), (300, 0), (513, 4)], true, false);
-        let plan = plan(&scene);
-        let work = Work::new(&scene, &Coordinates::new(&scene));
-        for (role, bytes) in [
-            (Role::Tiles, size_of_val(work.tiles.as_slice()) + 4 * work.tiles.len()),
-            (Role::Lanes, size_of_val(work.lanes.as_slice())),
-            (Role::CornerShifts, size_of_val(corner_shifts(&scene).as_slice())),
-        ] {
-            assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
-        }
-        assert_eq!(plan.total_bytes(), plan.buffers.iter().map(|buffer| buffer.bytes).sum::<u64>());
-    }
-}
+mod tests;

@@ -51,6 +51,16 @@ pub trait Bench {
         None
     }
 
+    /// Steps whose vertices the host reads, one after the other and side by side; an error says why there is no answer.
+    fn overlap(&self, _load: &Load, _states: &[State], _steps: usize) -> Option<Result<gpu::Overlap>> {
+        None
+    }
+
+    /// How fast this machine's cores write what goes to the CUDA device.
+    fn host_writes(&self, _replays: usize) -> Vec<gpu::HostWrite> {
+        Vec::new()
+    }
+
     /// What is missing here and why, in words.
     fn remarks(&self) -> Vec<String> {
         Vec::new()
@@ -139,6 +149,15 @@ impl Bench for Machine {
         let (bytes, timing) = gpu::ingest(device, &load.scene, &State::rest(&load.scene), replays).ok()?;
         let expected = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
         Some(Ingest { bytes, median_us: timing.median_us, of_pinned: timing.median_us / expected })
+    }
+
+    fn overlap(&self, load: &Load, states: &[State], steps: usize) -> Option<Result<gpu::Overlap>> {
+        Some(gpu::overlap(self.device.as_ref().ok()?, &load.scene, states, steps))
+    }
+
+    fn host_writes(&self, replays: usize) -> Vec<gpu::HostWrite> {
+        let writes = |device: &Arc<Device>| gpu::host_writes(device, replays).ok();
+        self.device.as_ref().ok().and_then(writes).unwrap_or_default()
     }
 
     fn remarks(&self) -> Vec<String> {

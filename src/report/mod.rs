@@ -39,6 +39,7 @@ use serde::Serialize;
 
 use crate::deform::Backend;
 use crate::error::{Result, during};
+use crate::gpu::{HostWrite, Overlap};
 use crate::load;
 use bench::{Bench, Roofs};
 use loads::{Kind, Load, Size};
@@ -50,6 +51,9 @@ use table::Row;
 use timing::Cache;
 use validate::Condition;
 use variant::Variant;
+
+/// What the request calls steps that the host reads beside the next.
+const OVERLAP: &str = "cuda overlap";
 
 /// States over which timed steps rotate.
 const ROTATING: usize = 8;
@@ -116,6 +120,8 @@ pub struct Entry {
     pub condition: Condition,
     /// What a whole step brings to the CUDA device, and how long that takes.
     pub ingest: Option<Ingest>,
+    /// Steps whose vertices the host reads, on the CUDA device.
+    pub overlap: Option<Overlap>,
 }
 
 /// The way in of a step, by itself.
@@ -135,6 +141,8 @@ pub struct Report {
     pub remarks: Vec<String>,
     pub seeds: usize,
     pub roofs: Vec<(Backend, Roofs)>,
+    /// Copies to the pinned memory from which the CUDA device takes a step's values.
+    pub host_writes: Vec<HostWrite>,
     pub loads: Vec<Entry>,
     /// Loads that were asked for and are not measured yet; empty when the report is whole.
     pub missing: Vec<String>,
@@ -162,29 +170,45 @@ pub fn deform(
     bench: &dyn Bench,
     mut progress: impl FnMut(Progress<'_>) -> Result<()>,
 ) -> Result<Report> {
-    let (mut loads, mut rows) = (Vec::new(), Vec::new());
-    let mut report = gathered(request, bench, (&loads, &rows));
+    let mut made = Made::default();
+    if request.wants(OVERLAP) {
+        made.host_writes = bench.host_writes(request.replays);
+    }
+    let mut report = gathered(request, bench, &made);
     for source in &request.sources {
         let (load, motion) = open(source, request.size)?;
         let (vertices, domains) = (load.scene.layout.vertices, load.scene.domains.len());
         progress(Progress::Begins(&format!("{}: {vertices} vertices, {domains} domains", load.name)))?;
         let (condition, measured) = measure(request, bench, &load, &motion);
-        rows.extend(measured);
+        made.rows.extend(measured);
         let full = request.size == Size::Full && matches!(source, Source::Synthetic(_));
         let entry = entry(&load, &motion, condition, full);
-        loads.push(Entry { ingest: bench.ingest(&load, request.replays), ..entry });
-        report = gathered(request, bench, (&loads, &rows));
+        let overlap = overlap(request, bench, &load, &motion, &mut made.failed);
+        made.loads.push(Entry { ingest: bench.ingest(&load, request.replays), overlap, ..entry });
+        report = gathered(request, bench, &made);
         progress(Progress::Measured(&report))?;
     }
     Ok(report)
 }
 
+/// What is measured so far.
+#[derive(Default)]
+struct Made {
+    host_writes: Vec<HostWrite>,
+    loads: Vec<Entry>,
+    rows: Vec<Row>,
+    /// What is no row's fault.
+    failed: Vec<String>,
+}
+
 /// The report of some loads and their rows, the first of those that were asked for.
-fn gathered(request: &Request, bench: &dyn Bench, (loads, rows): (&[Entry], &[Row])) -> Report {
+fn gathered(request: &Request, bench: &dyn Bench, made: &Made) -> Report {
+    let Made { loads, rows, .. } = made;
     let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
     let thesis = Peers::of(rows, full);
     let name = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
-    let mut failed: Vec<String> = rows.iter().filter(|row| !row.passed && !row.left_out).map(name).collect();
+    let mut failed = made.failed.clone();
+    failed.extend(rows.iter().filter(|row| !row.passed && !row.left_out).map(name));
     // The rows of warm and cold caches say the same of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
@@ -193,11 +217,38 @@ fn gathered(request: &Request, bench: &dyn Bench, (loads, rows): (&[Entry], &[Ro
         remarks: bench.remarks(),
         seeds: request.seeds,
         roofs,
-        loads: loads.to_vec(),
+        host_writes: made.host_writes.clone(),
+        loads: loads.clone(),
         missing: request.sources[loads.len()..].iter().map(Source::name).collect(),
-        rows: rows.to_vec(),
+        rows: rows.clone(),
         thesis,
         failed,
+    }
+}
+
+/// Measures the overlap if it is asked for. Vertices that differ from those of the serial way fail the report.
+fn overlap(
+    request: &Request,
+    bench: &dyn Bench,
+    load: &Load,
+    motion: &Motion,
+    failed: &mut Vec<String>,
+) -> Option<Overlap> {
+    if !request.wants(OVERLAP) {
+        return None;
+    }
+    let states: Vec<_> = (0..ROTATING).map(|seed| motion.seed(seed).state()).collect();
+    match bench.overlap(load, &states, request.replays)? {
+        Ok(overlap) => {
+            let differing = overlap.differing;
+            let wrong = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", load.name));
+            failed.extend(wrong);
+            Some(overlap)
+        }
+        Err(error) => {
+            failed.push(format!("{}: {OVERLAP}: {error}", load.name));
+            None
+        }
     }
 }
 
@@ -238,6 +289,7 @@ fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entr
         recorded: motion.is_recorded(),
         condition,
         ingest: None,
+        overlap: None,
     }
 }
 
@@ -303,149 +355,4 @@ impl Report {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::cpu::CpuDeformer;
-    use crate::error::invalid;
-    use bench::{Offer, Wanted, offer};
-    use testing::Damaged;
-    use variant::{Driven, Label};
-
-    /// The CPU, healthy and damaged, and a variant that cannot be made.
-    struct Mixed {
-        damage: f32,
-    }
-
-    impl Bench for Mixed {
-        fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
-            let label = |name: &str| Label::new(name, Backend::Cpu, &load.scene);
-            let cpu = |label: Label| Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
-            let bad = |label: Label| Ok(Damaged::new(cpu(label), self.damage));
-            vec![offer(wanted, label("good"), |label| Ok(cpu(label))), offer(wanted, label("bad"), bad)]
-        }
-
-        fn roofs(&self, _backend: Backend) -> Roofs {
-            Roofs { copy_gbs: Some(10.0), read_gbs: Some(12.0), ..Roofs::default() }
-        }
-    }
-
-    fn request(sources: Vec<Source>) -> Request {
-        Request { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
-    }
-
-    fn report(damage: f32) -> Report {
-        let sources = vec![Source::Synthetic(Kind::Plant(1)), Source::Synthetic(Kind::Single { power: 14, rank: 10 })];
-        let mut heard = Vec::new();
-        let hear = |told: Progress<'_>| {
-            heard.push(match told {
-                Progress::Begins(what) => what.to_owned(),
-                Progress::Measured(report) => format!("{} {:?}", report.rows.len(), report.missing),
-            });
-            Ok(())
-        };
-        let report = deform(&request(sources), &Mixed { damage }, hear).expect("a report");
-        assert!(heard[0].starts_with("plant-2: ") && heard[2].starts_with("single-14-10: "), "{heard:?}");
-        assert_eq!([&heard[1], &heard[3]], ["4 [\"single-14-10\"]", "8 []"]);
-        report
-    }
-
-    #[test]
-    fn a_run_that_is_cut_short_has_written_what_it_had_and_says_what_is_missing() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let absent = Source::Scene { source: "absent".into(), record: None };
-        let request = request(vec![Source::Synthetic(Kind::C), absent]);
-        let keep = |told: Progress<'_>| match told {
-            Progress::Measured(report) => report.write(folder.path()),
-            Progress::Begins(_) => Ok(()),
-        };
-        deform(&request, &Mixed { damage: 0.0 }, keep).expect_err("no such scene");
-        let json = std::fs::read(folder.path().join("report.json")).expect("written");
-        let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
-        assert_eq!((&json["missing"][0], json["rows"].as_array().map(Vec::len)), (&"absent".into(), Some(4)));
-        let page = std::fs::read_to_string(folder.path().join("report.md")).expect("written");
-        assert!(page.contains("Not measured yet: absent."), "{page}");
-        let mut names = std::fs::read_dir(folder.path()).expect("listed").map(|entry| entry.expect("one").file_name());
-        assert!(
-            names
-                .all(|name| name.to_string_lossy().starts_with("report.") && !name.to_string_lossy().ends_with("part"))
-        );
-    }
-
-    #[test]
-    fn a_report_writes_all_files_and_they_read_back() {
-        let report = report(0.0);
-        assert!(report.passed(), "{:?}", report.failed);
-        let folder = tempfile::tempdir().expect("a folder");
-        let out = folder.path().join("new");
-        report.write(&out).expect("written");
-        let read = |name: &str| std::fs::read(out.join(name)).expect(name);
-        let json: serde_json::Value = serde_json::from_slice(&read("report.json")).expect("JSON");
-        assert_eq!(json["rows"].as_array().map(Vec::len), Some(8), "two loads, two variants, two caches");
-        assert_eq!(json["rows"][0]["passed"], true);
-        assert!(json["rows"][0]["of_read"].as_f64().expect("a share") > 0.0);
-        assert_eq!(json["made"]["version"], env!("CARGO_PKG_VERSION"));
-        assert_eq!(json["thesis"]["tables_4_5_to_4_7"].as_array().map(Vec::len), Some(12));
-        let records = csv::Reader::from_reader(read("report.csv").as_slice()).records().count();
-        assert_eq!(records, 8);
-        assert!(String::from_utf8(read("report.md")).expect("UTF-8").contains("plant-2"));
-        assert!(read("report.svg").starts_with(b"<svg"));
-        let image = image::load_from_memory(&read("report.png")).expect("a PNG");
-        assert!(image.width() > 400);
-    }
-
-    #[test]
-    fn a_damaged_variant_fails_the_report_by_name_and_is_not_timed() {
-        let report = report(0.01);
-        assert!(!report.passed());
-        assert_eq!(report.failed.len(), 2);
-        assert!(report.failed[0].starts_with("plant-2: bad: "), "{:?}", report.failed);
-        for row in &report.rows {
-            assert_eq!((row.passed, row.timing.is_some()), (row.name == "good", row.name == "good"));
-        }
-    }
-
-    #[test]
-    fn a_variant_that_cannot_be_made_fails_the_report_by_name() {
-        struct Broken;
-        impl Bench for Broken {
-            fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
-                let label = Label::new("lost", Backend::Cuda, &load.scene);
-                vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
-            }
-        }
-        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Broken, |_| Ok(())).expect("a report");
-        assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, given none"]);
-        assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
-    }
-
-    #[test]
-    fn a_variant_that_lacks_what_is_not_here_is_left_out_with_the_reason_and_fails_nothing() {
-        struct Lacking;
-        impl Bench for Lacking {
-            fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
-                let label = Label::new("peer", Backend::Cuda, &load.scene);
-                let (reason, remedy) = ("not found".into(), "install it".into());
-                vec![(label, Err(crate::error::Error::Unavailable { what: "a library", reason, remedy }))]
-            }
-        }
-        let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| Ok(())).expect("a report");
-        assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
-        assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
-    }
-
-    #[test]
-    fn a_scene_of_the_user_is_measured_under_its_own_name() {
-        let source = Source::Scene { source: "tree".into(), record: None };
-        let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| Ok(())).expect("a report");
-        assert!(report.passed(), "{:?}", report.failed);
-        assert_eq!((report.loads[0].name.as_str(), report.loads[0].recorded), ("tree", false));
-        assert!(
-            deform(
-                &request(vec![Source::Scene { source: "absent".into(), record: None }]),
-                &Mixed { damage: 0.0 },
-                |_| Ok(())
-            )
-            .is_err()
-        );
-    }
-}
+mod tests;

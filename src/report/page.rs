@@ -3,6 +3,7 @@
 use super::peers::{dash, line, rule};
 use super::table::Row;
 use super::{Entry, Report};
+use crate::gpu::Overlap;
 
 /// The whole page.
 pub(super) fn markdown(report: &Report) -> String {
@@ -59,7 +60,23 @@ fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
     text.push_str(&line(HEAD.map(String::from)));
     text.push_str(&rule(HEAD.len()));
     rows.for_each(|row| text.push_str(&line(cells(row))));
+    if let Some(overlap) = &load.overlap {
+        text.push_str(&overlapped(overlap));
+    }
     text
+}
+
+/// What reading every step costs, serial and side by side.
+fn overlapped(overlap: &Overlap) -> String {
+    let Overlap { write_one_core_us: one, write_us: all, cores, graph_us, copy_out_us, step_us, .. } = overlap;
+    let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
+    format!(
+        "\nThe host reads every step, microseconds a step: {serial_us:.1} one after the other, {fetched_us:.1} with the \
+         way out beside the next step, {overlapped_us:.1} with two steps under way, {gain:.2} times as fast; \
+         {ideal_us:.1} would be the longest part alone. Parts: writing {all:.1} on {cores} cores ({one:.1} on one), copy \
+         in and kernels {graph_us:.1}, way out {copy_out_us:.1}; a step that nobody reads {step_us:.1}. Steps that \
+         differ in a bit: {differing}.\n"
+    )
 }
 
 fn cells(row: &Row) -> [String; 13] {

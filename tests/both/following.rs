@@ -10,6 +10,7 @@ use modalcast::scene::{
 };
 
 use super::changes::apply;
+use super::readers::{kept, wrong_box};
 use super::surfaces::largest_error;
 use super::{Shown, beyond, run, strip, within};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
@@ -113,6 +114,7 @@ pub(crate) fn steps_of_movers<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let plain = Deformation::default();
     for deformation in [
         plain,
+        kept(plain),
         Deformation { normals: Normals::Exact, ..plain },
         Deformation { normals: Normals::Exact, storage: Storage::Int8, ..plain },
         Deformation { truncation: Some(0.2), storage: Storage::F16, ..plain },
@@ -139,6 +141,7 @@ pub(crate) fn steps_of_movers<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
             let in_place = |domain: &u32| transforms.contains(&(root(&scene, *domain as usize) as u32));
             assert!(moved.iter().all(|domain| expected.contains(domain)));
             assert!(expected.iter().filter(|domain| in_place(domain)).all(|domain| moved.contains(domain)));
+            assert!(!scene.needs.boxes || wrong_box(&scene, &shown).is_none(), "step {step}");
             lists += usize::from(!expected.is_empty() && expected.len() <= 30);
             last = shown;
         }

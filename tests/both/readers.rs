@@ -127,6 +127,47 @@ pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
     }
 }
 
+/// What is fetched is what was wanted of its own step and nothing else; another wish for the same step is granted too, and
+/// all of it stays whatever is deformed later.
+pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    let scene = scene(kept(Deformation::default()), false);
+    let (mut deformer, mut random, mut state) = (make(&scene), Random(108), scenes::state(&scene, 109));
+    let mut before = Vec::new();
+    for step in 0..20 {
+        changes::apply(&scene, &mut state, &mut random, (&[1, 6, step % 4 + 8], &[2, 6]));
+        let want = run(&mut make(&scene), &state).surface;
+        deformer.deform(&state).expect("deforms");
+        let wishes = [step, step / 4 * 3 + 1, step * 7 + 2].map(|number| wish(number as usize % 16));
+        let begun = wishes.map(|wanted| (wanted, deformer.fetch(wanted).expect("begins")));
+        for (want, begun) in std::mem::replace(&mut before, vec![(want, begun)]) {
+            for (wanted, fetch) in begun.iter().rev() {
+                let got = deformer.fetched(fetch).expect("arrives");
+                let parts = [
+                    (wanted.positions, got.positions == want.positions, got.positions.is_empty()),
+                    (wanted.normals, got.normals == want.normals, got.normals.is_empty()),
+                    (wanted.displacements, got.displacements == want.displacements, got.displacements.is_empty()),
+                    (wanted.boxes, got.boxes == want.boxes, got.boxes.is_empty()),
+                ];
+                // What an earlier wish brought may serve a smaller one.
+                let is = |(wanted, same, empty): &(bool, bool, bool)| *same || !wanted && *empty;
+                assert!(parts.iter().all(is) && got.tangents.is_empty(), "before step {step}: {wanted:?}, {parts:?}");
+            }
+        }
+    }
+    // The control: the next step has other parts.
+    let (last, _) = before.pop().expect("a step");
+    changes::apply(&scene, &mut state, &mut random, (&[1, 6], &[2, 6]));
+    let next = run(&mut deformer, &state).surface;
+    assert!(last.positions != next.positions && last.normals != next.normals);
+    assert!(last.displacements != next.displacements && last.boxes != next.boxes);
+}
+
+/// One of sixteen.
+fn wish(number: usize) -> Wanted {
+    let bit = |at: usize| number >> at & 1 == 1;
+    Wanted { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
+}
+
 /// Two modes of ones along x and y, one along z, so that u is known.
 fn ones(deformation: Deformation) -> Arc<Scene> {
     let column = |row: [f32; 3]| row.repeat(5);

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
+use modalcast::deform::{Deformer, Wanted};
 use modalcast::gpu::{CudaDeformer, Device, GlBuffers};
 use modalcast::render::{Prefer, Renderer, SceneBuffers, Shot};
 use modalcast::scene::{Camera, Scene};
@@ -40,6 +40,34 @@ fn gpu_vertices_in_shared_buffers_equal_the_twin_and_the_copied_ones_bit_by_bit(
         assert!(same_bits(&direct.normals, &copied.normals));
         assert!(same_bits(&direct.tangents, &copied.tangents));
     }
+    drop(direct);
+    renderer.unload(buffers);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_shared_buffers_are_fetched_beside_the_step_that_overwrites_them() {
+    let (mut renderer, device, scene) = stage();
+    let buffers = renderer.load(&scene).expect("loads");
+    let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&buffers))).expect("a deformer");
+    let mut plain = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    assert!(direct.shares_buffers(), "interop was refused");
+    let mut before = None;
+    for seed in 0..50 {
+        let state = scenes::state(&scene, seed);
+        direct.deform(&state).expect("deforms");
+        plain.deform(&state).expect("deforms");
+        let want = plain.surface().expect("copies").clone();
+        let next = (direct.fetch(Wanted::VERTICES).expect("begins"), want);
+        if let Some((fetch, want)) = before.replace(next) {
+            let got = direct.fetched(&fetch).expect("arrives");
+            assert!(same_bits(&got.positions, &want.positions), "step {seed}");
+            assert!(same_bits(&got.normals, &want.normals), "step {seed}");
+            let now = &before.as_ref().expect("there").1;
+            assert!(!same_bits(&got.positions, &now.positions), "the judge can fail");
+        }
+    }
+    assert_eq!(direct.outputs(), 1, "OpenGL draws from the one there is");
     drop(direct);
     renderer.unload(buffers);
 }

@@ -9,6 +9,7 @@ mod extremes;
 mod interop;
 mod judge;
 mod normals;
+mod overlap;
 mod real;
 mod report;
 mod scenes;

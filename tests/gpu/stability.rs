@@ -114,6 +114,7 @@ fn gpu_a_scene_without_modes_has_displacements_of_zero() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_displacements_and_boxes_are_read_alone_and_are_those_of_the_last_step() {
     readers::parts_are_read_alone(deformer);
+    readers::parts_are_fetched_alone(deformer);
 }
 
 #[test]

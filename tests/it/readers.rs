@@ -1,16 +1,18 @@
 //! Displacements and boxes over the wire: what the scene keeps is sent, alone if asked; what it does not keep is refused.
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::deform::Deformer;
+use modalcast::deform::{Deformer, Surface, Wanted};
+use modalcast::engine::{Delivery, View};
 use modalcast::reference::{self, ReferenceDeformer};
 use modalcast::scene::Bounds;
 use modalcast_proto::v1;
 use tonic::Code;
 use v1::Policy;
+use v1::drive_scene_response::Kind as Told;
 
 use crate::both::readers;
 use crate::service_harness::{
-    Got, Server, details, expected, get_vertices, kept_strips, next_vertices, state_after, step,
+    Got, Server, details, expected, get_vertices, kept_strips, next_vertices, state_after, step, within,
 };
 
 fn ask(scene: &str, selection: v1::VertexSelection) -> v1::GetVerticesRequest {
@@ -110,6 +112,67 @@ async fn a_stream_of_boxes_has_one_of_each_step() {
         assert_eq!(got.boxes, boxes_of(&expected(&kept_strips(), &steps[..=sent]).0));
         assert!(got.displacements.is_empty() && got.positions.is_empty());
     }
+}
+
+/// What shows of a step, one list for each part.
+fn parts_of(shown: &modalcast::engine::Shown) -> (usize, &Surface) {
+    let modalcast::engine::Body::Vertices(surface) = &shown.body else { panic!("not vertices") };
+    (shown.step.number as usize, surface)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn readers_of_different_parts_get_theirs_of_every_step_while_the_next_is_computed() {
+    let server = Server::fresh().await;
+    server.open("kept").await;
+    let engine = server.engine.find("kept").expect("open");
+    let nothing = Wanted::default();
+    let wishes = [
+        Wanted { positions: true, ..nothing },
+        Wanted { boxes: true, ..nothing },
+        Wanted { displacements: true, normals: true, ..nothing },
+    ];
+    let mut feeds = Vec::new();
+    for wanted in wishes {
+        feeds.push(engine.watch(View::Vertices(wanted), Delivery::Lossless).await.expect("a feed"));
+    }
+    let mut late = engine.watch(View::Vertices(Wanted::ALL), Delivery::Latest).await.expect("a feed");
+    let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
+    let mut driver = server.drive("kept", Policy::Lossless, 40).await;
+    for step in &steps {
+        driver.step(step.clone()).await;
+    }
+    let want = |sent: usize| {
+        let ((x, n), u) = (expected(&kept_strips(), &steps[..=sent]), expected_u(&steps[..=sent]));
+        (x, n, u)
+    };
+    let boxes = |surface: &Surface| -> Vec<f32> {
+        surface.boxes.iter().flat_map(|side| [side.min, side.max].concat()).map(|number| number as f32).collect()
+    };
+    let shown = within(late.next()).await.expect("the newest");
+    let (sent, surface) = parts_of(&shown);
+    let (x, n, u) = want(sent);
+    assert!(surface.positions == x && surface.normals == n && boxes(surface) == boxes_of(&x));
+    assert!(largest_error(&surface.displacements, &u) < 1e-6);
+    drop(late);
+    for sent in 0..40 {
+        let (x, n, u) = want(sent);
+        for (feed, wanted) in feeds.iter_mut().zip(wishes) {
+            let shown = within(feed.next()).await.expect("goes on");
+            let (number, surface) = parts_of(&shown);
+            assert_eq!((number, shown.skipped), (sent, 0));
+            assert!(!wanted.positions || surface.positions == x, "step {sent}");
+            assert!(!wanted.boxes || boxes(surface) == boxes_of(&x), "step {sent}");
+            assert!(!wanted.displacements || largest_error(&surface.displacements, &u) < 1e-6, "step {sent}");
+            assert!(!wanted.normals || surface.normals == n, "step {sent}");
+        }
+    }
+    // The control: steps differ in their positions and so in their boxes, and in u.
+    let (x, _, u) = want(0);
+    assert!(x != want(1).0 && boxes_of(&x) != boxes_of(&want(1).0) && largest_error(&u, &want(1).2) > 1e-6);
+    for sent in 0..40 {
+        assert!(matches!(driver.reply().await, Told::Ack(ack) if ack.step == sent));
+    }
+    driver.finish().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

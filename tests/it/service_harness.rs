@@ -89,7 +89,7 @@ pub(crate) fn kept_strips() -> Arc<Scene> {
 }
 
 fn two_strips(size: f32) -> (Shape, Vec<Domain>) {
-    let entry = |entry: u32| if entry % 5 == 0 { 0.5 } else { 0.125 * (entry % 3) as f32 };
+    let entry = |entry: u32| if entry.is_multiple_of(5) { 0.5 } else { 0.125 * (entry % 3) as f32 };
     let columns = (0..24).map(|at| size * entry(at)).collect();
     let shape = Shape::new(grid(2), Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
     let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };

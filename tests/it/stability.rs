@@ -98,6 +98,7 @@ fn a_scene_without_modes_has_displacements_of_zero() {
 #[test]
 fn displacements_and_boxes_are_read_alone_and_are_those_of_the_last_step() {
     readers::parts_are_read_alone(deformer);
+    readers::parts_are_fetched_alone(deformer);
 }
 
 #[test]

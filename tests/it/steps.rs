@@ -68,6 +68,46 @@ async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_str
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn steps_that_are_computed_while_the_vertices_before_them_leave_keep_their_order_and_their_vertices() {
+    let server = Server::fresh().await;
+    server.open("strips").await;
+    let engine = server.engine.find("strips").expect("open");
+    let mut feeds = Vec::new();
+    for delivery in [Delivery::Lossless, Delivery::Lossless, Delivery::Latest] {
+        feeds.push(engine.watch(View::Vertices(Wanted::VERTICES), delivery).await.expect("a feed"));
+    }
+    let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
+    let mut driver = server.drive("strips", Policy::Lossless, 40).await;
+    // All are sent at once, so that a next one always waits.
+    for step in &steps {
+        driver.step(step.clone()).await;
+    }
+    let judge = |shown: &modalcast::engine::Shown| {
+        let modalcast::engine::Body::Vertices(surface) = &shown.body else { panic!("not vertices") };
+        let sent = shown.step.number as usize;
+        let stages: Vec<_> = shown.stages.iter().map(|(stage, _)| stage.name()).collect();
+        assert_eq!(stages, ["parse", "queue", "deform", "copy"]);
+        assert_eq!(surface.positions, expected(&strips(), &steps[..=sent]).0, "step {sent}");
+        assert_ne!(surface.positions, expected(&strips(), &steps[..=(sent + 1) % 40]).0, "the judge can fail");
+        sent
+    };
+    let mut latest = feeds.pop().expect("three");
+    let seen = judge(&within(latest.next()).await.expect("the newest"));
+    drop(latest);
+    assert!(seen < 40);
+    for sent in 0..40 {
+        for feed in &mut feeds {
+            let shown = within(feed.next()).await.expect("goes on");
+            assert_eq!((judge(&shown), shown.skipped), (sent, 0));
+        }
+    }
+    for sent in 0..40 {
+        assert!(matches!(driver.reply().await, Told::Ack(ack) if ack.step == sent));
+    }
+    driver.finish().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is_refused_by_name() {
     let server = Server::fresh().await;
     server.open("strips").await;

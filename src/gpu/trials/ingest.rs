@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::sync::Arc;
 
 use super::super::device::Device;
-use super::super::inputs::{Inputs, Packing};
+use super::super::inputs::{Inputs, Packing, Pinned};
 use super::super::layout::Header;
 use super::super::work::Coordinates;
 use super::measure::{Cache, Timing, time};
@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::scene::{Scene, State};
 
 /// The copy of whole steps.
-struct Ingest(RefCell<Inputs>);
+struct Ingest(Inputs, RefCell<Pinned>);
 
 impl Trial for Ingest {
     fn name(&self) -> String {
@@ -25,7 +25,7 @@ impl Trial for Ingest {
     }
 
     fn launch(&self, device: &Device, _turn: usize) -> Result<()> {
-        self.0.borrow_mut().send(device, None)
+        self.0.send(device, &mut self.1.borrow_mut(), None)
     }
 
     fn launches(&self) -> usize {
@@ -43,8 +43,9 @@ pub fn ingest(device: &Device, scene: &Arc<Scene>, state: &State, replays: usize
     let factors = vec![Vec::new(); scene.shapes.len()];
     let packing = Packing { scene: Arc::clone(scene), coordinates, factors, spans: Vec::new(), tiles: 0 };
     let mut inputs = Inputs::new(device, &Arc::new(packing))?;
-    inputs.write(&Header::default(), state)?;
+    let mut pinned = inputs.pinned(device)?;
+    inputs.write(&mut pinned, &Header::default(), state)?;
     let bytes = inputs.bytes();
-    let ingest = Ingest(RefCell::new(inputs));
+    let ingest = Ingest(inputs, RefCell::new(pinned));
     Ok((bytes, time(device, &ingest, Cache::Warm, replays)?))
 }

@@ -11,6 +11,7 @@
 //! | [`mod@batch`] | many vectors q of one U at once |
 //! | [`mod@batch_mma`] | the same by tensor cores, with an order and a rounding of its own |
 //! | [`mod@ingest`] | the way of a step's values to the device |
+//! | [`mod@overlap`] | steps that the host reads, one after the other and side by side |
 //! | [`cublas`], [`plain_update`] | a library's products, and the vertex update behind them |
 //! | [`thesis`] | the kernels of the thesis |
 
@@ -20,6 +21,7 @@ mod cublas;
 mod ingest;
 mod measure;
 mod ours;
+mod overlap;
 mod plain_update;
 mod roof;
 mod thesis;
@@ -32,6 +34,7 @@ pub use cublas::{Cublas, Peer, cublas_version};
 pub use ingest::ingest;
 pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
 pub use ours::{Extent, Ours};
+pub use overlap::{HostWrite, Overlap, host_writes, overlap};
 pub use roof::{Roofs, roofs};
 pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
 pub use trial::{KernelFacts, Trial};

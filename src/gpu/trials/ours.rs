@@ -9,11 +9,11 @@ use super::super::apply::{Apply, Lengths};
 use super::super::bounds::Bounds;
 use super::super::deform::Deform;
 use super::super::device::Device;
-use super::super::inputs::{Inputs, Values};
+use super::super::inputs::{Inputs, Pinned, Values};
 use super::super::layout::Header;
 use super::super::memory::{address, download, room};
 use super::super::normals::Normals;
-use super::super::plan::{Kernel, Launch, Plan, Role, plan};
+use super::super::plan::{Kernel, Launch, Plan, Role, Tables, plan_of};
 use super::measure::MOST_GRAPHS;
 use super::trial::{KernelFacts, Trial};
 use super::turns::Turns;
@@ -90,12 +90,13 @@ impl Ours {
         states: &[State],
         (extent, changed): (Extent, Option<&[u32]>),
     ) -> Result<Self> {
-        let plan = plan(scene);
+        let tables = Tables::new(scene);
+        let plan = plan_of(scene, &tables);
         let normals = plan.kernel(Launch::Normals).filter(|_| extent == Extent::Whole);
         let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
         let mut deform = plan.needed(Launch::Deform)?.clone();
         deform.shape_for(extent);
-        let deform = Deform::new(device, scene, &deform)?;
+        let deform = Deform::new(device, scene, &deform, tables)?;
         let outputs = room(device, outputs_of(&plan).iter().sum())?;
         let mut ours = Self {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
@@ -111,23 +112,38 @@ impl Ours {
             deform,
             plan,
         };
-        let mut apply = Apply::new(device, ours.deform.packing(), ours.plan.needed(Launch::Apply)?)?;
+        let mut pinned = None;
         for state in states {
             let header = Header { everything: 1, step: 1, ..ours.header(device) };
             let mut inputs = Inputs::new(device, ours.deform.packing())?;
-            send(device, &mut inputs, &header, state)?;
-            if let Some(changed) = changed {
-                let lengths = apply.write(ours.deform.packing(), state, changed)?;
-                let too_many = || invalid("changed", "a quarter of the domains at most", changed.len());
-                let Lengths { changed, stale } = lengths.ok_or_else(too_many)?;
-                let header = Header { since: 1, step: 2, changed, stale, ..header };
-                send(device, &mut inputs, &header, state)?;
-                apply.launch(device, inputs.values(device), ours.deform.list(device))?;
-                device.stream().synchronize().map_err(during("upload"))?;
-            }
+            let pinned = match &mut pinned {
+                Some(pinned) => pinned,
+                none => none.insert(inputs.pinned(device)?),
+            };
+            send(device, (&mut inputs, pinned), &header, state)?;
             ours.inputs.push(inputs);
         }
+        changed.map_or(Ok(()), |changed| ours.apply(device, states, changed))?;
         Ok(ours)
+    }
+
+    /// Makes the values of each turn those of a step that changed these domains.
+    fn apply(&mut self, device: &Device, states: &[State], changed: &[u32]) -> Result<()> {
+        let too_many = || invalid("changed", "a quarter of the domains at most, and no truncation", changed.len());
+        let mut apply =
+            Apply::new(device, self.deform.packing(), self.plan.kernel(Launch::Apply).ok_or_else(too_many)?)?;
+        let mut list = apply.list(device)?;
+        let old = Header { everything: 1, ..self.header(device) };
+        for (inputs, state) in self.inputs.iter_mut().zip(states) {
+            let mut pinned = inputs.pinned(device)?;
+            let lengths = apply.write(&mut list, self.deform.packing(), state, (changed, &[]))?;
+            let Lengths { changed, stale } = lengths.ok_or_else(too_many)?;
+            let header = Header { since: 1, step: 2, changed, stale, ..old };
+            send(device, (inputs, &mut pinned), &header, state)?;
+            apply.launch(device, &mut list, inputs.values(device), self.deform.list(device))?;
+            device.stream().synchronize().map_err(during("upload"))?;
+        }
+        Ok(())
     }
 
     fn header(&self, device: &Device) -> Header {
@@ -178,9 +194,9 @@ impl Kernel {
     }
 }
 
-fn send(device: &Device, inputs: &mut Inputs, header: &Header, state: &State) -> Result<()> {
-    inputs.write(header, state)?;
-    inputs.send(device, None)?;
+fn send(device: &Device, (inputs, pinned): (&mut Inputs, &mut Pinned), header: &Header, state: &State) -> Result<()> {
+    inputs.write(pinned, header, state)?;
+    inputs.send(device, pinned, None)?;
     device.stream().synchronize().map_err(during("upload"))
 }
 

@@ -50,6 +50,8 @@ pub(super) struct Work {
     pub scales: u64,
     /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
     pub spans: Vec<[(u32, u32); 2]>,
+    /// Of each domain, from its first vertex to its first corner, wrapping; empty when all are at the same place.
+    pub corner_shifts: Vec<u32>,
 }
 
 /// Whether corner i of a shape is its vertex i, so that one lane has both.
@@ -127,6 +129,7 @@ impl Work {
             first_scale,
             scales,
             spans: vec![[(0, 0); 2]; scene.domains.len()],
+            corner_shifts: corner_shifts(scene),
         }
     }
 
@@ -273,8 +276,7 @@ fn items(scene: &Scene) -> Vec<(Role, Item)> {
     items
 }
 
-/// From a domain's first vertex to its first corner, wrapping; empty when all are at the same place.
-pub(super) fn corner_shifts(scene: &Scene) -> Vec<u32> {
+fn corner_shifts(scene: &Scene) -> Vec<u32> {
     let shift = |slot: &crate::scene::Slot| (slot.first_corner as u32).wrapping_sub(slot.first_vertex as u32);
     let shifts: Vec<u32> = scene.layout.slots.iter().map(shift).collect();
     if orients(scene) && shifts.iter().any(|shift| *shift != 0) { shifts } else { Vec::new() }

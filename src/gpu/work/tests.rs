@@ -57,7 +57,7 @@ fn lane(work: &Work, tile: &Tile, quad: usize) -> (usize, u32, usize, u32, u32, 
 /// Counts the tiles that compute each packed corner, and checks where they look for its rest normal.
 fn check_corners(scene: &Scene, work: &Work) {
     let mut seen = vec![0; scene.layout.corners];
-    let shifts = corner_shifts(scene);
+    let shifts = &work.corner_shifts;
     for tile in work.tiles.iter().filter(|tile| tile.kind & TILE_CORNERS > 0) {
         for in_tile in 0..usize::from(tile.width) {
             let (domain, item, count, rest, ..) = lane(work, tile, in_tile);

@@ -1,0 +1,109 @@
+//! What one step under way has of its own: its values and lists on their way in, its answer, and the graphs that name
+//! that memory. A second one is made for a step that is submitted before the one before it has ended.
+
+use std::sync::Arc;
+
+use cudarc::driver::sys::{CUgraphInstantiate_flags, CUstreamCaptureMode};
+use cudarc::driver::{CudaEvent, CudaGraph, PinnedHostSlice, result};
+
+use super::apply::{Apply, List};
+use super::bounds::{Bounds, bounds_of};
+use super::deform::Deform;
+use super::device::Device;
+use super::inputs::{Inputs, Pinned};
+use super::layout::Header;
+use super::normals::Normals;
+use crate::error::{Error, Result, during};
+
+/// The kernels of a scene.
+#[derive(Debug)]
+pub(super) struct Kernels {
+    pub deform: Deform,
+    pub bounds: Bounds,
+    /// Of a scene whose normals follow the surface.
+    pub normals: Option<Normals>,
+    /// Of a scene whose steps may change few domains.
+    pub apply: Option<Apply>,
+}
+
+/// Pinned memory of a step, and its graphs.
+pub(super) struct Flight {
+    // Graphs first: they name the memory of all that follows.
+    whole: CudaGraph,
+    /// Of a list of changed domains.
+    some: Option<CudaGraph>,
+    pub values: Pinned,
+    pub list: Option<List>,
+    answer: PinnedHostSlice<u32>,
+    /// Recorded behind each step.
+    pub done: CudaEvent,
+}
+
+impl Flight {
+    pub(super) fn new(device: &Device, kernels: &Kernels, inputs: &Inputs) -> Result<Self> {
+        let mut values = inputs.pinned(device)?;
+        let mut list = kernels.apply.as_ref().map(|apply| apply.list(device)).transpose()?;
+        // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
+        let answer = unsafe { device.context().alloc_pinned_with_flags(6, 0) };
+        let mut answer = answer.map_err(during("allocate"))?;
+        let parts = (kernels, inputs);
+        let whole = capture(device, || start(device, parts, (&mut values, None), &mut answer))?;
+        let some = match &mut list {
+            Some(list) => Some(capture(device, || start(device, parts, (&mut values, Some(list)), &mut answer))?),
+            None => None,
+        };
+        let done = device.context().new_event(None).map_err(during("allocate"))?;
+        Ok(Self { whole, some, values, list, answer, done })
+    }
+
+    /// Starts the step's graph on the device's stream; its values are written. `some`: of the list.
+    pub(super) fn launch(&self, some: bool) -> Result<()> {
+        let graph = if some { self.some.as_ref() } else { Some(&self.whole) };
+        let missing = || Error::Fault { stage: "deform", reason: "no graph was captured".into() };
+        graph.ok_or_else(missing)?.launch().map_err(during("deform"))
+    }
+
+    /// Waits for the end of the step, and returns its bounds.
+    pub(super) fn wait(&self) -> Result<crate::scene::Bounds> {
+        self.done.synchronize().map_err(during("deform"))?;
+        Ok(bounds_of(self.answer.as_slice().map_err(during("deform"))?))
+    }
+}
+
+/// What `start` puts on the stream, as a graph.
+fn capture(device: &Device, start: impl FnOnce() -> Result<()>) -> Result<CudaGraph> {
+    let fail = during("capture");
+    let stream = Arc::clone(device.stream());
+    // Relaxed: a look at pinned memory asks the driver whether it is in use, which stricter modes refuse.
+    stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
+    let started = start();
+    // The capture ends whatever happened, or the stream would stay in it.
+    let graph = stream.end_capture(CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH);
+    started?;
+    let empty = || Error::Fault { stage: "capture", reason: "the graph is empty".into() };
+    graph.map_err(&fail)?.ok_or_else(empty)
+}
+
+/// A step: copies in, kernels, the bounds out.
+fn start(
+    device: &Device,
+    (kernels, inputs): (&Kernels, &Inputs),
+    (values, list): (&mut Pinned, Option<&mut List>),
+    answer: &mut PinnedHostSlice<u32>,
+) -> Result<()> {
+    let places = inputs.values(device);
+    inputs.send(device, values, list.is_some().then_some(size_of::<Header>()))?;
+    match (list, &kernels.apply) {
+        (Some(list), Some(apply)) => {
+            apply.launch(device, list, places, kernels.deform.list(device))?;
+            kernels.deform.launch_listed(device, places)?;
+        }
+        _ => kernels.deform.launch(device, places)?,
+    }
+    kernels.bounds.launch(device, places, kernels.deform.boxes(device))?;
+    kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, places))?;
+    let bounds = places.header + std::mem::offset_of!(Header, bounds) as u64;
+    let answer = answer.as_mut_slice().map_err(during("capture"))?;
+    // SAFETY: the header has six words of bounds, so has `answer`, and the step is waited for before they are read.
+    unsafe { result::memcpy_dtoh_async(answer, bounds, device.stream().cu_stream()) }.map_err(during("capture"))
+}

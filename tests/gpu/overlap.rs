@@ -1,0 +1,320 @@
+//! Vertices that are fetched while the next steps run are those of their own step, bit by bit.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use modalcast::deform::{Deformer, Fetch, Surface, Wanted};
+use modalcast::domain::{Domain, Follow};
+use modalcast::error::Error;
+use modalcast::gpu::{CudaDeformer, Device, MOST_UNDER_WAY, host_writes, overlap};
+use modalcast::scene::{Deformation, Normals, Scene, State, Storage};
+
+use crate::both::readers::kept;
+use crate::both::{self, changes};
+use crate::judge::{check, same_bits};
+use crate::scenes::{self, Random};
+use crate::twins::deformer;
+
+const STEPS: usize = 50;
+
+/// Sixty domains of several tiles, of few quads and without modes.
+fn crowd(deformation: Deformation) -> Arc<Scene> {
+    let mut random = Random(70);
+    let mut shapes: Vec<_> = (0..16).map(|at| both::strip(&mut random, 5 + at % 9, at % 5)).collect();
+    shapes.push(scenes::shape(&mut random, 900, 33));
+    shapes.extend((0..3).map(|at| scenes::shape(&mut random, 40 + at, 2)));
+    both::scene_of(shapes, 3, deformation, false)
+}
+
+/// The same, of which two of three domains follow one of the others, which come first.
+fn following(deformation: Deformation) -> Arc<Scene> {
+    let mut random = Random(73);
+    let mut parts = scenes::parts((0..20).map(|at| both::strip(&mut random, 5 + 20 * at, at % 3)).collect());
+    parts.deformation = deformation;
+    let follow =
+        |at: usize, random: &mut Random| Follow { parent: at % 20, frame: random.similarity(at.is_multiple_of(2)) };
+    let domain = |at: usize| Domain {
+        name: format!("domain {at}"),
+        follows: (at >= 20).then(|| follow(at, &mut random)),
+        ..scenes::domain(at * 3 % 20, 0)
+    };
+    parts.domains = (0..60).map(domain).collect();
+    Scene::new(parts).expect("a scene")
+}
+
+/// Some domains, none of them twice, ascending.
+fn some(scene: &Scene, random: &mut Random) -> Vec<u32> {
+    let share = random.number().abs() / 10.0;
+    (0..scene.domains.len() as u32).filter(|_| random.number().abs() < share).collect()
+}
+
+/// States that follow each other by random lists, now and then by one of all.
+fn states(scene: &Scene) -> Vec<State> {
+    let mut random = Random(71);
+    let mut state = scenes::state(scene, 72);
+    let next = |at: usize| {
+        let (q, mut transforms) = (some(scene, &mut random), some(scene, &mut random));
+        if scene.needs.followers {
+            // Those follow one of the others each, so that few of these are many domains.
+            transforms.retain(|domain| *domain < 20);
+            transforms.truncate(2);
+        }
+        changes::apply(scene, &mut state, &mut random, (&q, &transforms));
+        if at % 17 == 16 {
+            state.touch();
+        }
+        state.clone()
+    };
+    (0..STEPS).map(next).collect()
+}
+
+/// What each step shows when it is computed whole and read before the next.
+fn plainly(scene: &Arc<Scene>, states: &[State]) -> Vec<Surface> {
+    let mut deformer = deformer(scene);
+    let mut show = |state: &State| {
+        let mut whole = state.clone();
+        whole.touch();
+        deformer.deform(&whole).expect("deforms");
+        deformer.surface().expect("copies").clone()
+    };
+    states.iter().map(&mut show).collect()
+}
+
+fn is(got: &Surface, want: &Surface) -> bool {
+    same_bits(&got.positions, &want.positions)
+        && same_bits(&got.normals, &want.normals)
+        && same_bits(&got.displacements, &want.displacements)
+        && got.boxes == want.boxes
+        && got.tangents.is_empty()
+}
+
+/// Compares every fetch that is waited for with the step that it was begun in.
+struct Reader<'a> {
+    want: &'a [Surface],
+    waiting: VecDeque<(usize, Fetch)>,
+    read: usize,
+}
+
+impl Reader<'_> {
+    fn read(&mut self, deformer: &mut CudaDeformer, behind: usize) {
+        while self.waiting.len() > behind {
+            let Some((step, fetch)) = self.waiting.pop_front() else { break };
+            let surface = deformer.fetched(&fetch).expect("arrives");
+            assert!(is(&surface, &self.want[step]), "step {step}");
+            // Twice is the same memory.
+            assert!(Arc::ptr_eq(&surface, &deformer.fetched(&fetch).expect("is there")));
+            let other = (step + STEPS / 2) % self.want.len();
+            assert!(!is(&surface, &self.want[other]), "the judge can fail");
+            self.read += 1;
+        }
+    }
+}
+
+fn deformations() -> Vec<Deformation> {
+    let plain = |storage| Deformation { storage, ..Deformation::default() };
+    let exact = Deformation { normals: Normals::Exact, ..plain(Storage::F32) };
+    let truncated = Deformation { truncation: Some(1e-9), ..plain(Storage::F32) };
+    vec![plain(Storage::F32), exact, plain(Storage::Int8), truncated, kept(plain(Storage::F32))]
+}
+
+/// Of all deformations, and some of them with followers.
+fn all_scenes() -> Vec<Arc<Scene>> {
+    let exact = Deformation { normals: Normals::Exact, ..Deformation::default() };
+    let followed = [Deformation::default(), exact, kept(Deformation::default())].map(following);
+    deformations().into_iter().map(crowd).chain(followed).collect()
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_fifty_steps_of_random_lists_read_beside_the_next_are_those_read_one_by_one() {
+    for scene in all_scenes() {
+        let states = states(&scene);
+        let want = plainly(&scene, &states);
+        // How many fetches are behind when the oldest is waited for.
+        for late in [0, 1, 2, 5] {
+            let mut deformer = deformer(&scene);
+            let mut reader = Reader { want: &want, waiting: VecDeque::new(), read: 0 };
+            for (step, state) in states.iter().enumerate() {
+                deformer.deform(state).expect("deforms");
+                // Some are fetched and never read, some are not fetched.
+                match step % 7 {
+                    3 => drop(deformer.fetch(Wanted::ALL).expect("begins")),
+                    5 => {}
+                    _ => reader.waiting.push_back((step, deformer.fetch(Wanted::ALL).expect("begins"))),
+                }
+                reader.read(&mut deformer, late);
+            }
+            reader.read(&mut deformer, 0);
+            assert_eq!(reader.read, (0..STEPS).filter(|step| ![3, 5].contains(&(step % 7))).count());
+            assert_eq!(deformer.outputs(), 2, "steps were fetched beside steps");
+            assert!(is(&without_tangents(deformer.surface().expect("copies")), &want[STEPS - 1]));
+        }
+        let (deformation, followers) = (scene.deformation, scene.needs.followers);
+        eprintln!(
+            "{deformation:?}, followers {followers}: {STEPS} steps agree bit by bit, read at once and up to five steps late"
+        );
+    }
+}
+
+fn without_tangents(surface: &Surface) -> Surface {
+    Surface { tangents: vec![], ..surface.clone() }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_two_steps_under_way_give_the_bounds_and_vertices_of_each() {
+    for scene in all_scenes() {
+        let states = states(&scene);
+        let want = plainly(&scene, &states);
+        let bounds: Vec<_> = {
+            let mut one = deformer(&scene);
+            states.iter().map(|state| one.deform(state).expect("deforms").bounds).collect()
+        };
+        assert_ne!(bounds[0], bounds[STEPS - 1], "the judge can fail");
+        let mut deformer = deformer(&scene);
+        let mut reader = Reader { want: &want, waiting: VecDeque::new(), read: 0 };
+        for step in 0..STEPS + MOST_UNDER_WAY {
+            if step >= MOST_UNDER_WAY {
+                let told = deformer.finish().expect("ends").bounds;
+                assert_eq!(told, bounds[step - MOST_UNDER_WAY], "step {}", step - MOST_UNDER_WAY);
+            }
+            if step < STEPS {
+                deformer.submit(&states[step]).expect("starts");
+                reader.waiting.push_back((step, deformer.fetch(Wanted::ALL).expect("begins")));
+            }
+            reader.read(&mut deformer, MOST_UNDER_WAY);
+        }
+        reader.read(&mut deformer, 0);
+        assert_eq!(reader.read, STEPS);
+        if scene.deformation == Deformation::default() && !scene.needs.followers {
+            check("after it all", &scene, &scenes::state(&scene, 5), &mut deformer);
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_after_a_fault_in_the_middle_the_next_step_is_whole_and_readings_go_on() {
+    let scene = crowd(Deformation::default());
+    let states = states(&scene);
+    let want = plainly(&scene, &states);
+    let mut deformer = deformer(&scene);
+    for step in 0..STEPS {
+        deformer.submit(&states[step]).expect("starts");
+        let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+        if step % 5 == 4 {
+            // What a failed step leaves behind: nothing that counts as whole.
+            deformer.forget();
+            assert!(matches!(deformer.fetch(Wanted::ALL), Err(Error::Fault { .. })), "nothing is whole");
+            assert!(matches!(deformer.finish(), Err(Error::Fault { .. })), "nothing is under way");
+        } else {
+            deformer.finish().expect("ends");
+        }
+        assert!(is(&deformer.fetched(&fetch).expect("arrives"), &want[step]), "step {step}");
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_what_does_not_fit_together_is_refused_and_harms_nothing() {
+    let scene = crowd(Deformation::default());
+    let states = states(&scene);
+    let want = plainly(&scene, &states[..3]);
+    let (mut one, mut other) = (deformer(&scene), deformer(&scene));
+    assert!(matches!(one.fetch(Wanted::VERTICES), Err(Error::Fault { .. })), "nothing was deformed");
+    assert!(matches!(one.finish(), Err(Error::Fault { .. })));
+    one.submit(&states[0]).expect("starts");
+    one.submit(&states[1]).expect("starts");
+    assert!(matches!(one.submit(&states[2]), Err(Error::Busy { limit: MOST_UNDER_WAY, .. })));
+    // A step by itself waits for those before it.
+    one.deform(&states[2]).expect("deforms");
+    other.deform(&states[0]).expect("deforms");
+    let strange = other.fetch(Wanted::VERTICES).expect("begins");
+    assert!(matches!(one.fetched(&strange), Err(Error::Fault { .. })));
+    let own = one.fetch(Wanted::VERTICES).expect("begins");
+    assert!(is(&one.fetched(&own).expect("arrives"), &want[2]));
+    // What was read outlives the deformer.
+    let kept = other.fetched(&strange).expect("arrives");
+    drop(other);
+    assert!(is(&kept, &want[0]));
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_second_output_is_made_for_those_alone_who_read_beside_steps() {
+    let scene = crowd(Deformation::default());
+    let states = states(&scene);
+    let mut deformer = deformer(&scene);
+    for state in &states[..10] {
+        deformer.deform(state).expect("deforms");
+    }
+    assert_eq!(deformer.outputs(), 1, "nobody reads");
+    for state in &states[10..20] {
+        deformer.deform(state).expect("deforms");
+        let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+        deformer.fetched(&fetch).expect("arrives");
+        deformer.surface().expect("copies");
+    }
+    assert_eq!(deformer.outputs(), 1, "every step is read before the next");
+    let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+    deformer.deform(&states[20]).expect("deforms");
+    assert_eq!(deformer.outputs(), 1, "it was waited for already");
+    deformer.fetched(&fetch).expect("is there");
+    let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+    deformer.deform(&states[21]).expect("deforms");
+    assert_eq!(deformer.outputs(), 2);
+    deformer.fetched(&fetch).expect("arrives");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_step() {
+    let scene = following(kept(Deformation::default()));
+    let states = states(&scene);
+    let want = plainly(&scene, &states);
+    let mut deformer = deformer(&scene);
+    let wanted = Wanted { displacements: true, boxes: true, ..Wanted::default() };
+    let mut before: Option<(usize, Fetch)> = None;
+    for (step, state) in states.iter().enumerate() {
+        deformer.deform(state).expect("deforms");
+        let fetch = deformer.fetch(wanted).expect("begins");
+        assert!(fetch.is_there());
+        if let Some((step, fetch)) = before.replace((step, fetch)) {
+            let got = deformer.fetched(&fetch).expect("is there");
+            let alone = Surface {
+                displacements: want[step].displacements.clone(),
+                boxes: want[step].boxes.clone(),
+                ..Surface::default()
+            };
+            assert!(is(&got, &alone), "step {step}");
+            assert!(got.boxes != want[(step + STEPS / 2) % STEPS].boxes, "the judge can fail");
+        }
+        assert_eq!(deformer.outputs(), 1, "nobody reads an output");
+    }
+    // Positions alone are all that travels, and wait for nothing else.
+    let positions = Wanted { positions: true, ..Wanted::default() };
+    let fetch = deformer.fetch(positions).expect("begins");
+    deformer.deform(&states[0]).expect("deforms");
+    assert_eq!(deformer.outputs(), 2);
+    let got = deformer.fetched(&fetch).expect("arrives");
+    assert!(same_bits(&got.positions, &want[STEPS - 1].positions) && got.normals.is_empty() && got.boxes.is_empty());
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_overlap_is_measured_and_its_vertices_are_those_of_the_serial_way() {
+    let device = Device::open(0).expect("a CUDA device");
+    let scene = scenes::scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
+    let states: Vec<State> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();
+    let found = overlap(&device, &scene, &states, 50).expect("measures");
+    eprintln!("{found:#?}");
+    assert_eq!(found.differing, 0);
+    let times = [found.serial_us, found.fetched_us, found.overlapped_us, found.graph_us, found.copy_out_us];
+    assert!(times.iter().chain([&found.write_us, &found.step_us]).all(|time| time.is_finite() && *time > 0.0));
+    assert!(found.overlapped_us < found.serial_us, "what runs side by side takes less time");
+    assert!(found.overlapped_us > 0.5 * found.ideal_us, "and no less than its longest part");
+    assert!(overlap(&device, &scene, &[], 5).is_err() && overlap(&device, &scene, &states, 0).is_err());
+    for write in host_writes(&device, 20).expect("writes") {
+        eprintln!("{write:?}");
+    }
+}
