@@ -129,7 +129,7 @@ impl Stage {
 }
 
 /// Adds a rigid domain with a shape and a material of its own.
-fn add(parts: &mut Parts, name: &str, mesh: Mesh, material: Material) -> Result<()> {
+pub(super) fn add(parts: &mut Parts, name: &str, mesh: Mesh, material: Material) -> Result<()> {
     parts.shapes.push(Shape::new(mesh, Modes::rigid())?);
     parts.materials.push(Material { name: name.into(), ..material });
     parts.domains.push(Domain {
@@ -147,12 +147,12 @@ fn add(parts: &mut Parts, name: &str, mesh: Mesh, material: Material) -> Result<
 }
 
 /// Four corners, counter-clockwise, as two triangles.
-fn quad(corners: [[f32; 3]; 4], normal: [f32; 3]) -> Result<Mesh> {
+pub(super) fn quad(corners: [[f32; 3]; 4], normal: [f32; 3]) -> Result<Mesh> {
     Mesh::indexed(corners.to_vec(), vec![normal; 4], Vec::new(), vec![[0, 1, 2], [0, 2, 3]])
 }
 
 /// A square of one metre that faces up at this height.
-fn lying(half: f32, height: f32) -> Result<Mesh> {
+pub(super) fn lying(half: f32, height: f32) -> Result<Mesh> {
     let at = |x: f32, z: f32| [x * half, height, z * half];
     quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
 }

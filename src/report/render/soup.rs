@@ -203,6 +203,13 @@ impl Soup {
         !self.boxes.ray_traverse_miss(boxed, |_, index| blocks(index).map_or(f32::INFINITY, |()| 0.0))
     }
 
+    /// Where a ray meets one triangle.
+    #[cfg(test)]
+    pub(super) fn meet(&self, triangle: usize, ray: &Ray) -> Option<Hit> {
+        let (t, u, v, front) = self.triangles[triangle].meet(ray).filter(|meets| meets.0 >= 0.0)?;
+        Some(Hit { t, u, v, triangle, front })
+    }
+
     pub(super) fn number(&self, hit: &Hit) -> u32 {
         self.triangles[hit.triangle].number
     }
