@@ -26,15 +26,18 @@ pub struct Bounds {
     pub mean_colour: f64,
     /// Mean error of the light that arrives, of 1.
     pub mean_light: f64,
+    /// Mean light where none should be, and mean light that is missing where all should be, of 1.
+    pub bleeding: f64,
+    pub lost: f64,
 }
 
-/// Several times what the variants are found at, and far below what a shadow in the wrong place gives.
-pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 8.0, mean_light: 0.08 };
+/// Several times what variants are found at; a shadow that is missing or lies elsewhere gives far more.
+pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 8.0, mean_light: 0.1, bleeding: 0.25, lost: 0.25 };
 
 /// The step of the motion that still pictures show.
 const STILL: usize = 10;
-/// Steps over which flicker is looked at, and in a quick run.
-const STEPS: (usize, usize) = (60, 60);
+/// Steps over which flicker is looked at.
+const STEPS: usize = 60;
 /// Pictures of moving scenes are smaller by this on each side.
 const SMALLER: u32 = 4;
 
@@ -165,17 +168,13 @@ fn small(size: Size) -> Size {
     Size { width: (size.width / SMALLER).max(1), height: (size.height / SMALLER).max(1) }
 }
 
-fn steps(request: &Request) -> usize {
-    if request.quick { STEPS.1 } else { STEPS.0 }
-}
-
 /// The references of every step, with a quarter of the samples of a still one.
 fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Vec<[Picture; 2]>> {
     let size = small(request.size);
     let camera = Camera::framing(&stage.scene, size.width, size.height);
     let mut set = studio.set(&stage.scene)?;
     let mut all = Vec::new();
-    for step in 0..steps(request) {
+    for step in 0..STEPS {
         studio.pose(&mut set, &stage.state(step))?;
         let view = View::new(set.scene(), &set.shot(camera, size));
         let soup = Soup::new(&stage.scene, set.surface()?);
@@ -242,7 +241,7 @@ impl Job<'_> {
         let hard = &self.references.hard;
         let colour_of_aim = metrics::colours(&image.rgba, &aim.colours);
         let light_of_aim = metrics::light(lit, &aim.light);
-        let faults = faults(colour_of_aim.mean, light_of_aim.all.mean);
+        let faults = faults(&colour_of_aim, &light_of_aim);
         Row {
             load: self.stage.name.clone(),
             name: variant.name.clone(),
@@ -292,10 +291,38 @@ impl Job<'_> {
     }
 }
 
-fn faults(mean_colour: f64, mean_light: f64) -> Vec<String> {
-    let over = |what: &str, found: f64, bound: f64| {
-        (found.is_nan() || found > bound).then(|| format!("mean error of {what} {found:.3}, bound {bound}"))
+/// Which bounds a variant does not keep, in words.
+fn faults(colour: &Spread, light: &Light) -> Vec<String> {
+    let found = [
+        ("mean error of colour", Some(colour.mean), BOUNDS.mean_colour),
+        ("mean error of light", Some(light.all.mean), BOUNDS.mean_light),
+        ("mean light in the umbra", light.in_umbra, BOUNDS.bleeding),
+        ("mean light lost outside of shadows", light.lost, BOUNDS.lost),
+    ];
+    let over = |(what, found, bound): (&str, Option<f64>, f64)| {
+        let found = found.filter(|found| found.is_nan() || *found > bound)?;
+        Some(format!("{what} {found:.3}, bound {bound}"))
     };
-    let colour = over("colour", mean_colour, BOUNDS.mean_colour);
-    colour.into_iter().chain(over("light", mean_light, BOUNDS.mean_light)).collect()
+    found.into_iter().filter_map(over).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shadow_that_is_missing_too_dark_or_elsewhere_is_a_fault_however_small_it_is() {
+        let shadow = |first: usize| -> Vec<Option<f32>> {
+            (0..1000).map(|at| Some(if (first..first + 10).contains(&at) { 0.0 } else { 1.0 })).collect()
+        };
+        let judged = |own: &[Option<f32>]| faults(&Spread::default(), &metrics::light(own, &shadow(100)));
+        assert_eq!(judged(&shadow(100)), Vec::<String>::new(), "control: the right one");
+        assert_eq!(judged(&shadow(102)), Vec::<String>::new(), "a fifth of it beside its place is within the bound");
+        for wrong in [shadow(200), vec![Some(1.0); 1000], shadow(105)] {
+            assert!(judged(&wrong)[0].starts_with("mean light in the umbra"), "{:?}", judged(&wrong));
+        }
+        assert!(judged(&vec![Some(0.5); 1000]).iter().any(|fault| fault.starts_with("mean light lost")));
+        let loud = Spread { mean: f64::NAN, ..Spread::default() };
+        assert_eq!(faults(&loud, &Light::default()).len(), 1, "what is no number is a fault");
+    }
 }

@@ -51,6 +51,8 @@ pub struct Light {
     /// Mean light where the reference has none at all: light bleeding. None when it has no such pixel.
     pub in_umbra: Option<f64>,
     pub umbra_pixels: usize,
+    /// Mean light that is missing where all of the reference's arrives. None when it has no such pixel.
+    pub lost: Option<f64>,
     /// Mean of rendered minus reference: what is too bright on the whole.
     pub bias: f64,
 }
@@ -61,12 +63,16 @@ pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Light {
     let error = |(own, wanted): &(f32, f32)| (own - wanted).abs();
     let soft = |(_, wanted): &&(f32, f32)| (PENUMBRA..=1.0 - PENUMBRA).contains(wanted);
     let umbra: Vec<f64> = pairs.iter().filter(|pair| pair.1 <= UMBRA).map(|pair| f64::from(pair.0)).collect();
+    let whole = pairs.iter().filter(|pair| pair.1 >= 1.0 - UMBRA);
+    let lost: Vec<f64> = whole.map(|pair| f64::from(pair.1 - pair.0)).collect();
+    let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
     let bias = pairs.iter().map(|(own, wanted)| f64::from(own - wanted)).sum::<f64>();
     Light {
         all: Spread::of(pairs.iter().map(error).collect()),
         penumbra: Spread::of(pairs.iter().filter(soft).map(error).collect()),
-        in_umbra: (!umbra.is_empty()).then(|| umbra.iter().sum::<f64>() / umbra.len() as f64),
+        in_umbra: mean(&umbra),
         umbra_pixels: umbra.len(),
+        lost: mean(&lost),
         bias: bias / pairs.len().max(1) as f64,
     }
 }
@@ -144,7 +150,10 @@ mod tests {
         assert!((found.in_umbra.expect("an umbra") - 0.05).abs() < 1e-7 && found.umbra_pixels == 4);
         let mut dark = reference.clone();
         dark[9] = Some(0.5);
-        assert_eq!(light(&dark, &reference).in_umbra, Some(0.0), "control: an error in the light");
+        let found = light(&dark, &reference);
+        assert_eq!(found.in_umbra, Some(0.0), "control: an error in the light");
+        assert!((found.lost.expect("a lit part") - 0.5 / 6.0).abs() < 1e-7, "{found:?}");
+        assert_eq!(light(&leaking, &reference).lost, Some(0.0), "control: an error in the umbra");
         assert_eq!(light(&[Some(0.5)], &[Some(1.0)]).in_umbra, None, "no umbra, no bleeding");
         assert_eq!(light(&[None, Some(1.0)], &[Some(0.0), None]).all.count, 0, "what neither tells is left out");
     }

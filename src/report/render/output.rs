@@ -9,7 +9,7 @@ use crate::error::{Result, during};
 use crate::report::plot::png;
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
-const COLUMNS: [(&str, &str); 37] = [
+const COLUMNS: [(&str, &str); 38] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -44,6 +44,7 @@ const COLUMNS: [(&str, &str); 37] = [
     ("penumbra_p99", "/light_of_aim/penumbra/p99"),
     ("penumbra_pixels", "/light_of_aim/penumbra/count"),
     ("bleeding", "/light_of_aim/in_umbra"),
+    ("lost", "/light_of_aim/lost"),
     ("flicker_mean", "/flicker/mean"),
     ("flicker_p99", "/flicker/p99"),
     ("faults", ""),

@@ -17,8 +17,8 @@ pub(super) fn markdown(report: &Report) -> String {
     text.push_str(&match report.failed.is_empty() {
         true => format!(
             "\nEvery variant stays within its bounds against what it means to show: a mean error of colour of {} of 255, \
-             of light of {}.\n",
-            bounds.mean_colour, bounds.mean_light
+             of light of {}; {} of light in the umbra; {} lost outside of shadows.\n",
+            bounds.mean_colour, bounds.mean_light, bounds.bleeding, bounds.lost
         ),
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
     });

@@ -175,7 +175,8 @@ impl Soup {
         best
     }
 
-    /// Every triangle in between that `sees` accepts, farthest first; equally far ones by descending number.
+    /// Every triangle in between that `sees` accepts, farthest first; equally far ones by descending number. A ray through
+    /// the edge that two triangles share meets their surface once.
     pub(super) fn every(&self, ray: &Ray, (least, most): (f64, f64), sees: impl Fn(&Hit) -> bool) -> Vec<Hit> {
         let (boxed, _) = self.boxed(ray, least, most);
         let mut hits = Vec::new();
@@ -188,7 +189,19 @@ impl Soup {
         });
         hits.retain(sees);
         hits.sort_by(|a, b| b.t.total_cmp(&a.t).then(self.number(b).cmp(&self.number(a))));
+        hits.dedup_by(|one, other| self.are_one(one, other));
         hits
+    }
+
+    /// Whether two hits lie on an edge that their triangles share.
+    fn are_one(&self, one: &Hit, other: &Hit) -> bool {
+        let on_rim = |hit: &Hit| hit.u.min(hit.v).min(1.0 - hit.u - hit.v) < 1e-9;
+        if (one.t - other.t).abs() > 1e-9 * one.t.abs() || !on_rim(one) || !on_rim(other) {
+            return false;
+        }
+        let [own, theirs] = [one, other].map(|hit| self.triangles[hit.triangle].points());
+        let near = |a: &Vector3<f64>, b: &Vector3<f64>| (a - b).norm() <= 1e-9 * self.radius;
+        own.iter().filter(|point| theirs.iter().any(|other| near(point, other))).count() >= 2
     }
 
     /// Whether anything beyond `least` that casts a shadow, other than the triangle itself, is in the way.
