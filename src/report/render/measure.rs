@@ -31,8 +31,9 @@ pub struct Bounds {
     pub lost: f64,
 }
 
-/// Several times what variants are found at; a shadow that is missing or lies elsewhere gives far more.
-pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 8.0, mean_light: 0.1, bleeding: 0.25, lost: 0.25 };
+/// Twice what small pictures of many leaves are found at, where each leaf is a pixel or two; all others are far below. A
+/// shadow that is missing or lies elsewhere exceeds the last two however little of the picture it takes.
+pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
 
 /// The step of the motion that still pictures show.
 const STILL: usize = 10;
