@@ -29,6 +29,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 pub use self::device::{EglDevice, devices};
+pub use self::frame::shadow_texel;
 use self::gl::{Gl, Program};
 pub use self::plan::{Allocation, Plan, Saving, plan};
 use self::scene_buffers::Apart;
