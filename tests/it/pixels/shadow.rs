@@ -93,16 +93,16 @@ fn a_blended_square_casts_from_the_threshold_on() {
 
 #[test]
 fn one_texel_without_blur_gives_chebyshevs_bound_and_bleeding_is_taken_off() {
-    // A square at height 4 that covers the whole map: near = 4.00 + 1 % and far = 0 - 1 % of the diagonal.
+    // A square at height 4 that covers the whole map. The planes nearest to the sun and farthest from it lie 1 % of the
+    // diagonal, 14.97, beyond square and ground, rounded outwards to multiples of 1/8.
     let shown = |least_variance: f32, bleeding: f32| {
         let mut stage = stage();
-        stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, alpha_threshold: 0.5 });
+        stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, ..Shadow::default() });
         let cover = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };
         stage.0.look.shadow = stage.0.look.shadow.map(|shadow| Shadow { alpha_threshold: 0.0, ..shadow });
         from_above(stage.add(lying(5.1, 4.0), cover)).at(32, 32)
     };
-    let diagonal = (2.0 * 10.2_f64.powi(2) + 16.0).sqrt();
-    let behind = 4.0 / (4.0 + 0.02 * diagonal);
+    let behind = 4.0 / (4.25 + 0.25);
     for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
         let variance = f64::from(least_variance);
         let bound = variance / (variance + behind * behind);
