@@ -24,7 +24,7 @@ pub enum Moments {
     #[default]
     F32,
     /// Half the memory, and wrong: the second moment is rounded by up to 2^-14, thirty times the default least variance,
-    /// so that lit surfaces shadow themselves. It is there to be measured.
+    /// so that the shadow near its caster is spotted with light. It is there to be measured.
     F16,
 }
 
@@ -55,7 +55,7 @@ pub struct Shadow {
     /// variance is ever taken: [`Self::floor`].
     pub least_variance: f32,
     /// Chebyshev values below this count as full shadow, 0 to 0.99 (light-bleeding reduction). It moves the edge of a
-    /// shadow inwards: at 0.2 by a quarter of the deviation.
+    /// shadow outwards: at 0.2 by a quarter of the deviation.
     pub bleeding: f32,
     /// Blended materials cast a shadow from this alpha on (the thesis's t_alpha).
     pub alpha_threshold: f32,

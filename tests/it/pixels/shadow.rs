@@ -6,7 +6,7 @@ use modalcast::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
 use super::build::{Picture, Stage, close, draw, facing, lying, open};
 
 /// Looking down on the ground from a height of 20, ten pixels a unit there; the sun straight up unless it is moved.
-fn stage() -> Stage {
+pub(super) fn stage() -> Stage {
     let mut stage = Stage::new();
     stage.0.look.sun = [0.0, 1.0, 0.0];
     stage.0.look.ground = Some(Ground { colour: [0.8; 3] });
@@ -28,7 +28,12 @@ fn from_above(stage: Stage) -> Picture {
 }
 
 /// A square of two units that floats where the camera does not see it cover its shadow: the sun comes from the side.
-fn aside(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
+fn aside(stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
+    from_above(with_square(stage, alpha_mode, alpha))
+}
+
+/// Its shadow on the ground is x and z of -1 to 1.
+pub(super) fn with_square(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Stage {
     stage.0.look.sun = [3.0, 4.0, 0.0];
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
     let image = stage.texture(64, 64, |x, y| [255, 255, 255, if hole(x, y) { 0 } else { 255 }]);
@@ -38,7 +43,7 @@ fn aside(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
     square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh = modalcast::domain::Mesh::indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
-    from_above(stage.add(mesh.expect("a square"), material))
+    stage.add(mesh.expect("a square"), material)
 }
 
 /// The ground near the middle, where the haze has hardly begun: the horizon is black here.
