@@ -1,6 +1,6 @@
-// One direction of the Gaussian blur (equation 3.11) for rasterisers in software, where reading a texture is cheaper than
-// shared memory. The first direction reads depth, the second the moments that the first wrote. One invocation makes RUN
-// texels in a row along its direction, so that a texel is read once for all of them.
+// One direction of the Gaussian blur (equation 3.11) for rasterisers in software, where reading a texture is cheaper
+// than shared memory. The first direction reads depth, the second the moments that the first wrote. One invocation
+// makes RUN texels in a row along its direction, so that a texel is read once for all of them.
 layout(local_size_x = LANES) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D to;
 

@@ -1,7 +1,7 @@
 // Both directions of the Gaussian blur (equation 3.11) in one pass: depth in, blurred moments out. A workgroup makes
-// WIDE x TALL texels. It reads the depths around them once, BAND rows at a time, blurs each row into shared memory, then
-// blurs the columns of that. Sums run over RUN texels at once, so that a number is loaded once for all of them. Rows
-// have an odd pitch: lanes that go down a column then meet different banks.
+// WIDE x TALL texels. It reads their depths and those around them once, BAND rows at a time, blurs each row into shared
+// memory, then blurs the columns of that. Sums run over RUN texels at once, so that a number is loaded once for all of
+// them. Rows have an odd pitch: lanes that go down a column then meet different banks.
 layout(local_size_x = LANES) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D to;
 
@@ -13,6 +13,7 @@ void main() {
             ivec2 at = ivec2(cell % (WIDE + 2 * REACH), cell / (WIDE + 2 * REACH));
             depths[at.y * DEPTH_PITCH + at.x] = centred(corner + at + ivec2(-REACH, first - REACH), side);
         }
+        memoryBarrierShared();
         barrier();
         for (int run = lane; run < BAND * (WIDE / RUN); run += LANES) {
             int row = run % BAND, left = run / BAND * RUN;
@@ -22,6 +23,7 @@ void main() {
                 for (int index = 0; index < RUN; index++) rows[(first + row) * PITCH + left + index] = sums[index];
             }
         }
+        memoryBarrierShared();
         barrier();
     }
     for (int run = lane; run < WIDE * (TALL / RUN); run += LANES) {

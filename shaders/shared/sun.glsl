@@ -1,5 +1,5 @@
-// How much of the sun reaches a point of a surface with this normal, 0 to 1: the one lookup of every kind of shadow map.
-// It takes no derivatives, so that fragment and compute shaders may call it, and a NaN in gives a number out.
+// lit: how much of the sun reaches a point of a surface with this normal, 0 to 1, from every kind of shadow map. It
+// takes no derivatives, so that fragment and compute shaders may call it, and a NaN in gives a number out.
 #ifdef SHADOWS
 layout(binding = 0) uniform sampler2DArray shadow_map;
 
@@ -21,8 +21,8 @@ float arrives(vec3 at, int layer, vec3 normal) {
     return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
 }
 #else
-// The plane of the surface, as the map sees it: depth at its texel (x, y), counted from the point itself, is z + x a + y b.
-// Comparing with this plane in place of the point's own depth, no slope shadows itself.
+// The plane of the surface, as the map sees it: by how much its depth changes from a texel to the next, in x and in y.
+// Texels are compared with this plane in place of the point's own depth, so that no slope shadows itself.
 vec2 slope(vec3 normal, int layer) {
     // The rows of the map's matrix are the axes of light space, scaled; the third looks away from the sun.
     mat3 axes = transpose(mat3(frame.map_from_world));
@@ -75,7 +75,7 @@ float arrives(vec3 at, int layer, vec3 normal) {
             vec4 plane = there + vec4(steep.y, steep.x + steep.y, steep.x, 0.0);
             vec4 open = vec4(lessThanEqual(plane, depth));
             open = max(open, vec4(greaterThanEqual(depth, vec4(NOTHING))));
-            share += rows.y * (columns.x * open.x + columns.y * open.y) + rows.x * (columns.y * open.z + columns.x * open.w);
+            share += dot(open, rows.yyxx * columns.xyyx);
         }
     }
     return clamp(share, 0.0, 1.0);
