@@ -2,7 +2,8 @@
 //!
 //! The z axis of light space is v_l, the direction to the sun, and its y axis points up in the world. The box is the
 //! axis-aligned box there of the world-space bounds, symmetric about their centre in x and y. Its four side facets run
-//! along the light, so they are lengthened until they meet the ground: then the whole shadow on it lies inside.
+//! along the light, so they are lengthened until they meet the ground: then the whole shadow on it lies inside. All sides
+//! keep to steps that are fixed in the world, so that shadows do not crawl while the scene sways.
 
 use nalgebra::{Matrix4, Vector3};
 

@@ -7,13 +7,16 @@ use crate::error::{Result, invalid};
 #[serde(rename_all = "lowercase")]
 pub enum ShadowMethod {
     /// Chebyshev's bound on blurred moments of depth (variance shadow map, equation 3.10): soft, one lookup a pixel. On a
-    /// receiver with one caster before it the bound is exact; where casters overlap it lets light through.
+    /// receiver with one caster before it the bound is exact, and half dark within half a texel of the true edge but for
+    /// `bleeding`; where casters overlap it lets light through.
     #[default]
     Variance,
-    /// One depth a pixel (standard shadow map): hard, its edge within one texel of the true one.
+    /// One depth a pixel (standard shadow map): hard, its edge within half a texel of the true one in the plane of the
+    /// map. A caster nearer than the side of a texel to the surface behind it casts none.
     Standard,
     /// The share of depths around the pixel that lie behind it, weighed by the Gaussian of `blur` (percentage-closer
-    /// filtering): soft, no light through, and (6 blur + 2)^2 depths a pixel.
+    /// filtering): soft, half dark within half a texel of the true edge, no light through where casters overlap, and
+    /// (6 blur + 2)^2 depths a pixel. Nearer than the side of a texel it casts none either.
     Filtered,
 }
 
@@ -61,7 +64,9 @@ pub struct Shadow {
     pub alpha_threshold: f32,
     pub moments: Moments,
     /// Maps of this size, 1 to 4, split by distance from the camera: the nearer finer, the last over the whole scene.
+    /// `blur` is in texels of each, so that shadows are sharper nearby.
     pub splits: u32,
+    /// For measurements; no file names it.
     #[serde(skip)]
     pub blurring: Blurring,
 }
