@@ -9,7 +9,8 @@ void main() {
     int side = int(frame.shadow.w), lane = int(gl_LocalInvocationIndex);
     ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(WIDE, TALL);
     for (int first = 0; first < TALL + 2 * REACH; first += BAND) {
-        for (int cell = lane; cell < BAND * (WIDE + 2 * REACH); cell += LANES) {
+        int cells = min(BAND, TALL + 2 * REACH - first) * (WIDE + 2 * REACH);
+        for (int cell = lane; cell < cells; cell += LANES) {
             ivec2 at = ivec2(cell % (WIDE + 2 * REACH), cell / (WIDE + 2 * REACH));
             depths[at.y * DEPTH_PITCH + at.x] = centred(corner + at + ivec2(-REACH, first - REACH), side);
         }

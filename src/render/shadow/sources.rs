@@ -42,8 +42,9 @@ impl Tile {
     /// The first of these that fits into shared memory: a wider reach leaves room for fewer texels at once.
     pub(in crate::render) fn of(shadow: &Shadow) -> Self {
         let reach = shadow.reach();
-        let sizes = [(32, 64, 64), (32, 32, 64), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
-        let tiles = sizes.map(|(wide, tall, band)| Self { wide, tall, band, reach });
+        let sizes = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
+        // All rows at once where they fit: a second band would leave most lanes idle.
+        let tiles = sizes.map(|(wide, tall, band)| Self { wide, tall, band: (tall + 2 * reach).min(band), reach });
         tiles.into_iter().find(|tile| tile.bytes() <= SHARED_BYTES).unwrap_or(tiles[sizes.len() - 1])
     }
 
@@ -205,7 +206,8 @@ mod tests {
             assert!(tile.bytes() <= SHARED_BYTES, "{tile:?}: {} bytes", tile.bytes());
             assert!(tile.wide.is_multiple_of(RUN) && tile.tall.is_multiple_of(RUN));
         }
-        assert_eq!(Tile::of(&Shadow::default()).tall, 64, "the default blur has the largest tile");
+        let default = Tile::of(&Shadow::default());
+        assert_eq!((default.tall, default.band), (64, 74), "the default blur has the largest tile, in one band");
     }
 
     #[test]
