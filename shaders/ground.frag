@@ -4,7 +4,7 @@ layout(location = 0) out vec4 colour;
 
 void main() {
     float facing = max(dot(frame.up.xyz, frame.to_sun.xyz), 0.0);
-    vec3 light = frame.skylight.rgb + sunlit(world) * facing * frame.sunlight.rgb;
+    vec3 light = frame.skylight.rgb + lit(world, frame.up.xyz) * facing * frame.sunlight.rgb;
     vec3 out_there = world - frame.ground_centre.xyz;
     float share = dot(out_there, out_there) / (frame.ground.a * frame.ground.a);
     colour = vec4(mix(frame.horizon.rgb, light * frame.ground.rgb, exp(-share)), 1.0);

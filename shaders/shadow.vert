@@ -5,10 +5,16 @@ layout(binding = 13) uniform samplerBuffer positions;
 layout(location = 2) in vec2 uv;
 out vec2 uv_image;
 #endif
+#ifdef SPLITS
+layout(location = 1) uniform int layer;
+#endif
 
 void main() {
     vec3 world = texelFetch(positions, int(vertex)).xyz;
     vec3 at = (frame.map_from_world * vec4(world, 1.0)).xyz;
+#ifdef SPLITS
+    at.xy = in_layer(at.xy, layer);
+#endif
     bool bad = any(isnan(at)) || any(isinf(at));
     gl_Position = bad ? vec4(0.0, 0.0, -2.0, 1.0) : vec4(2.0 * at - 1.0, 1.0);
 #if defined(UVS) && !defined(SOLID)

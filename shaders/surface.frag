@@ -51,7 +51,7 @@ void main() {
         float gleam = dot(reflected, to_sun);
         float highlight = gleam > 0.0 ? pow(gleam, material.specular.a) : 0.0;
         vec3 answer = facing * material.diffuse.rgb * tint.rgb + highlight * material.specular.rgb;
-        light += sunlit(world) * frame.sunlight.rgb * answer;
+        light += lit(world, unit(normal_world)) * frame.sunlight.rgb * answer;
     }
     colour = vec4(light, alpha);
 }

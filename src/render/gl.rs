@@ -3,6 +3,7 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod layers;
 mod object;
 
 use std::rc::Rc;
@@ -17,8 +18,8 @@ use crate::error::{Error, Result, during};
 /// The constants that other files name.
 pub(super) use glow::{
     CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
-    LINEAR_MIPMAP_NEAREST, NEAREST, R32UI, REPEAT, RG32F, RGB32F, RGBA8, RGBA16F, RGBA32F, SRGB8_ALPHA8, STATIC_DRAW,
-    STREAM_COPY, STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE, TEXTURE_MAG_FILTER,
+    LINEAR_MIPMAP_NEAREST, NEAREST, R32UI, REPEAT, RG16F, RG32F, RGB32F, RGBA8, RGBA16F, RGBA32F, SRGB8_ALPHA8,
+    STATIC_DRAW, STREAM_COPY, STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE, TEXTURE_MAG_FILTER,
     TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
 };
 

@@ -3,7 +3,7 @@
 //! | pass | what it does | runs when |
 //! |---|---|---|
 //! | shadow | depth from the sun; cut-outs leave holes | the look has a shadow |
-//! | blur | depth to moments, blurred in x, then in y (compute) | the look has a shadow |
+//! | blur | depth to moments, blurred in x and in y (compute) | that shadow is a variance map |
 //! | opaque | Phong, colour and normal maps; mask discards | some triangle is not blended |
 //! | sky, ground | gradient; plane that receives the shadow and fades into the horizon | always; the look has a ground |
 //! | blended | the same shading over what is there, no depth written | some triangle is blended |
@@ -20,6 +20,8 @@ mod plan;
 mod programs;
 mod scene_buffers;
 mod shaders;
+mod shadow;
+mod splits;
 mod target;
 mod textures;
 
@@ -82,7 +84,7 @@ pub struct Image {
     pub width: u32,
     pub height: u32,
     pub rgba: Vec<u8>,
-    /// Milliseconds per pass, by the name of the stage: "shadow", "draw", "read".
+    /// Milliseconds per pass, by the name of the stage: "shadow" and, out of that, "blur"; "draw"; "read".
     pub passes: Vec<(&'static str, f64)>,
 }
 
@@ -234,7 +236,12 @@ impl Renderer {
         let mut ran = Ran { samples: target.samples, ..Ran::default() };
         buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
+        if let Some(splits) = buffers.buffers.get("splits") {
+            let fit = frame::sun_fit(&buffers.scene, shot, buffers.origin);
+            splits.write(bytemuck::bytes_of(&splits::Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
+        }
         let shadow = gl.timed(|| passes::shadow(gl, buffers, &mut ran))?;
+        let blur = gl.timed(|| passes::blur(gl, buffers, &mut ran))?;
         let draw = gl.timed(|| {
             passes::draw(gl, buffers, target, shot, &mut ran)?;
             passes::encode(gl, target, &mut ran)
@@ -248,7 +255,9 @@ impl Renderer {
         let begin = Instant::now();
         let rgba = target.staging.read(bytes)?;
         let mapped = begin.elapsed().as_secs_f64() * 1e3;
-        let passes = vec![("shadow", shadow.ms()), ("draw", draw.ms()), ("read", copy.ms() + mapped)];
+        let blur = blur.ms();
+        let passes =
+            vec![("shadow", shadow.ms() + blur), ("blur", blur), ("draw", draw.ms()), ("read", copy.ms() + mapped)];
         gl.check("read")?;
         self.ran = ran;
         Ok(Image { width: shot.width, height: shot.height, rgba, passes })

@@ -6,8 +6,9 @@ use super::gl::{Fixed, Gl, Program};
 use super::programs::DrawGroup;
 use super::scene_buffers::{MATERIAL_BYTES, SceneBuffers};
 use super::shaders::{
-    COLOUR_UNIT, LANES, MATERIAL_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TRIANGLE_MATERIAL_UNIT,
+    COLOUR_UNIT, LANES, MATERIAL_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TRIANGLE_MATERIAL_UNIT,
 };
+use super::splits::Splits;
 use super::target::Target;
 use super::{Ran, Shot};
 use crate::error::Result;
@@ -15,6 +16,7 @@ use crate::error::Result;
 const PIXELS: u32 = 0;
 const FRAME: u32 = 0;
 const MATERIAL: u32 = 1;
+const SPLITS: u32 = 2;
 
 /// Binds what all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
@@ -24,6 +26,9 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
         view.bind(TRIANGLE_MATERIAL_UNIT);
     }
     buffers.buffer("frame")?.bind_uniform(FRAME, 0, size_of::<Frame>());
+    if let Ok(splits) = buffers.buffer("splits") {
+        splits.bind_uniform(SPLITS, 0, size_of::<Splits>());
+    }
     for (unit, texture) in (COLOUR_UNIT..).zip(&buffers.colours) {
         texture.bind(unit);
     }
@@ -33,30 +38,21 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     Ok(())
 }
 
-/// Depth from the sun, then its blurred moments.
+/// Depth from the sun.
 pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
-    let (Some(map), Some([blur_x, blur_y])) = (&buffers.shadow, &buffers.programs.blur) else { return Ok(()) };
-    gl.begin(&map.framebuffer, map.size, map.size);
-    gl.set(Fixed { depth_write: true, ..Fixed::default() });
-    for drawn in &buffers.groups {
-        if let Some(program) = &drawn.shadow {
-            bind_material(buffers, drawn, program, drawn.group.kind != Kind::Opaque)?;
-            gl.draw_indexed(&buffers.casters, drawn.group.first_triangle, drawn.group.triangles);
-        }
-    }
+    let Some(map) = &buffers.shadow else { return Ok(()) };
+    super::shadow::depth(gl, buffers, map)?;
     ran.passes.push("shadow");
-    gl.check("shadow")?;
-    let runs = map.size.div_ceil(RUN);
-    let along_x = (blur_x, &map.depth, &map.half_blurred, [runs.div_ceil(LANES), map.size]);
-    let along_y = (blur_y, &map.half_blurred, &map.moments, [map.size.div_ceil(LANES), runs]);
-    for (program, from, to, groups) in [along_x, along_y] {
-        program.bind(None);
-        from.bind(0);
-        to.bind_image(0);
-        gl.dispatch(groups[0], groups[1]);
+    Ok(())
+}
+
+/// What the map of a method that needs it has besides depth: blurred moments.
+pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
+    let Some(map) = &buffers.shadow else { return Ok(()) };
+    if super::shadow::blur(gl, buffers, map)? {
+        ran.passes.push("blur");
     }
-    ran.passes.push("blur");
-    gl.check("blur")
+    Ok(())
 }
 
 /// The picture, in linear light.
@@ -64,7 +60,7 @@ pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot
     let programs = &buffers.programs;
     gl.begin(&target.framebuffer, target.width, target.height);
     if let Some(map) = &buffers.shadow {
-        map.moments.bind(SHADOW_UNIT);
+        map.lookup().bind(SHADOW_UNIT);
     }
     if surfaces(gl, buffers, target, &[Kind::Opaque, Kind::Mask], ran)? {
         ran.passes.push("opaque");
@@ -124,7 +120,12 @@ fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
 }
 
 /// Uses a program, with the one material of the group, or with the place where its triangles begin.
-fn bind_material(buffers: &SceneBuffers, drawn: &DrawGroup, program: &Program, reads_it: bool) -> Result<()> {
+pub(super) fn bind_material(
+    buffers: &SceneBuffers,
+    drawn: &DrawGroup,
+    program: &Program,
+    reads_it: bool,
+) -> Result<()> {
     if let Some(material) = drawn.group.material {
         buffers.buffer("materials")?.bind_uniform(MATERIAL, MATERIAL_BYTES * material, MATERIAL_BYTES);
     }

@@ -4,6 +4,7 @@
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
 use super::geometry::{Kind, groups, looks_up};
+use super::shadow::fitting;
 use super::textures::{Use, arrays};
 use crate::scene::{Scene, Shadow};
 
@@ -55,13 +56,19 @@ impl Plan {
     }
 }
 
-/// What a scene needs of the device.
+/// What a scene needs of a GPU.
 pub fn plan(scene: &Scene) -> Plan {
+    planned(scene, false)
+}
+
+/// What a scene needs of a device, which may be a rasteriser in software.
+pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
     let (groups, _) = groups(scene);
     let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
     let mut passes = Vec::new();
-    if scene.needs.shadows {
-        passes.extend(["shadow", "blur"]);
+    if let Some(shadow) = scene.look.shadow {
+        passes.push("shadow");
+        passes.extend(shadow.has_moments().then_some("blur"));
     }
     if has(Kind::Opaque) || has(Kind::Mask) {
         passes.push("opaque");
@@ -72,7 +79,7 @@ pub fn plan(scene: &Scene) -> Plan {
     passes.push("encode");
     Plan {
         buffers: buffers(scene),
-        textures: textures(scene),
+        textures: textures(scene, software),
         passes,
         draws: groups.len(),
         defines: defines(scene),
@@ -103,10 +110,13 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     if looks_up(scene) {
         buffers.push(named("triangle materials", 4 * layout.triangles));
     }
+    if scene.look.shadow.is_some_and(|shadow| shadow.splits > 1) {
+        buffers.push(named("splits", size_of::<super::splits::Splits>()));
+    }
     buffers
 }
 
-fn textures(scene: &Scene) -> Vec<Allocation> {
+fn textures(scene: &Scene, software: bool) -> Vec<Allocation> {
     let mut textures = Vec::new();
     for (purpose, word) in [(Use::Colour, "colours"), (Use::Normal, "normals")] {
         for array in arrays(scene, purpose) {
@@ -115,18 +125,15 @@ fn textures(scene: &Scene) -> Vec<Allocation> {
         }
     }
     if let Some(shadow) = scene.look.shadow {
-        textures.extend(shadow_textures(shadow));
+        textures.extend(shadow_textures(fitting(shadow, software)));
     }
     textures
 }
 
-fn shadow_textures(shadow: Shadow) -> [Allocation; 3] {
+fn shadow_textures(shadow: Shadow) -> Vec<Allocation> {
     let texels = shadow.size as usize * shadow.size as usize;
-    [
-        named("shadow depth", 4 * texels),
-        named("shadow moments, blurred in x", 8 * texels),
-        named("shadow moments", 8 * texels),
-    ]
+    let named = |(name, bytes, layers): (&'static str, u32, u32)| named(name, (bytes * layers) as usize * texels);
+    super::shadow::textures(&shadow).into_iter().map(named).collect()
 }
 
 fn defines(scene: &Scene) -> Vec<&'static str> {
@@ -136,9 +143,9 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("NORMAL_MAPS", needs.normal_maps),
         ("UVS", needs.textures || needs.normal_maps),
         ("LOOK_UP", looks_up(scene)),
-        ("SHADOWS", needs.shadows),
     ];
-    branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
+    let shadows = scene.look.shadow.iter().flat_map(super::shadow::defines);
+    branches.into_iter().filter_map(|(name, on)| on.then_some(name)).chain(shadows).collect()
 }
 
 fn left_out(scene: &Scene) -> Vec<Saving> {
@@ -202,7 +209,7 @@ mod tests {
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
         assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"]);
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
-        assert_eq!(plan.left_out[4].bytes, 20 * 1024 * 1024, "map and moments");
+        assert_eq!(plan.left_out[4].bytes, 12 * 1024 * 1024, "map and moments");
     }
 
     #[test]

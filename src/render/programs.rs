@@ -16,7 +16,8 @@ pub(super) type Compile<'a> = dyn FnMut(Source) -> Result<Rc<Program>> + 'a;
 /// Programs of whole passes; absent where the scene has no such pass.
 #[derive(Debug)]
 pub(super) struct Programs {
-    pub(super) blur: Option<[Rc<Program>; 2]>,
+    /// In order; none where the map has no moments.
+    pub(super) blur: Vec<Rc<Program>>,
     pub(super) ground: Option<Rc<Program>>,
     pub(super) sky: Rc<Program>,
 }
@@ -39,8 +40,8 @@ impl Programs {
         let has = |pass: &str| plan.passes.contains(&pass);
         Ok(Self {
             blur: match has("blur") {
-                true => Some([compile(options.blur(true))?, compile(options.blur(false))?]),
-                false => None,
+                true => options.blur().into_iter().map(&mut *compile).collect::<Result<_>>()?,
+                false => vec![],
             },
             ground: if has("ground") { Some(compile(options.ground())?) } else { None },
             sky: compile(options.sky())?,

@@ -9,10 +9,11 @@ use rayon::prelude::*;
 
 use super::SharedBuffers;
 use super::geometry::Geometry;
-use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Texture, TextureKind, VertexArray};
-use super::plan::{Allocation, Plan, plan};
+use super::gl::{self, Attribute, Buffer, Gl, Texture, TextureKind, VertexArray};
+use super::plan::{Allocation, Plan, planned};
 use super::programs::{Compile, DrawGroup, Programs};
 use super::shaders::Options;
+use super::shadow::{ShadowMap, fitting};
 use super::textures::{Array, Use, arrays, levels, place};
 use crate::domain::AlphaMode;
 use crate::error::{Result, during};
@@ -80,19 +81,11 @@ pub(super) struct Views {
     pub(super) triangle_materials: Option<Texture>,
 }
 
-#[derive(Debug)]
-pub(super) struct ShadowMap {
-    pub(super) size: u32,
-    pub(super) depth: Texture,
-    pub(super) half_blurred: Texture,
-    pub(super) moments: Texture,
-    pub(super) framebuffer: Framebuffer,
-}
-
 impl SceneBuffers {
     /// Allocates and fills what the plan of the scene says; `compile` gives programs that may be shared.
     pub(super) fn new(gl: &Rc<Gl>, scene: &Arc<Scene>, samples: u32, compile: &mut Compile<'_>) -> Result<Self> {
-        let plan = plan(scene);
+        let plan = planned(scene, gl.limits.software);
+        let shadow = scene.look.shadow.map(|shadow| fitting(shadow, gl.limits.software));
         let geometry = Geometry::new(scene);
         let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
         let materials = pack(scene, &images);
@@ -103,7 +96,7 @@ impl SceneBuffers {
             defines: plan.defines.clone(),
             colour_arrays: images[0].len(),
             normal_arrays: images[1].len(),
-            blur: scene.look.shadow.unwrap_or_default().blur,
+            shadow: shadow.unwrap_or_default(),
             samples,
         };
         let groups = geometry.groups.iter();
@@ -122,7 +115,7 @@ impl SceneBuffers {
             nothing: gl.vertex_array(None, &[])?,
             colours: upload_arrays(gl, scene, &colours, Use::Colour)?,
             normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
-            shadow: scene.look.shadow.map(|shadow| ShadowMap::new(gl, shadow.size)).transpose()?,
+            shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow)).transpose()?,
             programs,
             origin: [0.0; 3],
             apart: None,
@@ -156,7 +149,7 @@ impl SceneBuffers {
 
     /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.
     pub fn texture_count(&self) -> usize {
-        self.colours.len() + self.normals.len() + if self.shadow.is_some() { 3 } else { 0 }
+        self.colours.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
     }
 
     pub(super) fn buffer(&self, name: &'static str) -> Result<&Buffer> {
@@ -287,33 +280,4 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
     ];
     texture.sampling(&sampling, gl.limits.anisotropy);
     Ok(texture)
-}
-
-impl ShadowMap {
-    fn new(gl: &Rc<Gl>, size: u32) -> Result<Self> {
-        if size > gl.limits.max_side {
-            return Err(gl::too_large("look.shadow.size", u64::from(gl.limits.max_side), u64::from(size)));
-        }
-        let map = |format: u32, filter: u32| {
-            let kind = TextureKind { target: gl::TEXTURE_2D, format, width: size, height: size, depth: 1, levels: 1 };
-            let texture = gl.texture(kind)?;
-            let sampling = [
-                (gl::TEXTURE_MIN_FILTER, filter),
-                (gl::TEXTURE_MAG_FILTER, filter),
-                (gl::TEXTURE_WRAP_S, gl::CLAMP_TO_EDGE),
-                (gl::TEXTURE_WRAP_T, gl::CLAMP_TO_EDGE),
-            ];
-            texture.sampling(&sampling, 1.0);
-            Ok(texture)
-        };
-        let depth = map(gl::DEPTH_COMPONENT32F, gl::NEAREST)?;
-        let framebuffer = gl.framebuffer(None, &depth)?;
-        Ok(Self {
-            size,
-            depth,
-            half_blurred: map(gl::RG32F, gl::NEAREST)?,
-            moments: map(gl::RG32F, gl::LINEAR)?,
-            framebuffer,
-        })
-    }
 }

@@ -4,12 +4,12 @@ use std::fmt::Write as _;
 
 use super::geometry::Kind;
 use super::gl;
+use crate::scene::Shadow;
 
-const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
-const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
+pub(super) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
+pub(super) const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
 const CUT_OUT: &str = include_str!("../../shaders/shared/cut_out.glsl");
-const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
-const SUN: &str = include_str!("../../shaders/shared/sun.glsl");
+pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
 
 /// First texture unit of each use.
@@ -24,8 +24,6 @@ const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITI
 
 /// Lanes of a compute workgroup, along x.
 pub(super) const LANES: u32 = 64;
-/// Texels that one invocation of the blur makes, along its direction.
-pub(super) const RUN: u32 = 8;
 
 /// What the sources depend on.
 #[derive(Debug, Clone)]
@@ -33,8 +31,8 @@ pub(super) struct Options {
     pub(super) defines: Vec<&'static str>,
     pub(super) colour_arrays: usize,
     pub(super) normal_arrays: usize,
-    /// Standard deviation of the blur in texels.
-    pub(super) blur: f32,
+    /// The shadow map as the device is given it; what it says counts where the defines name shadows.
+    pub(super) shadow: Shadow,
     /// Samples a pixel of an ordinary picture.
     pub(super) samples: u32,
 }
@@ -47,7 +45,7 @@ pub(super) struct Source {
 }
 
 impl Options {
-    fn head(&self, more: &[&str]) -> String {
+    pub(super) fn head(&self, more: &[&str]) -> String {
         let mut text = String::from("#version 430 core\n");
         for define in self.defines.iter().chain(more) {
             writeln!(text, "#define {define}").ok();
@@ -85,35 +83,17 @@ impl Options {
         let vertex = [&head, FRAME, include_str!("../../shaders/surface.vert")].concat();
         let cut_out = if kind == Kind::Mask { CUT_OUT } else { "" };
         let body = include_str!("../../shaders/surface.frag");
-        let fragment = [&head, FRAME, MATERIAL, &self.samplers(), cut_out, SUN, body].concat();
+        let fragment = [&head, FRAME, MATERIAL, &self.samplers(), cut_out, &self.sun(), body].concat();
         Source {
             label: format!("surface, {kind:?}, {samples} samples"),
             stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)],
         }
     }
 
-    /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
-    pub(super) fn shadow(&self, kind: Kind) -> Source {
-        let more: &[&str] = match kind {
-            Kind::Opaque => &["SOLID"],
-            Kind::Mask => &["MASK"],
-            Kind::Blend => &["BLEND"],
-        };
-        let head = self.head(more);
-        let vertex = [&head, FRAME, include_str!("../../shaders/shadow.vert")].concat();
-        let mut stages = vec![(gl::VERTEX_SHADER, vertex)];
-        if kind != Kind::Opaque {
-            let body = include_str!("../../shaders/shadow.frag");
-            let fragment = [&head, FRAME, MATERIAL, &self.samplers(), CASTER, body].concat();
-            stages.push((gl::FRAGMENT_SHADER, fragment));
-        }
-        Source { label: format!("shadow, {kind:?}"), stages }
-    }
-
     pub(super) fn ground(&self) -> Source {
         let head = self.head(&[]);
         let vertex = [&head, FRAME, include_str!("../../shaders/ground.vert")].concat();
-        let fragment = [&head, FRAME, SUN, SKY, include_str!("../../shaders/ground.frag")].concat();
+        let fragment = [&head, FRAME, &self.sun(), SKY, include_str!("../../shaders/ground.frag")].concat();
         Source { label: "ground".into(), stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
     }
 
@@ -124,17 +104,9 @@ impl Options {
         Source { label: "sky".into(), stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
     }
 
-    /// One direction of the blur; the first also turns depth into moments.
-    pub(super) fn blur(&self, first: bool) -> Source {
-        let mut head = self.head(if first { &["FIRST"] } else { &[] });
-        writeln!(head, "#define LANES {LANES}\n#define RUN {RUN}\nvec2 moments(ivec2 at, int side);").ok();
-        let body = [&head, FRAME, &taps(&weights(self.blur)), include_str!("../../shaders/blur.comp")].concat();
-        Source { label: format!("blur, {}", if first { "x" } else { "y" }), stages: vec![(gl::COMPUTE_SHADER, body)] }
-    }
-
     /// The lookup in the texture arrays: sampling must not hang on a number that differs within a quad, so that with
     /// several arrays the gradients are taken first.
-    fn samplers(&self) -> String {
+    pub(super) fn samplers(&self) -> String {
         let mut text = String::new();
         let uses = [("colour", COLOUR_UNIT, self.colour_arrays), ("normal", NORMAL_UNIT, self.normal_arrays)];
         for (name, unit, count) in uses.into_iter().filter(|(_, _, count)| *count > 0) {
@@ -165,33 +137,6 @@ pub(super) fn encode(samples: u32) -> Source {
     Source { label: format!("encode, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
 }
 
-/// The weighted sums of one invocation of the blur, written out: each texel is read once for all the sums it is part of.
-fn taps(weights: &[f32]) -> String {
-    let reach = weights.len() as i32 - 1;
-    let mut text = String::from("void blur(ivec2 at, ivec2 along, int side, out vec2 sums[RUN]) {\n    vec2 texel;\n");
-    for index in 0..RUN {
-        writeln!(text, "    sums[{index}] = vec2(0.0);").ok();
-    }
-    for tap in -reach..RUN as i32 + reach {
-        writeln!(text, "    texel = moments(at + {tap} * along, side);").ok();
-        for index in 0..RUN as i32 {
-            if let Some(weight) = weights.get((tap - index).unsigned_abs() as usize) {
-                writeln!(text, "    sums[{index}] += {weight:?} * texel;").ok();
-            }
-        }
-    }
-    text + "}\n"
-}
-
-/// Half a normalised Gaussian (equation 3.11 in one dimension), centre first, cut off at three deviations.
-pub(super) fn weights(deviation: f32) -> Vec<f32> {
-    let deviation = f64::from(deviation);
-    let reach = (3.0 * deviation).ceil() as i32;
-    let bell = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / deviation).powi(2)).exp() };
-    let sum: f64 = (-reach..=reach).map(bell).sum();
-    (0..=reach).map(|step| (bell(step) / sum) as f32).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::geometry::tests::squares;
@@ -202,7 +147,7 @@ mod tests {
     fn options(alpha_mode: AlphaMode) -> Options {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
         let plan = super::super::plan::plan(&scene);
-        Options { defines: plan.defines, colour_arrays: 0, normal_arrays: 0, blur: 2.0, samples: 4 }
+        Options { defines: plan.defines, colour_arrays: 0, normal_arrays: 0, shadow: Shadow::default(), samples: 4 }
     }
 
     #[test]
@@ -221,17 +166,6 @@ mod tests {
         assert_eq!(full.narrowed(false, false).defines, ["SHADOWS"]);
         assert_eq!(full.narrowed(true, false).defines, ["TEXTURES", "UVS", "SHADOWS"]);
         assert_eq!(full.narrowed(false, true).normal_arrays, 1);
-    }
-
-    #[test]
-    fn blur_weights_are_a_normalised_bell() {
-        for deviation in [0.0, 0.3, 2.0, 16.0] {
-            let weights = weights(deviation);
-            let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
-            assert!((sum - 1.0).abs() < 1e-5, "{deviation}: {sum}");
-            assert!(weights.is_sorted_by(|near, far| near >= far));
-        }
-        assert_eq!(weights(0.0), [1.0]);
     }
 
     #[test]

@@ -10,6 +10,7 @@ mod layout;
 mod look;
 mod needs;
 mod rigid;
+mod shadow;
 mod state;
 mod update;
 
@@ -17,9 +18,10 @@ pub use camera::{Bounds, Camera, Lens, View};
 pub use cells::{Cells, GRID, REACH, nearest_cell};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
-pub use look::{Ground, Look, Shadow, UpAxis};
+pub use look::{Ground, Look, UpAxis};
 pub use needs::Needs;
 pub use rigid::TransformFormat;
+pub use shadow::{Blurring, Moments, Shadow, ShadowMethod};
 pub use state::{Changed, State};
 pub use update::{RawUpdate, Update};
 
