@@ -3,8 +3,9 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
-use super::geometry::{Kind, groups, looks_up};
+use super::geometry::{Kind, groups, looks_up, used_materials};
 use super::textures::{Use, arrays};
+use crate::domain::AlphaMode;
 use crate::scene::{Scene, Shadow};
 
 /// A buffer or texture and its size.
@@ -36,7 +37,7 @@ pub struct Plan {
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the opaque and blended passes together; the number of domains does not matter.
+    /// Draw calls of the visibility and blended passes together, six at most: domains and materials do not matter.
     pub draws: usize,
     /// Branches that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -64,12 +65,11 @@ pub fn plan(scene: &Scene) -> Plan {
         passes.extend(["shadow", "blur"]);
     }
     if has(Kind::Opaque) || has(Kind::Mask) {
-        passes.push("opaque");
+        passes.push("visibility");
     }
-    passes.push("sky");
     passes.extend(scene.look.ground.map(|_| "ground"));
     passes.extend(scene.needs.blend.then_some("blended"));
-    passes.push("encode");
+    passes.extend(["shade", "encode"]);
     Plan {
         buffers: buffers(scene),
         textures: textures(scene),
@@ -91,7 +91,7 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
         named("normals", 12 * layout.corners),
         named("corner vertices", 4 * layout.corners),
         named("triangles", 12 * layout.triangles),
-        named("materials", super::scene_buffers::MATERIAL_BYTES * scene.materials.len()),
+        named("materials", super::scene_buffers::MATERIAL_BYTES * used_materials(scene).len()),
         named("frame", size_of::<super::frame::Frame>()),
     ];
     if scene.needs.normal_maps {
@@ -137,6 +137,9 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("UVS", needs.textures || needs.normal_maps),
         ("LOOK_UP", looks_up(scene)),
         ("SHADOWS", needs.shadows),
+        ("GROUND_SEEN", scene.look.ground.is_some()),
+        ("TRIANGLES", used_materials(scene).iter().any(|used| scene.materials[*used].alpha_mode != AlphaMode::Blend)),
+        ("LAYERS", needs.blend),
     ];
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
 }
@@ -149,16 +152,10 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
     let all = [
         (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
         (needs.textures, "textures", uvs, vec![], "no colour lookup"),
-        (needs.mask, "mask", 0, vec![], "no discard; the shadow of opaque triangles needs no fragment shader"),
-        (needs.blend, "blend", 0, vec!["blended"], "no blended variant"),
+        (needs.mask, "mask", 0, vec![], "no discard, no sample mask; depth needs no fragment shader"),
+        (needs.blend, "blend", 0, vec!["blended"], "no layers in the shading, 8 bytes a sample less"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
-        (
-            looks_up(scene),
-            "many materials",
-            4 * layout.triangles as u64,
-            vec![],
-            "a draw call for each material, no lookup per triangle",
-        ),
+        (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (scene.look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
     ];
     let unneeded = all.into_iter().filter(|row| !row.0);
@@ -167,22 +164,20 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::geometry::DRAWN_APART;
     use super::super::geometry::tests::squares;
     use super::*;
-    use crate::domain::{AlphaMode, Material, Texture};
+    use crate::domain::{Material, Texture};
 
     fn names(allocations: &[Allocation]) -> Vec<&str> {
         allocations.iter().map(|allocation| allocation.name.as_str()).collect()
     }
 
     fn everything() -> crate::scene::Parts {
-        let mut materials = vec![
+        let materials = vec![
             Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
             Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
         ];
-        materials.resize(DRAWN_APART + 1, Material::default());
         let mut parts = squares(materials);
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
         parts
@@ -195,10 +190,11 @@ mod tests {
         parts.look.ground = None;
         let scene = Scene::new(parts).expect("good");
         let plan = plan(&scene);
-        assert_eq!(plan.passes, ["opaque", "sky", "encode"]);
+        assert_eq!(plan.passes, ["visibility", "shade", "encode"]);
         let expected = ["positions", "normals", "corner vertices", "triangles", "materials", "frame"];
         assert_eq!(names(&plan.buffers), expected);
-        assert!(plan.textures.is_empty() && plan.defines.is_empty());
+        assert!(plan.textures.is_empty());
+        assert_eq!(plan.defines, ["TRIANGLES"]);
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
         assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"]);
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
@@ -208,7 +204,7 @@ mod tests {
     #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
         let plan = plan(&Scene::new(everything()).expect("good"));
-        assert_eq!(plan.passes, ["shadow", "blur", "opaque", "sky", "ground", "blended", "encode"]);
+        assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "shade", "encode"]);
         assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
         assert_eq!(plan.textures[0], Allocation { name: "colours 1 x 1 x 1".into(), bytes: 4 });

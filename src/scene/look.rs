@@ -82,6 +82,8 @@ pub struct Look {
     pub horizon: [f32; 3],
     pub shadow: Option<Shadow>,
     pub ground: Option<Ground>,
+    /// Samples a pixel, 1 or 4: how smooth the edges of triangles and cut-outs are.
+    pub samples: u32,
 }
 
 impl Default for Look {
@@ -95,6 +97,7 @@ impl Default for Look {
             horizon: [0.72, 0.82, 0.90],
             shadow: Some(Shadow::default()),
             ground: Some(Ground::default()),
+            samples: 4,
         }
     }
 }
@@ -110,6 +113,9 @@ impl Look {
         let colours = [self.sun, self.sunlight, self.skylight, self.zenith, self.horizon];
         if !colours.as_flattened().iter().all(|number| number.is_finite()) {
             return Err(invalid("look", "finite numbers", format!("{self:?}")));
+        }
+        if ![1, 4].contains(&self.samples) {
+            return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
         }
         let Some(shadow) = self.shadow else { return Ok(()) };
         if !(16..=16384).contains(&shadow.size) {

@@ -5,3 +5,5 @@ mod far;
 mod limits;
 mod shading;
 mod shadow;
+mod snapshots;
+mod visibility;
