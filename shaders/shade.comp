@@ -3,6 +3,9 @@
 //   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1       (in)
 //   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, share that they let by   (in)
 //   picture  [height][width]           RGBA16F, bottom row first                                        (out)
+// Two dispatches: with BACKDROP for all tiles of pixels, to paint those that see sky and ground alone and to list the
+// others; then for the listed tiles. A software rasteriser runs both sides of every branch, and most tiles of most pictures
+// see no triangle.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 #ifdef LAYERS
 #if SAMPLES > 1
@@ -12,6 +15,15 @@ layout(binding = 22) uniform sampler2D layers;
 #endif
 #endif
 layout(rgba16f, binding = 0) uniform writeonly image2D picture;
+// The number of groups of the second dispatch, in rows; then the tiles, x and y in one word, in any order.
+layout(std430, binding = 1) buffer Tiles {
+    uint groups[3];
+    uint count;
+    uint tiles[];
+};
+#ifdef BACKDROP
+shared uint sees_triangle;
+#endif
 
 // A direction in the world, as long as it takes to go one unit of depth.
 vec3 through(vec2 image) { return mat3(frame.world_from_image) * vec3(image, 1.0); }
@@ -31,7 +43,7 @@ vec3 shaded(uint id, vec2 image, vec2 texel) {
 #ifdef GROUND_SEEN
     if (id == GROUND) light = ground_seen(direction);
 #endif
-#ifdef TRIANGLES
+#ifndef BACKDROP
     if (id != NOTHING && id != GROUND) light = triangle_seen(int(id - 1u), image, texel);
 #endif
     return light;
@@ -41,16 +53,12 @@ vec3 shaded(uint id, vec2 image, vec2 texel) {
 // black.
 vec3 clamped(vec3 light) { return mix(vec3(0.0), min(light, vec3(1.0)), greaterThan(light, vec3(0.0))); }
 
-void main() {
-    ivec2 size = size_of_ids();
-    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(at, size))) return;
-    uint seen[SAMPLES];
-    for (int index = 0; index < SAMPLES; index++) seen[index] = texelFetch(ids, at, index).x;
+// The mean light of a pixel's samples.
+vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
     vec2 texel = 2.0 / vec2(size);
     vec3 sum = vec3(0.0);
     uint left = (1u << SAMPLES) - 1u;
-    // The loop is left at its end: a software rasteriser runs the body of a loop, or of a branch, for lanes that are done.
+    // The loop is left at its end: a software rasteriser runs the body of a loop for lanes that are done.
     do {
         uint id = NOTHING;
         for (int index = SAMPLES - 1; index >= 0; index--) {
@@ -76,5 +84,39 @@ void main() {
 #endif
         left &= ~same;
     } while (left != 0u);
-    imageStore(picture, at, vec4(sum / float(SAMPLES), 1.0));
+    return sum / float(SAMPLES);
+}
+
+void main() {
+    ivec2 size = size_of_ids();
+    uint seen[SAMPLES];
+#ifdef BACKDROP
+    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
+    bool inside = all(lessThan(at, size));
+    bool triangle = false;
+    for (int index = 0; index < SAMPLES; index++) {
+        seen[index] = texelFetch(ids, min(at, size - 1), index).x;
+        triangle = triangle || (seen[index] != NOTHING && seen[index] != GROUND);
+    }
+    if (gl_LocalInvocationIndex == 0u) sees_triangle = 0u;
+    barrier();
+    if (inside && triangle) sees_triangle = 1u;
+    barrier();
+    if (sees_triangle != 0u) {
+        if (gl_LocalInvocationIndex == 0u) {
+            uint place = atomicAdd(count, 1u);
+            if (place % ROW == 0u) atomicAdd(groups[1], 1u);
+            tiles[place] = gl_WorkGroupID.x | gl_WorkGroupID.y << 16;
+        }
+    } else if (inside) {
+        imageStore(picture, at, vec4(pixel(at, size, seen), 1.0));
+    }
+#else
+    uint place = gl_WorkGroupID.y * ROW + gl_WorkGroupID.x;
+    uint tile = tiles[min(place, count - 1u)];
+    ivec2 at = TILE * ivec2(tile & 0xFFFFu, tile >> 16) + ivec2(gl_LocalInvocationID.xy);
+    if (place >= count || any(greaterThanEqual(at, size))) return;
+    for (int index = 0; index < SAMPLES; index++) seen[index] = texelFetch(ids, at, index).x;
+    imageStore(picture, at, vec4(pixel(at, size, seen), 1.0));
+#endif
 }

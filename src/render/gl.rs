@@ -334,6 +334,17 @@ impl Gl {
         }
     }
 
+    /// The same with as many groups as the first three words of a buffer say.
+    pub(super) fn dispatch_listed(&self, groups: &Buffer) {
+        let gl = self.on();
+        // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
+        unsafe {
+            gl.bind_buffer(glow::DISPATCH_INDIRECT_BUFFER, Some(groups.name));
+            gl.dispatch_compute_indirect(0);
+            gl.memory_barrier(glow::ALL_BARRIER_BITS);
+        }
+    }
+
     pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
         let gl = self.on();
         // SAFETY: OpenGL refuses ranges outside either buffer.

@@ -7,7 +7,8 @@
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
 //! | ground | the same of the ground | the look has a ground, and the camera is above it |
 //! | blended | light of the blended triangles over each other, no depth written | some triangle is blended |
-//! | shade | ids to light: Phong, images, sky, ground, the blended layer; samples to pixels (compute) | always |
+//! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
+//! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
 //! | encode | light to sRGB bytes, top row first (compute) | always |
 //!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.

@@ -1,16 +1,21 @@
-//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, shade, encode.
+//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade, encode.
 
 use super::frame::{Frame, above_ground};
 use super::geometry::Kind;
 use super::gl::{Clear, Fixed, Gl, Program, VertexArray};
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
-use super::shaders::{COLOUR_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TILE};
+use super::shaders::{
+    COLOUR_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TILE, TILE_ROW,
+};
 use super::target::Target;
 use super::{Ran, Shot};
 use crate::error::Result;
 
 const PIXELS: u32 = 0;
+const TILES: u32 = 1;
+/// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
+const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
 /// Nothing is blended yet: no light, and all that lies behind comes through.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
@@ -113,10 +118,18 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
     if let Some(layer) = &target.layer {
         layer.colour.bind(LAYER_UNIT);
     }
-    sampled.shade.bind(None);
     target.picture.bind_image(0);
+    target.tiles.write(bytemuck::cast_slice(&NO_TILES));
+    target.tiles.bind_storage(TILES);
+    sampled.backdrop.bind(None);
     gl.dispatch(target.form.width.div_ceil(TILE), target.form.height.div_ceil(TILE));
-    ran.passes.push("shade");
+    ran.passes.push("backdrop");
+    gl.check("backdrop")?;
+    if let Some(program) = &sampled.shade {
+        program.bind(None);
+        gl.dispatch_listed(&target.tiles);
+        ran.passes.push("shade");
+    }
     gl.check("shade")
 }
 

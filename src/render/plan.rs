@@ -5,7 +5,6 @@
 
 use super::geometry::{Kind, groups, looks_up, used_materials};
 use super::textures::{Use, arrays};
-use crate::domain::AlphaMode;
 use crate::scene::{Scene, Shadow};
 
 /// A buffer or texture and its size.
@@ -69,7 +68,11 @@ pub fn plan(scene: &Scene) -> Plan {
     }
     passes.extend(scene.look.ground.map(|_| "ground"));
     passes.extend(scene.needs.blend.then_some("blended"));
-    passes.extend(["shade", "encode"]);
+    passes.push("backdrop");
+    if has(Kind::Opaque) || has(Kind::Mask) {
+        passes.push("shade");
+    }
+    passes.push("encode");
     Plan {
         buffers: buffers(scene),
         textures: textures(scene),
@@ -138,7 +141,6 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("LOOK_UP", looks_up(scene)),
         ("SHADOWS", needs.shadows),
         ("GROUND_SEEN", scene.look.ground.is_some()),
-        ("TRIANGLES", used_materials(scene).iter().any(|used| scene.materials[*used].alpha_mode != AlphaMode::Blend)),
         ("LAYERS", needs.blend),
     ];
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
@@ -166,7 +168,7 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
 mod tests {
     use super::super::geometry::tests::squares;
     use super::*;
-    use crate::domain::{Material, Texture};
+    use crate::domain::{AlphaMode, Material, Texture};
 
     fn names(allocations: &[Allocation]) -> Vec<&str> {
         allocations.iter().map(|allocation| allocation.name.as_str()).collect()
@@ -190,11 +192,10 @@ mod tests {
         parts.look.ground = None;
         let scene = Scene::new(parts).expect("good");
         let plan = plan(&scene);
-        assert_eq!(plan.passes, ["visibility", "shade", "encode"]);
+        assert_eq!(plan.passes, ["visibility", "backdrop", "shade", "encode"]);
         let expected = ["positions", "normals", "corner vertices", "triangles", "materials", "frame"];
         assert_eq!(names(&plan.buffers), expected);
-        assert!(plan.textures.is_empty());
-        assert_eq!(plan.defines, ["TRIANGLES"]);
+        assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
         assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"]);
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
@@ -204,7 +205,7 @@ mod tests {
     #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
         let plan = plan(&Scene::new(everything()).expect("good"));
-        assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "shade", "encode"]);
+        assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
         assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
         assert_eq!(plan.textures[0], Allocation { name: "colours 1 x 1 x 1".into(), bytes: 4 });

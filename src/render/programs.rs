@@ -27,7 +27,8 @@ pub(super) struct Programs {
 pub(super) struct Sampled {
     pub(super) samples: u32,
     pub(super) mask: Option<Rc<Program>>,
-    pub(super) shade: Rc<Program>,
+    pub(super) backdrop: Rc<Program>,
+    pub(super) shade: Option<Rc<Program>>,
 }
 
 impl Programs {
@@ -59,11 +60,13 @@ impl Sampled {
         samples: u32,
         compile: &mut Compile<'_>,
     ) -> Result<Self> {
-        let cut_out = groups.iter().any(|group| group.kind == Kind::Mask);
+        let any = |kind: Kind| groups.iter().any(|group| group.kind == kind);
+        let (cut_out, triangles) = (any(Kind::Mask), any(Kind::Opaque) || any(Kind::Mask));
         Ok(Self {
             samples,
             mask: if cut_out { Some(compile(options.visibility(Kind::Mask, samples))?) } else { None },
-            shade: compile(options.shade(samples))?,
+            backdrop: compile(options.backdrop(samples))?,
+            shade: if triangles { Some(compile(options.shade(samples))?) } else { None },
         })
     }
 }

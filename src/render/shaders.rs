@@ -43,6 +43,8 @@ const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITI
 pub(super) const LANES: u32 = 64;
 /// Side of the square of pixels that a workgroup shades.
 pub(super) const TILE: u32 = 8;
+/// Workgroups in a row of the dispatch over listed tiles.
+pub(super) const TILE_ROW: u32 = 64;
 /// Texels that one invocation of the blur makes, along its direction.
 pub(super) const RUN: u32 = 8;
 
@@ -157,20 +159,27 @@ impl Options {
         Source { label: "blended".into(), stages: drawn(vertex, fragment) }
     }
 
-    /// Ids to colours.
+    /// Ids to light, in tiles where no triangle is seen.
+    pub(super) fn backdrop(&self, samples: u32) -> Source {
+        let mut text = self.shading(samples, &["BACKDROP"]);
+        text += include_str!("../../shaders/shade.comp");
+        Source { label: format!("backdrop, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+
+    /// Ids to light, in the other tiles.
     pub(super) fn shade(&self, samples: u32) -> Source {
         let kinds = [Kind::Opaque, Kind::Mask];
-        let mut text = self.head(&[]) + &self.branches(&kinds);
-        writeln!(text, "#define TILE {TILE}").ok();
-        text += &[&self.sampling(samples), FRAME, CLIP, IDS, SUN, SKY].concat();
-        if self.defines.contains(&"GROUND_SEEN") {
-            text += GROUND;
-        }
-        if self.defines.contains(&"TRIANGLES") {
-            text += &[&self.lookups(&kinds, Slopes::Given), PHONG, TRIANGLE].concat();
-        }
+        let mut text = self.shading(samples, &[]) + &self.branches(&kinds);
+        text += &[&self.lookups(&kinds, Slopes::Given), PHONG, TRIANGLE].concat();
         text += include_str!("../../shaders/shade.comp");
         Source { label: format!("shade, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+
+    fn shading(&self, samples: u32, more: &[&str]) -> String {
+        let mut head = self.head(more);
+        writeln!(head, "#define TILE {TILE}\n#define ROW {TILE_ROW}u").ok();
+        let ground = if self.defines.contains(&"GROUND_SEEN") { GROUND } else { "" };
+        [&head, &self.sampling(samples), FRAME, CLIP, IDS, SUN, SKY, ground].concat()
     }
 
     /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
@@ -319,15 +328,15 @@ mod tests {
 
     #[test]
     fn the_shading_of_a_plain_scene_knows_no_image_no_shadow_no_ground_and_no_layer() {
-        let plain = Options { defines: vec!["TRIANGLES"], ..options(AlphaMode::Opaque) };
-        let shading = text(plain.shade(4));
-        assert!(
-            shading.contains("triangle_seen") && !shading.contains("vec3 ground(") && !shading.contains("textureGrad")
-        );
-        let nothing = Options { defines: vec![], ..plain.clone() };
-        assert!(!text(nothing.shade(4)).contains("vec3 triangle_seen("), "no triangle, no shading of one");
+        let plain = Options { defines: vec![], ..options(AlphaMode::Opaque) };
+        let [backdrop, shading] = [plain.backdrop(4), plain.shade(4)].map(text);
+        assert!(!backdrop.contains("vec3 triangle_seen("), "no triangle, no shading of one");
+        assert!(shading.contains("vec3 triangle_seen("));
+        for text in [&backdrop, &shading] {
+            assert!(!text.contains("vec3 ground(") && !text.contains("textureGrad"));
+        }
         let used = vec![Used { kind: Kind::Opaque, colour: Some(0), normal: None }];
-        let full = Options { defines: vec!["TRIANGLES", "TEXTURES", "UVS", "GROUND_SEEN"], used, ..plain };
+        let full = Options { defines: vec!["TEXTURES", "UVS", "GROUND_SEEN"], used, ..plain };
         let shading = text(full.shade(1));
         assert!(shading.contains("vec3 ground(") && shading.contains("textureGrad(colour_0"));
     }

@@ -4,6 +4,7 @@
 use std::rc::Rc;
 
 use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
+use super::shaders::TILE;
 use crate::error::Result;
 
 /// Pixels of a multisampled frame, at most: with depth, ids and a blended layer they take 704 MiB of device memory. A
@@ -28,6 +29,8 @@ pub(super) struct Target {
     pub(super) ids: Texture,
     pub(super) visible: Framebuffer,
     pub(super) layer: Option<Layer>,
+    /// The tiles that see triangles, after the numbers of the dispatch over them.
+    pub(super) tiles: Buffer,
     /// Linear light, one value a pixel.
     pub(super) picture: Texture,
     /// RGBA8, top row first, as the encoder writes it.
@@ -65,6 +68,11 @@ impl Target {
             visible: gl.framebuffer(Some(&ids), &depth)?,
             ids,
             layer,
+            tiles: gl.buffer(
+                16 + 4 * u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE)),
+                gl::STREAM_COPY,
+                None,
+            )?,
             picture: image(gl, Form { samples: 1, ..form }, gl::RGBA16F)?,
             packed: gl.buffer(bytes, gl::STREAM_COPY, None)?,
             staging: gl.buffer(bytes, gl::STREAM_READ, None)?,

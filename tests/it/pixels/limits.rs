@@ -23,7 +23,7 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
     for absent in ["tangents", "uvs", "triangle materials"] {
         assert!(!names(&plain.allocated).contains(&absent.to_string()), "{absent}");
     }
-    assert_eq!(plain.ran.passes, ["shadow", "blur", "visibility", "ground", "shade", "encode"]);
+    assert_eq!(plain.ran.passes, ["shadow", "blur", "visibility", "ground", "backdrop", "shade", "encode"]);
 
     let mut stage = full();
     let image = stage.texture(1, 1, |_, _| [128, 128, 255, 255]);
@@ -38,7 +38,7 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
     for present in ["tangents", "uvs", "triangle materials"] {
         assert!(names(&rich.allocated).contains(&present.to_string()), "{present}");
     }
-    assert_eq!(rich.ran.passes, ["shadow", "blur", "visibility", "ground", "blended", "shade", "encode"]);
+    assert_eq!(rich.ran.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
     let mut planned = plan(&scene).buffers;
     planned.sort_by(|a, b| a.name.cmp(&b.name));
     assert_eq!(rich.allocated, planned, "what is planned is what is allocated");
