@@ -93,14 +93,16 @@ void main() {
 #ifdef BACKDROP
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     bool inside = all(lessThan(at, size));
-    bool triangle = false;
+    bool sees = false;
     for (int index = 0; index < SAMPLES; index++) {
         seen[index] = texelFetch(ids, min(at, size - 1), index).x;
-        triangle = triangle || (seen[index] != NOTHING && seen[index] != GROUND);
+        sees = sees || (seen[index] != NOTHING && seen[index] != GROUND);
     }
     if (gl_LocalInvocationIndex == 0u) sees_triangle = 0u;
+    memoryBarrierShared();
     barrier();
-    if (inside && triangle) sees_triangle = 1u;
+    if (inside && sees) sees_triangle = 1u;
+    memoryBarrierShared();
     barrier();
     if (sees_triangle != 0u) {
         if (gl_LocalInvocationIndex == 0u) {

@@ -1,4 +1,4 @@
-// The material of a triangle. Twin: `PackedMaterial` in src/render/scene_buffers.rs.
+// The material of a triangle, by its number in the index buffer. Twin: `PackedMaterial` in src/render/scene_buffers.rs.
 //   materials           [materials][STRIDE]  RGBA32F, fetched and never filtered
 //   triangle_materials  [triangles]          R32UI; not read where all these triangles have one
 // Buffer textures: a software rasteriser fetches eight of their texels at once, but storage words one by one.
@@ -14,9 +14,9 @@ layout(binding = 14) uniform samplerBuffer materials;
 layout(binding = 15) uniform usamplerBuffer triangle_materials;
 #endif
 
-Material material_of(int triangle) {
+Material material_of(int number) {
 #ifdef LOOK_UP
-    int first = STRIDE * int(texelFetch(triangle_materials, triangle).x);
+    int first = STRIDE * int(texelFetch(triangle_materials, number).x);
 #else
     const int first = STRIDE * ONLY_MATERIAL;
 #endif

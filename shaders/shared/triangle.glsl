@@ -2,7 +2,7 @@
 // their analytic slopes, and the colour there.
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 16) uniform samplerBuffer normals;
-layout(binding = 17) uniform usamplerBuffer triangles;
+layout(binding = 17) uniform usamplerBuffer triangle_corners;
 layout(binding = 18) uniform usamplerBuffer corner_vertices;
 #ifdef UVS
 layout(binding = 19) uniform samplerBuffer uvs;
@@ -43,8 +43,8 @@ Shares shares(vec3 a, vec3 b, vec3 c, vec2 texel) {
 
 vec2 finite(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
-vec3 triangle_seen(int triangle, vec2 image, vec2 texel) {
-    ivec3 corners = ivec3(texelFetch(triangles, triangle).xyz);
+vec3 triangle_seen(int number, vec2 image, vec2 texel) {
+    ivec3 corners = ivec3(texelFetch(triangle_corners, number).xyz);
     mat3 world, clip, normal;
     for (int index = 0; index < 3; index++) {
         int vertex = int(texelFetch(corner_vertices, corners[index]).x);
@@ -54,7 +54,7 @@ vec3 triangle_seen(int triangle, vec2 image, vec2 texel) {
         normal[index] = texelFetch(normals, corners[index]).xyz;
     }
     Shares share = shares(clip[0], clip[1], clip[2], texel);
-    Material material = material_of(triangle);
+    Material material = material_of(number);
     vec3 tint = vec3(1.0);
     vec3 facing = unit(normal * share.at);
 #ifdef UVS

@@ -316,11 +316,11 @@ mod tests {
     #[test]
     fn only_cut_out_triangles_have_a_discard_in_their_shader_and_depth_alone_needs_no_fragment_shader() {
         let options = options(AlphaMode::Opaque);
-        assert!(!text(options.visibility(Kind::Opaque, 4)).contains("discard"));
-        assert!(!text(options.blended()).contains("discard"));
+        assert!(!text(options.visibility(Kind::Opaque, 4)).contains("discard;"));
+        assert!(!text(options.blended()).contains("discard;"));
         for (samples, masks) in [(4, true), (1, false)] {
             let text = text(options.visibility(Kind::Mask, samples));
-            assert!(text.contains("discard") && text.contains(&format!("SAMPLES {samples}")));
+            assert!(text.contains("discard;") && text.contains(&format!("SAMPLES {samples}")));
             assert_eq!(text.contains("vec2(0.375, 0.125)"), masks, "places of the samples");
         }
         assert_eq!(options.shadow(Kind::Opaque).stages.len(), 1);
