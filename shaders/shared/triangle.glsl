@@ -3,7 +3,7 @@
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 16) uniform samplerBuffer normals;
 layout(binding = 17) uniform usamplerBuffer triangle_corners;
-layout(binding = 18) uniform usamplerBuffer corner_vertices;
+layout(binding = 18) uniform usamplerBuffer triangle_vertices;
 #ifdef UVS
 layout(binding = 19) uniform samplerBuffer uvs;
 #endif
@@ -45,10 +45,10 @@ vec2 finite(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0
 
 vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     ivec3 corners = ivec3(texelFetch(triangle_corners, number).xyz);
+    ivec3 vertices = ivec3(texelFetch(triangle_vertices, number).xyz);
     mat3 world, clip, normal;
     for (int index = 0; index < 3; index++) {
-        int vertex = int(texelFetch(corner_vertices, corners[index]).x);
-        world[index] = texelFetch(positions, vertex).xyz;
+        world[index] = texelFetch(positions, vertices[index]).xyz;
         vec4 there = to_clip(world[index]);
         clip[index] = vec3(there.xy - image * there.w, there.w);
         normal[index] = texelFetch(normals, corners[index]).xyz;

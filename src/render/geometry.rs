@@ -45,6 +45,8 @@ pub(super) struct Geometry {
     pub(super) uvs: Vec<[f32; 2]>,
     /// Per triangle, three corners in the packed normals.
     pub(super) triangles: Vec<[u32; 3]>,
+    /// Per triangle, the vertices of those.
+    pub(super) triangle_vertices: Vec<[u32; 3]>,
     /// Per triangle, its material's place among the used ones; empty when all triangles have one material.
     pub(super) materials: Vec<u32>,
     pub(super) groups: Vec<Group>,
@@ -113,6 +115,7 @@ impl Geometry {
             vertices: Vec::with_capacity(layout.corners),
             uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),
             triangles: vec![[0; 3]; layout.triangles],
+            triangle_vertices: Vec::new(),
             materials: vec![0; if looks_up(scene) { layout.triangles } else { 0 }],
             groups,
             stretches: Vec::new(),
@@ -127,6 +130,8 @@ impl Geometry {
             geometry.add_corners(scene, domain, &scene.layout.slots[index], textured);
             geometry.add_triangles(scene, index, &rank, &mut next);
         }
+        let vertex = |corner: u32| geometry.vertices[corner as usize];
+        geometry.triangle_vertices = geometry.triangles.iter().map(|corners| corners.map(vertex)).collect();
         geometry.stretches.sort_unstable_by_key(|stretch| stretch.first);
         geometry
     }
@@ -261,6 +266,7 @@ pub(super) mod tests {
         parts.domains[0].placement = mirror;
         let geometry = Geometry::new(&Scene::new(parts).expect("good"));
         assert_eq!(geometry.triangles, [[0, 2, 1], [0, 3, 2]]);
+        assert_eq!(geometry.triangle_vertices, geometry.triangles, "here a corner is a vertex");
         assert!(geometry.materials.is_empty() && geometry.uvs.is_empty());
     }
 

@@ -215,7 +215,7 @@ impl Renderer {
         }
         let apart = match buffers.apart.take() {
             Some(apart) => apart,
-            None => Apart::new(&self.gl, bytes)?,
+            None => Apart::new(&self.gl, buffers)?,
         };
         apart.buffer.write(bytemuck::cast_slice(positions));
         buffers.apart = Some(apart);

@@ -2,7 +2,7 @@
 
 use super::frame::{Frame, above_ground};
 use super::geometry::Kind;
-use super::gl::{Clear, Fixed, Gl, Program, VertexArray};
+use super::gl::{Clear, Fixed, Gl, Program};
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
@@ -42,10 +42,10 @@ pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<(
     gl.begin(&map.framebuffer, map.size, map.size, Clear::Depth);
     gl.set(Fixed { depth_write: true, ..Fixed::default() });
     for (kind, program) in [Kind::Opaque, Kind::Mask, Kind::Blend].into_iter().zip(&buffers.programs.shadow) {
-        if let Some(program) = program {
+        if let Some((program, array)) = program.as_ref().zip(buffers.array(kind)) {
             let (first, count) = buffers.triangles(kind);
             program.bind((kind != Kind::Opaque).then_some(first as u32));
-            gl.draw_indexed(&buffers.casters, first, count);
+            gl.draw_indexed(array, first, count);
         }
     }
     ran.passes.push("shadow");
@@ -78,7 +78,7 @@ pub(super) fn visibility(
     let mut any = false;
     for (kind, program) in kinds {
         if let Some(program) = program {
-            draw(gl, buffers, (kind, program, &buffers.casters), written, ran);
+            draw(gl, buffers, (kind, program), written, ran);
             any = true;
         }
     }
@@ -102,11 +102,10 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran
 
 /// The layer of the blended triangles, before what is opaque.
 pub(super) fn blended(gl: &Gl, buffers: &SceneBuffers, target: &Target, ran: &mut Ran) -> Result<()> {
-    let (Some(program), Some(corners)) = (&buffers.programs.blended, &buffers.corners) else { return Ok(()) };
-    let Some(layer) = &target.layer else { return Ok(()) };
+    let (Some(program), Some(layer)) = (&buffers.programs.blended, &target.layer) else { return Ok(()) };
     gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
     bind_shadow(buffers);
-    draw(gl, buffers, (Kind::Blend, program, corners), Fixed { blend: true, ..Fixed::default() }, ran);
+    draw(gl, buffers, (Kind::Blend, program), Fixed { blend: true, ..Fixed::default() }, ran);
     ran.passes.push("blended");
     gl.check("blended")
 }
@@ -153,13 +152,8 @@ pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
 }
 
 /// Draws the triangles of one kind: a call for those with one side, and one for those with two.
-fn draw(
-    gl: &Gl,
-    buffers: &SceneBuffers,
-    (kind, program, array): (Kind, &Program, &VertexArray),
-    fixed: Fixed,
-    ran: &mut Ran,
-) {
+fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), fixed: Fixed, ran: &mut Ran) {
+    let Some(array) = buffers.array(kind) else { return };
     for group in buffers.groups.iter().filter(|group| group.kind == kind) {
         gl.set(Fixed { cull: !group.double_sided, ..fixed });
         program.bind(Some(group.first_triangle as u32));

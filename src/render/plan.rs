@@ -92,11 +92,14 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     let mut buffers = vec![
         named("positions", 12 * layout.vertices),
         named("normals", 12 * layout.corners),
-        named("corner vertices", 4 * layout.corners),
         named("triangles", 12 * layout.triangles),
+        named("triangle vertices", 12 * layout.triangles),
         named("materials", super::scene_buffers::MATERIAL_BYTES * used_materials(scene).len()),
         named("frame", size_of::<super::frame::Frame>()),
     ];
+    if scene.needs.mask || scene.needs.blend {
+        buffers.push(named("corner vertices", 4 * layout.corners));
+    }
     if scene.needs.normal_maps {
         buffers.push(named("tangents", 16 * layout.corners));
     }
@@ -193,7 +196,7 @@ mod tests {
         let scene = Scene::new(parts).expect("good");
         let plan = plan(&scene);
         assert_eq!(plan.passes, ["visibility", "backdrop", "shade", "encode"]);
-        let expected = ["positions", "normals", "corner vertices", "triangles", "materials", "frame"];
+        let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame"];
         assert_eq!(names(&plan.buffers), expected);
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();

@@ -40,10 +40,10 @@ pub struct SceneBuffers {
     pub(super) buffers: BTreeMap<String, Buffer>,
     pub(super) views: Views,
     pub(super) groups: Vec<Group>,
-    /// What the blended triangles read; absent when there are none.
-    pub(super) corners: Option<VertexArray>,
-    /// What depth and ids are made from.
-    pub(super) casters: VertexArray,
+    /// What opaque triangles are made from.
+    solids: VertexArray,
+    /// What the others are made from; absent when there are none.
+    corners: Option<VertexArray>,
     /// No attributes: for triangles that shaders make themselves.
     pub(super) nothing: VertexArray,
     pub(super) colours: Vec<Texture>,
@@ -66,13 +66,15 @@ pub struct SceneBuffers {
 pub(super) struct Apart {
     pub(super) buffer: Buffer,
     view: Texture,
+    solids: VertexArray,
 }
 
 impl Apart {
-    pub(super) fn new(gl: &Rc<Gl>, bytes: u64) -> Result<Self> {
-        let buffer = gl.buffer(bytes, gl::DYNAMIC_DRAW, None)?;
+    pub(super) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
+        let buffer = gl.buffer(scene.buffer("positions")?.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.view(&buffer, gl::RGB32F)?;
-        Ok(Self { buffer, view })
+        let solids = solids(gl, &scene.buffers, &buffer)?;
+        Ok(Self { buffer, view, solids })
     }
 }
 
@@ -125,8 +127,8 @@ impl SceneBuffers {
             shared,
             scene: Arc::clone(scene),
             views,
-            corners: if scene.needs.blend { Some(corners(gl, &buffers)?) } else { None },
-            casters: casters(gl, &buffers)?,
+            solids: solids(gl, &buffers, named(&buffers, "positions")?)?,
+            corners: corners(gl, &buffers)?,
             buffers,
             groups: geometry.groups,
             nothing: gl.vertex_array(None, &[])?,
@@ -178,6 +180,14 @@ impl SceneBuffers {
     /// The positions that are drawn.
     pub(super) fn drawn_positions(&self) -> &Texture {
         self.apart.as_ref().map_or(&self.views.positions, |apart| &apart.view)
+    }
+
+    /// What triangles of a kind are made from, for ids and depth; none without such triangles.
+    pub(super) fn array(&self, kind: Kind) -> Option<&VertexArray> {
+        match kind {
+            Kind::Opaque => Some(self.apart.as_ref().map_or(&self.solids, |apart| &apart.solids)),
+            Kind::Mask | Kind::Blend => self.corners.as_ref(),
+        }
     }
 
     /// The plan that was followed.
@@ -247,6 +257,7 @@ fn allocate(
         let content: Option<&[u8]> = match allocation.name.as_str() {
             "corner vertices" => Some(bytemuck::cast_slice(&geometry.vertices)),
             "triangles" => Some(bytemuck::cast_slice(&geometry.triangles)),
+            "triangle vertices" => Some(bytemuck::cast_slice(&geometry.triangle_vertices)),
             "uvs" => Some(bytemuck::cast_slice(&geometry.uvs)),
             "triangle materials" => Some(bytemuck::cast_slice(&geometry.materials)),
             "materials" => Some(bytemuck::cast_slice(materials)),
@@ -282,7 +293,7 @@ impl Views {
             ("triangle materials", shaders::TRIANGLE_MATERIAL_UNIT, gl::R32UI),
             ("normals", shaders::CORNER_NORMAL_UNIT, gl::RGB32F),
             ("triangles", shaders::TRIANGLE_UNIT, gl::RGB32UI),
-            ("corner vertices", shaders::CORNER_VERTEX_UNIT, gl::R32UI),
+            ("triangle vertices", shaders::TRIANGLE_VERTEX_UNIT, gl::RGB32UI),
             ("uvs", shaders::UV_UNIT, gl::RG32F),
             ("tangents", shaders::TANGENT_UNIT, gl::RGBA32F),
         ];
@@ -298,20 +309,18 @@ const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: boo
     Attribute { location, buffer, components, integer }
 }
 
-/// Attributes of blended triangles.
-fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<VertexArray> {
-    let mut from = vec![attribute(0, named(buffers, "corner vertices")?, 1, true)];
-    from.push(attribute(1, named(buffers, "normals")?, 3, false));
-    from.extend(buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false)));
-    from.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
-    gl.vertex_array(Some(named(buffers, "triangles")?), &from)
+/// Vertices of triangles that are nothing but solid.
+fn solids(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, positions: &Buffer) -> Result<VertexArray> {
+    gl.vertex_array(Some(named(buffers, "triangle vertices")?), &[attribute(0, positions, 3, false)])
 }
 
-/// The fewer attributes of ids and depth.
-fn casters(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<VertexArray> {
-    let mut from = vec![attribute(0, named(buffers, "corner vertices")?, 1, true)];
+/// Corners of cut-out and blended triangles, where there are any.
+fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<Option<VertexArray>> {
+    let Some(vertices) = buffers.get("corner vertices") else { return Ok(None) };
+    let mut from = vec![attribute(0, vertices, 1, true), attribute(1, named(buffers, "normals")?, 3, false)];
     from.extend(buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false)));
-    gl.vertex_array(Some(named(buffers, "triangles")?), &from)
+    from.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
+    gl.vertex_array(Some(named(buffers, "triangles")?), &from).map(Some)
 }
 
 fn upload_arrays(gl: &Rc<Gl>, scene: &Scene, arrays: &[Array], purpose: Use) -> Result<Vec<Texture>> {
