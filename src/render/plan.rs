@@ -206,6 +206,16 @@ mod tests {
     }
 
     #[test]
+    fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
+        let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, ..Material::default() }]);
+        parts.look.shadow = None;
+        let plan = plan(&Scene::new(parts).expect("good"));
+        assert_eq!(plan.passes, ["ground", "blended", "backdrop", "encode"]);
+        assert_eq!((plan.draws, plan.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
+        assert_eq!(plan.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+    }
+
+    #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
         let plan = plan(&Scene::new(everything()).expect("good"));
         assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);

@@ -133,3 +133,19 @@ impl Look {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_that_are_neither_one_nor_four_are_refused() {
+        for samples in [1, 4] {
+            Look { samples, ..Look::default() }.check().expect("good");
+        }
+        for samples in [0, 2, 8, u32::MAX] {
+            let refusal = Look { samples, ..Look::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
+        }
+    }
+}
