@@ -41,8 +41,8 @@ float margin(int layer) {
     return frame.ground_depth.w / min(scale.x, scale.y) * length(away) + 4e-7;
 }
 
-// What the map holds where nothing is.
-const float NOTHING = 1.0;
+// What the map holds where no caster is.
+const float EMPTY = 1.0;
 #endif
 
 #ifdef STANDARD
@@ -51,7 +51,7 @@ float arrives(vec3 at, int layer, vec3 normal) {
     vec2 place = at.xy * frame.shadow.w;
     float depth = texelFetch(shadow_map, ivec3(place, layer), 0).x;
     float own = at.z - margin(layer) + dot(slope(normal, layer), floor(place) + 0.5 - place);
-    return depth >= NOTHING || own <= depth ? 1.0 : 0.0;
+    return depth >= EMPTY || own <= depth ? 1.0 : 0.0;
 }
 #endif
 
@@ -74,7 +74,7 @@ float arrives(vec3 at, int layer, vec3 normal) {
             float there = own + dot(steep, corner - past);
             vec4 plane = there + vec4(steep.y, steep.x + steep.y, steep.x, 0.0);
             vec4 open = vec4(lessThanEqual(plane, depth));
-            open = max(open, vec4(greaterThanEqual(depth, vec4(NOTHING))));
+            open = max(open, vec4(greaterThanEqual(depth, vec4(EMPTY))));
             share += dot(open, rows.yyxx * columns.xyyx);
         }
     }

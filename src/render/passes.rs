@@ -1,12 +1,12 @@
-//! The passes of one frame, in order: shadow, blur, opaque, sky, ground, blended, encode.
+//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade, encode.
 
 use super::frame::{Frame, above_ground};
 use super::geometry::Kind;
-use super::gl::{Fixed, Gl, Program};
-use super::programs::DrawGroup;
-use super::scene_buffers::{MATERIAL_BYTES, SceneBuffers};
+use super::gl::{Clear, Fixed, Gl, Program};
+use super::programs::Sampled;
+use super::scene_buffers::SceneBuffers;
 use super::shaders::{
-    COLOUR_UNIT, LANES, MATERIAL_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TRIANGLE_MATERIAL_UNIT,
+    COLOUR_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE, TILE_ROW,
 };
 use super::splits::Splits;
 use super::target::Target;
@@ -14,16 +14,19 @@ use super::{Ran, Shot};
 use crate::error::Result;
 
 const PIXELS: u32 = 0;
+const TILES: u32 = 1;
+/// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
+const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
-const MATERIAL: u32 = 1;
 const SPLITS: u32 = 2;
+/// Nothing is blended yet: no light, and all that lies behind comes through.
+const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 /// Binds what all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     buffers.drawn_positions().bind(POSITION_UNIT);
-    buffers.views.materials.bind(MATERIAL_UNIT);
-    if let Some(view) = &buffers.views.triangle_materials {
-        view.bind(TRIANGLE_MATERIAL_UNIT);
+    for (unit, view) in &buffers.views.others {
+        view.bind(*unit);
     }
     buffers.buffer("frame")?.bind_uniform(FRAME, 0, size_of::<Frame>());
     if let Ok(splits) = buffers.buffer("splits") {
@@ -55,87 +58,107 @@ pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()>
     Ok(())
 }
 
-/// The picture, in linear light.
-pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot, ran: &mut Ran) -> Result<()> {
-    let programs = &buffers.programs;
-    gl.begin(&target.framebuffer, target.width, target.height);
-    if let Some(map) = &buffers.shadow {
-        map.lookup().bind(SHADOW_UNIT);
+/// What each sample sees: ids and depth.
+pub(super) fn visibility(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    target: &Target,
+    sampled: &Sampled,
+    ran: &mut Ran,
+) -> Result<()> {
+    gl.begin(&target.visible, target.form.width, target.form.height, Clear::DepthAndIds);
+    // What is cut out comes last: where something stands before it, nothing is sampled.
+    let kinds = [(Kind::Opaque, &buffers.programs.opaque), (Kind::Mask, &sampled.mask)];
+    let written = Fixed { depth_write: true, ..Fixed::default() };
+    let mut any = false;
+    for (kind, program) in kinds {
+        if let Some(program) = program {
+            draw(gl, buffers, (kind, program), written, ran);
+            any = true;
+        }
     }
-    if surfaces(gl, buffers, target, &[Kind::Opaque, Kind::Mask], ran)? {
-        ran.passes.push("opaque");
-        gl.check("opaque")?;
+    if any {
+        ran.passes.push("visibility");
     }
-    gl.set(Fixed { depth_clamp: true, ..Fixed::default() });
-    made(gl, buffers, &programs.sky, 3);
-    ran.passes.push("sky");
-    gl.check("sky")?;
-    if let Some(program) = programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) {
-        gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
-        made(gl, buffers, program, 6);
-        ran.passes.push("ground");
-        gl.check("ground")?;
-    }
-    if surfaces(gl, buffers, target, &[Kind::Blend], ran)? {
-        ran.passes.push("blended");
-        gl.check("blended")?;
-    }
-    Ok(())
+    gl.check("visibility")
 }
 
-/// Samples to bytes, and the bytes to where the host can read them.
-pub(super) fn encode(gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
-    target.encode.bind(None);
-    target.colour.bind(0);
+/// The ground as one more thing that samples see.
+pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
+    let Some(program) = buffers.programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) else {
+        return Ok(());
+    };
+    gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
+    program.bind(None);
+    gl.draw_made(&buffers.nothing, 6);
+    ran.passes.push("ground");
+    gl.check("ground")
+}
+
+/// The layer of the blended triangles, before what is opaque.
+pub(super) fn blended(gl: &Gl, buffers: &SceneBuffers, target: &Target, ran: &mut Ran) -> Result<()> {
+    let (Some(program), Some(layer)) = (&buffers.programs.blended, &target.layer) else { return Ok(()) };
+    gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
+    bind_shadow(buffers);
+    draw(gl, buffers, (Kind::Blend, program), Fixed { blend: true, ..Fixed::default() }, ran);
+    ran.passes.push("blended");
+    gl.check("blended")
+}
+
+/// What is seen to linear light.
+pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
+    bind_shadow(buffers);
+    target.ids.bind(ID_UNIT);
+    if let Some(layer) = &target.layer {
+        layer.colour.bind(LAYER_UNIT);
+    }
+    target.picture.bind_image(0);
+    target.tiles.write(bytemuck::cast_slice(&NO_TILES));
+    target.tiles.bind_storage(TILES);
+    sampled.backdrop.bind(None);
+    gl.dispatch(target.form.width.div_ceil(TILE), target.form.height.div_ceil(TILE));
+    ran.passes.push("backdrop");
+    gl.check("backdrop")?;
+    if let Some(program) = &sampled.shade {
+        program.bind(None);
+        gl.dispatch_listed(&target.tiles);
+        ran.passes.push("shade");
+    }
+    gl.check("shade")
+}
+
+/// Light to bytes, where the host can read them.
+pub(super) fn encode(gl: &Gl, target: &Target, program: &Program, ran: &mut Ran) -> Result<()> {
+    program.bind(None);
+    target.picture.bind(0);
     target.packed.bind_storage(PIXELS);
-    gl.dispatch(target.width.div_ceil(LANES), target.height);
+    gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
     ran.passes.push("encode");
     gl.check("encode")
 }
 
-/// Draws the groups of these kinds; whether there were any.
-fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ran: &mut Ran) -> Result<bool> {
-    let before = ran.draws;
-    for drawn in buffers.groups.iter().filter(|drawn| kinds.contains(&drawn.group.kind)) {
-        let group = &drawn.group;
-        let single = drawn.surface_single.as_ref().filter(|_| target.samples == 1);
-        let program = single.unwrap_or(&drawn.surface);
-        gl.set(Fixed {
-            depth_write: group.kind != Kind::Blend,
-            cull: !group.double_sided,
-            blend: group.kind == Kind::Blend,
-            coverage: group.kind == Kind::Mask && target.samples > 1,
-            ..Fixed::default()
-        });
-        bind_material(buffers, drawn, program, true)?;
-        gl.draw_indexed(&buffers.corners, group.first_triangle, group.triangles);
+/// Ids of each pixel's first sample, where the host can read them.
+pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
+    program.bind(None);
+    target.ids.bind(ID_UNIT);
+    target.packed.bind_storage(PIXELS);
+    gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
+    gl.check("seen")
+}
+
+/// Draws the triangles of one kind: a call for those with one side, and one for those with two.
+fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), fixed: Fixed, ran: &mut Ran) {
+    let Some(array) = buffers.array(kind) else { return };
+    for group in buffers.groups.iter().filter(|group| group.kind == kind) {
+        gl.set(Fixed { cull: !group.double_sided, ..fixed });
+        program.bind(Some(group.first_triangle as u32));
+        gl.draw_indexed(array, group.first_triangle, group.triangles);
         ran.draws += 1;
     }
-    Ok(ran.draws > before)
 }
 
-fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
-    program.bind(None);
-    gl.draw_made(&buffers.nothing, vertices);
-}
-
-/// Uses a program, with the one material of the group, or with the place where its triangles begin.
-pub(super) fn bind_material(
-    buffers: &SceneBuffers,
-    drawn: &DrawGroup,
-    program: &Program,
-    reads_it: bool,
-) -> Result<()> {
-    if let Some(material) = drawn.group.material {
-        buffers.buffer("materials")?.bind_uniform(MATERIAL, MATERIAL_BYTES * material, MATERIAL_BYTES);
+fn bind_shadow(buffers: &SceneBuffers) {
+    if let Some(map) = &buffers.shadow {
+        map.lookup().bind(SHADOW_UNIT);
     }
-    if let Some(colour) = drawn.colour {
-        buffers.colours[colour].bind(COLOUR_UNIT);
-    }
-    if let Some(normal) = drawn.normal {
-        buffers.normals[normal].bind(NORMAL_UNIT);
-    }
-    let looks_up = reads_it && drawn.group.material.is_none();
-    program.bind(looks_up.then_some(drawn.group.first_triangle as u32));
-    Ok(())
 }

@@ -3,7 +3,7 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
-use super::geometry::{Kind, groups, looks_up};
+use super::geometry::{Kind, groups, looks_up, used_materials};
 use super::shadow::fitting;
 use super::textures::{Use, arrays};
 use crate::scene::{Scene, Shadow};
@@ -37,7 +37,7 @@ pub struct Plan {
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the opaque and blended passes together; the number of domains does not matter.
+    /// Draw calls of the visibility and blended passes together, six at most: domains and materials do not matter.
     pub draws: usize,
     /// Branches that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -71,11 +71,14 @@ pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
         passes.extend(shadow.has_moments().then_some("blur"));
     }
     if has(Kind::Opaque) || has(Kind::Mask) {
-        passes.push("opaque");
+        passes.push("visibility");
     }
-    passes.push("sky");
     passes.extend(scene.look.ground.map(|_| "ground"));
     passes.extend(scene.needs.blend.then_some("blended"));
+    passes.push("backdrop");
+    if has(Kind::Opaque) || has(Kind::Mask) {
+        passes.push("shade");
+    }
     passes.push("encode");
     Plan {
         buffers: buffers(scene),
@@ -96,11 +99,14 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     let mut buffers = vec![
         named("positions", 12 * layout.vertices),
         named("normals", 12 * layout.corners),
-        named("corner vertices", 4 * layout.corners),
         named("triangles", 12 * layout.triangles),
-        named("materials", super::scene_buffers::MATERIAL_BYTES * scene.materials.len()),
+        named("triangle vertices", 12 * layout.triangles),
+        named("materials", super::scene_buffers::MATERIAL_BYTES * used_materials(scene).len()),
         named("frame", size_of::<super::frame::Frame>()),
     ];
+    if scene.needs.mask || scene.needs.blend {
+        buffers.push(named("corner vertices", 4 * layout.corners));
+    }
     if scene.needs.normal_maps {
         buffers.push(named("tangents", 16 * layout.corners));
     }
@@ -143,6 +149,8 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("NORMAL_MAPS", needs.normal_maps),
         ("UVS", needs.textures || needs.normal_maps),
         ("LOOK_UP", looks_up(scene)),
+        ("GROUND_SEEN", scene.look.ground.is_some()),
+        ("LAYERS", needs.blend),
     ];
     let shadows = scene.look.shadow.iter().flat_map(super::shadow::defines);
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).chain(shadows).collect()
@@ -156,16 +164,10 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
     let all = [
         (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
         (needs.textures, "textures", uvs, vec![], "no colour lookup"),
-        (needs.mask, "mask", 0, vec![], "no discard; the shadow of opaque triangles needs no fragment shader"),
-        (needs.blend, "blend", 0, vec!["blended"], "no blended variant"),
+        (needs.mask, "mask", 0, vec![], "no discard, no sample mask; depth needs no fragment shader"),
+        (needs.blend, "blend", 0, vec!["blended"], "no layers in the shading, 8 bytes a sample less"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
-        (
-            looks_up(scene),
-            "many materials",
-            4 * layout.triangles as u64,
-            vec![],
-            "a draw call for each material, no lookup per triangle",
-        ),
+        (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (scene.look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
     ];
     let unneeded = all.into_iter().filter(|row| !row.0);
@@ -174,7 +176,6 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::geometry::DRAWN_APART;
     use super::super::geometry::tests::squares;
     use super::*;
     use crate::domain::{AlphaMode, Material, Texture};
@@ -184,12 +185,11 @@ mod tests {
     }
 
     fn everything() -> crate::scene::Parts {
-        let mut materials = vec![
+        let materials = vec![
             Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
             Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
         ];
-        materials.resize(DRAWN_APART + 1, Material::default());
         let mut parts = squares(materials);
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
         parts
@@ -202,8 +202,8 @@ mod tests {
         parts.look.ground = None;
         let scene = Scene::new(parts).expect("good");
         let plan = plan(&scene);
-        assert_eq!(plan.passes, ["opaque", "sky", "encode"]);
-        let expected = ["positions", "normals", "corner vertices", "triangles", "materials", "frame"];
+        assert_eq!(plan.passes, ["visibility", "backdrop", "shade", "encode"]);
+        let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame"];
         assert_eq!(names(&plan.buffers), expected);
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
@@ -213,9 +213,19 @@ mod tests {
     }
 
     #[test]
+    fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
+        let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, ..Material::default() }]);
+        parts.look.shadow = None;
+        let plan = plan(&Scene::new(parts).expect("good"));
+        assert_eq!(plan.passes, ["ground", "blended", "backdrop", "encode"]);
+        assert_eq!((plan.draws, plan.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
+        assert_eq!(plan.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+    }
+
+    #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
         let plan = plan(&Scene::new(everything()).expect("good"));
-        assert_eq!(plan.passes, ["shadow", "blur", "opaque", "sky", "ground", "blended", "encode"]);
+        assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
         assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
         assert_eq!(plan.textures[0], Allocation { name: "colours 1 x 1 x 1".into(), bytes: 4 });

@@ -61,6 +61,8 @@ pub struct Look {
     pub horizon: [f32; 3],
     pub shadow: Option<Shadow>,
     pub ground: Option<Ground>,
+    /// Samples a pixel, 1 or 4: how smooth the edges of triangles and cut-outs are.
+    pub samples: u32,
 }
 
 impl Default for Look {
@@ -74,6 +76,7 @@ impl Default for Look {
             horizon: [0.72, 0.82, 0.90],
             shadow: Some(Shadow::default()),
             ground: Some(Ground::default()),
+            samples: 4,
         }
     }
 }
@@ -90,6 +93,25 @@ impl Look {
         if !colours.as_flattened().iter().all(|number| number.is_finite()) {
             return Err(invalid("look", "finite numbers", format!("{self:?}")));
         }
+        if ![1, 4].contains(&self.samples) {
+            return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
+        }
         self.shadow.map_or(Ok(()), |shadow| shadow.check())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_that_are_neither_one_nor_four_are_refused() {
+        for samples in [1, 4] {
+            Look { samples, ..Look::default() }.check().expect("good");
+        }
+        for samples in [0, 2, 8, u32::MAX] {
+            let refusal = Look { samples, ..Look::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
+        }
     }
 }

@@ -7,3 +7,5 @@ mod shading;
 mod shadow;
 mod shadow_extremes;
 mod shadow_methods;
+mod snapshots;
+mod visibility;

@@ -8,8 +8,7 @@ use std::rc::Rc;
 use self::sources::RUN;
 pub(super) use self::sources::{Tile, defines};
 use super::geometry::Kind;
-use super::gl::{self, Fixed, Framebuffer, Gl, Program, Texture, TextureKind};
-use super::passes::bind_material;
+use super::gl::{self, Clear, Fixed, Framebuffer, Gl, Program, Texture, TextureKind};
 use super::scene_buffers::SceneBuffers;
 use super::shaders::LANES;
 use crate::error::{Result, during};
@@ -118,14 +117,14 @@ fn image(gl: &Rc<Gl>, shadow: &Shadow, format: u32, filter: u32, layers: u32) ->
 pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<()> {
     let size = map.shadow.size;
     for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
-        gl.begin(framebuffer, size, size);
+        gl.begin(framebuffer, size, size, Clear::Depth);
         gl.set(Fixed { depth_write: true, ..Fixed::default() });
-        for drawn in &buffers.groups {
-            if let Some(program) = &drawn.shadow {
-                bind_material(buffers, drawn, program, drawn.group.kind != Kind::Opaque)?;
-                choose(program, map, layer);
-                gl.draw_indexed(&buffers.casters, drawn.group.first_triangle, drawn.group.triangles);
-            }
+        for (kind, program) in [Kind::Opaque, Kind::Mask, Kind::Blend].into_iter().zip(&buffers.programs.shadow) {
+            let Some((program, array)) = program.as_ref().zip(buffers.array(kind)) else { continue };
+            let (first, count) = buffers.triangles(kind);
+            program.bind((kind != Kind::Opaque).then_some(first as u32));
+            choose(program, map, layer);
+            gl.draw_indexed(array, first, count);
         }
     }
     gl.check("shadow")

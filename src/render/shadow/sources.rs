@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::super::geometry::Kind;
 use super::super::gl;
-use super::super::shaders::{CASTER, FRAME, LANES, MATERIAL, Options, Source};
+use super::super::shaders::{CASTER, DRAWN, FRAME, LANES, Options, Slopes, Source, drawn};
 use crate::scene::{Blurring, Moments, Shadow, ShadowMethod};
 
 const SUN: &str = include_str!("../../../shaders/shared/sun.glsl");
@@ -86,20 +86,16 @@ impl Options {
 
     /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
     pub(in crate::render) fn shadow(&self, kind: Kind) -> Source {
-        let more: &[&str] = match kind {
-            Kind::Opaque => &["SOLID"],
-            Kind::Mask => &["MASK"],
-            Kind::Blend => &["BLEND"],
-        };
-        let head = self.head(more);
-        let vertex = [&head, FRAME, self.splits(), include_str!("../../../shaders/shadow.vert")].concat();
-        let mut stages = vec![(gl::VERTEX_SHADER, vertex)];
-        if kind != Kind::Opaque {
-            let body = include_str!("../../../shaders/shadow.frag");
-            let fragment = [&head, FRAME, MATERIAL, &self.samplers(), CASTER, body].concat();
-            stages.push((gl::FRAGMENT_SHADER, fragment));
+        let label = format!("shadow, {kind:?}");
+        let vertex = |head: &str| [head, FRAME, self.splits(), include_str!("../../../shaders/shadow.vert")].concat();
+        if kind == Kind::Opaque {
+            return Source { label, stages: vec![(gl::VERTEX_SHADER, vertex(&self.head(&["SOLID"])))] };
         }
-        Source { label: format!("shadow, {kind:?}"), stages }
+        let head = self.head(if kind == Kind::Mask { &["MASK"] } else { &[] }) + &self.branches(&[kind]);
+        let lookups = self.lookups(&[kind], Slopes::OfTheQuad);
+        let body = include_str!("../../../shaders/shadow.frag");
+        let fragment = [&head, FRAME, &lookups, DRAWN, CASTER, body].concat();
+        Source { label, stages: drawn(vertex(&head), fragment) }
     }
 
     /// The programs that make blurred moments of depth, in order.
@@ -219,7 +215,7 @@ mod tests {
             let shadow = Shadow { method, ..Shadow::default() };
             let names: Vec<&str> = defines(&shadow).collect();
             assert_eq!(names, ["SHADOWS", own]);
-            let options = Options { defines: names, colour_arrays: 0, normal_arrays: 0, shadow, samples: 1 };
+            let options = Options { defines: names, used: vec![], shadow, sample_places: vec![] };
             assert_eq!(options.sun().contains("const float TAPS"), own == "FILTERED");
             assert!(
                 !options.sun().contains("SplitBlock")

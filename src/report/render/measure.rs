@@ -226,8 +226,9 @@ impl Job<'_> {
         let ran = studio.renderer.ran().clone();
         let mut row = self.compared(variant, (&image, &lit), aim);
         (row.samples, row.draws) = (ran.samples, ran.draws);
-        row.bytes = set.plan.bytes();
-        let shadow = set.plan.textures.iter().filter(|texture| texture.name.starts_with("shadow"));
+        let plan = set.buffers.plan();
+        row.bytes = plan.bytes();
+        let shadow = plan.textures.iter().filter(|texture| texture.name.starts_with("shadow"));
         row.shadow_bytes = shadow.map(|texture| texture.bytes).sum();
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;

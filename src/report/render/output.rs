@@ -9,7 +9,7 @@ use crate::error::{Result, during};
 use crate::report::plot::png;
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
-const COLUMNS: [(&str, &str); 38] = [
+const COLUMNS: [(&str, &str); 43] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -20,7 +20,12 @@ const COLUMNS: [(&str, &str); 38] = [
     ("frame_q1_us", "frame"),
     ("frame_q3_us", "frame"),
     ("shadow_us", "shadow"),
+    ("blur_us", "blur"),
     ("draw_us", "draw"),
+    ("visibility_us", "visibility"),
+    ("blended_us", "blended"),
+    ("shade_us", "shade"),
+    ("encode_us", "encode"),
     ("read_us", "read"),
     ("bytes", "/bytes"),
     ("shadow_bytes", "/shadow_bytes"),

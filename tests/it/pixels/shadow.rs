@@ -80,6 +80,31 @@ fn a_surface_in_the_shadow_keeps_its_ambient_light_and_loses_the_rest() {
 }
 
 #[test]
+fn the_printed_ambient_term_equals_ours_in_sunlight_of_the_skys_colour_and_is_black_in_the_shadow() {
+    // Without a highlight, equation 3.12 prints s_f I_l (C_a + (n . v_l) C_d): the sun lights C_a too, and the shadow takes
+    // it away. Here the sky lights C_a, and the shadow leaves it.
+    let (ambient, diffuse, facing) = ([0.4, 0.2, 0.1], [0.3_f32, 0.5, 0.7], 0.8);
+    let colour = |ambient_light: f64, sunlight: f64| {
+        std::array::from_fn(|channel| {
+            let [a, d] = [ambient, diffuse].map(|colour| f64::from(colour[channel]));
+            ambient_light * a + sunlight * facing * d
+        })
+    };
+    for skylight in [0.5, 0.2] {
+        let mut stage = stage();
+        (stage.0.look.skylight, stage.0.look.sunlight) = ([skylight as f32; 3], [0.5; 3]);
+        let floor = Material { ambient, diffuse, specular: [0.0; 3], ..Material::default() };
+        let shown = aside(stage.add(lying(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+        for (share, pixel) in [(1.0, shown.at(32, 8)), (0.0, shown.at(32, 32))] {
+            let (printed, ours) = (colour(share * 0.5, share * 0.5), colour(skylight, share * 0.5));
+            assert!(close(pixel, ours, 1.0), "sky {skylight}, sun {share}: {pixel:?}, expected {ours:?}");
+            let same = skylight == 0.5 && share == 1.0;
+            assert_eq!(close(pixel, printed, 1.0), same, "sky {skylight}, sun {share}: {pixel:?}, printed {printed:?}");
+        }
+    }
+}
+
+#[test]
 fn the_shadow_of_a_cut_out_has_the_hole_too_and_an_opaque_one_has_not() {
     let cut = aside(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     assert!(close(cut.at(32, 32), ground(1.0, 0.8), 4.0), "the hole: {:?}", cut.at(32, 32));
