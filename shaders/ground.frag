@@ -1,11 +1,4 @@
-// Lambert's law on the ground, its shadow, and the haze in which it meets the sky.
-in vec3 world;
-layout(location = 0) out vec4 colour;
+// The ground is a thing that is seen, like a triangle; it is shaded where the picture is.
+layout(location = 0) out uint id;
 
-void main() {
-    float facing = max(dot(frame.up.xyz, frame.to_sun.xyz), 0.0);
-    vec3 light = frame.skylight.rgb + sunlit(world) * facing * frame.sunlight.rgb;
-    vec3 out_there = world - frame.ground_centre.xyz;
-    float share = dot(out_there, out_there) / (frame.ground.a * frame.ground.a);
-    colour = vec4(mix(frame.horizon.rgb, light * frame.ground.rgb, exp(-share)), 1.0);
-}
+void main() { id = GROUND; }

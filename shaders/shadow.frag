@@ -4,7 +4,7 @@ in vec2 uv_image;
 #endif
 
 void main() {
-    Material material = own_material();
+    Material material = material_of(own_triangle());
     float alpha = material.ambient.a;
 #ifdef TEXTURES
     vec4 texel = colour_texel(material.images.xy, uv_image);

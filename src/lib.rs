@@ -14,7 +14,7 @@
 //! |---|---|---|
 //! | `cli` | the command line: one file per command | `config`, `service`, `report`, `engine`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `tree`, `deform`, `scene`, `domain`, `telemetry`, `error` |
 //! | `service` | gRPC: wire to values and back; the only module that names proto | `config`, `engine`, `deform`, `scene`, `domain`, `telemetry`, `error` |
-//! | `report` | error against run time: synthetic scenes, errors by source, timing, tables and plots | `gpu`, `cpu`, `reference`, `load`, `deform`, `storage`, `scene`, `domain`, `error` |
+//! | `report` | error against run time: synthetic scenes, errors by source, timing, tables and plots | `gpu`, `cpu`, `reference`, `render`, `load`, `deform`, `storage`, `scene`, `domain`, `error` |
 //! | `engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `deform`, `scene`, `domain`, `telemetry`, `error` |
 //! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage`, `deform`, `scene`, `domain`, `error` |
 //! | `cpu` | the f32 deformer of machines without a GPU | `storage`, `deform`, `scene`, `domain`, `error` |

@@ -14,5 +14,5 @@ layout(std140, binding = 0) uniform FrameBlock {
     vec4 ground;           // colour, and the distance at which it fades into the horizon
     vec4 ground_centre;    // and half the side of the plane
     vec4 shadow;           // least variance, bleeding, threshold of alpha, side of the map in texels
-    vec4 ground_depth;     // depth of the ground at (x, y) of the map: a x + b y + c
+    vec4 ground_depth;     // depth of the ground at (x, y) of the map: a x + b y + c; side of a texel in scene units
 } frame;

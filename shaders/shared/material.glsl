@@ -1,4 +1,7 @@
-// The material of the triangle that this fragment belongs to. Twin: `PackedMaterial` in src/render/scene_buffers.rs.
+// The material of a triangle, by its number in the index buffer. Twin: `PackedMaterial` in src/render/scene_buffers.rs.
+//   materials           [materials][STRIDE]  RGBA32F, fetched and never filtered
+//   triangle_materials  [triangles]          R32UI; not read where all these triangles have one
+// Buffer textures: a software rasteriser fetches eight of their texels at once, but storage words one by one.
 struct Material {
     vec4 ambient;   // and alpha
     vec4 diffuse;   // and the cutoff of a mask
@@ -6,25 +9,17 @@ struct Material {
     ivec4 images;   // array and layer of the colour texture, array and layer of the normal map; -1 for none
 };
 
-#ifdef LOOK_UP
-// Each triangle has its own. Buffer textures: a software rasteriser fetches eight of their texels at once, but storage
-// words one by one.
 layout(binding = 14) uniform samplerBuffer materials;
+#ifdef LOOK_UP
 layout(binding = 15) uniform usamplerBuffer triangle_materials;
-layout(location = 0) uniform int first_triangle;
+#endif
 
-Material own_material() {
-    int first = STRIDE * int(texelFetch(triangle_materials, first_triangle + gl_PrimitiveID).x);
+Material material_of(int number) {
+#ifdef LOOK_UP
+    int first = STRIDE * int(texelFetch(triangle_materials, number).x);
+#else
+    const int first = STRIDE * ONLY_MATERIAL;
+#endif
     ivec4 images = ivec4(texelFetch(materials, first + 3));
     return Material(texelFetch(materials, first), texelFetch(materials, first + 1), texelFetch(materials, first + 2), images);
 }
-#else
-layout(std140, binding = 1) uniform MaterialBlock {
-    vec4 ambient;
-    vec4 diffuse;
-    vec4 specular;
-    vec4 images;
-} drawn;
-
-Material own_material() { return Material(drawn.ambient, drawn.diffuse, drawn.specular, ivec4(drawn.images)); }
-#endif

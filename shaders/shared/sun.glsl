@@ -1,20 +1,99 @@
-// How much of the sun reaches a point: Chebyshev's bound on the blurred moments of depth (equation 3.10 with the variance
-// M2 - M1 M1; depth is counted from the middle of its range, where floats are finest).
+// lit: how much of the sun reaches a point of a surface with this normal, 0 to 1, from every kind of shadow map. It
+// takes no derivatives, so that fragment and compute shaders may call it, and a NaN in gives a number out.
 #ifdef SHADOWS
-layout(binding = 0) uniform sampler2D moments_map;
+layout(binding = 0) uniform sampler2DArray shadow_map;
 
-float sunlit(vec3 world) {
-    vec3 at = (frame.map_from_world * vec4(world, 1.0)).xyz;
-    // The rim holds no caster; the outermost texels are left alone, where filtering repeats the edge.
-    vec2 inside = min(at.xy, 1.0 - at.xy) * frame.shadow.w;
-    if (min(inside.x, inside.y) < 1.0) return 1.0;
-    vec2 moments = textureLod(moments_map, at.xy, 0.0).xy;
+#ifdef SPLITS
+vec2 finer(int layer) { return splits.places[layer].xy; }
+#else
+vec2 finer(int layer) { return vec2(1.0); }
+#endif
+
+#ifdef VARIANCE
+// Chebyshev's bound on the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1; depth is counted from
+// the middle of its range, where floats are finest).
+float arrives(vec3 at, int layer, vec3 normal) {
+    vec2 moments = textureLod(shadow_map, vec3(at.xy, float(layer)), 0.0).xy;
     float behind = clamp(at.z, 0.0, 1.0) - 0.5 - moments.x;
-    if (behind <= 0.0) return 1.0;
+    if (!(behind > 0.0)) return 1.0;
     float variance = max(moments.y - moments.x * moments.x, frame.shadow.x);
     float bound = variance / (variance + behind * behind);
     return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
 }
 #else
-float sunlit(vec3 world) { return 1.0; }
+// The plane of the surface, as the map sees it: by how much its depth changes from a texel to the next, in x and in y.
+// Texels are compared with this plane in place of the point's own depth, so that no slope shadows itself.
+vec2 slope(vec3 normal, int layer) {
+    // The rows of the map's matrix are the axes of light space, scaled; the third looks away from the sun.
+    mat3 axes = transpose(mat3(frame.map_from_world));
+    vec3 part = vec3(dot(normal, axes[0]), dot(normal, axes[1]), dot(normal, axes[2]));
+    vec3 square = vec3(dot(axes[0], axes[0]), dot(axes[1], axes[1]), dot(axes[2], axes[2]));
+    // Steeper than ten to one is taken for ten to one: there the sun only grazes.
+    float facing = max(abs(part.z), 0.1 * sqrt(square.z)) * (part.z < 0.0 ? -1.0 : 1.0);
+    return -(part.xy / square.xy) * (square.z / facing) / (frame.shadow.w * finer(layer));
+}
+
+// A caster is seen from one side of a texel before the surface on. This is for curved surfaces, whose triangles are not
+// quite as their normals say, and for the roundings of depth.
+float margin(int layer) {
+    vec3 away = vec3(frame.map_from_world[0].z, frame.map_from_world[1].z, frame.map_from_world[2].z);
+    vec2 scale = finer(layer);
+    return frame.ground_depth.w / min(scale.x, scale.y) * length(away) + 4e-7;
+}
+
+// What the map holds where no caster is.
+const float EMPTY = 1.0;
+#endif
+
+#ifdef STANDARD
+// The standard shadow map: all or nothing, by the one texel that holds the point.
+float arrives(vec3 at, int layer, vec3 normal) {
+    vec2 place = at.xy * frame.shadow.w;
+    float depth = texelFetch(shadow_map, ivec3(place, layer), 0).x;
+    float own = at.z - margin(layer) + dot(slope(normal, layer), floor(place) + 0.5 - place);
+    return depth >= EMPTY || own <= depth ? 1.0 : 0.0;
+}
+#endif
+
+#ifdef FILTERED
+// Percentage-closer filtering: the share of the texels around the point that hold no caster before it, weighed by the
+// Gaussian (TAPS: its half, centre first, and a zero) that moves with the point.
+float arrives(vec3 at, int layer, vec3 normal) {
+    vec2 place = at.xy * frame.shadow.w - 0.5;
+    vec2 first = floor(place);
+    vec2 past = place - first;
+    vec2 steep = slope(normal, layer);
+    float own = at.z - margin(layer), share = 0.0;
+    for (int y = -REACH; y <= REACH; y += 2) {
+        vec2 rows = mix(vec2(TAPS[abs(y)], TAPS[abs(y + 1)]), vec2(TAPS[abs(y - 1)], TAPS[abs(y)]), past.y);
+        for (int x = -REACH; x <= REACH; x += 2) {
+            vec2 columns = mix(vec2(TAPS[abs(x)], TAPS[abs(x + 1)]), vec2(TAPS[abs(x - 1)], TAPS[abs(x)]), past.x);
+            vec2 corner = vec2(x, y);
+            // Four texels around their common corner, in the order (0, 1), (1, 1), (1, 0), (0, 0).
+            vec4 depth = textureGather(shadow_map, vec3((first + corner + 1.0) / frame.shadow.w, float(layer)), 0);
+            float there = own + dot(steep, corner - past);
+            vec4 plane = there + vec4(steep.y, steep.x + steep.y, steep.x, 0.0);
+            vec4 open = vec4(lessThanEqual(plane, depth));
+            open = max(open, vec4(greaterThanEqual(depth, vec4(EMPTY))));
+            share += dot(open, rows.yyxx * columns.xyyx);
+        }
+    }
+    return clamp(share, 0.0, 1.0);
+}
+#endif
+
+float lit(vec3 world, vec3 normal) {
+    vec3 at = (frame.map_from_world * vec4(world, 1.0)).xyz;
+    int layer = 0;
+#ifdef SPLITS
+    layer = layer_of(world);
+    at.xy = in_layer(at.xy, layer);
+#endif
+    // The rim holds no caster; the outermost texels are left alone, where filtering repeats the edge.
+    vec2 inside = min(at.xy, 1.0 - at.xy) * frame.shadow.w;
+    if (!(min(inside.x, inside.y) >= 1.0)) return 1.0;
+    return arrives(at, layer, normal);
+}
+#else
+float lit(vec3 world, vec3 normal) { return 1.0; }
 #endif

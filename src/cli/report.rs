@@ -1,5 +1,7 @@
 //! `modalcast report`: what every shortcut costs in error, and what it saves in time.
 
+mod render;
+
 use std::path::PathBuf;
 
 use clap::Subcommand;
@@ -22,6 +24,7 @@ pub(super) struct Args {
 #[derive(Debug, Subcommand)]
 enum What {
     Deform(DeformArgs),
+    Render(render::Args),
 }
 
 const EXAMPLES: &str = "Examples:
@@ -31,7 +34,8 @@ const EXAMPLES: &str = "Examples:
   modalcast report deform --out report --load c --variant 'cuda*' --variant 'cpu f32'
   modalcast report deform --out report --load c --load plants --variant 'cuda overlap'
   modalcast report deform --out report --scene path/to/finger
-  modalcast report deform --out report --scene tree --trajectory path/to/record";
+  modalcast report deform --out report --scene tree --trajectory path/to/record
+  modalcast report render --out report --quick";
 
 const LOADS: &str = "Loads:
   single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P 14 to 22, R 10 to 30)
@@ -84,6 +88,7 @@ struct DeformArgs {
 pub(super) fn run(args: &Args) -> Outcome {
     match &args.what {
         What::Deform(args) => run_deform(args),
+        What::Render(args) => render::run(args),
     }
 }
 

@@ -174,6 +174,9 @@ impl Conductor {
     }
 }
 
+/// The stages among the passes of a picture. Its pass "encode" makes bytes of light, and is part of the stage that draws;
+/// the stage of that name comes later.
 fn known(passes: &[(&'static str, f64)]) -> StageTimes {
-    passes.iter().filter_map(|(name, ms)| Some((Stage::named(name)?, *ms))).collect()
+    let stage = |name: &str| Stage::named(name).filter(|stage| *stage != Stage::Encode);
+    passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
 }

@@ -40,22 +40,13 @@ impl Frame {
     /// # Errors
     /// `Invalid` when the camera's numbers overflow.
     pub(super) fn new(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Result<Self> {
-        // Bounds that overflowed fit no shadow and no depth range; those at rest are always good.
-        let sound = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
-        let bounds = if sound { shot.bounds } else { scene.rest_bounds };
+        let bounds = sound(scene, shot);
         let home = home(scene, bounds, origin);
         let look = &scene.look;
         let to_sun = look.to_sun(scene.up);
         let height = home.min[scene.up.index()];
         let shadow = look.shadow.unwrap_or_default();
-        let light = LightBox::fit(&Fit {
-            to_sun,
-            up: scene.up,
-            bounds,
-            ground: look.ground.map(|_| height),
-            size: f64::from(shadow.size),
-            rim: (3.0 * f64::from(shadow.blur)).ceil() + 1.0,
-        });
+        let light = LightBox::fit(&sun_fit(scene, shot, origin));
         let viewer = shot.camera.relative_to(origin);
         let camera = viewer.camera_from_world();
         // The depth range is for the deformed and the rest state: planes must not jump when a branch bends.
@@ -75,8 +66,13 @@ impl Frame {
             up: wide(scene.up.vector(), height),
             ground: colour(look.ground.unwrap_or_default().colour, fade),
             ground_centre: wide(centre, EDGE * fade),
-            shadow: [shadow.least_variance, shadow.bleeding, shadow.alpha_threshold, shadow.size as f32],
-            ground_depth: wide(light.ground.into(), 0.0),
+            shadow: [
+                shadow.least_variance.max(shadow.floor()),
+                shadow.bleeding,
+                shadow.alpha_threshold,
+                shadow.size as f32,
+            ],
+            ground_depth: wide(light.ground.into(), light.texel(f64::from(shadow.size))),
         };
         let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));
         match numbers.iter().all(|number| number.is_finite()) {
@@ -84,6 +80,39 @@ impl Frame {
             false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", shot.camera))),
         }
     }
+}
+
+/// The bounds of a shot. Those that overflowed fit no shadow and no depth range; those at rest are always good.
+fn sound(scene: &Scene, shot: &Shot) -> Bounds {
+    let sound = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
+    if sound { shot.bounds } else { scene.rest_bounds }
+}
+
+/// What the sun's box is fitted to, relative to `origin` as the positions are.
+pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
+    let bounds = sound(scene, shot);
+    let height = home(scene, bounds, origin).min[scene.up.index()];
+    let shadow = scene.look.shadow.unwrap_or_default();
+    Fit {
+        to_sun: scene.look.to_sun(scene.up),
+        up: scene.up,
+        bounds,
+        ground: scene.look.ground.map(|_| height),
+        size: f64::from(shadow.size),
+        rim: f64::from(shadow.reach()) + 1.0,
+    }
+}
+
+/// The size of a texel of the shadow map in the world: two vectors across the light, along the map's x and y, in scene
+/// units. None when the look has no shadow. For positions that are relative to the scene's origin.
+pub fn shadow_texel(scene: &Scene, shot: &Shot) -> Option<[Vector3<f64>; 2]> {
+    let shadow = scene.look.shadow?;
+    let map = LightBox::fit(&sun_fit(scene, shot, [0.0; 3])).map_from_world;
+    let texel = |row: usize| {
+        let across = map.fixed_view::<1, 3>(row, 0).transpose();
+        across / (across.norm_squared() * f64::from(shadow.size))
+    };
+    Some([texel(0), texel(1)])
 }
 
 /// Whether the camera stands above the ground; from below it is not drawn.

@@ -17,19 +17,23 @@ pub(super) enum Kind {
     Blend,
 }
 
-/// The most materials that get a draw call each. With more, triangles of one pipeline state are drawn together and each
-/// looks its material up.
-pub(super) const DRAWN_APART: usize = 8;
-
 /// A contiguous run of triangles that one draw call draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Group {
     pub(super) kind: Kind,
     pub(super) double_sided: bool,
-    /// The material of all of them; none when each triangle has its own.
-    pub(super) material: Option<usize>,
     pub(super) first_triangle: usize,
     pub(super) triangles: usize,
+}
+
+/// Triangles that follow each other in a mesh and in the groups alike.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Stretch {
+    /// Its first triangle in the order of the groups.
+    pub(super) first: usize,
+    pub(super) domain: usize,
+    /// The same triangle in the domain's mesh.
+    pub(super) triangle: usize,
 }
 
 /// The static arrays, packed as the scene's layout says; triangles in the order of the groups.
@@ -41,32 +45,32 @@ pub(super) struct Geometry {
     pub(super) uvs: Vec<[f32; 2]>,
     /// Per triangle, three corners in the packed normals.
     pub(super) triangles: Vec<[u32; 3]>,
-    /// Per triangle; empty when every group has one material.
+    /// Per triangle, the vertices of those.
+    pub(super) triangle_vertices: Vec<[u32; 3]>,
+    /// Per triangle, its material's place among the used ones; empty when all triangles have one material.
     pub(super) materials: Vec<u32>,
     pub(super) groups: Vec<Group>,
+    /// Ascending by the first triangle.
+    pub(super) stretches: Vec<Stretch>,
     /// Group of each material.
     group_of: Vec<usize>,
 }
 
 /// Whether triangles look their materials up one by one.
 pub(super) fn looks_up(scene: &Scene) -> bool {
-    used_materials(scene).len() > DRAWN_APART
+    used_materials(scene).len() > 1
 }
 
-/// The groups of a scene: opaque, then mask, then blend; and the group of each material.
+/// The groups of a scene: opaque, then mask, then blend, six at most; and the group of each material.
 pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
-    let together = looks_up(scene);
     let mut groups: Vec<Group> = Vec::new();
     let mut of_material = vec![0; scene.materials.len()];
     let mut used = used_materials(scene);
     used.sort_by_key(|material| state(&scene.materials[*material]));
     for material in used {
         let (kind, double_sided) = state(&scene.materials[material]);
-        let joins =
-            groups.last().is_some_and(|last| together && (last.kind, last.double_sided) == (kind, double_sided));
-        if !joins {
-            let material = (!together).then_some(material);
-            groups.push(Group { kind, double_sided, material, first_triangle: 0, triangles: 0 });
+        if groups.last().is_none_or(|last| (last.kind, last.double_sided) != (kind, double_sided)) {
+            groups.push(Group { kind, double_sided, first_triangle: 0, triangles: 0 });
         }
         of_material[material] = groups.len() - 1;
     }
@@ -85,12 +89,15 @@ pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
 
 /// What the pipeline must be set to for a material.
 fn state(material: &Material) -> (Kind, bool) {
-    let kind = match material.alpha_mode {
+    (kind(material), material.double_sided)
+}
+
+pub(super) const fn kind(material: &Material) -> Kind {
+    match material.alpha_mode {
         AlphaMode::Opaque => Kind::Opaque,
         AlphaMode::Mask { .. } => Kind::Mask,
         AlphaMode::Blend => Kind::Blend,
-    };
-    (kind, material.double_sided)
+    }
 }
 
 /// Indices of the materials that triangles have, ascending.
@@ -108,15 +115,24 @@ impl Geometry {
             vertices: Vec::with_capacity(layout.corners),
             uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),
             triangles: vec![[0; 3]; layout.triangles],
+            triangle_vertices: Vec::new(),
             materials: vec![0; if looks_up(scene) { layout.triangles } else { 0 }],
             groups,
+            stretches: Vec::new(),
             group_of,
         };
-        let mut next: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
-        for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
-            geometry.add_corners(scene, domain, slot, textured);
-            geometry.add_triangles(scene, domain, slot, &mut next);
+        let mut rank = vec![0; scene.materials.len()];
+        for (place, material) in (0..).zip(used_materials(scene)) {
+            rank[material] = place;
         }
+        let mut next: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
+        for (index, domain) in scene.domains.iter().enumerate() {
+            geometry.add_corners(scene, domain, &scene.layout.slots[index], textured);
+            geometry.add_triangles(scene, index, &rank, &mut next);
+        }
+        let vertex = |corner: u32| geometry.vertices[corner as usize];
+        geometry.triangle_vertices = geometry.triangles.iter().map(|corners| corners.map(vertex)).collect();
+        geometry.stretches.sort_unstable_by_key(|stretch| stretch.first);
         geometry
     }
 
@@ -130,19 +146,21 @@ impl Geometry {
         }
     }
 
-    fn add_triangles(&mut self, scene: &Scene, domain: &Domain, slot: &Slot, next: &mut [usize]) {
+    fn add_triangles(&mut self, scene: &Scene, index: usize, rank: &[u32], next: &mut [usize]) {
+        let (domain, slot) = (&scene.domains[index], &scene.layout.slots[index]);
         let mesh = &scene.shapes[domain.shape].mesh;
         // A placement that mirrors turns every winding around.
         let mirrored = domain.placement.linear().determinant() < 0.0;
         for (material, range) in stretches(domain, slot) {
             let kind = &scene.materials[material];
             let place = &mut next[self.group_of[material]];
+            self.stretches.push(Stretch { first: *place, domain: index, triangle: range.start });
             for triangle in &mesh.triangles()[range] {
                 let disagrees = kind.double_sided && winding_disagrees(mesh, *triangle);
                 let [a, b, c] = triangle.map(|corner| corner + slot.first_corner as u32);
                 self.triangles[*place] = if mirrored == disagrees { [a, b, c] } else { [a, c, b] };
                 if let Some(slot) = self.materials.get_mut(*place) {
-                    *slot = material as u32;
+                    *slot = rank[material];
                 }
                 *place += 1;
             }
@@ -216,7 +234,6 @@ pub(super) mod tests {
         let geometry = Geometry::new(&scene);
         let kinds: Vec<Kind> = geometry.groups.iter().map(|group| group.kind).collect();
         assert_eq!(kinds, [Kind::Opaque, Kind::Mask, Kind::Blend]);
-        assert!(geometry.groups.iter().all(|group| group.material.is_none()), "three hundred materials are looked up");
         assert_eq!(geometry.groups.iter().map(|group| group.triangles).sum::<usize>(), 600);
         for group in &geometry.groups {
             for triangle in group.first_triangle..group.first_triangle + group.triangles {
@@ -236,9 +253,10 @@ pub(super) mod tests {
         parts.domains.truncate(1);
         parts.domains[0].runs = vec![Run { first_triangle: 0, material: 1 }, Run { first_triangle: 1, material: 0 }];
         let geometry = Geometry::new(&Scene::new(parts).expect("good"));
-        let materials: Vec<_> = geometry.groups.iter().map(|group| group.material).collect();
-        assert_eq!(materials, [Some(0), Some(1)], "few materials are drawn apart");
+        assert_eq!(geometry.materials, [0, 1]);
         assert_eq!(geometry.triangles, [[0, 2, 3], [0, 1, 2]]);
+        let stretch = |first, triangle| Stretch { first, domain: 0, triangle };
+        assert_eq!(geometry.stretches, [stretch(0, 1), stretch(1, 0)], "where each came from");
     }
 
     #[test]
@@ -249,6 +267,7 @@ pub(super) mod tests {
         parts.domains[0].placement = mirror;
         let geometry = Geometry::new(&Scene::new(parts).expect("good"));
         assert_eq!(geometry.triangles, [[0, 2, 1], [0, 3, 2]]);
+        assert_eq!(geometry.triangle_vertices, geometry.triangles, "here a corner is a vertex");
         assert!(geometry.materials.is_empty() && geometry.uvs.is_empty());
     }
 

@@ -3,6 +3,7 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod layers;
 mod object;
 
 use std::rc::Rc;
@@ -17,9 +18,9 @@ use crate::error::{Error, Result, during};
 /// The constants that other files name.
 pub(super) use glow::{
     CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
-    LINEAR_MIPMAP_NEAREST, NEAREST, R32UI, REPEAT, RG32F, RGB32F, RGBA8, RGBA16F, RGBA32F, SRGB8_ALPHA8, STATIC_DRAW,
-    STREAM_COPY, STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE, TEXTURE_MAG_FILTER,
-    TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
+    LINEAR_MIPMAP_NEAREST, NEAREST, R32UI, REPEAT, RG16F, RG32F, RGB32F, RGB32UI, RGBA8, RGBA16F, RGBA32F,
+    SRGB8_ALPHA8, STATIC_DRAW, STREAM_COPY, STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE,
+    TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
 };
 
 /// What the context can do.
@@ -29,7 +30,10 @@ pub(super) struct Limits {
     pub(super) version: String,
     pub(super) software: bool,
     pub(super) max_side: u32,
+    /// Samples that colour, depth and integer images may all have.
     pub(super) max_samples: u32,
+    /// Textures that one compute shader may read.
+    pub(super) max_reads: u32,
     pub(super) max_layers: u32,
     /// Largest buffer texture.
     pub(super) max_texels: u64,
@@ -68,9 +72,18 @@ pub(super) struct Fixed {
     /// Drawn a little farther away than it is, so that what lies in the same plane is seen.
     pub(super) behind: bool,
     pub(super) cull: bool,
+    /// Colours are blended over those that are there; alpha becomes the share of what was there before that is left.
     pub(super) blend: bool,
-    /// Alpha becomes the share of samples that are covered.
-    pub(super) coverage: bool,
+}
+
+/// What a pass begins with.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Clear {
+    /// Depth of 1.
+    Depth,
+    /// Depth of 1 and ids of 0.
+    DepthAndIds,
+    Colour([f32; 4]),
 }
 
 /// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around `glFinish` in software, where
@@ -230,17 +243,42 @@ impl Gl {
         }
     }
 
-    /// Binds a framebuffer, sets the viewport and clears depth to 1 and colour to zero.
-    pub(super) fn begin(&self, into: &Framebuffer, width: u32, height: u32) {
+    /// Where the samples of a framebuffer's pixels lie in them, 0 to 1 from the lower left.
+    pub(super) fn sample_places(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
+        type GetMultisample = unsafe extern "system" fn(u32, u32, *mut f32);
+        let gl = self.on();
+        let address = self.context.address("glGetMultisamplefv");
+        if address.is_null() {
+            return Err(during("samples")("glGetMultisamplefv is not there"));
+        }
+        // SAFETY: the address is that of the function of this name, whose parameters are these; it writes two floats.
+        unsafe {
+            let ask = std::mem::transmute::<*const std::ffi::c_void, GetMultisample>(address);
+            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(of.name));
+            let mut places = vec![[0.5; 2]; samples as usize];
+            for (index, place) in (0..).zip(&mut places) {
+                ask(glow::SAMPLE_POSITION, index, place.as_mut_ptr());
+            }
+            self.check("samples").map(|()| places)
+        }
+    }
+
+    /// Binds a framebuffer, sets the viewport and clears.
+    pub(super) fn begin(&self, into: &Framebuffer, width: u32, height: u32, clear: Clear) {
         let gl = self.on();
         // SAFETY: state and a clear of a complete framebuffer.
         unsafe {
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(into.name));
             gl.viewport(0, 0, width as i32, height as i32);
             gl.depth_mask(true);
-            gl.clear_color(0.0, 0.0, 0.0, 0.0);
-            gl.clear_depth_f64(1.0);
-            gl.clear(glow::DEPTH_BUFFER_BIT | glow::COLOR_BUFFER_BIT);
+            match clear {
+                Clear::Depth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
+                Clear::DepthAndIds => {
+                    gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]);
+                    gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]);
+                }
+                Clear::Colour(colour) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &colour),
+            }
         }
     }
 
@@ -255,13 +293,13 @@ impl Gl {
         flip(glow::POLYGON_OFFSET_FILL, fixed.behind);
         flip(glow::CULL_FACE, fixed.cull);
         flip(glow::BLEND, fixed.blend);
-        flip(glow::SAMPLE_ALPHA_TO_COVERAGE, fixed.coverage);
         // SAFETY: plain state.
         unsafe {
             gl.depth_func(glow::LEQUAL);
             gl.polygon_offset(1.0, 8.0);
             gl.depth_mask(fixed.depth_write);
-            gl.blend_func(glow::SRC_ALPHA, glow::ONE_MINUS_SRC_ALPHA);
+            let left = glow::ONE_MINUS_SRC_ALPHA;
+            gl.blend_func_separate(glow::SRC_ALPHA, left, glow::ZERO, left);
         }
     }
 
@@ -293,6 +331,17 @@ impl Gl {
         // SAFETY: the shaders check their own bounds.
         unsafe {
             gl.dispatch_compute(groups_x, groups_y, 1);
+            gl.memory_barrier(glow::ALL_BARRIER_BITS);
+        }
+    }
+
+    /// The same with as many groups as the first three words of a buffer say.
+    pub(super) fn dispatch_listed(&self, groups: &Buffer) {
+        let gl = self.on();
+        // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
+        unsafe {
+            gl.bind_buffer(glow::DISPATCH_INDIRECT_BUFFER, Some(groups.name));
+            gl.dispatch_compute_indirect(0);
             gl.memory_barrier(glow::ALL_BARRIER_BITS);
         }
     }
@@ -393,7 +442,11 @@ fn limits(gl: &glow::Context) -> Limits {
             version: gl.get_parameter_string(glow::VERSION),
             software,
             max_side: number(glow::MAX_TEXTURE_SIZE).min(viewport),
-            max_samples: number(glow::MAX_COLOR_TEXTURE_SAMPLES).min(number(glow::MAX_DEPTH_TEXTURE_SAMPLES)),
+            max_samples: [glow::MAX_COLOR_TEXTURE_SAMPLES, glow::MAX_DEPTH_TEXTURE_SAMPLES, glow::MAX_INTEGER_SAMPLES]
+                .map(number)
+                .into_iter()
+                .fold(u32::MAX, u32::min),
+            max_reads: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
             max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
             max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
             anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },

@@ -2,7 +2,8 @@
 //!
 //! The z axis of light space is v_l, the direction to the sun, and its y axis points up in the world. The box is the
 //! axis-aligned box there of the world-space bounds, symmetric about their centre in x and y. Its four side facets run
-//! along the light, so they are lengthened until they meet the ground: then the whole shadow on it lies inside.
+//! along the light, so they are lengthened until they meet the ground: then the whole shadow on it lies inside. All sides
+//! keep to steps that are fixed in the world, so that shadows do not crawl while the scene sways.
 
 use nalgebra::{Matrix4, Vector3};
 
@@ -19,6 +20,10 @@ pub(super) struct LightBox {
     pub(super) map_from_world: Matrix4<f64>,
     /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) when there is none.
     pub(super) ground: [f64; 3],
+    /// x, y and z of light space.
+    pub(super) axes: [Vector3<f64>; 3],
+    /// The map along x and y of light space.
+    pub(super) sides: [Side; 2],
 }
 
 /// What the box is fitted to.
@@ -34,48 +39,82 @@ pub(super) struct Fit {
     pub(super) rim: f64,
 }
 
+/// A side of a map, on a grid of texels that is fixed in the world: where it begins and half its length. What it is fitted
+/// to may grow or move; its length keeps to a few rungs and it moves by whole texels, so that no shadow crawls.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Side {
+    pub(super) low: f64,
+    pub(super) half: f64,
+}
+
+impl Side {
+    /// Holds `reach` to each side of the centre, inside the rim.
+    pub(super) fn snapped(centre: f64, reach: f64, fit: &Fit) -> Self {
+        let half = rung(reach) * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
+        let texel = 2.0 * half / fit.size;
+        Self { low: (centre / texel).round() * texel - half, half }
+    }
+}
+
+/// The next length above: sixteenths of the power of two below.
+fn rung(length: f64) -> f64 {
+    let step = length.log2().floor().exp2() / 16.0;
+    ((length / step).floor() + 1.0) * step
+}
+
 impl LightBox {
     pub(super) fn fit(fit: &Fit) -> Self {
         let axes = axes(fit.to_sun, fit.up);
         let centre = fit.bounds.centre().coords;
         let corners = fit.bounds.corners().map(|corner| corner.coords);
-        let diagonal = fit.bounds.diagonal().max(1e-6);
-        let (mut low, mut half) = ([0.0; 2], [0.0; 2]);
-        for axis in 0..2 {
+        let diagonal = diagonal(fit);
+        let sides = [0, 1].map(|axis: usize| {
             let reach = corners.iter().map(|corner| axes[axis].dot(&(corner - centre)).abs()).fold(0.0, f64::max);
-            // Whole steps keep the texels where they are while the scene sways a little.
-            let step = diagonal / 64.0;
-            half[axis] = ((reach / step).ceil() + 1.0) * step * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
-            let texel = 2.0 * half[axis] / fit.size;
-            low[axis] = (axes[axis].dot(&centre) / texel).round() * texel - half[axis];
-        }
-        let depths = corners.map(|corner| axes[2].dot(&corner));
-        let near = depths.iter().copied().fold(f64::NEG_INFINITY, f64::max) + 0.01 * diagonal;
-        let mut far = depths.iter().copied().fold(f64::INFINITY, f64::min);
+            Side::snapped(axes[axis].dot(&centre), reach.max(diagonal / 64.0), fit)
+        });
         let plane = fit.ground.and_then(|height| ground_plane(&axes, fit.up, height));
-        for side in 0..4 {
-            let at = |axis: usize| low[axis] + if side >> axis & 1 == 0 { 0.0 } else { 2.0 * half[axis] };
-            let meets = plane.map_or(far, |[a, b, c]| a * at(0) + b * at(1) + c);
-            far = far.min(meets.max(near - REACH * diagonal));
-        }
-        far -= 0.01 * diagonal;
+        let (near, far) = depths(fit, &corners.map(|corner| axes[2].dot(&corner)), &sides, plane);
         let range = near - far;
         let mut map_from_world = Matrix4::identity();
-        for axis in 0..2 {
-            let scale = 1.0 / (2.0 * half[axis]);
+        for (axis, side) in sides.iter().enumerate() {
+            let scale = 1.0 / (2.0 * side.half);
             map_from_world.fixed_view_mut::<1, 3>(axis, 0).copy_from(&(axes[axis] * scale).transpose());
-            map_from_world[(axis, 3)] = -low[axis] * scale;
+            map_from_world[(axis, 3)] = -side.low * scale;
         }
         map_from_world.fixed_view_mut::<1, 3>(2, 0).copy_from(&(-axes[2] / range).transpose());
         map_from_world[(2, 3)] = near / range;
         let ground = plane.map_or([0.0, 0.0, 1.0], |[a, b, c]| {
             let depth = |x: f64, y: f64| (near - (a * x + b * y + c)) / range;
-            let origin = depth(low[0], low[1]);
-            let along_x = depth(low[0] + 2.0 * half[0], low[1]) - origin;
-            [along_x, depth(low[0], low[1] + 2.0 * half[1]) - origin, origin]
+            let [x, y] = sides;
+            let origin = depth(x.low, y.low);
+            [depth(x.low + 2.0 * x.half, y.low) - origin, depth(x.low, y.low + 2.0 * y.half) - origin, origin]
         });
-        Self { map_from_world, ground }
+        Self { map_from_world, ground, axes, sides }
     }
+
+    /// The longer side of a texel, in scene units.
+    pub(super) fn texel(&self, size: f64) -> f64 {
+        2.0 * self.sides[0].half.max(self.sides[1].half) / size
+    }
+}
+
+/// The yardstick of the box. Bounds of no size get some, that f32 still tells apart where they are.
+fn diagonal(fit: &Fit) -> f64 {
+    fit.bounds.diagonal().max(1e-6).max(1e-6 * fit.bounds.centre().coords.amax())
+}
+
+/// z of light space at the planes nearest to the sun and farthest from it, in whole steps as the sides are.
+fn depths(fit: &Fit, corners: &[f64; 8], sides: &[Side; 2], plane: Option<[f64; 3]>) -> (f64, f64) {
+    let diagonal = diagonal(fit);
+    let near = corners.iter().copied().fold(f64::NEG_INFINITY, f64::max) + 0.01 * diagonal;
+    let mut far = corners.iter().copied().fold(f64::INFINITY, f64::min);
+    for corner in 0..4 {
+        let at = |axis: usize| sides[axis].low + if corner >> axis & 1 == 0 { 0.0 } else { 2.0 * sides[axis].half };
+        let meets = plane.map_or(far, |[a, b, c]| a * at(0) + b * at(1) + c);
+        far = far.min(meets.max(near - REACH * diagonal));
+    }
+    let step = diagonal.log2().floor().exp2() / 64.0;
+    ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
 }
 
 /// x, y and z of light space. With the sun straight up, "up in the world" says nothing, and any y will do.
@@ -141,13 +180,50 @@ mod tests {
         assert!(centre.iter().all(|number| (0.0..=1.0).contains(number)), "{centre}");
     }
 
+    /// Where a fixed point falls between the texels of the map, over bounds that sway and grow slowly: the most that it
+    /// moves from step to step, in texels, but for the steps at which the map takes another rung; and their number.
+    fn crawl(place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
+        let mut fit = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
+        let (mut last, mut most, mut jumps): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
+        for step in 0..400 {
+            let sway = f64::from(step) * 0.3;
+            fit.bounds.max = [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
+            let at = place(&fit).map(|number| number * fit.size);
+            let width = LightBox::fit(&fit).sides[0].half + LightBox::fit(&fit).sides[1].half;
+            if let Some((before, was)) = last {
+                let moved = |axis: usize| (at[axis] - before[axis] - (at[axis] - before[axis]).round()).abs();
+                if was == width { most = most.max(moved(0)).max(moved(1)) } else { jumps += 1 }
+            }
+            last = Some((at, width));
+        }
+        (most, jumps)
+    }
+
     #[test]
-    fn a_small_sway_does_not_move_the_texels() {
-        let still = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
-        let mut swayed = still;
-        swayed.bounds.max[0] += 1e-4;
-        let (still, swayed) = (LightBox::fit(&still), LightBox::fit(&swayed));
-        let shift = (still.map_from_world.column(0) - swayed.map_from_world.column(0)).norm();
-        assert!(shift < 1e-3 * still.map_from_world.column(0).norm(), "{shift}");
+    fn texels_stay_where_they_are_in_the_world_while_the_bounds_sway_and_grow() {
+        let point = Point3::new(0.3, 1.1, -0.7);
+        let (most, jumps) = crawl(|fit| {
+            let at = LightBox::fit(fit).map_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
+            [at.x, at.y]
+        });
+        assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs");
+        let (most, _) = crawl(|fit| {
+            let axes = axes(fit.to_sun, fit.up);
+            [0, 1].map(|axis| {
+                let ends = fit.bounds.corners().map(|corner| axes[axis].dot(&corner.coords));
+                let low = ends.into_iter().fold(f64::INFINITY, f64::min);
+                let high = ends.into_iter().fold(f64::NEG_INFINITY, f64::max);
+                (axes[axis].dot(&point.coords) - low) / (high - low)
+            })
+        });
+        assert!(most > 0.3, "control: a box fitted tightly moves its texels by {most}");
+    }
+
+    #[test]
+    fn a_box_holds_what_it_is_fitted_to_whatever_its_length_and_wastes_a_sixteenth() {
+        for step in -200..200 {
+            let length = 1.37_f64.powi(step);
+            assert!(rung(length) > length && rung(length) <= length * 1.0626, "{length}: {}", rung(length));
+        }
     }
 }

@@ -3,11 +3,15 @@
 //! | pass | what it does | runs when |
 //! |---|---|---|
 //! | shadow | depth from the sun; cut-outs leave holes | the look has a shadow |
-//! | blur | depth to moments, blurred in x, then in y (compute) | the look has a shadow |
-//! | opaque | Phong, colour and normal maps; mask discards | some triangle is not blended |
-//! | sky, ground | gradient; plane that receives the shadow and fades into the horizon | always; the look has a ground |
-//! | blended | the same shading over what is there, no depth written | some triangle is blended |
-//! | encode | four samples to one sRGB pixel, top row first (compute) | always |
+//! | blur | depth to moments, blurred in x and in y (compute) | that shadow is a variance map |
+//! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
+//! | ground | the same of the ground | the look has a ground, and the camera is above it |
+//! | blended | light of the blended triangles over each other, no depth written | some triangle is blended |
+//! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
+//! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
+//! | encode | light to sRGB bytes, top row first (compute) | always |
+//!
+//! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
 
 mod device;
 mod egl;
@@ -19,7 +23,10 @@ mod passes;
 mod plan;
 mod programs;
 mod scene_buffers;
+mod seen;
 mod shaders;
+mod shadow;
+mod splits;
 mod target;
 mod textures;
 
@@ -29,12 +36,14 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 pub use self::device::{EglDevice, devices};
+pub use self::frame::shadow_texel;
 use self::gl::{Gl, Program};
 pub use self::plan::{Allocation, Plan, Saving, plan};
 use self::scene_buffers::Apart;
 pub use self::scene_buffers::SceneBuffers;
+pub use self::seen::Seen;
 use self::shaders::Source;
-use self::target::Target;
+use self::target::{Form, Target};
 use crate::deform::Surface;
 use crate::error::{Result, during, invalid};
 use crate::scene::{Bounds, Camera, Scene};
@@ -81,7 +90,8 @@ pub struct Image {
     pub width: u32,
     pub height: u32,
     pub rgba: Vec<u8>,
-    /// Milliseconds per pass, by the name of the stage: "shadow", "draw", "read".
+    /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "blur" of the shadow,
+    /// "visibility" (with the ground), "blended", "shade" (with the backdrop) and "encode" of drawing.
     pub passes: Vec<(&'static str, f64)>,
 }
 
@@ -101,7 +111,7 @@ pub struct SharedBuffers {
 pub struct Ran {
     /// Passes, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the opaque and blended passes.
+    /// Draw calls of the visibility and blended passes.
     pub draws: usize,
     /// Samples a pixel.
     pub samples: u32,
@@ -109,7 +119,7 @@ pub struct Ran {
 
 /// The largest side of a frame, whatever the device can do.
 const MAX_SIDE: u32 = 8192;
-/// Frame sizes whose images are kept.
+/// Forms of frames whose images are kept.
 const TARGETS: usize = 4;
 /// Programs that are kept for scenes to come.
 const PROGRAMS: usize = 128;
@@ -122,6 +132,7 @@ pub struct Renderer {
     info: Info,
     gl: Rc<Gl>,
     programs: HashMap<Source, Rc<Program>>,
+    sample_places: Vec<[f32; 2]>,
     /// The most recently used last.
     targets: Vec<Target>,
     ran: Ran,
@@ -141,7 +152,8 @@ impl Renderer {
             cuda_device,
             max_side: gl.limits.max_side.min(MAX_SIDE),
         };
-        Ok(Self { info, gl, programs: HashMap::new(), targets: Vec::new(), ran: Ran::default() })
+        let sample_places = target::sample_places(&gl)?;
+        Ok(Self { info, gl, programs: HashMap::new(), sample_places, targets: Vec::new(), ran: Ran::default() })
     }
 
     /// What draws.
@@ -159,12 +171,12 @@ impl Renderer {
     /// # Errors
     /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
-        let gl = Rc::clone(&self.gl);
-        let samples = target::most_samples(&gl);
+        let (gl, places) = (Rc::clone(&self.gl), self.sample_places.clone());
         if self.programs.len() > PROGRAMS {
             self.programs.clear();
         }
-        let buffers = SceneBuffers::new(&gl, scene, samples, &mut |source| self.program(source))?;
+        let compile: &mut programs::Compile<'_> = &mut |source| self.program(source);
+        let buffers = SceneBuffers::new(&gl, scene, &places, compile)?;
         gl.check("load").map(|()| buffers)
     }
 
@@ -207,7 +219,7 @@ impl Renderer {
         }
         let apart = match buffers.apart.take() {
             Some(apart) => apart,
-            None => Apart::new(&self.gl, bytes)?,
+            None => Apart::new(&self.gl, buffers)?,
         };
         apart.buffer.write(bytemuck::cast_slice(positions));
         buffers.apart = Some(apart);
@@ -227,17 +239,29 @@ impl Renderer {
             return Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given));
         }
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
-        self.make_room(shot.width, shot.height)?;
+        let look = &buffers.scene.look;
+        let form = Form::new(&self.gl, [shot.width, shot.height], look.samples, buffers.scene.needs.blend);
+        self.make_room(form)?;
+        let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
+        let encode = self.program(shaders::encode())?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let gl = &self.gl;
-        let mut ran = Ran { samples: target.samples, ..Ran::default() };
+        let mut ran = Ran { samples: form.samples, ..Ran::default() };
         buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
+        if let Some(splits) = buffers.buffers.get("splits") {
+            let fit = frame::sun_fit(&buffers.scene, shot, buffers.origin);
+            splits.write(bytemuck::bytes_of(&splits::Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
+        }
         let shadow = gl.timed(|| passes::shadow(gl, buffers, &mut ran))?;
-        let draw = gl.timed(|| {
-            passes::draw(gl, buffers, target, shot, &mut ran)?;
-            passes::encode(gl, target, &mut ran)
+        let blur = gl.timed(|| passes::blur(gl, buffers, &mut ran))?;
+        let visibility = gl.timed(|| {
+            passes::visibility(gl, buffers, target, &sampled, &mut ran)?;
+            passes::ground(gl, buffers, shot, &mut ran)
         })?;
+        let blended = gl.timed(|| passes::blended(gl, buffers, target, &mut ran))?;
+        let shade = gl.timed(|| passes::shade(gl, buffers, target, &sampled, &mut ran))?;
+        let encode = gl.timed(|| passes::encode(gl, target, &encode, &mut ran))?;
         let bytes = 4 * shot.width as usize * shot.height as usize;
         let copy = gl.timed(|| {
             gl.copy(&target.packed, &target.staging, bytes as u64);
@@ -247,23 +271,46 @@ impl Renderer {
         let begin = Instant::now();
         let rgba = target.staging.read(bytes)?;
         let mapped = begin.elapsed().as_secs_f64() * 1e3;
-        let passes = vec![("shadow", shadow.ms()), ("draw", draw.ms()), ("read", copy.ms() + mapped)];
+        let drawn = [("visibility", visibility), ("blended", blended), ("shade", shade), ("encode", encode)];
+        let drawn = drawn.map(|(name, stopwatch)| (name, stopwatch.ms()));
+        let blur = blur.ms();
+        let mut passes = vec![("shadow", shadow.ms() + blur), ("blur", blur)];
+        passes.push(("draw", drawn.iter().map(|(_, ms)| ms).sum()));
+        passes.extend(drawn);
+        passes.push(("read", copy.ms() + mapped));
         gl.check("read")?;
         self.ran = ran;
         Ok(Image { width: shot.width, height: shot.height, rgba, passes })
     }
 
-    /// Puts the images for frames of this size last in the list, made if need be.
-    fn make_room(&mut self, width: u32, height: u32) -> Result<()> {
-        if let Some(at) = self.targets.iter().position(|target| (target.width, target.height) == (width, height)) {
+    /// What the first sample of each pixel of the last frame sees, top row first.
+    ///
+    /// # Errors
+    /// `Fault` when no frame was drawn, or the device does not finish.
+    pub fn seen(&mut self) -> Result<Vec<Seen>> {
+        let nothing = || during("seen")("no frame was drawn");
+        let samples = self.targets.last().ok_or_else(nothing)?.form.samples;
+        let program = self.program(shaders::seen(samples))?;
+        let target = self.targets.last().ok_or_else(nothing)?;
+        passes::seen(&self.gl, target, &program)?;
+        let bytes = 4 * target.form.width as usize * target.form.height as usize;
+        self.gl.copy(&target.packed, &target.staging, bytes as u64);
+        self.gl.wait("seen", WATCHDOG)?;
+        let words = target.staging.read(bytes)?;
+        let id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
+        Ok(words.chunks_exact(4).map(|word| Seen::from_id(id(word))).collect())
+    }
+
+    /// Puts the images for frames of this form last in the list, made if need be.
+    fn make_room(&mut self, form: Form) -> Result<()> {
+        if let Some(at) = self.targets.iter().position(|target| target.form == form) {
             self.targets[at..].rotate_left(1);
             return Ok(());
         }
         if self.targets.len() >= TARGETS {
             self.targets.remove(0);
         }
-        let encode = self.program(shaders::encode(target::samples(&self.gl, width, height)))?;
-        self.targets.push(Target::new(&self.gl, width, height, encode)?);
+        self.targets.push(Target::new(&self.gl, form)?);
         Ok(())
     }
 

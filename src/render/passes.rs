@@ -1,29 +1,37 @@
-//! The passes of one frame, in order: shadow, blur, opaque, sky, ground, blended, encode.
+//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade, encode.
 
 use super::frame::{Frame, above_ground};
 use super::geometry::Kind;
-use super::gl::{Fixed, Gl, Program};
-use super::programs::DrawGroup;
-use super::scene_buffers::{MATERIAL_BYTES, SceneBuffers};
+use super::gl::{Clear, Fixed, Gl, Program};
+use super::programs::Sampled;
+use super::scene_buffers::SceneBuffers;
 use super::shaders::{
-    COLOUR_UNIT, LANES, MATERIAL_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TRIANGLE_MATERIAL_UNIT,
+    COLOUR_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE, TILE_ROW,
 };
+use super::splits::Splits;
 use super::target::Target;
 use super::{Ran, Shot};
 use crate::error::Result;
 
 const PIXELS: u32 = 0;
+const TILES: u32 = 1;
+/// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
+const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
-const MATERIAL: u32 = 1;
+const SPLITS: u32 = 2;
+/// Nothing is blended yet: no light, and all that lies behind comes through.
+const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 /// Binds what all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     buffers.drawn_positions().bind(POSITION_UNIT);
-    buffers.views.materials.bind(MATERIAL_UNIT);
-    if let Some(view) = &buffers.views.triangle_materials {
-        view.bind(TRIANGLE_MATERIAL_UNIT);
+    for (unit, view) in &buffers.views.others {
+        view.bind(*unit);
     }
     buffers.buffer("frame")?.bind_uniform(FRAME, 0, size_of::<Frame>());
+    if let Ok(splits) = buffers.buffer("splits") {
+        splits.bind_uniform(SPLITS, 0, size_of::<Splits>());
+    }
     for (unit, texture) in (COLOUR_UNIT..).zip(&buffers.colours) {
         texture.bind(unit);
     }
@@ -33,108 +41,124 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     Ok(())
 }
 
-/// Depth from the sun, then its blurred moments.
+/// Depth from the sun.
 pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
-    let (Some(map), Some([blur_x, blur_y])) = (&buffers.shadow, &buffers.programs.blur) else { return Ok(()) };
-    gl.begin(&map.framebuffer, map.size, map.size);
-    gl.set(Fixed { depth_write: true, ..Fixed::default() });
-    for drawn in &buffers.groups {
-        if let Some(program) = &drawn.shadow {
-            bind_material(buffers, drawn, program, drawn.group.kind != Kind::Opaque)?;
-            gl.draw_indexed(&buffers.casters, drawn.group.first_triangle, drawn.group.triangles);
-        }
-    }
+    let Some(map) = &buffers.shadow else { return Ok(()) };
+    super::shadow::depth(gl, buffers, map)?;
     ran.passes.push("shadow");
-    gl.check("shadow")?;
-    let runs = map.size.div_ceil(RUN);
-    let along_x = (blur_x, &map.depth, &map.half_blurred, [runs.div_ceil(LANES), map.size]);
-    let along_y = (blur_y, &map.half_blurred, &map.moments, [map.size.div_ceil(LANES), runs]);
-    for (program, from, to, groups) in [along_x, along_y] {
-        program.bind(None);
-        from.bind(0);
-        to.bind_image(0);
-        gl.dispatch(groups[0], groups[1]);
-    }
-    ran.passes.push("blur");
-    gl.check("blur")
+    Ok(())
 }
 
-/// The picture, in linear light.
-pub(super) fn draw(gl: &Gl, buffers: &SceneBuffers, target: &Target, shot: &Shot, ran: &mut Ran) -> Result<()> {
-    let programs = &buffers.programs;
-    gl.begin(&target.framebuffer, target.width, target.height);
-    if let Some(map) = &buffers.shadow {
-        map.moments.bind(SHADOW_UNIT);
-    }
-    if surfaces(gl, buffers, target, &[Kind::Opaque, Kind::Mask], ran)? {
-        ran.passes.push("opaque");
-        gl.check("opaque")?;
-    }
-    gl.set(Fixed { depth_clamp: true, ..Fixed::default() });
-    made(gl, buffers, &programs.sky, 3);
-    ran.passes.push("sky");
-    gl.check("sky")?;
-    if let Some(program) = programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) {
-        gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
-        made(gl, buffers, program, 6);
-        ran.passes.push("ground");
-        gl.check("ground")?;
-    }
-    if surfaces(gl, buffers, target, &[Kind::Blend], ran)? {
-        ran.passes.push("blended");
-        gl.check("blended")?;
+/// What the map of a method that needs it has besides depth: blurred moments.
+pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
+    let Some(map) = &buffers.shadow else { return Ok(()) };
+    if super::shadow::blur(gl, buffers, map)? {
+        ran.passes.push("blur");
     }
     Ok(())
 }
 
-/// Samples to bytes, and the bytes to where the host can read them.
-pub(super) fn encode(gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
-    target.encode.bind(None);
-    target.colour.bind(0);
+/// What each sample sees: ids and depth.
+pub(super) fn visibility(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    target: &Target,
+    sampled: &Sampled,
+    ran: &mut Ran,
+) -> Result<()> {
+    gl.begin(&target.visible, target.form.width, target.form.height, Clear::DepthAndIds);
+    // What is cut out comes last: where something stands before it, nothing is sampled.
+    let kinds = [(Kind::Opaque, &buffers.programs.opaque), (Kind::Mask, &sampled.mask)];
+    let written = Fixed { depth_write: true, ..Fixed::default() };
+    let mut any = false;
+    for (kind, program) in kinds {
+        if let Some(program) = program {
+            draw(gl, buffers, (kind, program), written, ran);
+            any = true;
+        }
+    }
+    if any {
+        ran.passes.push("visibility");
+    }
+    gl.check("visibility")
+}
+
+/// The ground as one more thing that samples see.
+pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
+    let Some(program) = buffers.programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) else {
+        return Ok(());
+    };
+    gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
+    program.bind(None);
+    gl.draw_made(&buffers.nothing, 6);
+    ran.passes.push("ground");
+    gl.check("ground")
+}
+
+/// The layer of the blended triangles, before what is opaque.
+pub(super) fn blended(gl: &Gl, buffers: &SceneBuffers, target: &Target, ran: &mut Ran) -> Result<()> {
+    let (Some(program), Some(layer)) = (&buffers.programs.blended, &target.layer) else { return Ok(()) };
+    gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
+    bind_shadow(buffers);
+    draw(gl, buffers, (Kind::Blend, program), Fixed { blend: true, ..Fixed::default() }, ran);
+    ran.passes.push("blended");
+    gl.check("blended")
+}
+
+/// What is seen to linear light.
+pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
+    bind_shadow(buffers);
+    target.ids.bind(ID_UNIT);
+    if let Some(layer) = &target.layer {
+        layer.colour.bind(LAYER_UNIT);
+    }
+    target.picture.bind_image(0);
+    target.tiles.write(bytemuck::cast_slice(&NO_TILES));
+    target.tiles.bind_storage(TILES);
+    sampled.backdrop.bind(None);
+    gl.dispatch(target.form.width.div_ceil(TILE), target.form.height.div_ceil(TILE));
+    ran.passes.push("backdrop");
+    gl.check("backdrop")?;
+    if let Some(program) = &sampled.shade {
+        program.bind(None);
+        gl.dispatch_listed(&target.tiles);
+        ran.passes.push("shade");
+    }
+    gl.check("shade")
+}
+
+/// Light to bytes, where the host can read them.
+pub(super) fn encode(gl: &Gl, target: &Target, program: &Program, ran: &mut Ran) -> Result<()> {
+    program.bind(None);
+    target.picture.bind(0);
     target.packed.bind_storage(PIXELS);
-    gl.dispatch(target.width.div_ceil(LANES), target.height);
+    gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
     ran.passes.push("encode");
     gl.check("encode")
 }
 
-/// Draws the groups of these kinds; whether there were any.
-fn surfaces(gl: &Gl, buffers: &SceneBuffers, target: &Target, kinds: &[Kind], ran: &mut Ran) -> Result<bool> {
-    let before = ran.draws;
-    for drawn in buffers.groups.iter().filter(|drawn| kinds.contains(&drawn.group.kind)) {
-        let group = &drawn.group;
-        let single = drawn.surface_single.as_ref().filter(|_| target.samples == 1);
-        let program = single.unwrap_or(&drawn.surface);
-        gl.set(Fixed {
-            depth_write: group.kind != Kind::Blend,
-            cull: !group.double_sided,
-            blend: group.kind == Kind::Blend,
-            coverage: group.kind == Kind::Mask && target.samples > 1,
-            ..Fixed::default()
-        });
-        bind_material(buffers, drawn, program, true)?;
-        gl.draw_indexed(&buffers.corners, group.first_triangle, group.triangles);
+/// Ids of each pixel's first sample, where the host can read them.
+pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
+    program.bind(None);
+    target.ids.bind(ID_UNIT);
+    target.packed.bind_storage(PIXELS);
+    gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
+    gl.check("seen")
+}
+
+/// Draws the triangles of one kind: a call for those with one side, and one for those with two.
+fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), fixed: Fixed, ran: &mut Ran) {
+    let Some(array) = buffers.array(kind) else { return };
+    for group in buffers.groups.iter().filter(|group| group.kind == kind) {
+        gl.set(Fixed { cull: !group.double_sided, ..fixed });
+        program.bind(Some(group.first_triangle as u32));
+        gl.draw_indexed(array, group.first_triangle, group.triangles);
         ran.draws += 1;
     }
-    Ok(ran.draws > before)
 }
 
-fn made(gl: &Gl, buffers: &SceneBuffers, program: &Program, vertices: u32) {
-    program.bind(None);
-    gl.draw_made(&buffers.nothing, vertices);
-}
-
-/// Uses a program, with the one material of the group, or with the place where its triangles begin.
-fn bind_material(buffers: &SceneBuffers, drawn: &DrawGroup, program: &Program, reads_it: bool) -> Result<()> {
-    if let Some(material) = drawn.group.material {
-        buffers.buffer("materials")?.bind_uniform(MATERIAL, MATERIAL_BYTES * material, MATERIAL_BYTES);
+fn bind_shadow(buffers: &SceneBuffers) {
+    if let Some(map) = &buffers.shadow {
+        map.lookup().bind(SHADOW_UNIT);
     }
-    if let Some(colour) = drawn.colour {
-        buffers.colours[colour].bind(COLOUR_UNIT);
-    }
-    if let Some(normal) = drawn.normal {
-        buffers.normals[normal].bind(NORMAL_UNIT);
-    }
-    let looks_up = reads_it && drawn.group.material.is_none();
-    program.bind(looks_up.then_some(drawn.group.first_triangle as u32));
-    Ok(())
 }

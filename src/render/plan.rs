@@ -3,7 +3,8 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
-use super::geometry::{Kind, groups, looks_up};
+use super::geometry::{Kind, groups, looks_up, used_materials};
+use super::shadow::fitting;
 use super::textures::{Use, arrays};
 use crate::scene::{Scene, Shadow};
 
@@ -36,7 +37,7 @@ pub struct Plan {
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the opaque and blended passes together; the number of domains does not matter.
+    /// Draw calls of the visibility and blended passes together, six at most: domains and materials do not matter.
     pub draws: usize,
     /// Branches that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -55,24 +56,33 @@ impl Plan {
     }
 }
 
-/// What a scene needs of the device.
+/// What a scene needs of a GPU.
 pub fn plan(scene: &Scene) -> Plan {
+    planned(scene, false)
+}
+
+/// What a scene needs of a device, which may be a rasteriser in software.
+pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
     let (groups, _) = groups(scene);
     let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
     let mut passes = Vec::new();
-    if scene.needs.shadows {
-        passes.extend(["shadow", "blur"]);
+    if let Some(shadow) = scene.look.shadow {
+        passes.push("shadow");
+        passes.extend(shadow.has_moments().then_some("blur"));
     }
     if has(Kind::Opaque) || has(Kind::Mask) {
-        passes.push("opaque");
+        passes.push("visibility");
     }
-    passes.push("sky");
     passes.extend(scene.look.ground.map(|_| "ground"));
     passes.extend(scene.needs.blend.then_some("blended"));
+    passes.push("backdrop");
+    if has(Kind::Opaque) || has(Kind::Mask) {
+        passes.push("shade");
+    }
     passes.push("encode");
     Plan {
         buffers: buffers(scene),
-        textures: textures(scene),
+        textures: textures(scene, software),
         passes,
         draws: groups.len(),
         defines: defines(scene),
@@ -89,11 +99,14 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     let mut buffers = vec![
         named("positions", 12 * layout.vertices),
         named("normals", 12 * layout.corners),
-        named("corner vertices", 4 * layout.corners),
         named("triangles", 12 * layout.triangles),
-        named("materials", super::scene_buffers::MATERIAL_BYTES * scene.materials.len()),
+        named("triangle vertices", 12 * layout.triangles),
+        named("materials", super::scene_buffers::MATERIAL_BYTES * used_materials(scene).len()),
         named("frame", size_of::<super::frame::Frame>()),
     ];
+    if scene.needs.mask || scene.needs.blend {
+        buffers.push(named("corner vertices", 4 * layout.corners));
+    }
     if scene.needs.normal_maps {
         buffers.push(named("tangents", 16 * layout.corners));
     }
@@ -103,10 +116,13 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     if looks_up(scene) {
         buffers.push(named("triangle materials", 4 * layout.triangles));
     }
+    if scene.look.shadow.is_some_and(|shadow| shadow.splits > 1) {
+        buffers.push(named("splits", size_of::<super::splits::Splits>()));
+    }
     buffers
 }
 
-fn textures(scene: &Scene) -> Vec<Allocation> {
+fn textures(scene: &Scene, software: bool) -> Vec<Allocation> {
     let mut textures = Vec::new();
     for (purpose, word) in [(Use::Colour, "colours"), (Use::Normal, "normals")] {
         for array in arrays(scene, purpose) {
@@ -115,18 +131,15 @@ fn textures(scene: &Scene) -> Vec<Allocation> {
         }
     }
     if let Some(shadow) = scene.look.shadow {
-        textures.extend(shadow_textures(shadow));
+        textures.extend(shadow_textures(fitting(shadow, software)));
     }
     textures
 }
 
-fn shadow_textures(shadow: Shadow) -> [Allocation; 3] {
+fn shadow_textures(shadow: Shadow) -> Vec<Allocation> {
     let texels = shadow.size as usize * shadow.size as usize;
-    [
-        named("shadow depth", 4 * texels),
-        named("shadow moments, blurred in x", 8 * texels),
-        named("shadow moments", 8 * texels),
-    ]
+    let named = |(name, bytes, layers): (&'static str, u32, u32)| named(name, (bytes * layers) as usize * texels);
+    super::shadow::textures(&shadow).into_iter().map(named).collect()
 }
 
 fn defines(scene: &Scene) -> Vec<&'static str> {
@@ -136,9 +149,11 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("NORMAL_MAPS", needs.normal_maps),
         ("UVS", needs.textures || needs.normal_maps),
         ("LOOK_UP", looks_up(scene)),
-        ("SHADOWS", needs.shadows),
+        ("GROUND_SEEN", scene.look.ground.is_some()),
+        ("LAYERS", needs.blend),
     ];
-    branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
+    let shadows = scene.look.shadow.iter().flat_map(super::shadow::defines);
+    branches.into_iter().filter_map(|(name, on)| on.then_some(name)).chain(shadows).collect()
 }
 
 fn left_out(scene: &Scene) -> Vec<Saving> {
@@ -149,16 +164,10 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
     let all = [
         (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
         (needs.textures, "textures", uvs, vec![], "no colour lookup"),
-        (needs.mask, "mask", 0, vec![], "no discard; the shadow of opaque triangles needs no fragment shader"),
-        (needs.blend, "blend", 0, vec!["blended"], "no blended variant"),
+        (needs.mask, "mask", 0, vec![], "no discard, no sample mask; depth needs no fragment shader"),
+        (needs.blend, "blend", 0, vec!["blended"], "no layers in the shading, 8 bytes a sample less"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
-        (
-            looks_up(scene),
-            "many materials",
-            4 * layout.triangles as u64,
-            vec![],
-            "a draw call for each material, no lookup per triangle",
-        ),
+        (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (scene.look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
     ];
     let unneeded = all.into_iter().filter(|row| !row.0);
@@ -167,7 +176,6 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::geometry::DRAWN_APART;
     use super::super::geometry::tests::squares;
     use super::*;
     use crate::domain::{AlphaMode, Material, Texture};
@@ -177,12 +185,11 @@ mod tests {
     }
 
     fn everything() -> crate::scene::Parts {
-        let mut materials = vec![
+        let materials = vec![
             Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
             Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
         ];
-        materials.resize(DRAWN_APART + 1, Material::default());
         let mut parts = squares(materials);
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
         parts
@@ -195,20 +202,30 @@ mod tests {
         parts.look.ground = None;
         let scene = Scene::new(parts).expect("good");
         let plan = plan(&scene);
-        assert_eq!(plan.passes, ["opaque", "sky", "encode"]);
-        let expected = ["positions", "normals", "corner vertices", "triangles", "materials", "frame"];
+        assert_eq!(plan.passes, ["visibility", "backdrop", "shade", "encode"]);
+        let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame"];
         assert_eq!(names(&plan.buffers), expected);
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
         assert_eq!(left, ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"]);
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
-        assert_eq!(plan.left_out[4].bytes, 20 * 1024 * 1024, "map and moments");
+        assert_eq!(plan.left_out[4].bytes, 12 * 1024 * 1024, "map and moments");
+    }
+
+    #[test]
+    fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
+        let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, ..Material::default() }]);
+        parts.look.shadow = None;
+        let plan = plan(&Scene::new(parts).expect("good"));
+        assert_eq!(plan.passes, ["ground", "blended", "backdrop", "encode"]);
+        assert_eq!((plan.draws, plan.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
+        assert_eq!(plan.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
     }
 
     #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
         let plan = plan(&Scene::new(everything()).expect("good"));
-        assert_eq!(plan.passes, ["shadow", "blur", "opaque", "sky", "ground", "blended", "encode"]);
+        assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
         assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
         assert_eq!(plan.textures[0], Allocation { name: "colours 1 x 1 x 1".into(), bytes: 4 });

@@ -1,4 +1,4 @@
-//! The programs of a scene: those of the passes, and for each draw group the ones with the branches its material needs.
+//! The programs of a scene: those of its passes, with the branches that its materials need.
 
 use std::rc::Rc;
 
@@ -6,74 +6,68 @@ use super::geometry::{Group, Kind};
 use super::gl::Program;
 use super::plan::Plan;
 use super::shaders::{Options, Source};
-use super::textures::{Array, place};
 use crate::error::Result;
-use crate::scene::Scene;
 
 /// Gives the program of a source, compiled or shared.
 pub(super) type Compile<'a> = dyn FnMut(Source) -> Result<Rc<Program>> + 'a;
 
-/// Programs of whole passes; absent where the scene has no such pass.
+/// Programs whatever the samples a pixel; absent where the scene has no such pass or triangles.
 #[derive(Debug)]
 pub(super) struct Programs {
-    pub(super) blur: Option<[Rc<Program>; 2]>,
+    /// In order; none where the map has no moments.
+    pub(super) blur: Vec<Rc<Program>>,
+    /// Casters of each kind.
+    pub(super) shadow: [Option<Rc<Program>>; 3],
+    pub(super) opaque: Option<Rc<Program>>,
     pub(super) ground: Option<Rc<Program>>,
-    pub(super) sky: Rc<Program>,
+    pub(super) blended: Option<Rc<Program>>,
 }
 
-/// A draw group with its programs and the arrays of its material's images.
-#[derive(Debug)]
-pub(super) struct DrawGroup {
-    pub(super) group: Group,
-    pub(super) surface: Rc<Program>,
-    /// For pictures of one sample a pixel, where that makes a difference.
-    pub(super) surface_single: Option<Rc<Program>>,
-    pub(super) shadow: Option<Rc<Program>>,
-    /// Indices among the scene's arrays; none when triangles look their materials up, for then all arrays are bound.
-    pub(super) colour: Option<usize>,
-    pub(super) normal: Option<usize>,
+/// Programs for one number of samples a pixel.
+#[derive(Debug, Clone)]
+pub(super) struct Sampled {
+    pub(super) samples: u32,
+    pub(super) mask: Option<Rc<Program>>,
+    pub(super) backdrop: Rc<Program>,
+    pub(super) shade: Option<Rc<Program>>,
 }
 
 impl Programs {
-    pub(super) fn compile(options: &Options, plan: &Plan, compile: &mut Compile<'_>) -> Result<Self> {
+    pub(super) fn compile(options: &Options, plan: &Plan, groups: &[Group], compile: &mut Compile<'_>) -> Result<Self> {
         let has = |pass: &str| plan.passes.contains(&pass);
+        let blurs = if has("blur") { options.blur() } else { vec![] };
+        let blur = blurs.into_iter().map(&mut *compile).collect::<Result<_>>()?;
+        let mut when = |wanted: bool, source: &dyn Fn() -> Source| match wanted {
+            true => compile(source()).map(Some),
+            false => Ok(None),
+        };
+        let any = |kind: Kind| groups.iter().any(|group| group.kind == kind);
+        let mut caster = |kind: Kind| when(has("shadow") && any(kind), &|| options.shadow(kind));
+        let shadow = [caster(Kind::Opaque)?, caster(Kind::Mask)?, caster(Kind::Blend)?];
         Ok(Self {
-            blur: match has("blur") {
-                true => Some([compile(options.blur(true))?, compile(options.blur(false))?]),
-                false => None,
-            },
-            ground: if has("ground") { Some(compile(options.ground())?) } else { None },
-            sky: compile(options.sky())?,
+            blur,
+            shadow,
+            opaque: when(any(Kind::Opaque), &|| options.visibility(Kind::Opaque, 1))?,
+            ground: when(has("ground"), &|| options.ground())?,
+            blended: when(has("blended"), &|| options.blended())?,
         })
     }
 }
 
-impl DrawGroup {
+impl Sampled {
     pub(super) fn compile(
-        scene: &Scene,
-        group: Group,
-        images: &[Vec<Array>; 2],
         options: &Options,
+        groups: &[Group],
+        samples: u32,
         compile: &mut Compile<'_>,
     ) -> Result<Self> {
-        let material = group.material.map(|material| &scene.materials[material]);
-        let array = |arrays: &[Array], texture: Option<usize>| {
-            texture.and_then(|texture| place(arrays, texture)).map(|(array, _)| array)
-        };
-        let colour = material.and_then(|material| array(&images[0], material.colour_texture));
-        let normal = material.and_then(|material| array(&images[1], material.normal_texture));
-        let own = match material {
-            Some(_) => options.narrowed(colour.is_some(), normal.is_some()),
-            None => options.clone(),
-        };
-        let cut_out = group.kind == Kind::Mask && own.samples > 1;
+        let any = |kind: Kind| groups.iter().any(|group| group.kind == kind);
+        let (cut_out, triangles) = (any(Kind::Mask), any(Kind::Opaque) || any(Kind::Mask));
         Ok(Self {
-            group,
-            surface: compile(own.surface(group.kind, own.samples))?,
-            surface_single: if cut_out { Some(compile(own.surface(group.kind, 1))?) } else { None },
-            shadow: if scene.needs.shadows { Some(compile(own.shadow(group.kind))?) } else { None },
-            colour,
-            normal,
+            samples,
+            mask: if cut_out { Some(compile(options.visibility(Kind::Mask, samples))?) } else { None },
+            backdrop: compile(options.backdrop(samples))?,
+            shade: if triangles { Some(compile(options.shade(samples))?) } else { None },
         })
     }
 }

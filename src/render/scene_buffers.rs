@@ -8,12 +8,13 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::SharedBuffers;
-use super::geometry::Geometry;
-use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Texture, TextureKind, VertexArray};
-use super::plan::{Allocation, Plan, plan};
-use super::programs::{Compile, DrawGroup, Programs};
-use super::shaders::Options;
-use super::textures::{Array, Use, arrays, levels, place};
+use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials};
+use super::gl::{self, Attribute, Buffer, Gl, Texture, TextureKind, VertexArray};
+use super::plan::{Allocation, Plan, planned};
+use super::programs::{Compile, Programs, Sampled};
+use super::shaders::{self, OTHER_READS, Options, Used};
+use super::shadow::{ShadowMap, fitting};
+use super::textures::{Array, Use, arrays, levels, place, within_budget};
 use crate::domain::AlphaMode;
 use crate::error::{Result, during};
 use crate::scene::Scene;
@@ -26,12 +27,10 @@ struct PackedMaterial {
     diffuse_cutoff: [f32; 4],
     specular_exponent: [f32; 4],
     images: [f32; 4],
-    /// A uniform block may begin at any multiple of 256 bytes.
-    gap: [f32; 48],
 }
 
 pub(super) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
-const _: () = assert!(MATERIAL_BYTES == 256, "PackedMaterial differs from shaders/shared/material.glsl");
+const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
 
 /// A scene's buffers, textures and programs on the device; freed when dropped.
 #[derive(Debug)]
@@ -41,15 +40,21 @@ pub struct SceneBuffers {
     pub(super) scene: Arc<Scene>,
     pub(super) buffers: BTreeMap<String, Buffer>,
     pub(super) views: Views,
-    pub(super) groups: Vec<DrawGroup>,
-    pub(super) corners: VertexArray,
-    pub(super) casters: VertexArray,
+    pub(super) groups: Vec<Group>,
+    /// What opaque triangles are made from.
+    solids: VertexArray,
+    /// What the others are made from; absent when there are none.
+    corners: Option<VertexArray>,
     /// No attributes: for triangles that shaders make themselves.
     pub(super) nothing: VertexArray,
     pub(super) colours: Vec<Texture>,
     pub(super) normals: Vec<Texture>,
     pub(super) shadow: Option<ShadowMap>,
     pub(super) programs: Programs,
+    /// For the samples a pixel that the look asks for.
+    sampled: Sampled,
+    options: Options,
+    stretches: Vec<Stretch>,
     /// What positions are relative to, in scene units from the scene's origin.
     pub(super) origin: [f64; 3],
     /// Positions that are drawn in place of the shared ones.
@@ -62,72 +67,100 @@ pub struct SceneBuffers {
 pub(super) struct Apart {
     pub(super) buffer: Buffer,
     view: Texture,
+    solids: VertexArray,
 }
 
 impl Apart {
-    pub(super) fn new(gl: &Rc<Gl>, bytes: u64) -> Result<Self> {
-        let buffer = gl.buffer(bytes, gl::DYNAMIC_DRAW, None)?;
+    pub(super) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
+        let buffer = gl.buffer(scene.buffer("positions")?.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.view(&buffer, gl::RGB32F)?;
-        Ok(Self { buffer, view })
+        let solids = solids(gl, &scene.buffers, &buffer)?;
+        Ok(Self { buffer, view, solids })
     }
 }
 
 /// Buffers that shaders read like textures.
 #[derive(Debug)]
 pub(super) struct Views {
-    pub(super) positions: Texture,
-    pub(super) materials: Texture,
-    pub(super) triangle_materials: Option<Texture>,
-}
-
-#[derive(Debug)]
-pub(super) struct ShadowMap {
-    pub(super) size: u32,
-    pub(super) depth: Texture,
-    pub(super) half_blurred: Texture,
-    pub(super) moments: Texture,
-    pub(super) framebuffer: Framebuffer,
+    positions: Texture,
+    /// Each with its unit.
+    pub(super) others: Vec<(u32, Texture)>,
 }
 
 impl SceneBuffers {
     /// Allocates and fills what the plan of the scene says; `compile` gives programs that may be shared.
-    pub(super) fn new(gl: &Rc<Gl>, scene: &Arc<Scene>, samples: u32, compile: &mut Compile<'_>) -> Result<Self> {
-        let plan = plan(scene);
-        let geometry = Geometry::new(scene);
+    pub(super) fn new(
+        gl: &Rc<Gl>,
+        scene: &Arc<Scene>,
+        sample_places: &[[f32; 2]],
+        compile: &mut Compile<'_>,
+    ) -> Result<Self> {
+        let plan = planned(scene, gl.limits.software);
+        let shadow = scene.look.shadow.map(|shadow| fitting(shadow, gl.limits.software));
         let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
-        let materials = pack(scene, &images);
-        let buffers = allocate(gl, &plan, &geometry, &materials)?;
-        let (views, shared) = (views(gl, scene, &buffers)?, shared(&buffers)?);
-        let (corners, casters) = vertex_arrays(gl, &buffers)?;
+        within_budget(&images)?;
+        let reads = OTHER_READS + images[0].len() + images[1].len();
+        if reads > gl.limits.max_reads as usize {
+            return Err(gl::too_large("textures read by the shading", gl.limits.max_reads.into(), reads as u64));
+        }
+        let geometry = Geometry::new(scene);
+        let buffers = allocate(gl, &plan, &geometry, &pack(scene, &images))?;
+        let (views, shared) = (Views::new(gl, scene, &buffers)?, shared(&buffers)?);
         let options = Options {
             defines: plan.defines.clone(),
-            colour_arrays: images[0].len(),
-            normal_arrays: images[1].len(),
-            blur: scene.look.shadow.unwrap_or_default().blur,
-            samples,
+            used: used(scene, &images),
+            shadow: shadow.unwrap_or_default(),
+            sample_places: sample_places.to_vec(),
         };
-        let groups = geometry.groups.iter();
-        let groups: Result<Vec<DrawGroup>> =
-            groups.map(|group| DrawGroup::compile(scene, *group, &images, &options, compile)).collect();
-        let programs = Programs::compile(&options, &plan, compile)?;
+        let programs = Programs::compile(&options, &plan, &geometry.groups, compile)?;
+        let samples = if sample_places.is_empty() { 1 } else { scene.look.samples };
+        let sampled = Sampled::compile(&options, &geometry.groups, samples, compile)?;
         let [colours, normals] = images;
         Ok(Self {
             shared,
             scene: Arc::clone(scene),
-            buffers,
             views,
-            groups: groups?,
-            corners,
-            casters,
+            solids: solids(gl, &buffers, named(&buffers, "positions")?)?,
+            corners: corners(gl, &buffers)?,
+            buffers,
+            groups: geometry.groups,
             nothing: gl.vertex_array(None, &[])?,
             colours: upload_arrays(gl, scene, &colours, Use::Colour)?,
             normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
-            shadow: scene.look.shadow.map(|shadow| ShadowMap::new(gl, shadow.size)).transpose()?,
+            shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow)).transpose()?,
             programs,
+            sampled,
+            options,
+            stretches: geometry.stretches,
             origin: [0.0; 3],
             apart: None,
             plan,
         })
+    }
+
+    /// The programs of frames of so many samples a pixel; compiled now unless the look asked for that many.
+    pub(super) fn sampled(&self, samples: u32, compile: &mut Compile<'_>) -> Result<Sampled> {
+        match self.sampled.samples == samples {
+            true => Ok(self.sampled.clone()),
+            false => Sampled::compile(&self.options, &self.groups, samples, compile),
+        }
+    }
+
+    /// The triangles of one kind, which follow each other: the first, and how many.
+    pub(super) fn triangles(&self, kind: Kind) -> (usize, usize) {
+        let mut of_kind = self.groups.iter().filter(|group| group.kind == kind);
+        let first = of_kind.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
+        of_kind.fold(first, |(first, count), group| (first, count + group.triangles))
+    }
+
+    /// The domain of a triangle that a frame's ids name (the id less one), and its place in the domain's mesh.
+    pub fn triangle(&self, place: usize) -> Option<(usize, usize)> {
+        if place >= self.scene.layout.triangles {
+            return None;
+        }
+        let after = self.stretches.partition_point(|stretch| stretch.first <= place);
+        let stretch = self.stretches.get(after.checked_sub(1)?)?;
+        Some((stretch.domain, stretch.triangle + place - stretch.first))
     }
 
     /// Says what the positions in the shared buffers are relative to, in scene units from the scene's origin (which they
@@ -140,6 +173,14 @@ impl SceneBuffers {
     /// The positions that are drawn.
     pub(super) fn drawn_positions(&self) -> &Texture {
         self.apart.as_ref().map_or(&self.views.positions, |apart| &apart.view)
+    }
+
+    /// What triangles of a kind are made from, for ids and depth; none without such triangles.
+    pub(super) fn array(&self, kind: Kind) -> Option<&VertexArray> {
+        match kind {
+            Kind::Opaque => Some(self.apart.as_ref().map_or(&self.solids, |apart| &apart.solids)),
+            Kind::Mask | Kind::Blend => self.corners.as_ref(),
+        }
     }
 
     /// The plan that was followed.
@@ -156,7 +197,7 @@ impl SceneBuffers {
 
     /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.
     pub fn texture_count(&self) -> usize {
-        self.colours.len() + self.normals.len() + if self.shadow.is_some() { 3 } else { 0 }
+        self.colours.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
     }
 
     pub(super) fn buffer(&self, name: &'static str) -> Result<&Buffer> {
@@ -182,10 +223,20 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
             diffuse_cutoff: wide(material.diffuse, cutoff),
             specular_exponent: wide(material.specular, material.shininess),
             images: [a, b, c, d],
-            gap: [0.0; 48],
         }
     };
-    scene.materials.iter().map(one).collect()
+    used_materials(scene).into_iter().map(|material| one(&scene.materials[material])).collect()
+}
+
+/// What the shaders must know of each material.
+fn used(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<Used> {
+    let array = |arrays: &[Array], texture: Option<usize>| Some(place(arrays, texture?)?.0);
+    let one = |material: usize| {
+        let material = &scene.materials[material];
+        let (colour, normal) = (array(&images[0], material.colour_texture), array(&images[1], material.normal_texture));
+        Used { kind: kind(material), colour, normal }
+    };
+    used_materials(scene).into_iter().map(one).collect()
 }
 
 fn allocate(
@@ -199,6 +250,7 @@ fn allocate(
         let content: Option<&[u8]> = match allocation.name.as_str() {
             "corner vertices" => Some(bytemuck::cast_slice(&geometry.vertices)),
             "triangles" => Some(bytemuck::cast_slice(&geometry.triangles)),
+            "triangle vertices" => Some(bytemuck::cast_slice(&geometry.triangle_vertices)),
             "uvs" => Some(bytemuck::cast_slice(&geometry.uvs)),
             "triangle materials" => Some(bytemuck::cast_slice(&geometry.materials)),
             "materials" => Some(bytemuck::cast_slice(materials)),
@@ -219,33 +271,49 @@ fn shared(buffers: &BTreeMap<String, Buffer>) -> Result<SharedBuffers> {
     })
 }
 
-fn views(gl: &Rc<Gl>, scene: &Scene, buffers: &BTreeMap<String, Buffer>) -> Result<Views> {
-    let limit = gl.limits.max_texels;
-    for (field, count) in [("scene.vertices", scene.layout.vertices), ("scene.triangles", scene.layout.triangles)] {
-        if count as u64 > limit {
-            return Err(gl::too_large(field, limit, count as u64));
+impl Views {
+    fn new(gl: &Rc<Gl>, scene: &Scene, buffers: &BTreeMap<String, Buffer>) -> Result<Self> {
+        let (limit, layout) = (gl.limits.max_texels, &scene.layout);
+        for (field, count) in
+            [("vertices", layout.vertices), ("corners", layout.corners), ("triangles", layout.triangles)]
+        {
+            if count as u64 > limit {
+                return Err(gl::too_large(&format!("scene.{field}"), limit, count as u64));
+            }
         }
+        let read = [
+            ("materials", shaders::MATERIAL_UNIT, gl::RGBA32F),
+            ("triangle materials", shaders::TRIANGLE_MATERIAL_UNIT, gl::R32UI),
+            ("normals", shaders::CORNER_NORMAL_UNIT, gl::RGB32F),
+            ("triangles", shaders::TRIANGLE_UNIT, gl::RGB32UI),
+            ("triangle vertices", shaders::TRIANGLE_VERTEX_UNIT, gl::RGB32UI),
+            ("uvs", shaders::UV_UNIT, gl::RG32F),
+            ("tangents", shaders::TANGENT_UNIT, gl::RGBA32F),
+        ];
+        let view = |(name, unit, format): (&str, u32, u32)| {
+            buffers.get(name).map(|buffer| Ok((unit, gl.view(buffer, format)?)))
+        };
+        let others: Result<Vec<_>> = read.into_iter().filter_map(view).collect();
+        Ok(Self { positions: gl.view(named(buffers, "positions")?, gl::RGB32F)?, others: others? })
     }
-    let of_triangles = buffers.get("triangle materials");
-    Ok(Views {
-        positions: gl.view(named(buffers, "positions")?, gl::RGB32F)?,
-        materials: gl.view(named(buffers, "materials")?, gl::RGBA32F)?,
-        triangle_materials: of_triangles.map(|list| gl.view(list, gl::R32UI)).transpose()?,
-    })
 }
 
-/// Attributes for the picture, and the fewer for the shadow map.
-fn vertex_arrays(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<(VertexArray, VertexArray)> {
-    let attribute = |location, buffer, components, integer| Attribute { location, buffer, components, integer };
-    let index = named(buffers, "triangles")?;
-    let vertex = || Ok(attribute(0, named(buffers, "corner vertices")?, 1, true));
-    let uv = || buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false));
-    let mut corners = vec![vertex()?, attribute(1, named(buffers, "normals")?, 3, false)];
-    corners.extend(uv());
-    corners.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
-    let mut casters = vec![vertex()?];
-    casters.extend(uv());
-    Ok((gl.vertex_array(Some(index), &corners)?, gl.vertex_array(Some(index), &casters)?))
+const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: bool) -> Attribute<'_> {
+    Attribute { location, buffer, components, integer }
+}
+
+/// Vertices of triangles that are nothing but solid.
+fn solids(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, positions: &Buffer) -> Result<VertexArray> {
+    gl.vertex_array(Some(named(buffers, "triangle vertices")?), &[attribute(0, positions, 3, false)])
+}
+
+/// Corners of cut-out and blended triangles, where there are any.
+fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<Option<VertexArray>> {
+    let Some(vertices) = buffers.get("corner vertices") else { return Ok(None) };
+    let mut from = vec![attribute(0, vertices, 1, true), attribute(1, named(buffers, "normals")?, 3, false)];
+    from.extend(buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false)));
+    from.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
+    gl.vertex_array(Some(named(buffers, "triangles")?), &from).map(Some)
 }
 
 fn upload_arrays(gl: &Rc<Gl>, scene: &Scene, arrays: &[Array], purpose: Use) -> Result<Vec<Texture>> {
@@ -287,33 +355,4 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
     ];
     texture.sampling(&sampling, gl.limits.anisotropy);
     Ok(texture)
-}
-
-impl ShadowMap {
-    fn new(gl: &Rc<Gl>, size: u32) -> Result<Self> {
-        if size > gl.limits.max_side {
-            return Err(gl::too_large("look.shadow.size", u64::from(gl.limits.max_side), u64::from(size)));
-        }
-        let map = |format: u32, filter: u32| {
-            let kind = TextureKind { target: gl::TEXTURE_2D, format, width: size, height: size, depth: 1, levels: 1 };
-            let texture = gl.texture(kind)?;
-            let sampling = [
-                (gl::TEXTURE_MIN_FILTER, filter),
-                (gl::TEXTURE_MAG_FILTER, filter),
-                (gl::TEXTURE_WRAP_S, gl::CLAMP_TO_EDGE),
-                (gl::TEXTURE_WRAP_T, gl::CLAMP_TO_EDGE),
-            ];
-            texture.sampling(&sampling, 1.0);
-            Ok(texture)
-        };
-        let depth = map(gl::DEPTH_COMPONENT32F, gl::NEAREST)?;
-        let framebuffer = gl.framebuffer(None, &depth)?;
-        Ok(Self {
-            size,
-            depth,
-            half_blurred: map(gl::RG32F, gl::NEAREST)?,
-            moments: map(gl::RG32F, gl::LINEAR)?,
-            framebuffer,
-        })
-    }
 }

@@ -1,42 +1,69 @@
 //! Shader sources to programs: the files under `shaders/`, with the branches that a scene needs and no others.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::geometry::Kind;
 use super::gl;
+use super::textures::Use;
+use crate::scene::Shadow;
 
-const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
+pub(super) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
+const CLIP: &str = include_str!("../../shaders/shared/clip.glsl");
 const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
+pub(super) const DRAWN: &str = include_str!("../../shaders/shared/drawn.glsl");
+const IDS: &str = include_str!("../../shaders/shared/ids.glsl");
 const CUT_OUT: &str = include_str!("../../shaders/shared/cut_out.glsl");
-const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
-const SUN: &str = include_str!("../../shaders/shared/sun.glsl");
+pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
+const GROUND: &str = include_str!("../../shaders/shared/ground.glsl");
+const PHONG: &str = include_str!("../../shaders/shared/phong.glsl");
+const TRIANGLE: &str = include_str!("../../shaders/shared/triangle.glsl");
 
 /// First texture unit of each use.
 pub(super) const SHADOW_UNIT: u32 = 0;
 pub(super) const COLOUR_UNIT: u32 = 1;
 pub(super) const NORMAL_UNIT: u32 = COLOUR_UNIT + super::textures::MAX_ARRAYS as u32;
-/// Units of the buffer textures, as the shaders name them.
+/// Units of the buffer textures and of the frame's images, as the shaders name them.
 pub(super) const POSITION_UNIT: u32 = 13;
 pub(super) const MATERIAL_UNIT: u32 = 14;
 pub(super) const TRIANGLE_MATERIAL_UNIT: u32 = 15;
+pub(super) const CORNER_NORMAL_UNIT: u32 = 16;
+pub(super) const TRIANGLE_UNIT: u32 = 17;
+pub(super) const TRIANGLE_VERTEX_UNIT: u32 = 18;
+pub(super) const UV_UNIT: u32 = 19;
+pub(super) const TANGENT_UNIT: u32 = 20;
+pub(super) const ID_UNIT: u32 = 21;
+pub(super) const LAYER_UNIT: u32 = 22;
+/// Textures that the shading reads beside the scene's images, at most.
+pub(super) const OTHER_READS: usize = 11;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Lanes of a compute workgroup, along x.
 pub(super) const LANES: u32 = 64;
-/// Texels that one invocation of the blur makes, along its direction.
-pub(super) const RUN: u32 = 8;
+/// Side of the square of pixels that a workgroup shades.
+pub(super) const TILE: u32 = 8;
+/// Workgroups in a row of the dispatch over listed tiles.
+pub(super) const TILE_ROW: u32 = 64;
 
 /// What the sources depend on.
 #[derive(Debug, Clone)]
 pub(super) struct Options {
     pub(super) defines: Vec<&'static str>,
-    pub(super) colour_arrays: usize,
-    pub(super) normal_arrays: usize,
-    /// Standard deviation of the blur in texels.
-    pub(super) blur: f32,
-    /// Samples a pixel of an ordinary picture.
-    pub(super) samples: u32,
+    /// The materials that triangles have.
+    pub(super) used: Vec<Used>,
+    /// The shadow map as the device is given it; what it says counts where the defines name shadows.
+    pub(super) shadow: Shadow,
+    /// Where the samples of a multisampled pixel lie in it.
+    pub(super) sample_places: Vec<[f32; 2]>,
+}
+
+/// A material that triangles have: what pipeline draws them, and the arrays that hold its images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Used {
+    pub(super) kind: Kind,
+    pub(super) colour: Option<usize>,
+    pub(super) normal: Option<usize>,
 }
 
 /// The text of a program's stages.
@@ -47,7 +74,7 @@ pub(super) struct Source {
 }
 
 impl Options {
-    fn head(&self, more: &[&str]) -> String {
+    pub(super) fn head(&self, more: &[&str]) -> String {
         let mut text = String::from("#version 430 core\n");
         for define in self.defines.iter().chain(more) {
             writeln!(text, "#define {define}").ok();
@@ -56,140 +83,162 @@ impl Options {
         text
     }
 
-    /// The same for triangles of one material: without the images that it has not, and with the one array of each use
-    /// that is bound for it.
-    pub(super) fn narrowed(&self, colour: bool, normal: bool) -> Self {
-        let keeps = |define: &&'static str| match *define {
-            "TEXTURES" => colour,
-            "NORMAL_MAPS" => normal,
-            "UVS" => colour || normal,
-            _ => true,
+    /// The branches that triangles of these kinds need: those of their images, and the lookup of a material where they
+    /// have more than one.
+    pub(super) fn branches(&self, kinds: &[Kind]) -> String {
+        let mut own = (0..).zip(&self.used).filter(|(_, used)| kinds.contains(&used.kind));
+        let mut text = match (own.next(), own.next()) {
+            (Some((only, _)), None) => format!("#undef LOOK_UP\n#define ONLY_MATERIAL {only}\n"),
+            _ => String::new(),
         };
-        Self {
-            defines: self.defines.iter().copied().filter(keeps).collect(),
-            colour_arrays: usize::from(colour),
-            normal_arrays: usize::from(normal),
-            ..*self
+        let (colours, normals) = (self.arrays(kinds, Use::Colour), self.arrays(kinds, Use::Normal));
+        for (define, unneeded) in [
+            ("TEXTURES", colours.is_empty()),
+            ("NORMAL_MAPS", normals.is_empty()),
+            ("UVS", colours.is_empty() && normals.is_empty()),
+        ] {
+            if unneeded {
+                writeln!(text, "#undef {define}").ok();
+            }
         }
+        text
     }
 
-    /// Draws triangles of one kind into the picture.
-    pub(super) fn surface(&self, kind: Kind, samples: u32) -> Source {
-        let more: &[&str] = match kind {
-            Kind::Opaque => &[],
-            Kind::Mask if samples > 1 => &["MASK", "MULTISAMPLED"],
-            Kind::Mask => &["MASK"],
-            Kind::Blend => &["BLEND"],
-        };
-        let head = self.head(more);
-        let vertex = [&head, FRAME, include_str!("../../shaders/surface.vert")].concat();
-        let cut_out = if kind == Kind::Mask { CUT_OUT } else { "" };
-        let body = include_str!("../../shaders/surface.frag");
-        let fragment = [&head, FRAME, MATERIAL, &self.samplers(), cut_out, SUN, body].concat();
-        Source {
-            label: format!("surface, {kind:?}, {samples} samples"),
-            stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)],
-        }
+    /// The lookups of those branches.
+    pub(super) fn lookups(&self, kinds: &[Kind], slopes: Slopes) -> String {
+        let colours = sampler("colour", COLOUR_UNIT, &self.arrays(kinds, Use::Colour), slopes);
+        let normals = sampler("normal", NORMAL_UNIT, &self.arrays(kinds, Use::Normal), slopes);
+        [MATERIAL, &colours, &normals].concat()
     }
 
-    /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
-    pub(super) fn shadow(&self, kind: Kind) -> Source {
-        let more: &[&str] = match kind {
-            Kind::Opaque => &["SOLID"],
-            Kind::Mask => &["MASK"],
-            Kind::Blend => &["BLEND"],
+    /// The arrays that hold images of these kinds' materials.
+    fn arrays(&self, kinds: &[Kind], purpose: Use) -> BTreeSet<usize> {
+        let image = |used: &Used| match purpose {
+            Use::Colour => used.colour,
+            Use::Normal => used.normal,
         };
-        let head = self.head(more);
-        let vertex = [&head, FRAME, include_str!("../../shaders/shadow.vert")].concat();
-        let mut stages = vec![(gl::VERTEX_SHADER, vertex)];
-        if kind != Kind::Opaque {
-            let body = include_str!("../../shaders/shadow.frag");
-            let fragment = [&head, FRAME, MATERIAL, &self.samplers(), CASTER, body].concat();
-            stages.push((gl::FRAGMENT_SHADER, fragment));
+        self.used.iter().filter(|used| kinds.contains(&used.kind)).filter_map(image).collect()
+    }
+
+    /// What depends on the samples a pixel.
+    fn sampling(&self, samples: u32) -> String {
+        let middle = vec![[0.5; 2]];
+        let places = if samples > 1 { &self.sample_places } else { &middle };
+        let places: Vec<String> = places.iter().map(|[x, y]| format!("vec2({x:?}, {y:?})")).collect();
+        let list = places.join(", ");
+        format!("#define SAMPLES {samples}\nconst vec2 SAMPLE_PLACES[{}] = vec2[]({list});\n", places.len())
+    }
+
+    /// Ids and depth of the triangles of one kind.
+    pub(super) fn visibility(&self, kind: Kind, samples: u32) -> Source {
+        let label = format!("visibility, {kind:?}, {samples} samples");
+        let (vertex, body) =
+            (include_str!("../../shaders/visibility.vert"), include_str!("../../shaders/visibility.frag"));
+        if kind != Kind::Mask {
+            let head = self.head(&[]);
+            return Source {
+                label,
+                stages: drawn([&head, FRAME, CLIP, vertex].concat(), [&head, DRAWN, body].concat()),
+            };
         }
-        Source { label: format!("shadow, {kind:?}"), stages }
+        let head = self.head(&["MASK"]) + &self.branches(&[kind]);
+        let (lookups, sampling) = (self.lookups(&[kind], Slopes::OfTheQuad), self.sampling(samples));
+        let fragment = [&head, &lookups, DRAWN, &sampling, CUT_OUT, body].concat();
+        Source { label, stages: drawn([&head, FRAME, CLIP, vertex].concat(), fragment) }
+    }
+
+    /// The layer of the blended triangles.
+    pub(super) fn blended(&self) -> Source {
+        let head = self.head(&[]) + &self.branches(&[Kind::Blend]);
+        let lookups = self.lookups(&[Kind::Blend], Slopes::OfTheQuad);
+        let vertex = [&head, FRAME, CLIP, include_str!("../../shaders/blended.vert")].concat();
+        let body = include_str!("../../shaders/blended.frag");
+        let fragment = [&head, FRAME, &lookups, DRAWN, &self.sun(), PHONG, body].concat();
+        Source { label: "blended".into(), stages: drawn(vertex, fragment) }
+    }
+
+    /// Ids to light, in tiles where no triangle is seen.
+    pub(super) fn backdrop(&self, samples: u32) -> Source {
+        let mut text = self.shading(samples, &["BACKDROP"]);
+        text += include_str!("../../shaders/shade.comp");
+        Source { label: format!("backdrop, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+
+    /// Ids to light, in the other tiles.
+    pub(super) fn shade(&self, samples: u32) -> Source {
+        let kinds = [Kind::Opaque, Kind::Mask];
+        let mut text = self.shading(samples, &[]) + &self.branches(&kinds);
+        text += &[&self.lookups(&kinds, Slopes::Given), PHONG, TRIANGLE].concat();
+        text += include_str!("../../shaders/shade.comp");
+        Source { label: format!("shade, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+
+    fn shading(&self, samples: u32, more: &[&str]) -> String {
+        let mut head = self.head(more);
+        writeln!(head, "#define TILE {TILE}\n#define ROW {TILE_ROW}u").ok();
+        let ground = if self.defines.contains(&"GROUND_SEEN") { GROUND } else { "" };
+        [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground].concat()
     }
 
     pub(super) fn ground(&self) -> Source {
         let head = self.head(&[]);
         let vertex = [&head, FRAME, include_str!("../../shaders/ground.vert")].concat();
-        let fragment = [&head, FRAME, SUN, SKY, include_str!("../../shaders/ground.frag")].concat();
-        Source { label: "ground".into(), stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
-    }
-
-    pub(super) fn sky(&self) -> Source {
-        let head = self.head(&[]);
-        let vertex = [&head, FRAME, include_str!("../../shaders/sky.vert")].concat();
-        let fragment = [&head, FRAME, SKY, include_str!("../../shaders/sky.frag")].concat();
-        Source { label: "sky".into(), stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
-    }
-
-    /// One direction of the blur; the first also turns depth into moments.
-    pub(super) fn blur(&self, first: bool) -> Source {
-        let mut head = self.head(if first { &["FIRST"] } else { &[] });
-        writeln!(head, "#define LANES {LANES}\n#define RUN {RUN}\nvec2 moments(ivec2 at, int side);").ok();
-        let body = [&head, FRAME, &taps(&weights(self.blur)), include_str!("../../shaders/blur.comp")].concat();
-        Source { label: format!("blur, {}", if first { "x" } else { "y" }), stages: vec![(gl::COMPUTE_SHADER, body)] }
-    }
-
-    /// The lookup in the texture arrays: sampling must not hang on a number that differs within a quad, so that with
-    /// several arrays the gradients are taken first.
-    fn samplers(&self) -> String {
-        let mut text = String::new();
-        let uses = [("colour", COLOUR_UNIT, self.colour_arrays), ("normal", NORMAL_UNIT, self.normal_arrays)];
-        for (name, unit, count) in uses.into_iter().filter(|(_, _, count)| *count > 0) {
-            for index in 0..count {
-                let unit = unit as usize + index;
-                writeln!(text, "layout(binding = {unit}) uniform sampler2DArray {name}_{index};").ok();
-            }
-            writeln!(text, "vec4 {name}_texel(ivec2 place, vec2 uv) {{").ok();
-            writeln!(text, "    vec3 at = vec3(uv, float(max(place.y, 0)));").ok();
-            if count == 1 {
-                writeln!(text, "    return texture({name}_0, at);\n}}").ok();
-                continue;
-            }
-            writeln!(text, "    vec2 dx = dFdx(uv), dy = dFdy(uv);\n    switch (place.x) {{").ok();
-            for index in 1..count {
-                writeln!(text, "    case {index}: return textureGrad({name}_{index}, at, dx, dy);").ok();
-            }
-            writeln!(text, "    default: return textureGrad({name}_0, at, dx, dy);\n    }}\n}}").ok();
-        }
-        text
+        let fragment = [&head, IDS, include_str!("../../shaders/ground.frag")].concat();
+        Source { label: "ground".into(), stages: drawn(vertex, fragment) }
     }
 }
 
-/// Turns the samples of the picture into sRGB bytes.
-pub(super) fn encode(samples: u32) -> Source {
-    let head = format!("#version 430 core\n#define SAMPLES {samples}\n#define LANES {LANES}\n");
+pub(super) fn drawn(vertex: String, fragment: String) -> Vec<(u32, String)> {
+    vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
+}
+
+/// The lookup in texture arrays: sampling must not hang on a number that differs within a quad, so that with several
+/// arrays the slopes are taken first.
+fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: Slopes) -> String {
+    let mut text = String::new();
+    let Some(first) = arrays.first() else { return text };
+    for index in arrays {
+        let unit = unit as usize + index;
+        writeln!(text, "layout(binding = {unit}) uniform sampler2DArray {name}_{index};").ok();
+    }
+    let given = if slopes == Slopes::Given { ", vec2 dx, vec2 dy" } else { "" };
+    writeln!(text, "vec4 {name}_texel(ivec2 place, vec2 uv{given}) {{").ok();
+    writeln!(text, "    vec3 at = vec3(uv, float(max(place.y, 0)));").ok();
+    if slopes == Slopes::OfTheQuad && arrays.len() == 1 {
+        writeln!(text, "    return texture({name}_{first}, at);\n}}").ok();
+        return text;
+    }
+    if slopes == Slopes::OfTheQuad {
+        writeln!(text, "    vec2 dx = dFdx(uv), dy = dFdy(uv);").ok();
+    }
+    for index in arrays.iter().skip(1) {
+        writeln!(text, "    if (place.x == {index}) return textureGrad({name}_{index}, at, dx, dy);").ok();
+    }
+    writeln!(text, "    return textureGrad({name}_{first}, at, dx, dy);\n}}").ok();
+    text
+}
+
+/// Where the slopes of texture coordinates come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Slopes {
+    /// Differences between the fragments of a quad.
+    OfTheQuad,
+    /// The caller knows them.
+    Given,
+}
+
+/// What the first sample of each pixel sees.
+pub(super) fn seen(samples: u32) -> Source {
+    let head = format!("#version 430 core\n#define LANES {LANES}\n#define SAMPLES {samples}\n");
+    let body = [&head, IDS, include_str!("../../shaders/seen.comp")].concat();
+    Source { label: format!("seen, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
+}
+
+/// Turns the picture into sRGB bytes.
+pub(super) fn encode() -> Source {
+    let head = format!("#version 430 core\n#define LANES {LANES}\n");
     let body = [&head, include_str!("../../shaders/encode.comp")].concat();
-    Source { label: format!("encode, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
-}
-
-/// The weighted sums of one invocation of the blur, written out: each texel is read once for all the sums it is part of.
-fn taps(weights: &[f32]) -> String {
-    let reach = weights.len() as i32 - 1;
-    let mut text = String::from("void blur(ivec2 at, ivec2 along, int side, out vec2 sums[RUN]) {\n    vec2 texel;\n");
-    for index in 0..RUN {
-        writeln!(text, "    sums[{index}] = vec2(0.0);").ok();
-    }
-    for tap in -reach..RUN as i32 + reach {
-        writeln!(text, "    texel = moments(at + {tap} * along, side);").ok();
-        for index in 0..RUN as i32 {
-            if let Some(weight) = weights.get((tap - index).unsigned_abs() as usize) {
-                writeln!(text, "    sums[{index}] += {weight:?} * texel;").ok();
-            }
-        }
-    }
-    text + "}\n"
-}
-
-/// Half a normalised Gaussian (equation 3.11 in one dimension), centre first, cut off at three deviations.
-pub(super) fn weights(deviation: f32) -> Vec<f32> {
-    let deviation = f64::from(deviation);
-    let reach = (3.0 * deviation).ceil() as i32;
-    let bell = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / deviation).powi(2)).exp() };
-    let sum: f64 = (-reach..=reach).map(bell).sum();
-    (0..=reach).map(|step| (bell(step) / sum) as f32).collect()
+    Source { label: "encode".into(), stages: vec![(gl::COMPUTE_SHADER, body)] }
 }
 
 #[cfg(test)]
@@ -202,45 +251,70 @@ mod tests {
     fn options(alpha_mode: AlphaMode) -> Options {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
         let plan = super::super::plan::plan(&scene);
-        Options { defines: plan.defines, colour_arrays: 0, normal_arrays: 0, blur: 2.0, samples: 4 }
+        let sample_places = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
+        let used = vec![Used { kind: Kind::Opaque, colour: None, normal: None }];
+        Options { defines: plan.defines, used, shadow: Shadow::default(), sample_places }
+    }
+
+    fn text(source: Source) -> String {
+        source.stages.into_iter().map(|(_, text)| text).collect()
     }
 
     #[test]
-    fn only_cut_out_triangles_have_a_discard_in_their_shader() {
-        let text = |source: Source| source.stages.into_iter().map(|(_, text)| text).collect::<String>();
+    fn only_cut_out_triangles_have_a_discard_in_their_shader_and_depth_alone_needs_no_fragment_shader() {
         let options = options(AlphaMode::Opaque);
-        assert!(!text(options.surface(Kind::Opaque, 4)).contains("discard"));
-        assert!(!text(options.surface(Kind::Blend, 4)).contains("discard"));
-        assert!(text(options.surface(Kind::Mask, 4)).contains("discard"));
-        assert_eq!(options.shadow(Kind::Opaque).stages.len(), 1, "depth alone needs no fragment shader");
-    }
-
-    #[test]
-    fn a_material_without_images_gets_a_program_without_lookups() {
-        let full = Options { defines: vec!["TEXTURES", "NORMAL_MAPS", "UVS", "SHADOWS"], ..options(AlphaMode::Opaque) };
-        assert_eq!(full.narrowed(false, false).defines, ["SHADOWS"]);
-        assert_eq!(full.narrowed(true, false).defines, ["TEXTURES", "UVS", "SHADOWS"]);
-        assert_eq!(full.narrowed(false, true).normal_arrays, 1);
-    }
-
-    #[test]
-    fn blur_weights_are_a_normalised_bell() {
-        for deviation in [0.0, 0.3, 2.0, 16.0] {
-            let weights = weights(deviation);
-            let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
-            assert!((sum - 1.0).abs() < 1e-5, "{deviation}: {sum}");
-            assert!(weights.is_sorted_by(|near, far| near >= far));
+        assert!(!text(options.visibility(Kind::Opaque, 4)).contains("discard;"));
+        assert!(!text(options.blended()).contains("discard;"));
+        for (samples, masks) in [(4, true), (1, false)] {
+            let text = text(options.visibility(Kind::Mask, samples));
+            assert!(text.contains("discard;") && text.contains(&format!("SAMPLES {samples}")));
+            assert_eq!(text.contains("vec2(0.375, 0.125)"), masks, "places of the samples");
         }
-        assert_eq!(weights(0.0), [1.0]);
+        assert_eq!(options.shadow(Kind::Opaque).stages.len(), 1);
     }
 
     #[test]
-    fn several_arrays_are_chosen_by_a_switch_and_one_is_read_directly() {
-        let mut options = options(AlphaMode::Opaque);
-        assert_eq!(options.samplers(), "");
-        options.colour_arrays = 1;
-        assert!(!options.samplers().contains("switch"));
-        options.colour_arrays = 3;
-        assert!(options.samplers().contains("case 2: return textureGrad(colour_2"));
+    fn the_shading_of_a_plain_scene_knows_no_image_no_shadow_no_ground_and_no_layer() {
+        let plain = Options { defines: vec![], ..options(AlphaMode::Opaque) };
+        let [backdrop, shading] = [plain.backdrop(4), plain.shade(4)].map(text);
+        assert!(!backdrop.contains("vec3 triangle_seen("), "no triangle, no shading of one");
+        assert!(shading.contains("vec3 triangle_seen("));
+        for text in [&backdrop, &shading] {
+            assert!(!text.contains("vec3 ground(") && !text.contains("textureGrad"));
+        }
+        let used = vec![Used { kind: Kind::Opaque, colour: Some(0), normal: None }];
+        let full = Options { defines: vec!["TEXTURES", "UVS", "GROUND_SEEN"], used, ..plain };
+        let shading = text(full.shade(1));
+        assert!(shading.contains("vec3 ground(") && shading.contains("textureGrad(colour_0"));
+    }
+
+    #[test]
+    fn each_kind_reads_the_arrays_of_its_own_materials_and_looks_up_a_material_only_among_several() {
+        let of = |kind, colour, normal| Used { kind, colour, normal };
+        let used = vec![
+            of(Kind::Opaque, Some(0), Some(0)),
+            of(Kind::Mask, Some(1), None),
+            of(Kind::Blend, None, None),
+            of(Kind::Blend, Some(2), None),
+        ];
+        let options = Options { used, ..options(AlphaMode::Opaque) };
+        let of = |kinds: &[Kind], slopes| options.branches(kinds) + &options.lookups(kinds, slopes);
+        let mask = of(&[Kind::Mask], Slopes::OfTheQuad);
+        assert!(mask.contains("texture(colour_1, at)") && !mask.contains("colour_0") && !mask.contains("textureGrad"));
+        assert!(mask.contains("#undef NORMAL_MAPS") && !mask.contains("#undef UVS"));
+        assert!(mask.contains("ONLY_MATERIAL 1") && mask.contains("#undef LOOK_UP"));
+        let blend = of(&[Kind::Blend], Slopes::OfTheQuad);
+        assert!(!blend.contains("#undef LOOK_UP") && !blend.contains("#undef TEXTURES"));
+        let shade = of(&[Kind::Opaque, Kind::Mask], Slopes::Given);
+        assert!(shade.contains("if (place.x == 1) return textureGrad(colour_1") && !shade.contains("dFdx"));
+        assert!(shade.contains("normal_0") && !shade.contains("colour_2"));
+    }
+
+    #[test]
+    fn several_arrays_are_chosen_by_their_number_and_slopes_taken_before() {
+        let text = sampler("colour", 1, &BTreeSet::from([0, 2, 3]), Slopes::OfTheQuad);
+        let (slopes, choice) = (text.find("dFdx"), text.find("place.x == 2"));
+        assert!(slopes.is_some() && slopes < choice, "{text}");
+        assert_eq!(sampler("colour", 1, &BTreeSet::new(), Slopes::Given), "");
     }
 }

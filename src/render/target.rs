@@ -1,64 +1,102 @@
-//! Where a frame is drawn: multisampled colour and depth, and the buffers through which its pixels come back.
+//! Where a frame is drawn: ids, depth and blended layer of every sample, the picture, and the buffers through which its
+//! pixels come back.
 
 use std::rc::Rc;
 
-use super::gl::{self, Buffer, Framebuffer, Gl, Program, Texture, TextureKind};
+use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
+use super::shaders::TILE;
 use crate::error::Result;
 
-/// Device memory that a multisampled frame may take; a larger one is drawn with one sample a pixel.
-const MULTISAMPLED_BYTES: u64 = 512 << 20;
-/// Colour (RGBA16F) and depth (32 bit).
-const SAMPLE_BYTES: u64 = 12;
+/// Pixels of a multisampled frame, at most: with depth, ids and a blended layer they take 704 MiB of device memory. A
+/// larger frame is drawn with one sample a pixel.
+const MULTISAMPLED_PIXELS: u64 = 11 << 20;
 
-/// The images and buffers of frames of one size.
-#[derive(Debug)]
-pub(super) struct Target {
+/// What a frame's images are made for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Form {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) samples: u32,
-    pub(super) colour: Texture,
-    pub(super) framebuffer: Framebuffer,
+    /// Whether there is a layer for blended triangles.
+    pub(super) layered: bool,
+}
+
+/// The images and buffers of frames of one form.
+#[derive(Debug)]
+pub(super) struct Target {
+    pub(super) form: Form,
+    /// Per sample what it sees; kept until the next frame, like depth.
+    pub(super) ids: Texture,
+    pub(super) visible: Framebuffer,
+    pub(super) layer: Option<Layer>,
+    /// The tiles that see triangles, after the numbers of the dispatch over them.
+    pub(super) tiles: Buffer,
+    /// Linear light, one value a pixel.
+    pub(super) picture: Texture,
     /// RGBA8, top row first, as the encoder writes it.
     pub(super) packed: Buffer,
     /// The same where the host can read it.
     pub(super) staging: Buffer,
-    pub(super) encode: Rc<Program>,
-    // Attached to the framebuffer, which must not outlive it.
+    // Attached to framebuffers, which must not outlive it.
     _depth: Texture,
 }
 
-/// Samples a pixel that a frame of this size is drawn with.
-pub(super) fn samples(gl: &Gl, width: u32, height: u32) -> u32 {
-    let wanted = most_samples(gl);
-    let bytes = u64::from(width) * u64::from(height) * u64::from(wanted) * SAMPLE_BYTES;
-    if bytes <= MULTISAMPLED_BYTES { wanted } else { 1 }
+/// Light of the blended triangles of every sample, and the share of what lies behind that they let by.
+#[derive(Debug)]
+pub(super) struct Layer {
+    pub(super) framebuffer: Framebuffer,
+    pub(super) colour: Texture,
 }
 
-/// The most that any frame is drawn with: four, or one where the device has no four.
-pub(super) fn most_samples(gl: &Gl) -> u32 {
-    if gl.limits.max_samples >= 4 { 4 } else { 1 }
+impl Form {
+    /// The form of a frame for which a look wants so many samples a pixel.
+    pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], wanted: u32, layered: bool) -> Self {
+        let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
+        Self { width, height, samples: if fits { wanted } else { 1 }, layered }
+    }
 }
 
 impl Target {
-    pub(super) fn new(gl: &Rc<Gl>, width: u32, height: u32, encode: Rc<Program>) -> Result<Self> {
-        let samples = samples(gl, width, height);
-        let target = if samples > 1 { gl::TEXTURE_2D_MULTISAMPLE } else { gl::TEXTURE_2D };
-        let image = |format: u32| gl.texture(TextureKind { target, format, width, height, depth: samples, levels: 1 });
-        let (colour, depth) = (image(gl::RGBA16F)?, image(gl::DEPTH_COMPONENT32F)?);
-        if samples == 1 {
-            colour.sampling(&[(gl::TEXTURE_MIN_FILTER, gl::NEAREST), (gl::TEXTURE_MAG_FILTER, gl::NEAREST)], 1.0);
-        }
+    pub(super) fn new(gl: &Rc<Gl>, form: Form) -> Result<Self> {
+        let Form { width, height, samples, layered } = form;
+        let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
+        let layer = |colour: Texture| Ok(Layer { framebuffer: gl.framebuffer(Some(&colour), &depth)?, colour });
+        let layer = if layered { Some(layer(image(gl, form, gl::RGBA16F)?)?) } else { None };
         let bytes = 4 * u64::from(width) * u64::from(height);
         Ok(Self {
-            width,
-            height,
-            samples,
-            framebuffer: gl.framebuffer(Some(&colour), &depth)?,
+            form: Form { samples, ..form },
+            visible: gl.framebuffer(Some(&ids), &depth)?,
+            ids,
+            layer,
+            tiles: gl.buffer(
+                16 + 4 * u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE)),
+                gl::STREAM_COPY,
+                None,
+            )?,
+            picture: image(gl, Form { samples: 1, ..form }, gl::RGBA16F)?,
             packed: gl.buffer(bytes, gl::STREAM_COPY, None)?,
             staging: gl.buffer(bytes, gl::STREAM_READ, None)?,
-            colour,
-            encode,
             _depth: depth,
         })
     }
+}
+
+/// Where the samples of a pixel of four lie in it; empty on a device that has no four.
+pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
+    let form = Form { width: 1, height: 1, samples: 4, layered: false };
+    if gl.limits.max_samples < form.samples {
+        return Ok(Vec::new());
+    }
+    let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
+    gl.sample_places(&gl.framebuffer(Some(&ids), &depth)?, form.samples)
+}
+
+fn image(gl: &Rc<Gl>, form: Form, format: u32) -> Result<Texture> {
+    let Form { width, height, samples, .. } = form;
+    let target = if samples > 1 { gl::TEXTURE_2D_MULTISAMPLE } else { gl::TEXTURE_2D };
+    let texture = gl.texture(TextureKind { target, format, width, height, depth: samples, levels: 1 })?;
+    if samples == 1 {
+        texture.sampling(&[(gl::TEXTURE_MIN_FILTER, gl::NEAREST), (gl::TEXTURE_MAG_FILTER, gl::NEAREST)], 1.0);
+    }
+    Ok(texture)
 }

@@ -7,12 +7,17 @@
 use std::sync::OnceLock;
 
 use crate::domain::Texture;
+use crate::error::{Result, invalid};
 use crate::scene::Scene;
 
 use super::geometry::used_materials;
 
-/// Arrays per use. Colours, normals and the shadow map together stay below the sixteen units that OpenGL guarantees.
+/// Arrays per use. Colours, normals and the shadow map together stay below the sixteen units that OpenGL guarantees to a
+/// fragment shader.
 pub(super) const MAX_ARRAYS: usize = 6;
+
+/// Bytes of all arrays with their levels. 512 images of 4096 x 4096 would be 46 GB.
+const BUDGET: u64 = 8 << 30;
 
 /// What an image is read as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -62,6 +67,22 @@ pub(super) fn arrays(scene: &Scene, purpose: Use) -> Vec<Array> {
     let sizes =
         used.into_iter().map(|texture| (texture, scene.textures[texture].width(), scene.textures[texture].height()));
     merge(by_size(sizes), MAX_ARRAYS)
+}
+
+/// Refuses arrays that would take more device memory than images may.
+///
+/// # Errors
+/// `Invalid` with the bytes, the largest array first.
+pub(super) fn within_budget(images: &[Vec<Array>; 2]) -> Result<()> {
+    let mut arrays: Vec<&Array> = images.iter().flatten().collect();
+    let bytes: u64 = arrays.iter().map(|array| array.bytes()).sum();
+    if bytes <= BUDGET {
+        return Ok(());
+    }
+    arrays.sort_by_key(|array| std::cmp::Reverse(array.bytes()));
+    let words = |array: &&Array| format!("{} of {} x {}", array.layers.len(), array.width, array.height);
+    let list = arrays.iter().map(words).collect::<Vec<_>>().join(", ");
+    Err(invalid("scene.textures", format!("at most {BUDGET} bytes with all levels"), format!("{bytes} bytes: {list}")))
 }
 
 /// Where a texture lies in its arrays.
@@ -258,6 +279,15 @@ mod tests {
         }
         let few = by_size([(0, 4, 4), (1, 8, 8), (2, 4, 4)].into_iter());
         assert_eq!(merge(few.clone(), MAX_ARRAYS), few, "few sizes are left alone");
+    }
+
+    #[test]
+    fn images_over_the_budget_are_refused_with_the_numbers_and_five_hundred_of_usual_size_are_not() {
+        let array = |side, count| Array { width: side, height: side, layers: (0..count).collect() };
+        let refusal = within_budget(&[vec![array(16, 1), array(4096, 512)], vec![]]).expect_err("46 GB").to_string();
+        assert!(refusal.contains("8589934592") && refusal.contains("45812985172 bytes"), "{refusal}");
+        assert!(refusal.contains("512 of 4096 x 4096, 1 of 16 x 16"), "{refusal}");
+        within_budget(&[vec![array(1024, 512)], vec![array(1024, 512)]]).expect("5.7 GB");
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! Error against run time: every variant of the deformation, on scenes of known sizes or one of the user's.
+//! Error against run time: every variant of the deformation, on scenes of known sizes or one of the user's; and in
+//! [`render`] the same of the renderer.
 //!
 //! Validate first, then time: a variant whose error exceeds its a-priori bound on any vertex of any state is not timed,
 //! is named, and fails the report.
@@ -22,6 +23,7 @@ mod page;
 pub mod peers;
 pub mod plot;
 pub mod record;
+pub mod render;
 pub mod sources;
 pub mod table;
 #[cfg(test)]
@@ -75,9 +77,14 @@ pub struct Request {
 
 impl Request {
     fn wants(&self, name: &str) -> bool {
-        let fits = |wanted: &String| wanted.strip_suffix('*').map_or(name == wanted, |begin| name.starts_with(begin));
-        self.variants.is_empty() || self.variants.iter().any(fits)
+        wants(&self.variants, name)
     }
+}
+
+/// Whether a list of names, some of them beginnings with a `*`, has this one; an empty list has all.
+fn wants(list: &[String], name: &str) -> bool {
+    let fits = |wanted: &String| wanted.strip_suffix('*').map_or(name == wanted, |begin| name.starts_with(begin));
+    list.is_empty() || list.iter().any(fits)
 }
 
 /// Where a scene comes from.

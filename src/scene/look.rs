@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 
+use super::shadow::Shadow;
 use crate::error::{Result, invalid};
 
 /// The axis that points up.
@@ -29,28 +30,6 @@ impl UpAxis {
     pub fn from_y_up(self) -> nalgebra::Rotation3<f64> {
         let identity = nalgebra::Rotation3::identity();
         nalgebra::Rotation3::rotation_between(&Vector3::y(), &self.vector()).unwrap_or(identity)
-    }
-}
-
-/// The variance shadow map.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Shadow {
-    /// Side of the square map in texels, 16 to 16384.
-    pub size: u32,
-    /// Standard deviation of the Gaussian blur in texels, 0 (no blur) to 16.
-    pub blur: f32,
-    /// Smallest variance, as a fraction of the squared depth range.
-    pub least_variance: f32,
-    /// Chebyshev values below this count as full shadow, 0 to 0.99 (light-bleeding reduction).
-    pub bleeding: f32,
-    /// Blended materials cast a shadow from this alpha on (the thesis's t_alpha).
-    pub alpha_threshold: f32,
-}
-
-impl Default for Shadow {
-    fn default() -> Self {
-        Self { size: 1024, blur: 1.5, least_variance: 2e-6, bleeding: 0.2, alpha_threshold: 0.5 }
     }
 }
 
@@ -82,6 +61,8 @@ pub struct Look {
     pub horizon: [f32; 3],
     pub shadow: Option<Shadow>,
     pub ground: Option<Ground>,
+    /// Samples a pixel, 1 or 4: how smooth the edges of triangles and cut-outs are.
+    pub samples: u32,
 }
 
 impl Default for Look {
@@ -95,6 +76,7 @@ impl Default for Look {
             horizon: [0.72, 0.82, 0.90],
             shadow: Some(Shadow::default()),
             ground: Some(Ground::default()),
+            samples: 4,
         }
     }
 }
@@ -111,19 +93,25 @@ impl Look {
         if !colours.as_flattened().iter().all(|number| number.is_finite()) {
             return Err(invalid("look", "finite numbers", format!("{self:?}")));
         }
-        let Some(shadow) = self.shadow else { return Ok(()) };
-        if !(16..=16384).contains(&shadow.size) {
-            return Err(invalid("look.shadow.size", "16 to 16384 texels", shadow.size));
+        if ![1, 4].contains(&self.samples) {
+            return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
         }
-        if !(0.0..=16.0).contains(&shadow.blur) {
-            return Err(invalid("look.shadow.blur", "0 to 16 texels", shadow.blur));
+        self.shadow.map_or(Ok(()), |shadow| shadow.check())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_that_are_neither_one_nor_four_are_refused() {
+        for samples in [1, 4] {
+            Look { samples, ..Look::default() }.check().expect("good");
         }
-        if !(0.0..=0.99).contains(&shadow.bleeding) {
-            return Err(invalid("look.shadow.bleeding", "0 to 0.99", shadow.bleeding));
+        for samples in [0, 2, 8, u32::MAX] {
+            let refusal = Look { samples, ..Look::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
         }
-        if !(0.0..=1.0).contains(&shadow.alpha_threshold) || !(0.0..=1.0).contains(&shadow.least_variance) {
-            return Err(invalid("look.shadow", "alpha_threshold and least_variance of 0 to 1", format!("{shadow:?}")));
-        }
-        Ok(())
     }
 }

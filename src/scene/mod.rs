@@ -11,6 +11,7 @@ mod look;
 mod movers;
 mod needs;
 mod rigid;
+mod shadow;
 mod state;
 mod update;
 
@@ -18,10 +19,11 @@ pub use camera::{Bounds, Camera, Lens, View};
 pub use cells::{Cells, GRID, REACH, nearest_cell};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
-pub use look::{Ground, Look, Shadow, UpAxis};
+pub use look::{Ground, Look, UpAxis};
 pub use movers::Movers;
 pub use needs::Needs;
 pub use rigid::TransformFormat;
+pub use shadow::{Blurring, Moments, Shadow, ShadowMethod};
 pub use state::{Changed, State};
 pub use update::{RawUpdate, Update};
 

@@ -76,7 +76,8 @@ async fn a_frame_names_its_step_and_png_and_rgba_hold_the_same_pixels() {
     assert_eq!(decoded.into_raw(), raw.bytes);
     let stages: Vec<&str> = png.head.stages.iter().map(|stage| stage.stage.as_str()).collect();
     for stage in ["deform", "draw", "read", "encode"] {
-        assert!(stages.contains(&stage), "{stage} is not in {stages:?}");
+        let times = stages.iter().filter(|own| **own == stage).count();
+        assert_eq!(times, 1, "{stage} in {stages:?}");
     }
 }
 

@@ -5,3 +5,7 @@ mod far;
 mod limits;
 mod shading;
 mod shadow;
+mod shadow_extremes;
+mod shadow_methods;
+mod snapshots;
+mod visibility;

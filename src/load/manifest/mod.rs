@@ -9,7 +9,9 @@
 //! shadows = true             # false: no shadow map
 //! ground = true              # false: no ground plane
 //! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
-//! look.shadow = { size = 2048, blur = 2.0 }   # and least_variance, bleeding, alpha_threshold
+//! look.samples = 4           # or 1: samples a pixel
+//! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }   # variance, standard, filtered; maps, 1 to 4
+//!                            # and bleeding, least_variance, alpha_threshold, moments (f32, f16)
 //! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
 //! deform.boxes = true        # keep a box of each domain for readers, and with displacements u = U q of each vertex
 //!

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::*;
 use crate::domain::{AlphaMode, Transform};
-use crate::scene::{Deformation, Normals, Storage};
+use crate::scene::{Deformation, Moments, Normals, Shadow, ShadowMethod, Storage};
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
@@ -46,6 +46,14 @@ fn one_model_with_everything_said_about_the_scene() {
     assert_eq!(parts.deformation, deformation);
     assert_eq!(parts.shapes[0].modes.rank(), 2);
     assert_eq!(parts.domains[0].placement.translation(), nalgebra::Vector3::new(1.0, 2.0, 3.0));
+    let shaded = "model = 'a.obj'\nlook.shadow = { method = 'filtered', size = 512, splits = 3, moments = 'f16' }\n";
+    let named =
+        Shadow { method: ShadowMethod::Filtered, size: 512, splits: 3, moments: Moments::F16, ..Shadow::default() };
+    assert_eq!(scene(shaded).expect("good").look.shadow, Some(named));
+    for wrong in ["method = 'ray'", "splits = -1", "blurring = 'tiles'"] {
+        let refusal = scene(&format!("model = 'a.obj'\nlook.shadow = {{ {wrong} }}\n")).expect_err(wrong).to_string();
+        assert!(refusal.contains("line 2"), "{refusal}");
+    }
     let plain = scene("model = 'a.obj'\n").expect("good");
     assert_eq!((plain.name.as_str(), plain.up, plain.rigid_transforms), ("folder", UpAxis::Y, false));
     assert_eq!(plain.deformation, Deformation::default());

@@ -136,7 +136,7 @@ impl Texture {
 
     pub(in crate::render) fn bind(&self, unit: u32) {
         let gl = self.gl.on();
-        // SAFETY: units below the sixteen that every context has.
+        // SAFETY: units below the 96 that every context has over all stages.
         unsafe {
             gl.active_texture(glow::TEXTURE0 + unit);
             gl.bind_texture(self.kind.target, Some(self.name));

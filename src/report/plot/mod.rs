@@ -4,28 +4,30 @@
 //! machine.
 
 mod axis;
-mod panel;
+pub(super) mod panel;
 
 use std::fmt::Write as _;
 
 use super::Report;
 use super::table::Row;
+use super::timing::Cache;
+use super::trials::is_partial;
 use crate::deform::Backend;
 use crate::error::{Result, during};
-use panel::{Look, Panel};
+use panel::{Look, Panel, Point};
 
 /// Pixels of the PNG per unit of the SVG.
 const SCALE: f32 = 2.0;
 /// Size of a panel, and the margin around everything.
-const PANEL: (f64, f64) = (440.0, 320.0);
-const MARGIN: f64 = 24.0;
+pub(super) const PANEL: (f64, f64) = (440.0, 320.0);
+pub(super) const MARGIN: f64 = 24.0;
 /// Height of title, subtitle and the explanation of the marks.
-const HEAD: f64 = 94.0;
+pub(super) const HEAD: f64 = 94.0;
 /// Height of a line of the legend.
-const LEGEND: f64 = 22.0;
+pub(super) const LEGEND: f64 = 22.0;
 
 /// Colours that differ for the colour-blind too, then a few more (Okabe and Ito; Tableau).
-const COLOURS: [&str; 12] = [
+pub(super) const COLOURS: [&str; 12] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d9a", "#8c564b", "#7f7f7f", "#a6a800",
     "#17becf", "#b2182b",
 ];
@@ -67,8 +69,9 @@ pub fn svg(report: &Report) -> String {
     out.push_str(&legend);
     for (index, load) in loads.iter().enumerate() {
         let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
-        let rows: Vec<&Row> = report.rows.iter().filter(|row| row.load == *load).collect();
-        Panel::new(corner, load, &rows).draw(&mut out, |name| look(&names, name));
+        let points = report.rows.iter().filter(|row| row.load == *load).filter_map(point).collect();
+        let words = ["median time of a step", "largest error / diagonal"];
+        Panel::new(corner, load, words, points).draw(&mut out, |name| look(&names, name));
     }
     out.push_str("</svg>\n");
     out
@@ -93,6 +96,12 @@ pub fn png(svg: &str) -> Result<Vec<u8>> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     image::DynamicImage::from(image).to_rgb8().write_to(&mut bytes, image::ImageFormat::Png).map_err(during("plot"))?;
     Ok(bytes.into_inner())
+}
+
+/// Warm rows are filled; what computes less than all vertices is no rival.
+fn point(row: &Row) -> Option<Point<'_>> {
+    let warm = row.cache == Cache::Warm;
+    Some(Point { name: &row.name, at: row.point()?, filled: warm, rival: warm && !is_partial(&row.name) })
 }
 
 /// Each variant once, with its backend, in the order of the rows.
@@ -129,7 +138,7 @@ fn legend(names: &[(&str, Backend)], width: f64) -> (String, usize) {
     (out, line + 1)
 }
 
-fn text(out: &mut String, (x, y): (f64, f64), style: &str, words: &str) {
+pub(super) fn text(out: &mut String, (x, y): (f64, f64), style: &str, words: &str) {
     let words = words.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
     // Writing into a string cannot fail.
     let _ = writeln!(out, "<text x=\"{x:.1}\" y=\"{y:.1}\" {style}>{words}</text>");
@@ -139,7 +148,6 @@ fn text(out: &mut String, (x, y): (f64, f64), style: &str, words: &str) {
 mod tests {
     use super::*;
     use crate::report::table::tests::row;
-    use crate::report::timing::Cache;
 
     #[test]
     fn texts_are_escaped_and_the_font_is_built_in() {

@@ -5,9 +5,7 @@ use std::fmt::Write as _;
 use super::axis::{self, Axis};
 use super::{PANEL, text};
 use crate::deform::Backend;
-use crate::report::table::{Row, pareto};
-use crate::report::timing::Cache;
-use crate::report::trials::is_partial;
+use crate::report::table::pareto;
 
 /// Space for labels left, right, above and below the plotted area.
 const LEFT: f64 = 66.0;
@@ -20,29 +18,46 @@ const LETTERS: f64 = 11.0;
 /// x, y, width and height.
 type Area = (f64, f64, f64, f64);
 
+/// What a panel shows of one row.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::report) struct Point<'a> {
+    pub(in crate::report) name: &'a str,
+    /// Median time in microseconds, and error.
+    pub(in crate::report) at: (f64, f64),
+    /// Whether its mark is filled, and drawn over those that are not.
+    pub(in crate::report) filled: bool,
+    /// Whether it may be on the Pareto front.
+    pub(in crate::report) rival: bool,
+}
+
 /// A panel of one load.
-pub(super) struct Panel<'a> {
+pub(in crate::report) struct Panel<'a> {
     corner: (f64, f64),
     title: &'a str,
-    /// Rows that have a time and an error, with them.
-    points: Vec<(&'a Row, (f64, f64))>,
+    /// What is drawn along x and along y.
+    words: [&'a str; 2],
+    points: Vec<Point<'a>>,
     time: Axis,
     error: Axis,
 }
 
 impl<'a> Panel<'a> {
-    pub(super) fn new(corner: (f64, f64), title: &'a str, rows: &[&'a Row]) -> Self {
-        let points: Vec<_> = rows.iter().filter_map(|row| Some((*row, row.point()?))).collect();
+    pub(in crate::report) fn new(
+        corner: (f64, f64),
+        title: &'a str,
+        words: [&'a str; 2],
+        points: Vec<Point<'a>>,
+    ) -> Self {
         let across = (corner.0 + LEFT, corner.0 + PANEL.0 - RIGHT);
         let upwards = (corner.1 + PANEL.1 - BELOW, corner.1 + ABOVE);
-        let time = Axis::around(points.iter().map(|(_, point)| point.0), (1.0, 1e3), across);
-        let error = Axis::around(points.iter().map(|(_, point)| point.1), (1e-8, 1e-6), upwards);
-        Self { corner, title, points, time, error }
+        let time = Axis::around(points.iter().map(|point| point.at.0), (1.0, 1e3), across);
+        let error = Axis::around(points.iter().map(|point| point.at.1), (1e-8, 1e-6), upwards);
+        Self { corner, title, words, points, time, error }
     }
 
-    pub(super) fn draw(&self, out: &mut String, look: impl Fn(&str) -> Look) {
+    pub(in crate::report) fn draw(&self, out: &mut String, look: impl Fn(&str) -> Look) {
         self.frame(out);
-        let places: Vec<(f64, f64)> = self.points.iter().map(|(_, (us, error))| self.place(*us, *error)).collect();
+        let places: Vec<(f64, f64)> = self.points.iter().map(|point| self.place(point.at.0, point.at.1)).collect();
         let front = self.front();
         let steps: Vec<String> =
             front.iter().map(|index| format!("{:.1},{:.1}", places[*index].0, places[*index].1)).collect();
@@ -60,11 +75,11 @@ impl<'a> Panel<'a> {
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"9\" fill=\"none\" stroke=\"#444444\" stroke-width=\"1.2\"/>"
             );
         }
-        // Cold ones first, so that none hides a warm one.
-        for cache in [Cache::Cold, Cache::Warm] {
-            for ((row, _), place) in self.points.iter().zip(&places).filter(|((row, _), _)| row.cache == cache) {
-                let look = look(&row.name);
-                let style = if cache == Cache::Warm { filled(look.colour) } else { hollow(look.colour) };
+        // Hollow ones first, so that none hides a filled one.
+        for full in [false, true] {
+            for (point, place) in self.points.iter().zip(&places).filter(|(point, _)| point.filled == full) {
+                let look = look(point.name);
+                let style = if full { filled(look.colour) } else { hollow(look.colour) };
                 mark(out, *place, look, &style);
             }
         }
@@ -79,12 +94,11 @@ impl<'a> Panel<'a> {
         (self.time.place(us), self.error.place(error))
     }
 
-    /// Indices of the warm points on the Pareto front of variants that compute all vertices.
+    /// Indices of the points on the Pareto front of those that may be on it.
     fn front(&self) -> Vec<usize> {
-        let rivals = |row: &Row| row.cache == Cache::Warm && !is_partial(&row.name);
-        let warm: Vec<usize> = (0..self.points.len()).filter(|at| rivals(self.points[*at].0)).collect();
-        let points: Vec<(f64, f64)> = warm.iter().map(|at| self.points[*at].1).collect();
-        pareto(&points).into_iter().map(|at| warm[at]).collect()
+        let rivals: Vec<usize> = (0..self.points.len()).filter(|at| self.points[*at].rival).collect();
+        let points: Vec<(f64, f64)> = rivals.iter().map(|at| self.points[*at].at).collect();
+        pareto(&points).into_iter().map(|at| rivals[at]).collect()
     }
 
     fn frame(&self, out: &mut String) {
@@ -121,18 +135,18 @@ impl<'a> Panel<'a> {
         text(out, (left, top - 9.0), "font-size=\"14\" font-weight=\"bold\" fill=\"#222222\"", self.title);
         let middle = (left + right) / 2.0;
         let label = "font-size=\"11\" fill=\"#444444\" text-anchor=\"middle\"";
-        text(out, (middle, bottom + 33.0), label, "median time of a step");
+        text(out, (middle, bottom + 33.0), label, self.words[0]);
         let (x, y) = (self.corner.0 + 14.0, (top + bottom) / 2.0);
-        text(out, (x, y), &format!("{label} transform=\"rotate(-90 {x:.1} {y:.1})\""), "largest error / diagonal");
+        text(out, (x, y), &format!("{label} transform=\"rotate(-90 {x:.1} {y:.1})\""), self.words[1]);
     }
 
-    /// Names beside the points of the front, and beside all warm points when there are few.
+    /// Names beside the points of the front, and beside all filled points when there are few.
     fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], look: &impl Fn(&str) -> Look) {
         let mut taken: Vec<Area> = places.iter().map(|(x, y)| (x - 7.0, y - 7.0, 14.0, 14.0)).collect();
         let few = self.points.len() <= 8;
-        let warm = |at: &usize| front.contains(at) || (few && self.points[*at].0.cache == Cache::Warm);
-        for at in (0..self.points.len()).filter(warm) {
-            let name = &self.points[at].0.name;
+        let named = |at: &usize| front.contains(at) || (few && self.points[*at].filled);
+        for at in (0..self.points.len()).filter(named) {
+            let name = self.points[at].name;
             // A label that finds no room is left out: the legend names its point too.
             if let Some(area) = self.room(places[at], width_of(name, LETTERS), &taken) {
                 let fill = look(name).colour;
@@ -169,11 +183,11 @@ fn overlap(one: Area, other: Area) -> bool {
 }
 
 /// About the width of a text in `DejaVu Sans`.
-pub(super) fn width_of(words: &str, size: f64) -> f64 {
+pub(in crate::report) fn width_of(words: &str, size: f64) -> f64 {
     0.61 * size * words.chars().count() as f64
 }
 
-pub(super) fn filled(colour: &str) -> String {
+pub(in crate::report) fn filled(colour: &str) -> String {
     format!("fill=\"{colour}\" stroke=\"#ffffff\" stroke-width=\"0.8\"")
 }
 
@@ -183,15 +197,15 @@ fn hollow(colour: &str) -> String {
 
 /// A colour and a shape: no two variants of a report share both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Look {
-    pub(super) colour: &'static str,
-    pub(super) backend: Backend,
+pub(in crate::report) struct Look {
+    pub(in crate::report) colour: &'static str,
+    pub(in crate::report) backend: Backend,
     /// How many times all colours were used before.
-    pub(super) round: usize,
+    pub(in crate::report) round: usize,
 }
 
 /// The mark of a variant around a point.
-pub(super) fn mark(out: &mut String, (x, y): (f64, f64), look: Look, style: &str) {
+pub(in crate::report) fn mark(out: &mut String, (x, y): (f64, f64), look: Look, style: &str) {
     let shape = match (look.backend, look.round % 3) {
         (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {style}/>"),
         (Backend::Reference, _) => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {style}/>", y - 6.0),
@@ -208,18 +222,18 @@ pub(super) fn mark(out: &mut String, (x, y): (f64, f64), look: Look, style: &str
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::table::tests::row;
 
     #[test]
-    fn the_front_is_made_of_warm_points_only_and_labels_do_not_overlap() {
-        let rows = [
-            row("a", "cold and best", Cache::Cold, (0.1, 1e-9)),
-            row("a", "first", Cache::Warm, (1.0, 1e-6)),
-            row("a", "second", Cache::Warm, (1.05, 9e-7)),
-            row("a", "beaten", Cache::Warm, (2.0, 1e-5)),
-            row("a", "does less Uq", Cache::Warm, (0.5, 1e-8)),
+    fn the_front_is_made_of_rivals_only_and_labels_do_not_overlap() {
+        let point = |name, filled, rival, at| Point { name, at, filled, rival };
+        let points = vec![
+            point("cold and best", false, false, (0.1, 1e-9)),
+            point("first", true, true, (1.0, 1e-6)),
+            point("second", true, true, (1.05, 9e-7)),
+            point("beaten", true, true, (2.0, 1e-5)),
+            point("does less", true, false, (0.5, 1e-8)),
         ];
-        let panel = Panel::new((0.0, 0.0), "a", &rows.iter().collect::<Vec<_>>());
+        let panel = Panel::new((0.0, 0.0), "a", ["time", "error"], points);
         assert_eq!(panel.front(), [1, 2]);
         let mut out = String::new();
         panel.draw(&mut out, |_| Look { colour: "#0072b2", backend: Backend::Cpu, round: 0 });

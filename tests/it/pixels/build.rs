@@ -92,13 +92,23 @@ pub(super) fn open() -> Renderer {
     Renderer::open(Prefer::Any).expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)")
 }
 
-/// The scene at rest.
+/// The scene at rest in a square picture.
 pub(super) fn draw(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, size: u32) -> Picture {
+    draw_sized(renderer, scene, camera, [size, size])
+}
+
+/// The scene at rest.
+pub(super) fn draw_sized(
+    renderer: &mut Renderer,
+    scene: &Arc<Scene>,
+    camera: Camera,
+    [width, height]: [u32; 2],
+) -> Picture {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = Shot { camera, width: size, height: size, bounds };
+    let shot = Shot { camera, width, height, bounds };
     let image = renderer.draw(&buffers, &shot).expect("draws");
     let (ran, allocated) = (renderer.ran().clone(), buffers.allocated());
     renderer.unload(buffers);

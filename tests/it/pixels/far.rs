@@ -6,7 +6,9 @@ use modalcast::config::{BackendChoice, Config};
 use modalcast::domain::Material;
 use modalcast::engine::Workbench;
 use modalcast::render::Image;
-use modalcast::scene::{Camera, GRID, Lens, Look, RawUpdate, Scene, Shadow, State, TransformFormat, Update, View};
+use modalcast::scene::{
+    Camera, GRID, Lens, Look, RawUpdate, Scene, Shadow, ShadowMethod, State, TransformFormat, Update, View,
+};
 
 use super::build::{Stage, facing, lying};
 
@@ -70,7 +72,15 @@ fn a_scene_that_has_gone_far_looks_as_it_did_with_its_ground_and_its_shadow() {
     let on_grid = [9766.0 * GRID, 0.0, -9767.0 * GRID];
     // Off the grid positions are rounded elsewhere, by a five-hundredth of a pixel: a sample that an edge passes by less
     // may change sides, in one pixel of a thousand at most.
-    for (shadow, at, edges) in [(Some(Shadow::default()), on_grid, 0), (None, AWAY, 9)] {
+    let base = Shadow::default();
+    let kinds = [
+        (Some(base), on_grid, 0),
+        (Some(Shadow { method: ShadowMethod::Standard, ..base }), on_grid, 0),
+        (Some(Shadow { method: ShadowMethod::Filtered, ..base }), on_grid, 0),
+        (Some(Shadow { splits: 3, ..base }), on_grid, 0),
+        (None, AWAY, 9),
+    ];
+    for (shadow, at, edges) in kinds {
         let scene = table(shadow);
         let home = picture(&mut bench, &scene, &State::rest(&scene), &camera([0.0; 3]));
         let away = moved(&scene, &[0, 1], at);

@@ -23,7 +23,7 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
     for absent in ["tangents", "uvs", "triangle materials"] {
         assert!(!names(&plain.allocated).contains(&absent.to_string()), "{absent}");
     }
-    assert_eq!(plain.ran.passes, ["shadow", "blur", "opaque", "sky", "ground", "encode"]);
+    assert_eq!(plain.ran.passes, ["shadow", "blur", "visibility", "ground", "backdrop", "shade", "encode"]);
 
     let mut stage = full();
     let image = stage.texture(1, 1, |_, _| [128, 128, 255, 255]);
@@ -38,7 +38,7 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
     for present in ["tangents", "uvs", "triangle materials"] {
         assert!(names(&rich.allocated).contains(&present.to_string()), "{present}");
     }
-    assert_eq!(rich.ran.passes, ["shadow", "blur", "opaque", "sky", "ground", "blended", "encode"]);
+    assert_eq!(rich.ran.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
     let mut planned = plan(&scene).buffers;
     planned.sort_by(|a, b| a.name.cmp(&b.name));
     assert_eq!(rich.allocated, planned, "what is planned is what is allocated");
@@ -46,7 +46,7 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
 }
 
 #[test]
-fn the_draw_calls_are_at_most_eight_whatever_the_domains() {
+fn the_draw_calls_are_two_of_a_kind_at_most_whatever_the_domains_and_materials() {
     let draws = |domains: usize| {
         let mut stage = Stage::new();
         for index in 0..domains {
@@ -58,7 +58,7 @@ fn the_draw_calls_are_at_most_eight_whatever_the_domains() {
         }
         picture(&stage.scene()).ran.draws
     };
-    assert_eq!((draws(2), draws(8), draws(9), draws(60)), (2, 8, 2, 2));
+    assert_eq!((draws(1), draws(2), draws(9), draws(60)), (1, 2, 2, 2));
 }
 
 #[test]

@@ -6,7 +6,7 @@ use modalcast::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
 use super::build::{Picture, Stage, close, draw, facing, lying, open};
 
 /// Looking down on the ground from a height of 20, ten pixels a unit there; the sun straight up unless it is moved.
-fn stage() -> Stage {
+pub(super) fn stage() -> Stage {
     let mut stage = Stage::new();
     stage.0.look.sun = [0.0, 1.0, 0.0];
     stage.0.look.ground = Some(Ground { colour: [0.8; 3] });
@@ -28,7 +28,12 @@ fn from_above(stage: Stage) -> Picture {
 }
 
 /// A square of two units that floats where the camera does not see it cover its shadow: the sun comes from the side.
-fn aside(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
+fn aside(stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
+    from_above(with_square(stage, alpha_mode, alpha))
+}
+
+/// Its shadow on the ground is x and z of -1 to 1.
+pub(super) fn with_square(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Stage {
     stage.0.look.sun = [3.0, 4.0, 0.0];
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
     let image = stage.texture(64, 64, |x, y| [255, 255, 255, if hole(x, y) { 0 } else { 255 }]);
@@ -38,7 +43,7 @@ fn aside(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
     square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh = modalcast::domain::Mesh::indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
-    from_above(stage.add(mesh.expect("a square"), material))
+    stage.add(mesh.expect("a square"), material)
 }
 
 /// The ground near the middle, where the haze has hardly begun: the horizon is black here.
@@ -75,6 +80,31 @@ fn a_surface_in_the_shadow_keeps_its_ambient_light_and_loses_the_rest() {
 }
 
 #[test]
+fn the_printed_ambient_term_equals_ours_in_sunlight_of_the_skys_colour_and_is_black_in_the_shadow() {
+    // Without a highlight, equation 3.12 prints s_f I_l (C_a + (n . v_l) C_d): the sun lights C_a too, and the shadow takes
+    // it away. Here the sky lights C_a, and the shadow leaves it.
+    let (ambient, diffuse, facing) = ([0.4, 0.2, 0.1], [0.3_f32, 0.5, 0.7], 0.8);
+    let colour = |ambient_light: f64, sunlight: f64| {
+        std::array::from_fn(|channel| {
+            let [a, d] = [ambient, diffuse].map(|colour| f64::from(colour[channel]));
+            ambient_light * a + sunlight * facing * d
+        })
+    };
+    for skylight in [0.5, 0.2] {
+        let mut stage = stage();
+        (stage.0.look.skylight, stage.0.look.sunlight) = ([skylight as f32; 3], [0.5; 3]);
+        let floor = Material { ambient, diffuse, specular: [0.0; 3], ..Material::default() };
+        let shown = aside(stage.add(lying(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+        for (share, pixel) in [(1.0, shown.at(32, 8)), (0.0, shown.at(32, 32))] {
+            let (printed, ours) = (colour(share * 0.5, share * 0.5), colour(skylight, share * 0.5));
+            assert!(close(pixel, ours, 1.0), "sky {skylight}, sun {share}: {pixel:?}, expected {ours:?}");
+            let same = skylight == 0.5 && share == 1.0;
+            assert_eq!(close(pixel, printed, 1.0), same, "sky {skylight}, sun {share}: {pixel:?}, printed {printed:?}");
+        }
+    }
+}
+
+#[test]
 fn the_shadow_of_a_cut_out_has_the_hole_too_and_an_opaque_one_has_not() {
     let cut = aside(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     assert!(close(cut.at(32, 32), ground(1.0, 0.8), 4.0), "the hole: {:?}", cut.at(32, 32));
@@ -93,16 +123,16 @@ fn a_blended_square_casts_from_the_threshold_on() {
 
 #[test]
 fn one_texel_without_blur_gives_chebyshevs_bound_and_bleeding_is_taken_off() {
-    // A square at height 4 that covers the whole map: near = 4.00 + 1 % and far = 0 - 1 % of the diagonal.
+    // A square at height 4 that covers the whole map. The planes nearest to the sun and farthest from it lie 1 % of the
+    // diagonal, 14.97, beyond square and ground, rounded outwards to multiples of 1/8.
     let shown = |least_variance: f32, bleeding: f32| {
         let mut stage = stage();
-        stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, alpha_threshold: 0.5 });
+        stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, ..Shadow::default() });
         let cover = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };
         stage.0.look.shadow = stage.0.look.shadow.map(|shadow| Shadow { alpha_threshold: 0.0, ..shadow });
         from_above(stage.add(lying(5.1, 4.0), cover)).at(32, 32)
     };
-    let diagonal = (2.0 * 10.2_f64.powi(2) + 16.0).sqrt();
-    let behind = 4.0 / (4.0 + 0.02 * diagonal);
+    let behind = 4.0 / (4.25 + 0.25);
     for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
         let variance = f64::from(least_variance);
         let bound = variance / (variance + behind * behind);

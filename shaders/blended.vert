@@ -23,9 +23,5 @@ void main() {
 #ifdef NORMAL_MAPS
     tangent_world = tangent;
 #endif
-    vec4 clip = frame.clip_from_world * vec4(world, 1.0);
-    // A vertex that overflowed is put behind the camera: no NaN reaches the rasteriser.
-    bool bad = any(isnan(clip)) || any(isinf(clip));
-    gl_Position = bad ? vec4(0.0, 0.0, -2.0, 1.0) : clip;
-    if (bad) world = vec3(0.0);
+    gl_Position = to_clip(world);
 }

@@ -1,0 +1,34 @@
+// Phong (equation 3.12) with clamped dots and unshadowed ambient light:
+//   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e,
+// v_l to the sun, v_e to the eye, s_f the share of the sun that arrives. The printed v_e comes from the eye: its v_e'
+// points into the surface, and the highlight would lie on the far side of it.
+// A texel multiplies Ca and Cd where the material has a colour image (equation 3.14, whose printed s_tex is the wrong way
+// round): with white Ca and Cd it takes their place.
+vec3 unit(vec3 v) { return v * inversesqrt(max(dot(v, v), 1e-30)); }
+
+#ifdef NORMAL_MAPS
+// A unit normal turned by a texel of a normal map. No tangent, no turn.
+vec3 bumped(vec3 normal, vec4 along_u, vec3 texel) {
+    if (dot(along_u.xyz, along_u.xyz) <= 0.0) return normal;
+    texel = (texel * 255.0 - 128.0) / 127.0;
+    vec3 tangent = unit(along_u.xyz - normal * dot(normal, along_u.xyz));
+    vec3 bitangent = cross(normal, tangent) * (along_u.w < 0.0 ? -1.0 : 1.0);
+    return unit(tangent * texel.x + bitangent * texel.y + normal * texel.z);
+}
+#endif
+
+// `unbumped` is the normal without the turn of a normal map: the plane in which the shadow is looked up.
+vec3 phong(Material material, vec3 tint, vec3 normal, vec3 unbumped, vec3 world) {
+    vec3 to_sun = frame.to_sun.xyz;
+    vec3 light = frame.skylight.rgb * material.ambient.rgb * tint;
+    float facing = dot(normal, to_sun);
+    if (facing > 0.0) {
+        vec3 to_eye = unit(frame.eye.xyz - world);
+        vec3 reflected = 2.0 * dot(to_eye, normal) * normal - to_eye;
+        float gleam = dot(reflected, to_sun);
+        float highlight = gleam > 0.0 ? pow(gleam, material.specular.a) : 0.0;
+        vec3 answer = facing * material.diffuse.rgb * tint + highlight * material.specular.rgb;
+        light += lit(world, unbumped) * frame.sunlight.rgb * answer;
+    }
+    return light;
+}

@@ -1,0 +1,24 @@
+// One corner as the camera sees it. Opaque triangles have no need of corners: their vertices are enough, and are shared by
+// more triangles.
+#ifdef MASK
+layout(location = 0) in uint vertex;
+layout(binding = 13) uniform samplerBuffer positions;
+#else
+layout(location = 0) in vec3 position;
+#endif
+#if defined(MASK) && defined(TEXTURES)
+layout(location = 2) in vec2 uv;
+centroid out vec2 uv_image;
+#endif
+
+void main() {
+#ifdef MASK
+    vec3 world = texelFetch(positions, int(vertex)).xyz;
+#else
+    vec3 world = position;
+#endif
+    gl_Position = to_clip(world);
+#if defined(MASK) && defined(TEXTURES)
+    uv_image = uv;
+#endif
+}

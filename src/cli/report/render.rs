@@ -1,0 +1,133 @@
+//! `modalcast report render`: what every way to draw costs in error against brute force, and what it saves in time.
+
+use std::path::PathBuf;
+
+use crate::cli::options::{Size, working};
+use crate::cli::{Outcome, say};
+use crate::error::{Result, invalid};
+use crate::report::render::loads::Kind;
+use crate::report::render::{self, Report, Request, variants};
+
+const LOADS: &str = "Loads:
+  square       a square that floats over the ground
+  panes        three translucent panes, listed in the wrong order
+  tree, grove  the built-in tree, and four of them
+  triangles-N  a rolling field of about N triangles with poles on it
+
+Examples:
+  modalcast report render --out report
+  modalcast report render --out report --quick
+  modalcast report render --out report --load tree --load triangles-3000000 --size 1920x1080
+  modalcast report render --out report --load square --variant 'variance 512*'";
+
+/// Error against run time of the renderer: validates every variant against references by brute force, then times it.
+///
+/// Writes report.json, report.csv, report.md, report.svg, report.png and pictures/ with the references, and of every
+/// variant a strip of rendered, reference and difference. Exit code 1 when a variant exceeds its bounds.
+#[derive(Debug, clap::Args)]
+#[command(after_help = LOADS)]
+pub(super) struct Args {
+    /// The folder to write to; files of an earlier report there are replaced.
+    #[arg(long)]
+    out: PathBuf,
+    /// A scene; may be repeated. Without any: all.
+    #[arg(long = "load", value_name = "NAME")]
+    loads: Vec<String>,
+    /// Only this variant, or all whose names begin so: "variance 512*"; may be repeated.
+    #[arg(long = "variant", value_name = "GLOB")]
+    variants: Vec<String>,
+    /// The size of still pictures in pixels; those of moving ones are a quarter of it on each side.
+    #[arg(long, default_value = "640x360")]
+    size: Size,
+    /// Frames per median, at least 20; 100 without it, 20 with --quick.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    replays: Option<u32>,
+    /// Fewer variants, 16 samples a pixel and a smaller field, for machines without a GPU.
+    #[arg(long)]
+    quick: bool,
+}
+
+/// The largest side of a picture: each of its pixels is traced by 64 rays and more.
+const LARGEST: u32 = 4096;
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let request = request(args)?;
+    let report = working("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
+    report.write(&args.out)?;
+    lines(&report).into_iter().for_each(say);
+    say(format!("written to {}", args.out.display()));
+    Ok(report.passed())
+}
+
+fn request(args: &Args) -> Result<Request> {
+    let mut loads = args.loads.iter().map(|name| Kind::named(name)).collect::<Result<Vec<_>>>()?;
+    if loads.is_empty() {
+        loads = Kind::all(args.quick);
+    }
+    let Size { width, height } = args.size;
+    if ![width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
+        return Err(invalid("size", format!("1 to {LARGEST} pixels a side"), args.size));
+    }
+    let request = Request {
+        loads,
+        variants: args.variants.clone(),
+        size: render::Size { width, height },
+        quick: args.quick,
+        replays: args.replays.map_or(if args.quick { 20 } else { 100 }, |replays| replays as usize),
+    };
+    match variants::all(args.quick).iter().any(|variant| request.wants(&variant.name)) {
+        true => Ok(request),
+        false => {
+            let names: Vec<String> = variants::all(args.quick).into_iter().map(|variant| variant.name).collect();
+            Err(invalid("variant", format!("one or more of: {}", names.join("; ")), args.variants.join("; ")))
+        }
+    }
+}
+
+fn lines(report: &Report) -> Vec<String> {
+    let head = ["frame us", "colour", "of aim", "light", "penumbra", "bleeding", "flicker", "passed"];
+    let mut lines = vec![format!("{:<18}{:<26}{}", "load", "variant", head.map(|word| format!("{word:>10}")).concat())];
+    for row in &report.rows {
+        let show =
+            |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
+        let cells = [
+            show(row.median_us(), 1),
+            show(Some(row.colour.mean), 3),
+            show(Some(row.colour_of_aim.mean), 3),
+            show(Some(row.light_of_aim.all.mean), 4),
+            show(Some(row.light_of_aim.penumbra.mean), 4),
+            show(row.light_of_aim.in_umbra, 4),
+            show(row.flicker.map(|flicker| flicker.mean), 3),
+            if row.passed { "yes".into() } else { "NO".into() },
+        ];
+        lines.push(format!("{:<18}{:<26}{}", row.load, row.name, cells.map(|cell| format!("{cell:>10}")).concat()));
+    }
+    lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn args() -> Args {
+        let size = Size { width: 64, height: 48 };
+        Args { out: PathBuf::from("out"), loads: vec![], variants: vec![], size, replays: None, quick: true }
+    }
+
+    #[test]
+    fn nothing_named_means_every_load_and_wrong_names_and_sizes_are_refused() {
+        let all = request(&args()).expect("fits");
+        assert_eq!((all.loads.len(), all.replays), (Kind::all(true).len(), 20));
+        let named = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
+        assert_eq!(request(&named).expect("fits").loads, [Kind::Square, Kind::Triangles(10)]);
+        for wrong in [
+            Args { loads: vec!["cube".into()], ..args() },
+            Args { variants: vec!["varience*".into()], ..args() },
+            Args { size: Size { width: 0, height: 5 }, ..args() },
+            Args { size: Size { width: 5, height: 5000 }, ..args() },
+        ] {
+            assert!(request(&wrong).is_err(), "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,330 @@
+//! One load: its references, then every variant against them, then its times and its flicker.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use nalgebra::Vector3;
+use serde::Serialize;
+
+use super::loads::{Kind, Stage};
+use super::metrics::{self, Flicker, Light, Spread};
+use super::picture::{Detail, Picture, Term, trace};
+use super::pictures::{self, File};
+use super::soup::Soup;
+use super::studio::{Pass, Set, Size, Studio};
+use super::variants::{self, Aim, Method, Variant};
+use super::view::View;
+use super::{Entry, Request, meter};
+use crate::error::Result;
+use crate::render::{Image, shadow_texel};
+use crate::scene::{Camera, Look, Scene, Shadow};
+
+/// What a variant must keep against what it means to show.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Bounds {
+    /// Mean error of a pixel, of 255.
+    pub mean_colour: f64,
+    /// Mean error of the light that arrives, of 1.
+    pub mean_light: f64,
+    /// Mean light where none should be, and mean light that is missing where all should be, of 1.
+    pub bleeding: f64,
+    pub lost: f64,
+}
+
+/// Twice what small pictures of many leaves are found at, where each leaf is a pixel or two; all others are far below. A
+/// shadow that is missing or lies elsewhere exceeds the last two however little of the picture it takes.
+pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
+
+/// The step of the motion that still pictures show.
+const STILL: usize = 10;
+/// Steps over which flicker is looked at.
+const STEPS: usize = 60;
+/// Pictures of moving scenes are smaller by this on each side.
+const SMALLER: u32 = 4;
+
+/// One variant on one load.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Row {
+    pub load: String,
+    pub name: String,
+    pub method: Method,
+    pub shadow: Option<Shadow>,
+    pub passed: bool,
+    /// Why not, in words.
+    pub faults: Vec<String>,
+    /// Colours against one hard ray to the sun a sample: the truth of a sun that is a point.
+    pub colour: Spread,
+    /// Colours against what the variant means to show.
+    pub colour_of_aim: Spread,
+    /// The light that arrives, against the hard rays and against what the variant means to show.
+    pub light: Light,
+    pub light_of_aim: Light,
+    /// None when the variant did not pass.
+    pub flicker: Option<Spread>,
+    /// "frame" is all but reading back; none when the variant did not pass.
+    pub passes: Vec<Pass>,
+    /// Device memory of the scene, and of it what the shadow takes.
+    pub bytes: u64,
+    pub shadow_bytes: u64,
+    pub samples: u32,
+    pub draws: usize,
+}
+
+impl Row {
+    /// The median time of a frame in microseconds.
+    pub fn median_us(&self) -> Option<f64> {
+        self.passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us)
+    }
+}
+
+/// The references of a load's still picture.
+struct References {
+    hard: Picture,
+    /// One per variant.
+    aims: Vec<Picture>,
+}
+
+/// What all variants of a load are measured with.
+struct Job<'a> {
+    request: &'a Request,
+    stage: Stage,
+    camera: Camera,
+    variants: Vec<Variant>,
+    references: References,
+    /// The light meter of the still picture without shadows.
+    bright: Image,
+    /// References of the moving scene, unshadowed and hard.
+    moving: Vec<[Picture; 2]>,
+}
+
+/// Measures every variant that is wanted on one load.
+pub(super) fn load(
+    studio: &mut Studio,
+    request: &Request,
+    kind: Kind,
+    progress: &mut dyn FnMut(&str),
+) -> Result<(Entry, Vec<Row>, Vec<File>)> {
+    let stage = kind.stage()?;
+    let Size { width, height } = request.size;
+    let camera = Camera::framing(&stage.scene, width, height);
+    let variants: Vec<Variant> =
+        variants::all(request.quick).into_iter().filter(|variant| request.wants(&variant.name)).collect();
+    progress(&format!("{}: tracing the references", stage.name));
+    let begin = Instant::now();
+    let references = references(studio, request, &stage, camera, &variants)?;
+    let reference_ms = begin.elapsed().as_secs_f64() * 1e3;
+    progress(&format!("{}: tracing the moving scene", stage.name));
+    let moving = moving(studio, request, &stage)?;
+    let unlit = meter::relit(&stage.scene, Look { shadow: None, ..stage.scene.look })?;
+    let bright = frame(studio, &meter::meter(&unlit)?, &stage, request)?;
+    let job = Job { request, stage, camera, variants, references, bright, moving };
+    let mut files = vec![job.reference_file("hard", &job.references.hard)?];
+    files.push(job.light_file()?);
+    let mut rows = Vec::new();
+    for at in 0..job.variants.len() {
+        progress(&format!("{}: {}", job.stage.name, job.variants[at].name));
+        let (row, file) = job.measure(studio, at)?;
+        rows.push(row);
+        files.push(file);
+    }
+    Ok((job.entry(reference_ms), rows, files))
+}
+
+fn detail(request: &Request) -> Detail {
+    if request.quick { Detail::QUICK } else { Detail::FULL }
+}
+
+fn references(
+    studio: &mut Studio,
+    request: &Request,
+    stage: &Stage,
+    camera: Camera,
+    variants: &[Variant],
+) -> Result<References> {
+    let mut set = studio.set(&stage.scene)?;
+    studio.pose(&mut set, &stage.state(STILL))?;
+    let shot = set.shot(camera, request.size);
+    let soup = Soup::new(&stage.scene, set.surface()?);
+    let view = View::new(set.scene(), &shot);
+    let mut terms = vec![Term::Hard];
+    for variant in variants {
+        let scene = meter::relit(&stage.scene, variant.look(stage.scene.look))?;
+        terms.push(term(variant, shadow_texel(&scene, &shot)));
+    }
+    let mut pictures = trace(&soup, &view, &terms, detail(request));
+    studio.strike(set);
+    let aims = pictures.split_off(1);
+    Ok(References { hard: pictures.pop().unwrap_or_default(), aims })
+}
+
+fn term(variant: &Variant, texel: Option<[Vector3<f64>; 2]>) -> Term {
+    match (variant.aim, texel) {
+        (Aim::Filtered { texels }, Some(texel)) => Term::Filtered(texel.map(|side| side * texels)),
+        _ => Term::Unshadowed,
+    }
+}
+
+/// Size of the pictures of the moving scene.
+fn small(size: Size) -> Size {
+    Size { width: (size.width / SMALLER).max(1), height: (size.height / SMALLER).max(1) }
+}
+
+/// The references of every step, with a quarter of the samples of a still one.
+fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Vec<[Picture; 2]>> {
+    let size = small(request.size);
+    let camera = Camera::framing(&stage.scene, size.width, size.height);
+    let mut set = studio.set(&stage.scene)?;
+    let mut all = Vec::new();
+    for step in 0..STEPS {
+        studio.pose(&mut set, &stage.state(step))?;
+        let view = View::new(set.scene(), &set.shot(camera, size));
+        let soup = Soup::new(&stage.scene, set.surface()?);
+        let detail = Detail { taps: 1, ..Detail::QUICK };
+        if let Ok(pair) = trace(&soup, &view, &[Term::Unshadowed, Term::Hard], detail).try_into() {
+            all.push(pair);
+        }
+    }
+    studio.strike(set);
+    Ok(all)
+}
+
+/// The still picture of a scene.
+fn frame(studio: &mut Studio, scene: &Arc<Scene>, stage: &Stage, request: &Request) -> Result<Image> {
+    let mut set = studio.set(scene)?;
+    studio.pose(&mut set, &stage.state(STILL))?;
+    let camera = Camera::framing(scene, request.size.width, request.size.height);
+    let image = studio.draw(&set, camera, request.size);
+    studio.strike(set);
+    image
+}
+
+impl Job<'_> {
+    fn entry(&self, reference_ms: f64) -> Entry {
+        let (layout, detail) = (&self.stage.scene.layout, detail(self.request));
+        Entry {
+            name: self.stage.name.clone(),
+            vertices: layout.vertices,
+            triangles: layout.triangles,
+            domains: self.stage.scene.domains.len(),
+            samples: detail.side * detail.side,
+            taps: detail.taps,
+            reference_ms,
+            steps: self.moving.len(),
+            steps_size: small(self.request.size),
+        }
+    }
+
+    /// One variant: its still picture and its light against the references, then its times and its flicker if it passed.
+    fn measure(&self, studio: &mut Studio, at: usize) -> Result<(Row, File)> {
+        let (variant, aim) = (&self.variants[at], &self.references.aims[at]);
+        let scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+        let dark = frame(studio, &meter::meter(&scene)?, &self.stage, self.request)?;
+        let lit = meter::read(&dark.rgba, &self.bright.rgba);
+        let mut set = studio.set(&scene)?;
+        studio.pose(&mut set, &self.stage.state(STILL))?;
+        let image = studio.draw(&set, self.camera, self.request.size)?;
+        let ran = studio.renderer.ran().clone();
+        let mut row = self.compared(variant, (&image, &lit), aim);
+        (row.samples, row.draws) = (ran.samples, ran.draws);
+        let plan = set.buffers.plan();
+        row.bytes = plan.bytes();
+        let shadow = plan.textures.iter().filter(|texture| texture.name.starts_with("shadow"));
+        row.shadow_bytes = shadow.map(|texture| texture.bytes).sum();
+        if row.passed {
+            row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
+            row.flicker = Some(self.flicker(studio, &mut set, variant)?);
+        }
+        studio.strike(set);
+        let file = pictures::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colours))?;
+        Ok((row, file))
+    }
+
+    fn compared(&self, variant: &Variant, (image, lit): (&Image, &[Option<f32>]), aim: &Picture) -> Row {
+        let hard = &self.references.hard;
+        let colour_of_aim = metrics::colours(&image.rgba, &aim.colours);
+        let light_of_aim = metrics::light(lit, &aim.light);
+        let faults = faults(&colour_of_aim, &light_of_aim);
+        Row {
+            load: self.stage.name.clone(),
+            name: variant.name.clone(),
+            method: variant.method,
+            shadow: variant.shadow,
+            passed: faults.is_empty(),
+            faults,
+            colour: metrics::colours(&image.rgba, &hard.colours),
+            colour_of_aim,
+            light: metrics::light(lit, &hard.light),
+            light_of_aim,
+            flicker: None,
+            passes: Vec::new(),
+            bytes: 0,
+            shadow_bytes: 0,
+            samples: 0,
+            draws: 0,
+        }
+    }
+
+    fn flicker(&self, studio: &mut Studio, set: &mut Set, variant: &Variant) -> Result<Spread> {
+        let size = small(self.request.size);
+        let camera = Camera::framing(&self.stage.scene, size.width, size.height);
+        let mut flicker = Flicker::default();
+        for (step, [unshadowed, hard]) in self.moving.iter().enumerate() {
+            studio.pose(set, &self.stage.state(step))?;
+            let image = studio.draw(set, camera, size)?;
+            let reference = if variant.aim == Aim::Unshadowed { unshadowed } else { hard };
+            flicker.push(&image.rgba, &reference.colours);
+        }
+        Ok(flicker.spread())
+    }
+
+    fn file_name(&self, what: &str) -> String {
+        format!("{}-{}", self.stage.name, what.replace(", ", "-").replace(' ', "-"))
+    }
+
+    fn reference_file(&self, what: &str, picture: &Picture) -> Result<File> {
+        pictures::picture(&self.file_name(what), self.request.size, &picture.colours)
+    }
+
+    /// The light of the hard reference; what tells none is blue.
+    fn light_file(&self) -> Result<File> {
+        let shade = |light: &Option<f32>| light.map_or([60.0, 70.0, 110.0], |light| [255.0 * light; 3]);
+        let colours: Vec<[f32; 3]> = self.references.hard.light.iter().map(shade).collect();
+        pictures::picture(&self.file_name("hard light"), self.request.size, &colours)
+    }
+}
+
+/// Which bounds a variant does not keep, in words.
+fn faults(colour: &Spread, light: &Light) -> Vec<String> {
+    let found = [
+        ("mean error of colour", Some(colour.mean), BOUNDS.mean_colour),
+        ("mean error of light", Some(light.all.mean), BOUNDS.mean_light),
+        ("mean light in the umbra", light.in_umbra, BOUNDS.bleeding),
+        ("mean light lost outside of shadows", light.lost, BOUNDS.lost),
+    ];
+    let over = |(what, found, bound): (&str, Option<f64>, f64)| {
+        let found = found.filter(|found| found.is_nan() || *found > bound)?;
+        Some(format!("{what} {found:.3}, bound {bound}"))
+    };
+    found.into_iter().filter_map(over).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shadow_that_is_missing_too_dark_or_elsewhere_is_a_fault_however_small_it_is() {
+        let shadow = |first: usize| -> Vec<Option<f32>> {
+            (0..1000).map(|at| Some(if (first..first + 10).contains(&at) { 0.0 } else { 1.0 })).collect()
+        };
+        let judged = |own: &[Option<f32>]| faults(&Spread::default(), &metrics::light(own, &shadow(100)));
+        assert_eq!(judged(&shadow(100)), Vec::<String>::new(), "control: the right one");
+        assert_eq!(judged(&shadow(102)), Vec::<String>::new(), "a fifth of it beside its place is within the bound");
+        for wrong in [shadow(200), vec![Some(1.0); 1000], shadow(105)] {
+            assert!(judged(&wrong)[0].starts_with("mean light in the umbra"), "{:?}", judged(&wrong));
+        }
+        assert!(judged(&vec![Some(0.5); 1000]).iter().any(|fault| fault.starts_with("mean light lost")));
+        let loud = Spread { mean: f64::NAN, ..Spread::default() };
+        assert_eq!(faults(&loud, &Light::default()).len(), 1, "what is no number is a fault");
+    }
+}

@@ -1,0 +1,177 @@
+//! How far a picture is from its reference. Colours are compared as a display shows them: sRGB, 0 to 255, the largest
+//! difference of the three channels; light as the share of the unshadowed sunlight that arrives.
+
+use serde::Serialize;
+
+/// A pixel of a reference is in the penumbra when between this share and one minus it arrives.
+const PENUMBRA: f32 = 0.02;
+/// It is in the umbra when less than this arrives.
+const UMBRA: f32 = 1e-6;
+
+/// Mean, 99th percentile and largest of some numbers; all 0 of none.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Spread {
+    pub mean: f64,
+    pub p99: f64,
+    pub largest: f64,
+    pub count: usize,
+}
+
+impl Spread {
+    fn of(mut values: Vec<f32>) -> Self {
+        values.sort_by(f32::total_cmp);
+        let count = values.len();
+        let Some(last) = values.last() else { return Self::default() };
+        let mean = values.iter().map(|value| f64::from(*value)).sum::<f64>() / count as f64;
+        // The smallest number that 99 of a hundred do not exceed.
+        let rank = (99 * count).div_ceil(100).clamp(1, count);
+        Self { mean, p99: f64::from(values[rank - 1]), largest: f64::from(*last), count }
+    }
+}
+
+/// Errors of every pixel's colour, of 255.
+pub fn colours(rendered: &[u8], reference: &[[f32; 3]]) -> Spread {
+    Spread::of(differences(rendered, reference).collect())
+}
+
+/// The largest difference of the three channels, per pixel.
+pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl Iterator<Item = f32> + 'a {
+    let largest = |(pixel, wanted): (&[u8], &[f32; 3])| {
+        pixel.iter().zip(wanted).map(|(byte, value)| (f32::from(*byte) - value).abs()).fold(0.0, f32::max)
+    };
+    rendered.chunks_exact(4).zip(reference).map(largest)
+}
+
+/// Errors of the light that arrives, where both pictures can tell it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Light {
+    pub all: Spread,
+    /// On pixels that are in the reference's penumbra alone.
+    pub penumbra: Spread,
+    /// Mean light where the reference has none at all: light bleeding. None when it has no such pixel.
+    pub in_umbra: Option<f64>,
+    pub umbra_pixels: usize,
+    /// Mean light that is missing where all of the reference's arrives. None when it has no such pixel.
+    pub lost: Option<f64>,
+    /// Mean of rendered minus reference: what is too bright on the whole.
+    pub bias: f64,
+}
+
+/// Compares the light that arrives, pixel by pixel; none in either is left out.
+pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Light {
+    let pairs: Vec<(f32, f32)> = rendered.iter().zip(reference).filter_map(|(own, wanted)| own.zip(*wanted)).collect();
+    let error = |(own, wanted): &(f32, f32)| (own - wanted).abs();
+    let soft = |(_, wanted): &&(f32, f32)| (PENUMBRA..=1.0 - PENUMBRA).contains(wanted);
+    let umbra: Vec<f64> = pairs.iter().filter(|pair| pair.1 <= UMBRA).map(|pair| f64::from(pair.0)).collect();
+    let whole = pairs.iter().filter(|pair| pair.1 >= 1.0 - UMBRA);
+    let lost: Vec<f64> = whole.map(|pair| f64::from(pair.1 - pair.0)).collect();
+    let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
+    let bias = pairs.iter().map(|(own, wanted)| f64::from(own - wanted)).sum::<f64>();
+    Light {
+        all: Spread::of(pairs.iter().map(error).collect()),
+        penumbra: Spread::of(pairs.iter().filter(soft).map(error).collect()),
+        in_umbra: mean(&umbra),
+        umbra_pixels: umbra.len(),
+        lost: mean(&lost),
+        bias: bias / pairs.len().max(1) as f64,
+    }
+}
+
+/// Flicker of a moving scene: how much the error changes from frame to frame. The change of the picture less that of the
+/// reference, the largest of the three channels, of 255; a still error is none.
+#[derive(Debug, Default)]
+pub struct Flicker {
+    before: Vec<[f32; 3]>,
+    changes: Vec<f32>,
+}
+
+impl Flicker {
+    /// Takes the next frame and its reference.
+    pub fn push(&mut self, rendered: &[u8], reference: &[[f32; 3]]) {
+        let error = |(pixel, wanted): (&[u8], &[f32; 3])| {
+            std::array::from_fn(|channel| f32::from(pixel[channel]) - wanted[channel])
+        };
+        let now: Vec<[f32; 3]> = rendered.chunks_exact(4).zip(reference).map(error).collect();
+        let change = |(now, before): (&[f32; 3], &[f32; 3])| {
+            now.iter().zip(before).map(|(now, before)| (now - before).abs()).fold(0.0, f32::max)
+        };
+        self.changes.extend(now.iter().zip(&self.before).map(change));
+        self.before = now;
+    }
+
+    /// Over all pixels of all pairs of frames.
+    pub fn spread(self) -> Spread {
+        Spread::of(self.changes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grey(levels: impl IntoIterator<Item = u8>) -> Vec<u8> {
+        levels.into_iter().flat_map(|level| [level, level, level, 255]).collect()
+    }
+
+    #[test]
+    fn the_error_of_a_picture_with_one_wrong_pixel_in_a_hundred_is_known() {
+        let reference = vec![[100.0; 3]; 100];
+        assert_eq!(colours(&grey([100; 100]), &reference).largest, 0.0, "control: equal pictures");
+        let one = grey((0..100).map(|at| if at == 7 { 150 } else { 100 }));
+        let found = colours(&one, &reference);
+        assert_eq!((found.mean, found.p99, found.largest, found.count), (0.5, 0.0, 50.0, 100));
+        let two = grey((0..100).map(|at| if at < 2 { 150 } else { 100 }));
+        assert_eq!(colours(&two, &reference).p99, 50.0, "two in a hundred reach the percentile");
+        let mut tinted = grey([100; 100]);
+        tinted[1] = 90;
+        assert_eq!(colours(&tinted, &reference).largest, 10.0, "one channel counts");
+        assert_eq!(colours(&[], &[]), Spread::default());
+    }
+
+    #[test]
+    fn a_ramp_that_is_shifted_errs_by_its_slope_and_only_on_the_ramp() {
+        let ramp = |shift: i32| -> Vec<Option<f32>> {
+            (0..100).map(|at| Some(((at - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
+        };
+        let still = light(&ramp(0), &ramp(0));
+        assert_eq!((still.all.largest, still.penumbra.count, still.bias), (0.0, 19, 0.0), "control: the same ramp");
+        let moved = light(&ramp(2), &ramp(0));
+        assert!((moved.penumbra.largest - 0.1).abs() < 1e-6 && moved.penumbra.mean > 0.09, "{moved:?}");
+        assert!((moved.all.mean - 0.02).abs() < 1e-6 && (moved.bias + 0.02).abs() < 1e-6, "{moved:?}");
+        assert_eq!(moved.in_umbra, Some(0.0), "a shadow that is too large lets nothing in");
+    }
+
+    #[test]
+    fn light_in_the_umbra_is_bleeding_and_light_elsewhere_is_not() {
+        let reference: Vec<Option<f32>> = (0..10).map(|at| Some(if at < 4 { 0.0 } else { 1.0 })).collect();
+        let mut leaking = reference.clone();
+        leaking[1] = Some(0.2);
+        let found = light(&leaking, &reference);
+        assert!((found.in_umbra.expect("an umbra") - 0.05).abs() < 1e-7 && found.umbra_pixels == 4);
+        let mut dark = reference.clone();
+        dark[9] = Some(0.5);
+        let found = light(&dark, &reference);
+        assert_eq!(found.in_umbra, Some(0.0), "control: an error in the light");
+        assert!((found.lost.expect("a lit part") - 0.5 / 6.0).abs() < 1e-7, "{found:?}");
+        assert_eq!(light(&leaking, &reference).lost, Some(0.0), "control: an error in the umbra");
+        assert_eq!(light(&[Some(0.5)], &[Some(1.0)]).in_umbra, None, "no umbra, no bleeding");
+        assert_eq!(light(&[None, Some(1.0)], &[Some(0.0), None]).all.count, 0, "what neither tells is left out");
+    }
+
+    #[test]
+    fn only_what_changes_without_the_reference_flickers() {
+        let flicker = |rendered: &dyn Fn(usize) -> u8, reference: &dyn Fn(usize) -> f32| {
+            let mut flicker = Flicker::default();
+            (0..60).for_each(|step| flicker.push(&grey([rendered(step); 4]), &[[reference(step); 3]; 4]));
+            flicker.spread()
+        };
+        let still = flicker(&|_| 90, &|_| 100.0);
+        assert_eq!((still.largest, still.count), (0.0, 59 * 4), "a still error does not flicker");
+        let moving = flicker(&|step| 3 * step as u8, &|step| 3.0 * step as f32);
+        assert_eq!(moving.largest, 0.0, "a picture that moves with its reference does not");
+        let blinking = flicker(&|step| 100 + 10 * (step % 2) as u8, &|_| 100.0);
+        assert_eq!((blinking.mean, blinking.largest), (10.0, 10.0));
+        let frozen = flicker(&|_| 100, &|step| 100.0 + 10.0 * (step % 2) as f32);
+        assert_eq!(frozen.mean, 10.0, "a picture that misses a change of the reference does");
+    }
+}

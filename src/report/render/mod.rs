@@ -1,0 +1,124 @@
+//! Error against run time of the renderer: pictures by every variant against references that rays make by brute force.
+//!
+//! Validate first, then time: a variant whose error against what it means to show exceeds a stated bound is not timed, is
+//! named, and fails the report.
+//!
+//! - [`loads`], [`variants`]: what is drawn, and how.
+//! - `soup`, `paint`, `texels`, `view`, `shade`, `pattern`, `picture`: the references. 64 samples a pixel, all in f64 but
+//!   the boxes of the tree; solid surfaces and cut-outs by their nearest point, transparent ones sorted by depth along
+//!   every sample; the shadow by one ray a sample to the sun, or by rays over the blur's own footprint.
+//! - `studio`, `meter`: frames of the renderer, and the light in them.
+//! - [`metrics`]: errors, light bleeding, flicker.
+
+pub mod loads;
+mod measure;
+mod meter;
+pub mod metrics;
+mod output;
+mod page;
+mod paint;
+mod pattern;
+mod picture;
+mod pictures;
+mod plot;
+mod shade;
+mod soup;
+mod studio;
+#[cfg(test)]
+mod tests;
+mod texels;
+pub mod variants;
+mod view;
+
+use serde::Serialize;
+
+use self::loads::Kind;
+pub use self::measure::Row;
+pub use self::pictures::File;
+use self::studio::Studio;
+pub use self::studio::{Pass, Size};
+use super::machine::Provenance;
+use super::wants;
+use crate::error::Result;
+use crate::render::Info;
+
+/// What to report on.
+#[derive(Debug, Clone)]
+pub struct Request {
+    pub loads: Vec<Kind>,
+    /// Which variants, by name or by its beginning and a `*`; empty: all.
+    pub variants: Vec<String>,
+    pub size: Size,
+    /// Fewer variants, samples and steps, for machines of few cores.
+    pub quick: bool,
+    /// Frames per median.
+    pub replays: usize,
+}
+
+impl Request {
+    /// Whether a variant is to be measured.
+    pub fn wants(&self, name: &str) -> bool {
+        wants(&self.variants, name)
+    }
+}
+
+/// One load of a report.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Entry {
+    pub name: String,
+    pub vertices: usize,
+    pub triangles: usize,
+    pub domains: usize,
+    /// Samples of a pixel of the reference, and rays to the sun of each where its light is filtered.
+    pub samples: usize,
+    pub taps: usize,
+    /// What tracing all references of its still picture took.
+    pub reference_ms: f64,
+    /// Steps over which flicker was looked at, and the size of their pictures.
+    pub steps: usize,
+    pub steps_size: Size,
+}
+
+/// A whole report.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    pub made: Provenance,
+    pub renderer: Info,
+    pub size: Size,
+    /// What bounds a variant must keep against what it means to show.
+    pub bounds: measure::Bounds,
+    pub loads: Vec<Entry>,
+    pub rows: Vec<Row>,
+    /// Variants that did not pass, as load: variant: why.
+    pub failed: Vec<String>,
+    /// Pictures to be looked at.
+    #[serde(skip)]
+    pub pictures: Vec<File>,
+}
+
+/// Makes a report; `progress` hears what is being done.
+///
+/// # Errors
+/// `Unavailable` without OpenGL; those of loading and drawing a scene.
+pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Report> {
+    let mut studio = Studio::open()?;
+    let (mut loads, mut rows, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
+    for kind in &request.loads {
+        progress(&format!("{}: building", kind.name()));
+        let (entry, measured, files) = measure::load(&mut studio, request, *kind, &mut progress)?;
+        loads.push(entry);
+        rows.extend(measured);
+        pictures.extend(files);
+    }
+    let why = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
+    let failed = rows.iter().filter(|row: &&Row| !row.passed).map(why).collect();
+    let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), measure::BOUNDS);
+    Ok(Report { made, renderer, size: request.size, bounds, loads, rows, failed, pictures })
+}
+
+impl Report {
+    /// Whether every variant passed.
+    pub fn passed(&self) -> bool {
+        self.failed.is_empty()
+    }
+}

@@ -1,0 +1,92 @@
+//! `report.md`: the report as tables for people.
+
+use super::{Entry, Report, Row};
+use crate::report::peers::{dash, line, rule};
+
+/// The whole page.
+pub(super) fn markdown(report: &Report) -> String {
+    let (made, size) = (&report.made, report.size);
+    let mut text = format!("# Rendering: error against run time\n\n{}\n", made.line());
+    let commit = made.commit.as_deref().unwrap_or("unknown");
+    text.push_str(&format!(
+        "\n{}; {} x {} pixels. Commit {commit}.\n\n",
+        report.renderer.renderer, size.width, size.height
+    ));
+    text.push_str(EXPLAINED);
+    let bounds = report.bounds;
+    text.push_str(&match report.failed.is_empty() {
+        true => format!(
+            "\nEvery variant stays within its bounds against what it means to show: a mean error of colour of {} of 255, \
+             of light of {}; {} of light in the umbra; {} lost outside of shadows.\n",
+            bounds.mean_colour, bounds.mean_light, bounds.bleeding, bounds.lost
+        ),
+        false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
+    });
+    for load in &report.loads {
+        text.push_str(&section(load, report.rows.iter().filter(|row| row.load == load.name)));
+    }
+    text
+}
+
+const EXPLAINED: &str = "Colours are compared as a display shows them, of 255, the largest difference of three channels: \
+against hard shadow rays, and against what the variant means to show (no shadow, or the hard shadow under the blur's own \
+footprint). Light is the share of the unshadowed sunlight that arrives, against the same two. Bleeding is the mean light \
+where the filtered reference has none. Flicker is the change of the error from step to step. `frame` is all passes but \
+reading back.\n";
+
+const HEAD: [&str; 16] = [
+    "variant",
+    "frame us",
+    "quartiles us",
+    "shadow us",
+    "draw us",
+    "MB",
+    "shadow MB",
+    "colour mean",
+    "p99",
+    "largest",
+    "colour of aim mean",
+    "light of aim mean",
+    "penumbra",
+    "bleeding",
+    "flicker mean",
+    "passed",
+];
+
+fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
+    let Entry { name, vertices, triangles, domains, samples, taps, reference_ms, steps, .. } = load;
+    let mut text = format!(
+        "\n## {name}\n\n{vertices} vertices, {triangles} triangles, {domains} domains. References: {samples} samples a \
+         pixel, {taps} rays each over a footprint, {:.1} s; flicker over {steps} steps.\n\n",
+        reference_ms / 1e3
+    );
+    text.push_str(&line(HEAD.map(String::from)));
+    text.push_str(&rule(HEAD.len()));
+    rows.for_each(|row| text.push_str(&line(cells(row))));
+    text
+}
+
+fn cells(row: &Row) -> [String; 16] {
+    let timing = |name: &str| row.passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
+    let median = |name: &str| timing(name).map_or_else(dash, |timing| format!("{:.1}", timing.median_us));
+    let small = |value: f64| format!("{value:.4}");
+    let megabytes = |bytes: u64| format!("{:.1}", bytes as f64 / 1e6);
+    [
+        row.name.clone(),
+        median("frame"),
+        timing("frame").map_or_else(dash, |timing| format!("{:.1} to {:.1}", timing.q1_us, timing.q3_us)),
+        median("shadow"),
+        median("draw"),
+        megabytes(row.bytes),
+        megabytes(row.shadow_bytes),
+        format!("{:.3}", row.colour.mean),
+        format!("{:.1}", row.colour.p99),
+        format!("{:.1}", row.colour.largest),
+        format!("{:.3}", row.colour_of_aim.mean),
+        small(row.light_of_aim.all.mean),
+        small(row.light_of_aim.penumbra.mean),
+        row.light_of_aim.in_umbra.map_or_else(dash, small),
+        row.flicker.map_or_else(dash, |flicker| format!("{:.3}", flicker.mean)),
+        if row.passed { "yes".into() } else { format!("no: {}", row.faults.join("; ")) },
+    ]
+}

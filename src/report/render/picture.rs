@@ -1,0 +1,166 @@
+//! The reference pictures: every sample of every pixel traced, transparent layers sorted, shadows by rays.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::pattern;
+use super::shade::{self, Seen};
+use super::soup::{Ray, Soup};
+use super::texels::srgb_from_linear;
+use super::view::View;
+
+/// What decides how much of the sun reaches a point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Term {
+    /// All of it, always.
+    Unshadowed,
+    /// One ray to the sun.
+    Hard,
+    /// The share of rays that arrive under a bell in the plane across the light: two vectors of one deviation each. The
+    /// rays begin on the receiver's own tangent plane, where half their distance from its middle is free of casters: so
+    /// near, it is the receiver itself.
+    Filtered([Vector3<f64>; 2]),
+}
+
+/// A picture under one term.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Picture {
+    /// sRGB, 0 to 255 but not rounded, top row first.
+    pub(super) colours: Vec<[f32; 3]>,
+    /// The share of the unshadowed sunlight that arrives at what a pixel sees; none where that is less than
+    /// [`LEAST_LIGHT`].
+    pub(super) light: Vec<Option<f32>>,
+}
+
+/// Sunlight below this, of all that there is, is too little to tell shares of it.
+pub(super) const LEAST_LIGHT: f64 = 0.1;
+
+/// How finely a reference is traced.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Detail {
+    /// Samples along each side of a pixel.
+    pub(super) side: usize,
+    /// Rays to the sun per sample of a filtered term.
+    pub(super) taps: usize,
+}
+
+impl Detail {
+    /// The 64 samples of a reference.
+    pub(super) const FULL: Self = Self { side: 8, taps: 1 };
+    /// A quarter of that, for machines of few cores.
+    pub(super) const QUICK: Self = Self { side: 4, taps: 4 };
+}
+
+/// Traces pictures under all of the terms at once: what the camera sees is the same for all.
+pub(super) fn trace(soup: &Soup, view: &View, terms: &[Term], detail: Detail) -> Vec<Picture> {
+    let samples = pattern::pixel(detail.side);
+    let pixels: Vec<Vec<([f32; 3], Option<f32>)>> = (0..view.width * view.height)
+        .into_par_iter()
+        .map(|pixel| trace_pixel(soup, view, terms, (pixel % view.width, pixel / view.width), (&samples, detail.taps)))
+        .collect();
+    let of_term = |term: usize| Picture {
+        colours: pixels.iter().map(|pixel| pixel[term].0).collect(),
+        light: pixels.iter().map(|pixel| pixel[term].1).collect(),
+    };
+    (0..terms.len()).map(of_term).collect()
+}
+
+/// Sums over the samples of a pixel under one term.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sum {
+    colour: Vector3<f64>,
+    /// Sunlight that arrives, and that would if nothing were in the way.
+    arrives: f64,
+    whole: f64,
+}
+
+type Samples<'a> = (&'a [[f64; 2]], usize);
+
+fn trace_pixel(
+    soup: &Soup,
+    view: &View,
+    terms: &[Term],
+    (x, y): (u32, u32),
+    (samples, taps): Samples<'_>,
+) -> Vec<([f32; 3], Option<f32>)> {
+    let bell = pattern::bell(samples.len() * taps, pattern::scatter(x, y));
+    let mut sums = vec![Sum::default(); terms.len()];
+    for (at, [dx, dy]) in samples.iter().enumerate() {
+        let layers = layers(soup, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
+        // Any odd stride goes through all of the bell; this one leaves neighbours apart.
+        let own: Vec<[f64; 2]> = (0..taps).map(|tap| bell[((at * 37 + 11) % samples.len()) * taps + tap]).collect();
+        for (sum, term) in sums.iter_mut().zip(terms) {
+            add(sum, &layers, |seen| sunlit(soup, view, seen, *term, &own));
+        }
+    }
+    sums.iter().map(|sum| sum.shown(samples.len())).collect()
+}
+
+/// What a ray sees, farthest first: something solid, then every transparent layer before it.
+fn layers(soup: &Soup, view: &View, ray: &Ray) -> Vec<Seen> {
+    let (near, far) = view.range;
+    let mut solid = soup.nearest(ray, (near, far), |hit| soup.is_solid(hit));
+    let ground = view.ground_at(ray);
+    // Triangles in the plane of the ground cover it.
+    if let (Some(hit), Some(t)) = (solid, ground)
+        && hit.t > t + 1e-6 * soup.radius
+    {
+        solid = None;
+    }
+    let (back, until) = match (solid, ground) {
+        (Some(hit), _) => (shade::surface(soup, view, ray, &hit), hit.t),
+        (None, Some(t)) => (shade::ground(view, ray, t), t.min(far)),
+        (None, None) => (shade::sky(view, ray), far),
+    };
+    let mut layers = vec![back];
+    if soup.has_blended {
+        let before = soup.every(ray, (near, until), |hit| soup.is_blended(hit));
+        layers.extend(before.iter().map(|hit| shade::surface(soup, view, ray, hit)));
+    }
+    layers
+}
+
+/// Composes layers back to front: C = a C_layer + (1 - a) C_behind, and so for the light.
+fn add(sum: &mut Sum, layers: &[Seen], arrives: impl Fn(&Seen) -> f64) {
+    let mut sample = Sum::default();
+    for seen in layers {
+        let share = if seen.facing > 0.0 { arrives(seen) } else { 0.0 };
+        let rest = 1.0 - seen.alpha;
+        sample.colour = (seen.ambient + seen.sun * share) * seen.alpha + sample.colour * rest;
+        sample.arrives = seen.facing * share * seen.alpha + sample.arrives * rest;
+        sample.whole = seen.facing * seen.alpha + sample.whole * rest;
+    }
+    // Each sample is clamped by itself: what is too bright for the display does not whiten its pixel's edge.
+    sum.colour += sample.colour.map(|channel| channel.clamp(0.0, 1.0));
+    sum.arrives += sample.arrives;
+    sum.whole += sample.whole;
+}
+
+impl Sum {
+    fn shown(&self, samples: usize) -> ([f32; 3], Option<f32>) {
+        let count = samples as f64;
+        let colour = (self.colour / count).map(|channel| (255.0 * srgb_from_linear(channel)) as f32);
+        let lit = self.whole / count >= LEAST_LIGHT;
+        (colour.into(), lit.then(|| (self.arrives / self.whole) as f32))
+    }
+}
+
+/// How much of the sun reaches a point.
+fn sunlit(soup: &Soup, view: &View, seen: &Seen, term: Term, bell: &[[f64; 2]]) -> f64 {
+    let dark = |from: Vector3<f64>, least: f64| {
+        soup.is_dark(&Ray { from, along: view.to_sun }, least + 1e-9 * soup.radius, seen.triangle)
+    };
+    match term {
+        Term::Unshadowed => 1.0,
+        Term::Hard => f64::from(u8::from(!dark(seen.point, 0.0))),
+        Term::Filtered([across, upward]) => {
+            let cosine = seen.facet.dot(&view.to_sun).max(0.05);
+            let arrives = bell.iter().filter(|[x, y]| {
+                let aside = across * *x + upward * *y;
+                let slide = -seen.facet.dot(&aside) / cosine;
+                !dark(seen.point + aside + view.to_sun * slide, 0.5 * aside.norm())
+            });
+            arrives.count() as f64 / bell.len() as f64
+        }
+    }
+}

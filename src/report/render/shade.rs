@@ -1,0 +1,102 @@
+//! Phong after equation 3.12, as the shaders have it but in f64: what one point sends to the eye without the sun and by
+//! the sun alone.
+//!
+//!   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e
+
+use nalgebra::Vector3;
+
+use super::soup::{Hit, Ray, Soup};
+use super::view::View;
+
+/// One point that a ray sees.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Seen {
+    pub(super) point: Vector3<f64>,
+    /// Normal of the flat surface there, on the sun's side.
+    pub(super) facet: Vector3<f64>,
+    /// The triangle that it lies on; none for the ground.
+    pub(super) triangle: Option<usize>,
+    /// Linear light without the sun, and what the unshadowed sun adds.
+    pub(super) ambient: Vector3<f64>,
+    pub(super) sun: Vector3<f64>,
+    /// How much of the sunlight it would receive: the cosine, or 0 where it looks away.
+    pub(super) facing: f64,
+    pub(super) alpha: f64,
+}
+
+/// A point of the sky, which no sun lights.
+pub(super) fn sky(view: &View, ray: &Ray) -> Seen {
+    let (point, zero) = (ray.from, Vector3::zeros());
+    Seen { point, facet: zero, triangle: None, ambient: view.sky(&ray.along), sun: zero, facing: 0.0, alpha: 1.0 }
+}
+
+/// A point of the ground at `t`: Lambert's law, and the haze.
+pub(super) fn ground(view: &View, ray: &Ray, t: f64) -> Seen {
+    let point = ray.at(t);
+    let (colour, haze) = view.ground_colours();
+    let clear = view.clear(&point);
+    let facing = view.up.dot(&view.to_sun).max(0.0);
+    Seen {
+        point,
+        facet: view.up,
+        triangle: None,
+        ambient: haze.lerp(&colour.component_mul(&view.skylight), clear),
+        sun: colour.component_mul(&view.sunlight) * (clear * facing),
+        facing: clear * facing,
+        alpha: 1.0,
+    }
+}
+
+/// A point of a triangle.
+pub(super) fn surface(soup: &Soup, view: &View, ray: &Ray, hit: &Hit) -> Seen {
+    let paint = soup.paint(hit);
+    let point = ray.at(hit.t);
+    let [r, g, b, a] = paint.colour.as_ref().map_or([1.0; 4], |image| image.at(soup.uv(hit)));
+    let tint = Vector3::new(r, g, b);
+    let normal = normal(soup, hit);
+    let cosine = normal.dot(&view.to_sun);
+    let mut sun = Vector3::zeros();
+    if cosine > 0.0 {
+        let to_eye = unit(view.eye - point);
+        let reflected = 2.0 * to_eye.dot(&normal) * normal - to_eye;
+        let gleam = reflected.dot(&view.to_sun);
+        let highlight = if gleam > 0.0 { gleam.powf(paint.exponent) } else { 0.0 };
+        let answer = cosine * paint.diffuse.component_mul(&tint) + highlight * paint.specular;
+        sun = answer.component_mul(&view.sunlight);
+    }
+    let flat = soup.triangles[hit.triangle].facet();
+    Seen {
+        point,
+        facet: if flat.dot(&view.to_sun) < 0.0 { -flat } else { flat },
+        triangle: Some(hit.triangle),
+        ambient: view.skylight.component_mul(&paint.ambient).component_mul(&tint),
+        sun,
+        facing: cosine.max(0.0),
+        alpha: if soup.is_blended(hit) { paint.alpha * a } else { 1.0 },
+    }
+}
+
+/// The interpolated normal, bent by the normal map, turned to the side that is seen.
+fn normal(soup: &Soup, hit: &Hit) -> Vector3<f64> {
+    let corners = soup.triangles[hit.triangle].corners.map(|corner| corner as usize);
+    let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
+    let mut normal: Vector3<f64> = corners.iter().zip(weights).map(|(at, weight)| soup.normals[*at] * weight).sum();
+    normal = unit(normal);
+    if let Some(image) = soup.paint(hit).normal.as_ref().filter(|_| !soup.tangents.is_empty()) {
+        let tangent =
+            |axis: usize| corners.iter().zip(weights).map(|(at, weight)| soup.tangents[*at][axis] * weight).sum();
+        let [x, y, z, sign]: [f64; 4] = [0, 1, 2, 3].map(tangent);
+        let along = Vector3::new(x, y, z);
+        if along.norm_squared() > 0.0 {
+            let [r, g, b] = std::array::from_fn(|channel| (image.at(soup.uv(hit))[channel] * 255.0 - 128.0) / 127.0);
+            let along = unit(along - normal * normal.dot(&along));
+            let across = normal.cross(&along) * if sign < 0.0 { -1.0 } else { 1.0 };
+            normal = unit(along * r + across * g + normal * b);
+        }
+    }
+    if hit.front { normal } else { -normal }
+}
+
+fn unit(vector: Vector3<f64>) -> Vector3<f64> {
+    vector / vector.norm_squared().max(1e-30).sqrt()
+}

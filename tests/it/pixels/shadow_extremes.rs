@@ -1,0 +1,123 @@
+//! Suns, cameras and scenes at the ends of what is possible, with every kind of shadow map; and shadows that stay still.
+
+use modalcast::deform::Deformer as _;
+use modalcast::domain::{Material, Mesh};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Image, Shot};
+use modalcast::scene::{Bounds, Camera, Lens, Look, Scene, Shadow, ShadowMethod, State, View};
+
+use super::build::{Stage, lying, open};
+
+fn kinds() -> [Shadow; 5] {
+    let base = Shadow { size: 128, ..Shadow::default() };
+    [
+        base,
+        Shadow { method: ShadowMethod::Standard, ..base },
+        Shadow { method: ShadowMethod::Filtered, ..base },
+        Shadow { splits: 4, ..base },
+        Shadow { size: 16, blur: 16.0, splits: 2, method: ShadowMethod::Filtered, ..base },
+    ]
+}
+
+fn triangle(corners: [[f32; 3]; 3]) -> Mesh {
+    Mesh::indexed(corners.to_vec(), vec![[0.0, 1.0, 0.0]; 3], vec![], vec![[0, 1, 2]]).expect("a triangle")
+}
+
+/// The picture of a scene with this sun and map. The sky is bright and all is lit by it, so that black is not a colour.
+fn picture(meshes: &[Mesh], sun: [f32; 3], shadow: Shadow, camera: Option<(f64, f64)>) -> Image {
+    let mut stage = Stage::new();
+    stage.0.look = Look { sun, shadow: Some(shadow), ..Look::default() };
+    for mesh in meshes {
+        stage = stage.add(mesh.clone(), Material { double_sided: true, ..Material::default() });
+    }
+    let scene = stage.scene();
+    let mut shown = Camera::framing(&scene, 32, 32);
+    if let Some((near, far)) = camera {
+        (shown.near, shown.far) = (near, far);
+    }
+    let mut deformer = ReferenceDeformer::new(&scene);
+    let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+    let mut renderer = open();
+    let buffers = renderer.load(&scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    renderer.draw(&buffers, &Shot { camera: shown, width: 32, height: 32, bounds }).expect("draws")
+}
+
+fn black(image: &Image) -> usize {
+    image.rgba.chunks_exact(4).filter(|pixel| pixel[..3] == [0; 3]).count()
+}
+
+#[test]
+fn no_sun_camera_or_scene_leaves_a_pixel_without_a_number() {
+    let one = [triangle([[0.0, 0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 1.0, 1.0]])];
+    let point = [triangle([[5.0, 2.0, 5.0]; 3])];
+    let upright = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
+    let far = [triangle([[1e7, 0.5, 0.0], [1e7 + 2.0, 0.5, 0.0], [1e7, 1.0, 2.0]])];
+    let high = Vec::from([lying(2.0, 0.0), lying(1.0, 1.0)]);
+    let scenes: [(&[Mesh], &str); 5] = [
+        (&one, "one triangle"),
+        (&point, "a point"),
+        (&upright, "edge on"),
+        (&far, "far away"),
+        (&high, "two squares"),
+    ];
+    let suns = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1e-4, 0.2], [0.3, -1.0, 0.2], [0.4, 0.8, 0.5]];
+    for shadow in kinds() {
+        for (meshes, name) in scenes {
+            for sun in suns {
+                let shown = picture(meshes, sun, shadow, None);
+                assert_eq!(black(&shown), 0, "{name}, sun {sun:?}, {shadow:?}");
+            }
+        }
+        assert_eq!(black(&picture(&high, suns[4], shadow, Some((1e-6, 1e9)))), 0, "wide planes, {shadow:?}");
+    }
+    let mut dark = picture(&high, suns[4], kinds()[0], None);
+    dark.rgba[..3].fill(0);
+    assert_eq!(black(&dark), 1, "control: the judge sees one black pixel");
+}
+
+#[test]
+fn a_still_shadow_does_not_flicker_while_the_bounds_grow_out_of_sight() {
+    let table = |shadow: Shadow| {
+        let mut stage = Stage::new();
+        stage.0.look = Look { shadow: Some(shadow), ..Look::default() };
+        stage.add(lying(1.0, 0.7), Material::default()).add(lying(0.1, 0.0), Material::default()).scene()
+    };
+    let base = Shadow { size: 100, ..Shadow::default() };
+    for method in [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::Filtered] {
+        let scene = table(Shadow { method, ..base });
+        let steps = frames(&scene);
+        let changes: Vec<usize> = steps.windows(2).map(|pair| differing(&pair[0], &pair[1])).collect();
+        let jumps = changes.iter().filter(|change| **change > 0).count();
+        // Over 60 steps the bounds grow by a quarter along x and an eighth along z: each side of the map takes two rungs,
+        // and so does its depth. A box fitted tightly would change the picture in all steps.
+        assert!(jumps <= 10, "{method:?}: the picture changed in {jumps} of 59 steps, {changes:?}");
+        assert!(differing(&steps[0], &steps[59]) > 0, "control: another texel size is seen");
+    }
+}
+
+/// 60 frames of a scene at rest whose bounds grow.
+fn frames(scene: &std::sync::Arc<Scene>) -> Vec<Image> {
+    let mut deformer = ReferenceDeformer::new(scene);
+    let rest = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let mut renderer = open();
+    let buffers = renderer.load(scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let view = View::LookAt { eye: [3.0, 4.0, 5.0], target: [-0.3, 0.0, -0.3], up: [0.0, 1.0, 0.0] };
+    let camera = Camera { view, lens: Lens::FieldOfView(30.0), near: 1.0, far: 30.0 };
+    let grown = |step: u32| {
+        let by = 0.125 * f64::from(step) / 59.0;
+        Bounds { min: rest.min, max: [rest.max[0] * (1.0 + 2.0 * by), rest.max[1], rest.max[2] * (1.0 + by)] }
+    };
+    let mut frame = |step: u32| {
+        let shot = Shot { camera, width: 96, height: 96, bounds: grown(step) };
+        renderer.draw(&buffers, &shot).expect("draws")
+    };
+    (0..60).map(&mut frame).collect()
+}
+
+/// Pixels that differ by more than a level.
+fn differing(one: &Image, other: &Image) -> usize {
+    let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
+    pairs.filter(|(a, b)| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > 1)).count()
+}

@@ -1,0 +1,238 @@
+//! Every kind of shadow map against the same arithmetic: the shadow of a straight edge on the ground.
+
+use modalcast::domain::{AlphaMode, Material, Mesh};
+use modalcast::render::plan;
+use modalcast::scene::{Blurring, Camera, Lens, Moments, Scene, Shadow, ShadowMethod, View};
+
+use super::build::{Picture, close, draw, lying, open};
+use super::shadow::{stage, with_square};
+
+/// Pixels a unit of the ground, in the picture of the edge.
+const SCALE: f64 = 100.0;
+/// Half the side of the sun's box across the edge: 5, the reach of the bounds, on the next sixteenth of 4.
+const HALF: f64 = 5.25;
+
+fn variance() -> Shadow {
+    Shadow { size: 256, blur: 2.0, bleeding: 0.0, ..Shadow::default() }
+}
+
+/// Texels to each side that no caster reaches, and the side of a texel across the edge.
+fn texel(shadow: &Shadow) -> f64 {
+    let rim = f64::from(shadow.reach()) + 1.0;
+    2.0 * HALF / (f64::from(shadow.size) - 2.0 * rim)
+}
+
+fn scene(shadow: Shadow) -> std::sync::Arc<Scene> {
+    let mut stage = stage();
+    stage.0.look.shadow = Some(shadow);
+    with_square(stage, AlphaMode::Opaque, 1.0).scene()
+}
+
+/// The edge at z = 1 of the shadow of the square, seen from straight above.
+fn edge(shadow: Shadow) -> Picture {
+    let view = View::LookAt { eye: [0.0, 20.0, 1.0], target: [0.0, 0.0, 1.0], up: [0.0, 0.0, -1.0] };
+    let lens = Lens::Intrinsics { fx: 20.0 * SCALE, fy: 20.0 * SCALE, cx: 32.0, cy: 32.0 };
+    draw(&mut open(), &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
+}
+
+/// z of the ground in the middle of a row.
+fn z_of(row: u32) -> f64 {
+    1.0 + (f64::from(row) + 0.5 - 32.0) / SCALE
+}
+
+/// The share of the sun that reaches the ground in a pixel.
+fn share([byte, ..]: [u8; 3]) -> f64 {
+    let encoded = f64::from(byte) / 255.0;
+    let linear = if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) };
+    (linear / 0.8 - 0.25) / (0.5 * 0.8)
+}
+
+fn profile(picture: &Picture, column: u32) -> Vec<f64> {
+    (0..64).map(|row| share(picture.at(column, row))).collect()
+}
+
+/// What arrives at z when every texel whose centre the square covers is dark, weighed by the Gaussian and taken linearly
+/// between texels.
+fn expected(shadow: &Shadow, z: f64) -> f64 {
+    let (texel, reach) = (texel(shadow), shadow.reach() as i64);
+    let bell = |step: i64| if step == 0 { 1.0 } else { (-0.5 * (step as f64 / f64::from(shadow.blur)).powi(2)).exp() };
+    let sum: f64 = (-reach..=reach).map(bell).sum();
+    // The grid is laid from the middle, texel edges at multiples of a texel.
+    let open = |index: i64| f64::from(u8::from((index as f64 + 0.5) * texel > 1.0));
+    let blurred = |index: i64| (-reach..=reach).map(|step| bell(step) / sum * open(index + step)).sum::<f64>();
+    let place = z / texel - 0.5;
+    let past = place - place.floor();
+    (1.0 - past) * blurred(place.floor() as i64) + past * blurred(place.floor() as i64 + 1)
+}
+
+#[test]
+fn filtered_and_variance_maps_give_the_blurred_edge_to_a_hundredth_however_it_is_blurred() {
+    let base = variance();
+    let kinds = [
+        Shadow { method: ShadowMethod::Filtered, ..base },
+        Shadow { method: ShadowMethod::Filtered, blur: 0.7, ..base },
+        Shadow { blurring: Blurring::Rows, ..base },
+        Shadow { blurring: Blurring::Tiles, ..base },
+        Shadow { blurring: Blurring::Tiles, blur: 0.0, ..base },
+        Shadow { blurring: Blurring::Tiles, blur: 4.0, ..base },
+        Shadow { blurring: Blurring::Fragments, ..base },
+    ];
+    for shadow in kinds {
+        let seen = profile(&edge(shadow), 32);
+        let wrong = |shift: f64| {
+            let error = |row: u32| (seen[row as usize] - expected(&shadow, z_of(row) + shift)).abs();
+            (0..64).map(error).fold(0.0, f64::max)
+        };
+        assert!(wrong(0.0) < 0.012, "{shadow:?}: {} at the worst", wrong(0.0));
+        assert!(wrong(0.5 * texel(&shadow)) > 0.02, "control: half a texel aside is seen");
+    }
+}
+
+#[test]
+fn tiles_rows_and_fragments_blur_alike_whatever_the_blur() {
+    for blur in [0.0, 1.5, 4.0, 9.0, 12.0, 16.0] {
+        let [tiles, rows, fragments] = [Blurring::Tiles, Blurring::Rows, Blurring::Fragments]
+            .map(|blurring| edge(Shadow { size: 200, blur, blurring, ..variance() }).image.rgba);
+        let most = |other: &[u8]| tiles.iter().zip(other).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
+        assert!(most(&rows) <= 1 && most(&fragments) <= 1, "blur {blur}: {} {}", most(&rows), most(&fragments));
+        let wider = edge(Shadow { size: 200, blur: (blur + 1.0).min(15.0), ..variance() }).image.rgba;
+        assert!(most(&wider) > 1, "control: another blur is seen");
+    }
+}
+
+/// z where half of the sun arrives.
+fn crossing(profile: &[f64]) -> f64 {
+    let row = profile.iter().position(|share| *share > 0.5).expect("the picture has a lit side");
+    let (dark, light) = (profile[row - 1], profile[row]);
+    z_of(row as u32) - (light - 0.5) / (light - dark) / SCALE
+}
+
+#[test]
+fn the_edge_of_every_kind_is_within_its_stated_distance_of_the_true_one() {
+    let base = variance();
+    // Half a texel for where the caster is sampled; bleeding moves the edge outwards by 0.2533 deviations.
+    let kinds = [
+        (Shadow { method: ShadowMethod::Standard, ..base }, 0.0),
+        (Shadow { method: ShadowMethod::Filtered, ..base }, 0.0),
+        (base, 0.0),
+        (Shadow { bleeding: 0.2, ..base }, 0.2533 * 2.0),
+        (Shadow { moments: Moments::F16, ..base }, 0.0),
+    ];
+    for size in [64, 100, 256] {
+        for (shadow, outwards) in kinds {
+            let shadow = Shadow { size, ..shadow };
+            let off = (crossing(&profile(&edge(shadow), 32)) - 1.0) / texel(&shadow);
+            let pixel = 1.0 / SCALE / texel(&shadow);
+            assert!((off - outwards).abs() <= 0.5 + pixel, "{shadow:?}: {off} texels");
+        }
+    }
+    let narrow = expected(&base, 1.0 + 4.0 * texel(&base));
+    assert!(narrow > 0.95, "control: four texels aside is no edge, {narrow} arrive there");
+}
+
+#[test]
+fn a_standard_map_is_all_or_nothing_and_the_others_are_not() {
+    let between = |shadow: Shadow| {
+        let picture = edge(shadow);
+        (0..64).flat_map(|column| profile(&picture, column)).filter(|share| (0.05..0.95).contains(share)).count()
+    };
+    assert_eq!(between(Shadow { method: ShadowMethod::Standard, ..variance() }), 0);
+    for method in [ShadowMethod::Filtered, ShadowMethod::Variance] {
+        assert!(between(Shadow { method, ..variance() }) > 500, "control: {method:?} is soft");
+    }
+}
+
+/// How many pixels of a lit square of three units, which casts and receives, are not as bright as the sun makes them.
+fn self_shadowed(over: &[Mesh], shadow: Shadow, sun: [f32; 3]) -> usize {
+    let mut stage = stage();
+    (stage.0.look.shadow, stage.0.look.sun) = (Some(shadow), sun);
+    let stage = over.iter().fold(stage, |stage, mesh| stage.add(mesh.clone(), Material::default()));
+    let scene = stage.add(lying(3.0, 2.0), Material::default()).scene();
+    let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
+    let lens = Lens::Intrinsics { fx: 200.0, fy: 200.0, cx: 32.0, cy: 32.0 };
+    let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let facing = nalgebra::Vector3::from(sun).cast::<f64>().normalize().y;
+    let inner = (8..56).flat_map(|y| (8..56).map(move |x| (x, y)));
+    inner.filter(|(x, y)| !close(shown.at(*x, *y), [0.25 + 0.5 * facing; 3], 2.0)).count()
+}
+
+#[test]
+fn no_kind_shadows_a_lit_surface() {
+    let base = Shadow { size: 512, ..Shadow::default() };
+    for sun in [[0.0, 1.0, 0.0], [3.0, 4.0, 0.0], [1.0, 0.4, 0.6], [1.0, 0.15, 0.3]] {
+        let kinds = [
+            base,
+            Shadow { method: ShadowMethod::Standard, ..base },
+            Shadow { method: ShadowMethod::Filtered, ..base },
+            Shadow { method: ShadowMethod::Filtered, blur: 4.0, ..base },
+            Shadow { splits: 4, ..base },
+        ];
+        for shadow in kinds {
+            assert_eq!(self_shadowed(&[], shadow, sun), 0, "{sun:?} {shadow:?}");
+        }
+    }
+    let over = self_shadowed(&[lying(0.5, 3.0)], base, [1.0, 0.4, 0.6]);
+    assert!(over > 20, "control: a caster over it darkens {over} pixels only");
+}
+
+/// How many pixels are lit of a strip of the ground that lies wholly in the shadow of a square just above it.
+fn lit_in_the_umbra(moments: Moments) -> usize {
+    let mut stage = stage();
+    stage.0.look.shadow = Some(Shadow { size: 2048, blur: 0.5, moments, ..Shadow::default() });
+    stage.0.look.sun = [3.0, 1.0, 0.0];
+    // Far from the middle of the range of depths, where f16 is coarse. The shadow reaches 0.09 beyond the square.
+    let mut rest = lying(1.0, 0.03).rest().to_vec();
+    rest.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
+    let mesh = Mesh::indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+    let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
+    let view = View::LookAt { eye: [-3.545, 20.0, 0.0], target: [-3.545, 0.0, 0.0], up: [0.0, 0.0, -1.0] };
+    let lens = Lens::Intrinsics { fx: 2e4, fy: 2e4, cx: 32.0, cy: 32.0 };
+    let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let dark = [0.8 * 0.25; 3];
+    (0..64 * 64).filter(|pixel| !close(shown.at(pixel % 64, pixel / 64), dark, 3.0)).count()
+}
+
+#[test]
+fn moments_of_f16_let_light_into_a_shadow_near_its_caster_and_those_of_f32_do_not() {
+    assert_eq!(lit_in_the_umbra(Moments::F32), 0);
+    let failed = lit_in_the_umbra(Moments::F16);
+    assert!(failed > 400, "f16 spoils {failed} of 4096 pixels only");
+}
+
+/// The shadow's edge on the ground from nearby: how many pixels of the middle column are half lit.
+fn half_lit(splits: u32) -> usize {
+    let view = View::LookAt { eye: [0.0, 2.0, 4.0], target: [0.0, 0.0, 1.0], up: [0.0, 1.0, 0.0] };
+    let lens = Lens::Intrinsics { fx: 400.0, fy: 400.0, cx: 64.0, cy: 64.0 };
+    let scene = scene(Shadow { size: 64, splits, ..variance() });
+    let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
+    let column: Vec<f64> = (0..128).map(|row| share(shown.at(64, row))).collect();
+    assert!(column[0] < 0.1 && column[127] > 0.9, "dark behind the edge and lit before it, {splits} maps: {column:?}");
+    column.iter().filter(|share| (0.1..0.9).contains(*share)).count()
+}
+
+#[test]
+fn splits_give_the_near_shadow_finer_texels() {
+    let (one, four) = (half_lit(1), half_lit(4));
+    assert!(one > 30 && four > 0 && 3 * four <= one, "{one} pixels with one map, {four} with four");
+}
+
+#[test]
+fn what_the_scene_does_not_name_is_not_made() {
+    let made = |shadow: Shadow| {
+        let scene = scene(shadow);
+        let (shown, plan) = (edge(shadow), plan(&scene));
+        assert_eq!(shown.ran.passes, plan.passes, "what is planned is what runs");
+        let textures: Vec<String> = plan.textures.iter().map(|part| part.name.clone()).collect();
+        let maps: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
+        let splits = shown.allocated.iter().any(|part| part.name == "splits");
+        (shown.ran.passes.contains(&"blur"), maps, splits)
+    };
+    let base = Shadow { size: 64, ..Shadow::default() };
+    let depth = vec!["shadow depth".to_string()];
+    for method in [ShadowMethod::Standard, ShadowMethod::Filtered] {
+        assert_eq!(made(Shadow { method, ..base }), (false, depth.clone(), false));
+    }
+    let both = vec!["shadow depth".to_string(), "shadow moments".to_string()];
+    assert_eq!(made(base), (true, both.clone(), false));
+    assert_eq!(made(Shadow { splits: 2, ..base }), (true, both, true));
+}

@@ -1,0 +1,252 @@
+//! What the visibility image adds to a picture: coverage by samples, slopes of images, ids, and hostile triangles.
+
+use std::sync::Arc;
+
+use modalcast::deform::Surface;
+use modalcast::domain::{AlphaMode, Material, Mesh};
+use modalcast::render::{Seen, Shot};
+use modalcast::scene::{Camera, Ground, Lens, Scene, View};
+use nalgebra::Vector3;
+
+use super::build::{Picture, Stage, camera, close, draw, facing, open, picture, srgb};
+
+/// Seen by ambient light alone: a texel of value v shows as v.
+fn painted(colour_texture: Option<usize>) -> Material {
+    Material { ambient: [1.0; 3], diffuse: [0.0; 3], colour_texture, ..Material::default() }
+}
+
+fn stage() -> Stage {
+    let mut stage = Stage::new();
+    stage.0.look.skylight = [1.0; 3];
+    stage
+}
+
+/// Linear light of a byte that encodes a grey.
+fn linear(byte: u8) -> f64 {
+    let encoded = f64::from(byte) / 255.0;
+    if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+}
+
+#[test]
+fn an_edge_through_a_pixel_covers_the_samples_on_its_side_and_with_one_sample_all_or_nothing() {
+    // Four samples lie at 1/8, 3/8, 5/8 and 7/8 across a pixel, in some order.
+    for (edge, share) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
+        let shown = |samples: u32| {
+            let mut stage = stage();
+            stage.0.look.samples = samples;
+            picture(&stage.add(facing(-1.0, -1.0, 0.1 * edge, 1.0, 0.0), painted(None)).scene())
+        };
+        let four = shown(4);
+        assert_eq!(four.ran.samples, 4);
+        assert!(close(four.at(32, 30), [share; 3], 1.0), "{edge}: {:?}", four.at(32, 30));
+        let one = shown(1);
+        assert_eq!(one.ran.samples, 1);
+        assert!([[0; 3], [255; 3]].contains(&one.at(32, 30)), "{edge}: {:?}", one.at(32, 30));
+    }
+}
+
+#[test]
+fn the_edge_of_a_cut_out_covers_the_samples_where_alpha_reaches_the_cutoff() {
+    // Alpha rises by 1/40 a pixel from left to right, so that 40 pixels across it passes each cutoff once.
+    let shown = |cutoff: f32, samples: u32| {
+        let mut stage = stage();
+        stage.0.look.samples = samples;
+        let image = stage.texture(256, 1, |x, _| [255, 255, 255, x as u8]);
+        let alpha_mode = AlphaMode::Mask { cutoff };
+        let cut = Material { alpha_mode, ..painted(Some(image)) };
+        picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), cut).scene())
+    };
+    let sum = |shown: &Picture| (14..50).map(|x| linear(shown.at(x, 30)[0])).sum::<f64>();
+    for quarter in 0..4 {
+        // The edge lies `quarter` quarters of a pixel, and an eighth, into pixel 32.
+        let across = f64::from(20 + 12 - 12) + 0.25 * f64::from(quarter) + 0.01;
+        let cutoff = ((across / 40.0 * 256.0 - 0.5) / 255.0) as f32;
+        let (four, one) = (shown(cutoff, 4), shown(cutoff, 1));
+        let covered = 50.0 - 12.0 - across;
+        assert!((sum(&four) - covered).abs() < 0.3, "{quarter}: {} of {covered} pixels", sum(&four));
+        let between = |shown: &Picture| shown.count(|[red, ..]| red > 4 && red < 251);
+        assert!(between(&one) == 0 && between(&four) <= 2 * 40, "{quarter}: {} and {}", between(&one), between(&four));
+    }
+    assert!((sum(&shown(0.25, 4)) - sum(&shown(0.75, 4))).abs() > 15.0, "control: the judge sees the cutoff");
+}
+
+/// Stripes of two texels on a square of 40 x 40 pixels, whose texture coordinates run from 0 to `turns`.
+fn stripes(size: u32, turns: f32) -> Picture {
+    let mut stage = stage();
+    let image = stage.texture(size, size, |x, _| if x % 4 < 2 { [255; 4] } else { [0, 0, 0, 255] });
+    let rest = facing(-2.0, -2.0, 2.0, 2.0, 0.0).rest().to_vec();
+    let uvs = vec![[0.0, turns], [turns, turns], [turns, 0.0], [0.0, 0.0]];
+    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+    picture(&stage.add(mesh, painted(Some(image))).scene())
+}
+
+/// Pixels of the square away from its rim and diagonal, where one triangle fills the pixel.
+fn inner() -> impl Iterator<Item = (u32, u32)> {
+    (13..51_u32).flat_map(|y| (13..51_u32).map(move |x| (x, y))).filter(|(x, y)| (x + y).abs_diff(63) > 1)
+}
+
+#[test]
+fn a_texel_a_pixel_is_read_from_the_finest_level_and_four_from_their_mean() {
+    let fine = stripes(40, 1.0);
+    for (x, y) in inner() {
+        let white = (x - 12) % 4 < 2;
+        assert!(close(fine.at(x, y), [f64::from(u8::from(white)); 3], 3.0), "({x}, {y}): {:?}", fine.at(x, y));
+    }
+    let coarse = stripes(160, 1.0);
+    assert!(
+        inner().all(|(x, y)| close(coarse.at(x, y), [0.5; 3], 3.0)),
+        "level 2 is even grey: {:?}",
+        coarse.at(20, 20)
+    );
+    assert!(!close(fine.at(20, 20), [0.5; 3], 3.0), "control: level 0 is not");
+}
+
+#[test]
+fn an_image_that_repeats_has_no_seam_of_a_coarser_level() {
+    // Two turns of 20 texels: slopes of wrapped coordinates would jump at the middle, and blur a line there.
+    let shown = stripes(20, 2.0);
+    for (x, y) in inner() {
+        let white = (x - 12) % 4 < 2;
+        assert!(close(shown.at(x, y), [f64::from(u8::from(white)); 3], 3.0), "({x}, {y}): {:?}", shown.at(x, y));
+    }
+}
+
+#[test]
+fn coordinates_are_perspective_on_a_floor_that_reaches_behind_the_camera() {
+    let mut stage = stage();
+    let image = stage.texture(64, 64, |x, y| [4 * x as u8, 4 * y as u8, 0, 255]);
+    let half = 40.0_f32;
+    let rest = vec![[-half, 0.0, half], [half, 0.0, half], [half, 0.0, -half], [-half, 0.0, -half]];
+    let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
+    let mesh = Mesh::indexed(rest, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a floor");
+    let eye = Vector3::new(3.0, 5.0, 4.0);
+    let view = View::LookAt { eye: eye.into(), target: [3.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
+    let lens = Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 };
+    let shown =
+        draw(&mut open(), &stage.add(mesh, painted(Some(image))).scene(), Camera { view, lens, ..camera(64) }, 64);
+    let forward = Vector3::new(0.0, -5.0, -10.0_f64).normalize();
+    let (right, up) = (Vector3::x(), Vector3::x().cross(&forward));
+    for (x, y) in [(10, 40), (32, 32), (55, 60), (20, 25), (40, 50)] {
+        let aside = (f64::from(x) + 0.5 - 32.0) / 60.0;
+        let above = (32.0 - f64::from(y) - 0.5) / 60.0;
+        let ray = forward + aside * right + above * up;
+        let point = eye - ray * (eye.y / ray.y);
+        // Texel i is centred at (i + 1/2) / 64; between centres light is mixed, nearly as bytes are on so gentle a ramp.
+        let [u, v] = [point.x, point.z].map(|number| (number + 40.0) / 80.0 * 64.0 - 0.5);
+        let want = [4.0 * u, 4.0 * v, 0.0];
+        let seen = shown.at(x, y).map(f64::from);
+        let off = seen.iter().zip(want).map(|(seen, want)| (seen - want).abs()).fold(0.0, f64::max);
+        assert!(off < 3.0, "({x}, {y}): {seen:?}, expected {want:?}");
+    }
+}
+
+#[test]
+fn equations_hold_as_written_here_and_not_as_printed() {
+    // Equation 3.12: with the sun from the left and the eye in the middle the mirror direction is met on the left.
+    let sun = Vector3::new(-0.3, 0.0, 1.0).normalize();
+    let mut shiny = Stage::new();
+    shiny.0.look.sun = sun.cast::<f32>().into();
+    let material =
+        Material { diffuse: [0.0; 3], ambient: [0.0; 3], specular: [1.0; 3], shininess: 60.0, ..painted(None) };
+    let shown = picture(&shiny.add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), material).scene());
+    let (mut differ, normal) = (0, Vector3::z());
+    for x in [5, 15, 17, 20, 32, 48] {
+        let point = Vector3::new((f64::from(x) + 0.5 - 32.0) / 10.0, -0.05, 0.0);
+        let to_eye = (Vector3::new(0.0, 0.0, 10.0) - point).normalize();
+        let mirrored = |toward: Vector3<f64>| 2.0 * toward.dot(&normal) * normal - toward;
+        let light = |toward: Vector3<f64>| [0.5 * mirrored(toward).dot(&sun).max(0.0).powi(60); 3];
+        assert!(close(shown.at(x, 32), light(to_eye), 1.0), "{x}: {:?}", shown.at(x, 32));
+        // Printed, v_e comes from the camera.
+        differ += usize::from(!close(shown.at(x, 32), light(-to_eye), 1.0));
+    }
+    assert!(differ > 2, "the printed sign of v_e is told from ours");
+
+    // Equation 3.14: s_tex = 1 means an image, whose colour is taken; printed, the material's own would be.
+    let shown = |textured: bool| {
+        let mut stage = stage();
+        let image = stage.texture(1, 1, |_, _| [188, 10, 90, 255]);
+        picture(&stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), painted(textured.then_some(image))).scene()).at(30, 30)
+    };
+    assert_eq!((shown(true), shown(false)), ([188, 10, 90], [255; 3]));
+}
+
+#[test]
+fn every_pixel_knows_its_triangle_the_ground_or_nothing() {
+    let mut stage = stage();
+    stage.0.look.ground = Some(Ground::default());
+    // The second domain is opaque and the first cut out: the renderer draws them the other way round.
+    let leaf = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..painted(None) };
+    let scene =
+        stage.add(facing(-2.0, 0.0, -1.0, 1.0, 0.0), leaf).add(facing(1.0, 0.0, 2.0, 1.0, 0.0), painted(None)).scene();
+    let mut renderer = open();
+    renderer.seen().expect_err("no frame yet");
+    let view = View::LookAt { eye: [0.0, 0.5, 10.0], target: [0.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let shown = draw(&mut renderer, &scene, Camera { view, ..camera(64) }, 64);
+    let seen = renderer.seen().expect("reads");
+    assert_eq!(seen.len(), 64 * 64);
+    let buffers = renderer.load(&scene).expect("loads");
+    let at = |x: usize, y: usize| match seen[64 * y + x] {
+        Seen::Triangle(place) => buffers.triangle(place),
+        _ => None,
+    };
+    // Of each square the first triangle lies right of and below the diagonal.
+    assert_eq!((at(19, 34), at(15, 29)), (Some((0, 0)), Some((0, 1))));
+    assert_eq!((at(49, 34), at(45, 29)), (Some((1, 0)), Some((1, 1))));
+    assert_eq!((seen[64 * 5 + 32], seen[64 * 60 + 32]), (Seen::Nothing, Seen::Ground));
+    assert_eq!(buffers.triangle(4), None);
+    assert!(shown.at(19, 34) != shown.at(32, 5));
+}
+
+#[test]
+fn five_hundred_and_twelve_images_are_drawn_in_one_call() {
+    let mut stage = stage();
+    for index in 0..512_u32 {
+        let image =
+            stage.texture(4, 4, |_, _| [(index % 256) as u8, 255 - (index % 256) as u8, (index / 2) as u8, 255]);
+        let (left, bottom) = (-3.2 + 0.2 * (index % 32) as f32, -3.2 + 0.4 * (index / 32) as f32);
+        stage = stage.add(facing(left, bottom, left + 0.2, bottom + 0.4, 0.0), painted(Some(image)));
+    }
+    let shown = picture(&stage.scene());
+    assert_eq!(shown.ran.draws, 1);
+    for index in [0, 1, 100, 255, 256, 300, 511_u32] {
+        let seen = shown.at(2 * (index % 32), 64 - 2 - 4 * (index / 32));
+        let want = [(index % 256) as u8, 255 - (index % 256) as u8, (index / 2) as u8];
+        assert!(seen.iter().zip(want).all(|(a, b)| a.abs_diff(b) <= 1), "image {index}: {seen:?}, expected {want:?}");
+    }
+}
+
+/// One square with an image and a normal map, whose corners' numbers are replaced.
+fn spoiled(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], flat: bool) -> Vec<u8> {
+    let mut renderer = open();
+    let buffers = renderer.load(scene).expect("loads");
+    let mut positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
+    if flat {
+        // Seen edge on and shrunk to less than a float tells: no area on the screen.
+        positions.chunks_exact_mut(3).for_each(|vertex| vertex[0] *= 1e-30);
+    }
+    let surface = Surface { positions, normals: normals.repeat(4), tangents: tangents.repeat(4), ..Surface::default() };
+    renderer.upload(&buffers, &surface).expect("uploads");
+    let shot = Shot { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds };
+    renderer.draw(&buffers, &shot).expect("draws").rgba
+}
+
+#[test]
+fn normals_and_tangents_that_are_none_and_triangles_without_area_blacken_no_pixel() {
+    let mut stage = stage();
+    stage.0.look.zenith = [0.3; 3];
+    stage.0.look.horizon = [0.3; 3];
+    let image = stage.texture(4, 4, |_, _| [200, 200, 200, 255]);
+    let bump = stage.texture(1, 1, |_, _| [150, 100, 220, 255]);
+    let material = Material { normal_texture: Some(bump), specular: [1.0; 3], shininess: 1e6, ..painted(Some(image)) };
+    let scene = stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), material).scene();
+    for normal in [[0.0; 3], [f32::NAN; 3], [f32::INFINITY; 3], [1e-30; 3], [f32::MAX; 3]] {
+        for tangent in [[0.0; 4], [f32::NAN; 4], [0.0, 0.0, f32::MAX, 1.0]] {
+            for flat in [false, true] {
+                let rgba = spoiled(&scene, normal, tangent, flat);
+                let black = rgba.chunks_exact(4).filter(|pixel| pixel[..3].iter().any(|byte| *byte < 100)).count();
+                assert_eq!(black, 0, "{normal:?} {tangent:?} {flat}");
+            }
+        }
+    }
+    assert!(srgb(0.3) > 100.0, "control: the sky is brighter than the judge's black");
+}
