@@ -6,4 +6,5 @@ mod limits;
 mod shading;
 mod shadow;
 mod shadow_extremes;
+mod shadow_ground;
 mod shadow_methods;
