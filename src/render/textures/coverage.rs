@@ -3,7 +3,8 @@
 //!
 //! Averaged alpha forgets shapes: of an image more than half of which is left, the coarse levels leave all, so that small
 //! leaves grow into the polygons that carry them; of one less than half of which is, nothing. Alpha of each level is scaled
-//! until the share of it at or above the cutoff, sampled bilinearly as the shaders do, is that of level 0.
+//! until the share of it at or above the cutoff, sampled bilinearly as the shaders do, is that of level 0. Alpha ends at 1,
+//! so that a level whose alpha is raised falls short by what that clips, and a single texel has no shape to keep.
 
 use super::Linear;
 
@@ -91,14 +92,14 @@ mod tests {
     }
 
     #[test]
-    fn every_level_but_the_last_leaves_as_much_as_the_first_and_averages_do_not() {
-        for (radius, cutoff) in [(0.4, 0.5), (0.7, 0.5), (0.9, 0.5), (0.7, 0.2), (0.7, 0.9)] {
+    fn every_level_down_to_four_texels_leaves_as_much_as_the_first_and_averages_do_not() {
+        for (radius, cutoff) in [(0.4, 0.5), (0.9, 0.5), (0.7, 0.2)] {
             let texture = disc(radius);
             let off = |kept: bool| {
                 let shares = shares(&texture, cutoff, kept);
-                shares[..6].iter().map(|share| (share - shares[0]).abs()).fold(0.0, f32::max)
+                shares[..5].iter().map(|share| (share - shares[0]).abs()).fold(0.0, f32::max)
             };
-            assert!(off(true) < 0.03, "{radius} {cutoff}: off by {}", off(true));
+            assert!(off(true) < 0.02, "{radius} {cutoff}: off by {}", off(true));
             assert!(off(false) > 0.06, "control, {radius} {cutoff}: averages are off by {}", off(false));
         }
     }
@@ -118,10 +119,10 @@ mod tests {
         let cutoff = super::super::cutoff(&scene, index).expect("a cut-out");
         let off = |kept: bool| {
             let shares = shares(&scene.textures[index], cutoff, kept);
-            eprintln!("{shares:?}");
-            shares[..7].iter().map(|share| (share - shares[0]).abs()).fold(0.0, f32::max)
+            shares[..8].iter().map(|share| (share - shares[0]).abs()).fold(0.0, f32::max)
         };
-        assert!(off(true) < 0.03 && off(false) > 0.1, "{} and without {}", off(true), off(false));
+        // Of 256 texels a side down to two: an average of two texels a side leaves all, where half is right.
+        assert!(off(true) < 0.01 && off(false) > 0.4, "{} and without {}", off(true), off(false));
     }
 
     #[test]

@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::cpu::CpuDeformer;
 use crate::deform::{Deformer, Surface};
 use crate::error::{Result, during};
-use crate::render::{Image, Plan, Prefer, Renderer, SceneBuffers, Shot, plan};
+use crate::render::{Image, Plan, Prefer, Renderer, SceneBuffers, Shot};
 use crate::report::timing::{FEWEST, Timing};
 use crate::scene::{Bounds, Camera, Scene, State};
 
@@ -47,7 +47,9 @@ impl Studio {
     /// Loads a scene.
     pub(super) fn set(&mut self, scene: &Arc<Scene>) -> Result<Set> {
         let (buffers, deformer) = (self.renderer.load(scene)?, CpuDeformer::new(scene));
-        Ok(Set { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, plan: plan(scene) })
+        // What this device needs: one in software blurs by other passes.
+        let plan = buffers.plan().clone();
+        Ok(Set { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, plan })
     }
 
     /// Deforms it and uploads what came of that.

@@ -60,6 +60,9 @@ pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 16.0, mean_light: 0.2, b
 /// The light that a filtered map may let into the umbra where no two casters overlap: the bound of Chebyshev is exact
 /// there, and only rounding is left.
 const EXACT: f64 = 0.01;
+/// The mean error of light on the shelf, whose shadow fills half of the picture and is narrower than the widest blur:
+/// the depths of the ground itself then vary as much as the shelf is above it, and most of the sun gets through.
+const NARROW: f64 = 0.4;
 
 /// Sides of shadow maps and deviations of their blur, texels.
 const SIZES: [u32; 4] = [512, 1024, 2048, 4096];
@@ -73,10 +76,12 @@ impl Variant {
 
     /// What it must keep on a load.
     pub fn bounds(&self, load: Kind) -> Bounds {
-        match (self.aim, load) {
-            (Aim::Filtered { .. }, Kind::Square | Kind::Shelf) => Bounds { bleeding: EXACT, ..BOUNDS },
-            _ => BOUNDS,
-        }
+        let bleeding = match (self.aim, load) {
+            (Aim::Filtered { .. }, Kind::Square | Kind::Shelf) => EXACT,
+            _ => BOUNDS.bleeding,
+        };
+        let mean_light = if load == Kind::Shelf { NARROW } else { BOUNDS.mean_light };
+        Bounds { bleeding, mean_light, ..BOUNDS }
     }
 
     /// Whether it is there to be seen to exceed its bounds: the second moment of f16 lets light into a shadow near its
