@@ -6,20 +6,21 @@ layout(location = 1) uniform int layer;
 const int layer = 0;
 #endif
 
-// m at a texel; those beyond the edge repeat it.
-float centred(ivec2 at, int side) {
-    at = clamp(at, ivec2(0), ivec2(side - 1));
-    float depth = texelFetch(from, ivec3(at, layer), 0).x;
-    if (depth >= 1.0) {
-        // Nothing is there but the ground behind it. The ground casts no shadow, but with its own depth in place of the
-        // far plane's the bound is exact on it: the share of the blur's weight that lies off the caster.
-        vec2 place = (vec2(at) + 0.5) / float(side);
+// m of the ground at a texel, which may lie beyond the edge.
+float ground(ivec2 at, int side) {
+    vec2 place = (vec2(at) + 0.5) / float(side);
 #ifdef SPLITS
-        place = in_whole(place, layer);
+    place = in_whole(place, layer);
 #endif
-        depth = clamp(dot(frame.ground_depth.xy, place) + frame.ground_depth.z, 0.0, 1.0);
-    }
-    return depth - 0.5;
+    return clamp(dot(frame.ground_depth.xy, place) + frame.ground_depth.z, 0.0, 1.0) - 0.5;
+}
+
+// m at a texel. Beyond the edge as on it: the rim of the map is empty, and the ground goes on.
+float centred(ivec2 at, int side) {
+    float depth = texelFetch(from, ivec3(clamp(at, ivec2(0), ivec2(side - 1)), layer), 0).x;
+    // Where nothing is, there is but the ground behind it. The ground casts no shadow, but with its own depth in place of
+    // the far plane's the bound is exact on it: the share of the blur's weight that lies off the caster.
+    return depth >= 1.0 ? ground(at, side) : depth - 0.5;
 }
 
 vec2 moments(ivec2 at, int side) {
@@ -27,6 +28,10 @@ vec2 moments(ivec2 at, int side) {
     float m = centred(at, side);
     return vec2(m, m * m);
 #else
-    return texelFetch(from, ivec3(clamp(at, ivec2(0), ivec2(side - 1)), 0), 0).xy;
+    ivec2 held = clamp(at, ivec2(0), ivec2(side - 1));
+    vec2 sums = texelFetch(from, ivec3(held, 0), 0).xy;
+    // A row beyond the edge is the last one, shifted by as much as the ground is deeper there.
+    float deeper = ground(at, side) - ground(held, side);
+    return sums + deeper * vec2(1.0, 2.0 * sums.x + deeper);
 #endif
 }

@@ -9,20 +9,7 @@ vec2 finer(int layer) { return splits.places[layer].xy; }
 vec2 finer(int layer) { return vec2(1.0); }
 #endif
 
-#ifdef VARIANCE
-// Chebyshev's bound on the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1; depth is counted from
-// the middle of its range, where floats are finest).
-float arrives(vec3 at, int layer, vec3 normal) {
-    vec2 moments = textureLod(shadow_map, vec3(at.xy, float(layer)), 0.0).xy;
-    float behind = clamp(at.z, 0.0, 1.0) - 0.5 - moments.x;
-    if (!(behind > 0.0)) return 1.0;
-    float variance = max(moments.y - moments.x * moments.x, frame.shadow.x);
-    float bound = variance / (variance + behind * behind);
-    return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
-}
-#else
 // The plane of the surface, as the map sees it: by how much its depth changes from a texel to the next, in x and in y.
-// Texels are compared with this plane in place of the point's own depth, so that no slope shadows itself.
 vec2 slope(vec3 normal, int layer) {
     // The rows of the map's matrix are the axes of light space, scaled; the third looks away from the sun.
     mat3 axes = transpose(mat3(frame.map_from_world));
@@ -33,7 +20,35 @@ vec2 slope(vec3 normal, int layer) {
     return -(part.xy / square.xy) * (square.z / facing) / (frame.shadow.w * finer(layer));
 }
 
-// A caster is seen from one side of a texel before the surface on. This is for curved surfaces, whose triangles are not
+#ifdef VARIANCE
+// By how much the ground draws the mean depth towards the sun beside the line where a surface meets it. It casts no
+// shadow, so that the surface is let off that much. With h the height over that line, in deviations, and k what surface
+// and ground part by in one, the mean of what the ground is nearer is k (phi(h) - h Q(h)); 0.4 k (1 - h / 2)^2 is not less
+// up to h = 1.9.
+float let_off(vec3 at, int layer, vec3 normal) {
+    vec2 whole = at.xy;
+#ifdef SPLITS
+    whole = in_whole(whole, layer);
+#endif
+    float above = max(dot(frame.ground_depth.xy, whole) + frame.ground_depth.z - at.z, 0.0);
+    float apart = DEVIATION * length(slope(normal, layer) - slope(frame.up.xyz, layer));
+    float near = 1.0 - 0.5 * above / max(apart, 1e-12);
+    return near > 0.0 ? 0.4 * apart * near * near : 0.0;
+}
+
+// Chebyshev's bound on the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1; depth is counted from
+// the middle of its range, where floats are finest).
+float arrives(vec3 at, int layer, vec3 normal) {
+    vec2 moments = textureLod(shadow_map, vec3(at.xy, float(layer)), 0.0).xy;
+    float behind = clamp(at.z, 0.0, 1.0) - 0.5 - moments.x - let_off(at, layer, normal);
+    if (!(behind > 0.0)) return 1.0;
+    float variance = max(moments.y - moments.x * moments.x, frame.shadow.x);
+    float bound = variance / (variance + behind * behind);
+    return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
+}
+#else
+// Texels are compared with the plane of the surface in place of the point's own depth, so that no slope shadows itself.
+// A caster is seen from one side of a texel before that plane on. This is for curved surfaces, whose triangles are not
 // quite as their normals say, and for the roundings of depth.
 float margin(int layer) {
     vec3 away = vec3(frame.map_from_world[0].z, frame.map_from_world[1].z, frame.map_from_world[2].z);

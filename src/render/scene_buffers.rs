@@ -14,7 +14,7 @@ use super::plan::{Allocation, Plan, planned};
 use super::programs::{Compile, Programs, Sampled};
 use super::shaders::{self, OTHER_READS, Options, Used};
 use super::shadow::{ShadowMap, fitting};
-use super::textures::{Array, Use, arrays, levels, place, within_budget};
+use super::textures::{Array, Use, arrays, cutoff, levels, place, within_budget};
 use crate::domain::AlphaMode;
 use crate::error::{Result, during};
 use crate::scene::Scene;
@@ -336,8 +336,11 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
     })?;
     // A few layers at a time: all chains of a large scene at once would take many times its textures in memory.
     for (chunk, part) in array.layers.chunks(8).enumerate() {
-        let chains: Vec<Vec<Vec<u8>>> =
-            part.par_iter().map(|layer| levels(&scene.textures[*layer], array, purpose)).collect();
+        let chain = |layer: &usize| {
+            let cutoff = if purpose == Use::Colour { cutoff(scene, *layer) } else { None };
+            levels(&scene.textures[*layer], array, purpose, cutoff)
+        };
+        let chains: Vec<Vec<Vec<u8>>> = part.par_iter().map(chain).collect();
         for (offset, chain) in chains.iter().enumerate() {
             for (level, rgba) in chain.iter().enumerate() {
                 let size = [(array.width >> level).max(1), (array.height >> level).max(1)];

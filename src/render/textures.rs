@@ -2,11 +2,14 @@
 //!
 //! Images of one size share an array. When there are more sizes than [`MAX_ARRAYS`], the smallest array is merged into
 //! the one where that wastes the fewest texels, and its images are stretched to that size; texture coordinates run from
-//! 0 to 1 either way, so nothing else changes. Colours are stored sRGB, normal maps linear.
+//! 0 to 1 either way, so nothing else changes. Colours are stored sRGB, normal maps linear. Where alpha only cuts out, its levels
+//! keep the share of the image that is left (`coverage`).
+
+mod coverage;
 
 use std::sync::OnceLock;
 
-use crate::domain::Texture;
+use crate::domain::{AlphaMode, Texture};
 use crate::error::{Result, invalid};
 use crate::scene::Scene;
 
@@ -123,8 +126,20 @@ fn merge(mut arrays: Vec<Array>, limit: usize) -> Vec<Array> {
     arrays
 }
 
-/// All levels of one image at the size of its array, level 0 first, RGBA8.
-pub(super) fn levels(texture: &Texture, array: &Array, purpose: Use) -> Vec<Vec<u8>> {
+/// From which alpha on a texture's texels are left, when nothing but cut-outs of one cutoff reads them.
+pub(super) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
+    let materials = used_materials(scene).into_iter().map(|material| &scene.materials[material]);
+    let of_material = |material: &crate::domain::Material| match material.alpha_mode {
+        AlphaMode::Mask { cutoff } => Some(cutoff / material.alpha),
+        _ => None,
+    };
+    let mut cutoffs = materials.filter(|material| material.colour_texture == Some(texture)).map(of_material);
+    let first = cutoffs.next()??;
+    (first > 0.0 && first < 1.0 && cutoffs.all(|cutoff| cutoff == Some(first))).then_some(first)
+}
+
+/// All levels of one image at the size of its array, level 0 first, RGBA8. With a cutoff, all leave the same share of it.
+pub(super) fn levels(texture: &Texture, array: &Array, purpose: Use, cutoff: Option<f32>) -> Vec<Vec<u8>> {
     let mut image = Linear::new(texture, purpose);
     if (texture.width(), texture.height()) != (array.width, array.height) {
         image = image.stretched(array.width, array.height);
@@ -136,6 +151,9 @@ pub(super) fn levels(texture: &Texture, array: &Array, purpose: Use) -> Vec<Vec<
     }
     if purpose == Use::Colour {
         bleed(&mut chain);
+    }
+    if let Some(cutoff) = cutoff {
+        coverage::keep(&mut chain, cutoff);
     }
     chain.iter().map(|level| level.bytes(purpose)).collect()
 }
@@ -295,7 +313,7 @@ mod tests {
         let picture = image(16, 16, |x, y| [(16 * y + x) as u8, (255 - 16 * y) as u8, x as u8, 1 + 15 * y as u8]);
         let array = Array { width: 16, height: 16, layers: vec![0] };
         for purpose in [Use::Colour, Use::Normal] {
-            let chain = levels(&picture, &array, purpose);
+            let chain = levels(&picture, &array, purpose, None);
             assert_eq!(chain[0], picture.rgba());
             assert_eq!(chain.iter().map(Vec::len).collect::<Vec<_>>(), [1024, 256, 64, 16, 4]);
             assert_eq!(chain.iter().map(Vec::len).sum::<usize>() as u64, array.bytes());
@@ -305,7 +323,7 @@ mod tests {
     #[test]
     fn transparent_texels_take_the_colour_of_the_leaf_and_darken_no_level() {
         let leaf = image(4, 4, |x, _| if x == 0 { [0, 200, 0, 255] } else { [255, 0, 255, 0] });
-        let chain = levels(&leaf, &Array { width: 4, height: 4, layers: vec![0] }, Use::Colour);
+        let chain = levels(&leaf, &Array { width: 4, height: 4, layers: vec![0] }, Use::Colour, None);
         for (level, rgba) in chain.iter().enumerate() {
             assert!(rgba.chunks_exact(4).all(|texel| texel[..3] == [0, 200, 0]), "level {level}: {rgba:?}");
         }
@@ -316,11 +334,11 @@ mod tests {
     fn an_enlarged_image_keeps_its_corners_and_odd_sizes_reach_one_texel() {
         let picture = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
         let array = Array { width: 7, height: 3, layers: vec![0] };
-        let chain = levels(&picture, &array, Use::Normal);
+        let chain = levels(&picture, &array, Use::Normal, None);
         assert_eq!((chain[0].len(), chain.len(), chain[2].len()), (84, 3, 4));
         assert_eq!(array.bytes(), 4 * (21 + 3 + 1));
         let constant = image(1, 1, |_, _| [9, 99, 199, 255]);
-        let chain = levels(&constant, &array, Use::Colour);
+        let chain = levels(&constant, &array, Use::Colour, None);
         assert!(chain[0].chunks_exact(4).all(|texel| texel == [9, 99, 199, 255]));
     }
 }

@@ -104,6 +104,12 @@ impl Shadow {
         }
     }
 
+    /// Standard deviation of what a soft map weighs depths with, in texels: that of the blur, and of reading between
+    /// texels, which is a tent of variance 1/6.
+    pub fn deviation(&self) -> f64 {
+        (f64::from(self.blur).powi(2) + 1.0 / 6.0).sqrt()
+    }
+
     /// The variance that rounding to f32 can make of equal depths m, |m| <= 1/2, blurred by N taps in x and in y. With
     /// u = 2^-24: the products, sums and weights of two passes and the bilinear lookup leave M2 <= 1/4 wrong by at most
     /// (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, so M1^2 by (N + 3) u; in all below (1.5 N + 5) u.

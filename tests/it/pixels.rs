@@ -6,6 +6,7 @@ mod limits;
 mod shading;
 mod shadow;
 mod shadow_extremes;
+mod shadow_ground;
 mod shadow_methods;
 mod snapshots;
 mod visibility;

@@ -67,6 +67,9 @@ impl Options {
     /// The function `lit`, for every shader that asks how much of the sun arrives.
     pub(in crate::render) fn sun(&self) -> String {
         let mut text = String::new();
+        if self.has("VARIANCE") {
+            writeln!(text, "const float DEVIATION = {:?};", self.shadow.deviation() as f32).ok();
+        }
         if self.has("FILTERED") {
             let taps = weights(self.shadow.blur);
             writeln!(text, "#define REACH {}", taps.len() - 1).ok();

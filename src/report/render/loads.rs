@@ -3,6 +3,7 @@
 //! | name | what it is |
 //! |---|---|
 //! | `square` | a square that floats over the ground: umbra and penumbra are known |
+//! | `shelf` | the narrow shadow of a square just above the ground, from nearby and far from the middle of all depths |
 //! | `panes` | three translucent panes before each other and a solid one behind, listed in the wrong order |
 //! | `tree` | the built-in tree |
 //! | `grove` | four of them |
@@ -13,17 +14,19 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
+use super::studio::Size;
 use crate::domain::{AlphaMode, Domain, Material, Mesh, Metadata, Modes, Shape, Transform, smooth_normals};
 use crate::error::{Result, invalid};
 use crate::load;
 use crate::report::loads::Load;
 use crate::report::motion::Motion;
-use crate::scene::{Look, Parts, Scene, State};
+use crate::scene::{Camera, Lens, Look, Parts, Scene, State, View};
 
 /// Which scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Square,
+    Shelf,
     Panes,
     Tree,
     Grove,
@@ -39,6 +42,7 @@ const MOST: usize = 8_000_000;
 /// A scene and how it moves.
 pub(super) struct Stage {
     pub(super) name: String,
+    pub(super) kind: Kind,
     pub(super) scene: Arc<Scene>,
     motion: Motion,
     /// The domain that slides when nothing bends.
@@ -53,7 +57,8 @@ const SWAY: f64 = 0.2;
 impl Kind {
     /// Every load, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
-        vec![Self::Square, Self::Panes, Self::Tree, Self::Grove, Self::Triangles(if quick { FIELD.1 } else { FIELD.0 })]
+        let field = Self::Triangles(if quick { FIELD.1 } else { FIELD.0 });
+        vec![Self::Square, Self::Shelf, Self::Panes, Self::Tree, Self::Grove, field]
     }
 
     /// The load of this name.
@@ -63,6 +68,7 @@ impl Kind {
     pub fn named(name: &str) -> Result<Self> {
         let found = match name {
             "square" => Some(Self::Square),
+            "shelf" => Some(Self::Shelf),
             "panes" => Some(Self::Panes),
             "tree" => Some(Self::Tree),
             "grove" => Some(Self::Grove),
@@ -71,7 +77,7 @@ impl Kind {
                 count.filter(|count| (2..=MOST).contains(count)).map(Self::Triangles)
             }
         };
-        let expected = format!("square, panes, tree, grove, or triangles-N (2 to {MOST})");
+        let expected = format!("square, shelf, panes, tree, grove, or triangles-N (2 to {MOST})");
         found.ok_or_else(|| invalid("load", expected, name))
     }
 
@@ -79,6 +85,7 @@ impl Kind {
     pub fn name(self) -> String {
         match self {
             Self::Square => "square".into(),
+            Self::Shelf => "shelf".into(),
             Self::Panes => "panes".into(),
             Self::Tree => "tree".into(),
             Self::Grove => "grove".into(),
@@ -93,20 +100,31 @@ impl Kind {
     pub(super) fn stage(self) -> Result<Stage> {
         let (scene, slides) = match self {
             Self::Square => (Scene::new(square()?)?, Some(1)),
+            Self::Shelf => (Scene::new(shelf()?)?, None),
             Self::Panes => (Scene::new(panes()?)?, Some(1)),
             Self::Tree => (load::open("tree")?, None),
             Self::Grove => (Scene::new(grove(load::open("tree")?.as_ref()))?, None),
             Self::Triangles(count) => (Scene::new(field(count)?)?, Some(1)),
         };
-        Ok(Stage::new(self.name(), scene, slides))
+        Ok(Stage::new(self, scene, slides))
     }
 }
 
 impl Stage {
-    fn new(name: String, scene: Arc<Scene>, slides: Option<usize>) -> Self {
-        let load = Load { name, scene, paired: false, species: None, remarks: Vec::new() };
+    fn new(kind: Kind, scene: Arc<Scene>, slides: Option<usize>) -> Self {
+        let load = Load { name: kind.name(), scene, paired: false, species: None, remarks: Vec::new() };
         let motion = Motion::new(&load, None);
-        Self { name: load.name, scene: load.scene, motion, slides }
+        Self { name: load.name, kind, scene: load.scene, motion, slides }
+    }
+
+    /// What its pictures are seen through: all of the scene, but of the shelf the shadow alone.
+    pub(super) fn camera(&self, size: Size) -> Camera {
+        if self.kind != Kind::Shelf {
+            return Camera::framing(&self.scene, size.width, size.height);
+        }
+        let eye = |height: f64| [f64::from(SHELF_EDGE) - 0.06, height, 0.0];
+        let view = View::LookAt { eye: eye(2.0), target: eye(0.0), up: [0.0, 0.0, -1.0] };
+        Camera { view, lens: Lens::FieldOfView(2.9), near: 0.0, far: 0.0 }
     }
 
     /// The state at step `step` of the moving scene: modes oscillate where there are any, all domains staying at their
@@ -175,6 +193,24 @@ fn square() -> Result<Parts> {
     add(&mut parts, "slab", lying(1.6, 0.0)?, paint([0.75, 0.72, 0.68]))?;
     add(&mut parts, "square", lying(0.7, 1.0)?, paint([0.80, 0.35, 0.25]))?;
     parts.look = Look { sun: [0.45, 0.8, 0.3], ..Look::default() };
+    Ok(parts)
+}
+
+/// Where the shelf ends, and with it begins what is seen of its shadow.
+const SHELF_EDGE: f32 = -3.5;
+
+/// A square of two metres three hundredths above the ground, its shadow nine hundredths long; and two slabs that hold the
+/// ground and widen the scene, so that the shadow lies near the end of all depths.
+fn shelf() -> Result<Parts> {
+    let mut parts = Parts::named("shelf");
+    let moved = |half: f32, height: f32, x: f32, z: f32| {
+        let at = |dx: f32, dz: f32| [x + dx * half, height, z + dz * half];
+        quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
+    };
+    add(&mut parts, "near slab", moved(0.1, 0.0, 5.0, 5.0)?, paint([0.75, 0.72, 0.68]))?;
+    add(&mut parts, "far slab", moved(0.1, 0.0, -5.0, -5.0)?, paint([0.75, 0.72, 0.68]))?;
+    add(&mut parts, "shelf", moved(1.0, 0.03, SHELF_EDGE + 1.0, 0.0)?, paint([0.80, 0.35, 0.25]))?;
+    parts.look = Look { sun: [3.0, 1.0, 0.0], ..Look::default() };
     Ok(parts)
 }
 

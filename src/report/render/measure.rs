@@ -12,28 +12,12 @@ use super::picture::{Detail, Picture, Term, trace};
 use super::pictures::{self, File};
 use super::soup::Soup;
 use super::studio::{Pass, Set, Size, Studio};
-use super::variants::{self, Aim, Method, Variant};
+use super::variants::{self, Aim, Bounds, Method, Variant};
 use super::view::View;
 use super::{Entry, Request, meter};
 use crate::error::Result;
 use crate::render::{Image, shadow_texel};
 use crate::scene::{Camera, Look, Scene, Shadow};
-
-/// What a variant must keep against what it means to show.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Bounds {
-    /// Mean error of a pixel, of 255.
-    pub mean_colour: f64,
-    /// Mean error of the light that arrives, of 1.
-    pub mean_light: f64,
-    /// Mean light where none should be, and mean light that is missing where all should be, of 1.
-    pub bleeding: f64,
-    pub lost: f64,
-}
-
-/// Twice what small pictures of many leaves are found at, where each leaf is a pixel or two; all others are far below. A
-/// shadow that is missing or lies elsewhere exceeds the last two however little of the picture it takes.
-pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
 
 /// The step of the motion that still pictures show.
 const STILL: usize = 10;
@@ -49,8 +33,12 @@ pub struct Row {
     pub name: String,
     pub method: Method,
     pub shadow: Option<Shadow>,
+    /// What it must keep against what it means to show, and whether it does.
+    pub bounds: Bounds,
     pub passed: bool,
-    /// Why not, in words.
+    /// It is there to be seen to fail: the report fails if it passes.
+    pub to_fail: bool,
+    /// Why it did not pass, in words.
     pub faults: Vec<String>,
     /// Colours against one hard ray to the sun a sample: the truth of a sun that is a point.
     pub colour: Spread,
@@ -71,6 +59,11 @@ pub struct Row {
 }
 
 impl Row {
+    /// Whether it passed or failed as it is stated to.
+    pub const fn as_stated(&self) -> bool {
+        self.passed != self.to_fail
+    }
+
     /// The median time of a frame in microseconds.
     pub fn median_us(&self) -> Option<f64> {
         self.passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us)
@@ -105,8 +98,7 @@ pub(super) fn load(
     progress: &mut dyn FnMut(&str),
 ) -> Result<(Entry, Vec<Row>, Vec<File>)> {
     let stage = kind.stage()?;
-    let Size { width, height } = request.size;
-    let camera = Camera::framing(&stage.scene, width, height);
+    let camera = stage.camera(request.size);
     let variants: Vec<Variant> =
         variants::all(request.quick).into_iter().filter(|variant| request.wants(&variant.name)).collect();
     progress(&format!("{}: tracing the references", stage.name));
@@ -159,6 +151,7 @@ fn references(
 
 fn term(variant: &Variant, texel: Option<[Vector3<f64>; 2]>) -> Term {
     match (variant.aim, texel) {
+        (Aim::Hard, _) => Term::Hard,
         (Aim::Filtered { texels }, Some(texel)) => Term::Filtered(texel.map(|side| side * texels)),
         _ => Term::Unshadowed,
     }
@@ -172,7 +165,7 @@ fn small(size: Size) -> Size {
 /// The references of every step, with a quarter of the samples of a still one.
 fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Vec<[Picture; 2]>> {
     let size = small(request.size);
-    let camera = Camera::framing(&stage.scene, size.width, size.height);
+    let camera = stage.camera(size);
     let mut set = studio.set(&stage.scene)?;
     let mut all = Vec::new();
     for step in 0..STEPS {
@@ -192,8 +185,7 @@ fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Vec<[
 fn frame(studio: &mut Studio, scene: &Arc<Scene>, stage: &Stage, request: &Request) -> Result<Image> {
     let mut set = studio.set(scene)?;
     studio.pose(&mut set, &stage.state(STILL))?;
-    let camera = Camera::framing(scene, request.size.width, request.size.height);
-    let image = studio.draw(&set, camera, request.size);
+    let image = studio.draw(&set, stage.camera(request.size), request.size);
     studio.strike(set);
     image
 }
@@ -243,13 +235,16 @@ impl Job<'_> {
         let hard = &self.references.hard;
         let colour_of_aim = metrics::colours(&image.rgba, &aim.colours);
         let light_of_aim = metrics::light(lit, &aim.light);
-        let faults = faults(&colour_of_aim, &light_of_aim);
+        let bounds = variant.bounds(self.stage.kind);
+        let faults = faults(&colour_of_aim, &light_of_aim, &bounds);
         Row {
             load: self.stage.name.clone(),
             name: variant.name.clone(),
             method: variant.method,
             shadow: variant.shadow,
+            bounds,
             passed: faults.is_empty(),
+            to_fail: variant.is_to_fail(self.stage.kind),
             faults,
             colour: metrics::colours(&image.rgba, &hard.colours),
             colour_of_aim,
@@ -266,7 +261,7 @@ impl Job<'_> {
 
     fn flicker(&self, studio: &mut Studio, set: &mut Set, variant: &Variant) -> Result<Spread> {
         let size = small(self.request.size);
-        let camera = Camera::framing(&self.stage.scene, size.width, size.height);
+        let camera = self.stage.camera(size);
         let mut flicker = Flicker::default();
         for (step, [unshadowed, hard]) in self.moving.iter().enumerate() {
             studio.pose(set, &self.stage.state(step))?;
@@ -294,12 +289,12 @@ impl Job<'_> {
 }
 
 /// Which bounds a variant does not keep, in words.
-fn faults(colour: &Spread, light: &Light) -> Vec<String> {
+fn faults(colour: &Spread, light: &Light, bounds: &Bounds) -> Vec<String> {
     let found = [
-        ("mean error of colour", Some(colour.mean), BOUNDS.mean_colour),
-        ("mean error of light", Some(light.all.mean), BOUNDS.mean_light),
-        ("mean light in the umbra", light.in_umbra, BOUNDS.bleeding),
-        ("mean light lost outside of shadows", light.lost, BOUNDS.lost),
+        ("mean error of colour", Some(colour.mean), bounds.mean_colour),
+        ("mean error of light", Some(light.all.mean), bounds.mean_light),
+        ("mean light in the umbra", light.in_umbra, bounds.bleeding),
+        ("mean light lost outside of shadows", light.lost, bounds.lost),
     ];
     let over = |(what, found, bound): (&str, Option<f64>, f64)| {
         let found = found.filter(|found| found.is_nan() || *found > bound)?;
@@ -310,6 +305,7 @@ fn faults(colour: &Spread, light: &Light) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::variants::BOUNDS;
     use super::*;
 
     #[test]
@@ -317,7 +313,7 @@ mod tests {
         let shadow = |first: usize| -> Vec<Option<f32>> {
             (0..1000).map(|at| Some(if (first..first + 10).contains(&at) { 0.0 } else { 1.0 })).collect()
         };
-        let judged = |own: &[Option<f32>]| faults(&Spread::default(), &metrics::light(own, &shadow(100)));
+        let judged = |own: &[Option<f32>]| faults(&Spread::default(), &metrics::light(own, &shadow(100)), &BOUNDS);
         assert_eq!(judged(&shadow(100)), Vec::<String>::new(), "control: the right one");
         assert_eq!(judged(&shadow(102)), Vec::<String>::new(), "a fifth of it beside its place is within the bound");
         for wrong in [shadow(200), vec![Some(1.0); 1000], shadow(105)] {
@@ -325,6 +321,6 @@ mod tests {
         }
         assert!(judged(&vec![Some(0.5); 1000]).iter().any(|fault| fault.starts_with("mean light lost")));
         let loud = Spread { mean: f64::NAN, ..Spread::default() };
-        assert_eq!(faults(&loud, &Light::default()).len(), 1, "what is no number is a fault");
+        assert_eq!(faults(&loud, &Light::default(), &BOUNDS).len(), 1, "what is no number is a fault");
     }
 }

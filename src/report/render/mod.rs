@@ -1,7 +1,7 @@
 //! Error against run time of the renderer: pictures by every variant against references that rays make by brute force.
 //!
 //! Validate first, then time: a variant whose error against what it means to show exceeds a stated bound is not timed, is
-//! named, and fails the report.
+//! named, and fails the report. A variant that is shown as a failure is stated so, and fails the report if it is none.
 //!
 //! - [`loads`], [`variants`]: what is drawn, and how.
 //! - `soup`, `paint`, `texels`, `view`, `shade`, `pattern`, `picture`: the references. 64 samples a pixel, all in f64 but
@@ -85,11 +85,11 @@ pub struct Report {
     pub made: Provenance,
     pub renderer: Info,
     pub size: Size,
-    /// What bounds a variant must keep against what it means to show.
-    pub bounds: measure::Bounds,
+    /// What bounds a variant must keep against what it means to show, where its row has no closer ones.
+    pub bounds: variants::Bounds,
     pub loads: Vec<Entry>,
     pub rows: Vec<Row>,
-    /// Variants that did not pass, as load: variant: why.
+    /// Variants that did not pass though they should, or passed though they should not, as load: variant: why.
     pub failed: Vec<String>,
     /// Pictures to be looked at.
     #[serde(skip)]
@@ -110,14 +110,18 @@ pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Repor
         rows.extend(measured);
         pictures.extend(files);
     }
-    let why = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
-    let failed = rows.iter().filter(|row: &&Row| !row.passed).map(why).collect();
-    let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), measure::BOUNDS);
+    let failed = rows.iter().filter(|row: &&Row| !row.as_stated()).map(why).collect();
+    let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::BOUNDS);
     Ok(Report { made, renderer, size: request.size, bounds, loads, rows, failed, pictures })
 }
 
+fn why(row: &Row) -> String {
+    let why = if row.passed { "keeps bounds that it is stated to exceed".into() } else { row.faults.join("; ") };
+    format!("{}: {}: {why}", row.load, row.name)
+}
+
 impl Report {
-    /// Whether every variant passed.
+    /// Whether every variant passed, but for those that are there to be seen to fail: these must not have.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()
     }

@@ -9,13 +9,18 @@ use crate::error::{Result, during};
 use crate::report::plot::png;
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
-const COLUMNS: [(&str, &str); 43] = [
+const COLUMNS: [(&str, &str); 48] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
     ("map_size", "/shadow/size"),
     ("blur", "/shadow/blur"),
+    ("moments", "/shadow/moments"),
+    ("splits", "/shadow/splits"),
+    ("bleeding_cut", "/shadow/bleeding"),
     ("passed", "/passed"),
+    ("to_fail", "/to_fail"),
+    ("bleeding_bound", "/bounds/bleeding"),
     ("frame_us", "frame"),
     ("frame_q1_us", "frame"),
     ("frame_q3_us", "frame"),

@@ -1,0 +1,73 @@
+//! The ground in the shadow map: it receives and never casts, where the map ends and where a wall stands on it.
+
+use modalcast::domain::{AlphaMode, Material};
+use modalcast::scene::{Blurring, Camera, Lens, Shadow, ShadowMethod, View};
+
+use super::build::{Picture, close, draw, facing, open};
+use super::shadow::{stage, with_square};
+
+/// All of the map's ground from above, seen with a map of this kind; or with none.
+fn from_high_above(shadow: Option<Shadow>, caster: bool) -> Picture {
+    let mut stage = stage();
+    stage.0.look.sun = [3.0, 4.0, 0.0];
+    stage.0.look.shadow = shadow;
+    let stage = if caster { with_square(stage, AlphaMode::Opaque, 1.0) } else { stage };
+    let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
+    let lens = Lens::Intrinsics { fx: 120.0, fy: 120.0, cx: 80.0, cy: 80.0 };
+    draw(&mut open(), &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 160)
+}
+
+#[test]
+fn the_ground_is_lit_where_the_map_ends() {
+    let base = Shadow { size: 64, blur: 4.0, bleeding: 0.2, ..Shadow::default() };
+    let kinds = [
+        Shadow { blurring: Blurring::Rows, ..base },
+        Shadow { blurring: Blurring::Tiles, ..base },
+        Shadow { blurring: Blurring::Fragments, ..base },
+        Shadow { method: ShadowMethod::Filtered, ..base },
+        Shadow { splits: 2, ..base },
+    ];
+    let bright = from_high_above(None, false);
+    let darker = |shown: &Picture| {
+        let pairs = shown.image.rgba.iter().zip(&bright.image.rgba);
+        pairs.filter(|(own, bright)| bright.abs_diff(**own) > 2).count()
+    };
+    for shadow in kinds {
+        assert_eq!(darker(&from_high_above(Some(shadow), false)), 0, "{shadow:?}");
+    }
+    assert!(darker(&from_high_above(Some(base), true)) > 300, "control: a caster is seen");
+}
+
+/// How many pixels of a wall that stands on the ground are not lit as the sun lights it; and not dark.
+fn on_the_wall(shadow: Shadow, shaded: bool) -> [usize; 2] {
+    let mut stage = stage();
+    stage.0.look.sun = [0.0, 3.0, 4.0];
+    stage.0.look.shadow = Some(shadow);
+    let mut stage = stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default());
+    if shaded {
+        // Above what the camera sees; its shadow on the wall reaches from the ground to half a unit over the top.
+        stage = stage.add(facing(-3.0, 1.8, 3.0, 4.5, 4.0), Material::default());
+    }
+    let lens = Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: 32.0, cy: 32.0 };
+    let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+    let shown = draw(&mut open(), &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    // The wall is 20 x 20 pixels in the middle, without those of its rim.
+    let wall = || (23..41).flat_map(|y| (23..41).map(move |x| (x, y)));
+    let differing = |light: f64| wall().filter(|(x, y)| !close(shown.at(*x, *y), [light; 3], 2.0)).count();
+    [differing(0.25 + 0.5 * 0.8), differing(0.25)]
+}
+
+#[test]
+fn a_lit_wall_is_lit_down_to_its_foot_and_one_in_the_shadow_is_dark_there() {
+    for blur in [0.0, 2.0, 4.0] {
+        for size in [128, 512] {
+            let base = Shadow { size, blur, bleeding: 0.2, ..Shadow::default() };
+            for shadow in [base, Shadow { splits: 3, ..base }, Shadow { method: ShadowMethod::Filtered, ..base }] {
+                let [unlit, _] = on_the_wall(shadow, false);
+                assert_eq!(unlit, 0, "{shadow:?}");
+            }
+            let [unlit, light] = on_the_wall(base, true);
+            assert!(unlit == 18 * 18 && light < 50, "control, {base:?}: {unlit} not lit, {light} not dark");
+        }
+    }
+}
