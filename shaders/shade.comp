@@ -1,5 +1,5 @@
 // What every sample sees to the colour of its pixel, in linear light. A triangle is shaded once in a pixel, in the middle of
-// the samples that see it, however many those are; each sample is clamped, and their mean is the pixel.
+// the samples that see it, however many those are; the mean of the samples, as they are shown, is the pixel.
 //   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1       (in)
 //   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, share that they let by   (in)
 //   picture  [height][width]           RGBA16F, bottom row first                                        (out)
@@ -49,14 +49,10 @@ vec3 shaded(uint id, vec2 image, vec2 texel) {
     return light;
 }
 
-// Each sample is clamped by itself, so that one bright sample does not whiten an edge; a NaN fails the comparison and is
-// black.
-vec3 clamped(vec3 light) { return mix(vec3(0.0), min(light, vec3(1.0)), greaterThan(light, vec3(0.0))); }
-
 // The mean light of a pixel's samples.
 vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
     vec2 texel = 2.0 / vec2(size);
-    vec3 sum = vec3(0.0);
+    vec4 sum = vec4(0.0);
     uint left = (1u << SAMPLES) - 1u;
     // The loop is left at its end: a software rasteriser runs the body of a loop for lanes that are done.
     do {
@@ -77,14 +73,14 @@ vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
 #ifdef LAYERS
         for (int index = 0; index < SAMPLES; index++) {
             vec4 layer = texelFetch(layers, at, index);
-            if ((same >> index & 1u) != 0u) sum += clamped(layer.rgb + layer.a * light);
+            if ((same >> index & 1u) != 0u) sum += resolved(layer.rgb + layer.a * light);
         }
 #else
-        sum += count * clamped(light);
+        sum += count * resolved(light);
 #endif
         left &= ~same;
     } while (left != 0u);
-    return sum / float(SAMPLES);
+    return sum.rgb / sum.a;
 }
 
 void main() {

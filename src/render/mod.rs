@@ -9,7 +9,8 @@
 //! | blended | light of the blended triangles over each other, no depth written | some triangle is blended |
 //! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
 //! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
-//! | encode | light to sRGB bytes, top row first (compute) | always |
+//! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
+//! | encode | light to sRGB bytes, top row first; smooths edges and mixes levels (compute) | always |
 //!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
 
@@ -21,6 +22,7 @@ mod gl;
 mod light;
 mod passes;
 mod plan;
+mod post;
 mod programs;
 mod scene_buffers;
 mod seen;
@@ -236,10 +238,9 @@ impl Renderer {
         }
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
         let look = &buffers.scene.look;
-        let form = Form::new(&self.gl, [shot.width, shot.height], look.samples, buffers.scene.needs.blend);
+        let form = Form::new(&self.gl, [shot.width, shot.height], look, buffers.scene.needs.blend);
         self.make_room(form)?;
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
-        let encode = self.program(shaders::encode())?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let gl = &self.gl;
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
@@ -251,7 +252,8 @@ impl Renderer {
             passes::ground(gl, buffers, shot, &mut ran)?;
             passes::blended(gl, buffers, target, &mut ran)?;
             passes::shade(gl, buffers, target, &sampled, &mut ran)?;
-            passes::encode(gl, target, &encode, &mut ran)
+            buffers.post.bloom(gl, target, &mut ran)?;
+            buffers.post.encode(gl, target, &mut ran)
         })?;
         let bytes = 4 * shot.width as usize * shot.height as usize;
         let copy = gl.timed(|| {

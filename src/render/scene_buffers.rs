@@ -11,6 +11,7 @@ use super::SharedBuffers;
 use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials};
 use super::gl::{self, Attribute, Buffer, Framebuffer, Gl, Texture, TextureKind, VertexArray};
 use super::plan::{Allocation, Plan, plan};
+use super::post::Post;
 use super::programs::{Compile, Programs, Sampled};
 use super::shaders::{self, OTHER_READS, Options, Used};
 use super::textures::{Array, Use, arrays, levels, place, within_budget};
@@ -50,6 +51,7 @@ pub struct SceneBuffers {
     pub(super) normals: Vec<Texture>,
     pub(super) shadow: Option<ShadowMap>,
     pub(super) programs: Programs,
+    pub(super) post: Post,
     /// For the samples a pixel that the look asks for.
     sampled: Sampled,
     options: Options,
@@ -118,9 +120,10 @@ impl SceneBuffers {
             used: used(scene, &images),
             blur: scene.look.shadow.unwrap_or_default().blur,
             sample_places: sample_places.to_vec(),
+            resolve: super::post::resolve(&scene.look),
         };
         let programs = Programs::compile(&options, &plan, &geometry.groups, compile)?;
-        let samples = if sample_places.is_empty() { 1 } else { scene.look.samples };
+        let samples = if sample_places.is_empty() { 1 } else { scene.look.samples_a_pixel() };
         let sampled = Sampled::compile(&options, &geometry.groups, samples, compile)?;
         let [colours, normals] = images;
         Ok(Self {
@@ -136,6 +139,7 @@ impl SceneBuffers {
             normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
             shadow: scene.look.shadow.map(|shadow| ShadowMap::new(gl, shadow.size)).transpose()?,
             programs,
+            post: Post::compile(&scene.look, compile)?,
             sampled,
             options,
             stretches: geometry.stretches,
