@@ -1,7 +1,7 @@
 // Doubles a picture, with weights 3/4 and 1/4 of the nearest two texels in each direction (Chaikin 1974: repeated, it tends
 // to a quadratic B-spline), and adds it to the next finer one. All levels count the same: what comes from below is the
-// mean of `coarser` levels. The last adds the glow to the shaded picture, takes away what began to glow, and goes through
-// the tone curve.
+// mean of `coarser` levels. The last adds the glow to the shaded picture, from which what began to glow is taken: what is
+// shown goes back to light and through the tone curve again.
 //   from  [ceil height/2][ceil width/2]  RGBA16F (in)
 //   to    [height][width]                RGBA16F (in and out)
 layout(local_size_x = TILE, local_size_y = TILE) in;
@@ -21,9 +21,7 @@ void main() {
     glow += 0.1875 * (texelFetch(from, ivec2(far.x, near.y), 0).rgb + texelFetch(from, ivec2(near.x, far.y), 0).rgb);
     vec3 own = imageLoad(to, at).rgb;
 #ifdef LAST
-    // Rounding may leave a little less than none.
-    vec3 light = max(own + STRENGTH * (glow - bright(own)), vec3(0.0));
-    own = toned(light);
+    own = toned(untoned(own) + STRENGTH * glow);
 #else
     own = (own + float(coarser) * glow) / float(coarser + 1);
 #endif

@@ -118,6 +118,9 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
         layer.colour.bind(LAYER_UNIT);
     }
     target.picture.bind_image(0);
+    if let Some(glare) = target.glow.first() {
+        glare.bind_image(1);
+    }
     target.tiles.write(bytemuck::cast_slice(&NO_TILES));
     target.tiles.bind_storage(TILES);
     sampled.backdrop.bind(None);

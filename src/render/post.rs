@@ -14,9 +14,10 @@ use crate::scene::{Antialias, Bloom, Look, Tone};
 
 const TONE: &str = include_str!("../../shaders/shared/tone.glsl");
 const RESOLVE: &str = include_str!("../../shaders/shared/resolve.glsl");
-const BRIGHT: &str = include_str!("../../shaders/shared/bright.glsl");
 const FXAA: &str = include_str!("../../shaders/shared/fxaa.glsl");
 const VERSION: &str = "#version 430 core\n";
+/// A sample's light, at most: far above white, and well within half precision.
+const MOST_LIGHT: f32 = 1000.0;
 
 /// The programs of one look.
 #[derive(Debug)]
@@ -27,7 +28,6 @@ pub(super) struct Post {
 
 #[derive(Debug)]
 struct Glow {
-    first: Rc<Program>,
     down: Rc<Program>,
     up: Rc<Program>,
     last: Rc<Program>,
@@ -37,8 +37,7 @@ impl Post {
     pub(super) fn compile(look: &Look, compile: &mut Compile<'_>) -> Result<Self> {
         let glow = match look.bloom {
             Some(bloom) => Some(Glow {
-                first: compile(down(bloom, true))?,
-                down: compile(down(bloom, false))?,
+                down: compile(down())?,
                 up: compile(up(look, bloom, false))?,
                 last: compile(up(look, bloom, true))?,
             }),
@@ -49,18 +48,15 @@ impl Post {
 
     /// Spreads the glow and goes through the tone curve, in place.
     pub(super) fn bloom(&self, gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
-        let (Some(glow), Some(coarsest)) = (&self.glow, target.halves.last()) else { return Ok(()) };
-        let mut from = &target.picture;
-        for (index, to) in target.halves.iter().enumerate() {
-            let program = if index == 0 { &glow.first } else { &glow.down };
-            program.bind(None);
+        let (Some(glow), Some(coarsest)) = (&self.glow, target.glow.last()) else { return Ok(()) };
+        glow.down.bind(None);
+        for (from, to) in target.glow.iter().zip(target.glow.iter().skip(1)) {
             from.bind(0);
             to.bind_image(0);
             tiles(gl, to);
-            from = to;
         }
-        from = coarsest;
-        for (coarser, to) in (1..).zip(target.halves.iter().rev().skip(1)) {
+        let mut from = coarsest;
+        for (coarser, to) in (1..).zip(target.glow.iter().skip(1).rev().skip(1)) {
             glow.up.bind(Some(coarser));
             from.bind(0);
             to.bind_image_both_ways(0);
@@ -91,8 +87,11 @@ fn tiles(gl: &Gl, of: &Texture) {
     gl.dispatch(of.kind.width.div_ceil(TILE), of.kind.height.div_ceil(TILE));
 }
 
-/// The images between which glow spreads, each half as large as the one before, rounded up.
-pub(super) fn halves(gl: &Rc<Gl>, form: Form) -> Result<Vec<Texture>> {
+/// The images between which glow spreads: what glows of each pixel, and each half as large as the one before, rounded up.
+pub(super) fn glow(gl: &Rc<Gl>, form: Form) -> Result<Vec<Texture>> {
+    if form.halvings == 0 {
+        return Ok(Vec::new());
+    }
     let half = |level: u32| {
         let [width, height] = [form.width, form.height].map(|side| side.div_ceil(1 << level));
         let kind = TextureKind { target: gl::TEXTURE_2D, format: gl::RGBA16F, width, height, depth: 1, levels: 1 };
@@ -100,7 +99,7 @@ pub(super) fn halves(gl: &Rc<Gl>, form: Form) -> Result<Vec<Texture>> {
         texture.sampling(&[(gl::TEXTURE_MIN_FILTER, gl::NEAREST), (gl::TEXTURE_MAG_FILTER, gl::NEAREST)], 1.0);
         Ok(texture)
     };
-    (1..=form.glow).map(half).collect()
+    (0..=form.halvings).map(half).collect()
 }
 
 /// What the shading makes of a sample's light, as text for its program.
@@ -109,35 +108,32 @@ pub(super) fn resolve(look: &Look) -> String {
     if look.exposure != 1.0 {
         writeln!(text, "#define EXPOSURE {:?}", look.exposure).ok();
     }
-    if look.bloom.is_some() {
-        return text + "#define BLOOM\n" + RESOLVE;
+    if let Some(Bloom { threshold, strength, .. }) = look.bloom {
+        write!(text, "#define BLOOM\n#define THRESHOLD {threshold:?}\n#define STRENGTH {strength:?}\n").ok();
     }
-    [&text, curve(look), TONE, RESOLVE].concat()
+    [&text, &curve(look), RESOLVE].concat()
 }
 
-const fn curve(look: &Look) -> &'static str {
-    match look.tone {
+/// The tone curve and its inverse.
+fn curve(look: &Look) -> String {
+    let name = match look.tone {
         Tone::None => "",
         Tone::Reinhard => "#define REINHARD\n",
         Tone::Aces => "#define ACES\n",
-    }
+    };
+    format!("#define MOST_LIGHT {MOST_LIGHT:?}\n{name}{TONE}")
 }
 
-fn down(bloom: Bloom, first: bool) -> Source {
-    let mut text = format!("{VERSION}#define TILE {TILE}\n");
-    if first {
-        write!(text, "#define FIRST\n#define THRESHOLD {:?}\n{BRIGHT}", bloom.threshold).ok();
-    }
-    text += include_str!("../../shaders/bloom_down.comp");
-    compute(if first { "bloom, first half" } else { "bloom, half" }, text)
+fn down() -> Source {
+    let head = format!("{VERSION}#define TILE {TILE}\n");
+    compute("bloom, half", head + include_str!("../../shaders/bloom_down.comp"))
 }
 
 fn up(look: &Look, bloom: Bloom, last: bool) -> Source {
     let mut text = format!("{VERSION}#define TILE {TILE}\n");
     if last {
-        let Bloom { threshold, strength, .. } = bloom;
-        write!(text, "#define LAST\n#define THRESHOLD {threshold:?}\n#define STRENGTH {strength:?}\n").ok();
-        text += &[curve(look), TONE, BRIGHT].concat();
+        write!(text, "#define LAST\n#define STRENGTH {:?}\n", bloom.strength).ok();
+        text += &curve(look);
     }
     text += include_str!("../../shaders/bloom_up.comp");
     compute(if last { "bloom, onto the picture" } else { "bloom, double" }, text)
@@ -176,7 +172,7 @@ mod tests {
         assert!(!encode_text.contains("#define FXAA") && !encode_text.contains("smoothed(ivec2 at) {"));
         assert!(!encode_text.contains("#define DITHER"));
         let shading = resolve(&plain);
-        for define in ["EXPOSURE", "BLOOM", "REINHARD", "ACES"] {
+        for define in ["EXPOSURE", "BLOOM", "STRENGTH", "REINHARD", "ACES"] {
             assert!(!shading.contains(&format!("#define {define}")), "{define}");
         }
         let named = Look { tone: Tone::Aces, exposure: 1.5, antialias: Antialias::Fxaa, dither: true, ..plain };
@@ -184,15 +180,5 @@ mod tests {
         assert!(encode_text.contains("#define FXAA") && encode_text.contains("smoothed(ivec2 at) {"));
         assert!(encode_text.contains("#define DITHER"));
         assert!(shading.contains("#define EXPOSURE 1.5\n") && shading.contains("#define ACES"));
-    }
-
-    #[test]
-    fn the_curve_is_in_the_shading_or_after_the_glow_and_never_in_both() {
-        for bloom in [None, Some(Bloom::default())] {
-            let look = Look { bloom, tone: Tone::Reinhard, ..Look::default() };
-            let after = text(up(&look, bloom.unwrap_or_default(), true));
-            let shading = resolve(&look).contains("vec3 toned(");
-            assert!(shading == bloom.is_none() && after.contains("#define REINHARD"));
-        }
     }
 }

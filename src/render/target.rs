@@ -21,7 +21,7 @@ pub(super) struct Form {
     /// Whether there is a layer for blended triangles.
     pub(super) layered: bool,
     /// Halvings of the picture through which light glows.
-    pub(super) glow: u32,
+    pub(super) halvings: u32,
 }
 
 /// The images and buffers of frames of one form.
@@ -36,8 +36,8 @@ pub(super) struct Target {
     pub(super) tiles: Buffer,
     /// Linear light, one value a pixel.
     pub(super) picture: Texture,
-    /// What glows of it, half as large each time.
-    pub(super) halves: Vec<Texture>,
+    /// What glows of each pixel, then half as large each time; none without glow.
+    pub(super) glow: Vec<Texture>,
     /// RGBA8, top row first, as the encoder writes it.
     pub(super) packed: Buffer,
     /// The same where the host can read it.
@@ -58,8 +58,8 @@ impl Form {
     pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &Look, layered: bool) -> Self {
         let wanted = look.samples_a_pixel();
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
-        let glow = look.bloom.map_or(0, |bloom| bloom.levels);
-        Self { width, height, samples: if fits { wanted } else { 1 }, layered, glow }
+        let halvings = look.bloom.map_or(0, |bloom| bloom.levels);
+        Self { width, height, samples: if fits { wanted } else { 1 }, layered, halvings }
     }
 }
 
@@ -81,7 +81,7 @@ impl Target {
                 None,
             )?,
             picture: image(gl, Form { samples: 1, ..form }, gl::RGBA16F)?,
-            halves: super::post::halves(gl, form)?,
+            glow: super::post::glow(gl, form)?,
             packed: gl.buffer(bytes, gl::STREAM_COPY, None)?,
             staging: gl.buffer(bytes, gl::STREAM_READ, None)?,
             _depth: depth,
@@ -91,7 +91,7 @@ impl Target {
 
 /// Where the samples of a pixel of four lie in it; empty on a device that has no four.
 pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
-    let form = Form { width: 1, height: 1, samples: 4, layered: false, glow: 0 };
+    let form = Form { width: 1, height: 1, samples: 4, layered: false, halvings: 0 };
     if gl.limits.max_samples < form.samples {
         return Ok(Vec::new());
     }
