@@ -4,12 +4,12 @@
 // samples of a pixel are. A pixel without an edge is not changed at all.
 
 // A jump counts from this share of the brightest pixel around on, and from this brightness on.
-const float LEAST_SHARE = 0.125;
+const float LEAST_SHARE = 0.2;
 const float LEAST_JUMP = 0.0416;
 // Pixels along an edge that are searched, to each side.
 const int REACH = 16;
 // The most that a lone pixel takes from a neighbour, where no line explains it.
-const float MOST_ALONE = 0.375;
+const float MOST_ALONE = 0.5;
 
 ivec2 within(ivec2 at) { return clamp(at, ivec2(0), textureSize(picture, 0) - 1); }
 
