@@ -163,7 +163,7 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
         (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
-        (look.bloom.is_some(), "bloom", 0, vec!["bloom"], "light above white is dropped at once, 10.7 bytes a pixel less"),
+        (look.bloom.is_some(), "bloom", 0, vec!["bloom"], "what glows is not kept, 10.7 bytes a pixel less"),
         (look.tone != Tone::None, "tone curve", 0, vec![], "light is shown as it is"),
         (look.antialias == Antialias::Fxaa, "fxaa", 0, vec![], "no search for edges in the picture"),
         (look.dither, "dither", 0, vec![], "levels are rounded without a pattern"),

@@ -1,7 +1,7 @@
 //! Tone curves, glow, smoothed edges and mixed levels against arithmetic.
 
 use modalcast::deform::{Deformer as _, Surface};
-use modalcast::domain::{Material, Mesh};
+use modalcast::domain::{AlphaMode, Material, Mesh};
 use modalcast::reference::ReferenceDeformer;
 use modalcast::render::{Shot, plan};
 use modalcast::scene::{Antialias, Bloom, Camera, Lens, Look, State, Tone};
@@ -117,6 +117,25 @@ fn a_glow_in_the_middle_is_the_same_in_every_mirror_and_leaves_what_is_below_the
     let plain = picture(&glowing([30.0, 12.0, 5.0], |look| look).add(four.clone(), white()).scene());
     assert!(picture(&stage(30.5).add(four, white()).scene()).image.rgba == plain.image.rgba, "nothing is above 30.5");
     assert!(shown.image.rgba != plain.image.rgba, "control");
+}
+
+#[test]
+fn the_rim_of_a_bright_surface_stays_smooth_when_light_above_white_is_kept_for_a_glow() {
+    let shown = |bloom: Option<Bloom>| {
+        let stage = glowing([50.0; 3], |look| Look { bloom, samples: 4, ..look });
+        let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white() };
+        // The lamp covers the right half of the pixels of column 32; half of it is behind dark glass.
+        let scene = stage.add(facing(0.05, -2.0, 2.0, 2.0, 0.0), white()).add(facing(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
+        picture(&scene.scene())
+    };
+    let plain = shown(None);
+    let idle = shown(Some(Bloom { strength: 0.0, ..Bloom::default() }));
+    assert_eq!(plain.ran.samples, 4);
+    assert!(plain.image.rgba == idle.image.rgba, "a glow of no strength changes nothing");
+    for y in [20, 40] {
+        assert!(close(plain.at(32, y), [0.5; 3], 1.0) && plain.at(33, y) == [255; 3], "{:?}", plain.at(32, y));
+    }
+    assert!(plain.image.rgba != shown(Some(Bloom::default())).image.rgba, "control");
 }
 
 /// A white rhomb with slanted edges before grey, `scale` times 64 pixels a side.
