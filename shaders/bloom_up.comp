@@ -15,10 +15,10 @@ void main() {
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     ivec2 last = textureSize(from, 0) - 1;
     if (any(greaterThanEqual(at, imageSize(to)))) return;
-    ivec2 near = at >> 1;
-    ivec2 far = clamp(near + 2 * (at & 1) - 1, ivec2(0), last);
-    vec3 glow = 0.5625 * texelFetch(from, near, 0).rgb + 0.0625 * texelFetch(from, far, 0).rgb;
-    glow += 0.1875 * (texelFetch(from, ivec2(far.x, near.y), 0).rgb + texelFetch(from, ivec2(near.x, far.y), 0).rgb);
+    ivec2 here = at >> 1;
+    ivec2 next = clamp(here + 2 * (at & 1) - 1, ivec2(0), last);
+    vec3 glow = 0.5625 * texelFetch(from, here, 0).rgb + 0.0625 * texelFetch(from, next, 0).rgb;
+    glow += 0.1875 * (texelFetch(from, ivec2(next.x, here.y), 0).rgb + texelFetch(from, ivec2(here.x, next.y), 0).rgb);
     vec3 own = imageLoad(to, at).rgb;
 #ifdef LAST
     own = toned(untoned(own) + STRENGTH * glow);
