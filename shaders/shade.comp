@@ -1,8 +1,9 @@
 // What every sample sees to the colour of its pixel, in linear light. A triangle is shaded once in a pixel, in the middle of
-// the samples that see it, however many those are; each sample is clamped, and their mean is the pixel.
+// the samples that see it, however many those are; the mean of the samples, as they are shown, is the pixel.
 //   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1       (in)
 //   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, share that they let by   (in)
 //   picture  [height][width]           RGBA16F, bottom row first                                        (out)
+//   glare    [height][width]           RGBA16F: light that glows                                        (out)
 // Two dispatches: with BACKDROP for all tiles of pixels, to paint those that see sky and ground alone and to list the
 // others; then for the listed tiles. A software rasteriser runs both sides of every branch, and most tiles of most pictures
 // see no triangle.
@@ -15,6 +16,9 @@ layout(binding = 22) uniform sampler2D layers;
 #endif
 #endif
 layout(rgba16f, binding = 0) uniform writeonly image2D picture;
+#ifdef BLOOM
+layout(rgba16f, binding = 1) uniform writeonly image2D glare;
+#endif
 // The number of groups of the second dispatch, in rows; then the tiles, x and y in one word, in any order.
 layout(std430, binding = 1) buffer Tiles {
     uint groups[3];
@@ -49,14 +53,10 @@ vec3 shaded(uint id, vec2 image, vec2 texel) {
     return light;
 }
 
-// Each sample is clamped by itself, so that one bright sample does not whiten an edge; a NaN fails the comparison and is
-// black.
-vec3 clamped(vec3 light) { return mix(vec3(0.0), min(light, vec3(1.0)), greaterThan(light, vec3(0.0))); }
-
-// The mean light of a pixel's samples.
+// What a pixel's samples show together.
 vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
     vec2 texel = 2.0 / vec2(size);
-    vec3 sum = vec3(0.0);
+    Gathered sum = Gathered(vec3(0.0), vec3(0.0));
     uint left = (1u << SAMPLES) - 1u;
     // The loop is left at its end: a software rasteriser runs the body of a loop for lanes that are done.
     do {
@@ -77,14 +77,17 @@ vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
 #ifdef LAYERS
         for (int index = 0; index < SAMPLES; index++) {
             vec4 layer = texelFetch(layers, at, index);
-            if ((same >> index & 1u) != 0u) sum += clamped(layer.rgb + layer.a * light);
+            if ((same >> index & 1u) != 0u) gather(sum, layer.rgb + layer.a * light, 1.0);
         }
 #else
-        sum += count * clamped(light);
+        gather(sum, light, count);
 #endif
         left &= ~same;
     } while (left != 0u);
-    return sum / float(SAMPLES);
+#ifdef BLOOM
+    imageStore(glare, at, vec4(sum.glow / float(SAMPLES), 1.0));
+#endif
+    return sum.shown / float(SAMPLES);
 }
 
 void main() {

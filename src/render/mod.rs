@@ -9,7 +9,8 @@
 //! | blended | light of the blended triangles over each other, no depth written | some triangle is blended |
 //! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
 //! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
-//! | encode | light to sRGB bytes, top row first (compute) | always |
+//! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
+//! | encode | light to sRGB bytes, top row first; smooths edges and mixes levels (compute) | always |
 //!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
 
@@ -21,6 +22,7 @@ mod gl;
 mod light;
 mod passes;
 mod plan;
+mod post;
 mod programs;
 mod scene_buffers;
 mod seen;
@@ -240,10 +242,9 @@ impl Renderer {
         }
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
         let look = &buffers.scene.look;
-        let form = Form::new(&self.gl, [shot.width, shot.height], look.samples, buffers.scene.needs.blend);
+        let form = Form::new(&self.gl, [shot.width, shot.height], look, buffers.scene.needs.blend);
         self.make_room(form)?;
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
-        let encode = self.program(shaders::encode())?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let gl = &self.gl;
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
@@ -261,7 +262,8 @@ impl Renderer {
         })?;
         let blended = gl.timed(|| passes::blended(gl, buffers, target, &mut ran))?;
         let shade = gl.timed(|| passes::shade(gl, buffers, target, &sampled, &mut ran))?;
-        let encode = gl.timed(|| passes::encode(gl, target, &encode, &mut ran))?;
+        let bloom = gl.timed(|| buffers.post.bloom(gl, target, &mut ran))?;
+        let encode = gl.timed(|| buffers.post.encode(gl, target, &mut ran))?;
         let bytes = 4 * shot.width as usize * shot.height as usize;
         let copy = gl.timed(|| {
             gl.copy(&target.packed, &target.staging, bytes as u64);
@@ -271,8 +273,9 @@ impl Renderer {
         let begin = Instant::now();
         let rgba = target.staging.read(bytes)?;
         let mapped = begin.elapsed().as_secs_f64() * 1e3;
-        let drawn = [("visibility", visibility), ("blended", blended), ("shade", shade), ("encode", encode)];
-        let drawn = drawn.map(|(name, stopwatch)| (name, stopwatch.ms()));
+        let drawn = [("visibility", visibility), ("blended", blended), ("shade", shade)];
+        let drawn = drawn.into_iter().chain([("bloom", bloom), ("encode", encode)]);
+        let drawn: Vec<_> = drawn.map(|(name, stopwatch)| (name, stopwatch.ms())).collect();
         let blur = blur.ms();
         let mut passes = vec![("shadow", shadow.ms() + blur), ("blur", blur)];
         passes.push(("draw", drawn.iter().map(|(_, ms)| ms).sum()));

@@ -1,4 +1,4 @@
-//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade, encode.
+//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade; then those of `post.rs`.
 
 use super::frame::{Frame, above_ground};
 use super::geometry::Kind;
@@ -13,7 +13,7 @@ use super::target::Target;
 use super::{Ran, Shot};
 use crate::error::Result;
 
-const PIXELS: u32 = 0;
+pub(super) const PIXELS: u32 = 0;
 const TILES: u32 = 1;
 /// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
 const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
@@ -113,6 +113,9 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
         layer.colour.bind(LAYER_UNIT);
     }
     target.picture.bind_image(0);
+    if let Some(glare) = target.glow.first() {
+        glare.bind_image(1);
+    }
     target.tiles.write(bytemuck::cast_slice(&NO_TILES));
     target.tiles.bind_storage(TILES);
     sampled.backdrop.bind(None);
@@ -125,16 +128,6 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
         ran.passes.push("shade");
     }
     gl.check("shade")
-}
-
-/// Light to bytes, where the host can read them.
-pub(super) fn encode(gl: &Gl, target: &Target, program: &Program, ran: &mut Ran) -> Result<()> {
-    program.bind(None);
-    target.picture.bind(0);
-    target.packed.bind_storage(PIXELS);
-    gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
-    ran.passes.push("encode");
-    gl.check("encode")
 }
 
 /// Ids of each pixel's first sample, where the host can read them.

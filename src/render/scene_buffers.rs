@@ -11,6 +11,7 @@ use super::SharedBuffers;
 use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials};
 use super::gl::{self, Attribute, Buffer, Gl, Texture, TextureKind, VertexArray};
 use super::plan::{Allocation, Plan, planned};
+use super::post::Post;
 use super::programs::{Compile, Programs, Sampled};
 use super::shaders::{self, OTHER_READS, Options, Used};
 use super::shadow::{ShadowMap, fitting};
@@ -51,6 +52,7 @@ pub struct SceneBuffers {
     pub(super) normals: Vec<Texture>,
     pub(super) shadow: Option<ShadowMap>,
     pub(super) programs: Programs,
+    pub(super) post: Post,
     /// For the samples a pixel that the look asks for.
     sampled: Sampled,
     options: Options,
@@ -111,9 +113,10 @@ impl SceneBuffers {
             used: used(scene, &images),
             shadow: shadow.unwrap_or_default(),
             sample_places: sample_places.to_vec(),
+            resolve: super::post::resolve(&scene.look),
         };
         let programs = Programs::compile(&options, &plan, &geometry.groups, compile)?;
-        let samples = if sample_places.is_empty() { 1 } else { scene.look.samples };
+        let samples = if sample_places.is_empty() { 1 } else { scene.look.samples_a_pixel() };
         let sampled = Sampled::compile(&options, &geometry.groups, samples, compile)?;
         let [colours, normals] = images;
         Ok(Self {
@@ -129,6 +132,7 @@ impl SceneBuffers {
             normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
             shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow)).transpose()?,
             programs,
+            post: Post::compile(&scene.look, compile)?,
             sampled,
             options,
             stretches: geometry.stretches,

@@ -56,6 +56,8 @@ pub(super) struct Options {
     pub(super) shadow: Shadow,
     /// Where the samples of a multisampled pixel lie in it.
     pub(super) sample_places: Vec<[f32; 2]>,
+    /// What the shading makes of a sample's light.
+    pub(super) resolve: String,
 }
 
 /// A material that triangles have: what pipeline draws them, and the arrays that hold its images.
@@ -177,7 +179,7 @@ impl Options {
         let mut head = self.head(more);
         writeln!(head, "#define TILE {TILE}\n#define ROW {TILE_ROW}u").ok();
         let ground = if self.defines.contains(&"GROUND_SEEN") { GROUND } else { "" };
-        [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground].concat()
+        [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground, &self.resolve].concat()
     }
 
     pub(super) fn ground(&self) -> Source {
@@ -234,13 +236,6 @@ pub(super) fn seen(samples: u32) -> Source {
     Source { label: format!("seen, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
 }
 
-/// Turns the picture into sRGB bytes.
-pub(super) fn encode() -> Source {
-    let head = format!("#version 430 core\n#define LANES {LANES}\n");
-    let body = [&head, include_str!("../../shaders/encode.comp")].concat();
-    Source { label: "encode".into(), stages: vec![(gl::COMPUTE_SHADER, body)] }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::geometry::tests::squares;
@@ -253,7 +248,8 @@ mod tests {
         let plan = super::super::plan::plan(&scene);
         let sample_places = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
         let used = vec![Used { kind: Kind::Opaque, colour: None, normal: None }];
-        Options { defines: plan.defines, used, shadow: Shadow::default(), sample_places }
+        let resolve = super::super::post::resolve(&scene.look);
+        Options { defines: plan.defines, used, shadow: Shadow::default(), sample_places, resolve }
     }
 
     fn text(source: Source) -> String {

@@ -6,6 +6,7 @@ use std::rc::Rc;
 use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
 use super::shaders::TILE;
 use crate::error::Result;
+use crate::scene::Look;
 
 /// Pixels of a multisampled frame, at most: with depth, ids and a blended layer they take 704 MiB of device memory. A
 /// larger frame is drawn with one sample a pixel.
@@ -19,6 +20,8 @@ pub(super) struct Form {
     pub(super) samples: u32,
     /// Whether there is a layer for blended triangles.
     pub(super) layered: bool,
+    /// Halvings of the picture through which light glows.
+    pub(super) halvings: u32,
 }
 
 /// The images and buffers of frames of one form.
@@ -33,6 +36,8 @@ pub(super) struct Target {
     pub(super) tiles: Buffer,
     /// Linear light, one value a pixel.
     pub(super) picture: Texture,
+    /// What glows of each pixel, then half as large each time; none without glow.
+    pub(super) glow: Vec<Texture>,
     /// RGBA8, top row first, as the encoder writes it.
     pub(super) packed: Buffer,
     /// The same where the host can read it.
@@ -49,16 +54,18 @@ pub(super) struct Layer {
 }
 
 impl Form {
-    /// The form of a frame for which a look wants so many samples a pixel.
-    pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], wanted: u32, layered: bool) -> Self {
+    /// The form of a frame of a look.
+    pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &Look, layered: bool) -> Self {
+        let wanted = look.samples_a_pixel();
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
-        Self { width, height, samples: if fits { wanted } else { 1 }, layered }
+        let halvings = look.bloom.map_or(0, |bloom| bloom.levels);
+        Self { width, height, samples: if fits { wanted } else { 1 }, layered, halvings }
     }
 }
 
 impl Target {
     pub(super) fn new(gl: &Rc<Gl>, form: Form) -> Result<Self> {
-        let Form { width, height, samples, layered } = form;
+        let Form { width, height, samples, layered, .. } = form;
         let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
         let layer = |colour: Texture| Ok(Layer { framebuffer: gl.framebuffer(Some(&colour), &depth)?, colour });
         let layer = if layered { Some(layer(image(gl, form, gl::RGBA16F)?)?) } else { None };
@@ -74,6 +81,7 @@ impl Target {
                 None,
             )?,
             picture: image(gl, Form { samples: 1, ..form }, gl::RGBA16F)?,
+            glow: super::post::glow(gl, form)?,
             packed: gl.buffer(bytes, gl::STREAM_COPY, None)?,
             staging: gl.buffer(bytes, gl::STREAM_READ, None)?,
             _depth: depth,
@@ -83,7 +91,7 @@ impl Target {
 
 /// Where the samples of a pixel of four lie in it; empty on a device that has no four.
 pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
-    let form = Form { width: 1, height: 1, samples: 4, layered: false };
+    let form = Form { width: 1, height: 1, samples: 4, layered: false, halvings: 0 };
     if gl.limits.max_samples < form.samples {
         return Ok(Vec::new());
     }

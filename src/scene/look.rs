@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 
 use super::shadow::Shadow;
+use super::{Antialias, Bloom, Tone};
 use crate::error::{Result, invalid};
 
 /// The axis that points up.
@@ -63,6 +64,15 @@ pub struct Look {
     pub ground: Option<Ground>,
     /// Samples a pixel, 1 or 4: how smooth the edges of triangles and cut-outs are.
     pub samples: u32,
+    /// What smooths edges: these samples, or something that needs but one.
+    pub antialias: Antialias,
+    pub bloom: Option<Bloom>,
+    pub tone: Tone,
+    /// All light is multiplied by this before glow and tone curve, above 0.
+    pub exposure: f32,
+    /// Whether levels of 8 bits are mixed in a fixed pattern of 8 x 8 pixels, so that slow gradients show no bands. A pixel
+    /// changes by one level at most, and one that lies on a level stays.
+    pub dither: bool,
 }
 
 impl Default for Look {
@@ -77,6 +87,11 @@ impl Default for Look {
             shadow: Some(Shadow::default()),
             ground: Some(Ground::default()),
             samples: 4,
+            antialias: Antialias::Samples,
+            bloom: None,
+            tone: Tone::None,
+            exposure: 1.0,
+            dither: false,
         }
     }
 }
@@ -96,6 +111,7 @@ impl Look {
         if ![1, 4].contains(&self.samples) {
             return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
         }
+        self.check_post()?;
         self.shadow.map_or(Ok(()), |shadow| shadow.check())
     }
 }

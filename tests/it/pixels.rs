@@ -3,6 +3,7 @@
 mod build;
 mod far;
 mod limits;
+mod post;
 mod shading;
 mod shadow;
 mod shadow_extremes;

@@ -10,6 +10,10 @@
 //! ground = true              # false: no ground plane
 //! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
 //! look.samples = 4           # or 1: samples a pixel
+//! look.antialias = "samples" # or "fxaa", "none": one sample a pixel
+//! look.bloom = { threshold = 1.0, strength = 0.5, levels = 5 }   # light above the threshold glows
+//! look.tone = "aces"         # or "reinhard", "none"; look.exposure = 1.2 multiplies all light before it
+//! look.dither = true         # slow gradients show no bands
 //! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }   # variance, standard, filtered; maps, 1 to 4
 //!                            # and bleeding, least_variance, alpha_threshold, moments (f32, f16)
 //! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres

@@ -145,23 +145,32 @@ impl Texture {
 
     /// Binds it as an image that a compute shader writes.
     pub(in crate::render) fn bind_image(&self, unit: u32) {
+        self.bind_image_for(unit, glow::WRITE_ONLY);
+    }
+
+    /// The same for a shader that also reads what was there.
+    pub(in crate::render) fn bind_image_both_ways(&self, unit: u32) {
+        self.bind_image_for(unit, glow::READ_WRITE);
+    }
+
+    fn bind_image_for(&self, unit: u32, access: u32) {
         // SAFETY: level 0 of a texture whose format the shader names.
         unsafe {
             let gl = self.gl.on();
-            gl.bind_image_texture(unit, Some(self.name), 0, false, 0, glow::WRITE_ONLY, self.kind.format);
+            gl.bind_image_texture(unit, Some(self.name), 0, false, 0, access, self.kind.format);
         }
     }
 }
 
 impl Program {
-    /// Uses it; `first_triangle` goes to location 0 of those programs that have one.
-    pub(in crate::render) fn bind(&self, first_triangle: Option<u32>) {
+    /// Uses it; a number, as the first triangle, goes to location 0 of those programs that have one.
+    pub(in crate::render) fn bind(&self, number: Option<u32>) {
         let gl = self.gl.on();
         // SAFETY: a linked program; location 0 is declared by the shaders that are given a number.
         unsafe {
             gl.use_program(Some(self.name));
-            if let Some(first) = first_triangle {
-                gl.uniform_1_i32(Some(&glow::NativeUniformLocation(0)), first as i32);
+            if let Some(number) = number {
+                gl.uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32);
             }
         }
     }

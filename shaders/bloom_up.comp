@@ -1,0 +1,29 @@
+// Doubles a picture, with weights 3/4 and 1/4 of the nearest two texels in each direction (Chaikin 1974: repeated, it tends
+// to a quadratic B-spline), and adds it to the next finer one. All levels count the same: what comes from below is the
+// mean of `coarser` levels. The last adds the glow to the shaded picture, from which what began to glow is taken: what is
+// shown goes back to light and through the tone curve again.
+//   from  [ceil height/2][ceil width/2]  RGBA16F (in)
+//   to    [height][width]                RGBA16F (in and out)
+layout(local_size_x = TILE, local_size_y = TILE) in;
+#ifndef LAST
+layout(location = 0) uniform int coarser;
+#endif
+layout(binding = 0) uniform sampler2D from;
+layout(rgba16f, binding = 0) uniform image2D to;
+
+void main() {
+    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 last = textureSize(from, 0) - 1;
+    if (any(greaterThanEqual(at, imageSize(to)))) return;
+    ivec2 here = at >> 1;
+    ivec2 next = clamp(here + 2 * (at & 1) - 1, ivec2(0), last);
+    vec3 glow = 0.5625 * texelFetch(from, here, 0).rgb + 0.0625 * texelFetch(from, next, 0).rgb;
+    glow += 0.1875 * (texelFetch(from, ivec2(next.x, here.y), 0).rgb + texelFetch(from, ivec2(here.x, next.y), 0).rgb);
+    vec3 own = imageLoad(to, at).rgb;
+#ifdef LAST
+    own = toned(untoned(own) + STRENGTH * glow);
+#else
+    own = (own + float(coarser) * glow) / float(coarser + 1);
+#endif
+    imageStore(to, at, vec4(own, 1.0));
+}

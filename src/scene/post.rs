@@ -1,0 +1,121 @@
+//! What happens to a picture after it is shaded: smoothed edges, glow, and the curve from light to what a screen shows.
+
+use crate::error::{Result, invalid};
+
+/// How the edges of a picture are smoothed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Antialias {
+    /// By the samples of a pixel, as many as the look says.
+    #[default]
+    Samples,
+    /// One sample a pixel; edges are found in the picture and smoothed along their length (FXAA, Lottes 2009).
+    Fxaa,
+    /// One sample a pixel, and nothing after it.
+    None,
+}
+
+/// The curve from light to what the screen shows, for each colour channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Tone {
+    /// Light is shown as it is; what is above 1 is white.
+    #[default]
+    None,
+    /// x / (1 + x): Reinhard et al. 2002, "Photographic tone reproduction for digital images", equation 3. Never white.
+    Reinhard,
+    /// The film curve of the Academy Color Encoding System, in Narkowicz's fit of 2015:
+    /// x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14).
+    Aces,
+}
+
+/// Light above a threshold glows: a share of it leaves its pixel and spreads over the surroundings, as in a lens. None is
+/// made and none is lost.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Bloom {
+    /// Light that does not glow, in the brightest channel of a pixel after exposure, 0 to 1000.
+    pub threshold: f32,
+    /// The share that spreads, 0 to 1.
+    pub strength: f32,
+    /// Halvings of the picture, 1 to 8: the widest glow is about 2 to this power pixels to each side, the others each half
+    /// as wide, and all have the same light.
+    pub levels: u32,
+}
+
+impl Default for Bloom {
+    fn default() -> Self {
+        Self { threshold: 1.0, strength: 0.5, levels: 5 }
+    }
+}
+
+/// The most exposure, so that no light overflows.
+const MOST_EXPOSURE: f32 = 1024.0;
+
+impl Bloom {
+    fn check(&self) -> Result<()> {
+        if !(0.0..=1000.0).contains(&self.threshold) {
+            return Err(invalid("look.bloom.threshold", "0 to 1000", self.threshold));
+        }
+        if !(0.0..=1.0).contains(&self.strength) {
+            return Err(invalid("look.bloom.strength", "a share of 0 to 1", self.strength));
+        }
+        if !(1..=8).contains(&self.levels) {
+            return Err(invalid("look.bloom.levels", "1 to 8 halvings", self.levels));
+        }
+        Ok(())
+    }
+}
+
+impl super::Look {
+    /// Samples of a pixel that this look asks for.
+    pub fn samples_a_pixel(&self) -> u32 {
+        if self.antialias == Antialias::Samples { self.samples } else { 1 }
+    }
+
+    pub(super) fn check_post(&self) -> Result<()> {
+        if !(self.exposure > 0.0 && self.exposure <= MOST_EXPOSURE) {
+            return Err(invalid("look.exposure", format!("above 0, up to {MOST_EXPOSURE}"), self.exposure));
+        }
+        self.bloom.map_or(Ok(()), |bloom| bloom.check())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Look;
+    use super::*;
+
+    #[test]
+    fn numbers_out_of_range_and_nan_are_refused_with_the_field() {
+        let look = |bloom: Bloom, exposure: f32| Look { bloom: Some(bloom), exposure, ..Look::default() };
+        let base = Bloom::default();
+        for (bloom, exposure) in [
+            (base, 1.0),
+            (Bloom { threshold: 0.0, strength: 0.0, levels: 1 }, 1e-6),
+            (Bloom { threshold: 1000.0, strength: 1.0, levels: 8 }, 1024.0),
+        ] {
+            look(bloom, exposure).check_post().expect("good");
+        }
+        for (bloom, exposure, field) in [
+            (Bloom { threshold: f32::NAN, ..base }, 1.0, "look.bloom.threshold"),
+            (Bloom { threshold: -0.1, ..base }, 1.0, "look.bloom.threshold"),
+            (Bloom { strength: 1.1, ..base }, 1.0, "look.bloom.strength"),
+            (Bloom { levels: 0, ..base }, 1.0, "look.bloom.levels"),
+            (Bloom { levels: 9, ..base }, 1.0, "look.bloom.levels"),
+            (base, 0.0, "look.exposure"),
+            (base, f32::NAN, "look.exposure"),
+            (base, f32::INFINITY, "look.exposure"),
+        ] {
+            let refusal = look(bloom, exposure).check_post().expect_err("refused").to_string();
+            assert!(refusal.starts_with(&format!("{field}:")), "{refusal}");
+        }
+    }
+
+    #[test]
+    fn only_antialiasing_by_samples_asks_for_more_than_one() {
+        let samples = |antialias| Look { antialias, samples: 4, ..Look::default() }.samples_a_pixel();
+        assert_eq!([Antialias::Samples, Antialias::Fxaa, Antialias::None].map(samples), [4, 1, 1]);
+        assert_eq!(Look { samples: 1, ..Look::default() }.samples_a_pixel(), 1);
+    }
+}

@@ -1,0 +1,289 @@
+//! Tone curves, glow, smoothed edges and mixed levels against arithmetic.
+
+use modalcast::deform::{Deformer as _, Surface};
+use modalcast::domain::{AlphaMode, Material, Mesh};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Shot, plan};
+use modalcast::scene::{Antialias, Bloom, Camera, Lens, Look, State, Tone};
+
+use super::build::{Picture, Stage, camera, close, draw, draw_sized, facing, open, picture, srgb};
+
+/// A stage whose white surfaces give this light, with one sample a pixel.
+fn glowing(light: [f32; 3], change: impl FnOnce(Look) -> Look) -> Stage {
+    let mut stage = Stage::new();
+    stage.0.look.skylight = light;
+    stage.0.look.samples = 1;
+    stage.0.look = change(stage.0.look);
+    stage
+}
+
+fn white() -> Material {
+    Material { ambient: [1.0; 3], diffuse: [0.0; 3], ..Material::default() }
+}
+
+fn linear(byte: u8) -> f64 {
+    let shown = f64::from(byte) / 255.0;
+    if shown <= 0.040_45 { shown / 12.92 } else { ((shown + 0.055) / 1.055).powf(2.4) }
+}
+
+fn reinhard(light: f64) -> f64 {
+    light / (1.0 + light)
+}
+
+fn aces(light: f64) -> f64 {
+    light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)
+}
+
+#[test]
+fn a_tone_curve_has_its_known_values_before_and_after_a_glow() {
+    let shown = |light: [f32; 3], look: &dyn Fn(Look) -> Look| {
+        picture(&glowing(light, look).add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), white()).scene()).at(32, 32)
+    };
+    // Too high a threshold for anything to glow: the curve is gone through there and back.
+    let idle = Some(Bloom { threshold: 1000.0, ..Bloom::default() });
+    for light in [[0.01, 0.18, 0.5], [1.0, 2.0, 8.0], [0.0, 30.0, 1e30]] {
+        let wide = light.map(f64::from);
+        for bloom in [None, idle] {
+            for (tone, want) in [(Tone::Reinhard, wide.map(reinhard)), (Tone::Aces, wide.map(aces)), (Tone::None, wide)]
+            {
+                let want = want.map(|value| if value.is_finite() { value } else { 1.0 });
+                let got = shown(light, &|look| Look { tone, bloom, ..look });
+                assert!(close(got, want, 1.0), "{tone:?}, {bloom:?}, {light:?}: {got:?}");
+            }
+        }
+    }
+    let got = shown([0.09, 0.25, 1.0], &|look| Look { tone: Tone::Aces, exposure: 2.0, ..look });
+    assert!(close(got, [0.18, 0.5, 2.0].map(aces), 1.0), "{got:?}");
+    assert!(!close(got, [0.09, 0.25, 1.0].map(aces), 10.0), "control: exposure is seen");
+    assert!(!close(got, [0.18, 0.5, 2.0].map(reinhard), 10.0), "control: the curves differ");
+}
+
+/// Sum and centroid of the red light, in pixels from the top left.
+fn sum_and_centroid(shown: &Picture) -> (f64, [f64; 2]) {
+    let (mut sum, mut moment) = (0.0, [0.0; 2]);
+    for y in 0..shown.image.height {
+        for x in 0..shown.image.width {
+            let light = linear(shown.at(x, y)[0]);
+            sum += light;
+            moment = [moment[0] + light * (f64::from(x) + 0.5), moment[1] + light * (f64::from(y) + 0.5)];
+        }
+    }
+    (sum, moment.map(|moment| moment / sum))
+}
+
+#[test]
+fn one_bright_pixel_glows_around_its_middle_with_the_light_that_it_had() {
+    let shown = |light: f32, bloom: Option<Bloom>, size: [u32; 2]| {
+        // One pixel, the second from the middle: x 33, and y 30 from the top.
+        let pixel = facing(0.1, 0.1, 0.2, 0.2, 0.0);
+        let scene = glowing([light; 3], |look| Look { bloom, ..look }).add(pixel, white()).scene();
+        draw_sized(&mut open(), &scene, camera(64), size)
+    };
+    let all = |threshold: f32, levels: u32| Some(Bloom { threshold, strength: 1.0, levels });
+    // Pixels that end below white, so that all of their light is in the picture.
+    for (size, levels, light, above) in
+        [([64, 64], 3, 8.0, 0.0), ([61, 67], 3, 8.0, 0.0), ([64, 64], 1, 8.0, 0.0), ([64, 64], 2, 1.2, 0.6)]
+    {
+        let (sum, centroid) = sum_and_centroid(&shown(light, all(above, levels), size));
+        assert!((sum / f64::from(light) - 1.0).abs() < 0.01, "{size:?}, {levels} levels: a sum of {sum}");
+        let (_, own) = sum_and_centroid(&shown(light, None, size));
+        let off = [centroid[0] - own[0], centroid[1] - own[1]];
+        assert!(off.iter().all(|off| off.abs() < 0.05), "{size:?}, {levels} levels: {off:?} from {own:?}");
+    }
+    let (sum, _) = sum_and_centroid(&shown(8.0, None, [64, 64]));
+    assert!((sum - 1.0).abs() < 1e-9, "control: without glow a pixel is white and no more, {sum}");
+    let spread = |levels| shown(8.0, all(0.0, levels), [64, 64]).count(|pixel| pixel != [0; 3]);
+    assert!(spread(1) == 36 && spread(3) > 200, "{} and {} pixels", spread(1), spread(3));
+}
+
+#[test]
+fn a_glow_in_the_middle_is_the_same_in_every_mirror_and_leaves_what_is_below_the_threshold() {
+    let four = facing(-0.1, -0.1, 0.1, 0.1, 0.0);
+    let bloom =
+        |threshold| Look { bloom: Some(Bloom { threshold, strength: 0.8, levels: 4 }), ..Look::default() }.bloom;
+    let stage = |threshold| glowing([30.0, 12.0, 5.0], |look| Look { bloom: bloom(threshold), ..look });
+    let shown = picture(&stage(1.0).add(four.clone(), white()).scene());
+    for (x, y) in (0..32).flat_map(|x| (0..32).map(move |y| (x, y))) {
+        let here = shown.at(x, y);
+        for other in [shown.at(63 - x, y), shown.at(x, 63 - y), shown.at(y, x)] {
+            assert!(
+                (0..3).all(|channel| here[channel].abs_diff(other[channel]) <= 1),
+                "({x}, {y}): {here:?}, {other:?}"
+            );
+        }
+    }
+    let [r, g, b] = shown.at(36, 32);
+    assert!(r > g && g > b && b > 0, "a glow has the hue of its light: {r} {g} {b}");
+    let plain = picture(&glowing([30.0, 12.0, 5.0], |look| look).add(four.clone(), white()).scene());
+    assert!(picture(&stage(30.5).add(four, white()).scene()).image.rgba == plain.image.rgba, "nothing is above 30.5");
+    assert!(shown.image.rgba != plain.image.rgba, "control");
+}
+
+#[test]
+fn the_rim_of_a_bright_surface_stays_smooth_when_light_above_white_is_kept_for_a_glow() {
+    let shown = |bloom: Option<Bloom>| {
+        let stage = glowing([50.0; 3], |look| Look { bloom, samples: 4, ..look });
+        let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white() };
+        // The lamp covers the right half of the pixels of column 32; half of it is behind dark glass.
+        let scene = stage.add(facing(0.05, -2.0, 2.0, 2.0, 0.0), white()).add(facing(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
+        picture(&scene.scene())
+    };
+    let plain = shown(None);
+    let idle = shown(Some(Bloom { strength: 0.0, ..Bloom::default() }));
+    assert_eq!(plain.ran.samples, 4);
+    assert!(plain.image.rgba == idle.image.rgba, "a glow of no strength changes nothing");
+    for y in [20, 40] {
+        assert!(close(plain.at(32, y), [0.5; 3], 1.0) && plain.at(33, y) == [255; 3], "{:?}", plain.at(32, y));
+    }
+    assert!(plain.image.rgba != shown(Some(Bloom::default())).image.rgba, "control");
+}
+
+/// A white rhomb with slanted edges before grey, `scale` times 64 pixels a side.
+fn slanted(antialias: Antialias, samples: u32, scale: u32) -> Picture {
+    let rest = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
+    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a rhomb");
+    let mut stage = glowing([0.9; 3], |look| Look { antialias, samples, ..look });
+    (stage.0.look.zenith, stage.0.look.horizon) = ([0.1; 3], [0.1; 3]);
+    let middle = f64::from(32 * scale);
+    let focal = f64::from(100 * scale);
+    let lens = Lens::Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle };
+    draw(&mut open(), &stage.add(mesh, white()).scene(), Camera { lens, ..camera(64) }, 64 * scale)
+}
+
+/// Mean difference from the mean light of 8 x 8 pixels, in levels.
+fn error(shown: &Picture, fine: &Picture) -> f64 {
+    let exact = |x: u32, y: u32| {
+        let light = |i: u32| linear(fine.at(8 * x + i % 8, 8 * y + i / 8)[0]);
+        srgb((0..64).map(light).sum::<f64>() / 64.0)
+    };
+    let off = |(x, y): (u32, u32)| (f64::from(shown.at(x, y)[0]) - exact(x, y)).abs();
+    (0..64).flat_map(|y| (0..64).map(move |x| (x, y))).map(off).sum::<f64>() / 4096.0
+}
+
+#[test]
+fn fxaa_brings_slanted_edges_nearer_to_64_samples_and_leaves_flat_areas_as_they_are() {
+    let fine = slanted(Antialias::None, 1, 8);
+    let (none, fxaa) = (slanted(Antialias::None, 1, 1), slanted(Antialias::Fxaa, 4, 1));
+    let [one, smoothed, four] = [&none, &fxaa, &slanted(Antialias::Samples, 4, 1)].map(|shown| error(shown, &fine));
+    assert_eq!((none.ran.samples, fxaa.ran.samples), (1, 1));
+    assert!(smoothed < 0.45 * one, "one sample {one}, smoothed {smoothed}, four samples {four} levels");
+    assert!(four < 0.6 * one, "control: the judge favours four samples, {four} against {one}");
+    assert!(slanted(Antialias::Samples, 1, 1).image.rgba == none.image.rgba);
+    let mut changed = 0;
+    for (x, y) in (1..63).flat_map(|x| (1..63).map(move |y| (x, y))) {
+        let own = none.at(x, y);
+        let flat = (0..9).all(|i| none.at(x + i % 3 - 1, y + i / 3 - 1) == own);
+        assert!(!flat || fxaa.at(x, y) == own, "({x}, {y}) is flat");
+        changed += usize::from(fxaa.at(x, y) != own);
+    }
+    assert!(changed > 100, "control: {changed} pixels were smoothed");
+}
+
+/// A sky that lies between two levels in each channel.
+fn sky(dither: bool) -> Picture {
+    let mut stage = glowing([0.0; 3], |look| Look { dither, ..look });
+    (stage.0.look.zenith, stage.0.look.horizon) = ([0.2985, 0.06, 0.41], [0.2988, 0.0601, 0.4103]);
+    picture(&stage.add(facing(-0.1, -3.2, 0.1, -3.1, 0.0), white()).scene())
+}
+
+/// The exact level of a channel of that sky.
+fn exact(x: u32, y: u32, channel: usize) -> f64 {
+    let away = nalgebra::Vector3::new((f64::from(x) - 31.5) / 100.0, (31.5 - f64::from(y)) / 100.0, -1.0).normalize();
+    let sine = away.y.max(0.0);
+    let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
+    let (low, high) = ([0.2988, 0.0601, 0.4103][channel], [0.2985, 0.06, 0.41][channel]);
+    srgb(low + share * (high - low))
+}
+
+#[test]
+fn dithering_stays_within_a_level_and_keeps_the_mean_that_rounding_loses() {
+    let (rounded, mixed) = (sky(false), sky(true));
+    let pixels = || (0..64).flat_map(|y| (0..64).map(move |x| (x, y)));
+    for (x, y) in pixels() {
+        let (one, other) = (rounded.at(x, y), mixed.at(x, y));
+        assert!((0..3).all(|channel| one[channel].abs_diff(other[channel]) <= 1), "({x}, {y})");
+    }
+    // The upper half alone: below the horizon the sky is one colour.
+    let bias = |shown: &Picture, channel: usize| {
+        let block = |corner: (u32, u32)| {
+            let off = |i: u32| {
+                let (x, y) = (8 * corner.0 + i % 8, 8 * corner.1 + i / 8);
+                f64::from(shown.at(x, y)[channel]) - exact(x, y, channel)
+            };
+            ((0..64).map(off).sum::<f64>() / 64.0).abs()
+        };
+        (0..4).flat_map(|y| (0..8).map(move |x| (x, y))).map(block).fold(0.0, f64::max)
+    };
+    for channel in 0..3 {
+        let (lost, kept) = (bias(&rounded, channel), bias(&mixed, channel));
+        assert!(kept < 0.1 && lost > 0.2, "channel {channel}: {kept} levels with dithering, {lost} without");
+    }
+    let flat = |dither| {
+        let stage = glowing([1.0, 0.0, 2.0], |look| Look { dither, ..look });
+        picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), white()).scene()).image.rgba
+    };
+    assert!(flat(true) == flat(false), "what lies on a level stays");
+}
+
+fn everything(look: Look) -> Look {
+    let bloom = Some(Bloom { threshold: 0.3, ..Bloom::default() });
+    Look { bloom, tone: Tone::Aces, exposure: 1.3, antialias: Antialias::Fxaa, dither: true, ..look }
+}
+
+#[test]
+fn the_same_input_gives_the_same_bytes_whatever_is_named_and_only_the_named_passes_run() {
+    let scene = |look: Look| {
+        let mut stage = Stage::new();
+        stage.0.look = look;
+        stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.3), white()).add(facing(-2.0, 0.5, 2.0, 0.6, 0.5), white()).scene()
+    };
+    let rich = scene(everything(Look::default()));
+    let mut renderer = open();
+    let first = draw(&mut renderer, &rich, camera(96), 96);
+    assert_eq!(first.ran.passes, plan(&rich).passes);
+    assert!(first.ran.passes.contains(&"bloom"));
+    let plain = draw(&mut renderer, &scene(Look::default()), camera(96), 96);
+    assert!(!plain.ran.passes.contains(&"bloom"));
+    assert!(draw(&mut renderer, &rich, camera(96), 96).image.rgba == first.image.rgba);
+    assert!(draw(&mut open(), &rich, camera(96), 96).image.rgba == first.image.rgba, "another context");
+    assert!(plain.image.rgba != first.image.rgba, "control");
+}
+
+#[test]
+fn light_that_is_no_number_or_infinite_spoils_no_other_pixel() {
+    for tone in [Tone::None, Tone::Reinhard, Tone::Aces] {
+        for bloom in [None, Some(Bloom { threshold: 0.9, strength: 1.0, levels: 8 })] {
+            let mut stage = glowing([0.25; 3], |look| Look { tone, bloom, ..look });
+            stage.0.look.sunlight = [3e38; 3];
+            let lamp = Material { diffuse: [1.0; 3], specular: [1.0; 3], shininess: 1.0, ..white() };
+            let scene = stage
+                .add(facing(-3.0, -3.0, -2.0, -2.0, 0.0), lamp.clone())
+                .add(facing(-0.5, -0.5, 0.5, 0.5, 0.0), white())
+                .scene();
+            let mut renderer = open();
+            let mut deformer = ReferenceDeformer::new(&scene);
+            let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+            let rest = deformer.surface().expect("there").clone();
+            let shown = |normal: [f32; 3]| {
+                let mut surface = Surface { normals: rest.normals.clone(), ..rest.clone() };
+                surface.normals[..12].copy_from_slice(&normal.repeat(4));
+                let buffers = renderer.load(&scene).expect("loads");
+                renderer.upload(&buffers, &surface).expect("uploads");
+                let shot = Shot { camera: camera(64), width: 64, height: 64, bounds };
+                let image = renderer.draw(&buffers, &shot).expect("draws");
+                Picture { image, ran: renderer.ran().clone(), allocated: vec![] }
+            };
+            let mut shown = shown;
+            let lit = shown([0.0, 0.0, 1.0]);
+            assert!(lit.at(7, 57).iter().all(|level| *level > 250), "{tone:?} {bloom:?}: {:?}", lit.at(7, 57));
+            let dark = shown([f32::NAN; 3]);
+            let want = match tone {
+                Tone::None => 0.25,
+                Tone::Reinhard => reinhard(0.25),
+                Tone::Aces => aces(0.25),
+            };
+            assert!(close(dark.at(32, 32), [want; 3], 1.0), "{tone:?} {bloom:?}: {:?}", dark.at(32, 32));
+            assert_eq!(dark.at(60, 3), [0; 3], "{tone:?} {bloom:?}");
+        }
+    }
+}
