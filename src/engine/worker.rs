@@ -1,7 +1,7 @@
 //! The device thread: takes commands from a bounded queue, owns the workbench and every staged scene, answers each
 //! command once.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::Instant;
@@ -10,12 +10,14 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
 use super::staged::Staged;
+use super::viewer::Showing;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
 use crate::deform::{Deformed, Surface};
 use crate::error::{Error, Result, during};
-use crate::render::Image;
-use crate::scene::{Camera, Scene, State};
+use crate::frame::Legend;
+use crate::render::{Hit, Image, Pick, Survey};
+use crate::scene::{Camera, Rectangle, Scene, State};
 use crate::telemetry::ms_since;
 
 /// Names a staged scene on the device thread.
@@ -40,6 +42,21 @@ pub(super) enum Command {
         camera: Camera,
         size: (u32, u32),
         reply: Reply<Image>,
+    },
+    /// A frame of numbers, with the legend of a colour map.
+    Survey {
+        id: SceneId,
+        camera: Camera,
+        size: [u32; 2],
+        showing: Showing,
+        reply: Reply<(Survey, Option<Legend>)>,
+    },
+    Pick {
+        id: SceneId,
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: Rectangle,
+        reply: Reply<Vec<Hit>>,
     },
     /// Copies positions and normals out; the second value is its milliseconds.
     Copy {
@@ -100,6 +117,26 @@ impl Worker {
         self.ask(|reply| Command::Draw { id, camera, size, reply }).await
     }
 
+    pub(super) async fn survey(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        size: [u32; 2],
+        showing: Showing,
+    ) -> Result<(Survey, Option<Legend>)> {
+        self.ask(|reply| Command::Survey { id, camera, size, showing, reply }).await
+    }
+
+    pub(super) async fn pick(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: Rectangle,
+    ) -> Result<Vec<Hit>> {
+        self.ask(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
+    }
+
     pub(super) async fn copy(&self, id: SceneId) -> Result<(Arc<Surface>, f64)> {
         self.ask(|reply| Command::Copy { id, reply }).await
     }
@@ -134,12 +171,27 @@ fn gone() -> Error {
 
 fn work(mut workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
     let mut scenes = HashMap::new();
-    while let Some(command) = inbox.blocking_recv() {
-        if matches!(command, Command::Quit) {
+    let mut picks = VecDeque::new();
+    loop {
+        // Picks that are on their way are waited for only when there is nothing else to do.
+        let command = match picks.is_empty() {
+            true => inbox.blocking_recv(),
+            false => inbox.try_recv().ok(),
+        };
+        let idle = command.is_none();
+        if matches!(command, Some(Command::Quit)) || (idle && picks.is_empty()) {
             break;
         }
         // A panic below costs the one command whose reply it drops; the thread and all scenes live on.
-        let outcome = catch_unwind(AssertUnwindSafe(|| obey(&mut workbench, &mut scenes, command)));
+        let outcome = catch_unwind(AssertUnwindSafe(|| {
+            if let Some(command) = command {
+                obey(&mut workbench, (&mut scenes, &mut picks), command);
+            }
+            while picks.front().is_some_and(|(pick, _): &(Pick, _)| idle || pick.is_ready()) {
+                let Some((pick, reply)) = picks.pop_front() else { break };
+                reply.send(workbench.finish_pick(pick)).ok(); // The asker has gone, and its answer goes with it.
+            }
+        }));
         if outcome.is_err() {
             tracing::error!("a command panicked on the device thread");
         }
@@ -149,7 +201,10 @@ fn work(mut workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
     }
 }
 
-fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, command: Command) {
+/// Picks on their way, and who waits for them.
+type Picks = VecDeque<(Pick, Reply<Vec<Hit>>)>;
+
+fn obey(workbench: &mut Workbench, (scenes, picks): (&mut HashMap<SceneId, Staged>, &mut Picks), command: Command) {
     // Every ignored result below means: the asker has gone, and its answer goes with it.
     match command {
         Command::Stage { id, scene, reply } => {
@@ -168,11 +223,24 @@ fn obey(workbench: &mut Workbench, scenes: &mut HashMap<SceneId, Staged>, comman
             let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
             reply.send(drawn).ok();
         }
+        Command::Survey { id, camera, size, showing, reply } if !reply.is_closed() => {
+            reply.send(find(scenes, id).and_then(|staged| workbench.survey(staged, &camera, size, showing))).ok();
+        }
+        Command::Pick { id, camera, picture, rectangle, reply } if !reply.is_closed() => {
+            let begun = find(scenes, id).and_then(|staged| workbench.begin_pick(staged, &camera, picture, rectangle));
+            match begun {
+                Ok(pick) => picks.push_back((pick, reply)),
+                Err(error) => {
+                    reply.send(Err(error)).ok();
+                }
+            }
+        }
         Command::Copy { id, reply } if !reply.is_closed() => {
             reply.send(find(scenes, id).and_then(copy)).ok();
         }
         // Whoever asked has given up waiting: the picture is not made.
-        Command::Draw { .. } | Command::Copy { .. } | Command::Quit => {}
+        Command::Draw { .. } | Command::Survey { .. } | Command::Pick { .. } | Command::Copy { .. } | Command::Quit => {
+        }
         Command::Unstage { id, reply } => {
             if let Some(staged) = scenes.remove(&id) {
                 workbench.unstage(staged);

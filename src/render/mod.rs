@@ -20,11 +20,13 @@ mod geometry;
 mod gl;
 mod light;
 mod passes;
+mod pick;
 mod plan;
 mod programs;
 mod scene_buffers;
 mod seen;
 mod shaders;
+mod survey;
 mod target;
 mod textures;
 
@@ -35,11 +37,13 @@ use std::time::{Duration, Instant};
 
 pub use self::device::{EglDevice, devices};
 use self::gl::{Gl, Program};
+pub use self::pick::{Hit, Pick};
 pub use self::plan::{Allocation, Plan, Saving, plan};
 use self::scene_buffers::Apart;
 pub use self::scene_buffers::SceneBuffers;
 pub use self::seen::Seen;
 use self::shaders::Source;
+pub use self::survey::{Field, Survey};
 use self::target::{Form, Target};
 use crate::deform::Surface;
 use crate::error::{Result, during, invalid};
@@ -132,6 +136,10 @@ pub struct Renderer {
     /// The most recently used last.
     targets: Vec<Target>,
     ran: Ran,
+    /// What picks are drawn into, once there was one.
+    picker: Option<pick::Picker>,
+    /// What the last survey was drawn into, once there was one.
+    surveyor: Option<survey::Surveyor>,
 }
 
 impl Renderer {
@@ -149,7 +157,16 @@ impl Renderer {
             max_side: gl.limits.max_side.min(MAX_SIDE),
         };
         let sample_places = target::sample_places(&gl)?;
-        Ok(Self { info, gl, programs: HashMap::new(), sample_places, targets: Vec::new(), ran: Ran::default() })
+        Ok(Self {
+            info,
+            gl,
+            programs: HashMap::new(),
+            sample_places,
+            targets: Vec::new(),
+            ran: Ran::default(),
+            picker: None,
+            surveyor: None,
+        })
     }
 
     /// What draws.

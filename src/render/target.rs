@@ -91,7 +91,7 @@ pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
     gl.sample_places(&gl.framebuffer(Some(&ids), &depth)?, form.samples)
 }
 
-fn image(gl: &Rc<Gl>, form: Form, format: u32) -> Result<Texture> {
+pub(super) fn image(gl: &Rc<Gl>, form: Form, format: u32) -> Result<Texture> {
     let Form { width, height, samples, .. } = form;
     let target = if samples > 1 { gl::TEXTURE_2D_MULTISAMPLE } else { gl::TEXTURE_2D };
     let texture = gl.texture(TextureKind { target, format, width, height, depth: samples, levels: 1 })?;

@@ -8,6 +8,7 @@ mod frames;
 mod hostile;
 mod layering;
 mod normals;
+mod picks;
 mod pixels;
 mod real;
 mod restart;

@@ -3,7 +3,9 @@
 mod build;
 mod far;
 mod limits;
+mod picking;
 mod shading;
 mod shadow;
 mod snapshots;
+mod surveys;
 mod visibility;
