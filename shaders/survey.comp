@@ -33,10 +33,10 @@ Met meet(int number, vec2 image) {
         met.depths[index] = there.w;
         normal[index] = texelFetch(normals, corners[index]).xyz;
     }
-    Shares shares = shares(clip[0], clip[1], clip[2], vec2(0.0));
-    met.share = shares.at;
+    Shares found = shares(clip[0], clip[1], clip[2], vec2(0.0));
+    met.share = found.at;
     met.world = world * met.share;
-    met.normal = shares.front ? normal * met.share : -(normal * met.share);
+    met.normal = found.front ? normal * met.share : -(normal * met.share);
     return met;
 }
 

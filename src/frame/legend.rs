@@ -20,8 +20,9 @@ const ROOM: [u32; 2] = [240, 160];
 const WIDTH: f64 = 330.0;
 const HEIGHT: f64 = 84.0;
 /// The bar inside of the box.
-const BAR: (f64, f64, f64, f64) = (16.0, 34.0, 298.0, 16.0);
-const STRIPES: u32 = 149;
+const BAR: (f64, f64, f64, f64) = (26.0, 34.0, 278.0, 16.0);
+/// Colours of the bar between which it is interpolated.
+const STOPS: u32 = 64;
 
 /// Draws the legend into the lower left corner of RGBA8 pixels, top row first. A picture smaller than 240 x 160 stays as it
 /// is.
@@ -32,7 +33,7 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
     if width < ROOM[0] || height < ROOM[1] {
         return Ok(());
     }
-    let scale = (f64::from(height) / 720.0).max(0.72).min(f64::from(width) / (1.15 * WIDTH));
+    let scale = (f64::from(height) / 720.0).max(0.62).min(f64::from(width) / (1.15 * WIDTH));
     let mut options = resvg::usvg::Options::default();
     options.fontdb_mut().load_font_data(dejavu::sans::regular().to_vec());
     let tree = resvg::usvg::Tree::from_str(&svg(legend), &options).map_err(during("legend"))?;
@@ -74,39 +75,19 @@ fn svg(legend: &Legend) -> String {
          <text x='{left}' y='23' font-size='15' fill='#1a1a1a'>{}</text>",
         escaped(&legend.title)
     );
-    for stripe in 0..STRIPES {
-        let share = (stripe as f32 + 0.5) / STRIPES as f32;
+    text += "<defs><linearGradient id='map'>";
+    for stop in 0..=STOPS {
+        let share = stop as f32 / STOPS as f32;
         let [r, g, b] = viridis(share).map(|channel| (255.0 * channel).round() as u8);
-        let step = width / f64::from(STRIPES);
-        let x = left + f64::from(stripe) * step;
-        // Half a unit wider, so that no seam shows; the last one ends with the bar.
-        let wide = (step + 0.5).min(left + width - x);
-        write!(text, "<rect x='{x:.2}' y='{top}' width='{wide:.2}' height='{height}' fill='rgb({r},{g},{b})'/>").ok();
+        write!(text, "<stop offset='{share}' stop-color='rgb({r},{g},{b})'/>").ok();
     }
+    text += "</linearGradient></defs>";
+    write!(text, "<rect x='{left}' y='{top}' width='{width}' height='{height}' fill='url(#map)'/>").ok();
     for (share, label) in ticks(legend.largest) {
-        let x = left + share * width;
-        let y = top + height;
+        let (x, y) = (left + share * width, top + height);
         write!(text, "<path d='M{x:.2} {y} v5' stroke='#1a1a1a' stroke-width='1.2'/>").ok();
-        let anchor = if share < 0.02 {
-            "start"
-        } else if share > 0.98 {
-            "end"
-        } else {
-            "middle"
-        };
-        let x = if share < 0.02 {
-            x - 2.0
-        } else if share > 0.98 {
-            x + 2.0
-        } else {
-            x
-        };
-        write!(
-            text,
-            "<text x='{x:.2}' y='{}' font-size='13' text-anchor='{anchor}' fill='#1a1a1a'>{label}</text>",
-            y + 19.0
-        )
-        .ok();
+        let y = y + 19.0;
+        write!(text, "<text x='{x:.2}' y='{y}' font-size='13' text-anchor='middle' fill='#1a1a1a'>{label}</text>").ok();
     }
     text + "</svg>"
 }

@@ -1,4 +1,4 @@
-//! Pixels to bytes: pure functions, run off the device thread.
+//! Pixels to bytes, and numbers to colour maps: pure functions, run off the device thread.
 
 mod legend;
 mod map;

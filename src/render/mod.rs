@@ -11,6 +11,9 @@
 //! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
 //! | encode | light to sRGB bytes, top row first (compute) | always |
 //!
+//! Two things are drawn only when asked for, with programs and buffers made then: what a few pixels see ([`Pick`]), and
+//! numbers in place of colours ([`Survey`]).
+//!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
 
 mod device;

@@ -116,16 +116,20 @@ impl Renderer {
             values.view.bind(VALUE_UNIT);
         }
         let scale = match field {
-            Field::Depth => buffers.scene.unit as f32,
-            Field::Values { largest } => largest.recip(),
-            Field::Domains | Field::Normals => 1.0,
+            Field::Depth => Some(buffers.scene.unit as f32),
+            Field::Values { largest } => Some(largest.recip()),
+            Field::Domains | Field::Normals => None,
         };
-        let scale = (field != Field::Domains).then_some(scale.to_bits());
         let drawn = gl.timed(|| {
             let ran = &mut Ran::default();
             passes::identify(gl, buffers, (&surveyor.visible, [form.width, form.height]), cut_out.as_deref(), ran)?;
             passes::ground(gl, buffers, shot, ran)?;
-            passes::words(gl, (&surveyor.ids, &surveyor.packed), (&program, scale), [form.width, form.height])
+            passes::words(
+                gl,
+                (&surveyor.ids, &surveyor.packed),
+                (&program, scale.map(f32::to_bits)),
+                [form.width, form.height],
+            )
         })?;
         let bytes = (4 * words) as usize * form.width as usize * form.height as usize;
         gl.copy(&surveyor.packed, &surveyor.staging, bytes as u64);

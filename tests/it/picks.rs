@@ -220,3 +220,20 @@ async fn every_output_arrives_in_its_format_and_agrees_with_a_pick() {
         assert!(map.bytes != colour && maps[..at].iter().all(|other| other.bytes != map.bytes), "{at}");
     }
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_domain_far_from_the_others_is_picked_from_beside_it_and_they_from_beside_them() {
+    let (server, client) = server("strips").await;
+    let away = [1e7 + 1.25, 0.0, -1e7];
+    let moved = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, [0.0, 0.0, 0.0, 1.0], away)]);
+    server.drive("strips", v1::Policy::Lossless, 0).await.acked(moved).await;
+    for (domain, at) in [(1, away), (0, [0.0; 3]), (1, away)] {
+        let near = |x: f64, y: f64, z: f64| [at[0] + x, at[1] + y, at[2] + z];
+        let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
+        let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
+        let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
+        let hits = client.pick(&PickRequest::of("strips", picture, 32, 32)).await.expect("picks").hits;
+        let off = (Vector3::from(hits[0].position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
+        assert!(hits[0].domain == domain && off < 1e-3, "{off} units from {at:?}: {hits:?}");
+    }
+}
