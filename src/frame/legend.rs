@@ -92,10 +92,17 @@ fn svg(legend: &Legend) -> String {
     text + "</svg>"
 }
 
-/// Places from 0 to 1 and their labels: four or five equal steps from 0 to the largest value.
+/// Places from 0 to 1 and their labels: three to five equal steps from 0 to the largest value.
 fn ticks(largest: f64) -> Vec<(f64, String)> {
     let leading = largest / 10f64.powi(largest.log10().floor() as i32);
-    let steps = if (leading - 2.0).abs() < 1e-6 { 4 } else { 5 };
+    let is = |round: f64| (leading - round).abs() < 1e-6;
+    let steps = if [2.0, 4.0, 8.0].into_iter().any(is) {
+        4
+    } else if [3.0, 6.0].into_iter().any(is) {
+        3
+    } else {
+        5
+    };
     (0..=steps)
         .map(|step| (f64::from(step) / f64::from(steps), label(largest * f64::from(step) / f64::from(steps))))
         .collect()
@@ -132,7 +139,7 @@ mod tests {
         }
         let labels = |largest| ticks(largest).into_iter().map(|(_, label)| label).collect::<Vec<_>>().join(" ");
         assert_eq!(labels(0.02), "0 0.005 0.01 0.015 0.02");
-        assert_eq!(labels(2.5), "0 0.5 1 1.5 2 2.5");
+        assert_eq!((labels(2.5), labels(0.8)), ("0 0.5 1 1.5 2 2.5".into(), "0 0.2 0.4 0.6 0.8".into()));
         assert_eq!(labels(1e-7), "0 2e-8 4e-8 6e-8 8e-8 1e-7");
         assert_eq!(labels(1e9), "0 2e8 4e8 6e8 8e8 1e9");
     }
