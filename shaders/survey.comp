@@ -9,7 +9,7 @@ layout(local_size_x = LANES) in;
 layout(location = 0) uniform int scale_bits;
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
 #ifdef VALUES
-layout(binding = 23) uniform samplerBuffer values;
+layout(binding = 24) uniform samplerBuffer values;
 #endif
 
 // A triangle at a place of the picture.

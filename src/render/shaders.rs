@@ -40,7 +40,7 @@ pub(super) const UV_UNIT: u32 = 19;
 pub(super) const TANGENT_UNIT: u32 = 20;
 pub(super) const ID_UNIT: u32 = 21;
 pub(super) const LAYER_UNIT: u32 = 22;
-pub(super) const VALUE_UNIT: u32 = 23;
+pub(super) const VALUE_UNIT: u32 = 24;
 /// Textures that the shading reads beside the scene's images, at most.
 pub(super) const OTHER_READS: usize = 11;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
