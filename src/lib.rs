@@ -20,7 +20,7 @@
 //! | `cpu` | the f32 deformer of machines without a GPU | `storage`, `deform`, `scene`, `domain`, `error` |
 //! | `reference` | the same in f64, plain: the definition that the others are tested against | `deform`, `scene`, `domain`, `error` |
 //! | `render` | EGL and OpenGL: buffers, passes, readback | `deform`, `scene`, `domain`, `error` |
-//! | `frame` | pixels to bytes; pure functions | `error` |
+//! | `frame` | pixels and numbers to bytes, colour maps with their legends; pure functions | `error` |
 //! | `load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
 //! | `tree` | the built-in scene: beams to modes, modes to skin | `scene`, `domain`, `error` |
 //! | `deform` | what every deformer does, as a trait | `scene`, `error` |

@@ -1,45 +1,10 @@
-// A triangle at a place of the picture, fetched from the scene's buffers: perspective-correct shares of its corners with
-// their analytic slopes, and the colour there.
-layout(binding = 13) uniform samplerBuffer positions;
-layout(binding = 16) uniform samplerBuffer normals;
-layout(binding = 17) uniform usamplerBuffer triangle_corners;
-layout(binding = 18) uniform usamplerBuffer triangle_vertices;
+// The colour of a triangle at a place of the picture.
 #ifdef UVS
 layout(binding = 19) uniform samplerBuffer uvs;
 #endif
 #ifdef NORMAL_MAPS
 layout(binding = 20) uniform samplerBuffer tangents;
 #endif
-
-// Shares of the three corners; their slopes along x and y of the picture, per pixel; and whether the front is seen.
-struct Shares {
-    vec3 at;
-    vec3 along_x;
-    vec3 along_y;
-    bool front;
-};
-
-// With c_i = (x, y, w) of the corners on the screen, seen from the place, corner i has the share (c_j x c_k).z of their sum:
-// homogeneous, so that corners behind the camera need no clipping. Taking the place off first keeps the digits that tell
-// small triangles apart.
-Shares shares(vec3 a, vec3 b, vec3 c, vec2 texel) {
-    float scale = 1.0 / max(max(abs(a.z), abs(b.z)), max(abs(c.z), 1e-30));
-    a *= scale, b *= scale, c *= scale;
-    mat3 edges = mat3(cross(b, c), cross(c, a), cross(a, b));
-    vec3 inside = vec3(edges[0].z, edges[1].z, edges[2].z);
-    float sum = inside.x + inside.y + inside.z;
-    Shares found;
-    found.front = sum > 0.0;
-    // The place lies inside but for rounding. A triangle without area has no sum: any share is right.
-    found.at = clamp(inside / sum, 0.0, 1.0);
-    float whole = found.at.x + found.at.y + found.at.z;
-    found.at = whole > 0.5 ? found.at / whole : vec3(1.0 / 3.0);
-    vec3 by_x = texel.x * vec3(edges[0].x, edges[1].x, edges[2].x);
-    vec3 by_y = texel.y * vec3(edges[0].y, edges[1].y, edges[2].y);
-    found.along_x = (by_x - found.at * (by_x.x + by_x.y + by_x.z)) / sum;
-    found.along_y = (by_y - found.at * (by_y.x + by_y.y + by_y.z)) / sum;
-    return found;
-}
 
 vec2 finite(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 

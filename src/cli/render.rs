@@ -7,8 +7,8 @@ use std::sync::Arc;
 use super::options::{Size, triple, working};
 use super::{Outcome, say};
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::engine::Workbench;
-use crate::error::{Error, Result, invalid};
+use crate::engine::{Showing, Staged, Workbench, checked_mode};
+use crate::error::{Error, Result, during, invalid};
 use crate::frame;
 use crate::load;
 use crate::scene::{Camera, Lens, Scene, State, View};
@@ -40,6 +40,12 @@ pub(super) struct Args {
     /// Vertical field of view in degrees; 35 without it.
     #[arg(long, requires = "eye")]
     field_of_view: Option<f64>,
+    /// A colour map with a legend in place of colours: `displacement`, or the number of a column of U, from 0.
+    #[arg(long, value_parser = map, value_name = "MAP")]
+    map: Option<Showing>,
+    /// The value at the bright end of the map; fitted to the frame without it.
+    #[arg(long, requires = "map", default_value_t = 0.0)]
+    largest: f64,
     /// Which deformer to use.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendChoice,
@@ -57,13 +63,40 @@ pub(super) fn run(args: &Args) -> Outcome {
     let mut bench = Workbench::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
     let mut staged = bench.stage(&scene)?;
     staged.deform(&Arc::new(state))?;
-    let image = bench.draw(&mut staged, &camera(args, &scene), args.size.width, args.size.height)?;
-    let bytes = frame::png(image.width, image.height, &image.rgba)?;
+    let bytes = match args.map {
+        None => {
+            let image = bench.draw(&mut staged, &camera(args, &scene), args.size.width, args.size.height)?;
+            frame::png(image.width, image.height, &image.rgba)?
+        }
+        Some(showing) => mapped(args, &mut bench, &mut staged, showing)?,
+    };
     let place = format!("--out {}", args.out.display());
     fs::write(&args.out, bytes).map_err(|error| invalid(place, "a file that can be written", error))?;
     bench.unstage(staged);
     say(format!("{} ({}, {})", args.out.display(), args.size, bench.backend().name()));
     Ok(true)
+}
+
+/// The PNG of a colour map.
+fn mapped(args: &Args, bench: &mut Workbench, staged: &mut Staged, showing: Showing) -> Result<Vec<u8>> {
+    let scene = Arc::clone(staged.scene());
+    let showing = match showing {
+        Showing::Mode { mode, .. } => Showing::Mode { mode: checked_mode(&scene, mode)?, largest: args.largest },
+        _ => Showing::Displacement { largest: args.largest },
+    };
+    let size = [args.size.width, args.size.height];
+    let (survey, legend) = bench.survey(staged, &camera(args, &scene), size, showing)?;
+    let legend = legend.ok_or_else(|| during("encode")("a colour map without legend"))?;
+    let rgba = frame::colour_map(&survey.bytes, survey.samples, size, &legend)?;
+    frame::png(size[0], size[1], &rgba)
+}
+
+fn map(text: &str) -> Result<Showing, String> {
+    if text == "displacement" {
+        return Ok(Showing::Displacement { largest: 0.0 });
+    }
+    let mode = text.parse().map_err(|_| "expected `displacement` or the number of a column of U".to_owned())?;
+    Ok(Showing::Mode { mode, largest: 0.0 })
 }
 
 fn camera(args: &Args, scene: &Scene) -> Camera {

@@ -83,6 +83,20 @@ impl Modes {
         self.columns[3 * self.vertices * mode + 3 * vertex + component]
     }
 
+    /// The 3 x r block of U at a point of a triangle, row-major: the rows of three vertices, weighted by barycentric
+    /// coordinates in f64 and rounded once.
+    pub fn at_point(&self, vertices: [u32; 3], shares: [f64; 3]) -> Vec<f32> {
+        let entry = |component: usize, mode: usize| {
+            let of_vertex =
+                |(vertex, share): (&u32, f64)| share * f64::from(self.at(*vertex as usize, component, mode));
+            vertices.iter().zip(shares).map(of_vertex).sum::<f64>() as f32
+        };
+        (0..3)
+            .flat_map(|component| (0..self.rank).map(move |mode| (component, mode)))
+            .map(|(c, m)| entry(c, m))
+            .collect()
+    }
+
     /// The same without modes if every entry is zero.
     pub fn without_zero_matrix(self) -> Self {
         if self.columns.iter().all(|entry| *entry == 0.0) { Self::rigid() } else { self }
@@ -100,6 +114,15 @@ mod tests {
         assert_eq!(rows, columns);
         assert_eq!(rows.at(0, 2, 1), 6.0);
         assert_eq!(rows.column(1), [2.0, 4.0, 6.0]);
+    }
+
+    #[test]
+    fn the_block_at_a_point_is_the_mean_of_its_corners_and_at_a_corner_its_rows() {
+        let modes = Modes::from_columns(9, 2, (0..18).map(|entry| entry as f32).collect()).expect("fits");
+        assert_eq!(modes.at_point([2, 0, 1], [0.0, 1.0, 0.0]), [0.0, 9.0, 1.0, 10.0, 2.0, 11.0]);
+        let third = [1.0 / 3.0; 3];
+        assert_eq!(modes.at_point([0, 1, 2], third), [3.0, 12.0, 4.0, 13.0, 5.0, 14.0]);
+        assert!(Modes::rigid().at_point([0, 1, 2], third).is_empty());
     }
 
     #[test]

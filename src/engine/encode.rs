@@ -24,6 +24,12 @@ pub enum Format {
     Png,
     /// RGBA8, top row first.
     Rgba,
+    /// f32 a pixel: depth.
+    F32,
+    /// u32 a pixel: domains.
+    U32,
+    /// Three f32 a pixel: normals.
+    F32x3,
 }
 
 /// A step as bytes.
@@ -146,14 +152,21 @@ pub fn checked_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<
 /// # Errors
 /// `Fault` when the encoder refuses, or when it was vertices that were shown.
 pub async fn encode_frame(shown: Shown, format: Format) -> Result<Encoded> {
-    let Body::Frame(image) = shown.body else { return Err(during("encode")("vertices are no picture")) };
     let mut stages = shown.stages;
+    let begin = Instant::now();
+    let (size, pixels) = match shown.body {
+        Body::Frame(image) => ([image.width, image.height], image.rgba),
+        Body::Survey(survey, Some(legend)) => {
+            let size = [survey.width, survey.height];
+            (size, aside("encode", move || frame::colour_map(&survey.bytes, survey.samples, size, &legend)).await?)
+        }
+        Body::Survey(survey, None) => ([survey.width, survey.height], survey.bytes),
+        Body::Vertices(_) | Body::Picked(_) => return Err(during("encode")("it is no picture")),
+    };
     let bytes = match format {
-        Format::Rgba => image.rgba,
+        Format::Rgba | Format::F32 | Format::U32 | Format::F32x3 => pixels,
         Format::Png => {
-            let begin = Instant::now();
-            let encode = move || frame::png(image.width, image.height, &image.rgba);
-            let bytes = aside("encode", encode).await?;
+            let bytes = aside("encode", move || frame::png(size[0], size[1], &pixels)).await?;
             stages.push((Stage::Encode, ms_since(begin)));
             bytes
         }

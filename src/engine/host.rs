@@ -123,7 +123,7 @@ impl Host {
 
     fn check_view(&self, view: &View) -> Result<()> {
         match (view, &self.no_frames) {
-            (View::Frame { .. }, Some(error)) => Err(error.clone()),
+            (View::Frame { .. } | View::Pick { .. }, Some(error)) => Err(error.clone()),
             _ => Ok(()),
         }
     }

@@ -10,6 +10,7 @@ mod host;
 mod keep;
 mod lane;
 mod ledger;
+mod picked;
 mod registry;
 mod show;
 mod source;
@@ -17,6 +18,7 @@ mod staged;
 #[cfg(test)]
 mod testing;
 mod upload;
+mod values;
 mod viewer;
 mod workbench;
 mod worker;
@@ -26,10 +28,12 @@ pub use encode::{Encoded, Format, Packed, Selection, checked_domains, encode_fra
 pub use host::{Drive, Host};
 pub use lane::{Policy, Report};
 pub use ledger::{Origin, checked_name};
+pub use picked::{Picked, Picks, resolve_picks};
 pub use source::SceneSource;
 pub use staged::Staged;
 pub use upload::{Announcement, Upload};
-pub use viewer::{Body, Delivery, Feed, Shown, StepName, View};
+pub use values::checked_mode;
+pub use viewer::{Body, Delivery, Feed, Showing, Shown, StepName, View};
 pub use workbench::{Info, Workbench};
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::conductor::{Conductor, Done, Held};
-use super::viewer::{Body, Delivery, Shown, StepName, View, Viewer};
+use super::picked::with_transforms;
+use super::viewer::{Body, Delivery, Showing, Shown, StepName, View, Viewer};
 use super::worker::{Asked, Copied};
 use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result};
@@ -141,10 +142,19 @@ impl Conductor {
     async fn show(&mut self, view: &View, skipped: u64, others: Wanted) -> Result<Shown> {
         let mut stages = self.stages.clone();
         let body = match *view {
-            View::Frame { camera, width, height } => {
+            View::Frame { camera, width, height, showing: Showing::Colour } => {
                 let image = self.means.worker.draw(self.id, camera, (width, height)).await?;
                 stages.extend(known(&image.passes));
                 Body::Frame(image)
+            }
+            View::Frame { camera, width, height, showing } => {
+                let (survey, legend) = self.means.worker.survey(self.id, camera, [width, height], showing).await?;
+                stages.extend(known(&survey.passes));
+                Body::Survey(survey, legend)
+            }
+            View::Pick { camera, picture, rectangle } => {
+                let hits = self.means.worker.pick(self.id, camera, picture, rectangle).await?;
+                Body::Picked(with_transforms(&self.state, &self.scene, hits))
             }
             View::Vertices(wanted) => {
                 let (surface, copy_ms) = self.vertices((wanted, others)).await?;

@@ -2,8 +2,11 @@
 
 use std::sync::Arc;
 
+use super::values;
+use super::viewer::Showing;
 use crate::deform::{Deformed, Deformer, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during, invalid};
+use crate::frame::Legend;
 use crate::render::{Renderer, SceneBuffers};
 use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
 
@@ -20,13 +23,23 @@ pub struct Staged {
     bounds: Bounds,
     /// What the deformer's output shows.
     shown: Arc<State>,
+    /// The colour map whose values the buffers hold.
+    mapped: Option<(Showing, Legend)>,
 }
 
 impl Staged {
     /// A scene whose output is to be made by [`Self::rest`] before anything else.
     pub(super) fn new(scene: &Arc<Scene>, deformer: Box<dyn Deformer>, buffers: Option<SceneBuffers>) -> Self {
         let shown = Arc::new(State::rest(scene));
-        Self { scene: Arc::clone(scene), deformer, buffers, filled: false, bounds: scene.rest_bounds, shown }
+        Self {
+            scene: Arc::clone(scene),
+            deformer,
+            buffers,
+            filled: false,
+            bounds: scene.rest_bounds,
+            shown,
+            mapped: None,
+        }
     }
 
     /// Deforms the rest state.
@@ -115,6 +128,28 @@ impl Staged {
     /// Waits until all of it is there.
     pub(super) fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
         self.deformer.fetched(fetch)
+    }
+
+    /// Brings the values of a colour map into the buffers, which are filled; tells their legend. A mode's shape never changes
+    /// and is computed once; none for what is no colour map.
+    pub(super) fn map_values(&mut self, renderer: &mut Renderer, showing: Showing) -> Result<Option<Legend>> {
+        let fixed = matches!(showing, Showing::Mode { .. });
+        if let Some((_, legend)) = self.mapped.as_ref().filter(|(held, _)| fixed && *held == showing) {
+            return Ok(Some(legend.clone()));
+        }
+        let values = match showing {
+            Showing::Mode { mode, .. } => values::mode_shape(&self.scene, mode as usize),
+            Showing::Displacement { .. } => {
+                values::displacements(&self.scene, &self.shown, self.deformer.read(Wanted::VERTICES)?)
+            }
+            Showing::Colour | Showing::Depth | Showing::Domains | Showing::Normals => return Ok(None),
+        };
+        let legend = values::legend(&self.scene, showing, &values);
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        self.mapped = None;
+        renderer.upload_values(buffers, &values)?;
+        self.mapped = Some((showing, legend.clone()));
+        Ok(Some(legend))
     }
 
     /// Makes the buffers if need be and fills those that the deformer does not write itself.

@@ -7,10 +7,12 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, watch};
 
+use super::picked::Picked;
 use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result, during};
-use crate::render::Image;
-use crate::scene::{Camera, Cells, State};
+use crate::frame::Legend;
+use crate::render::{Image, Survey};
+use crate::scene::{Camera, Cells, Rectangle, State};
 use crate::telemetry::StageTimes;
 
 /// How many pictures a lossless subscriber may be behind before it holds back the writer.
@@ -28,8 +30,39 @@ pub enum Delivery {
 /// What a subscriber wants to see of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum View {
-    Frame { camera: Camera, width: u32, height: u32 },
+    Frame {
+        camera: Camera,
+        width: u32,
+        height: u32,
+        showing: Showing,
+    },
     Vertices(Wanted),
+    /// What a small rectangle of a picture of this size shows.
+    Pick {
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: Rectangle,
+    },
+}
+
+/// What of a step a frame shows.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub enum Showing {
+    #[default]
+    Colour,
+    /// See [`crate::render::Field`].
+    Depth,
+    Domains,
+    Normals,
+    /// |u| as a colour map; `largest` metres at its bright end, or 0 for a scale that is fitted to each frame.
+    Displacement {
+        largest: f64,
+    },
+    /// One column of U as a colour map, in metres per unit of its coordinate; `largest` as above.
+    Mode {
+        mode: u32,
+        largest: f64,
+    },
 }
 
 /// A step by name: numbers belong to one run of one writer.
@@ -53,6 +86,9 @@ impl StepName {
 pub enum Body {
     Frame(Image),
     Vertices(Arc<Surface>),
+    /// Numbers in place of colours; a colour map of them when there is a legend.
+    Survey(Survey, Option<Legend>),
+    Picked(Vec<Picked>),
 }
 
 /// A view of one step.

@@ -4,14 +4,16 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::staged::Staged;
+use super::viewer::Showing;
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::cpu::CpuDeformer;
 use crate::deform::{Backend, Deformer};
 use crate::error::{Error, Result};
+use crate::frame::Legend;
 use crate::gpu::{self, CudaDeformer, GlBuffers};
 use crate::reference::ReferenceDeformer;
-use crate::render::{self, Image, Prefer, Renderer, SceneBuffers, Shot};
-use crate::scene::{Camera, Scene};
+use crate::render::{self, Field, Hit, Image, Pick, Prefer, Renderer, SceneBuffers, Shot, Survey};
+use crate::scene::{Camera, Rectangle, Scene};
 use crate::telemetry::{Stage, ms_since};
 
 /// What deforms and what draws, for people to read.
@@ -113,6 +115,57 @@ impl Workbench {
             image.passes.insert(0, (Stage::Upload.name(), upload_ms));
         }
         Ok(image)
+    }
+
+    /// Numbers in place of colours, and the legend when they are to be a colour map. For what shows colour, use
+    /// [`Self::draw`].
+    ///
+    /// # Errors
+    /// As [`Self::draw`].
+    pub fn survey(
+        &mut self,
+        staged: &mut Staged,
+        camera: &Camera,
+        [width, height]: [u32; 2],
+        showing: Showing,
+    ) -> Result<(Survey, Option<Legend>)> {
+        let camera = camera.checked()?;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let (bounds, _) = staged.fill_buffers(renderer, &camera)?;
+        let legend = staged.map_values(renderer, showing)?;
+        let field = match (showing, &legend) {
+            (_, Some(legend)) => Field::Values { largest: legend.largest as f32 },
+            (Showing::Depth, _) => Field::Depth,
+            (Showing::Normals, _) => Field::Normals,
+            _ => Field::Domains,
+        };
+        let survey = renderer.survey(staged.buffers()?, &Shot { camera, width, height, bounds }, field)?;
+        Ok((survey, legend))
+    }
+
+    /// Begins to pick in a rectangle of a picture of this size, without waiting for the device.
+    ///
+    /// # Errors
+    /// As [`Self::draw`].
+    pub fn begin_pick(
+        &mut self,
+        staged: &mut Staged,
+        camera: &Camera,
+        [width, height]: [u32; 2],
+        rectangle: Rectangle,
+    ) -> Result<Pick> {
+        let camera = camera.checked()?;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let (bounds, _) = staged.fill_buffers(renderer, &camera)?;
+        renderer.begin_pick(staged.buffers()?, &Shot { camera, width, height, bounds }, rectangle)
+    }
+
+    /// Waits for a pick; the hits, row by row.
+    ///
+    /// # Errors
+    /// `Fault` when the device does not finish.
+    pub fn finish_pick(&mut self, pick: Pick) -> Result<Vec<Hit>> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.finish_pick(pick)
     }
 
     /// Buffers that CUDA may map: only when the renderer is that very device.

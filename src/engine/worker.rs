@@ -10,12 +10,14 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
 use super::staged::Staged;
+use super::viewer::Showing;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
 use crate::deform::{Deformed, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during};
-use crate::render::Image;
-use crate::scene::{Camera, Scene, State};
+use crate::frame::Legend;
+use crate::render::{Hit, Image, Pick, Survey};
+use crate::scene::{Camera, Rectangle, Scene, State};
 use crate::telemetry::ms_since;
 
 /// Names a staged scene on the device thread.
@@ -40,6 +42,21 @@ pub(super) enum Command {
         camera: Camera,
         size: (u32, u32),
         reply: Reply<Image>,
+    },
+    /// A frame of numbers, with the legend of a colour map.
+    Survey {
+        id: SceneId,
+        camera: Camera,
+        size: [u32; 2],
+        showing: Showing,
+        reply: Reply<(Survey, Option<Legend>)>,
+    },
+    Pick {
+        id: SceneId,
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: Rectangle,
+        reply: Reply<Vec<Hit>>,
     },
     /// Brings what is wanted to the host, beside the command after it; the second value is the milliseconds until it was
     /// there.
@@ -103,6 +120,26 @@ impl Worker {
         self.ask(|reply| Command::Draw { id, camera, size, reply }).await
     }
 
+    pub(super) async fn survey(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        size: [u32; 2],
+        showing: Showing,
+    ) -> Result<(Survey, Option<Legend>)> {
+        self.ask(|reply| Command::Survey { id, camera, size, showing, reply }).await
+    }
+
+    pub(super) async fn pick(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: Rectangle,
+    ) -> Result<Vec<Hit>> {
+        self.ask(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
+    }
+
     /// Begins to copy what is wanted of the last deformation, whatever is asked of the scene next.
     pub(super) fn copy(&self, id: SceneId, wanted: Wanted) -> Asked<Copied> {
         self.begin(|reply| Command::Copy { id, wanted, reply })
@@ -160,6 +197,8 @@ struct Desk {
     scenes: HashMap<SceneId, Staged>,
     /// Vertices on their way, oldest first.
     arriving: VecDeque<Arriving>,
+    /// Picks on their way, likewise.
+    picks: VecDeque<(Pick, Reply<Vec<Hit>>)>,
 }
 
 struct Arriving {
@@ -170,7 +209,8 @@ struct Arriving {
 }
 
 fn work(workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
-    let mut desk = Desk { workbench, scenes: HashMap::new(), arriving: VecDeque::new() };
+    let (arriving, picks) = (VecDeque::new(), VecDeque::new());
+    let mut desk = Desk { workbench, scenes: HashMap::new(), arriving, picks };
     while let Some(command) = next(&mut desk, &mut inbox) {
         if matches!(command, Command::Quit) {
             break;
@@ -181,18 +221,23 @@ fn work(workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
         for _ in 0..arriving {
             guarded(|| desk.hand_over());
         }
+        while desk.picks.front().is_some_and(|(pick, _)| pick.is_ready()) {
+            guarded(|| desk.answer_pick());
+        }
     }
     desk.arriving.clear();
+    desk.picks.clear();
     for (_, staged) in desk.scenes.drain() {
         desk.workbench.unstage(staged);
     }
 }
 
-/// The next command. While there is none, vertices are handed over.
+/// The next command. While there is none, vertices are handed over and picks answered.
 fn next(desk: &mut Desk, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
-    while !desk.arriving.is_empty() {
+    while !desk.arriving.is_empty() || !desk.picks.is_empty() {
         match inbox.try_recv() {
             Ok(command) => return Some(command),
+            Err(_) if desk.arriving.is_empty() => guarded(|| desk.answer_pick()),
             Err(_) => guarded(|| desk.hand_over()),
         }
     }
@@ -227,9 +272,25 @@ impl Desk {
                 let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
                 reply.send(drawn).ok();
             }
+            Command::Survey { id, camera, size, showing, reply } if !reply.is_closed() => {
+                reply.send(find(scenes, id).and_then(|staged| workbench.survey(staged, &camera, size, showing))).ok();
+            }
+            Command::Pick { id, camera, picture, rectangle, reply } if !reply.is_closed() => {
+                let pick = |staged| workbench.begin_pick(staged, &camera, picture, rectangle);
+                match find(scenes, id).and_then(pick) {
+                    Ok(pick) => self.picks.push_back((pick, reply)),
+                    Err(error) => {
+                        reply.send(Err(error)).ok();
+                    }
+                }
+            }
             Command::Copy { id, wanted, reply } if !reply.is_closed() => self.copy((id, wanted), reply),
-            // Whoever asked has given up waiting: the picture is not made.
-            Command::Draw { .. } | Command::Copy { .. } | Command::Quit => {}
+            // Whoever asked has given up waiting: nothing is made.
+            Command::Draw { .. }
+            | Command::Survey { .. }
+            | Command::Pick { .. }
+            | Command::Copy { .. }
+            | Command::Quit => {}
             Command::Unstage { id, reply } => {
                 if let Some(staged) = scenes.remove(&id) {
                     workbench.unstage(staged);
@@ -255,6 +316,12 @@ impl Desk {
                 reply.send(Err(error)).ok(); // The asker has gone, and its answer goes with it.
             }
         }
+    }
+
+    /// Waits for the pick that has been under way for the longest.
+    fn answer_pick(&mut self) {
+        let Some((pick, reply)) = self.picks.pop_front() else { return };
+        reply.send(self.workbench.finish_pick(pick)).ok(); // As above.
     }
 
     /// Waits for the vertices that have been under way for the longest.

@@ -1,6 +1,23 @@
-//! Pixels to bytes: pure functions, run off the device thread.
+//! Pixels to bytes, and numbers to colour maps: pure functions, run off the device thread.
+
+mod legend;
+mod map;
+
+pub use legend::{Legend, draw as draw_legend, round_up};
+pub use map::{paint, viridis};
 
 use crate::error::Result;
+
+/// RGBA8 pixels of a survey of values (little-endian words, `samples` of them a pixel), with their legend.
+///
+/// # Errors
+/// `Fault` when the legend cannot be drawn.
+pub fn colour_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -> Result<Vec<u8>> {
+    let words: Vec<u32> = bytemuck::pod_collect_to_vec(words);
+    let mut rgba = paint(&words, samples as usize);
+    draw_legend(&mut rgba, size, legend)?;
+    Ok(rgba)
+}
 
 /// PNG of RGBA8 sRGB pixels, top row first.
 ///

@@ -36,6 +36,13 @@ pub(super) struct Stretch {
     pub(super) triangle: usize,
 }
 
+/// The domain of the triangle at a place in the order of the groups, and the same triangle in the domain's mesh.
+pub(super) fn whose(stretches: &[Stretch], place: usize) -> Option<(usize, usize)> {
+    let after = stretches.partition_point(|stretch| stretch.first <= place);
+    let stretch = stretches.get(after.checked_sub(1)?)?;
+    Some((stretch.domain, stretch.triangle + place - stretch.first))
+}
+
 /// The static arrays, packed as the scene's layout says; triangles in the order of the groups.
 #[derive(Debug, Default)]
 pub(super) struct Geometry {

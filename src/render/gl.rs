@@ -3,6 +3,7 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod fence;
 mod layers;
 mod object;
 
@@ -11,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use glow::HasContext as _;
 
+pub(super) use self::fence::Fence;
 pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureKind, VertexArray};
 use super::egl::Context;
 use crate::error::{Error, Result, during};
@@ -18,7 +20,7 @@ use crate::error::{Error, Result, during};
 /// The constants that other files name.
 pub(super) use glow::{
     CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
-    LINEAR_MIPMAP_NEAREST, NEAREST, R32UI, REPEAT, RG16F, RG32F, RGB32F, RGB32UI, RGBA8, RGBA16F, RGBA32F,
+    LINEAR_MIPMAP_NEAREST, NEAREST, R32F, R32UI, REPEAT, RG16F, RG32F, RGB32F, RGB32UI, RGBA8, RGBA16F, RGBA32F,
     SRGB8_ALPHA8, STATIC_DRAW, STREAM_COPY, STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE,
     TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
 };

@@ -12,6 +12,9 @@
 //! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
 //! | encode | light to sRGB bytes, top row first; smooths edges and mixes levels (compute) | always |
 //!
+//! Two things are drawn only when asked for, with programs and buffers made then: what a few pixels see ([`Pick`]), and
+//! numbers in place of colours ([`Survey`]).
+//!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
 
 mod device;
@@ -21,6 +24,7 @@ mod geometry;
 mod gl;
 mod light;
 mod passes;
+mod pick;
 mod plan;
 mod post;
 mod programs;
@@ -29,6 +33,7 @@ mod seen;
 mod shaders;
 mod shadow;
 mod splits;
+mod survey;
 mod target;
 mod textures;
 
@@ -40,11 +45,13 @@ use std::time::{Duration, Instant};
 pub use self::device::{EglDevice, devices};
 pub use self::frame::shadow_texel;
 use self::gl::{Gl, Program};
+pub use self::pick::{Hit, Pick};
 pub use self::plan::{Allocation, Plan, Saving, plan};
 use self::scene_buffers::Apart;
 pub use self::scene_buffers::SceneBuffers;
 pub use self::seen::Seen;
 use self::shaders::Source;
+pub use self::survey::{Field, Survey};
 use self::target::{Form, Target};
 use crate::deform::Surface;
 use crate::error::{Result, during, invalid};
@@ -138,6 +145,10 @@ pub struct Renderer {
     /// The most recently used last.
     targets: Vec<Target>,
     ran: Ran,
+    /// What picks are drawn into, once there was one.
+    picker: Option<pick::Picker>,
+    /// What the last survey was drawn into, once there was one.
+    surveyor: Option<survey::Surveyor>,
 }
 
 impl Renderer {
@@ -155,7 +166,16 @@ impl Renderer {
             max_side: gl.limits.max_side.min(MAX_SIDE),
         };
         let sample_places = target::sample_places(&gl)?;
-        Ok(Self { info, gl, programs: HashMap::new(), sample_places, targets: Vec::new(), ran: Ran::default() })
+        Ok(Self {
+            info,
+            gl,
+            programs: HashMap::new(),
+            sample_places,
+            targets: Vec::new(),
+            ran: Ran::default(),
+            picker: None,
+            surveyor: None,
+        })
     }
 
     /// What draws.

@@ -2,7 +2,7 @@
 
 use super::frame::{Frame, above_ground};
 use super::geometry::Kind;
-use super::gl::{Clear, Fixed, Gl, Program};
+use super::gl::{Buffer, Clear, Fixed, Framebuffer, Gl, Program, Texture};
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
@@ -66,9 +66,20 @@ pub(super) fn visibility(
     sampled: &Sampled,
     ran: &mut Ran,
 ) -> Result<()> {
-    gl.begin(&target.visible, target.form.width, target.form.height, Clear::DepthAndIds);
+    identify(gl, buffers, (&target.visible, [target.form.width, target.form.height]), sampled.mask.as_deref(), ran)
+}
+
+/// Ids and depth into a framebuffer of this width and height or larger.
+pub(super) fn identify(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    (into, [width, height]): (&Framebuffer, [u32; 2]),
+    cut_out: Option<&Program>,
+    ran: &mut Ran,
+) -> Result<()> {
+    gl.begin(into, width, height, Clear::DepthAndIds);
     // What is cut out comes last: where something stands before it, nothing is sampled.
-    let kinds = [(Kind::Opaque, &buffers.programs.opaque), (Kind::Mask, &sampled.mask)];
+    let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out)];
     let written = Fixed { depth_write: true, ..Fixed::default() };
     let mut any = false;
     for (kind, program) in kinds {
@@ -128,6 +139,20 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
         ran.passes.push("shade");
     }
     gl.check("shade")
+}
+
+/// Words made from ids, where the host can read them; `program` has a number at location 0 when one is given.
+pub(super) fn words(
+    gl: &Gl,
+    (ids, into): (&Texture, &Buffer),
+    (program, number): (&Program, Option<u32>),
+    [width, height]: [u32; 2],
+) -> Result<()> {
+    program.bind(number);
+    ids.bind(ID_UNIT);
+    into.bind_storage(PIXELS);
+    gl.dispatch(width.div_ceil(LANES), height);
+    gl.check("words")
 }
 
 /// Ids of each pixel's first sample, where the host can read them.

@@ -8,8 +8,8 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::SharedBuffers;
-use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials};
-use super::gl::{self, Attribute, Buffer, Gl, Texture, TextureKind, VertexArray};
+use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials, whose};
+use super::gl::{self, Attribute, Buffer, Gl, Program, Texture, TextureKind, VertexArray};
 use super::plan::{Allocation, Plan, planned};
 use super::post::Post;
 use super::programs::{Compile, Programs, Sampled};
@@ -56,11 +56,13 @@ pub struct SceneBuffers {
     /// For the samples a pixel that the look asks for.
     sampled: Sampled,
     options: Options,
-    stretches: Vec<Stretch>,
+    pub(super) stretches: Rc<[Stretch]>,
     /// What positions are relative to, in scene units from the scene's origin.
     pub(super) origin: [f64; 3],
     /// Positions that are drawn in place of the shared ones.
     pub(super) apart: Option<Apart>,
+    /// A number per vertex, once a picture of numbers was asked for.
+    pub(super) values: Option<Values>,
     plan: Plan,
 }
 
@@ -79,6 +81,13 @@ impl Apart {
         let solids = solids(gl, &scene.buffers, &buffer)?;
         Ok(Self { buffer, view, solids })
     }
+}
+
+/// A number per vertex, as a picture of numbers shows them.
+#[derive(Debug)]
+pub(super) struct Values {
+    pub(super) buffer: Buffer,
+    pub(super) view: Texture,
 }
 
 /// Buffers that shaders read like textures.
@@ -135,9 +144,10 @@ impl SceneBuffers {
             post: Post::compile(&scene.look, compile)?,
             sampled,
             options,
-            stretches: geometry.stretches,
+            stretches: geometry.stretches.into(),
             origin: [0.0; 3],
             apart: None,
+            values: None,
             plan,
         })
     }
@@ -150,6 +160,20 @@ impl SceneBuffers {
         }
     }
 
+    /// The program that identifies cut-out triangles in frames of so many samples a pixel, where there are any.
+    pub(super) fn cut_out(&self, samples: u32, compile: &mut Compile<'_>) -> Result<Option<Rc<Program>>> {
+        if self.sampled.samples == samples {
+            return Ok(self.sampled.mask.clone());
+        }
+        let any = self.groups.iter().any(|group| group.kind == Kind::Mask);
+        if any { compile(self.options.visibility(Kind::Mask, samples)).map(Some) } else { Ok(None) }
+    }
+
+    /// The program that reads a field off ids of so many samples a pixel.
+    pub(super) fn survey(&self, field: &'static str, samples: u32, compile: &mut Compile<'_>) -> Result<Rc<Program>> {
+        compile(self.options.survey(field, samples))
+    }
+
     /// The triangles of one kind, which follow each other: the first, and how many.
     pub(super) fn triangles(&self, kind: Kind) -> (usize, usize) {
         let mut of_kind = self.groups.iter().filter(|group| group.kind == kind);
@@ -159,12 +183,7 @@ impl SceneBuffers {
 
     /// The domain of a triangle that a frame's ids name (the id less one), and its place in the domain's mesh.
     pub fn triangle(&self, place: usize) -> Option<(usize, usize)> {
-        if place >= self.scene.layout.triangles {
-            return None;
-        }
-        let after = self.stretches.partition_point(|stretch| stretch.first <= place);
-        let stretch = self.stretches.get(after.checked_sub(1)?)?;
-        Some((stretch.domain, stretch.triangle + place - stretch.first))
+        if place < self.scene.layout.triangles { whose(&self.stretches, place) } else { None }
     }
 
     /// Says what the positions in the shared buffers are relative to, in scene units from the scene's origin (which they
@@ -196,7 +215,8 @@ impl SceneBuffers {
     pub fn allocated(&self) -> Vec<Allocation> {
         let buffers = self.buffers.iter().map(|(name, buffer)| Allocation { name: name.clone(), bytes: buffer.bytes });
         let apart = self.apart.iter().map(|apart| Allocation { name: "apart".into(), bytes: apart.buffer.bytes });
-        buffers.chain(apart).collect()
+        let values = self.values.iter().map(|own| Allocation { name: "values".into(), bytes: own.buffer.bytes });
+        buffers.chain(apart).chain(values).collect()
     }
 
     /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.

@@ -1,5 +1,9 @@
 //! Shader sources to programs: the files under `shaders/`, with the branches that a scene needs and no others.
 
+mod asked;
+
+pub(super) use self::asked::pick;
+
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
@@ -18,6 +22,7 @@ pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl")
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../shaders/shared/ground.glsl");
 const PHONG: &str = include_str!("../../shaders/shared/phong.glsl");
+const SHARES: &str = include_str!("../../shaders/shared/shares.glsl");
 const TRIANGLE: &str = include_str!("../../shaders/shared/triangle.glsl");
 
 /// First texture unit of each use.
@@ -35,6 +40,7 @@ pub(super) const UV_UNIT: u32 = 19;
 pub(super) const TANGENT_UNIT: u32 = 20;
 pub(super) const ID_UNIT: u32 = 21;
 pub(super) const LAYER_UNIT: u32 = 22;
+pub(super) const VALUE_UNIT: u32 = 24;
 /// Textures that the shading reads beside the scene's images, at most.
 pub(super) const OTHER_READS: usize = 11;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
@@ -170,7 +176,7 @@ impl Options {
     pub(super) fn shade(&self, samples: u32) -> Source {
         let kinds = [Kind::Opaque, Kind::Mask];
         let mut text = self.shading(samples, &[]) + &self.branches(&kinds);
-        text += &[&self.lookups(&kinds, Slopes::Given), PHONG, TRIANGLE].concat();
+        text += &[&self.lookups(&kinds, Slopes::Given), PHONG, SHARES, TRIANGLE].concat();
         text += include_str!("../../shaders/shade.comp");
         Source { label: format!("shade, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }

@@ -56,10 +56,14 @@ pub(super) struct Layer {
 impl Form {
     /// The form of a frame of a look.
     pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &Look, layered: bool) -> Self {
-        let wanted = look.samples_a_pixel();
-        let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
         let halvings = look.bloom.map_or(0, |bloom| bloom.levels);
-        Self { width, height, samples: if fits { wanted } else { 1 }, layered, halvings }
+        Self { layered, halvings, ..Self::plain(gl, [width, height], look.samples_a_pixel()) }
+    }
+
+    /// The form of a frame of ids and depth alone, with as many samples a pixel as are wanted and fit.
+    pub(super) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
+        let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
+        Self { width, height, samples: if fits { wanted } else { 1 }, layered: false, halvings: 0 }
     }
 }
 
@@ -99,7 +103,7 @@ pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
     gl.sample_places(&gl.framebuffer(Some(&ids), &depth)?, form.samples)
 }
 
-fn image(gl: &Rc<Gl>, form: Form, format: u32) -> Result<Texture> {
+pub(super) fn image(gl: &Rc<Gl>, form: Form, format: u32) -> Result<Texture> {
     let Form { width, height, samples, .. } = form;
     let target = if samples > 1 { gl::TEXTURE_2D_MULTISAMPLE } else { gl::TEXTURE_2D };
     let texture = gl.texture(TextureKind { target, format, width, height, depth: samples, levels: 1 })?;

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3x4, Matrix4, Point3, Vector3};
 
-use super::Scene;
+use super::{Rectangle, Scene};
 use crate::error::{Result, invalid};
 
 /// An axis-aligned box in scene units; empty when `min > max`.
@@ -201,17 +201,30 @@ impl Camera {
         Self { view, ..self }
     }
 
+    /// fx, fy, cx and cy in pixels for an image of this width and height; (0, 0) is its top left corner.
+    pub fn intrinsics(&self, [width, height]: [u32; 2]) -> [f64; 4] {
+        match self.lens {
+            Lens::FieldOfView(degrees) => {
+                let focal = 0.5 * f64::from(height) / (degrees.to_radians() / 2.0).tan();
+                [focal, focal, 0.5 * f64::from(width), 0.5 * f64::from(height)]
+            }
+            Lens::Intrinsics { fx, fy, cx, cy } => [fx, fy, cx, cy],
+        }
+    }
+
+    /// The camera whose image is one rectangle of this camera's image of a width and height, pixel for pixel.
+    #[must_use]
+    pub fn cropped(self, picture: [u32; 2], rectangle: Rectangle) -> Self {
+        let [fx, fy, cx, cy] = self.intrinsics(picture);
+        let (cx, cy) = (cx - f64::from(rectangle.x()), cy - f64::from(rectangle.y()));
+        Self { lens: Lens::Intrinsics { fx, fy, cx, cy }, ..self }
+    }
+
     /// `clip_from_camera` for an image of `width` x `height` pixels that shows `bounds`.
     pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &Bounds) -> Matrix4<f64> {
         let (near, far) = self.range(bounds);
+        let [fx, fy, cx, cy] = self.intrinsics([width, height]);
         let (width, height) = (f64::from(width), f64::from(height));
-        let (fx, fy, cx, cy) = match self.lens {
-            Lens::FieldOfView(degrees) => {
-                let focal = 0.5 * height / (degrees.to_radians() / 2.0).tan();
-                (focal, focal, width / 2.0, height / 2.0)
-            }
-            Lens::Intrinsics { fx, fy, cx, cy } => (fx, fy, cx, cy),
-        };
         let mut clip = Matrix4::zeros();
         clip[(0, 0)] = 2.0 * fx / width;
         clip[(0, 2)] = 1.0 - 2.0 * cx / width;

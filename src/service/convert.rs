@@ -5,10 +5,11 @@ use modalcast_proto::v1;
 
 use crate::engine::{self, Delivery, Engine, Format, Host, Policy, StepName, View, Which};
 use crate::error::{Result, invalid};
-use crate::scene::{Camera, RawUpdate, Scene, TransformFormat};
+use crate::scene::{Camera, RawUpdate, Rectangle, Scene, TransformFormat};
 use crate::telemetry::StageTimes;
 
 mod camera;
+mod output;
 
 /// The most bytes of remarks that a description carries.
 const MOST_REMARKS: usize = 64 << 10;
@@ -107,11 +108,7 @@ pub(super) fn delivery(number: i32) -> Result<Delivery> {
 /// A picture that can be drawn: what to show, and as what to send it.
 pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Picture>) -> Result<(View, Format)> {
     let picture = picture.unwrap_or_default();
-    let format = match v1::Format::try_from(picture.format) {
-        Ok(v1::Format::Unspecified | v1::Format::Png) => Format::Png,
-        Ok(v1::Format::Rgba) => Format::Rgba,
-        Err(_) => return Err(invalid("picture.format", "a format of this version", picture.format)),
-    };
+    let (showing, format) = output::parse(scene, &picture)?;
     let (width, height) = match (picture.width, picture.height) {
         (0, 0) => (1280, 720),
         size => size,
@@ -126,13 +123,44 @@ pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Pictur
         None => framing,
         Some(camera) => camera::parse(framing, camera).map_err(|error| error.within("picture"))?,
     };
-    Ok((View::Frame { camera, width, height }, format))
+    Ok((View::Frame { camera, width, height, showing }, format))
+}
+
+/// A rectangle of a picture, and the view that picks in it.
+pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<View> {
+    let bare = request.picture.clone().map(|wire| v1::Picture {
+        width: wire.width,
+        height: wire.height,
+        camera: wire.camera,
+        ..v1::Picture::default()
+    });
+    let (View::Frame { camera, width, height, .. }, _) = picture(engine, scene, bare)? else {
+        return Err(invalid("picture", "a picture", "none"));
+    };
+    let size = match (request.width, request.height) {
+        (0, 0) => [1, 1],
+        (width, height) => [width, height],
+    };
+    let picture = [width, height];
+    let rectangle = Rectangle::within(picture, [request.x, request.y], size)?;
+    Ok(View::Pick { camera, picture, rectangle })
 }
 
 pub(super) const fn wire_format(format: Format) -> v1::Format {
     match format {
         Format::Png => v1::Format::Png,
         Format::Rgba => v1::Format::Rgba,
+        Format::F32 => v1::Format::F32,
+        Format::U32 => v1::Format::U32,
+        Format::F32x3 => v1::Format::F32x3,
+    }
+}
+
+pub(super) const fn which_of_pick(step: Option<&v1::pick_request::Step>) -> Which {
+    match step {
+        None => Which::Current,
+        Some(v1::pick_request::Step::ExactStep(number)) => Which::Exact(*number),
+        Some(v1::pick_request::Step::MinimumStep(number)) => Which::Minimum(*number),
     }
 }
 

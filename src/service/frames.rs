@@ -5,6 +5,7 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use super::convert::{delivery, picture, said, stages, step_id, which_of_frame, wire_format};
+use super::picks;
 use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
 use crate::engine::{Encoded, Engine, Feed, Format, View, encode_frame};
@@ -38,6 +39,14 @@ impl v1::frame_service_server::FrameService for Frames {
             };
             deadline.hold(&said(which, &host.name), work).await
         }))
+    }
+
+    type PickStream = Replies<v1::PickResponse>;
+
+    async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
+        let config = self.0.config();
+        let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
+        picks::answer(&self.0, deadline, request.into_inner())
     }
 
     type StreamFramesStream = Replies<v1::StreamFramesResponse>;
@@ -91,7 +100,7 @@ impl Show {
 fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iterator<Item = v1::FrameChunk> {
     let (width, height) = match view {
         View::Frame { width, height, .. } => (width, height),
-        View::Vertices(_) => (0, 0),
+        View::Vertices(_) | View::Pick { .. } => (0, 0),
     };
     let head = v1::FrameHead {
         step: Some(step_id(frame.step)),

@@ -5,6 +5,7 @@ mod describe;
 mod frames;
 mod info;
 mod listen;
+mod picks;
 mod routes;
 mod scenes;
 mod status;

@@ -15,7 +15,7 @@ async fn server() -> Server {
 }
 
 fn picture(width: u32, height: u32, format: v1::Format) -> Option<v1::Picture> {
-    Some(v1::Picture { width, height, format: format.into(), camera: None })
+    Some(v1::Picture { width, height, format: format.into(), ..v1::Picture::default() })
 }
 
 fn request() -> v1::RenderFrameRequest {

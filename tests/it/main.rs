@@ -9,6 +9,7 @@ mod frames;
 mod hostile;
 mod layering;
 mod normals;
+mod picks;
 mod pixels;
 mod readers;
 mod real;

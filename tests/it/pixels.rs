@@ -3,6 +3,7 @@
 mod build;
 mod far;
 mod limits;
+mod picking;
 mod post;
 mod shading;
 mod shadow;
@@ -10,4 +11,5 @@ mod shadow_extremes;
 mod shadow_ground;
 mod shadow_methods;
 mod snapshots;
+mod surveys;
 mod visibility;

@@ -14,12 +14,35 @@ use crate::error::{Error, Result, malformed};
 /// Milliseconds per stage of the work, by the server's stage names, in its order.
 pub type Stages = Vec<(String, f32)>;
 
-/// How the bytes of a frame are encoded: 8-bit sRGB, top row first.
+/// How the bytes of a frame are encoded, top row first: 8-bit sRGB, or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Format {
     #[default]
     Png,
     Rgba,
+    /// Little-endian f32, one a pixel: depth in metres. The frame says so; a request need not.
+    F32,
+    /// Little-endian u32, one a pixel: domains.
+    U32,
+    /// Little-endian f32, three a pixel: normals.
+    F32x3,
+}
+
+/// What a picture shows; `frames.proto` says what each means to the last detail.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub enum Output {
+    #[default]
+    Colour,
+    /// Metres along the view axis, infinite where nothing is.
+    Depth,
+    /// Index of the domain, `u32::MAX` where none is.
+    Domains,
+    /// Unit normals, zeros where nothing is.
+    Normals,
+    /// |u| as a colour map with a legend; `largest` metres at its bright end, 0: fitted to each frame.
+    Displacement { largest: f64 },
+    /// One column of U as a colour map with a legend.
+    ModeShape { mode: u32, largest: f64 },
 }
 
 /// Which steps a subscriber gets.
@@ -68,6 +91,7 @@ pub struct Picture {
     pub height: u32,
     pub format: Format,
     pub camera: Option<Camera>,
+    pub output: Output,
 }
 
 /// Which step a single reply shows.
@@ -140,7 +164,7 @@ pub struct Frame {
     pub width: u32,
     pub height: u32,
     pub format: Format,
-    /// The file (PNG) or width x height x 4 bytes (RGBA).
+    /// The file (PNG), or every pixel's 4 or 12 bytes.
     pub bytes: Bytes,
     /// Steps passed over since the last frame of the stream.
     pub skipped: u64,
@@ -238,13 +262,18 @@ fn piece(chunk: Option<v1::FrameChunk>) -> Result<Piece<v1::FrameHead>> {
 }
 
 fn frame(head: v1::FrameHead, bytes: Bytes) -> Result<Frame> {
-    let pixels = 4 * u64::from(head.width) * u64::from(head.height);
-    let format = match head.format() {
-        v1::Format::Png => Format::Png,
-        v1::Format::Rgba if bytes.len() as u64 == pixels => Format::Rgba,
-        v1::Format::Rgba => return Err(malformed("frame.total", format!("{pixels} bytes"), bytes.len())),
-        v1::Format::Unspecified => return Err(malformed("frame.format", "PNG or RGBA", head.format)),
+    let (format, size) = match head.format() {
+        v1::Format::Png => (Format::Png, None),
+        v1::Format::Rgba => (Format::Rgba, Some(4)),
+        v1::Format::F32 => (Format::F32, Some(4)),
+        v1::Format::U32 => (Format::U32, Some(4)),
+        v1::Format::F32x3 => (Format::F32x3, Some(12)),
+        v1::Format::Unspecified => return Err(malformed("frame.format", "a format that is named", head.format)),
     };
+    let pixels = u64::from(head.width) * u64::from(head.height);
+    if let Some(total) = size.map(|size: u64| size * pixels).filter(|total| *total != bytes.len() as u64) {
+        return Err(malformed("frame.total", format!("{total} bytes"), bytes.len()));
+    }
     let step = head.step.ok_or_else(|| malformed("frame.step", "a step", "none"))?;
     let stages = stages(head.stages);
     Ok(Frame { step, width: head.width, height: head.height, format, bytes, skipped: head.skipped, stages })
@@ -265,12 +294,25 @@ impl From<Delivery> for v1::Delivery {
 
 impl From<Picture> for v1::Picture {
     fn from(picture: Picture) -> Self {
-        let format = match picture.format {
-            Format::Png => v1::Format::Png,
-            Format::Rgba => v1::Format::Rgba,
+        let (output, mode, largest) = match picture.output {
+            Output::Colour => (v1::Output::Colour, 0, 0.0),
+            Output::Depth => (v1::Output::Depth, 0, 0.0),
+            Output::Domains => (v1::Output::Domains, 0, 0.0),
+            Output::Normals => (v1::Output::Normals, 0, 0.0),
+            Output::Displacement { largest } => (v1::Output::Displacement, 0, largest),
+            Output::ModeShape { mode, largest } => (v1::Output::ModeShape, mode, largest),
+        };
+        // What is no colour has one format only, which the server knows.
+        let format = match (picture.output, picture.format) {
+            (Output::Depth | Output::Domains | Output::Normals, _) | (_, Format::Png) => v1::Format::Unspecified,
+            (_, Format::Rgba) => v1::Format::Rgba,
+            (_, Format::F32) => v1::Format::F32,
+            (_, Format::U32) => v1::Format::U32,
+            (_, Format::F32x3) => v1::Format::F32x3,
         };
         let camera = picture.camera.map(Into::into);
-        Self { width: picture.width, height: picture.height, format: format.into(), camera }
+        let (width, height) = (picture.width, picture.height);
+        Self { width, height, format: format.into(), camera, output: output.into(), mode, largest }
     }
 }
 

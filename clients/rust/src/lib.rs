@@ -7,6 +7,7 @@ mod drive;
 mod error;
 mod frames;
 pub mod npy;
+mod pick;
 mod scene;
 mod step;
 mod upload;
@@ -15,9 +16,12 @@ mod vertices;
 pub use client::{Client, REPLY_LIMIT};
 pub use drive::{Ack, Drive, Finished, Policy};
 pub use error::{Error, Refusal, Result};
-pub use frames::{Camera, Delivery, Format, Frame, FrameRequest, Frames, FramesRequest, Lens, Picture, Stages, View};
+pub use frames::{
+    Camera, Delivery, Format, Frame, FrameRequest, Frames, FramesRequest, Lens, Output, Picture, Stages, View,
+};
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};
+pub use pick::{Hit, PickRequest, Picks};
 pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
 pub use step::{Step, Transforms};
 pub use tonic::Code;

@@ -56,7 +56,7 @@ async fn a_frame_above_four_mebibytes_comes_whole_and_names_its_step() {
 #[tokio::test]
 async fn a_subscription_made_before_the_first_step_gets_every_step() {
     let (world, client) = connected(world(4)).await;
-    let picture = Picture { width: 600, height: 600, format: Format::Rgba, camera: None };
+    let picture = Picture { width: 600, height: 600, format: Format::Rgba, ..Picture::default() };
     let request = FramesRequest { scene: "toy".into(), picture, frames: 20, ..FramesRequest::default() };
     let mut frames = client.frames(&request).await.expect("accepted");
     let request = VertexStreamRequest { scene: "toy".into(), steps: 20, ..VertexStreamRequest::default() };

@@ -245,6 +245,12 @@ impl FrameService for Fake {
         Ok(replies(chunks.into_iter().map(|chunk| v1::RenderFrameResponse { chunk: Some(chunk) }).collect()))
     }
 
+    type PickStream = Replies<v1::PickResponse>;
+
+    async fn pick(&self, _: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
+        Err(Status::unimplemented("there is no surface here"))
+    }
+
     type StreamFramesStream = Replies<v1::StreamFramesResponse>;
 
     async fn stream_frames(

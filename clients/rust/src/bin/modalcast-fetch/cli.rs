@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use modalcast_client::{Camera, Delivery, Format, Lens, Picture, View};
+use modalcast_client::{Camera, Delivery, Format, Lens, Output, Picture, View};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -75,7 +75,16 @@ pub(crate) struct PictureOptions {
     /// Size in pixels.
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = size)]
     size: (u32, u32),
-    /// How the bytes are encoded: PNG, or raw RGBA8 (top row first, sRGB).
+    /// What it shows: colour, raw depth (f32 metres), domains (u32) or normals (3 f32), or a colour map with a legend.
+    #[arg(long, value_enum, default_value = "colour")]
+    output: OutputOption,
+    /// The column of U for `--output mode-shape`.
+    #[arg(long, default_value_t = 0)]
+    mode: u32,
+    /// The value at the bright end of a colour map; 0: fitted to each frame.
+    #[arg(long, default_value_t = 0.0)]
+    largest: f64,
+    /// How the bytes of colours are encoded: PNG, or raw RGBA8 (top row first, sRGB).
     #[arg(long, value_enum, default_value = "png")]
     pub(crate) format: FormatOption,
     /// Where the camera is; without it the server frames the scene.
@@ -98,6 +107,16 @@ pub(crate) enum FormatOption {
     Raw,
 }
 
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum OutputOption {
+    Colour,
+    Depth,
+    Domains,
+    Normals,
+    Displacement,
+    ModeShape,
+}
+
 impl PictureOptions {
     pub(crate) fn picture(&self) -> Picture {
         let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
@@ -106,7 +125,16 @@ impl PictureOptions {
             FormatOption::Png => Format::Png,
             FormatOption::Raw => Format::Rgba,
         };
-        Picture { width: self.size.0, height: self.size.1, format, camera }
+        let (mode, largest) = (self.mode, self.largest);
+        let output = match self.output {
+            OutputOption::Colour => Output::Colour,
+            OutputOption::Depth => Output::Depth,
+            OutputOption::Domains => Output::Domains,
+            OutputOption::Normals => Output::Normals,
+            OutputOption::Displacement => Output::Displacement { largest },
+            OutputOption::ModeShape => Output::ModeShape { mode, largest },
+        };
+        Picture { width: self.size.0, height: self.size.1, format, camera, output }
     }
 }
 

@@ -57,5 +57,8 @@ const fn extension(format: Format) -> &'static str {
     match format {
         Format::Png => "png",
         Format::Rgba => "rgba",
+        Format::F32 => "f32",
+        Format::U32 => "u32",
+        Format::F32x3 => "f32x3",
     }
 }

@@ -1,0 +1,219 @@
+//! Picking: the point of the deformed surface that a pixel shows, and what it takes to push there.
+
+use modalcast_proto::v1;
+use v1::frame_service_client::FrameServiceClient;
+
+use crate::assemble::floats;
+use crate::client::Client;
+use crate::error::{Result, malformed};
+use crate::frames::{Picture, Stages, Wanted, stages};
+
+/// A request for what a small rectangle of a picture shows.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PickRequest {
+    pub scene: String,
+    /// The picture in which the pixels are counted: its size and camera.
+    pub picture: Picture,
+    corner: [u32; 2],
+    size: [u32; 2],
+    without_modes: bool,
+    at: Wanted,
+    deadline_ms: u32,
+}
+
+impl PickRequest {
+    /// One pixel of a picture of the newest state; (0, 0) is the top left.
+    pub fn of(scene: &str, picture: Picture, x: u32, y: u32) -> Self {
+        Self { scene: scene.to_owned(), picture, corner: [x, y], size: [1, 1], ..Self::default() }
+    }
+
+    /// A rectangle whose top left pixel is that one; at most 64 pixels a side.
+    #[must_use]
+    pub const fn rectangle(mut self, width: u32, height: u32) -> Self {
+        self.size = [width, height];
+        self
+    }
+
+    /// Hits without [`Hit::modes`].
+    #[must_use]
+    pub const fn without_modes(mut self) -> Self {
+        self.without_modes = true;
+        self
+    }
+
+    /// Exactly this step of the current run; refused when it is gone.
+    #[must_use]
+    pub const fn exactly(mut self, step: u64) -> Self {
+        self.at = Wanted::Exactly(step);
+        self
+    }
+
+    /// This step of the current run or a later one.
+    #[must_use]
+    pub const fn at_least(mut self, step: u64) -> Self {
+        self.at = Wanted::AtLeast(step);
+        self
+    }
+
+    /// How long the server may wait for the step; 0 is its own default.
+    #[must_use]
+    pub const fn within_ms(mut self, milliseconds: u32) -> Self {
+        self.deadline_ms = milliseconds;
+        self
+    }
+
+    fn wire(&self) -> v1::PickRequest {
+        use v1::pick_request::Step;
+        v1::PickRequest {
+            scene: self.scene.clone(),
+            picture: Some(self.picture.into()),
+            step: match self.at {
+                Wanted::Newest => None,
+                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
+                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
+            },
+            deadline_ms: self.deadline_ms,
+            x: self.corner[0],
+            y: self.corner[1],
+            width: self.size[0],
+            height: self.size[1],
+            without_modes: self.without_modes,
+        }
+    }
+}
+
+/// What the pixels show, row by row; one that shows no triangle has no hit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picks {
+    pub step: v1::StepId,
+    pub hits: Vec<Hit>,
+    pub stages: Stages,
+}
+
+/// The surface at the middle of a pixel; `frames.proto` says more of each field.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hit {
+    pub pixel: [u32; 2],
+    pub domain: u32,
+    pub triangle: u32,
+    /// Rows of U over three.
+    pub vertices: [u32; 3],
+    /// In the order of `vertices`.
+    pub barycentric: [f64; 3],
+    /// Scene units from the scene's origin.
+    pub position: [f64; 3],
+    /// Unit, on the side that is seen.
+    pub normal: [f64; 3],
+    /// Metres along the view axis.
+    pub depth: f64,
+    /// A, row-major.
+    pub linear: [f32; 9],
+    pub rank: usize,
+    /// 3 x `rank`, row-major: U at the point; empty when it was left out.
+    pub modes: Vec<f32>,
+}
+
+impl Hit {
+    /// f_q = U^T A^T f: what a force at the point, in world axes, is on the domain's coordinates. Empty without modes.
+    pub fn reduced_force(&self, force: [f64; 3]) -> Vec<f64> {
+        let turned: [f64; 3] =
+            std::array::from_fn(|row| (0..3).map(|axis| f64::from(self.linear[3 * axis + row]) * force[axis]).sum());
+        let rank = self.modes.len() / 3;
+        let entry = |mode: usize| (0..3).map(|row| f64::from(self.modes[row * rank + mode]) * turned[row]).sum();
+        (0..rank).map(entry).collect()
+    }
+}
+
+impl Client {
+    /// Picks in a rectangle of a picture.
+    ///
+    /// # Errors
+    /// `Refused` when scene or step do not exist, the rectangle is not in the picture or the deadline passed; `Malformed`;
+    /// `Connect`.
+    pub async fn pick(&self, request: &PickRequest) -> Result<Picks> {
+        let wire = request.wire();
+        let mut stream = FrameServiceClient::new(self.channel.clone()).pick(wire).await?.into_inner();
+        let mut head = None;
+        let mut hits = Vec::new();
+        while let Some(response) = stream.message().await? {
+            head = head.or(response.head);
+            for wire in response.hits {
+                hits.push(hit(wire)?);
+            }
+            // The server's limit; a stream without end must not fill the memory.
+            if hits.len() > 64 * 64 {
+                return Err(malformed("pick.hits", "at most 4096", hits.len()));
+            }
+        }
+        let head = head.ok_or_else(|| malformed("pick.head", "a head", "none"))?;
+        if head.hits as usize != hits.len() {
+            return Err(malformed("pick.hits", head.hits, hits.len()));
+        }
+        let step = head.step.ok_or_else(|| malformed("pick.step", "a step", "none"))?;
+        Ok(Picks { step, hits, stages: stages(head.stages) })
+    }
+}
+
+fn hit(wire: v1::Hit) -> Result<Hit> {
+    let whole = 12 * wire.rank as usize;
+    if !wire.modes.is_empty() && wire.modes.len() != whole {
+        return Err(malformed("hit.modes", format!("none or {whole} bytes"), wire.modes.len()));
+    }
+    Ok(Hit {
+        pixel: [wire.x, wire.y],
+        domain: wire.domain,
+        triangle: wire.triangle,
+        vertices: exactly("hit.vertices", wire.vertices)?,
+        barycentric: exactly("hit.barycentric", wire.barycentric)?,
+        position: exactly("hit.position", wire.position)?,
+        normal: exactly("hit.normal", wire.normal)?,
+        depth: wire.depth,
+        linear: exactly("hit.linear", wire.linear)?,
+        rank: wire.rank as usize,
+        modes: floats(&wire.modes),
+    })
+}
+
+fn exactly<T, const N: usize>(field: &str, list: Vec<T>) -> Result<[T; N]> {
+    list.try_into().map_err(|list: Vec<T>| malformed(field, format!("{N} numbers"), list.len()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wire() -> v1::Hit {
+        v1::Hit {
+            vertices: vec![1, 2, 3],
+            barycentric: vec![0.5, 0.25, 0.25],
+            position: vec![0.0; 3],
+            normal: vec![0.0; 3],
+            linear: vec![0.0, -2.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+            rank: 2,
+            modes: [1.0_f32, 2.0, 3.0, 4.0, 5.0, 6.0].into_iter().flat_map(f32::to_le_bytes).collect(),
+            ..v1::Hit::default()
+        }
+    }
+
+    #[test]
+    fn a_force_is_turned_into_the_domains_axes_and_onto_its_modes() {
+        let hit = hit(wire()).expect("fits");
+        // A^T f = (2 f_y, -2 f_x, f_z), and the columns of U are (1, 3, 5) and (2, 4, 6).
+        assert_eq!(hit.reduced_force([1.0, 0.0, 0.0]), [-6.0, -8.0]);
+        assert_eq!(hit.reduced_force([0.0, 1.0, 10.0]), [52.0, 64.0]);
+        let bare = super::hit(v1::Hit { modes: bytes::Bytes::new(), ..wire() }).expect("fits");
+        assert!(bare.reduced_force([1.0; 3]).is_empty());
+    }
+
+    #[test]
+    fn hits_that_do_not_fit_are_refused_by_field() {
+        for (wrong, field) in [
+            (v1::Hit { rank: 3, ..wire() }, "hit.modes"),
+            (v1::Hit { vertices: vec![1], ..wire() }, "hit.vertices"),
+            (v1::Hit { linear: vec![1.0; 8], ..wire() }, "hit.linear"),
+        ] {
+            let refusal = hit(wrong).expect_err(field).to_string();
+            assert!(refusal.contains(field), "{refusal}");
+        }
+    }
+}

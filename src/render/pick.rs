@@ -1,0 +1,243 @@
+//! Picking: what the pixels of a small rectangle see, on the deformed surface. Only the rectangle is drawn, as a picture of
+//! its own with one sample in the middle of each pixel, and only its triangles are read back. The host meets them in f64.
+//!
+//! A pick is begun and finished apart, so that other work can be given to the device in between. Holes of cut-out materials
+//! are holes. Blended triangles cannot be picked: what stands behind them is. The ground stands before what lies below it,
+//! and is no hit itself.
+
+use std::rc::Rc;
+use std::sync::Arc;
+
+use nalgebra::{Matrix3, Matrix4, Vector3};
+
+use super::geometry::{Stretch, whose};
+use super::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
+use super::scene_buffers::SceneBuffers;
+use super::seen::Seen;
+use super::shaders;
+use super::target::{Form, image};
+use super::{Ran, Renderer, Shot, WATCHDOG, frame, passes};
+use crate::error::Result;
+use crate::scene::{Camera, Rectangle, Scene};
+
+/// Words per pixel as `shaders/pick.comp` writes them.
+const WORDS: usize = 22;
+const LARGEST: u32 = Rectangle::LARGEST;
+const BYTES: u64 = 4 * WORDS as u64 * LARGEST as u64 * LARGEST as u64;
+
+/// The surface at the middle of a pixel.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hit {
+    /// Column and row in the whole picture; (0, 0) is the top left.
+    pub pixel: [u32; 2],
+    pub domain: usize,
+    /// Triangle of the domain's mesh.
+    pub triangle: usize,
+    /// Vertices of the triangle in the domain's mesh (rows of U over three).
+    pub vertices: [u32; 3],
+    /// Barycentric coordinates of the point, in the order of `vertices`: 0 to 1, their sum is 1.
+    pub shares: [f64; 3],
+    /// The point, in scene units from the scene's origin.
+    pub position: [f64; 3],
+    /// The corners' normals at the point, unit, on the side that is seen; zeros when they cancel.
+    pub normal: [f64; 3],
+    /// Along the view axis, in scene units.
+    pub depth: f64,
+}
+
+/// What picks are drawn into.
+#[derive(Debug)]
+pub(super) struct Picker {
+    ids: Texture,
+    visible: Framebuffer,
+    packed: Buffer,
+    /// Host-readable buffers of picks that are finished.
+    free: Vec<Buffer>,
+    // Attached to the framebuffer, which must not outlive it.
+    _depth: Texture,
+}
+
+/// A pick on its way.
+#[derive(Debug)]
+pub struct Pick {
+    staging: Buffer,
+    fence: Fence,
+    scene: Arc<Scene>,
+    stretches: Rc<[Stretch]>,
+    rectangle: Rectangle,
+    /// The rectangle's camera, relative to `origin`.
+    camera: Camera,
+    origin: [f64; 3],
+}
+
+impl Picker {
+    fn new(gl: &Rc<Gl>) -> Result<Self> {
+        let form = Form { width: LARGEST, height: LARGEST, samples: 1, layered: false, halvings: 0 };
+        let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
+        let visible = gl.framebuffer(Some(&ids), &depth)?;
+        let packed = gl.buffer(BYTES, gl::STREAM_COPY, None)?;
+        Ok(Self { ids, visible, packed, free: Vec::new(), _depth: depth })
+    }
+}
+
+impl Renderer {
+    /// Begins to pick in a rectangle of the picture that `shot` is, without waiting for the device.
+    ///
+    /// # Errors
+    /// `Invalid` for a camera that overflows, `Fault` when OpenGL reports an error.
+    pub fn begin_pick(&mut self, buffers: &SceneBuffers, shot: &Shot, rectangle: Rectangle) -> Result<Pick> {
+        let [width, height] = rectangle.size();
+        let camera = shot.camera.cropped([shot.width, shot.height], rectangle);
+        let shot = Shot { camera, width, height, ..*shot };
+        let numbers = frame::Frame::new(&buffers.scene, &shot, buffers.origin)?;
+        let cut_out = buffers.cut_out(1, &mut |source| self.program(source))?;
+        let program = self.program(shaders::pick())?;
+        let mut picker = match self.picker.take() {
+            Some(picker) => picker,
+            None => Picker::new(&self.gl)?,
+        };
+        let free = picker.free.pop();
+        let picker = self.picker.insert(picker);
+        let gl = &self.gl;
+        let staging = match free {
+            Some(staging) => staging,
+            None => gl.buffer(BYTES, gl::STREAM_READ, None)?,
+        };
+        buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
+        passes::bind(buffers)?;
+        let ran = &mut Ran::default();
+        passes::identify(gl, buffers, (&picker.visible, [width, height]), cut_out.as_deref(), ran)?;
+        passes::ground(gl, buffers, &shot, ran)?;
+        let size = Some(width | height << 16);
+        passes::words(gl, (&picker.ids, &picker.packed), (&program, size), [width, height])?;
+        gl.copy(&picker.packed, &staging, 4 * (WORDS * width as usize * height as usize) as u64);
+        Ok(Pick {
+            staging,
+            fence: gl.fence("pick")?,
+            scene: Arc::clone(&buffers.scene),
+            stretches: Rc::clone(&buffers.stretches),
+            rectangle,
+            camera: camera.relative_to(buffers.origin),
+            origin: buffers.origin,
+        })
+    }
+
+    /// Waits for a pick and tells what its pixels see, row by row; a pixel that sees no triangle has no entry.
+    ///
+    /// # Errors
+    /// `Fault` when the device does not finish.
+    pub fn finish_pick(&mut self, pick: Pick) -> Result<Vec<Hit>> {
+        pick.fence.wait("pick", WATCHDOG)?;
+        let [width, height] = pick.rectangle.size();
+        let words = WORDS * width as usize * height as usize;
+        let words: Vec<u32> = bytemuck::pod_collect_to_vec(&pick.staging.read(4 * words)?);
+        let rays = Rays::of(&pick);
+        let pixels = words.chunks_exact(WORDS).zip(0..);
+        let hits = pixels.filter_map(|(words, at)| hit(&pick, &rays, words, [at % width, at / width])).collect();
+        if let Some(picker) = &mut self.picker {
+            picker.free.push(pick.staging);
+        }
+        self.gl.check("pick").map(|()| hits)
+    }
+}
+
+impl Pick {
+    /// Whether [`Renderer::finish_pick`] would not wait.
+    pub fn is_ready(&self) -> bool {
+        self.fence.is_over()
+    }
+}
+
+/// The rays through the pixels of a picture.
+struct Rays {
+    camera_from_world: Matrix4<f64>,
+    /// fx, fy, cx and cy.
+    lens: [f64; 4],
+}
+
+impl Rays {
+    fn of(pick: &Pick) -> Self {
+        let lens = pick.camera.intrinsics(pick.rectangle.size());
+        Self { camera_from_world: pick.camera.camera_from_world(), lens }
+    }
+
+    /// From the eye through the middle of a pixel, one unit of depth long, in the camera's frame.
+    fn through(&self, [x, y]: [u32; 2]) -> Vector3<f64> {
+        let [fx, fy, cx, cy] = self.lens;
+        Vector3::new((f64::from(x) + 0.5 - cx) / fx, (cy - f64::from(y) - 0.5) / fy, -1.0)
+    }
+}
+
+/// What one pixel of the rectangle sees, from the words that the device wrote.
+fn hit(pick: &Pick, rays: &Rays, words: &[u32], at: [u32; 2]) -> Option<Hit> {
+    let Seen::Triangle(place) = Seen::from_id(words[0]) else { return None };
+    let (domain, triangle) = whose(&pick.stretches, place)?;
+    let mesh = &pick.scene.shapes[pick.scene.domains[domain].shape].mesh;
+    let corners = *mesh.triangles().get(triangle)?;
+    let first = pick.scene.layout.slots[domain].first_corner as u32;
+    // The renderer turns the winding of some triangles around; the mesh's own order counts.
+    let drawn: [u32; 3] = [words[1], words[2], words[3]];
+    let order = corners.map(|corner| drawn.iter().position(|own| *own == corner + first).unwrap_or(0));
+    let point = |from: usize, index: usize| {
+        Vector3::from_fn(|axis, _| f64::from(f32::from_bits(words[from + 3 * index + axis])))
+    };
+    let ray = rays.through(at);
+    let in_camera = [0, 1, 2].map(|index| rays.camera_from_world.transform_point(&point(4, index).into()).coords);
+    let (shares, front) = meet(&in_camera, &ray);
+    let shares = Vector3::from(shares);
+    let mix = |from: usize| Matrix3::from_columns(&[point(from, 0), point(from, 1), point(from, 2)]) * shares;
+    let normal = mix(13).try_normalize(1e-30).filter(|unit| unit.iter().all(|number| number.is_finite()));
+    let normal = normal.unwrap_or_default();
+    Some(Hit {
+        pixel: [pick.rectangle.x() + at[0], pick.rectangle.y() + at[1]],
+        domain,
+        triangle,
+        vertices: corners.map(|corner| mesh.corners().vertices[corner as usize]),
+        shares: order.map(|index| shares[index]),
+        position: (mix(4) + Vector3::from(pick.origin)).into(),
+        normal: if front { normal } else { -normal }.into(),
+        depth: -(Matrix3::from_columns(&in_camera) * shares).z,
+    })
+}
+
+/// Barycentric coordinates of the point where a ray from the origin meets a triangle, and whether its front is seen: corner
+/// i has the share d . (v_j x v_k) of their sum. The ray may pass the triangle by as much as the rasteriser rounds (1/256
+/// pixel): then the nearest shares that are none below 0 are taken. A triangle without area on the screen has equal shares.
+fn meet([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
+    let volumes = [b.cross(c), c.cross(a), a.cross(b)].map(|normal| ray.dot(&normal));
+    let sum: f64 = volumes.iter().sum();
+    let inside = volumes.map(|volume| (volume / sum).max(0.0));
+    let whole: f64 = inside.iter().sum();
+    // NaN fails the comparison.
+    let shares = if whole > 0.5 && whole.is_finite() { inside.map(|share| share / whole) } else { [1.0 / 3.0; 3] };
+    // Rays point away from the eye, so the front is seen where the sum is negative.
+    (shares, sum < 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ray_meets_a_triangle_where_its_point_is_and_a_degenerate_one_gives_finite_shares() {
+        let corners = [Vector3::new(-1.0, -1.0, -4.0), Vector3::new(3.0, -1.0, -9.0), Vector3::new(0.5, 2.0, -2.0)];
+        let want = [0.2, 0.5, 0.3];
+        let point: Vector3<f64> = corners.iter().zip(want).map(|(corner, share)| corner * share).sum();
+        let (shares, front) = meet(&corners, &(point / -point.z));
+        assert!(shares.iter().zip(want).all(|(got, want)| (got - want).abs() < 1e-14), "{shares:?}");
+        assert!(front, "counter-clockwise");
+        let turned = [corners[0], corners[2], corners[1]];
+        assert!(!meet(&turned, &(point / -point.z)).1);
+        for flat in [[corners[0]; 3], [Vector3::zeros(); 3], [corners[0] * f64::NAN; 3]] {
+            let (shares, _) = meet(&flat, &Vector3::new(0.1, 0.2, -1.0));
+            assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{shares:?}");
+        }
+    }
+
+    #[test]
+    fn a_ray_that_passes_by_is_moved_onto_the_rim() {
+        let corners = [Vector3::new(0.0, 0.0, -1.0), Vector3::new(1.0, 0.0, -1.0), Vector3::new(0.0, 1.0, -1.0)];
+        let (shares, _) = meet(&corners, &Vector3::new(0.5, -0.01, -1.0));
+        assert!(shares[2] == 0.0 && (shares[0] + shares[1] - 1.0).abs() < 1e-15, "{shares:?}");
+    }
+}

@@ -1,0 +1,23 @@
+//! Sources of what is drawn only when somebody asks: picks, and pictures of numbers.
+
+use super::{CLIP, FRAME, IDS, LANES, Options, SHARES, Source};
+use crate::render::gl;
+
+impl Options {
+    /// Reads a field off the ids: `DEPTH` and `NORMALS` of one sample a pixel, `VALUES` of all samples.
+    pub(in crate::render) fn survey(&self, field: &'static str, samples: u32) -> Source {
+        let mut text = format!("#version 430 core\n#define LANES {LANES}\n#define {field}\n");
+        // Without a ground in the look no id is the ground's.
+        text += if self.defines.contains(&"GROUND_SEEN") { "#define GROUND_SEEN\n" } else { "" };
+        text += &self.sampling(samples);
+        text += &[FRAME, CLIP, IDS, SHARES, include_str!("../../../shaders/survey.comp")].concat();
+        Source { label: format!("survey of {field}, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+}
+
+/// The triangles of a few pixels.
+pub(in crate::render) fn pick() -> Source {
+    let head = format!("#version 430 core\n#define LANES {LANES}\n#define SAMPLES 1\n");
+    let body = [&head, IDS, SHARES, include_str!("../../../shaders/pick.comp")].concat();
+    Source { label: "pick".into(), stages: vec![(gl::COMPUTE_SHADER, body)] }
+}

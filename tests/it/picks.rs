@@ -1,0 +1,239 @@
+//! Picks and pictures of numbers over the wire. Needs an EGL that draws.
+
+use modalcast::config::{Config, RendererChoice};
+use modalcast::reference;
+use modalcast::scene::Scene;
+use modalcast_client::{Camera, Client, Code, Format, FrameRequest, Hit, Lens, Output, PickRequest, Picture, View};
+use modalcast_proto::v1;
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+
+use crate::service_harness::{Server, far_strips, rigid_step, sheet, state_after, step, strips};
+
+/// Positions of picks, against the reference's triangle, in scene units: f32 vertices of a few units.
+const NEAR: f64 = 2e-6;
+
+async fn server(source: &str) -> (Server, Client) {
+    let server = Server::with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
+    server.open(source).await;
+    let client = Client::connect(&server.address).await.expect("connects");
+    (server, client)
+}
+
+/// Looks at the strips from before, 40 pixels a unit.
+fn picture() -> Picture {
+    let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let lens = Lens::Intrinsics { fx: 160.0, fy: 160.0, cx: 48.0, cy: 40.0 };
+    let camera = Some(Camera { view, lens, clip: None });
+    Picture { width: 96, height: 80, camera, ..Picture::default() }
+}
+
+/// The ray of a pixel of that picture meets its hit.
+fn on_ray(hit: &Hit) -> bool {
+    let [x, y] = hit.pixel.map(f64::from);
+    let ray = Vector3::new((x + 0.5 - 48.0) / 160.0, (40.0 - y - 0.5) / 160.0, -1.0);
+    let point = Vector3::from(hit.position) - Vector3::new(0.5, 0.5, 4.0);
+    (point - ray * (ray.dot(&point) / ray.norm_squared())).norm() < NEAR
+}
+
+/// The scene's own U, 3n x r, of a domain.
+fn modes(scene: &Scene, domain: u32) -> DMatrix<f64> {
+    let shape = &scene.shapes[scene.domains[domain as usize].shape];
+    let (rows, rank) = (3 * shape.mesh.rest().len(), shape.modes.rank());
+    DMatrix::from_iterator(rows, rank, shape.modes.columns().iter().map(|entry| f64::from(*entry)))
+}
+
+/// U^T A^T f of a force that acts on the vertices of a triangle by their shares.
+fn whole_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f64>) -> DVector<f64> {
+    let modes = modes(scene, hit.domain);
+    let mut on_vertices = DVector::zeros(modes.nrows());
+    for (vertex, share) in hit.vertices.iter().zip(hit.barycentric) {
+        let own = share * linear.transpose() * force;
+        (0..3).for_each(|axis| on_vertices[3 * *vertex as usize + axis] += own[axis]);
+    }
+    modes.transpose() * on_vertices
+}
+
+fn position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
+    let deformed = reference::deform(scene, &state_after(scene, steps));
+    let first = scene.layout.slots[hit.domain as usize].first_vertex;
+    let corners = hit.vertices.iter().map(|vertex| Vector3::from(deformed[first + *vertex as usize]));
+    corners.zip(hit.barycentric).map(|(corner, share)| corner * share).sum()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_forms_the_force_on_q_from_a_pick_as_the_scene_itself_would() {
+    let (server, client) = server("strips").await;
+    let scene = strips();
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let steps = [
+        step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
+        rigid_step(2, v1::TransformFormat::RigidF32, &[(1, [0.0, 0.0, half, half], [1.0, 0.25, -0.5])]),
+    ];
+    let before = client.pick(&PickRequest::of("strips", picture(), 44, 37)).await.expect("at rest");
+    assert_eq!((before.step.run, before.hits.len()), (0, 1));
+    for step in steps.clone() {
+        driver.acked(step).await;
+    }
+    let request = PickRequest::of("strips", picture(), 0, 0).rectangle(64, 64).exactly(2);
+    let picks = client.pick(&request).await.expect("picks");
+    assert_eq!(picks.step.number, 2);
+    let state = state_after(&scene, &steps);
+    let force = Vector3::new(0.3, -2.0, 1.1);
+    let mut counts = [0; 2];
+    for hit in &picks.hits {
+        counts[hit.domain as usize] += 1;
+        let linear = state.transforms[hit.domain as usize].linear();
+        let want = whole_force(&scene, hit, linear, force);
+        let got = DVector::from_vec(hit.reduced_force(force.into()));
+        assert!((&got - &want).norm() < 1e-6 * force.norm(), "{got} is not {want}");
+        assert!((Vector3::from(hit.position) - position(&scene, &steps, hit)).norm() < NEAR && on_ray(hit), "{hit:?}");
+    }
+    assert!(counts.iter().all(|count| *count > 200), "control: both domains are seen, {counts:?}");
+    let turned = picks.hits.iter().find(|hit| hit.domain == 1).expect("counted");
+    let without_turn = whole_force(&scene, turned, Matrix3::identity(), force);
+    let got = DVector::from_vec(turned.reduced_force(force.into()));
+    assert!((got - without_turn).norm() > 0.1, "control: A matters");
+    let now = client.pick(&PickRequest::of("strips", picture(), 44, 37)).await.expect("now");
+    assert!((Vector3::from(now.hits[0].position) - Vector3::from(before.hits[0].position)).norm() > 0.01, "it moved");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn many_hits_with_modes_arrive_in_small_messages_and_a_scene_far_away_keeps_its_digits() {
+    let (_server, client) = server("sheet").await;
+    let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: [0.0, 1.0, 0.0] };
+    let camera = Some(Camera { view, lens: Lens::FieldOfView(20.0), clip: None });
+    let picture = Picture { width: 640, height: 480, camera, ..Picture::default() };
+    let all = client.pick(&PickRequest::of("sheet", picture, 100, 100).rectangle(64, 64)).await.expect("picks");
+    assert_eq!(all.hits.len(), 64 * 64, "the sheet fills the view");
+    let scene = sheet();
+    for hit in all.hits.iter().step_by(97) {
+        let want = whole_force(&scene, hit, Matrix3::identity(), Vector3::new(1.0, 2.0, -3.0));
+        let got = DVector::from_vec(hit.reduced_force([1.0, 2.0, -3.0]));
+        assert!((got - want).norm() < 1e-5);
+    }
+    let bare =
+        client.pick(&PickRequest::of("sheet", picture, 0, 0).rectangle(2, 1).without_modes()).await.expect("picks");
+    assert!(bare.hits.iter().all(|hit| hit.modes.is_empty() && hit.rank == 4));
+
+    let (server, client) = server_of_far().await;
+    let scene = far_strips();
+    let places = [0, 1].map(|domain| (domain, [0.0, 0.0, 0.0, 1.0], [3e7, -2e7 + 0.125, 2e7]));
+    let moved = rigid_step(1, v1::TransformFormat::RigidF64, &places);
+    server.drive("far", v1::Policy::Lossless, 0).await.acked(moved.clone()).await;
+    // Scene units from the scene's origin.
+    let at: [f64; 3] = std::array::from_fn(|axis| places[0].2[axis] - scene.origin[axis] / scene.unit);
+    let near = |x: f64, y: f64, z: f64| [at[0] + x, at[1] + y, at[2] + z];
+    let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
+    let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
+    let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
+    let hit = client.pick(&PickRequest::of("far", picture, 32, 32)).await.expect("picks").hits.remove(0);
+    let off = (Vector3::from(hit.position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
+    assert!(off < 1e-3, "{off} units at {at:?}");
+    assert!((hit.depth - 1.5).abs() < 1e-3, "half metres: {}", hit.depth);
+}
+
+async fn server_of_far() -> (Server, Client) {
+    server("far").await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bad_rectangles_outputs_and_steps_are_refused_by_name() {
+    let (server, client) = server("strips").await;
+    for (corner, size, field) in [
+        ([0, 0], [65, 1], "rectangle.size"),
+        ([0, 0], [0, 3], "rectangle.size"),
+        ([95, 79], [2, 1], "rectangle"),
+        ([96, 0], [1, 1], "rectangle"),
+    ] {
+        let request = PickRequest::of("strips", picture(), corner[0], corner[1]).rectangle(size[0], size[1]);
+        let error = client.pick(&request).await.expect_err(field);
+        assert_eq!(error.refusal().map(|refusal| refusal.field.as_str()), Some(field), "{error}");
+    }
+    let corner = client.pick(&PickRequest::of("strips", picture(), 95, 79)).await.expect("the last pixel");
+    assert!(corner.hits.is_empty(), "nothing is there");
+    let late = PickRequest::of("strips", picture(), 0, 0).at_least(1).within_ms(60);
+    let error = client.pick(&late).await.expect_err("no step yet");
+    assert!(matches!(error, modalcast_client::Error::Refused { code: Code::DeadlineExceeded, .. }), "{error}");
+
+    let wire = |output: v1::Output, format: v1::Format| v1::Picture {
+        width: 32,
+        height: 32,
+        output: output.into(),
+        format: format.into(),
+        ..v1::Picture::default()
+    };
+    let depth_as_png = wire(v1::Output::Depth, v1::Format::Png);
+    let colour_as_floats = wire(v1::Output::Colour, v1::Format::F32);
+    let third_mode = v1::Picture { mode: 2, ..wire(v1::Output::ModeShape, v1::Format::Png) };
+    let scaled_depth = v1::Picture { largest: 1.0, ..wire(v1::Output::Depth, v1::Format::F32) };
+    let no_number = v1::Picture { largest: f64::NAN, ..wire(v1::Output::Displacement, v1::Format::Png) };
+    let unknown = v1::Picture { output: 99, ..v1::Picture::default() };
+    for (picture, field) in [
+        (depth_as_png, "picture.format"),
+        (colour_as_floats, "picture.format"),
+        (third_mode, "picture.mode"),
+        (scaled_depth, "picture.largest"),
+        (no_number, "picture.largest"),
+        (unknown, "picture.output"),
+    ] {
+        let request = v1::RenderFrameRequest { scene: "strips".into(), picture: Some(picture), ..Default::default() };
+        let status = server.frames().await.render_frame(request).await.expect_err(field);
+        assert_eq!(crate::service_harness::details(&status).field, field);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_output_arrives_in_its_format_and_agrees_with_a_pick() {
+    let (server, client) = server("strips").await;
+    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    driver.acked(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
+    let show = async |output| {
+        let mut request = FrameRequest::of("strips").at_least(1);
+        request.picture = Picture { output, ..picture() };
+        client.frame(&request).await.expect("a frame")
+    };
+    let (depth, domains, normals) =
+        (show(Output::Depth).await, show(Output::Domains).await, show(Output::Normals).await);
+    assert_eq!([depth.format, domains.format, normals.format], [Format::F32, Format::U32, Format::F32x3]);
+    let picks = client.pick(&PickRequest::of("strips", picture(), 20, 10).rectangle(64, 64)).await.expect("picks");
+    let word = |bytes: &[u8], at: usize| <[u8; 4]>::try_from(&bytes[4 * at..][..4]).expect("four bytes");
+    let mut differ = 0;
+    for hit in &picks.hits {
+        let at = (hit.pixel[1] * 96 + hit.pixel[0]) as usize;
+        let same = u32::from_le_bytes(word(&domains.bytes, at)) == hit.domain;
+        let off = (f64::from(f32::from_le_bytes(word(&depth.bytes, at))) / hit.depth - 1.0).abs();
+        let turned = (0..3).map(|axis| f64::from(f32::from_le_bytes(word(&normals.bytes, 3 * at + axis))));
+        let aside = turned.zip(hit.normal).map(|(got, want)| (got - want).abs()).fold(0.0, f64::max);
+        differ += usize::from(!(same && off < 1e-5 && aside < 1e-5));
+    }
+    assert!(picks.hits.len() > 1000 && differ <= 3, "{differ} of {} pixels", picks.hits.len());
+    let colour = show(Output::Colour).await.bytes;
+    let maps = [
+        show(Output::Displacement { largest: 0.0 }).await,
+        show(Output::Displacement { largest: 9.0 }).await,
+        show(Output::ModeShape { mode: 0, largest: 0.0 }).await,
+        show(Output::ModeShape { mode: 1, largest: 0.0 }).await,
+    ];
+    for (at, map) in maps.iter().enumerate() {
+        assert_eq!((map.format, image::load_from_memory(&map.bytes).expect("a PNG").width()), (Format::Png, 96));
+        assert!(map.bytes != colour && maps[..at].iter().all(|other| other.bytes != map.bytes), "{at}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_domain_far_from_the_others_is_picked_from_beside_it_and_they_from_beside_them() {
+    let (server, client) = server("strips").await;
+    let away = [1e7 + 1.25, 0.0, -1e7];
+    let moved = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, [0.0, 0.0, 0.0, 1.0], away)]);
+    server.drive("strips", v1::Policy::Lossless, 0).await.acked(moved).await;
+    for (domain, at) in [(1, away), (0, [0.0; 3]), (1, away)] {
+        let near = |x: f64, y: f64, z: f64| [at[0] + x, at[1] + y, at[2] + z];
+        let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
+        let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
+        let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
+        let hits = client.pick(&PickRequest::of("strips", picture, 32, 32)).await.expect("picks").hits;
+        let off = (Vector3::from(hits[0].position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
+        assert!(hits[0].domain == domain && off < 1e-3, "{off} units from {at:?}: {hits:?}");
+    }
+}

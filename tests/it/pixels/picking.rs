@@ -1,0 +1,232 @@
+//! Picks against arithmetic: which triangle, where on it, and what is no hit.
+
+use std::sync::Arc;
+
+use modalcast::deform::{Deformer as _, Surface};
+use modalcast::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Transform};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Hit, Renderer, SceneBuffers, Seen, Shot};
+use modalcast::scene::{Bounds, Camera, Ground, Lens, Rectangle, Scene, State, View};
+use nalgebra::Vector3;
+
+use super::build::{Stage, camera, facing, lying, open};
+
+/// Ids are those of the frame unless an edge passes a sample by less than the rasteriser's 1/256 pixel; the point is met in
+/// f64 on the f32 triangle, so that in these scenes it is right to a millionth of a unit.
+const NEAR: f64 = 1e-6;
+
+struct Board {
+    renderer: Renderer,
+    buffers: SceneBuffers,
+    bounds: Bounds,
+}
+
+impl Board {
+    fn of(scene: &Arc<Scene>, state: &State) -> Self {
+        let mut renderer = open();
+        let mut deformer = ReferenceDeformer::new(scene);
+        let bounds = deformer.deform(state).expect("deforms").bounds;
+        let buffers = renderer.load(scene).expect("loads");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        Self { renderer, buffers, bounds }
+    }
+
+    fn rest(scene: &Arc<Scene>) -> Self {
+        Self::of(scene, &State::rest(scene))
+    }
+
+    fn shot(&self, camera: Camera, size: u32) -> Shot {
+        Shot { camera, width: size, height: size, bounds: self.bounds }
+    }
+
+    /// In a square picture: the hits of a rectangle, by its corner and size.
+    fn pick(&mut self, camera: Camera, picture: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<Hit> {
+        let rectangle = Rectangle::within([picture; 2], corner, size).expect("inside");
+        let shot = self.shot(camera, picture);
+        let pick = self.renderer.begin_pick(&self.buffers, &shot, rectangle).expect("begins");
+        self.renderer.finish_pick(pick).expect("ends")
+    }
+}
+
+fn off(got: [f64; 3], want: [f64; 3]) -> f64 {
+    (Vector3::from(got) - Vector3::from(want)).abs().max()
+}
+
+/// Where the middle of a pixel of [`camera`]`(64)` meets the plane z = 0.
+fn at(x: u32, y: u32) -> [f64; 3] {
+    [(f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0]
+}
+
+#[test]
+fn a_pick_tells_domain_triangle_shares_position_normal_and_depth() {
+    let stage = Stage::new().add(facing(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
+    let scene = stage.add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), Material::default()).scene();
+    let hits = Board::rest(&scene).pick(camera(64), 64, [40, 30], [1, 1]);
+    let [hit] = &hits[..] else { panic!("{hits:?}") };
+    let [x, y, _] = at(40, 30);
+    assert_eq!((hit.pixel, hit.domain, hit.triangle, hit.vertices), ([40, 30], 1, 0, [0, 1, 2]));
+    assert!(off(hit.position, [x, y, 0.0]) < NEAR && off(hit.normal, [0.0, 0.0, 1.0]) < NEAR, "{hit:?}");
+    assert!((hit.depth - 10.0).abs() < NEAR);
+    // (-2, -1), (2, -1), (2, 1): the second share is what is left of the others.
+    let [first, third] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
+    assert!(off(hit.shares, [first, 1.0 - first - third, third]) < NEAR, "{hit:?}");
+}
+
+#[test]
+fn a_mirrored_domain_keeps_the_order_of_its_mesh_and_a_back_side_turns_its_normal() {
+    let double_sided = Material { double_sided: true, ..Material::default() };
+    let mut stage = Stage::new().add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), double_sided);
+    stage.0.domains[0].placement.0[0] = -1.0;
+    let scene = stage.scene();
+    let mut board = Board::rest(&scene);
+    let hit = board.pick(camera(64), 64, [24, 34], [1, 1]).remove(0);
+    // The mesh's point is mirrored in x.
+    let [x, y, _] = at(24, 34);
+    assert_eq!(hit.vertices, [0, 1, 2]);
+    assert!(off(hit.shares, [(2.0 + x) / 4.0, 1.0 - (2.0 + x) / 4.0 - (y + 1.0) / 2.0, (y + 1.0) / 2.0]) < NEAR);
+    let behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+    for (view, z) in [(camera(64).view, 1.0), (behind, -1.0)] {
+        let hit = board.pick(Camera { view, ..camera(64) }, 64, [30, 30], [1, 1]).remove(0);
+        assert!(off(hit.normal, [0.0, 0.0, z]) < NEAR, "{hit:?}");
+    }
+}
+
+#[test]
+fn after_a_step_the_pick_moves_with_the_surface() {
+    let mesh = facing(-1.0, -1.0, 1.0, 1.0, 0.0);
+    let columns = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
+    let mut stage = Stage::new().add(mesh.clone(), Material::default());
+    stage.0.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, columns).expect("12 x 1")).expect("fits");
+    let scene = stage.scene();
+    let mut state = State::rest(&scene);
+    for q in [0.0, 2.0, -3.0_f32] {
+        state.q[0] = q;
+        let hit = Board::of(&scene, &state).pick(camera(64), 64, [36, 27], [1, 1]).remove(0);
+        let (z, [x, y, _]) = (f64::from(q), at(36, 27));
+        // The ray from (0, 0, 10) meets the plane at z a little nearer or farther.
+        let want = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
+        assert!(off(hit.position, want) < NEAR && (hit.depth - 10.0 + z).abs() < NEAR, "{q}: {hit:?}");
+    }
+}
+
+#[test]
+fn every_pixel_of_the_largest_rectangle_and_at_the_border_sees_what_the_frame_sees() {
+    let mut stage = Stage::new();
+    stage.0.look.samples = 1;
+    stage.0.look.ground = Some(Ground::default());
+    let image = stage.texture(8, 8, |x, y| [200, 200, 200, if (x + y) % 2 == 0 { 255 } else { 0 }]);
+    let leaf =
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(image), ..Material::default() };
+    let scene = stage
+        .add(lying(3.0, 0.0), Material::default())
+        .add(facing(-1.5, 0.3, 1.5, 2.5, 0.4), leaf)
+        .add(facing(-0.9, 0.2, 2.0, 1.1, -0.7), Material::default())
+        .scene();
+    let mut board = Board::rest(&scene);
+    let view = View::LookAt { eye: [3.0, 4.0, 9.0], target: [0.2, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    for lens in [Lens::FieldOfView(40.0), Lens::Intrinsics { fx: 120.0, fy: 130.0, cx: 50.0, cy: 44.0 }] {
+        let camera = Camera { view, lens, near: 0.0, far: 0.0 };
+        let shot = board.shot(camera, 100);
+        board.renderer.draw(&board.buffers, &shot).expect("draws");
+        let frame = board.renderer.seen().expect("reads");
+        let (mut differ, mut holes, mut seen) = (0, 0, [0; 3]);
+        for (corner, size) in [([0, 0], [64, 64]), ([64, 0], [36, 64]), ([0, 64], [64, 36]), ([64, 64], [36, 36])] {
+            let hits = board.pick(camera, 100, corner, size);
+            for y in corner[1]..corner[1] + size[1] {
+                for x in corner[0]..corner[0] + size[0] {
+                    let want = match frame[(100 * y + x) as usize] {
+                        Seen::Triangle(place) => board.buffers.triangle(place),
+                        _ => None,
+                    };
+                    let got = hits.iter().find(|hit| hit.pixel == [x, y]);
+                    differ += usize::from(got.map(|hit| (hit.domain, hit.triangle)) != want);
+                    holes += usize::from(got.is_none());
+                    got.into_iter().for_each(|hit| seen[hit.domain] += 1);
+                }
+            }
+        }
+        // An edge may pass a sample by less than the rasteriser tells.
+        assert!(differ <= 5, "{differ} of 10000 pixels");
+        assert!(holes > 500 && seen.iter().all(|count| *count > 100), "control: {holes} {seen:?}");
+    }
+}
+
+#[test]
+fn holes_blended_surfaces_sky_and_ground_are_no_hit_and_what_stands_behind_a_hole_is() {
+    let mut stage = Stage::new();
+    let image = stage.texture(2, 1, |x, _| [200, 200, 200, if x == 0 { 255 } else { 0 }]);
+    let leaf =
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(image), ..Material::default() };
+    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
+    // The leaf is whole on its left half and open on its right one; the glass stands before its upper right.
+    let scene = stage
+        .add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), leaf)
+        .add(facing(-2.0, -2.0, 2.0, 0.0, -1.0), Material::default())
+        .add(facing(-2.0, 0.0, 2.0, 2.0, 1.0), glass)
+        .scene();
+    let mut board = Board::rest(&scene);
+    let mut at = |x: u32, y: u32| board.pick(camera(64), 64, [x, y], [1, 1]).first().map(|hit| hit.domain);
+    assert_eq!([at(22, 22), at(42, 22), at(42, 42), at(2, 2)], [Some(0), None, Some(1), None]);
+    let floor = Camera {
+        view: View::LookAt { eye: [0.0, 2.0, 10.0], target: [0.0, -3.0, 0.0], up: [0.0, 1.0, 0.0] },
+        ..camera(64)
+    };
+    let mut stage = Stage::new();
+    stage.0.look.ground = Some(Ground::default());
+    let scene = stage.add(facing(-1.0, 0.0, 1.0, 1.0, 0.0), Material::default()).scene();
+    assert!(Board::rest(&scene).pick(floor, 64, [32, 60], [1, 1]).is_empty(), "the ground");
+}
+
+#[test]
+fn picks_begun_together_end_in_any_order_each_with_its_own_rectangle() {
+    let scene = Stage::new().add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), Material::default()).scene();
+    let mut board = Board::rest(&scene);
+    let shot = board.shot(camera(64), 64);
+    let picks: Vec<_> = (10..50)
+        .map(|x| {
+            let rectangle = Rectangle::within([64; 2], [x, 20], [1, 1]).expect("inside");
+            (x, board.renderer.begin_pick(&board.buffers, &shot, rectangle).expect("begins"))
+        })
+        .collect();
+    board.renderer.draw(&board.buffers, &shot).expect("a frame in between");
+    for (x, pick) in picks.into_iter().rev() {
+        let hits = board.renderer.finish_pick(pick).expect("ends");
+        assert!(off(hits[0].position, at(x, 20)) < NEAR, "{x}: {hits:?}");
+    }
+}
+
+#[test]
+fn a_triangle_far_from_the_origin_of_its_positions_or_without_area_gives_finite_numbers() {
+    let scene = Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
+    let mut board = Board::rest(&scene);
+    let away = [1e7, 0.0, -1e7];
+    board.buffers.relative_to(away);
+    let view = View::LookAt { eye: [1e7, 0.0, 10.0 - 1e7], target: away, up: [0.0, 1.0, 0.0] };
+    let hit = board.pick(Camera { view, ..camera(64) }, 64, [36, 30], [1, 1]).remove(0);
+    let [x, y, _] = at(36, 30);
+    assert!(off(hit.position, [1e7 + x, y, -1e7]) < 2e-6, "{hit:?}");
+    board.buffers.relative_to([0.0; 3]);
+    for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
+        let positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
+        let surface = Surface { positions, normals: normals.repeat(4), tangents: vec![], ..Surface::default() };
+        board.renderer.upload(&board.buffers, &surface).expect("uploads");
+        let hit = board.pick(camera(64), 64, [30, 30], [1, 1]).remove(0);
+        assert_eq!(hit.normal.map(f64::abs), [0.0; 3]);
+    }
+}
+
+#[test]
+fn a_scene_of_one_triangle_before_a_near_camera_is_picked_at_its_corners_pixel() {
+    let mesh = Mesh::indexed(
+        vec![[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0]],
+        vec![[0.0, 0.0, 1.0]; 3],
+        vec![],
+        vec![[0, 1, 2]],
+    );
+    let mut stage = Stage::new().add(mesh.expect("a triangle"), Material::default());
+    stage.0.domains[0] = Domain { placement: Transform::IDENTITY, ..stage.0.domains[0].clone() };
+    let view = View::LookAt { eye: [2e-7, 2e-7, 2e-6], target: [2e-7, 2e-7, 0.0], up: [0.0, 1.0, 0.0] };
+    let near = Camera { view, near: 1e-6, far: 1e9, ..camera(64) };
+    let hit = Board::rest(&stage.scene()).pick(near, 64, [31, 31], [1, 1]).remove(0);
+    assert!((hit.depth - 2e-6).abs() < 1e-12 && (hit.shares.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{hit:?}");
+}
