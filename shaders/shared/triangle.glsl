@@ -1,5 +1,5 @@
 // A triangle at a place of the picture, fetched from the scene's buffers: perspective-correct shares of its corners with
-// their analytic slopes, and the colour there.
+// their analytic slopes, and the colour and alpha there.
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 16) uniform samplerBuffer normals;
 layout(binding = 17) uniform usamplerBuffer triangle_corners;
@@ -43,7 +43,7 @@ Shares shares(vec3 a, vec3 b, vec3 c, vec2 texel) {
 
 vec2 finite(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
-vec3 triangle_seen(int number, vec2 image, vec2 texel) {
+vec4 triangle_seen(int number, vec2 image, vec2 texel) {
     ivec3 corners = ivec3(texelFetch(triangle_corners, number).xyz);
     ivec3 vertices = ivec3(texelFetch(triangle_vertices, number).xyz);
     mat3 world, clip, normal;
@@ -55,7 +55,7 @@ vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     }
     Shares share = shares(clip[0], clip[1], clip[2], texel);
     Material material = material_of(number);
-    vec3 tint = vec3(1.0);
+    vec4 tint = vec4(1.0);
     vec3 facing = unit(normal * share.at);
 #ifdef UVS
     mat3x2 uv;
@@ -63,7 +63,7 @@ vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     vec2 place = uv * share.at, by_x = finite(uv * share.along_x), by_y = finite(uv * share.along_y);
 #endif
 #ifdef TEXTURES
-    vec3 colour = colour_texel(material.images.xy, place, by_x, by_y).rgb;
+    vec4 colour = colour_texel(material.images.xy, place, by_x, by_y);
     if (material.images.x >= 0) tint = colour;
 #endif
 #ifdef NORMAL_MAPS
@@ -72,5 +72,6 @@ vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     vec3 bump = normal_texel(material.images.zw, place, by_x, by_y).xyz;
     if (material.images.z >= 0) facing = bumped(facing, along_u * share.at, bump);
 #endif
-    return phong(material, tint, share.front ? facing : -facing, world * share.at);
+    vec3 light = phong(material, tint.rgb, share.front ? facing : -facing, world * share.at);
+    return vec4(light, material.ambient.a * tint.a);
 }

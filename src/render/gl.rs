@@ -36,6 +36,10 @@ pub(super) struct Limits {
     pub(super) max_layers: u32,
     /// Largest buffer texture.
     pub(super) max_texels: u64,
+    /// Largest buffer that shaders write.
+    pub(super) max_storage: u64,
+    /// Whether fragments can know their samples that pass the depth test.
+    pub(super) post_depth: bool,
     /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
     pub(super) anisotropy: f32,
 }
@@ -83,6 +87,10 @@ pub(super) enum Clear {
     /// Depth of 1 and ids of 0.
     DepthAndIds,
     Colour([f32; 4]),
+    /// Words of 0, without depth.
+    Words,
+    /// All stays.
+    Nothing,
 }
 
 /// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around `glFinish` in software, where
@@ -202,6 +210,15 @@ impl Gl {
     }
 
     pub(super) fn framebuffer(self: &Rc<Self>, colour: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
+        self.attached(colour, Some(depth))
+    }
+
+    /// A framebuffer without depth.
+    pub(super) fn colour_framebuffer(self: &Rc<Self>, colour: &Texture) -> Result<Framebuffer> {
+        self.attached(Some(colour), None)
+    }
+
+    fn attached(self: &Rc<Self>, colour: Option<&Texture>, depth: Option<&Texture>) -> Result<Framebuffer> {
         let gl = self.on();
         // SAFETY: attaches textures of this context; completeness is asked for at once.
         unsafe {
@@ -211,7 +228,9 @@ impl Gl {
             if let Some(colour) = colour {
                 gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(colour.name), 0);
             }
-            gl.framebuffer_texture(glow::FRAMEBUFFER, glow::DEPTH_ATTACHMENT, Some(depth.name), 0);
+            if let Some(depth) = depth {
+                gl.framebuffer_texture(glow::FRAMEBUFFER, glow::DEPTH_ATTACHMENT, Some(depth.name), 0);
+            }
             gl.draw_buffers(&[if colour.is_some() { glow::COLOR_ATTACHMENT0 } else { glow::NONE }]);
             match gl.check_framebuffer_status(glow::FRAMEBUFFER) {
                 glow::FRAMEBUFFER_COMPLETE => self.check("framebuffer").map(|()| framebuffer),
@@ -276,6 +295,8 @@ impl Gl {
                     gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]);
                     gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]);
                 }
+                Clear::Words => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
+                Clear::Nothing => {}
                 Clear::Colour(colour) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &colour),
             }
         }
@@ -311,6 +332,24 @@ impl Gl {
             gl.draw_elements(glow::TRIANGLES, 3 * triangles as i32, glow::UNSIGNED_INT, 12 * first as i32);
             gl.bind_vertex_array(None);
         }
+    }
+
+    /// Draws triangles of an array's index buffer as a command in a buffer says, which a shader may have written.
+    pub(super) fn draw_told(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
+        let gl = self.on();
+        // SAFETY: the command names a checked range of the index buffer; shaders change its number of instances alone.
+        unsafe {
+            gl.bind_vertex_array(Some(array.name));
+            gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name));
+            gl.draw_elements_indirect_offset(glow::TRIANGLES, glow::UNSIGNED_INT, offset as i32);
+            gl.bind_vertex_array(None);
+        }
+    }
+
+    /// Lets everything after this see what shaders wrote.
+    pub(super) fn wait_for_stores(&self) {
+        // SAFETY: only orders memory.
+        unsafe { self.on().memory_barrier(glow::ALL_BARRIER_BITS) }
     }
 
     /// Draws vertices that the shader makes from their number.
@@ -448,6 +487,8 @@ fn limits(gl: &glow::Context) -> Limits {
             max_reads: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
             max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
             max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
+            max_storage: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
+            post_depth: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
             anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
         }
     }

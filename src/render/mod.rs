@@ -6,7 +6,9 @@
 //! | blur | depth to moments, blurred in x, then in y (compute) | the look has a shadow |
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
 //! | ground | the same of the ground | the look has a ground, and the camera is above it |
-//! | blended | light of the blended triangles over each other, no depth written | some triangle is blended |
+//! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
+//! | count, scan, fill | lists of the blended fragments of each pixel | exact, and some triangle is blended |
+//! | resolve | lists sorted by depth, shaded and blended (compute) | the same |
 //! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
 //! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
 //! | encode | light to sRGB bytes, top row first (compute) | always |
@@ -19,6 +21,7 @@ mod frame;
 mod geometry;
 mod gl;
 mod light;
+mod lists;
 mod passes;
 mod plan;
 mod programs;
@@ -35,6 +38,7 @@ use std::time::{Duration, Instant};
 
 pub use self::device::{EglDevice, devices};
 use self::gl::{Gl, Program};
+pub use self::lists::Lists;
 pub use self::plan::{Allocation, Plan, Saving, plan};
 use self::scene_buffers::Apart;
 pub use self::scene_buffers::SceneBuffers;
@@ -111,6 +115,8 @@ pub struct Ran {
     pub draws: usize,
     /// Samples a pixel.
     pub samples: u32,
+    /// Of exact transparency: how many fragments were blended, and whether all fitted.
+    pub lists: Option<Lists>,
 }
 
 /// The largest side of a frame, whatever the device can do.
@@ -236,7 +242,8 @@ impl Renderer {
         }
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
         let look = &buffers.scene.look;
-        let form = Form::new(&self.gl, [shot.width, shot.height], look.samples, buffers.scene.needs.blend);
+        let size = [shot.width, shot.height];
+        let form = Form::new(&self.gl, size, look.samples, lists::wanted(&self.gl, &buffers.scene, size)?);
         self.make_room(form)?;
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
         let encode = self.program(shaders::encode())?;
@@ -249,7 +256,7 @@ impl Renderer {
         let draw = gl.timed(|| {
             passes::visibility(gl, buffers, target, &sampled, &mut ran)?;
             passes::ground(gl, buffers, shot, &mut ran)?;
-            passes::blended(gl, buffers, target, &mut ran)?;
+            passes::blended(gl, buffers, target, &sampled, &mut ran)?;
             passes::shade(gl, buffers, target, &sampled, &mut ran)?;
             passes::encode(gl, target, &encode, &mut ran)
         })?;
@@ -263,7 +270,9 @@ impl Renderer {
         let rgba = target.staging.read(bytes)?;
         let mapped = begin.elapsed().as_secs_f64() * 1e3;
         let passes = vec![("shadow", shadow.ms()), ("draw", draw.ms()), ("read", copy.ms() + mapped)];
+        ran.lists = target.lists.as_ref().map(lists::ListTarget::tell).transpose()?;
         gl.check("read")?;
+        warn_of_lists(&self.ran, &ran);
         self.ran = ran;
         Ok(Image { width: shot.width, height: shot.height, rgba, passes })
     }
@@ -307,5 +316,18 @@ impl Renderer {
         let program = Rc::new(self.gl.program(&source.label, &stages)?);
         self.programs.insert(source, Rc::clone(&program));
         Ok(program)
+    }
+}
+
+/// Says so when a frame lacks blended fragments and the one before did not.
+fn warn_of_lists(last: &Ran, ran: &Ran) {
+    let lacks = |ran: &Ran| ran.lists.filter(|lists| lists.dropped() > 0);
+    if let (Some(lists), None) = (lacks(ran), lacks(last)) {
+        let (dropped, kept) = (lists.dropped(), lists.kept);
+        tracing::warn!(
+            dropped,
+            kept,
+            "blended fragments are over the budget (look.fragments): the farthest are not drawn"
+        );
     }
 }

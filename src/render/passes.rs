@@ -6,16 +6,16 @@ use super::gl::{Clear, Fixed, Gl, Program};
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
-    COLOUR_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TILE, TILE_ROW,
+    COLOUR_UNIT, COUNT_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, RUN, SHADOW_UNIT, TILE, TILE_ROW,
 };
 use super::target::Target;
 use super::{Ran, Shot};
 use crate::error::Result;
 
 const PIXELS: u32 = 0;
-const TILES: u32 = 1;
+pub(super) const TILES: u32 = 1;
 /// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
-const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
+pub(super) const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
 /// Nothing is blended yet: no light, and all that lies behind comes through.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
@@ -73,7 +73,7 @@ pub(super) fn visibility(
 ) -> Result<()> {
     gl.begin(&target.visible, target.form.width, target.form.height, Clear::DepthAndIds);
     // What is cut out comes last: where something stands before it, nothing is sampled.
-    let kinds = [(Kind::Opaque, &buffers.programs.opaque), (Kind::Mask, &sampled.mask)];
+    let kinds = [(Kind::Opaque, &buffers.programs.opaque), (Kind::Mask, &sampled.mask), (Kind::Blend, &sampled.parts)];
     let written = Fixed { depth_write: true, ..Fixed::default() };
     let mut any = false;
     for (kind, program) in kinds {
@@ -101,8 +101,17 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran
 }
 
 /// The layer of the blended triangles, before what is opaque.
-pub(super) fn blended(gl: &Gl, buffers: &SceneBuffers, target: &Target, ran: &mut Ran) -> Result<()> {
-    let (Some(program), Some(layer)) = (&buffers.programs.blended, &target.layer) else { return Ok(()) };
+pub(super) fn blended(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    target: &Target,
+    sampled: &Sampled,
+    ran: &mut Ran,
+) -> Result<()> {
+    if let (Some(programs), Some(lists)) = (&sampled.lists, &target.lists) {
+        return super::lists::draw(gl, buffers, (lists, target.form), programs, ran);
+    }
+    let (Some(program), Some(layer)) = (&sampled.blended, &target.layer) else { return Ok(()) };
     gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
     bind_shadow(buffers);
     draw(gl, buffers, (Kind::Blend, program), Fixed { blend: true, ..Fixed::default() }, ran);
@@ -116,6 +125,10 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
     target.ids.bind(ID_UNIT);
     if let Some(layer) = &target.layer {
         layer.colour.bind(LAYER_UNIT);
+    }
+    if let Some(lists) = &target.lists {
+        lists.layers.bind(LAYER_UNIT);
+        lists.counts.bind(COUNT_UNIT);
     }
     target.picture.bind_image(0);
     target.tiles.write(bytemuck::cast_slice(&NO_TILES));
@@ -162,7 +175,7 @@ fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), fixe
     }
 }
 
-fn bind_shadow(buffers: &SceneBuffers) {
+pub(super) fn bind_shadow(buffers: &SceneBuffers) {
     if let Some(map) = &buffers.shadow {
         map.moments.bind(SHADOW_UNIT);
     }

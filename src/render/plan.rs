@@ -3,9 +3,9 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
-use super::geometry::{Kind, groups, looks_up, used_materials};
+use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
 use super::textures::{Use, arrays};
-use crate::scene::{Scene, Shadow};
+use crate::scene::{Scene, Shadow, Transparency};
 
 /// A buffer or texture and its size.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -36,7 +36,7 @@ pub struct Plan {
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the visibility and blended passes together, six at most: domains and materials do not matter.
+    /// Draw calls of the visibility and blended passes together, ten at most: domains and materials do not matter.
     pub draws: usize,
     /// Branches that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -63,13 +63,16 @@ pub fn plan(scene: &Scene) -> Plan {
     if scene.needs.shadows {
         passes.extend(["shadow", "blur"]);
     }
-    if has(Kind::Opaque) || has(Kind::Mask) {
+    let seen = has(Kind::Opaque) || has(Kind::Mask) || opaque_parts(scene);
+    if seen {
         passes.push("visibility");
     }
     passes.extend(scene.look.ground.map(|_| "ground"));
-    passes.extend(scene.needs.blend.then_some("blended"));
+    if scene.needs.blend {
+        passes.extend(blended(scene));
+    }
     passes.push("backdrop");
-    if has(Kind::Opaque) || has(Kind::Mask) {
+    if seen {
         passes.push("shade");
     }
     passes.push("encode");
@@ -77,10 +80,39 @@ pub fn plan(scene: &Scene) -> Plan {
         buffers: buffers(scene),
         textures: textures(scene),
         passes,
-        draws: groups.len(),
+        draws: draws(scene, &groups),
         defines: defines(scene),
         left_out: left_out(scene),
     }
+}
+
+/// The passes of blended triangles.
+fn blended(scene: &Scene) -> Vec<&'static str> {
+    match scene.look.transparency {
+        Transparency::TwoPass => vec!["blended"],
+        Transparency::Exact => super::lists::PASSES.to_vec(),
+    }
+}
+
+/// Whether some blended triangle may reach the threshold from which two passes draw it as opaque.
+fn opaque_parts(scene: &Scene) -> bool {
+    let (look, materials) = (scene.look, used_materials(scene));
+    let dense = |material: usize| {
+        let material = &scene.materials[material];
+        kind(material) == Kind::Blend && material.alpha >= look.opaque_alpha
+    };
+    look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
+}
+
+/// Blended triangles take three turns for their lists, the third as often as the device finds it needed; with two passes
+/// a second turn for their opaque parts.
+fn draws(scene: &Scene, groups: &[Group]) -> usize {
+    let blended = groups.iter().filter(|group| group.kind == Kind::Blend).count();
+    let turns = match scene.look.transparency {
+        Transparency::Exact => 3,
+        Transparency::TwoPass => 1 + usize::from(opaque_parts(scene)),
+    };
+    groups.len() + (turns - 1) * blended
 }
 
 fn named(name: impl Into<String>, bytes: usize) -> Allocation {
@@ -145,6 +177,8 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("SHADOWS", needs.shadows),
         ("GROUND_SEEN", scene.look.ground.is_some()),
         ("LAYERS", needs.blend),
+        ("LISTED", needs.blend && scene.look.transparency == Transparency::Exact),
+        ("OPAQUE_PARTS", opaque_parts(scene)),
     ];
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
 }
@@ -158,7 +192,7 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
         (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
         (needs.textures, "textures", uvs, vec![], "no colour lookup"),
         (needs.mask, "mask", 0, vec![], "no discard, no sample mask; depth needs no fragment shader"),
-        (needs.blend, "blend", 0, vec!["blended"], "no layers in the shading, 8 bytes a sample less"),
+        (needs.blend, "blend", 0, blended(scene), "no layers in the shading, 8 bytes a sample less"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
         (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (scene.look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),

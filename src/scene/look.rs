@@ -67,6 +67,23 @@ impl Default for Ground {
     }
 }
 
+/// Blended fragments that one frame may keep: they lie in one buffer, 8 bytes each, and one buffer has less than 2 GiB.
+pub const MAX_FRAGMENTS: u32 = (1 << 28) - 1;
+
+/// How blended triangles are drawn over what is opaque, and over each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Transparency {
+    /// The thesis's two passes (chapter 3.3): what reaches [`Look::opaque_alpha`] first, with depth; then the rest, blended
+    /// over that without writing depth. Blended triangles lie over each other in the order of the index buffer: those with
+    /// one side before those with two, then by domain, then by triangle.
+    TwoPass,
+    /// A list of all blended fragments in each pixel, sorted by depth: order does not matter. Depths are compared in the
+    /// middle of the pixel; of equal ones the later triangle of the index buffer lies in front.
+    #[default]
+    Exact,
+}
+
 /// Light, shadow, ground and sky. Colours are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -84,6 +101,13 @@ pub struct Look {
     pub ground: Option<Ground>,
     /// Samples a pixel, 1 or 4: how smooth the edges of triangles and cut-outs are.
     pub samples: u32,
+    /// How blended triangles are drawn.
+    pub transparency: Transparency,
+    /// Two passes only: alpha from which a blended triangle counts as opaque, above 0; above 1 none does.
+    pub opaque_alpha: f32,
+    /// Exact only: blended fragments of a frame that are kept, 1 to 2^28 - 1; by default eight a pixel, as far as the device
+    /// has buffers so large. Where a frame has more, every pixel keeps as many of its nearest as all pixels can.
+    pub fragments: Option<u32>,
 }
 
 impl Default for Look {
@@ -98,6 +122,9 @@ impl Default for Look {
             shadow: Some(Shadow::default()),
             ground: Some(Ground::default()),
             samples: 4,
+            transparency: Transparency::default(),
+            opaque_alpha: 0.95,
+            fragments: None,
         }
     }
 }
@@ -116,6 +143,12 @@ impl Look {
         }
         if ![1, 4].contains(&self.samples) {
             return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
+        }
+        if !(self.opaque_alpha > 0.0 && self.opaque_alpha.is_finite()) {
+            return Err(invalid("look.opaque_alpha", "a number above 0", self.opaque_alpha));
+        }
+        if self.fragments.is_some_and(|fragments| !(1..=MAX_FRAGMENTS).contains(&fragments)) {
+            return Err(invalid("look.fragments", format!("1 to {MAX_FRAGMENTS}"), format!("{:?}", self.fragments)));
         }
         let Some(shadow) = self.shadow else { return Ok(()) };
         if !(16..=16384).contains(&shadow.size) {

@@ -17,7 +17,7 @@ pub use camera::{Bounds, Camera, Lens, View};
 pub use cells::{Cells, GRID, REACH, nearest_cell};
 pub use deformation::{Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
-pub use look::{Ground, Look, Shadow, UpAxis};
+pub use look::{Ground, Look, MAX_FRAGMENTS, Shadow, Transparency, UpAxis};
 pub use needs::Needs;
 pub use rigid::TransformFormat;
 pub use state::{Changed, State};

@@ -10,6 +10,7 @@
 //! ground = true              # false: no ground plane
 //! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
 //! look.samples = 4           # or 1: samples a pixel
+//! look.transparency = "exact" # or "two-pass", with opaque_alpha; exact keeps as many fragments as look.fragments says
 //! look.shadow = { size = 2048, blur = 2.0 }   # and least_variance, bleeding, alpha_threshold
 //! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
 //!
