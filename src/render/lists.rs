@@ -27,8 +27,9 @@ const ENDS: u32 = 2;
 const LAYERS: u32 = 3;
 /// Bytes of a fragment: depth, and id with coverage.
 const RECORD_BYTES: u64 = 8;
-/// Fragments a pixel for which there is room by default, on average.
+/// Fragments a pixel for which there is room by default, on average; and in a frame however small.
 const USUAL: u64 = 8;
+const FEWEST: u64 = 1 << 20;
 /// Turns of the gathering program.
 const COUNT: i32 = 0;
 const FILL: i32 = 1;
@@ -110,7 +111,7 @@ pub(super) fn budget(limits: &Limits, look: &Look, [width, height]: [u32; 2]) ->
         let fits = u64::from(fragments) <= most;
         return if fits { Ok(fragments) } else { Err(gl::too_large("look.fragments", most, fragments.into())) };
     }
-    Ok((USUAL * u64::from(width) * u64::from(height)).min(most) as u32)
+    Ok((USUAL * u64::from(width) * u64::from(height)).max(FEWEST).min(most) as u32)
 }
 
 impl ListPrograms {
@@ -249,7 +250,12 @@ pub(super) fn wanted(gl: &Gl, scene: &crate::scene::Scene, size: [u32; 2]) -> Re
 
 #[cfg(test)]
 mod tests {
+    use super::super::geometry::tests::squares;
+    use super::super::{Prefer, Renderer, Shot};
     use super::*;
+    use crate::deform::Deformer as _;
+    use crate::domain::{AlphaMode, Material, Transform};
+    use crate::scene::{Camera, Scene, State, Transparency};
 
     #[test]
     fn the_budget_is_eight_a_pixel_or_what_the_look_says_as_far_as_one_buffer_reaches() {
@@ -258,9 +264,59 @@ mod tests {
             budget(&limits(max_storage), &Look { fragments, ..Look::default() }, size)
         };
         assert_eq!(of(None, 1 << 31, [640, 480]).expect("fits"), 8 * 640 * 480);
+        assert_eq!(of(None, 1 << 31, [1, 1]).expect("fits"), 1 << 20);
         assert_eq!(of(None, 1 << 27, [8192, 8192]).expect("less"), 1 << 24, "as many as fit");
         assert_eq!(of(Some(100), 1 << 27, [8192, 8192]).expect("fits"), 100);
         let refusal = of(Some(1 << 25), 1 << 27, [64, 64]).expect_err("refused").to_string();
         assert_eq!(refusal, "look.fragments: expected at most 16777216 on this device, given 33554432");
+    }
+
+    /// A square of glass before and behind an opaque one, in squares of 64 pixels; and the renderer that drew it.
+    fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth: bool) -> (Vec<u8>, Renderer) {
+        let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
+        let mut parts =
+            squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);
+        parts.look.transparency = transparency;
+        for (index, domain) in parts.domains.iter_mut().enumerate() {
+            // Turned a little, so that edges cross pixels.
+            let angle = 0.3 + 0.2 * index as f32;
+            let (sine, cosine) = angle.sin_cos();
+            let z = [0.0, 0.3, -0.3][index];
+            domain.placement = Transform([cosine, -sine, 0.0, 0.0, sine, cosine, 0.0, 0.0, 0.0, 0.0, 1.0, z]);
+        }
+        let scene = Scene::new(parts).expect("good");
+        let mut renderer = Renderer::open(Prefer::Any).expect("EGL");
+        let gl = Rc::get_mut(&mut renderer.gl).expect("not shared yet");
+        gl.limits.post_depth &= post_depth;
+        let buffers = renderer.load(&scene).expect("loads");
+        let mut deformer = crate::reference::ReferenceDeformer::new(&scene);
+        let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        let camera = Camera::framing(&scene, 64, 64);
+        let image = renderer.draw(&buffers, &Shot { camera, width: 64, height: 64, bounds }).expect("draws");
+        (image.rgba, renderer)
+    }
+
+    #[test]
+    fn a_fragment_a_pixel_with_its_samples_and_a_fragment_a_sample_give_the_same_picture() {
+        let (known, renderer) = drawn(Transparency::Exact, AlphaMode::Blend, true);
+        let (apart, other) = drawn(Transparency::Exact, AlphaMode::Blend, false);
+        let worst = known.iter().zip(&apart).map(|(a, b)| a.abs_diff(*b)).max();
+        assert!(worst <= Some(2), "{worst:?} levels");
+        let [few, many] = [&renderer, &other].map(|renderer| renderer.ran().lists.expect("exact").fragments);
+        assert!(!renderer.gl.limits.post_depth || many > 3 * few, "control: {few} and {many} fragments");
+    }
+
+    #[test]
+    fn only_the_method_that_the_look_names_is_compiled_and_neither_without_blended_triangles() {
+        let compiled = |transparency, alpha_mode| {
+            let (_, renderer) = drawn(transparency, alpha_mode, true);
+            let any = |name: &str| renderer.programs.keys().any(|source| source.label.starts_with(name));
+            (["gather", "tally", "place", "resolve"].map(any), any("blended"))
+        };
+        assert_eq!(compiled(Transparency::Exact, AlphaMode::Opaque), ([false; 4], false));
+        assert_eq!(compiled(Transparency::TwoPass, AlphaMode::Opaque), ([false; 4], false));
+        assert_eq!(compiled(Transparency::Exact, AlphaMode::Blend), ([true; 4], false));
+        assert_eq!(compiled(Transparency::TwoPass, AlphaMode::Blend), ([false; 4], true));
     }
 }

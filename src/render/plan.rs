@@ -241,17 +241,32 @@ mod tests {
 
     #[test]
     fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
-        let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, ..Material::default() }]);
-        parts.look.shadow = None;
-        let plan = plan(&Scene::new(parts).expect("good"));
-        assert_eq!(plan.passes, ["ground", "blended", "backdrop", "encode"]);
-        assert_eq!((plan.draws, plan.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
-        assert_eq!(plan.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+        let glass = |transparency, alpha| {
+            let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, alpha, ..Material::default() }]);
+            (parts.look.shadow, parts.look.transparency) = (None, transparency);
+            plan(&Scene::new(parts).expect("good"))
+        };
+        let passes = glass(Transparency::TwoPass, 0.5);
+        assert_eq!(passes.passes, ["ground", "blended", "backdrop", "encode"]);
+        assert_eq!((passes.draws, passes.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
+        assert_eq!(passes.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+        let exact = glass(Transparency::Exact, 1.0);
+        assert_eq!(exact.passes, ["ground", "count", "scan", "fill", "resolve", "backdrop", "encode"]);
+        assert_eq!((exact.draws, exact.defines), (3, vec!["GROUND_SEEN", "LAYERS", "LISTED"]));
+        let dense = glass(Transparency::TwoPass, 1.0);
+        assert_eq!(
+            dense.passes,
+            ["visibility", "ground", "blended", "backdrop", "shade", "encode"],
+            "it may be opaque"
+        );
+        assert_eq!((dense.draws, dense.defines), (2, vec!["GROUND_SEEN", "LAYERS", "OPAQUE_PARTS"]));
     }
 
     #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
-        let plan = plan(&Scene::new(everything()).expect("good"));
+        let mut parts = everything();
+        parts.look.transparency = Transparency::TwoPass;
+        let plan = plan(&Scene::new(parts).expect("good"));
         assert_eq!(plan.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
         assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));

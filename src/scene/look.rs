@@ -105,8 +105,8 @@ pub struct Look {
     pub transparency: Transparency,
     /// Two passes only: alpha from which a blended triangle counts as opaque, above 0; above 1 none does.
     pub opaque_alpha: f32,
-    /// Exact only: blended fragments of a frame that are kept, 1 to 2^28 - 1; by default eight a pixel, as far as the device
-    /// has buffers so large. Where a frame has more, every pixel keeps as many of its nearest as all pixels can.
+    /// Exact only: blended fragments of a frame that are kept, 1 to 2^28 - 1; by default eight a pixel (2^20 at
+    /// least), as far as the device has buffers so large. Where a frame has more, every pixel keeps as many of its nearest as all pixels can.
     pub fragments: Option<u32>,
 }
 
@@ -179,6 +179,20 @@ mod tests {
         for samples in [0, 2, 8, u32::MAX] {
             let refusal = Look { samples, ..Look::default() }.check().expect_err("refused").to_string();
             assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
+        }
+    }
+
+    #[test]
+    fn a_threshold_of_nothing_and_a_budget_of_nothing_or_beyond_a_buffer_are_refused() {
+        for opaque_alpha in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            let refusal = Look { opaque_alpha, ..Look::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.opaque_alpha: expected a number above 0, given {opaque_alpha}"));
+        }
+        for fragments in [0, MAX_FRAGMENTS + 1, u32::MAX] {
+            Look { fragments: Some(fragments), ..Look::default() }.check().expect_err("refused");
+        }
+        for fragments in [None, Some(1), Some(MAX_FRAGMENTS)] {
+            Look { fragments, opaque_alpha: 2.0, ..Look::default() }.check().expect("good");
         }
     }
 }
