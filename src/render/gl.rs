@@ -3,6 +3,7 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod lists;
 mod object;
 
 use std::rc::Rc;
@@ -213,11 +214,6 @@ impl Gl {
         self.attached(colour, Some(depth))
     }
 
-    /// A framebuffer without depth.
-    pub(super) fn colour_framebuffer(self: &Rc<Self>, colour: &Texture) -> Result<Framebuffer> {
-        self.attached(Some(colour), None)
-    }
-
     fn attached(self: &Rc<Self>, colour: Option<&Texture>, depth: Option<&Texture>) -> Result<Framebuffer> {
         let gl = self.on();
         // SAFETY: attaches textures of this context; completeness is asked for at once.
@@ -332,24 +328,6 @@ impl Gl {
             gl.draw_elements(glow::TRIANGLES, 3 * triangles as i32, glow::UNSIGNED_INT, 12 * first as i32);
             gl.bind_vertex_array(None);
         }
-    }
-
-    /// Draws triangles of an array's index buffer as a command in a buffer says, which a shader may have written.
-    pub(super) fn draw_told(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
-        let gl = self.on();
-        // SAFETY: the command names a checked range of the index buffer; shaders change its number of instances alone.
-        unsafe {
-            gl.bind_vertex_array(Some(array.name));
-            gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name));
-            gl.draw_elements_indirect_offset(glow::TRIANGLES, glow::UNSIGNED_INT, offset as i32);
-            gl.bind_vertex_array(None);
-        }
-    }
-
-    /// Lets everything after this see what shaders wrote.
-    pub(super) fn wait_for_stores(&self) {
-        // SAFETY: only orders memory.
-        unsafe { self.on().memory_barrier(glow::ALL_BARRIER_BITS) }
     }
 
     /// Draws vertices that the shader makes from their number.
