@@ -253,9 +253,9 @@ mod tests {
     use super::super::geometry::tests::squares;
     use super::super::{Prefer, Renderer, Shot};
     use super::*;
-    use crate::deform::Deformer as _;
-    use crate::domain::{AlphaMode, Material, Transform};
-    use crate::scene::{Camera, Scene, State, Transparency};
+    use crate::deform::Surface;
+    use crate::domain::{AlphaMode, Material};
+    use crate::scene::{Bounds, Camera, Scene, Transparency};
 
     #[test]
     fn the_budget_is_eight_a_pixel_or_what_the_look_says_as_far_as_one_buffer_reaches() {
@@ -276,22 +276,31 @@ mod tests {
         let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
         let mut parts =
             squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);
-        parts.look.transparency = transparency;
-        for (index, domain) in parts.domains.iter_mut().enumerate() {
-            // Turned a little, so that edges cross pixels.
-            let angle = 0.3 + 0.2 * index as f32;
+        // Without a shadow: light that changes within a pixel would tell where in it a fragment is shaded.
+        (parts.look.transparency, parts.look.shadow) = (transparency, None);
+        // Turned a little, so that edges cross pixels.
+        let corner = |z: f32, angle: f32, [x, y]: [f32; 2]| {
             let (sine, cosine) = angle.sin_cos();
-            let z = [0.0, 0.3, -0.3][index];
-            domain.placement = Transform([cosine, -sine, 0.0, 0.0, sine, cosine, 0.0, 0.0, 0.0, 0.0, 1.0, z]);
-        }
+            [cosine * x - sine * y, sine * x + cosine * y, z]
+        };
+        let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+        let positions: Vec<[f32; 3]> = [(0.0, 0.3), (0.3, 0.5), (-0.3, 0.7)]
+            .into_iter()
+            .flat_map(|(z, angle)| square.map(|at| corner(z, angle, at)))
+            .collect();
+        let mut bounds = Bounds::EMPTY;
+        positions.iter().for_each(|position| bounds.include(position.map(f64::from)));
+        let surface = Surface {
+            positions: positions.as_flattened().to_vec(),
+            normals: [0.0, 0.0, 1.0].repeat(positions.len()),
+            tangents: vec![],
+        };
         let scene = Scene::new(parts).expect("good");
         let mut renderer = Renderer::open(Prefer::Any).expect("EGL");
         let gl = Rc::get_mut(&mut renderer.gl).expect("not shared yet");
         gl.limits.post_depth &= post_depth;
         let buffers = renderer.load(&scene).expect("loads");
-        let mut deformer = crate::reference::ReferenceDeformer::new(&scene);
-        let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
-        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        renderer.upload(&buffers, &surface).expect("uploads");
         let camera = Camera::framing(&scene, 64, 64);
         let image = renderer.draw(&buffers, &Shot { camera, width: 64, height: 64, bounds }).expect("draws");
         (image.rgba, renderer)
