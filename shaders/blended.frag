@@ -24,5 +24,9 @@ void main() {
     if (material.images.z >= 0) normal = bumped(normal, tangent_world, bump);
 #endif
     normal = gl_FrontFacing ? normal : -normal;
+#ifdef OPAQUE_PARTS
+    // What reaches the threshold was drawn as opaque.
+    cut_in(material.ambient.a * tint.a, material.diffuse.a);
+#endif
     colour = vec4(phong(material, tint.rgb, normal, unbumped, world), material.ambient.a * tint.a);
 }

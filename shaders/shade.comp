@@ -8,7 +8,11 @@
 // others; then for the listed tiles. A software rasteriser runs both sides of every branch, and most tiles of most pictures
 // see no triangle.
 layout(local_size_x = TILE, local_size_y = TILE) in;
-#ifdef LAYERS
+#ifdef LISTED
+// Of exact transparency: a layer a sample, written where there are blended fragments alone.
+layout(binding = 22) uniform sampler2DArray layers;
+layout(binding = 23) uniform usampler2D kept;
+#elif defined(LAYERS)
 #if SAMPLES > 1
 layout(binding = 22) uniform sampler2DMS layers;
 #else
@@ -48,7 +52,7 @@ vec3 shaded(uint id, vec2 image, vec2 texel) {
     if (id == GROUND) light = ground_seen(direction);
 #endif
 #ifndef BACKDROP
-    if (id != NOTHING && id != GROUND) light = triangle_seen(int(id - 1u), image, texel);
+    if (id != NOTHING && id != GROUND) light = triangle_seen(int(id - 1u), image, texel).rgb;
 #endif
     return light;
 }
@@ -58,6 +62,9 @@ vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
     vec2 texel = 2.0 / vec2(size);
     Gathered sum = Gathered(vec3(0.0), vec3(0.0));
     uint left = (1u << SAMPLES) - 1u;
+#ifdef LISTED
+    bool blended = texelFetch(kept, at, 0).x > 0u;
+#endif
     // The loop is left at its end: a software rasteriser runs the body of a loop for lanes that are done.
     do {
         uint id = NOTHING;
@@ -76,7 +83,12 @@ vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
         vec3 light = shaded(id, (vec2(at) + middle / count) * texel - 1.0, texel);
 #ifdef LAYERS
         for (int index = 0; index < SAMPLES; index++) {
+#ifdef LISTED
+            vec4 layer = vec4(0.0, 0.0, 0.0, 1.0);
+            if (blended) layer = texelFetch(layers, ivec3(at, index), 0);
+#else
             vec4 layer = texelFetch(layers, at, index);
+#endif
             if ((same >> index & 1u) != 0u) gather(sum, layer.rgb + layer.a * light, 1.0);
         }
 #else

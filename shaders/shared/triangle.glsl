@@ -1,4 +1,4 @@
-// The colour of a triangle at a place of the picture.
+// The colour and alpha of a triangle at a place of the picture.
 #ifdef UVS
 layout(binding = 19) uniform samplerBuffer uvs;
 #endif
@@ -8,7 +8,7 @@ layout(binding = 20) uniform samplerBuffer tangents;
 
 vec2 finite(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
-vec3 triangle_seen(int number, vec2 image, vec2 texel) {
+vec4 triangle_seen(int number, vec2 image, vec2 texel) {
     ivec3 corners = ivec3(texelFetch(triangle_corners, number).xyz);
     ivec3 vertices = ivec3(texelFetch(triangle_vertices, number).xyz);
     mat3 world, clip, normal;
@@ -20,7 +20,7 @@ vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     }
     Shares share = shares(clip[0], clip[1], clip[2], texel);
     Material material = material_of(number);
-    vec3 tint = vec3(1.0);
+    vec4 tint = vec4(1.0);
     vec3 unbumped = unit(normal * share.at), facing = unbumped;
 #ifdef UVS
     mat3x2 uv;
@@ -28,7 +28,7 @@ vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     vec2 place = uv * share.at, by_x = finite(uv * share.along_x), by_y = finite(uv * share.along_y);
 #endif
 #ifdef TEXTURES
-    vec3 colour = colour_texel(material.images.xy, place, by_x, by_y).rgb;
+    vec4 colour = colour_texel(material.images.xy, place, by_x, by_y);
     if (material.images.x >= 0) tint = colour;
 #endif
 #ifdef NORMAL_MAPS
@@ -37,5 +37,6 @@ vec3 triangle_seen(int number, vec2 image, vec2 texel) {
     vec3 bump = normal_texel(material.images.zw, place, by_x, by_y).xyz;
     if (material.images.z >= 0) facing = bumped(facing, along_u * share.at, bump);
 #endif
-    return phong(material, tint, share.front ? facing : -facing, unbumped, world * share.at);
+    vec3 light = phong(material, tint.rgb, share.front ? facing : -facing, unbumped, world * share.at);
+    return vec4(light, material.ambient.a * tint.a);
 }

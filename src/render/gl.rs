@@ -5,6 +5,7 @@
 
 mod fence;
 mod layers;
+mod lists;
 mod object;
 
 use std::rc::Rc;
@@ -39,6 +40,10 @@ pub(super) struct Limits {
     pub(super) max_layers: u32,
     /// Largest buffer texture.
     pub(super) max_texels: u64,
+    /// Largest buffer that shaders write.
+    pub(super) max_storage: u64,
+    /// Whether fragments can know their samples that pass the depth test.
+    pub(super) post_depth: bool,
     /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
     pub(super) anisotropy: f32,
 }
@@ -86,6 +91,10 @@ pub(super) enum Clear {
     /// Depth of 1 and ids of 0.
     DepthAndIds,
     Colour([f32; 4]),
+    /// Words of 0, without depth.
+    Words,
+    /// All stays.
+    Nothing,
 }
 
 /// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around `glFinish` in software, where
@@ -205,6 +214,10 @@ impl Gl {
     }
 
     pub(super) fn framebuffer(self: &Rc<Self>, colour: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
+        self.attached(colour, Some(depth))
+    }
+
+    fn attached(self: &Rc<Self>, colour: Option<&Texture>, depth: Option<&Texture>) -> Result<Framebuffer> {
         let gl = self.on();
         // SAFETY: attaches textures of this context; completeness is asked for at once.
         unsafe {
@@ -214,7 +227,9 @@ impl Gl {
             if let Some(colour) = colour {
                 gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(colour.name), 0);
             }
-            gl.framebuffer_texture(glow::FRAMEBUFFER, glow::DEPTH_ATTACHMENT, Some(depth.name), 0);
+            if let Some(depth) = depth {
+                gl.framebuffer_texture(glow::FRAMEBUFFER, glow::DEPTH_ATTACHMENT, Some(depth.name), 0);
+            }
             gl.draw_buffers(&[if colour.is_some() { glow::COLOR_ATTACHMENT0 } else { glow::NONE }]);
             match gl.check_framebuffer_status(glow::FRAMEBUFFER) {
                 glow::FRAMEBUFFER_COMPLETE => self.check("framebuffer").map(|()| framebuffer),
@@ -279,6 +294,8 @@ impl Gl {
                     gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]);
                     gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]);
                 }
+                Clear::Words => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
+                Clear::Nothing => {}
                 Clear::Colour(colour) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &colour),
             }
         }
@@ -451,6 +468,8 @@ fn limits(gl: &glow::Context) -> Limits {
             max_reads: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
             max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
             max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
+            max_storage: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
+            post_depth: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
             anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
         }
     }

@@ -6,7 +6,9 @@
 //! | blur | depth to moments, blurred in x and in y (compute) | that shadow is a variance map |
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
 //! | ground | the same of the ground | the look has a ground, and the camera is above it |
-//! | blended | light of the blended triangles over each other, no depth written | some triangle is blended |
+//! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
+//! | count, scan, fill | lists of the blended fragments of each pixel | exact, and some triangle is blended |
+//! | resolve | lists sorted by depth, shaded and blended (compute) | the same |
 //! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
 //! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
 //! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
@@ -23,6 +25,7 @@ mod frame;
 mod geometry;
 mod gl;
 mod light;
+mod lists;
 mod passes;
 mod pick;
 mod plan;
@@ -45,6 +48,7 @@ use std::time::{Duration, Instant};
 pub use self::device::{EglDevice, devices};
 pub use self::frame::shadow_texel;
 use self::gl::{Gl, Program};
+pub use self::lists::Lists;
 pub use self::pick::{Hit, Pick};
 pub use self::plan::{Allocation, Plan, Saving, plan};
 use self::scene_buffers::Apart;
@@ -124,6 +128,8 @@ pub struct Ran {
     pub draws: usize,
     /// Samples a pixel.
     pub samples: u32,
+    /// Of exact transparency: how many fragments were blended, and whether all fitted.
+    pub lists: Option<Lists>,
 }
 
 /// The largest side of a frame, whatever the device can do.
@@ -262,7 +268,8 @@ impl Renderer {
         }
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
         let look = &buffers.scene.look;
-        let form = Form::new(&self.gl, [shot.width, shot.height], look, buffers.scene.needs.blend);
+        let size = [shot.width, shot.height];
+        let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
         self.make_room(form)?;
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
@@ -280,7 +287,7 @@ impl Renderer {
             passes::visibility(gl, buffers, target, &sampled, &mut ran)?;
             passes::ground(gl, buffers, shot, &mut ran)
         })?;
-        let blended = gl.timed(|| passes::blended(gl, buffers, target, &mut ran))?;
+        let blended = gl.timed(|| passes::blended(gl, buffers, target, &sampled, &mut ran))?;
         let shade = gl.timed(|| passes::shade(gl, buffers, target, &sampled, &mut ran))?;
         let bloom = gl.timed(|| buffers.post.bloom(gl, target, &mut ran))?;
         let encode = gl.timed(|| buffers.post.encode(gl, target, &mut ran))?;
@@ -301,7 +308,9 @@ impl Renderer {
         passes.push(("draw", drawn.iter().map(|(_, ms)| ms).sum()));
         passes.extend(drawn);
         passes.push(("read", copy.ms() + mapped));
+        ran.lists = target.lists.as_ref().map(lists::ListTarget::tell).transpose()?;
         gl.check("read")?;
+        warn_of_lists(&self.ran, &ran);
         self.ran = ran;
         Ok(Image { width: shot.width, height: shot.height, rgba, passes })
     }
@@ -345,5 +354,18 @@ impl Renderer {
         let program = Rc::new(self.gl.program(&source.label, &stages)?);
         self.programs.insert(source, Rc::clone(&program));
         Ok(program)
+    }
+}
+
+/// Says so when a frame lacks blended fragments and the one before did not.
+fn warn_of_lists(last: &Ran, ran: &Ran) {
+    let lacks = |ran: &Ran| ran.lists.filter(|lists| lists.dropped() > 0);
+    if let (Some(lists), None) = (lacks(ran), lacks(last)) {
+        let (dropped, kept) = (lists.dropped(), lists.kept);
+        tracing::warn!(
+            dropped,
+            kept,
+            "blended fragments are over the budget (look.fragments): the farthest are not drawn"
+        );
     }
 }

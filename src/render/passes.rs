@@ -6,7 +6,7 @@ use super::gl::{Buffer, Clear, Fixed, Framebuffer, Gl, Program, Texture};
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
-    COLOUR_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE, TILE_ROW,
+    COLOUR_UNIT, COUNT_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE, TILE_ROW,
 };
 use super::splits::Splits;
 use super::target::Target;
@@ -14,9 +14,9 @@ use super::{Ran, Shot};
 use crate::error::Result;
 
 pub(super) const PIXELS: u32 = 0;
-const TILES: u32 = 1;
+pub(super) const TILES: u32 = 1;
 /// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
-const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
+pub(super) const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
 const SPLITS: u32 = 2;
 /// Nothing is blended yet: no light, and all that lies behind comes through.
@@ -66,20 +66,22 @@ pub(super) fn visibility(
     sampled: &Sampled,
     ran: &mut Ran,
 ) -> Result<()> {
-    identify(gl, buffers, (&target.visible, [target.form.width, target.form.height]), sampled.mask.as_deref(), ran)
+    let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
+    identify(gl, buffers, (&target.visible, [target.form.width, target.form.height]), programs, ran)
 }
 
-/// Ids and depth into a framebuffer of this width and height or larger.
+/// Ids and depth into a framebuffer of this width and height or larger: of what is opaque; of what is cut out, by the first
+/// program; and of the opaque parts of what is blended, by the second.
 pub(super) fn identify(
     gl: &Gl,
     buffers: &SceneBuffers,
     (into, [width, height]): (&Framebuffer, [u32; 2]),
-    cut_out: Option<&Program>,
+    (cut_out, parts): (Option<&Program>, Option<&Program>),
     ran: &mut Ran,
 ) -> Result<()> {
     gl.begin(into, width, height, Clear::DepthAndIds);
     // What is cut out comes last: where something stands before it, nothing is sampled.
-    let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out)];
+    let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out), (Kind::Blend, parts)];
     let written = Fixed { depth_write: true, ..Fixed::default() };
     let mut any = false;
     for (kind, program) in kinds {
@@ -107,8 +109,17 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran
 }
 
 /// The layer of the blended triangles, before what is opaque.
-pub(super) fn blended(gl: &Gl, buffers: &SceneBuffers, target: &Target, ran: &mut Ran) -> Result<()> {
-    let (Some(program), Some(layer)) = (&buffers.programs.blended, &target.layer) else { return Ok(()) };
+pub(super) fn blended(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    target: &Target,
+    sampled: &Sampled,
+    ran: &mut Ran,
+) -> Result<()> {
+    if let (Some(programs), Some(lists)) = (&sampled.lists, &target.lists) {
+        return super::lists::draw(gl, buffers, (lists, target.form), programs, ran);
+    }
+    let (Some(program), Some(layer)) = (&sampled.blended, &target.layer) else { return Ok(()) };
     gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
     bind_shadow(buffers);
     draw(gl, buffers, (Kind::Blend, program), Fixed { blend: true, ..Fixed::default() }, ran);
@@ -122,6 +133,10 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
     target.ids.bind(ID_UNIT);
     if let Some(layer) = &target.layer {
         layer.colour.bind(LAYER_UNIT);
+    }
+    if let Some(lists) = &target.lists {
+        lists.layers.bind(LAYER_UNIT);
+        lists.counts.bind(COUNT_UNIT);
     }
     target.picture.bind_image(0);
     if let Some(glare) = target.glow.first() {
@@ -175,7 +190,7 @@ fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), fixe
     }
 }
 
-fn bind_shadow(buffers: &SceneBuffers) {
+pub(super) fn bind_shadow(buffers: &SceneBuffers) {
     if let Some(map) = &buffers.shadow {
         map.lookup().bind(SHADOW_UNIT);
     }

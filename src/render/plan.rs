@@ -3,10 +3,10 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
-use super::geometry::{Kind, groups, looks_up, used_materials};
+use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
 use super::shadow::fitting;
 use super::textures::{Use, arrays};
-use crate::scene::{Antialias, Scene, Shadow, Tone};
+use crate::scene::{Antialias, Scene, Shadow, Tone, Transparency};
 
 /// A buffer or texture and its size.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -37,7 +37,7 @@ pub struct Plan {
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the visibility and blended passes together, six at most: domains and materials do not matter.
+    /// Draw calls of the visibility and blended passes together, ten at most: domains and materials do not matter.
     pub draws: usize,
     /// Branches that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -70,13 +70,16 @@ pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
         passes.push("shadow");
         passes.extend(shadow.has_moments().then_some("blur"));
     }
-    if has(Kind::Opaque) || has(Kind::Mask) {
+    let seen = has(Kind::Opaque) || has(Kind::Mask) || opaque_parts(scene);
+    if seen {
         passes.push("visibility");
     }
     passes.extend(scene.look.ground.map(|_| "ground"));
-    passes.extend(scene.needs.blend.then_some("blended"));
+    if scene.needs.blend {
+        passes.extend(blended(scene));
+    }
     passes.push("backdrop");
-    if has(Kind::Opaque) || has(Kind::Mask) {
+    if seen {
         passes.push("shade");
     }
     passes.extend(scene.look.bloom.map(|_| "bloom"));
@@ -85,10 +88,39 @@ pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
         buffers: buffers(scene),
         textures: textures(scene, software),
         passes,
-        draws: groups.len(),
+        draws: draws(scene, &groups),
         defines: defines(scene),
         left_out: left_out(scene),
     }
+}
+
+/// The passes of blended triangles.
+fn blended(scene: &Scene) -> Vec<&'static str> {
+    match scene.look.transparency {
+        Transparency::TwoPass => vec!["blended"],
+        Transparency::Exact => super::lists::PASSES.to_vec(),
+    }
+}
+
+/// Whether some blended triangle may reach the threshold from which two passes draw it as opaque.
+fn opaque_parts(scene: &Scene) -> bool {
+    let (look, materials) = (scene.look, used_materials(scene));
+    let dense = |material: usize| {
+        let material = &scene.materials[material];
+        kind(material) == Kind::Blend && material.alpha >= look.opaque_alpha
+    };
+    look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
+}
+
+/// Blended triangles take three turns for their lists, the third as often as the device finds it needed; with two passes
+/// a second turn for their opaque parts.
+fn draws(scene: &Scene, groups: &[Group]) -> usize {
+    let blended = groups.iter().filter(|group| group.kind == Kind::Blend).count();
+    let turns = match scene.look.transparency {
+        Transparency::Exact => 3,
+        Transparency::TwoPass => 1 + usize::from(opaque_parts(scene)),
+    };
+    groups.len() + (turns - 1) * blended
 }
 
 fn named(name: impl Into<String>, bytes: usize) -> Allocation {
@@ -152,6 +184,8 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("LOOK_UP", looks_up(scene)),
         ("GROUND_SEEN", scene.look.ground.is_some()),
         ("LAYERS", needs.blend),
+        ("LISTED", needs.blend && scene.look.transparency == Transparency::Exact),
+        ("OPAQUE_PARTS", opaque_parts(scene)),
     ];
     let shadows = scene.look.shadow.iter().flat_map(super::shadow::defines);
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).chain(shadows).collect()
@@ -166,7 +200,7 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
         (needs.normal_maps, "normal maps", per_corner(16), vec![], "no tangent frame, no normal map lookup"),
         (needs.textures, "textures", uvs, vec![], "no colour lookup"),
         (needs.mask, "mask", 0, vec![], "no discard, no sample mask; depth needs no fragment shader"),
-        (needs.blend, "blend", 0, vec!["blended"], "no layers in the shading, 8 bytes a sample less"),
+        (needs.blend, "blend", 0, blended(scene), "no layers in the shading, 8 bytes a sample less"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
         (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
@@ -223,17 +257,32 @@ mod tests {
 
     #[test]
     fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
-        let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, ..Material::default() }]);
-        parts.look.shadow = None;
-        let plan = plan(&Scene::new(parts).expect("good"));
-        assert_eq!(plan.passes, ["ground", "blended", "backdrop", "encode"]);
-        assert_eq!((plan.draws, plan.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
-        assert_eq!(plan.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+        let glass = |transparency, alpha| {
+            let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, alpha, ..Material::default() }]);
+            (parts.look.shadow, parts.look.transparency) = (None, transparency);
+            plan(&Scene::new(parts).expect("good"))
+        };
+        let passes = glass(Transparency::TwoPass, 0.5);
+        assert_eq!(passes.passes, ["ground", "blended", "backdrop", "encode"]);
+        assert_eq!((passes.draws, passes.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
+        assert_eq!(passes.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+        let exact = glass(Transparency::Exact, 1.0);
+        assert_eq!(exact.passes, ["ground", "count", "scan", "fill", "resolve", "backdrop", "encode"]);
+        assert_eq!((exact.draws, exact.defines), (3, vec!["GROUND_SEEN", "LAYERS", "LISTED"]));
+        let dense = glass(Transparency::TwoPass, 1.0);
+        assert_eq!(
+            dense.passes,
+            ["visibility", "ground", "blended", "backdrop", "shade", "encode"],
+            "it may be opaque"
+        );
+        assert_eq!((dense.draws, dense.defines), (2, vec!["GROUND_SEEN", "LAYERS", "OPAQUE_PARTS"]));
     }
 
     #[test]
     fn a_scene_that_needs_all_leaves_out_nothing() {
-        let plan = plan(&Scene::new(everything()).expect("good"));
+        let mut parts = everything();
+        parts.look.transparency = Transparency::TwoPass;
+        let plan = plan(&Scene::new(parts).expect("good"));
         assert_eq!(
             plan.passes,
             ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "bloom", "encode"]

@@ -4,6 +4,7 @@ use std::rc::Rc;
 
 use super::geometry::{Group, Kind};
 use super::gl::Program;
+use super::lists::ListPrograms;
 use super::plan::Plan;
 use super::shaders::{Options, Source};
 use crate::error::Result;
@@ -20,7 +21,6 @@ pub(super) struct Programs {
     pub(super) shadow: [Option<Rc<Program>>; 3],
     pub(super) opaque: Option<Rc<Program>>,
     pub(super) ground: Option<Rc<Program>>,
-    pub(super) blended: Option<Rc<Program>>,
 }
 
 /// Programs for one number of samples a pixel.
@@ -28,6 +28,11 @@ pub(super) struct Programs {
 pub(super) struct Sampled {
     pub(super) samples: u32,
     pub(super) mask: Option<Rc<Program>>,
+    /// Of two passes: the opaque parts of blended triangles, where there are any; and the rest of them.
+    pub(super) parts: Option<Rc<Program>>,
+    pub(super) blended: Option<Rc<Program>>,
+    /// Of exact transparency.
+    pub(super) lists: Option<ListPrograms>,
     pub(super) backdrop: Rc<Program>,
     pub(super) shade: Option<Rc<Program>>,
 }
@@ -49,7 +54,6 @@ impl Programs {
             shadow,
             opaque: when(any(Kind::Opaque), &|| options.visibility(Kind::Opaque, 1))?,
             ground: when(has("ground"), &|| options.ground())?,
-            blended: when(has("blended"), &|| options.blended())?,
         })
     }
 }
@@ -62,10 +66,18 @@ impl Sampled {
         compile: &mut Compile<'_>,
     ) -> Result<Self> {
         let any = |kind: Kind| groups.iter().any(|group| group.kind == kind);
-        let (cut_out, triangles) = (any(Kind::Mask), any(Kind::Opaque) || any(Kind::Mask));
+        let (cut_out, triangles) = (any(Kind::Mask), any(Kind::Opaque) || any(Kind::Mask) || options.opaque_parts());
+        let listed = options.defines.contains(&"LISTED");
+        let mut when = |wanted: bool, source: &dyn Fn() -> Source| match wanted {
+            true => compile(source()).map(Some),
+            false => Ok(None),
+        };
         Ok(Self {
             samples,
-            mask: if cut_out { Some(compile(options.visibility(Kind::Mask, samples))?) } else { None },
+            mask: when(cut_out, &|| options.visibility(Kind::Mask, samples))?,
+            parts: when(options.opaque_parts(), &|| options.visibility(Kind::Blend, samples))?,
+            blended: when(any(Kind::Blend) && !listed, &|| options.blended(samples))?,
+            lists: if listed { Some(ListPrograms::compile(options, samples, compile)?) } else { None },
             backdrop: compile(options.backdrop(samples))?,
             shade: if triangles { Some(compile(options.shade(samples))?) } else { None },
         })

@@ -123,6 +123,7 @@ impl SceneBuffers {
             shadow: shadow.unwrap_or_default(),
             sample_places: sample_places.to_vec(),
             resolve: super::post::resolve(&scene.look),
+            post_depth: gl.limits.post_depth,
         };
         let programs = Programs::compile(&options, &plan, &geometry.groups, compile)?;
         let samples = if sample_places.is_empty() { 1 } else { scene.look.samples_a_pixel() };
@@ -240,7 +241,11 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
         place.map_or([-1.0; 2], |(array, layer)| [array as f32, layer as f32])
     };
     let one = |material: &crate::domain::Material| {
-        let cutoff = if let AlphaMode::Mask { cutoff } = material.alpha_mode { cutoff } else { 0.0 };
+        let cutoff = match material.alpha_mode {
+            AlphaMode::Mask { cutoff } => cutoff,
+            AlphaMode::Blend => scene.look.opaque_alpha,
+            AlphaMode::Opaque => 0.0,
+        };
         let ([a, b], [c, d]) = (at(&images[0], material.colour_texture), at(&images[1], material.normal_texture));
         PackedMaterial {
             ambient_alpha: wide(material.ambient, material.alpha),

@@ -1,6 +1,7 @@
 //! Shader sources to programs: the files under `shaders/`, with the branches that a scene needs and no others.
 
 mod asked;
+pub(super) mod lists;
 
 pub(super) use self::asked::pick;
 
@@ -19,6 +20,7 @@ pub(super) const DRAWN: &str = include_str!("../../shaders/shared/drawn.glsl");
 const IDS: &str = include_str!("../../shaders/shared/ids.glsl");
 const CUT_OUT: &str = include_str!("../../shaders/shared/cut_out.glsl");
 pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
+const LISTS: &str = include_str!("../../shaders/shared/lists.glsl");
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../shaders/shared/ground.glsl");
 const PHONG: &str = include_str!("../../shaders/shared/phong.glsl");
@@ -40,9 +42,10 @@ pub(super) const UV_UNIT: u32 = 19;
 pub(super) const TANGENT_UNIT: u32 = 20;
 pub(super) const ID_UNIT: u32 = 21;
 pub(super) const LAYER_UNIT: u32 = 22;
+pub(super) const COUNT_UNIT: u32 = 23;
 pub(super) const VALUE_UNIT: u32 = 24;
 /// Textures that the shading reads beside the scene's images, at most.
-pub(super) const OTHER_READS: usize = 11;
+pub(super) const OTHER_READS: usize = 12;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Lanes of a compute workgroup, along x.
@@ -64,6 +67,8 @@ pub(super) struct Options {
     pub(super) sample_places: Vec<[f32; 2]>,
     /// What the shading makes of a sample's light.
     pub(super) resolve: String,
+    /// Whether a fragment can know its samples that pass the depth test.
+    pub(super) post_depth: bool,
 }
 
 /// A material that triangles have: what pipeline draws them, and the arrays that hold its images.
@@ -128,6 +133,11 @@ impl Options {
         self.used.iter().filter(|used| kinds.contains(&used.kind)).filter_map(image).collect()
     }
 
+    /// Whether parts of blended triangles are drawn as opaque.
+    pub(super) fn opaque_parts(&self) -> bool {
+        self.defines.contains(&"OPAQUE_PARTS")
+    }
+
     /// What depends on the samples a pixel.
     fn sampling(&self, samples: u32) -> String {
         let middle = vec![[0.5; 2]];
@@ -142,7 +152,7 @@ impl Options {
         let label = format!("visibility, {kind:?}, {samples} samples");
         let (vertex, body) =
             (include_str!("../../shaders/visibility.vert"), include_str!("../../shaders/visibility.frag"));
-        if kind != Kind::Mask {
+        if kind == Kind::Opaque {
             let head = self.head(&[]);
             return Source {
                 label,
@@ -155,13 +165,14 @@ impl Options {
         Source { label, stages: drawn([&head, FRAME, CLIP, vertex].concat(), fragment) }
     }
 
-    /// The layer of the blended triangles.
-    pub(super) fn blended(&self) -> Source {
+    /// The layer of the blended triangles, but for the parts that were drawn as opaque.
+    pub(super) fn blended(&self, samples: u32) -> Source {
         let head = self.head(&[]) + &self.branches(&[Kind::Blend]);
         let lookups = self.lookups(&[Kind::Blend], Slopes::OfTheQuad);
         let vertex = [&head, FRAME, CLIP, include_str!("../../shaders/blended.vert")].concat();
         let body = include_str!("../../shaders/blended.frag");
-        let fragment = [&head, FRAME, &lookups, DRAWN, &self.sun(), PHONG, body].concat();
+        let parts = if self.opaque_parts() { self.sampling(samples) + CUT_OUT } else { String::new() };
+        let fragment = [&head, FRAME, &lookups, DRAWN, &self.sun(), PHONG, &parts, body].concat();
         Source { label: "blended".into(), stages: drawn(vertex, fragment) }
     }
 
@@ -174,9 +185,10 @@ impl Options {
 
     /// Ids to light, in the other tiles.
     pub(super) fn shade(&self, samples: u32) -> Source {
-        let kinds = [Kind::Opaque, Kind::Mask];
-        let mut text = self.shading(samples, &[]) + &self.branches(&kinds);
-        text += &[&self.lookups(&kinds, Slopes::Given), PHONG, SHARES, TRIANGLE].concat();
+        let all = [Kind::Opaque, Kind::Mask, Kind::Blend];
+        let kinds = if self.opaque_parts() { &all } else { &all[..2] };
+        let mut text = self.shading(samples, &[]) + &self.branches(kinds);
+        text += &[&self.lookups(kinds, Slopes::Given), PHONG, SHARES, TRIANGLE].concat();
         text += include_str!("../../shaders/shade.comp");
         Source { label: format!("shade, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
@@ -255,7 +267,7 @@ mod tests {
         let sample_places = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
         let used = vec![Used { kind: Kind::Opaque, colour: None, normal: None }];
         let resolve = super::super::post::resolve(&scene.look);
-        Options { defines: plan.defines, used, shadow: Shadow::default(), sample_places, resolve }
+        Options { defines: plan.defines, used, shadow: Shadow::default(), sample_places, resolve, post_depth: false }
     }
 
     fn text(source: Source) -> String {
@@ -266,7 +278,7 @@ mod tests {
     fn only_cut_out_triangles_have_a_discard_in_their_shader_and_depth_alone_needs_no_fragment_shader() {
         let options = options(AlphaMode::Opaque);
         assert!(!text(options.visibility(Kind::Opaque, 4)).contains("discard;"));
-        assert!(!text(options.blended()).contains("discard;"));
+        assert!(!text(options.blended(4)).contains("discard;"));
         for (samples, masks) in [(4, true), (1, false)] {
             let text = text(options.visibility(Kind::Mask, samples));
             assert!(text.contains("discard;") && text.contains(&format!("SAMPLES {samples}")));
@@ -279,8 +291,8 @@ mod tests {
     fn the_shading_of_a_plain_scene_knows_no_image_no_shadow_no_ground_and_no_layer() {
         let plain = Options { defines: vec![], ..options(AlphaMode::Opaque) };
         let [backdrop, shading] = [plain.backdrop(4), plain.shade(4)].map(text);
-        assert!(!backdrop.contains("vec3 triangle_seen("), "no triangle, no shading of one");
-        assert!(shading.contains("vec3 triangle_seen("));
+        assert!(!backdrop.contains("vec4 triangle_seen("), "no triangle, no shading of one");
+        assert!(shading.contains("vec4 triangle_seen("));
         for text in [&backdrop, &shading] {
             assert!(!text.contains("vec3 ground(") && !text.contains("textureGrad"));
         }

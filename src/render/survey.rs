@@ -122,7 +122,13 @@ impl Renderer {
         };
         let drawn = gl.timed(|| {
             let ran = &mut Ran::default();
-            passes::identify(gl, buffers, (&surveyor.visible, [form.width, form.height]), cut_out.as_deref(), ran)?;
+            passes::identify(
+                gl,
+                buffers,
+                (&surveyor.visible, [form.width, form.height]),
+                (cut_out.as_deref(), None),
+                ran,
+            )?;
             passes::ground(gl, buffers, shot, ran)?;
             passes::words(
                 gl,

@@ -4,6 +4,7 @@
 use std::rc::Rc;
 
 use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
+use super::lists::ListTarget;
 use super::shaders::TILE;
 use crate::error::Result;
 use crate::scene::Look;
@@ -18,10 +19,19 @@ pub(super) struct Form {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) samples: u32,
-    /// Whether there is a layer for blended triangles.
-    pub(super) layered: bool,
+    pub(super) blended: Blended,
     /// Halvings of the picture through which light glows.
     pub(super) halvings: u32,
+}
+
+/// What a frame needs for blended triangles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Blended {
+    None,
+    /// A layer that is drawn over.
+    Drawn,
+    /// Lists of so many fragments.
+    Listed(u32),
 }
 
 /// The images and buffers of frames of one form.
@@ -32,6 +42,7 @@ pub(super) struct Target {
     pub(super) ids: Texture,
     pub(super) visible: Framebuffer,
     pub(super) layer: Option<Layer>,
+    pub(super) lists: Option<ListTarget>,
     /// The tiles that see triangles, after the numbers of the dispatch over them.
     pub(super) tiles: Buffer,
     /// Linear light, one value a pixel.
@@ -55,30 +66,35 @@ pub(super) struct Layer {
 
 impl Form {
     /// The form of a frame of a look.
-    pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &Look, layered: bool) -> Self {
+    pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &Look, blended: Blended) -> Self {
         let halvings = look.bloom.map_or(0, |bloom| bloom.levels);
-        Self { layered, halvings, ..Self::plain(gl, [width, height], look.samples_a_pixel()) }
+        Self { blended, halvings, ..Self::plain(gl, [width, height], look.samples_a_pixel()) }
     }
 
     /// The form of a frame of ids and depth alone, with as many samples a pixel as are wanted and fit.
     pub(super) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
-        Self { width, height, samples: if fits { wanted } else { 1 }, layered: false, halvings: 0 }
+        Self { width, height, samples: if fits { wanted } else { 1 }, blended: Blended::None, halvings: 0 }
     }
 }
 
 impl Target {
     pub(super) fn new(gl: &Rc<Gl>, form: Form) -> Result<Self> {
-        let Form { width, height, samples, layered, .. } = form;
+        let Form { width, height, samples, blended, .. } = form;
         let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
         let layer = |colour: Texture| Ok(Layer { framebuffer: gl.framebuffer(Some(&colour), &depth)?, colour });
-        let layer = if layered { Some(layer(image(gl, form, gl::RGBA16F)?)?) } else { None };
+        let layer = if blended == Blended::Drawn { Some(layer(image(gl, form, gl::RGBA16F)?)?) } else { None };
+        let lists = match blended {
+            Blended::Listed(budget) => Some(ListTarget::new(gl, form, budget, &depth)?),
+            Blended::None | Blended::Drawn => None,
+        };
         let bytes = 4 * u64::from(width) * u64::from(height);
         Ok(Self {
             form: Form { samples, ..form },
             visible: gl.framebuffer(Some(&ids), &depth)?,
             ids,
             layer,
+            lists,
             tiles: gl.buffer(
                 16 + 4 * u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE)),
                 gl::STREAM_COPY,
@@ -95,7 +111,7 @@ impl Target {
 
 /// Where the samples of a pixel of four lie in it; empty on a device that has no four.
 pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
-    let form = Form { width: 1, height: 1, samples: 4, layered: false, halvings: 0 };
+    let form = Form { width: 1, height: 1, samples: 4, blended: Blended::None, halvings: 0 };
     if gl.limits.max_samples < form.samples {
         return Ok(Vec::new());
     }

@@ -47,6 +47,23 @@ impl Default for Ground {
     }
 }
 
+/// Blended fragments that one frame may keep: they lie in one buffer, 8 bytes each, and one buffer has less than 2 GiB.
+pub const MAX_FRAGMENTS: u32 = (1 << 28) - 1;
+
+/// How blended triangles are drawn over what is opaque, and over each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Transparency {
+    /// The thesis's two passes (chapter 3.3): what reaches [`Look::opaque_alpha`] first, with depth; then the rest, blended
+    /// over that without writing depth. Blended triangles lie over each other in the order of the index buffer: those with
+    /// one side before those with two, then by domain, then by triangle.
+    TwoPass,
+    /// A list of all blended fragments in each pixel, sorted by depth: order does not matter. Depths are compared in the
+    /// middle of the pixel; of equal ones the later triangle of the index buffer lies in front.
+    #[default]
+    Exact,
+}
+
 /// Light, shadow, ground and sky. Colours are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -73,6 +90,13 @@ pub struct Look {
     /// Whether levels of 8 bits are mixed in a fixed pattern of 8 x 8 pixels, so that slow gradients show no bands. A pixel
     /// changes by one level at most, and one that lies on a level stays.
     pub dither: bool,
+    /// How blended triangles are drawn.
+    pub transparency: Transparency,
+    /// Two passes only: alpha from which a blended triangle counts as opaque, above 0; above 1 none does.
+    pub opaque_alpha: f32,
+    /// Exact only: blended fragments of a frame that are kept, 1 to 2^28 - 1; by default eight a pixel (2^20 at
+    /// least), as far as the device has buffers so large. Where a frame has more, every pixel keeps as many of its nearest as all pixels can.
+    pub fragments: Option<u32>,
 }
 
 impl Default for Look {
@@ -92,6 +116,9 @@ impl Default for Look {
             tone: Tone::None,
             exposure: 1.0,
             dither: false,
+            transparency: Transparency::default(),
+            opaque_alpha: 0.95,
+            fragments: None,
         }
     }
 }
@@ -111,6 +138,12 @@ impl Look {
         if ![1, 4].contains(&self.samples) {
             return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
         }
+        if !(self.opaque_alpha > 0.0 && self.opaque_alpha.is_finite()) {
+            return Err(invalid("look.opaque_alpha", "a number above 0", self.opaque_alpha));
+        }
+        if self.fragments.is_some_and(|fragments| !(1..=MAX_FRAGMENTS).contains(&fragments)) {
+            return Err(invalid("look.fragments", format!("1 to {MAX_FRAGMENTS}"), format!("{:?}", self.fragments)));
+        }
         self.check_post()?;
         self.shadow.map_or(Ok(()), |shadow| shadow.check())
     }
@@ -128,6 +161,20 @@ mod tests {
         for samples in [0, 2, 8, u32::MAX] {
             let refusal = Look { samples, ..Look::default() }.check().expect_err("refused").to_string();
             assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
+        }
+    }
+
+    #[test]
+    fn a_threshold_of_nothing_and_a_budget_of_nothing_or_beyond_a_buffer_are_refused() {
+        for opaque_alpha in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            let refusal = Look { opaque_alpha, ..Look::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.opaque_alpha: expected a number above 0, given {opaque_alpha}"));
+        }
+        for fragments in [0, MAX_FRAGMENTS + 1, u32::MAX] {
+            Look { fragments: Some(fragments), ..Look::default() }.check().expect_err("refused");
+        }
+        for fragments in [None, Some(1), Some(MAX_FRAGMENTS)] {
+            Look { fragments, opaque_alpha: 2.0, ..Look::default() }.check().expect("good");
         }
     }
 }

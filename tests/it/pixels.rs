@@ -2,6 +2,7 @@
 
 mod build;
 mod far;
+mod layers;
 mod limits;
 mod picking;
 mod post;

@@ -157,7 +157,8 @@ impl Texture {
         // SAFETY: level 0 of a texture whose format the shader names.
         unsafe {
             let gl = self.gl.on();
-            gl.bind_image_texture(unit, Some(self.name), 0, false, 0, access, self.kind.format);
+            let layered = self.kind.target == glow::TEXTURE_2D_ARRAY;
+            gl.bind_image_texture(unit, Some(self.name), 0, layered, 0, access, self.kind.format);
         }
     }
 }
@@ -173,6 +174,14 @@ impl Program {
                 gl.uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32);
             }
         }
+    }
+}
+
+impl Program {
+    /// Says which turn it takes: location 1 of those programs that take several, while it is in use.
+    pub(in crate::render) fn turn(&self, turn: i32) {
+        // SAFETY: a linked program, in use; location 1 is declared by the shaders that are given a turn.
+        unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), turn) }
     }
 }
 

@@ -218,8 +218,14 @@ mod tests {
             let shadow = Shadow { method, ..Shadow::default() };
             let names: Vec<&str> = defines(&shadow).collect();
             assert_eq!(names, ["SHADOWS", own]);
-            let options =
-                Options { defines: names, used: vec![], shadow, sample_places: vec![], resolve: String::new() };
+            let options = Options {
+                defines: names,
+                used: vec![],
+                shadow,
+                sample_places: vec![],
+                resolve: String::new(),
+                post_depth: false,
+            };
             assert_eq!(options.sun().contains("const float TAPS"), own == "FILTERED");
             assert!(
                 !options.sun().contains("SplitBlock")

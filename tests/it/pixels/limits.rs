@@ -38,7 +38,10 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
     for present in ["tangents", "uvs", "triangle materials"] {
         assert!(names(&rich.allocated).contains(&present.to_string()), "{present}");
     }
-    assert_eq!(rich.ran.passes, ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "encode"]);
+    assert_eq!(
+        rich.ran.passes,
+        ["shadow", "blur", "visibility", "ground", "count", "scan", "fill", "resolve", "backdrop", "shade", "encode"]
+    );
     let mut planned = plan(&scene).buffers;
     planned.sort_by(|a, b| a.name.cmp(&b.name));
     assert_eq!(rich.allocated, planned, "what is planned is what is allocated");

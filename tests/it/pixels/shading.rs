@@ -1,7 +1,7 @@
 //! Area, Phong, normal maps, cut-outs, blending, sky, and which way is up.
 
 use modalcast::domain::{AlphaMode, Material};
-use modalcast::scene::{Camera, Lens, View};
+use modalcast::scene::{Camera, Lens, Transparency, View};
 use nalgebra::Vector3;
 
 use super::build::{Stage, camera, close, draw, facing, open, picture};
@@ -190,11 +190,13 @@ fn two_blended_layers_equal_the_arithmetic() {
 }
 
 #[test]
-fn a_blended_layer_hides_none_behind_it_that_comes_later() {
+fn with_two_passes_a_blended_layer_hides_none_behind_it_that_comes_later() {
     let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..plain(diffuse) };
     let shown = |second: f32| {
         let first = facing(-2.0, -2.0, 2.0, 2.0, 0.0);
-        let scene = Stage::new()
+        let mut stage = Stage::new();
+        stage.0.look.transparency = Transparency::TwoPass;
+        let scene = stage
             .add(first, layer([1.0, 0.0, 0.0]))
             .add(facing(-2.0, -2.0, 2.0, 2.0, second), layer([0.0, 1.0, 0.0]))
             .scene();

@@ -1,0 +1,71 @@
+// One fragment of a blended triangle to its pixel's list. One program takes three turns, so that all see the same
+// fragments: they are counted; they are put in lists; and where a pixel has more than it may, ids join the depths that were
+// kept. What is behind opaque surfaces fails the depth test before; what is wholly transparent changes nothing.
+layout(early_fragment_tests) in;
+#if SAMPLES > 1 && defined(POST_DEPTH)
+// The samples that pass the depth test, rather than all that the triangle covers.
+layout(post_depth_coverage) in;
+#endif
+#ifdef TEXTURES
+centroid in vec2 uv_image;
+#endif
+layout(std430, binding = 2) buffer Records { uint records[]; };
+layout(location = 1) uniform int turn;
+const int COUNT = 0;
+const int FILL = 1;
+
+uint covered() {
+#if SAMPLES == 1
+    return 1u;
+#elif defined(POST_DEPTH)
+    return uint(gl_SampleMaskIn[0]) & 15u;
+#else
+    // Naming the sample runs this once for each that passes.
+    return 1u << gl_SampleID;
+#endif
+}
+
+// The nearest depths of a pixel, in order: each slot keeps the least that comes by and hands the rest on, so that in the
+// end all slots are sorted, whoever came first.
+void keep_depth(uint first, uint depth) {
+    for (uint index = 0u; index < ledger.most && depth != ALL; index++) {
+        uint there = atomicMin(records[2u * (first + index)], depth);
+        depth = max(there, depth);
+    }
+}
+
+// The same for ids, among slots of their depth: the latest first, and too many are dropped in that order.
+void keep_id(uint first, uint depth, uint word) {
+    for (uint index = 0u; index < ledger.most && word != 0u; index++) {
+        if (records[2u * (first + index)] != depth) continue;
+        uint there = atomicMax(records[2u * (first + index) + 1u], word);
+        word = min(there, word);
+    }
+}
+
+void main() {
+    float alpha = material_of(own_triangle()).ambient.a;
+#ifdef TEXTURES
+    ivec2 image = material_of(own_triangle()).images.xy;
+    vec4 texel = colour_texel(image, uv_image);
+    if (image.x >= 0) alpha *= texel.a;
+#endif
+    ivec2 at = ivec2(gl_FragCoord.xy);
+    uint depth = floatBitsToUint(abs(clamp(gl_FragCoord.z, 0.0, 1.0)));
+    uint word = uint(own_triangle()) + 1u << 4 | covered();
+    if (!(alpha > 0.0)) return;
+    if (turn == COUNT) {
+        imageAtomicAdd(counts, at, 1u);
+        return;
+    }
+    bool fits = imageLoad(counts, at).x <= ledger.most;
+    if (fits && turn == FILL) {
+        uint place = imageAtomicAdd(ends, at, 1u);
+        records[2u * place] = depth;
+        records[2u * place + 1u] = word;
+    }
+    if (fits) return;
+    uint first = imageLoad(ends, at).x;
+    if (turn == FILL) keep_depth(first, depth);
+    else keep_id(first, depth, word);
+}

@@ -1,0 +1,331 @@
+//! Exact transparency: a list of all blended fragments in each pixel, in bounded memory.
+//!
+//! Fragments are counted, each pixel is given room, the lists are filled in whatever order fragments come, and sorted by
+//! depth and id before they are blended: the picture does not depend on that order. The budget is in fragments. Where a
+//! frame has more, all pixels keep the same number of their nearest at most, the largest for which all fit; what is left
+//! out is counted.
+
+use std::rc::Rc;
+
+use bytemuck::{Pod, Zeroable};
+
+use super::Ran;
+use super::geometry::Kind;
+use super::gl::{self, Buffer, Clear, Fixed, Framebuffer, Gl, Limits, Program, Texture, TextureKind};
+use super::passes::{NO_TILES, TILES, bind_shadow};
+use super::scene_buffers::SceneBuffers;
+use super::shaders::lists::{BINS, TALLY};
+use super::shaders::{self, Options, TILE};
+use super::target::{Blended, Form};
+use crate::error::Result;
+use crate::scene::{Look, MAX_FRAGMENTS};
+
+const RECORDS: u32 = 2;
+const LEDGER: u32 = 3;
+const COUNTS: u32 = 1;
+const ENDS: u32 = 2;
+const LAYERS: u32 = 3;
+/// Bytes of a fragment: depth, and id with coverage.
+const RECORD_BYTES: u64 = 8;
+/// Fragments a pixel for which there is room by default, on average; and in a frame however small.
+const USUAL: u64 = 8;
+const FEWEST: u64 = 1 << 20;
+/// Turns of the gathering program.
+const COUNT: i32 = 0;
+const FILL: i32 = 1;
+const JOIN: i32 = 2;
+
+/// What a frame's lists held.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Lists {
+    /// Blended fragments that something opaque does not hide and that are not wholly transparent.
+    pub fragments: u64,
+    /// Those that fitted into the budget; the others, farthest in their pixels, are not in the picture.
+    pub kept: u64,
+    /// Fragments of the pixel with the most.
+    pub deepest: u32,
+    /// Fragments that a pixel could keep, where not all fitted.
+    pub bound: Option<u32>,
+}
+
+impl Lists {
+    /// Fragments that the picture lacks.
+    pub const fn dropped(&self) -> u64 {
+        self.fragments - self.kept
+    }
+}
+
+/// Twin of `Ledger` in `shaders/shared/lists.glsl`, up to its bins.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct Ledger {
+    total: [u32; 2],
+    deepest: u32,
+    most: u32,
+    used: u32,
+    budget: u32,
+    /// Count, instances, first index, base vertex, base instance of a draw.
+    commands: [[u32; 5]; 2],
+}
+
+const HEAD: usize = size_of::<Ledger>();
+const COMMANDS: usize = 24;
+const LEDGER_BYTES: usize = HEAD + 4 * BINS;
+const _: () = assert!(HEAD == 64, "Ledger differs from shaders/shared/lists.glsl");
+
+/// Programs of exact transparency.
+#[derive(Debug, Clone)]
+pub(super) struct ListPrograms {
+    gather: Rc<Program>,
+    tally: Rc<Program>,
+    place: Rc<Program>,
+    resolve: Rc<Program>,
+}
+
+/// Images and buffers of exact transparency for frames of one form.
+#[derive(Debug)]
+pub(super) struct ListTarget {
+    /// Blended fragments of each pixel.
+    pub(super) counts: Texture,
+    ends: Texture,
+    /// One layer of the array a sample.
+    pub(super) layers: Texture,
+    /// Clears the counts.
+    counted: Framebuffer,
+    /// Depth alone, to test against.
+    behind: Framebuffer,
+    records: Buffer,
+    ledger: Buffer,
+    /// The ledger's head where the host can read it.
+    told: Buffer,
+    tiles: Buffer,
+}
+
+/// The records that a frame may have.
+///
+/// # Errors
+/// `Invalid` when the look asks for more than the device has in one buffer.
+pub(super) fn budget(limits: &Limits, look: &Look, [width, height]: [u32; 2]) -> Result<u32> {
+    let most = u64::from(MAX_FRAGMENTS).min(limits.max_storage / RECORD_BYTES);
+    if let Some(fragments) = look.fragments {
+        let fits = u64::from(fragments) <= most;
+        return if fits { Ok(fragments) } else { Err(gl::too_large("look.fragments", most, fragments.into())) };
+    }
+    Ok((USUAL * u64::from(width) * u64::from(height)).max(FEWEST).min(most) as u32)
+}
+
+impl ListPrograms {
+    pub(super) fn compile(options: &Options, samples: u32, compile: &mut super::programs::Compile<'_>) -> Result<Self> {
+        Ok(Self {
+            gather: compile(options.gather(samples))?,
+            tally: compile(shaders::lists::tally())?,
+            place: compile(shaders::lists::place())?,
+            resolve: compile(options.resolve_lists(samples))?,
+        })
+    }
+}
+
+impl ListTarget {
+    pub(super) fn new(gl: &Rc<Gl>, form: Form, budget: u32, depth: &Texture) -> Result<Self> {
+        let Form { width, height, samples, .. } = form;
+        let image = |target: u32, format: u32, depth: u32| {
+            let texture = gl.texture(TextureKind { target, format, width, height, depth, levels: 1 })?;
+            texture.sampling(&[(gl::TEXTURE_MIN_FILTER, gl::NEAREST), (gl::TEXTURE_MAG_FILTER, gl::NEAREST)], 1.0);
+            Ok(texture)
+        };
+        let counts = image(gl::TEXTURE_2D, gl::R32UI, 1)?;
+        let tiles = u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE));
+        Ok(Self {
+            counted: gl.colour_framebuffer(&counts)?,
+            behind: gl.framebuffer(None, depth)?,
+            counts,
+            ends: image(gl::TEXTURE_2D, gl::R32UI, 1)?,
+            layers: image(gl::TEXTURE_2D_ARRAY, gl::RGBA16F, samples)?,
+            records: gl.buffer(RECORD_BYTES * u64::from(budget), gl::STREAM_COPY, None)?,
+            ledger: gl.buffer(LEDGER_BYTES as u64, gl::STREAM_COPY, None)?,
+            told: gl.buffer(HEAD as u64, gl::STREAM_READ, None)?,
+            tiles: gl.buffer(16 + 4 * tiles, gl::STREAM_COPY, None)?,
+        })
+    }
+
+    /// What the last frame's lists held, once its commands are done.
+    pub(super) fn tell(&self) -> Result<Lists> {
+        let bytes = self.told.read(HEAD)?;
+        let ledger: Ledger = bytemuck::pod_read_unaligned(&bytes);
+        let [low, high] = ledger.total.map(u64::from);
+        let bound = (ledger.most != u32::MAX).then_some(ledger.most);
+        Ok(Lists { fragments: high << 32 | low, kept: ledger.used.into(), deepest: ledger.deepest, bound })
+    }
+
+    fn bind(&self) {
+        self.counts.bind_image_both_ways(COUNTS);
+        self.ends.bind_image_both_ways(ENDS);
+        self.records.bind_storage(RECORDS);
+        self.ledger.bind_storage(LEDGER);
+        self.tiles.bind_storage(TILES);
+    }
+
+    /// An empty ledger: nothing is counted yet, and no pixel has more than it may.
+    fn empty(&self, buffers: &SceneBuffers) {
+        let mut commands = [[0; 5]; 2];
+        let blended = buffers.groups.iter().filter(|group| group.kind == Kind::Blend);
+        for (command, group) in commands.iter_mut().zip(blended) {
+            *command = [3 * group.triangles as u32, 0, 3 * group.first_triangle as u32, 0, 0];
+        }
+        let budget = (self.records.bytes / RECORD_BYTES) as u32;
+        let head = Ledger { total: [0; 2], deepest: 0, most: u32::MAX, used: 0, budget, commands };
+        let mut bytes = vec![0; LEDGER_BYTES];
+        bytes[..HEAD].copy_from_slice(bytemuck::bytes_of(&head));
+        self.ledger.write(&bytes);
+        self.tiles.write(bytemuck::cast_slice(&NO_TILES));
+    }
+}
+
+/// The layers of the blended triangles, before what is opaque, whose depth is there.
+pub(super) fn draw(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    (target, form): (&ListTarget, Form),
+    programs: &ListPrograms,
+    ran: &mut Ran,
+) -> Result<()> {
+    target.empty(buffers);
+    gl.begin(&target.counted, form.width, form.height, Clear::Words);
+    target.bind();
+    gather(gl, buffers, (target, form), (programs, COUNT), ran);
+    gl.check("count")?;
+    programs.tally.bind(None);
+    gl.dispatch(form.width.div_ceil(TALLY), form.height.div_ceil(TALLY));
+    programs.place.bind(None);
+    gl.dispatch(form.width.div_ceil(TILE), form.height.div_ceil(TILE));
+    gl.check("scan")?;
+    gather(gl, buffers, (target, form), (programs, FILL), ran);
+    gather(gl, buffers, (target, form), (programs, JOIN), ran);
+    gl.check("fill")?;
+    bind_shadow(buffers);
+    target.layers.bind_image(LAYERS);
+    programs.resolve.bind(None);
+    gl.dispatch_listed(&target.tiles);
+    gl.copy(&target.ledger, &target.told, HEAD as u64);
+    ran.passes.extend(PASSES);
+    gl.check("resolve")
+}
+
+/// The passes of exact transparency.
+pub(super) const PASSES: [&str; 4] = ["count", "scan", "fill", "resolve"];
+
+/// One turn of all blended triangles. The last is drawn as often as the ledger says: not at all where all fragments fit.
+fn gather(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    (target, form): (&ListTarget, Form),
+    (programs, turn): (&ListPrograms, i32),
+    ran: &mut Ran,
+) {
+    let Some(array) = buffers.array(Kind::Blend) else { return };
+    gl.begin(&target.behind, form.width, form.height, Clear::Nothing);
+    let groups = buffers.groups.iter().filter(|group| group.kind == Kind::Blend);
+    for (index, group) in groups.enumerate() {
+        gl.set(Fixed { cull: !group.double_sided, ..Fixed::default() });
+        programs.gather.bind(Some(group.first_triangle as u32));
+        programs.gather.turn(turn);
+        if turn == JOIN {
+            gl.draw_told(array, &target.ledger, COMMANDS + size_of::<[u32; 5]>() * index);
+        } else {
+            gl.draw_indexed(array, group.first_triangle, group.triangles);
+        }
+        ran.draws += 1;
+    }
+    gl.wait_for_stores();
+}
+
+/// What a look wants for the blended triangles of a frame.
+pub(super) fn wanted(gl: &Gl, scene: &crate::scene::Scene, size: [u32; 2]) -> Result<Blended> {
+    match scene.look.transparency {
+        _ if !scene.needs.blend => Ok(Blended::None),
+        crate::scene::Transparency::TwoPass => Ok(Blended::Drawn),
+        crate::scene::Transparency::Exact => budget(&gl.limits, &scene.look, size).map(Blended::Listed),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::geometry::tests::squares;
+    use super::super::{Prefer, Renderer, Shot};
+    use super::*;
+    use crate::deform::Surface;
+    use crate::domain::{AlphaMode, Material};
+    use crate::scene::{Bounds, Camera, Scene, Transparency};
+
+    #[test]
+    fn the_budget_is_eight_a_pixel_or_what_the_look_says_as_far_as_one_buffer_reaches() {
+        let limits = |max_storage: u64| Limits { max_storage, ..Limits::default() };
+        let of = |fragments: Option<u32>, max_storage: u64, size: [u32; 2]| {
+            budget(&limits(max_storage), &Look { fragments, ..Look::default() }, size)
+        };
+        assert_eq!(of(None, 1 << 31, [640, 480]).expect("fits"), 8 * 640 * 480);
+        assert_eq!(of(None, 1 << 31, [1, 1]).expect("fits"), 1 << 20);
+        assert_eq!(of(None, 1 << 27, [8192, 8192]).expect("less"), 1 << 24, "as many as fit");
+        assert_eq!(of(Some(100), 1 << 27, [8192, 8192]).expect("fits"), 100);
+        let refusal = of(Some(1 << 25), 1 << 27, [64, 64]).expect_err("refused").to_string();
+        assert_eq!(refusal, "look.fragments: expected at most 16777216 on this device, given 33554432");
+    }
+
+    /// A square of glass before and behind an opaque one, in squares of 64 pixels; and the renderer that drew it.
+    fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth: bool) -> (Vec<u8>, Renderer) {
+        let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
+        let mut parts =
+            squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);
+        // Without a shadow: light that changes within a pixel would tell where in it a fragment is shaded.
+        (parts.look.transparency, parts.look.shadow) = (transparency, None);
+        // Turned a little, so that edges cross pixels.
+        let corner = |z: f32, angle: f32, [x, y]: [f32; 2]| {
+            let (sine, cosine) = angle.sin_cos();
+            [cosine * x - sine * y, sine * x + cosine * y, z]
+        };
+        let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+        let positions: Vec<[f32; 3]> = [(0.0, 0.3), (0.3, 0.5), (-0.3, 0.7)]
+            .into_iter()
+            .flat_map(|(z, angle)| square.map(|at| corner(z, angle, at)))
+            .collect();
+        let mut bounds = Bounds::EMPTY;
+        positions.iter().for_each(|position| bounds.include(position.map(f64::from)));
+        let surface = Surface {
+            positions: positions.as_flattened().to_vec(),
+            normals: [0.0, 0.0, 1.0].repeat(positions.len()),
+            ..Surface::default()
+        };
+        let scene = Scene::new(parts).expect("good");
+        let mut renderer = Renderer::open(Prefer::Any).expect("EGL");
+        let gl = Rc::get_mut(&mut renderer.gl).expect("not shared yet");
+        gl.limits.post_depth &= post_depth;
+        let buffers = renderer.load(&scene).expect("loads");
+        renderer.upload(&buffers, &surface).expect("uploads");
+        let camera = Camera::framing(&scene, 64, 64);
+        let image = renderer.draw(&buffers, &Shot { camera, width: 64, height: 64, bounds }).expect("draws");
+        (image.rgba, renderer)
+    }
+
+    #[test]
+    fn a_fragment_a_pixel_with_its_samples_and_a_fragment_a_sample_give_the_same_picture() {
+        let (known, renderer) = drawn(Transparency::Exact, AlphaMode::Blend, true);
+        let (apart, other) = drawn(Transparency::Exact, AlphaMode::Blend, false);
+        let worst = known.iter().zip(&apart).map(|(a, b)| a.abs_diff(*b)).max();
+        assert!(worst <= Some(2), "{worst:?} levels");
+        let [few, many] = [&renderer, &other].map(|renderer| renderer.ran().lists.expect("exact").fragments);
+        assert!(!renderer.gl.limits.post_depth || many > 3 * few, "control: {few} and {many} fragments");
+    }
+
+    #[test]
+    fn only_the_method_that_the_look_names_is_compiled_and_neither_without_blended_triangles() {
+        let compiled = |transparency, alpha_mode| {
+            let (_, renderer) = drawn(transparency, alpha_mode, true);
+            let any = |name: &str| renderer.programs.keys().any(|source| source.label.starts_with(name));
+            (["gather", "tally", "place", "resolve"].map(any), any("blended"))
+        };
+        assert_eq!(compiled(Transparency::Exact, AlphaMode::Opaque), ([false; 4], false));
+        assert_eq!(compiled(Transparency::TwoPass, AlphaMode::Opaque), ([false; 4], false));
+        assert_eq!(compiled(Transparency::Exact, AlphaMode::Blend), ([true; 4], false));
+        assert_eq!(compiled(Transparency::TwoPass, AlphaMode::Blend), ([false; 4], true));
+    }
+}
