@@ -99,8 +99,8 @@ pub(super) fn load(
 ) -> Result<(Entry, Vec<Row>, Vec<File>)> {
     let stage = kind.stage()?;
     let camera = stage.camera(request.size);
-    let variants: Vec<Variant> =
-        variants::all(request.quick).into_iter().filter(|variant| request.wants(&variant.name)).collect();
+    let wanted = |variant: &Variant| variant.suits(kind) && request.wants(&variant.name);
+    let variants: Vec<Variant> = variants::all(request.quick).into_iter().filter(wanted).collect();
     progress(&format!("{}: tracing the references", stage.name));
     let begin = Instant::now();
     let references = references(studio, request, &stage, camera, &variants)?;

@@ -274,3 +274,19 @@ fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
         assert_eq!(picture.height(), 54, "{name}");
     }
 }
+
+#[test]
+fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farther_in_the_order_of_the_file() {
+    let request = Request {
+        loads: vec![Kind::Panes, Kind::Square],
+        variants: vec!["exact transparency".into(), "two-pass transparency".into()],
+        size: Size { width: 96, height: 54 },
+        quick: true,
+        replays: 20,
+    };
+    let report = render(&request, |_| {}).expect("a report");
+    let [exact, passes] = &report.rows[..] else { panic!("two rows, of the panes: {:?}", report.rows) };
+    let [near, far] = [exact, passes].map(|row| row.colour_of_aim.mean);
+    assert!(near < 1.0 && far > 3.0 * near, "{near} and {far} levels");
+    assert!(report.passed(), "{:?}", report.failed);
+}

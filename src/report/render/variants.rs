@@ -5,7 +5,7 @@
 use serde::Serialize;
 
 use super::loads::Kind;
-use crate::scene::{Blurring, Look, Moments, Shadow, ShadowMethod};
+use crate::scene::{Blurring, Look, Moments, Shadow, ShadowMethod, Transparency};
 
 /// How shadows are made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -51,6 +51,8 @@ pub struct Variant {
     pub name: String,
     pub method: Method,
     pub shadow: Option<Shadow>,
+    /// How blended triangles are drawn, where that is what is compared; else as the look of the load says.
+    pub transparency: Option<Transparency>,
     pub aim: Aim,
 }
 
@@ -71,7 +73,12 @@ const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
 impl Variant {
     /// The look of a scene as this variant draws it.
     pub fn look(&self, look: Look) -> Look {
-        Look { shadow: self.shadow, ..look }
+        Look { shadow: self.shadow, transparency: self.transparency.unwrap_or(look.transparency), ..look }
+    }
+
+    /// Whether a load has what it is about.
+    pub fn suits(&self, load: Kind) -> bool {
+        self.transparency.is_none() || load == Kind::Panes
     }
 
     /// What it must keep on a load.
@@ -91,13 +98,19 @@ impl Variant {
     }
 
     fn unshadowed() -> Self {
-        Self { name: "none".into(), method: Method::None, shadow: None, aim: Aim::Unshadowed }
+        Self { name: "none".into(), method: Method::None, shadow: None, transparency: None, aim: Aim::Unshadowed }
     }
 
     /// One map, hard: it means to show the hard shadow, whatever its texels.
     fn standard(size: u32) -> Self {
         let shadow = Shadow { method: ShadowMethod::Standard, size, ..Shadow::default() };
-        Self { name: format!("standard {size}"), method: Method::Standard, shadow: Some(shadow), aim: Aim::Hard }
+        Self {
+            name: format!("standard {size}"),
+            method: Method::Standard,
+            shadow: Some(shadow),
+            transparency: None,
+            aim: Aim::Hard,
+        }
     }
 
     /// A map whose answers are weighed by a bell of `blur` texels that moves with the point.
@@ -133,12 +146,17 @@ impl Variant {
     fn split(size: u32, splits: u32) -> Self {
         let shadow = Shadow { size, splits, ..Shadow::default() };
         let name = format!("variance {size}, {splits} splits");
-        Self { name, method: Method::Variance, shadow: Some(shadow), aim: Aim::Hard }
+        Self { name, method: Method::Variance, shadow: Some(shadow), transparency: None, aim: Aim::Hard }
+    }
+
+    /// Panes as this method blends them, without shadows.
+    fn blended(name: &str, transparency: Transparency) -> Self {
+        Self { name: name.into(), transparency: Some(transparency), ..Self::unshadowed() }
     }
 
     fn soft(name: String, method: Method, shadow: Shadow) -> Self {
         let aim = Aim::Filtered { texels: shadow.deviation() };
-        Self { name, method, shadow: Some(shadow), aim }
+        Self { name, method, shadow: Some(shadow), transparency: None, aim }
     }
 }
 
@@ -160,6 +178,8 @@ pub fn all(quick: bool) -> Vec<Variant> {
     for size in [1024, 4096] {
         all.extend(passes.map(|pass| Variant::blurred(size, pass)));
     }
+    all.push(Variant::blended("exact transparency", Transparency::Exact));
+    all.push(Variant::blended("two-pass transparency", Transparency::TwoPass));
     all
 }
 
@@ -173,6 +193,8 @@ fn few() -> Vec<Variant> {
         Variant::filtered(1024, BLURS[1]),
         Variant::f16(2048),
         Variant::split(1024, 3),
+        Variant::blended("exact transparency", Transparency::Exact),
+        Variant::blended("two-pass transparency", Transparency::TwoPass),
     ]
 }
 
@@ -181,14 +203,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_differ_and_only_the_shadow_of_a_look_changes() {
+    fn names_differ_and_only_the_shadow_of_a_look_changes_or_how_it_blends() {
         for quick in [false, true] {
             let all = all(quick);
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
-            assert_eq!((names.len(), all.len()), if quick { (8, 8) } else { (38, 38) });
+            assert_eq!((names.len(), all.len()), if quick { (10, 10) } else { (40, 40) });
             for variant in &all {
                 let look = variant.look(Look::default());
-                assert_eq!(Look { shadow: None, ..look }, Look { shadow: None, ..Look::default() });
+                let transparency = variant.transparency.unwrap_or_default();
+                assert_eq!(Look { shadow: None, ..look }, Look { shadow: None, transparency, ..Look::default() });
+                assert!(variant.suits(Kind::Panes) && variant.suits(Kind::Tree) == variant.transparency.is_none());
                 assert_eq!(look.shadow.is_none(), variant.aim == Aim::Unshadowed);
             }
         }
