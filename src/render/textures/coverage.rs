@@ -112,20 +112,6 @@ mod tests {
     }
 
     #[test]
-    fn the_leaves_of_the_tree_keep_their_size() {
-        let scene = crate::load::open("tree").expect("built in");
-        let material = scene.materials.iter().find(|material| material.name.contains("leaf")).expect("it has leaves");
-        let index = material.colour_texture.expect("with an image");
-        let cutoff = super::super::cutoff(&scene, index).expect("a cut-out");
-        let off = |kept: bool| {
-            let shares = shares(&scene.textures[index], cutoff, kept);
-            shares[..8].iter().map(|share| (share - shares[0]).abs()).fold(0.0, f32::max)
-        };
-        // Of 256 texels a side down to two: an average of two texels a side leaves all, where half is right.
-        assert!(off(true) < 0.01 && off(false) > 0.4, "{} and without {}", off(true), off(false));
-    }
-
-    #[test]
     fn only_images_that_nothing_but_cut_outs_reads_have_a_cutoff() {
         use super::super::super::geometry::tests::squares;
         use crate::domain::{AlphaMode, Material};
