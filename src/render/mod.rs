@@ -104,7 +104,8 @@ pub struct Image {
     pub height: u32,
     pub rgba: Vec<u8>,
     /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "blur" of the shadow,
-    /// "visibility" (with the ground), "blended", "shade" (with the backdrop) and "encode" of drawing.
+    /// "visibility" (with the ground), "blended" (lists and all), "shade" (with the backdrop), "bloom" and "encode" of
+    /// drawing.
     pub passes: Vec<(&'static str, f64)>,
 }
 

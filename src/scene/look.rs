@@ -95,7 +95,8 @@ pub struct Look {
     /// Two passes only: alpha from which a blended triangle counts as opaque, above 0; above 1 none does.
     pub opaque_alpha: f32,
     /// Exact only: blended fragments of a frame that are kept, 1 to 2^28 - 1; by default eight a pixel (2^20 at
-    /// least), as far as the device has buffers so large. Where a frame has more, every pixel keeps as many of its nearest as all pixels can.
+    /// least), as far as the device has buffers so large. Where a frame has more, every pixel keeps as many of its
+    /// nearest as all pixels can.
     pub fragments: Option<u32>,
 }
 
