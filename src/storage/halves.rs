@@ -78,7 +78,7 @@ impl Products {
     ///
     /// A tensor core multiplies exactly, aligns all terms and the sum before to the largest of them, and truncates
     /// (Fasi, Higham, Mikaitis, Pranesh, Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 7:e330,
-    /// 2021). So no product loses more than [`TRUNCATIONS`] units of the sum of all magnitudes, and there are two for
+    /// 2021). So no product loses more than `TRUNCATIONS` units of the sum of all magnitudes, and there are two for
     /// every 16 modes.
     pub fn of(storage: Storage, rank: usize) -> Self {
         let coordinate = f64::from(if storage == Storage::F16 { -22_i8 } else { -16 }).exp2();

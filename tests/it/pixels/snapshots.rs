@@ -35,6 +35,7 @@ fn the_tree_looks_as_it_did() {
 }
 
 /// Stated tolerance, in levels of 255, between renderers: in a picture so small most pixels of the leaves are edges, and
-/// drivers round slopes of texture coordinates and samples of edges differently.
-const MEAN: f64 = 3.0;
-const HIGH: u8 = 64;
+/// drivers round slopes of texture coordinates and samples of edges differently. An NVIDIA H200 (driver 580.159.04) is 5.6 off
+/// llvmpipe on average, and 97 at the 99th percentile.
+const MEAN: f64 = 7.0;
+const HIGH: u8 = 128;
