@@ -5,8 +5,8 @@
 //   transforms [VECTORS][3] float4: the rows of T; zeros where there is no domain                       (in)
 //   q          [modes][VECTORS], times the factor of the mode with STORE_F16 and STORE_BF16; likewise   (in)
 //   positions  [vertices][3] f32; domain b begins at vertex `first[b]`                                  (out)
-// Launch: a block of WARPS warps for each tile, with shared memory for WARPS Own, T and q (src/gpu/batch.rs).
-// CPU twin: the tests of src/gpu/batch.rs.
+// Launch: a block of WARPS warps for each tile, with shared memory for WARPS Own, T and q (src/gpu/trials/batch.rs).
+// CPU twin: the tests of src/gpu/trials/batch.rs.
 //
 // The modes are summed in their order, from +0, by fused multiply-adds, as `deform` does: the same bits. What is not
 // finite in f32 is computed again in f64.
@@ -51,7 +51,7 @@ constexpr unsigned STAGE_WORDS = ROWS * QUADS;
 // Chunks whose loads and sums are interleaved: two modes at least.
 constexpr unsigned TOGETHER = CHUNK_MODES < 2 ? 2 : 1;
 
-// Twin: src/gpu/batch.rs.
+// Twin: src/gpu/trials/batch.rs.
 struct BatchArgs {
     const uint4* words;
     const float4* rest;
@@ -65,14 +65,14 @@ struct BatchArgs {
     unsigned chunks;
     unsigned aligned; // whether every domain begins at 16 bytes
 };
-static_assert(sizeof(BatchArgs) == 128, "BatchArgs differs from src/gpu/batch.rs");
+static_assert(sizeof(BatchArgs) == 128, "BatchArgs differs from src/gpu/trials/batch.rs");
 
 // What a warp has of shared memory: a ring of stages, which leaves when x comes, and x0.
 struct Own {
     uint4 ring[STAGES * STAGE_WORDS];
     float4 rest[3 * QUADS];
 };
-static_assert(sizeof(Own) == 9984, "Own differs from src/gpu/batch.rs");
+static_assert(sizeof(Own) == 9984, "Own differs from src/gpu/trials/batch.rs");
 
 __device__ __forceinline__ unsigned lane_of() {
     return threadIdx.x % 32;

@@ -1,4 +1,4 @@
-//! Normals by the inverse transpose of A, tangents by A, both of unit length. Twin of `kernels/orient.cu`.
+//! Normals by the inverse transpose of A, tangents by A, both of unit length. Twin of `kernels/orient.cuh`.
 
 use nalgebra::{Matrix3, Vector3};
 
