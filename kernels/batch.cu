@@ -1,12 +1,15 @@
-// x = T_b (x0 + U q_b) for up to VECTORS domains b of one shape: U is read once for all of them. Only trials use it.
+// x = T_b (x0 + U q_b) for domains b that share a shape, up to VECTORS at once: their U is read once for all of them.
+//   blocks     the work of each block: a group of domains, and a tile of their shape (layout.cuh)       (in)
+//   groups     domains of one shape, and where its U and x0 lie                                         (in)
+//   members    the domains of all groups                                                                (in)
 //   words      U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                             (in)
-//   rest       x0, [quads][12] f32: 4 x, 4 y, 4 z                                                       (in)
-//   scales     with STORE_INT8: [tiles][modes], whole chunks of modes                                   (in)
-//   transforms [VECTORS][3] float4: the rows of T; zeros where there is no domain                       (in)
-//   q          [modes][VECTORS], times the factor of the mode with STORE_F16 and STORE_BF16; likewise   (in)
-//   positions  [vertices][3] f32; domain b begins at vertex `first[b]`                                  (out)
-// Launch: a block of WARPS warps for each tile, with shared memory for WARPS Own, T and q (src/gpu/trials/batch.rs).
-// CPU twin: the tests of src/gpu/trials/batch.rs.
+//   rest       x0, per tile [3][width][4] f32                                                           (in)
+//   scales     with STORE_INT8: per tile of U and mode                                                  (in)
+//   transforms, following, frames, q   as `deform` has them                                             (in)
+//   positions  [vertices][3] f32, in the header                                                         (out)
+//   boxes      [tiles of deform][4][6] u32, as `deform` writes them                                     (out)
+// Launch: a block of WARPS warps for each tile of each group, with shared memory for WARPS Own, T, members and q.
+// CPU twin: the tests of src/gpu/batch.rs.
 //
 // The modes are summed in their order, from +0, by fused multiply-adds, as `deform` does: the same bits. What is not
 // finite in f32 is computed again in f64.
@@ -19,7 +22,8 @@
 // the memory busy only if loads in flight need no registers: U goes to shared memory by asynchronous copies,
 // STAGES * 3 KB a warp ahead, 144 KB a multiprocessor, where a latency of 1 us at 5 TB/s needs 38 KB.
 #include "chunk.cuh"
-#include "layout.cuh"
+#include "follow.cuh"
+#include "ordered.cuh"
 
 #if defined(BATCH_4)
 constexpr unsigned VECTORS = 4;
@@ -28,7 +32,6 @@ constexpr unsigned VECTORS = 8;
 #else
 constexpr unsigned VECTORS = 16;
 #endif
-constexpr unsigned MOST = 16;
 // Blocks that a multiprocessor is to hold: as many as registers allow, where shared memory is as large as that.
 #if __CUDA_ARCH__ == 900
 constexpr unsigned RESIDENT = VECTORS == 16 ? 8 : 10;
@@ -51,28 +54,12 @@ constexpr unsigned STAGE_WORDS = ROWS * QUADS;
 // Chunks whose loads and sums are interleaved: two modes at least.
 constexpr unsigned TOGETHER = CHUNK_MODES < 2 ? 2 : 1;
 
-// Twin: src/gpu/trials/batch.rs.
-struct BatchArgs {
-    const uint4* words;
-    const float4* rest;
-    const float* scales;
-    const float4* transforms;
-    const float4* q;
-    float* positions;
-    unsigned first[MOST]; // packed vertex of each domain
-    unsigned domains;
-    unsigned vertices; // of the shape
-    unsigned chunks;
-    unsigned aligned; // whether every domain begins at 16 bytes
-};
-static_assert(sizeof(BatchArgs) == 128, "BatchArgs differs from src/gpu/trials/batch.rs");
-
 // What a warp has of shared memory: a ring of stages, which leaves when x comes, and x0.
 struct Own {
     uint4 ring[STAGES * STAGE_WORDS];
     float4 rest[3 * QUADS];
 };
-static_assert(sizeof(Own) == 9984, "Own differs from src/gpu/trials/batch.rs");
+static_assert(sizeof(Own) == 9984, "Own differs from src/gpu/batch.rs");
 
 __device__ __forceinline__ unsigned lane_of() {
     return threadIdx.x % 32;
@@ -109,63 +96,103 @@ __device__ __forceinline__ void wait_for_all_but() {
     __syncwarp();
 }
 
-// A warp's part of a tile.
+// A warp's part of a tile. It lies in shared memory and is read anew between barriers: summing takes all registers.
 struct Part {
     const uint4* words; // of its first quad
+    const float4* rest; // likewise
     unsigned width;     // quads of the tile
     unsigned quads;     // of the part; 0 without any
-    unsigned rest;      // its first quad
     unsigned first;     // its first vertex in the shape
     unsigned vertices;
+    unsigned chunks;
+    unsigned members;
+    unsigned first_member;
+    unsigned first_scale; // of the tile
+    unsigned tile;
+    unsigned reserved[3];
 };
 
+// What the warps of a block share: T and the members themselves, zeros where there is no domain; q follows,
+// [modes][VECTORS] numbers times the tile's scales.
+struct Common {
+    Affine transforms[VECTORS];
+    Member members[VECTORS];
+    Part parts[WARPS];
+};
+static_assert(sizeof(Common) == 64 * (VECTORS + WARPS), "Common differs from src/gpu/batch.rs");
+
+__device__ __forceinline__ Own& own_of(uint4* shared) {
+    return ((Own*)shared)[threadIdx.x / 32];
+}
+
+__device__ __forceinline__ Common& common_of(uint4* shared) {
+    return *(Common*)((Own*)shared + WARPS);
+}
+
+__device__ __forceinline__ float4* q_of(uint4* shared) {
+    return (float4*)(&common_of(shared) + 1);
+}
+
 __device__ __forceinline__ Part part_of(const BatchArgs& args) {
-    const unsigned before = QUADS * (threadIdx.x / 32), tile = TILE_QUADS * blockIdx.x;
+    const uint2 block = __ldg((const uint2*)(args.blocks + blockIdx.x));
+    const uint4 head = __ldg((const uint4*)(args.groups + block.x));
+    const uint4 tail = __ldg((const uint4*)(args.groups + block.x) + 1);
+    const unsigned vertices = tail.x, before = QUADS * (threadIdx.x / 32), quad = TILE_QUADS * block.y;
     Part part;
-    part.width = min(TILE_QUADS, (args.vertices + 3) / 4 - tile);
+    part.tile = block.y;
+    part.chunks = tail.z;
+    part.members = tail.w;
+    part.first_member = tail.y;
+    part.first_scale = head.w + part.chunks * CHUNK_MODES * block.y;
+    part.width = min(TILE_QUADS, (vertices + 3) / 4 - quad);
     part.quads = part.width > before ? min(QUADS, part.width - before) : 0;
-    part.rest = tile + before;
-    part.first = 4 * part.rest;
-    part.vertices = part.quads > 0 ? min(VERTICES, args.vertices - part.first) : 0;
-    part.words = args.words + 3 * (size_t)args.chunks * tile + before;
+    part.first = 4 * (quad + before);
+    part.vertices = part.quads > 0 ? min(VERTICES, vertices - part.first) : 0;
+    part.words = args.words + (head.x | (unsigned long long)head.y << 32) + 3 * (size_t)part.chunks * quad + before;
+    part.rest = args.rest + 3 * ((size_t)head.z + quad) + before;
     return part;
 }
 
 // Starts the copies of a stage, [row][quad]. Lanes beyond the last quad copy that one again.
-__device__ __forceinline__ void copy_stage(const BatchArgs& args, const Part& part, Own& own, unsigned stage) {
+__device__ __forceinline__ void copy_stage(const Part& part, Own& own, unsigned stage) {
     const unsigned row = ROWS * stage + lane_of() / QUADS;
     const uint4* from = part.words + (size_t)row * part.width + min(lane_of() % QUADS, part.quads - 1);
     uint4* to = own.ring + stage % STAGES * STAGE_WORDS + lane_of();
 #pragma unroll
     for (unsigned i = 0; i < STAGE_WORDS / 32; ++i) {
-        copy(to + 32 * i, from + i * (32 / QUADS) * part.width, row + i * (32 / QUADS) < 3 * args.chunks);
+        copy(to + 32 * i, from + i * (32 / QUADS) * part.width, row + i * (32 / QUADS) < 3 * part.chunks);
     }
 }
 
-__device__ __forceinline__ void copy_rest(const BatchArgs& args, const Part& part, Own& own) {
+// x0, [axis][quad].
+__device__ __forceinline__ void copy_rest(const Part& part, Own& own) {
 #pragma unroll
     for (unsigned i = lane_of(); i < lane_of() + 3 * QUADS; i += 32) {
-        copy(own.rest + i, args.rest + 3 * (size_t)part.rest + min(i, 3 * part.quads - 1), i < 3 * QUADS);
+        const float4* from = part.rest + i / QUADS * part.width + min(i % QUADS, part.quads - 1);
+        copy(own.rest + i, from, i < 3 * QUADS);
     }
 }
 
-// T and q, the same for all of a block; q times the tile's scales.
-__device__ __forceinline__ void load_values(const BatchArgs& args, float4* transforms, float4* q) {
-    for (unsigned i = threadIdx.x; i < 3 * VECTORS; i += 32 * WARPS) {
-        transforms[i] = __ldg(args.transforms + i);
+// T, members and q, the same for all of a block.
+__device__ __forceinline__ void load_values(const BatchArgs& args, const Part& part, Common& common, float* q) {
+    const unsigned own = threadIdx.x % VECTORS;
+    Member member = {};
+    if (own < part.members) {
+        const uint4 words = __ldg((const uint4*)(args.members + part.first_member + own));
+        member = {words.x, words.y, words.z, words.w};
     }
-    const unsigned modes = args.chunks * CHUNK_MODES;
-#pragma unroll 1
-    for (unsigned i = threadIdx.x; i < modes * (VECTORS / 4); i += 32 * WARPS) {
-        float4 four = __ldg(args.q + i);
+    if (threadIdx.x < VECTORS) {
+        common.members[own] = member;
+        common.transforms[own] = own < part.members ? place_of(transforms_of(args), member.domain) : Affine{};
+    }
+    const unsigned modes = part.chunks * CHUNK_MODES;
+#pragma unroll 4
+    for (unsigned mode = threadIdx.x / VECTORS; mode < modes; mode += 32 * WARPS / VECTORS) {
+        float amount = own < part.members ? __ldg(args.q + member.first_q + mode) : 0.0f;
 #ifdef STORE_INT8
-        const float scale = __ldg(args.scales + (size_t)blockIdx.x * modes + i / (VECTORS / 4));
-        four.x *= scale;
-        four.y *= scale;
-        four.z *= scale;
-        four.w *= scale;
+        amount *= __ldg(args.scales + part.first_scale + mode);
 #endif
-        q[i] = four;
+        q[mode * VECTORS + own] = amount;
     }
 }
 
@@ -225,15 +252,14 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const f
 }
 
 // All modes, stage by stage; the ring is full when this begins.
-__device__ __forceinline__ void sum_modes(const BatchArgs& args, const Part& part, Own& own, const float4* q,
-                                          Sums& sums) {
+__device__ __forceinline__ void sum_modes(const Part& part, Own& own, const float4* q, Sums& sums) {
     const unsigned offset = 16 * (lane_of() / 2) + 2 * ENTRY_BYTES * (lane_of() % 2);
-    const unsigned stages = (args.chunks + STAGE_CHUNKS - 1) / STAGE_CHUNKS;
+    const unsigned stages = (part.chunks + STAGE_CHUNKS - 1) / STAGE_CHUNKS;
 #pragma unroll 1
     for (unsigned stage = 0; stage < stages; ++stage) {
         wait_for_all_but<STAGES - 1>();
         const char* chunk = (const char*)(own.ring + stage % STAGES * STAGE_WORDS) + offset;
-        const unsigned count = min(STAGE_CHUNKS, args.chunks - STAGE_CHUNKS * stage);
+        const unsigned count = min(STAGE_CHUNKS, part.chunks - STAGE_CHUNKS * stage);
 #pragma unroll TOGETHER
         for (unsigned i = 0; i < count; ++i) {
             add_chunk(sums, chunk, q);
@@ -242,31 +268,46 @@ __device__ __forceinline__ void sum_modes(const BatchArgs& args, const Part& par
         }
         __syncwarp();
         if (stage + STAGES < stages) {
-            copy_stage(args, part, own, stage + STAGES);
+            copy_stage(part, own, stage + STAGES);
         }
         end_group();
     }
-}
-
-__device__ __forceinline__ float placed(const float4& row, float x, float y, float z) {
-    return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
 // x0 of a lane's two vertices.
 struct Base {
     float2 x, y, z;
     __device__ __forceinline__ void load(const Own& own) {
-        const float* from = (const float*)(own.rest + 3 * (lane_of() / 2)) + 2 * (lane_of() % 2);
+        const float* from = (const float*)(own.rest + lane_of() / 2) + 2 * (lane_of() % 2);
         x = *(const float2*)from;
-        y = *(const float2*)(from + 4);
-        z = *(const float2*)(from + 8);
+        y = *(const float2*)(from + 4 * QUADS);
+        z = *(const float2*)(from + 8 * QUADS);
     }
 };
 
+// Of a lane's two vertices, those that are there.
+__device__ __forceinline__ unsigned count_of(const Part& part) {
+    return part.vertices > 2 * lane_of() ? min(2u, part.vertices - 2 * lane_of()) : 0;
+}
+
+// The box of one domain's vertices of this warp, where `deform` puts those of the same half of the tile.
+__device__ __forceinline__ void store_box(const BatchArgs& args, const Part& part, const Member& member,
+                                          const unsigned (&keys)[6]) {
+    unsigned* boxes = args.boxes + 24 * (size_t)(member.first_tile + part.tile) + 12 * (threadIdx.x / 32);
+#pragma unroll
+    for (unsigned side = 0; side < 6; ++side) {
+        const unsigned key = warp_max(keys[side]);
+        if (lane_of() < 12 && lane_of() % 6 == side) {
+            boxes[lane_of()] = key;
+        }
+    }
+}
+
 // Puts x of a lane's two vertices at its place of a stage, [vertex][3]. `total` stays zero while all are finite.
-__device__ __forceinline__ void stage_domain(const Base& base, const float4* rows, const Sums& sums, unsigned domain,
+__device__ __forceinline__ void stage_domain(const Base& base, const Common& common, const Sums& sums, unsigned domain,
                                              float* staged, float& total) {
-    const float4 a = rows[0], b = rows[1], c = rows[2];
+    const Affine& t = common.transforms[domain];
+    const float4 a = t.a, b = t.b, c = t.c;
     float world[6];
 #pragma unroll
     for (unsigned i = 0; i < 2; ++i) {
@@ -283,114 +324,150 @@ __device__ __forceinline__ void stage_domain(const Base& base, const float4* row
     }
 }
 
+// The box of what a lane staged, from there: while it staged, registers were short.
+__device__ __forceinline__ void box_domain(const BatchArgs& args, const Part& part, const Member& member,
+                                           const float* staged) {
+    unsigned keys[6] = {};
+    const unsigned count = count_of(part);
+    if (count > 0) {
+        const float* world = staged + 6 * lane_of();
+#pragma unroll
+        for (unsigned axis = 0; axis < 3; ++axis) {
+            const float first = world[axis], second = count > 1 ? world[3 + axis] : first;
+            keys[axis] = ordered(-fminf(first, second));
+            keys[3 + axis] = ordered(fmaxf(first, second));
+        }
+    }
+    store_box(args, part, member, keys);
+}
+
+// No load moves across: side by side, what they bring would take more registers than there are.
+__device__ __forceinline__ void part_loads() {
+    __syncwarp();
+}
+
 // Writes what two domains staged, 48 words of 16 bytes each.
 __device__ __forceinline__ void store_both(float* first, float* second, const float4* staged) {
     const unsigned lane = lane_of();
     float4 *low = (float4*)first, *high = (float4*)second;
     __stcs(low + lane, staged[lane]);
+    part_loads();
     __stcs(lane < 16 ? low + 32 + lane : high + lane - 16, staged[32 + lane]);
+    part_loads();
     __stcs(high + 16 + lane, staged[64 + lane]);
 }
 
-__device__ __forceinline__ float* place_of(const BatchArgs& args, const Part& part, unsigned domain) {
-    return args.positions + 3 * ((size_t)args.first[domain] + part.first);
+__device__ __forceinline__ float* home_of(const BatchArgs& args, const Part& part, const Member& member) {
+    return args.header->positions + 3 * ((size_t)member.first + part.first);
 }
 
 // The same, number by number.
-__device__ __forceinline__ void store_numbers(const BatchArgs& args, const Part& part, unsigned domain,
-                                              const float* staged) {
+__device__ __forceinline__ void store_numbers(const BatchArgs& args, const Part& part, const Common& common,
+                                              unsigned domain, const float* staged) {
     const unsigned numbers = 3 * part.vertices;
 #pragma unroll 1
-    for (unsigned i = 0; i < 2 && domain + i < args.domains; ++i) {
+    for (unsigned i = 0; i < 2 && domain + i < part.members; ++i) {
+        float* to = home_of(args, part, common.members[domain + i]);
 #pragma unroll 1
         for (unsigned k = lane_of(); k < numbers; k += 32) {
-            __stcs(place_of(args, part, domain + i) + k, staged[i * 3 * VERTICES + k]);
+            __stcs(to + k, staged[i * 3 * VERTICES + k]);
         }
     }
 }
 
 // Two domains at a time, by turns through two halves of the ring: lanes write when all have read what was there.
-__device__ __forceinline__ void place(const BatchArgs& args, const Part& part, Own& own, const float4* transforms,
+__device__ __forceinline__ void put(const BatchArgs& args, const Part& part, Own& own, const Common& common,
                                       const Sums& sums, float& total) {
-    Base base;
-    base.load(own);
-    const bool is_whole = args.aligned && part.vertices == VERTICES;
 #pragma unroll
     for (unsigned domain = 0; domain < VECTORS; domain += 2) {
-        if (domain < args.domains) {
+        if (domain < part.members) {
+            const bool are_two = domain + 1 < part.members;
             float* staged = (float*)own.ring + domain / 2 % 2 * (2 * 3 * VERTICES);
-#pragma unroll
-            for (unsigned i = 0; i < 2; ++i) {
-                stage_domain(base, transforms + 3 * (domain + i), sums, domain + i, staged + i * 3 * VERTICES, total);
+            Base base;
+            base.load(own);
+            stage_domain(base, common, sums, domain, staged, total);
+            part_loads();
+            if (CHUNK_MODES == 2) {
+                // Sums of two modes leave no registers to keep x0 in.
+                base.load(own);
+            }
+            // Zeros, if it is not there.
+            stage_domain(base, common, sums, domain + 1, staged + 3 * VERTICES, total);
+            const Member &low = common.members[domain], &high = common.members[domain + 1];
+            box_domain(args, part, low, staged);
+            if (are_two) {
+                box_domain(args, part, high, staged + 3 * VERTICES);
             }
             __syncwarp();
-            if (is_whole && domain + 1 < args.domains) {
-                store_both(place_of(args, part, domain), place_of(args, part, domain + 1), (const float4*)staged);
+            if (are_two && part.vertices == VERTICES && (low.first | high.first) % 4 == 0) {
+                store_both(home_of(args, part, low), home_of(args, part, high), (const float4*)staged);
             } else {
-                store_numbers(args, part, domain, staged);
+                store_numbers(args, part, common, domain, staged);
             }
         }
     }
 }
 
 // x of one vertex of this lane in f64, rounded once.
-__device__ __noinline__ float3 placed_exactly(const BatchArgs& args, const float4* transforms, const float* q,
-                                              unsigned vertex) {
-    const Part part = part_of(args);
+__device__ __forceinline__ float3 summed_exactly(const BatchArgs& args, const Part& part, const Member& member,
+                                                 const float* q, unsigned vertex) {
     const unsigned quad = lane_of() / 2, within = 2 * (lane_of() % 2) + vertex;
     double bent[3];
     for (unsigned axis = 0; axis < 3; ++axis) {
         double sum = 0.0;
-        for (unsigned chunk = 0; chunk < args.chunks; ++chunk) {
+        for (unsigned chunk = 0; chunk < part.chunks; ++chunk) {
             const uint4* words = part.words + quad + chunk * 3 * (size_t)part.width;
             for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
                 const float amount = q[(chunk * CHUNK_MODES + mode) * VECTORS];
                 sum += (double)entry_at(words, part.width, mode, axis, within) * (double)amount;
             }
         }
-        bent[axis] = (double)((const float*)(args.rest + 3 * (size_t)(part.rest + quad)))[4 * axis + within] + sum;
+        bent[axis] = (double)((const float*)(part.rest + axis * part.width + quad))[within] + sum;
     }
-    float placed[3];
-    for (unsigned axis = 0; axis < 3; ++axis) {
-        const float4 row = transforms[axis];
-        placed[axis] = (float)(row.x * bent[0] + row.y * bent[1] + row.z * bent[2] + row.w);
-    }
-    return make_float3(placed[0], placed[1], placed[2]);
+    return placed_exactly(transforms_of(args), member.domain, bent);
 }
 
-// Computes anew what this lane's vertices have that is not finite, and writes it over what the warp wrote.
-__device__ __noinline__ void mend(const BatchArgs& args, const float4* transforms, const float* q) {
-    const Part part = part_of(args);
-    const unsigned before = 2 * lane_of();
-    for (unsigned domain = 0; domain < args.domains; ++domain) {
-        for (unsigned vertex = 0; vertex < 2 && before + vertex < part.vertices; ++vertex) {
-            float* at = place_of(args, part, domain) + 3 * (before + vertex);
+// Computes anew what a warp has that is not finite, over what it wrote, and the boxes of all its domains: a NaN wins.
+__device__ __noinline__ void mend(const BatchArgs& args, const Common& common, const float* q) {
+    const Part& part = common.parts[threadIdx.x / 32];
+    const unsigned count = count_of(part);
+    for (unsigned domain = 0; domain < part.members; ++domain) {
+        const Member& member = common.members[domain];
+        float* at = home_of(args, part, member) + 6 * lane_of();
+        unsigned keys[6] = {};
+        for (unsigned vertex = 0; vertex < count; ++vertex, at += 3) {
             if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
-                const float3 exact = placed_exactly(args, transforms + 3 * domain, q + domain, vertex);
+                const float3 exact = summed_exactly(args, part, member, q + domain, vertex);
                 at[0] = exact.x;
                 at[1] = exact.y;
                 at[2] = exact.z;
             }
+            for (unsigned axis = 0; axis < 3; ++axis) {
+                keys[axis] = max(keys[axis], ordered(-at[axis]));
+                keys[3 + axis] = max(keys[3 + axis], ordered(at[axis]));
+            }
         }
+        store_box(args, part, member, keys);
     }
 }
 
 extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const __grid_constant__ BatchArgs args) {
     extern __shared__ uint4 shared[];
-    Own& own = ((Own*)shared)[threadIdx.x / 32];
-    float4* transforms = (float4*)((Own*)shared + WARPS);
-    float4* q = transforms + 3 * VECTORS;
+    Own& own = own_of(shared);
+    Common& common = common_of(shared);
     const Part part = part_of(args);
     if (part.quads > 0) {
-        // x0 belongs to the first group, and groups of stages that are not there are empty.
-        copy_rest(args, part, own);
+        // x0 belongs to the first group of copies, and groups of stages that are not there are empty.
+        copy_rest(part, own);
 #pragma unroll
         for (unsigned stage = 0; stage < STAGES; ++stage) {
-            copy_stage(args, part, own, stage);
+            copy_stage(part, own, stage);
             end_group();
         }
     }
-    load_values(args, transforms, q);
+    Part& kept = common.parts[threadIdx.x / 32];
+    kept = part;
+    load_values(args, part, common, (float*)q_of(shared));
     __syncthreads();
     if (part.quads == 0) {
         return;
@@ -403,13 +480,13 @@ extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const _
             sums[i][domain] = 0.0f;
         }
     }
-    sum_modes(args, part, own, q, sums);
+    sum_modes(kept, own, q_of(shared), sums);
     wait_for_all_but<0>();
     float total = 0.0f;
-    place(args, part, own, transforms, sums, total);
-    // Others wrote some of what this lane now reads.
+    put(args, kept, own, common, sums, total);
+    // Others wrote some of what a lane now reads.
     __syncwarp();
-    if (total != 0.0f) {
-        mend(args, transforms, (const float*)q);
+    if (__any_sync(0xffffffffu, total != 0.0f)) {
+        mend(args, common, (const float*)q_of(shared));
     }
 }

@@ -240,10 +240,6 @@ __device__ __forceinline__ void sum_modes(const DeformArgs& args, const Part& pa
 }
 #endif
 
-__device__ __forceinline__ float placed(const float4& row, float x, float y, float z) {
-    return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
-}
-
 // The u of one vertex of this lane in f64.
 __device__ __forceinline__ void sum_exactly(const DeformArgs& args, const Part& part, unsigned vertex, double (&u)[3]) {
     for (unsigned axis = 0; axis < 3; ++axis) {
@@ -263,7 +259,7 @@ __device__ __forceinline__ void sum_exactly(const DeformArgs& args, const Part& 
 }
 
 // The x of one vertex of this lane in f64, rounded once: for what overflowed on its way in f32 although it need not.
-__device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
+__device__ __noinline__ float3 summed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
     const Part part = part_of(args, tile, share);
     const float* rest = first_of(args.rest, part, 3);
     double bent[3];
@@ -271,29 +267,7 @@ __device__ __noinline__ float3 placed_exactly(const DeformArgs& args, unsigned t
     for (unsigned axis = 0; axis < 3; ++axis) {
         bent[axis] = (double)rest[4 * axis * part.stride + vertex] + bent[axis];
     }
-#ifdef FOLLOWERS
-    // One after the other: the product of both may overflow f32.
-    const Following own = following_of(transforms_of(args), part.domain);
-    const float4* rows = args.transforms + 3 * (size_t)own.mover;
-    if (own.frame != NO_FRAME) {
-        double framed[3];
-        for (unsigned axis = 0; axis < 3; ++axis) {
-            const float4 row = args.frames[3 * (size_t)own.frame + axis];
-            framed[axis] = row.x * bent[0] + row.y * bent[1] + row.z * bent[2] + row.w;
-        }
-        for (unsigned axis = 0; axis < 3; ++axis) {
-            bent[axis] = framed[axis];
-        }
-    }
-#else
-    const float4* rows = args.transforms + 3 * (size_t)part.domain;
-#endif
-    float placed[3];
-    for (unsigned axis = 0; axis < 3; ++axis) {
-        const float4 row = rows[axis];
-        placed[axis] = (float)(row.x * bent[0] + row.y * bent[1] + row.z * bent[2] + row.w);
-    }
-    return make_float3(placed[0], placed[1], placed[2]);
+    return placed_exactly(transforms_of(args), part.domain, bent);
 }
 
 #if defined(DISPLACEMENTS) && defined(MODES)
@@ -342,7 +316,7 @@ __device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigne
     for (unsigned vertex = 0; vertex < count; ++vertex) {
         float* at = numbers + 3 * vertex;
         if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
-            const float3 exact = placed_exactly(args, tile, share, vertex);
+            const float3 exact = summed_exactly(args, tile, share, vertex);
 #if defined(DISPLACEMENTS) && defined(MODES)
             // A u that is not finite makes no x that is.
             mend_displacement(args, tile, share, vertex, keys);

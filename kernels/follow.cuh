@@ -61,3 +61,34 @@ __device__ __forceinline__ Affine place_of(const Transforms& transforms, unsigne
     return affine_at(transforms.rows, domain);
 #endif
 }
+
+// A row of T times a point.
+__device__ __forceinline__ float placed(const float4& row, float x, float y, float z) {
+    return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
+}
+
+__device__ __forceinline__ void place_exactly(const float4* rows, const double (&point)[3], double (&placed)[3]) {
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        const float4 row = rows[axis];
+        placed[axis] = row.x * point[0] + row.y * point[1] + row.z * point[2] + row.w;
+    }
+}
+
+// T of a domain times a point in f64, rounded once.
+__device__ __forceinline__ float3 placed_exactly(const Transforms& transforms, unsigned domain, double (&point)[3]) {
+    double world[3];
+#ifdef FOLLOWERS
+    // One after the other: the product of both may overflow f32.
+    const Following own = following_of(transforms, domain);
+    if (own.frame != NO_FRAME) {
+        place_exactly(transforms.frames + 3 * (size_t)own.frame, point, world);
+        point[0] = world[0];
+        point[1] = world[1];
+        point[2] = world[2];
+    }
+    place_exactly(transforms.rows + 3 * (size_t)own.mover, point, world);
+#else
+    place_exactly(transforms.rows + 3 * (size_t)domain, point, world);
+#endif
+    return make_float3((float)world[0], (float)world[1], (float)world[2]);
+}

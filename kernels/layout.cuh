@@ -110,6 +110,50 @@ struct DeformArgs {
 };
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/gpu/layout.rs");
 
+// Domains of one shape whose U `batch` reads once.
+struct Group {
+    unsigned long long first_word;
+    unsigned rest; // first quad of x0
+    unsigned first_scale;
+    unsigned vertices; // of the shape
+    unsigned first_member;
+    unsigned chunks;
+    unsigned members;
+};
+static_assert(sizeof(Group) == 32, "Group differs from src/gpu/layout.rs");
+
+// One of them.
+struct Member {
+    unsigned first; // packed vertex
+    unsigned first_q;
+    unsigned domain;
+    unsigned first_tile; // of `deform`: its boxes
+};
+static_assert(sizeof(Member) == 16, "Member differs from src/gpu/layout.rs");
+
+// The work of one block of `batch`.
+struct Block {
+    unsigned group;
+    unsigned tile; // of its shape
+};
+static_assert(sizeof(Block) == 8, "Block differs from src/gpu/layout.rs");
+
+struct BatchArgs {
+    const Header* header;
+    const Block* blocks;
+    const Group* groups;
+    const Member* members;
+    const uint4* words;
+    const float4* rest;
+    const float* scales;
+    const float4* transforms;
+    const Following* following;
+    const float4* frames;
+    const float* q;
+    unsigned* boxes;
+};
+static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/gpu/layout.rs");
+
 // A part of a domain of which `bounds` makes a box.
 struct Piece {
     unsigned first; // packed vertex, or box of `deform`

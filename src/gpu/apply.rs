@@ -70,7 +70,7 @@ impl Apply {
             config: config(kernel),
             most: most_changes(&packing.scene),
             coordinates: packing.coordinates.total,
-            named: vec![0; packing.tiles],
+            named: vec![0; packing.listing.tiles],
             lists: 0,
         })
     }
@@ -84,7 +84,7 @@ impl Apply {
     }
 
     /// Writes the lists of a step that changes some domains, into an output that lacks others besides; the caller has
-    /// waited for the last launch with `list`. None when there are too many changes for it.
+    /// waited for the last launch with `list`. None when there are too many changes for it, or a whole step is less work.
     pub(super) fn write(
         &mut self,
         list: &mut List,
@@ -133,6 +133,9 @@ impl Apply {
         // What the output lacks has its values and stamps on the device already.
         let lacking = changed.iter().chain(behind);
         let stale = list_tiles(packing, lacking, (&mut self.named, self.lists), tiles);
+        if stale as usize > packing.listing.whole {
+            return Ok(None);
+        }
         Ok(Some(Lengths { changed: count, stale }))
     }
 
@@ -171,7 +174,7 @@ fn list_tiles<'a>(
 ) -> u32 {
     let mut count = 0;
     for domain in domains {
-        for (first, length) in packing.spans[*domain as usize] {
+        for (first, length) in packing.listing.spans[*domain as usize] {
             for tile in first..first + length {
                 let mark = &mut named[tile as usize];
                 if *mark != list {

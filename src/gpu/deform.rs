@@ -6,8 +6,9 @@ use std::sync::Arc;
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
 
 use super::apply::most_domains;
+use super::batch::{Batch, Shared};
 use super::device::Device;
-use super::inputs::{Packing, Values};
+use super::inputs::{Listing, Packing, Values};
 use super::layout::{DeformArgs, Piece};
 use super::memory::{address, room, upload};
 use super::plan::{Kernel, Tables};
@@ -16,14 +17,19 @@ use crate::error::{Error, Result, during};
 use crate::scene::Scene;
 use crate::storage::{Plane, TILE_QUADS, Tiles};
 
+/// Tiles of `deform` that take as long as a block of `batch`, about.
+const WORK_OF_BLOCK: usize = 2;
+
 /// Words of U that go to the device in one piece while packing, so that packing needs little memory of its own.
 const PIECE: usize = 1 << 22;
 
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
 pub(super) struct Deform {
-    pub(super) function: CudaFunction,
+    function: CudaFunction,
     config: LaunchConfig,
+    /// For the domains whose U is read once for several of them.
+    batch: Option<Batch>,
     /// The same for a list of tiles, and the list, where there can be one.
     listed: Option<CudaFunction>,
     tiles: CudaSlice<u8>,
@@ -38,8 +44,9 @@ pub(super) struct Deform {
     list: CudaSlice<u8>,
     /// Four boxes of six keys per tile.
     boxes: CudaSlice<u8>,
-    /// Of tiles.
+    /// Of tiles, and of those that a whole step launches.
     count: u32,
+    launched: u32,
     /// Quads before the first that has normals.
     directed: u64,
     packing: Arc<Packing>,
@@ -48,8 +55,13 @@ pub(super) struct Deform {
 }
 
 impl Deform {
-    /// Packs what the tables name onto the device.
-    pub(super) fn new(device: &Device, scene: &Arc<Scene>, kernel: &Kernel, tables: Tables) -> Result<Self> {
+    /// Packs what the tables name onto the device. `batch` is the kernel of scenes with batches.
+    pub(super) fn new(
+        device: &Device,
+        scene: &Arc<Scene>,
+        (kernel, batch): (&Kernel, Option<&Kernel>),
+        tables: Tables,
+    ) -> Result<Self> {
         let Tables { coordinates, work, pieces } = tables;
         let mut load = Load::new(device, scene, &work)?;
         work.sources.iter().try_for_each(|source| load.add(source))?;
@@ -60,6 +72,7 @@ impl Deform {
         Ok(Self {
             function: function(device, kernel)?,
             config: config(kernel),
+            batch: batch.map(|kernel| Batch::new(device, kernel, &work.batched)).transpose()?,
             listed: has_lists.then(|| listed(device, kernel)).transpose()?,
             tiles: upload(device, &work.tiles)?,
             lanes: upload(device, &work.lanes)?,
@@ -73,14 +86,18 @@ impl Deform {
             list: room(device, if has_lists { 4 * work.tiles.len() as u64 } else { 0 })?,
             boxes: room(device, 96 * work.tiles.len() as u64)?,
             count: work.tiles.len() as u32,
+            launched: work.launched as u32,
             directed: work.quads.directed,
             pieces: scene.needs.boxes.then_some(pieces),
             packing: Arc::new(Packing {
                 scene: Arc::clone(scene),
                 coordinates,
                 factors,
-                spans: work.spans,
-                tiles: work.tiles.len(),
+                listing: Listing {
+                    spans: work.spans,
+                    tiles: work.tiles.len(),
+                    whole: work.launched + WORK_OF_BLOCK * work.batched.blocks.len(),
+                },
             }),
         })
     }
@@ -105,8 +122,23 @@ impl Deform {
         address(device, &self.list)
     }
 
-    /// Starts the kernel on all tiles; the header among the values says where everything goes.
+    /// What a whole step launches.
+    pub(super) fn kernels(&self) -> Vec<(&'static str, &CudaFunction)> {
+        let batch = self.batch.as_ref().map(|batch| ("batch", &batch.function));
+        batch.into_iter().chain((self.launched > 0).then_some(("deform", &self.function))).collect()
+    }
+
+    /// Starts the kernels of a whole step; the header among the values says where everything goes.
     pub(super) fn launch(&self, device: &Device, values: Values) -> Result<()> {
+        if let Some(batch) = &self.batch {
+            let [words, rest, scales, boxes] =
+                [&self.words, &self.rest, &self.scales, &self.boxes].map(|buffer| address(device, buffer));
+            batch.launch(device, values, Shared { words, rest, scales, boxes })?;
+        }
+        // Nothing may be left to do.
+        if self.launched == 0 {
+            return Ok(());
+        }
         self.launch_as(device, values, (&self.function, self.config))
     }
 
@@ -145,7 +177,7 @@ impl Deform {
             kept_counts: values.kept_counts,
             kept: values.kept,
             boxes: at(&self.boxes),
-            count: self.count,
+            count: self.launched,
             reserved: 0,
         };
         let mut launch = device.stream().launch_builder(function);

@@ -68,7 +68,7 @@ impl CudaDeformer {
         let plan = plan_of(scene, &tables);
         device.context().bind_to_thread().map_err(during("device"))?;
         check_memory(device, &plan)?;
-        let deform = Deform::new(device, scene, plan.needed(Launch::Deform)?, tables)?;
+        let deform = Deform::new(device, scene, (plan.needed(Launch::Deform)?, plan.kernel(Launch::Batch)), tables)?;
         let apply = plan.kernel(Launch::Apply);
         let kernels = Kernels {
             bounds: Bounds::new(device, plan.needed(Launch::Bounds)?, deform.pieces())?,

@@ -26,10 +26,18 @@ pub(super) struct Packing {
     pub coordinates: Coordinates,
     /// Per shape the factors of its modes; empty lists unless the storage has factors.
     pub factors: Vec<Vec<f32>>,
+    pub listing: Listing,
+}
+
+/// What lists of changed domains name.
+#[derive(Debug, Default)]
+pub(super) struct Listing {
     /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
     pub spans: Vec<[(u32, u32); 2]>,
     /// Tiles of all.
     pub tiles: usize,
+    /// As many tiles as a whole step is worth: batches read U once, but compute no less.
+    pub whole: usize,
 }
 
 /// Device addresses of a step's values.
@@ -295,7 +303,7 @@ mod tests {
     fn packing(scene: &Arc<Scene>) -> Arc<Packing> {
         let coordinates = Coordinates::new(scene);
         let factors = vec![vec![0.5; 64]; scene.shapes.len()];
-        Arc::new(Packing { scene: Arc::clone(scene), coordinates, factors, spans: Vec::new(), tiles: 0 })
+        Arc::new(Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() })
     }
 
     fn state(scene: &Scene) -> State {

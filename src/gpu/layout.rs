@@ -110,6 +110,55 @@ pub(super) struct DeformArgs {
     pub reserved: u32,
 }
 
+/// Domains of one shape whose U `batch` reads once.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Group {
+    pub first_word: u64,
+    pub rest: u32,
+    pub first_scale: u32,
+    pub vertices: u32,
+    pub first_member: u32,
+    pub chunks: u32,
+    pub members: u32,
+}
+
+/// One of them.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Member {
+    pub first: u32,
+    pub first_q: u32,
+    pub domain: u32,
+    pub first_tile: u32,
+}
+
+/// The work of one block of `batch`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Block {
+    pub group: u32,
+    pub tile: u32,
+}
+
+/// Arguments of `batch`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct BatchArgs {
+    pub header: u64,
+    pub blocks: u64,
+    pub groups: u64,
+    pub members: u64,
+    pub words: u64,
+    pub rest: u64,
+    pub scales: u64,
+    pub transforms: u64,
+    pub following: u64,
+    pub frames: u64,
+    pub q: u64,
+    pub boxes: u64,
+}
+
 /// A part of a domain of which `bounds` makes a box.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
@@ -189,6 +238,10 @@ const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Following>() == 8, "Following differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Group>() == 32, "Group differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Member>() == 16, "Member differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Block>() == 8, "Block differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchArgs>() == 96, "BatchArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Piece>() == 16, "Piece differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BoundsArgs>() == 48, "BoundsArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
@@ -197,6 +250,8 @@ const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in kernels/layout.cuh.
 unsafe impl DeviceRepr for DeformArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for BatchArgs {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for BoundsArgs {}
 // SAFETY: as above.
@@ -238,6 +293,12 @@ pub fn agreements() -> Vec<Agreement> {
         DeformArgs {
             header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
             transforms, following, frames, q, list, kept_counts, kept, boxes, count, reserved
+        }
+        Group { first_word, rest, first_scale, vertices, first_member, chunks, members }
+        Member { first, first_q, domain, first_tile }
+        Block { group, tile }
+        BatchArgs {
+            header, blocks, groups, members, words, rest, scales, transforms, following, frames, q, boxes
         }
         Piece { first, count, domain, of_vertices }
         BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count }

@@ -6,16 +6,17 @@
 //! on their way back.
 //!
 //! ```text
-//! inputs -> [apply] -> deform -> bounds -> [normals] -> answer
+//! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> answer
 //! ```
-//! `apply` is there in steps that change few domains, `normals` where normals follow the deformed surface.
+//! `apply` is there in steps that change few domains, `batch` in the others where domains share a large U, `normals` where
+//! normals follow the deformed surface.
 //!
 //! | file | what |
 //! |---|---|
 //! | `plan` | scene to kernels with their macros, buffers and launches |
 //! | `work`, `pack`, `rings`, `layout` | scene to the tables that kernels read; pure |
 //! | `inputs`, `staging` | the values of a step on their way to the device |
-//! | `apply`, `deform`, `bounds`, `normals` | the launchers |
+//! | `apply`, `batch`, `deform`, `bounds`, `normals` | the launchers |
 //! | `chain` | a launch that begins while the kernel before it ends |
 //! | `deformer`, `flight` | the graph of a step, its pinned memory and its answer |
 //! | `output`, `interop` | where the vertices go |
@@ -27,6 +28,7 @@
 //! | `trials` | what only measures |
 
 mod apply;
+mod batch;
 mod bounds;
 mod boxes;
 mod chain;
@@ -59,9 +61,9 @@ pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use trials::{
-    Batch, BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Roofs, Split,
-    Thesis, Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes, idle_in_warp, ingest,
-    lanes, overlap, roofs, time,
+    BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Roofs, Split, Thesis,
+    Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes, idle_in_warp, ingest, lanes,
+    overlap, roofs, time,
 };
 
 /// OpenGL buffers to write into, by name.

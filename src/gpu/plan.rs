@@ -3,12 +3,12 @@
 use serde::Serialize;
 
 use super::apply::most_changes;
-use super::boxes;
 use super::inputs::{Sizes, following};
 use super::layout::{BLOCK, Change, Lane, NormalSlot, Piece, Tile};
 use super::pack;
 use super::rings::Counts;
 use super::work::{Coordinates, Work, orients};
+use super::{batch, boxes};
 use crate::error::{Error, Result};
 use crate::scene::{Scene, Storage};
 use crate::storage::TILE_QUADS;
@@ -22,7 +22,7 @@ pub(super) struct KernelSource {
 }
 
 /// All kernels there are.
-pub(super) const KERNELS: [KernelSource; 4] = [
+pub(super) const KERNELS: [KernelSource; 5] = [
     KernelSource {
         name: "deform",
         source: include_str!("../../kernels/deform.cu"),
@@ -38,6 +38,11 @@ pub(super) const KERNELS: [KernelSource; 4] = [
             "SHEAR",
             "FOLLOWERS",
         ],
+    },
+    KernelSource {
+        name: "batch",
+        source: include_str!("../../kernels/batch.cu"),
+        features: &["FOLLOWERS", "BATCH_8", "BATCH_4"],
     },
     KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &["BOXES"] },
     KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &["FOLLOWERS"] },
@@ -59,6 +64,8 @@ const FEW_TILES: usize = 1024;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Launch {
+    /// In whole steps, domains whose U is read once for several of them; in scenes that have such.
+    Batch,
     Deform,
     Bounds,
     /// Normals that follow the surface.
@@ -105,6 +112,8 @@ pub enum Role {
     Lanes,
     /// From vertices to corners, per domain; where they differ.
     CornerShifts,
+    /// Groups of domains, and the work of each block of `batch`.
+    Batches,
     /// A box of each warp's vertices.
     Boxes,
     /// The step that last changed each domain.
@@ -145,7 +154,7 @@ pub struct Buffer {
 /// A part that the scene does without.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct LeftOut {
-    /// The flag of [`crate::scene::Needs`] that is off.
+    /// The flag of [`crate::scene::Needs`] that is off, or "batches".
     pub feature: &'static str,
     /// What is not compiled, computed or stored.
     pub what: &'static str,
@@ -223,6 +232,9 @@ pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tabl
     if needs.displacements {
         buffers.push((Role::Displacements, 12 * vertices));
     }
+    if !work.batched.blocks.is_empty() {
+        buffers.push((Role::Batches, batch::bytes(&work.batched)));
+    }
     let (pieces, domain_boxes) = boxes::bytes(pieces.len());
     if needs.boxes {
         buffers.extend([(Role::Pieces, pieces), (Role::DomainBoxes, domain_boxes)]);
@@ -249,7 +261,11 @@ pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tabl
         bytes_in: inputs,
         bytes_out: 24,
         bytes_of_changes: changes as u64,
-        left_out: left_out(scene, [16 * (rest_corners + corners), 12 * vertices, pieces + domain_boxes]),
+        left_out: left_out(
+            scene,
+            !work.batched.blocks.is_empty(),
+            [16 * (rest_corners + corners), 12 * vertices, pieces + domain_boxes],
+        ),
     }
 }
 
@@ -265,7 +281,7 @@ pub(super) const fn storage_define(storage: Storage) -> Option<&'static str> {
 
 /// Whether a lane takes one item instead of four.
 pub(super) const fn is_narrow(work: &Work) -> bool {
-    work.tiles.len() < FEW_TILES
+    work.launched < FEW_TILES
 }
 
 /// Threads of a block of `deform`: WARPS in its source, which the launcher compares.
@@ -276,10 +292,10 @@ fn threads_of(defines: &[&str]) -> u32 {
 
 fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
     let needs = scene.needs;
-    let [deform, bounds, apply, normals] = KERNELS;
+    let [deform, batch, bounds, apply, normals] = KERNELS;
     let defines = deform_defines(scene, work);
     let threads = threads_of(&defines);
-    let warps = work.tiles.len() * if is_narrow(work) { 4 } else { 1 };
+    let warps = work.launched * if is_narrow(work) { 4 } else { 1 };
     let blocks_of_tiles = warps.div_ceil(threads as usize / TILE_QUADS) as u32;
     let launch = Launch::Deform;
     let deform =
@@ -299,7 +315,9 @@ fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
     // Eight threads make a box of a domain, and wait for the memory most of the time.
     let many = pieces.len().div_ceil(BLOCK as usize / 8).min(4 * MOST_BLOCKS);
     let boxes = if needs.boxes { few.max(many) } else { few };
-    let mut kernels = vec![deform, walk(Launch::Bounds, &bounds, boxes)];
+    let batch = (!work.batched.blocks.is_empty()).then(|| batch::kernel(scene, &work.batched, batch));
+    let mut kernels: Vec<Kernel> = batch.into_iter().chain([deform]).collect();
+    kernels.push(walk(Launch::Bounds, &bounds, boxes));
     if needs.exact_normals {
         kernels.push(walk(Launch::Normals, &normals, blocks(scene.layout.corners) as usize));
     }
@@ -332,7 +350,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
 /// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
 const MOST_BLOCKS: usize = 264;
 
-fn left_out(scene: &Scene, [tangents, displacements, boxes]: [u64; 3]) -> Vec<LeftOut> {
+fn left_out(scene: &Scene, batched: bool, [tangents, displacements, boxes]: [u64; 3]) -> Vec<LeftOut> {
     let needs = scene.needs;
     let more = size_of::<NormalSlot>() * scene.domains.len();
     let exact_normals = LeftOut {
@@ -357,7 +375,9 @@ fn left_out(scene: &Scene, [tangents, displacements, boxes]: [u64; 3]) -> Vec<Le
         ),
         (needs.boxes, LeftOut { feature: "boxes", what: "a box of each domain in `bounds`", bytes: boxes }),
     ];
-    all.into_iter().filter(|(needed, _)| !needed).map(|(_, part)| part).collect()
+    let batches = LeftOut { feature: "batches", what: "`batch`, and groups of domains", bytes: 0 };
+    let all = all.into_iter().chain([(batched, batches)]);
+    all.filter(|(needed, _)| !needed).map(|(_, part)| part).collect()
 }
 
 /// Blocks that cover so many corners.
@@ -388,8 +408,11 @@ impl Plan {
     }
 
     /// The most kernel launches of one step, whatever the number of domains.
-    pub const fn launches(&self) -> usize {
-        self.kernels.len()
+    pub fn launches(&self) -> usize {
+        // A step is whole, and then has batches, or of a list.
+        let whole = self.kernels.iter().filter(|kernel| kernel.launch != Launch::Apply).count();
+        let listed = self.kernels.iter().filter(|kernel| kernel.launch != Launch::Batch).count();
+        if self.kernel(Launch::Apply).is_some() { whole.max(listed) } else { whole }
     }
 }
 

@@ -9,8 +9,8 @@ use super::traffic::Part;
 use super::variant::{Label, Variant};
 use crate::deform::{Backend, Surface};
 use crate::error::{Error, Result};
-use crate::gpu::{self, Batch, BatchMma, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
-use crate::scene::{Deformation, Scene, State, Storage};
+use crate::gpu::{self, BatchMma, Cublas, Device, Extent, KernelFacts, Ours, Peer, Split, Thesis, Trial};
+use crate::scene::{Batches, Deformation, Scene, State, Storage};
 
 /// Makes a trial of a scene for some states.
 type Make = Box<dyn Fn(&Device, &Arc<Scene>, &[State]) -> Result<Box<dyn Trial>>>;
@@ -41,7 +41,9 @@ struct Tried {
 /// All trials for a scene: ours in every storage type, and the thesis's kernels where they apply.
 pub(super) fn trials(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let stored = |storage: Storage, extent: Extent| -> Offer {
-        let deformation = Deformation { storage, ..scene.deformation };
+        // u alone comes from a kernel that batches do not have.
+        let batches = if extent == Extent::Uq { Batches::Never } else { scene.deformation.batches };
+        let deformation = Deformation { storage, batches, ..scene.deformation };
         let suffix = match extent {
             Extent::Uq => UQ,
             Extent::Positions => " positions",
@@ -109,32 +111,31 @@ fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offe
     offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
 }
 
-/// Many q of one shape at once, in every storage type; and by tensor cores where U has 16 bits.
+/// Many q of one shape at once, in every storage type; f32 one after the other, for comparison; and by tensor cores where
+/// U has 16 bits.
 fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     if scene.shapes.len() > 1 || scene.domains.len() < 2 {
         return Vec::new();
     }
+    let count = scene.domains.len();
+    let of = |storage: Storage, batches: Batches| Deformation { storage, batches, ..scene.deformation };
     let one = |storage: Storage| {
-        let deformation = Deformation { storage, ..scene.deformation };
-        let name = format!("cuda batch of {} {}", scene.domains.len(), storage.name());
-        let label = Label { name, backend: Backend::Cuda, deformation };
-        offer(wanted, label, |label| {
-            let scene = stock.scene(deformation)?;
-            let make: Make = Box::new(|device, scene, states| Ok(Box::new(Batch::new(device, scene, states)?)));
-            Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene), make)))
-        })
+        let name = format!("cuda batch of {count} {}", storage.name());
+        positions(device, stock, wanted, (name, of(storage, Batches::Always)))
     };
+    let apart = (format!("cuda {count} apart f32"), of(Storage::F32, Batches::Never));
     let products = |storage: Storage| {
         let deformation = Deformation { storage, ..scene.deformation };
         // Another order and rounding than the deformer's: its name says so.
-        let name = format!("cuda batch of {} {} mma", scene.domains.len(), storage.name());
+        let name = format!("cuda batch of {count} {} mma", storage.name());
         offer(wanted, Label { name, backend: Backend::Cuda, deformation }, |label| {
             let scene = stock.scene(deformation)?;
             let make: Make = Box::new(|device, scene, states| Ok(Box::new(BatchMma::new(device, scene, states)?)));
             Ok(Tried::sharing(label, &scene, device, (stock.ingredients(&scene).with_products(), make)))
         })
     };
-    Storage::ALL.into_iter().map(one).chain([Storage::F16, Storage::Bf16].map(products)).collect()
+    let ours = Storage::ALL.into_iter().map(one).chain([positions(device, stock, wanted, apart)]);
+    ours.chain([Storage::F16, Storage::Bf16].map(products)).collect()
 }
 
 /// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.

@@ -43,6 +43,20 @@ pub enum Normals {
     Exact,
 }
 
+/// Whether domains that share a shape are deformed together, so that its U is read once for all of them: the same numbers,
+/// bit by bit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Batches {
+    /// Where it is known to be faster.
+    #[default]
+    Auto,
+    /// Each for itself.
+    Never,
+    /// Wherever several domains share a shape that has modes.
+    Always,
+}
+
 /// Choices between error and time. The default leaves nothing out.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -57,6 +71,8 @@ pub struct Deformation {
     pub displacements: bool,
     /// Keep an axis-aligned box of each domain's deformed positions.
     pub boxes: bool,
+    /// Of the CUDA deformer. Truncated and compensated sums, and kept displacements, have no batches.
+    pub batches: Batches,
 }
 
 impl Deformation {

@@ -19,7 +19,7 @@ mod update;
 
 pub use camera::{Bounds, Camera, Lens, View};
 pub use cells::{Cells, GRID, REACH, nearest_cell};
-pub use deformation::{Deformation, Normals, Storage};
+pub use deformation::{Batches, Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
 pub use look::{Ground, Look, MAX_FRAGMENTS, Transparency, UpAxis};
 pub use movers::Movers;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast::deform::Deformer;
 use modalcast::domain::{Domain, Shape};
-use modalcast::scene::{Changed, Deformation, Normals, RawUpdate, Scene, State, Storage, Update};
+use modalcast::scene::{Batches, Changed, Deformation, Normals, RawUpdate, Scene, State, Storage, Update};
 
 use super::readers::{kept, wrong_box};
 use super::{Shown, run, strip};
@@ -178,6 +178,7 @@ pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
     let plain = |storage| Deformation { storage, ..Deformation::default() };
     let exact = |storage| Deformation { normals: Normals::Exact, ..plain(storage) };
     let compensated = |deformation| Deformation { compensated: true, ..deformation };
+    let together = |deformation| Deformation { batches: Batches::Always, ..deformation };
     let truncated = |storage| Deformation { truncation: Some(0.2), ..plain(storage) };
     for (deformation, normal_maps) in [
         (plain(Storage::F32), true),
@@ -192,6 +193,9 @@ pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
         (kept(plain(Storage::F32)), true),
         (kept(truncated(Storage::F16)), false),
         (kept(compensated(exact(Storage::Int8))), false),
+        (together(plain(Storage::F32)), true),
+        (together(exact(Storage::F16)), true),
+        (Deformation { boxes: true, ..together(plain(Storage::Int8)) }, true),
     ] {
         follow(&format!("{deformation:?}, normal maps {normal_maps}"), &crowd(deformation, normal_maps), &make);
     }

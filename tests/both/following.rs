@@ -33,7 +33,7 @@ fn frame(random: &mut Random, at: usize, rigid: bool) -> Transform {
 }
 
 /// A third of the domains are movers, and the others follow an earlier domain each, be it a follower itself.
-fn grove(count: usize, deformation: Deformation, rigid: bool) -> Parts {
+pub(crate) fn grove(count: usize, deformation: Deformation, rigid: bool) -> Parts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> = SIZES.iter().map(|(vertices, rank)| strip(&mut random, *vertices, *rank)).collect();
     // And corners that are no vertices.

@@ -1,24 +1,42 @@
-//! Many coordinate vectors for one U, as one product: each instance is where the deformer puts it.
+//! Many coordinate vectors for one U, read once: each instance is where the deformer puts it alone, bit by bit.
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
 use modalcast::domain::Transform;
-use modalcast::error::Error;
-use modalcast::gpu::{Batch, BatchMma, Cache, Device, Extent, Ours, Trial, gigabytes_per_second, time};
-use modalcast::scene::{Bounds, Scene, State, Storage};
+use modalcast::gpu::{BatchMma, Cache, Device, Extent, Launch, Ours, Trial, gigabytes_per_second, time};
+use modalcast::scene::{Batches, Deformation, Normals, Parts, Scene, State, Storage};
 use modalcast::storage::bound::{Reaches, Step};
 use modalcast::storage::{Products, QUAD, TILE_QUADS, Tiles};
 
-use crate::judge::{POSITION, largest_error, same_bits};
+use crate::both::following::grove;
+use crate::both::readers::wrong_box;
+use crate::both::{run, scene_of, strip, within};
+use crate::judge::same_bits;
 use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
-/// `count` domains of one shape, stored as said.
-fn ensemble(vertices: usize, rank: usize, count: usize, storage: Storage) -> Arc<Scene> {
+/// The scene with batches and without.
+fn both(mut parts: impl FnMut() -> Parts) -> [Arc<Scene>; 2] {
+    [Batches::Always, Batches::Never].map(|batches| {
+        let mut parts = parts();
+        parts.deformation.batches = batches;
+        Scene::new(parts).expect("a scene")
+    })
+}
+
+/// `count` domains of one shape, deformed so.
+fn ensemble((vertices, rank, count): (usize, usize, usize), deformation: Deformation) -> Parts {
     let mut parts = scenes::parts(vec![scenes::shape(&mut Random(7), vertices, rank)]);
     parts.domains = vec![scenes::domain(0, 0); count];
-    parts.deformation.storage = storage;
+    parts.deformation = deformation;
+    parts
+}
+
+fn stored(storage: Storage) -> Deformation {
+    Deformation { storage, ..Deformation::default() }
+}
+
+fn made(parts: Parts) -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
@@ -26,54 +44,81 @@ fn states(scene: &Scene) -> Vec<State> {
     (1..=3).map(|seed| scenes::state(scene, seed)).collect()
 }
 
-/// What the deformer says.
-fn one_by_one(scene: &Arc<Scene>, state: &State) -> Vec<f32> {
-    let mut deformer = deformer(scene);
-    deformer.deform(state).expect("deforms");
-    deformer.surface().expect("copies").positions.clone()
+/// Shows states of a scene with batches and without, and returns in how many a bit differs.
+fn differences(name: &str, [together, apart]: &[Arc<Scene>; 2]) -> usize {
+    let (mut one, mut other) = (deformer(together), deformer(apart));
+    assert!(one.plan().kernel(Launch::Batch).is_some(), "{name}: there is a batch");
+    assert!(other.plan().kernel(Launch::Batch).is_none(), "{name}: there is none");
+    assert!(one.plan().launches() <= 4, "{name}");
+    let states = states(together);
+    let count = states.iter().filter(|state| {
+        let (shown, want) = (run(&mut one, state), run(&mut other, state));
+        if shown.bounds.is_finite() {
+            within(name, (together, state), &shown.surface.positions, 0.0);
+            assert!(shown.surface.boxes.is_empty() || wrong_box(together, &shown).is_none(), "{name}");
+        }
+        let difference = shown.difference(&want);
+        difference.iter().for_each(|difference| eprintln!("{name}: {difference}"));
+        let moved = run(&mut other, &states[0]).difference(&shown).is_some();
+        assert!(moved || state.q == states[0].q, "{name}: the judge can fail");
+        difference.is_some()
+    });
+    count.count()
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_batch_has_the_bits_of_the_deformer_at_every_size_rank_count_and_storage() {
-    let device = Device::open(0).expect("a CUDA device");
+fn gpu_a_batch_has_the_bits_of_domains_apart_at_every_size_rank_count_and_storage() {
     for storage in Storage::ALL {
-        for (vertices, rank, count) in [
-            (1, 3, 1),
-            (33, 0, 2),
+        for size in [
+            (1, 3, 2),
+            (33, 1, 2),
             (64, 1, 16),
             (127, 4, 5),
             (128, 33, 16),
             (129, 16, 8),
+            (261, 12, 40),
             (2000, 32, 16),
             (5003, 512, 13),
         ] {
-            let scene = ensemble(vertices, rank, count, storage);
-            let states = states(&scene);
-            let batch = Batch::new(&device, &scene, &states).expect("a trial");
-            let name = format!("{} n {vertices} r {rank}", batch.name());
-            for (turn, state) in states.iter().enumerate() {
-                batch.launch(&device, turn).expect("launches");
-                let got = batch.positions(&device).expect("copies");
-                assert!(same_bits(&got, &one_by_one(&scene, state)), "{name} turn {turn}");
-                let other = one_by_one(&scene, &states[(turn + 1) % states.len()]);
-                assert!(!same_bits(&got, &other), "{name}: the judge can fail");
-                if storage == Storage::F32 {
-                    judge(&scene, state, &got).unwrap_or_else(|error| panic!("{name}: {error}"));
-                }
-            }
-            for facts in batch.kernels() {
-                assert!(facts.registers <= 128 && facts.spilled_bytes == 0, "{name}: {facts:?}");
-            }
+            let deformation = Deformation { boxes: true, ..stored(storage) };
+            let name = format!("{} n, r, domains {size:?}", storage.name());
+            assert_eq!(differences(&name, &both(|| ensemble(size, deformation))), 0, "{name}");
         }
     }
 }
 
-fn judge(scene: &Scene, state: &State, positions: &[f32]) -> Result<f64, String> {
-    let want = modalcast::reference::deform(scene, state);
-    let mut bounds = Bounds::EMPTY;
-    want.iter().for_each(|position| bounds.include(*position));
-    largest_error(positions, &want, POSITION * bounds.diagonal().max(1.0))
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_batches_among_other_domains_agree_with_all_that_a_scene_may_ask_for() {
+    let exact = |storage| Deformation { normals: Normals::Exact, ..stored(storage) };
+    let crowd = |deformation: Deformation, normal_maps: bool| {
+        let mut random = Random(70);
+        let sizes = [(300, 33), (40, 0), (7, 2), (513, 5), (200, 0), (130, 1)];
+        let shapes = sizes.iter().enumerate().map(|(at, (vertices, rank))| match at % 2 {
+            0 => strip(&mut random, *vertices, *rank),
+            _ => scenes::shape(&mut random, *vertices, *rank),
+        });
+        let scene = scene_of(shapes.collect(), 19, deformation, normal_maps);
+        let mut parts = scenes::parts(scene.shapes.clone());
+        (parts.domains, parts.deformation) = (scene.domains.clone(), deformation);
+        // One that has nobody to share with.
+        parts.shapes.push(scenes::shape(&mut random, 90, 9));
+        parts.domains.push(scenes::domain(sizes.len(), 0));
+        parts
+    };
+    for (deformation, normal_maps) in [
+        (stored(Storage::F32), true),
+        (stored(Storage::F16), false),
+        (exact(Storage::F32), true),
+        (exact(Storage::Int8), false),
+        (Deformation { boxes: true, ..stored(Storage::Bf16) }, true),
+    ] {
+        let name = format!("{deformation:?}, normal maps {normal_maps}");
+        assert_eq!(differences(&name, &both(|| crowd(deformation, normal_maps))), 0, "{name}");
+        let name = format!("followers, {name}");
+        assert_eq!(differences(&name, &both(|| grove(90, deformation, !normal_maps))), 0, "{name}");
+    }
 }
 
 /// The largest error of a vertex over the bound of its tile: of U in 16 bits, of q in two numbers of 16 bits, and of the
@@ -111,7 +156,7 @@ fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_cou
             (2000, 32, 16),
             (5003, 512, 13),
         ] {
-            let scene = ensemble(vertices, rank, count, storage);
+            let scene = made(ensemble((vertices, rank, count), stored(storage)));
             let states = states(&scene);
             let batch = BatchMma::new(&device, &scene, &states).expect("a trial");
             let name = format!("{} n {vertices} r {rank}", batch.name());
@@ -131,42 +176,38 @@ fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_cou
         }
     }
     let refused = |scene: &Arc<Scene>| BatchMma::new(&device, scene, &states(scene)).expect_err("refused");
-    assert!(refused(&ensemble(9, 2, 2, Storage::F32)).to_string().contains("f16 or bf16"));
-    assert!(refused(&ensemble(9, 2, 33, Storage::F16)).to_string().contains("at most 32"));
+    assert!(refused(&made(ensemble((9, 2, 2), stored(Storage::F32)))).to_string().contains("f16 or bf16"));
+    assert!(refused(&made(ensemble((9, 2, 33), stored(Storage::F16)))).to_string().contains("at most 32"));
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_what_overflows_on_its_way_in_f32_is_mended_in_a_batch_too() {
-    let device = Device::open(0).expect("a CUDA device");
     for vertices in [300, 512] {
-        let scene = ensemble(vertices, 5, 6, Storage::F32);
-        let mut state = scenes::state(&scene, 4);
-        // The sum of domain 1 overflows for good; the products of domain 3 do, although their sum need not.
-        state.q[5..10].fill(f32::MAX);
-        state.transforms[3] = Transform([2e38, 2e38, -2e38, 0.0, 3e38, -3e38, 3e38, 0.0, 1e38, 1e38, 1e38, 0.0]);
-        state.q[15..20].fill(3.0);
-        let batch = Batch::new(&device, &scene, std::slice::from_ref(&state)).expect("a trial");
-        batch.launch(&device, 0).expect("launches");
-        let (got, want) = (batch.positions(&device).expect("copies"), one_by_one(&scene, &state));
-        assert!(want.iter().any(|number| !number.is_finite()), "something overflows");
-        for (index, (got, want)) in got.iter().zip(&want).enumerate() {
-            let same = got.to_bits() == want.to_bits() || got.is_nan() && want.is_nan();
-            assert!(same, "vertex {}: {got} not {want}", index / 3);
+        let [together, apart] =
+            both(|| ensemble((vertices, 5, 6), Deformation { boxes: true, ..Deformation::default() }));
+        let (mut one, mut other) = (deformer(&together), deformer(&apart));
+        for lost in [false, true] {
+            let mut state = scenes::state(&together, 4);
+            // The products of domain 3 overflow, although their sum need not; the sum of domain 1 does for good.
+            state.transforms[3] = Transform([2e38, 2e38, -2e38, 0.0, 3e38, -3e38, 3e38, 0.0, 1e38, 1e38, 1e38, 0.0]);
+            state.q[15..20].fill(3.0);
+            if lost {
+                state.q[5..10].fill(f32::MAX);
+            }
+            let [(got, boxes), (want, _)] = [&mut one, &mut other].map(|deformer| {
+                let shown = run(deformer, &state);
+                (shown.surface.positions, shown.surface.boxes)
+            });
+            assert_eq!(want.iter().any(|number| !number.is_finite()), lost, "something overflows");
+            for (index, (got, want)) in got.iter().zip(&want).enumerate() {
+                let same = got.to_bits() == want.to_bits() || got.is_nan() && want.is_nan();
+                assert!(same, "vertex {}: {got} not {want}", index / 3);
+            }
+            let finite: Vec<bool> = boxes.iter().map(modalcast::scene::Bounds::is_finite).collect();
+            assert_eq!(finite, [true, !lost, true, true, true, true], "boxes tell who is lost");
         }
     }
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
-fn gpu_batches_refuse_scenes_that_they_are_not_for() {
-    let device = Device::open(0).expect("a CUDA device");
-    let field = |scene: &Arc<Scene>| match Batch::new(&device, scene, &states(scene)) {
-        Err(Error::Invalid { field, .. }) => field,
-        other => panic!("{other:?}"),
-    };
-    assert_eq!(field(&ensemble(9, 2, 17, Storage::F32)), "scene.domains");
-    assert_eq!(field(&scenes::scene(&[(40, 3), (40, 3)], 2, false, false)), "domain 1: shape");
 }
 
 #[test]
@@ -181,12 +222,15 @@ fn gpu_sixteen_vectors_at_once_take_less_than_four_times_as_long_as_one() {
         us
     };
     for storage in Storage::ALL {
-        let scene = ensemble(1_500_000, 32, 1, storage);
+        let batched = Deformation { batches: Batches::Always, ..stored(storage) };
+        let scene = made(ensemble((1_500_000, 32, 1), batched));
         let state = scenes::state(&scene, 1);
         let one = measure(&Ours::new(&device, &scene, &[state], Extent::Positions).expect("a trial"));
-        let scene = ensemble(1_500_000, 32, 16, storage);
+        let scene = made(ensemble((1_500_000, 32, 16), batched));
         let state = scenes::state(&scene, 1);
-        let sixteen = measure(&Batch::new(&device, &scene, std::slice::from_ref(&state)).expect("a trial"));
+        let sixteen = Ours::new(&device, &scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
+        assert_eq!(sixteen.kernels()[0].name, "batch");
+        let sixteen = measure(&sixteen);
         eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
         assert!(sixteen < 4.0 * one, "{storage:?} {one} {sixteen}");
         if matches!(storage, Storage::F16 | Storage::Bf16) {
@@ -195,4 +239,34 @@ fn gpu_sixteen_vectors_at_once_take_less_than_four_times_as_long_as_one() {
             assert!(products < 4.0 * one, "{storage:?} {one} {products}");
         }
     }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_scenes_that_choose_have_batches_where_they_pay() {
+    let device = Device::open(0).expect("a CUDA device");
+    let mut slow = Vec::new();
+    for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {
+        for count in [2, 3, 4, 8, 16, 64] {
+            if vertices * count * rank > 1 << 29 {
+                continue;
+            }
+            let of =
+                |batches| made(ensemble((vertices, rank, count), Deformation { batches, ..Deformation::default() }));
+            let [together, apart, chosen] = [Batches::Always, Batches::Never, Batches::Auto].map(of);
+            let state = scenes::state(&together, 1);
+            let measured = |scene: &Arc<Scene>| {
+                let ours = Ours::new(&device, scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
+                time(&device, &ours, Cache::Warm, 100).expect("times").median_us
+            };
+            let [batch, alone] = [&together, &apart].map(measured);
+            let chooses = modalcast::gpu::plan(&chosen).kernel(Launch::Batch).is_some();
+            eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
+            let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
+            if own > 1.5 * other + 2.0 {
+                slow.push((vertices, rank, count, own, other));
+            }
+        }
+    }
+    assert!(slow.is_empty(), "chosen and slower: {slow:?}");
 }

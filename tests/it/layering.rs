@@ -129,8 +129,9 @@ fn provoked_faults_are_seen() {
     assert_eq!(illegal("low", "use modalcast_proto::v1;", &table), ["low names proto"]);
 }
 
-/// A kernel that no deformer launches, only trials that are measured: its twin is a test of its launcher.
-fn is_only_measured(name: &str) -> bool {
+/// A kernel that only trials launch, or that computes what another one does by another way: its twin is a test of its
+/// launcher, or beside it.
+fn is_walked_in_tests(name: &str) -> bool {
     name.starts_with("thesis_") || ["roof", "plain_update", "batch", "batch_mma"].contains(&name)
 }
 
@@ -177,7 +178,7 @@ fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
         let name = kernel.file_stem().expect("a name").to_string_lossy().into_owned();
         let launcher = launchers.iter().find(|path| path.file_stem().is_some_and(|stem| *stem == *name));
         let launcher = launcher.unwrap_or_else(|| panic!("{name} has no launcher below src/gpu"));
-        if is_only_measured(&name) {
+        if is_walked_in_tests(&name) {
             let text = fs::read_to_string(launcher).expect("a file");
             assert!(text.contains("    fn twin_of_"), "{} has no twin of {name}", launcher.display());
             continue;

@@ -98,6 +98,16 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
     list
 }
 
+/// All that `batch` is compiled with on a large device, and the most vectors elsewhere.
+fn variants_of_batch(features: &[&'static str]) -> Vec<Variant> {
+    let counts = subsets(features).into_iter().filter(|set| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8")));
+    let large: Vec<Vec<&str>> =
+        counts.flat_map(|set| storages().map(move |storage| [set.clone(), storage].concat())).collect();
+    let others = [(7, 5), (8, 0), (12, 0)].into_iter();
+    let others = others.flat_map(|capability| storages().map(move |storage| (storage, capability)));
+    large.into_iter().map(|set| (set, (9, 0))).chain(others).collect()
+}
+
 /// All that the other kernels have.
 fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
     let capabilities = [(7, 5), (8, 0), (9, 0), (12, 0)];
@@ -117,8 +127,11 @@ fn compiled(kernel: &plan::KernelSource, variants: &[Variant]) -> Vec<Assembled>
 #[ignore = "needs NVRTC: deploy/check installs it"]
 fn nvrtc_compiles_every_kernel_without_spilling() {
     for kernel in plan::KERNELS {
-        let deform = kernel.name == "deform";
-        let variants = if deform { variants_of_deform } else { variants_of_others }(kernel.features);
+        let variants = match kernel.name {
+            "deform" => variants_of_deform,
+            "batch" => variants_of_batch,
+            _ => variants_of_others,
+        }(kernel.features);
         let spills = |(variant, compiled): (&Variant, Assembled)| {
             let spilled = compiled.spilled();
             (spilled > 0).then(|| format!("{variant:?}: {spilled} bytes"))
@@ -129,7 +142,7 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
 }
 
 /// Macros that add code, each with the macro that it builds on; the others choose among code of about the same length.
-const ADD: [(&str, &str, &[&str]); 12] = [
+const ADD: [(&str, &str, &[&str]); 13] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED", &["MODES"]),
     ("deform", "DISPLACEMENTS", &["MODES"]),
@@ -139,12 +152,14 @@ const ADD: [(&str, &str, &[&str]); 12] = [
     ("deform", "NORMAL_MAPS", &["ORIENT"]),
     ("deform", "SHEAR", &["ORIENT"]),
     ("deform", "FOLLOWERS", &[]),
+    ("batch", "FOLLOWERS", &[]),
     ("normals", "NORMAL_MAPS", &[]),
     ("normals", "SHEAR", &[]),
     ("normals", "FOLLOWERS", &[]),
 ];
 /// `apply` asks one question more with followers, which is less than what its file is filled up to.
-const CHOOSE: [(&str, &str); 3] = [("deform", "NARROW"), ("deform", "TRUNCATED"), ("apply", "FOLLOWERS")];
+const CHOOSE: [(&str, &str); 5] =
+    [("batch", "BATCH_8"), ("batch", "BATCH_4"), ("deform", "NARROW"), ("deform", "TRUNCATED"), ("apply", "FOLLOWERS")];
 
 #[test]
 #[ignore = "needs NVRTC: deploy/check installs it"]

@@ -20,7 +20,7 @@ fn a_scene_without_modes_normal_maps_and_shear_compiles_none_of_their_branches()
     assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
     assert_eq!(bare.bytes_in, 80 + 48 * 4, "a header and four transforms, no q");
     let left_out: Vec<_> = bare.left_out.iter().map(|part| part.feature).collect();
-    let last = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes"];
+    let last = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
     assert_eq!(left_out, [&["modes", "normal_maps", "shear"][..], &last].concat());
     assert_eq!(bare.left_out[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
 }
@@ -32,7 +32,7 @@ fn a_scene_that_needs_more_leaves_less_out() {
     assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
     assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
     assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
-    assert_eq!(full.left_out.len(), 6);
+    assert_eq!(full.left_out.len(), 7);
 }
 
 #[test]

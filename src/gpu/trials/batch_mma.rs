@@ -9,7 +9,6 @@ use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 use super::super::device::Device;
 use super::super::memory::{address, download, room, upload};
 use super::super::plan::storage_define;
-use super::batch::{bytes, check};
 use super::trial::{Code, Compiled, KernelFacts, Trial};
 use super::turns::{Turns, Values};
 use crate::error::{Error, Result, during, invalid};
@@ -83,7 +82,7 @@ impl BatchMma {
     /// compensated sums, or there is no state; `Unavailable` when the device has no such tensor cores or NVRTC is
     /// missing; `Fault` when the device refuses.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State]) -> Result<Self> {
-        check(scene, MOST)?;
+        check(scene)?;
         let storage = scene.deformation.storage;
         if !matches!(storage, Storage::F16 | Storage::Bf16) {
             return Err(invalid("deform.storage", "f16 or bf16 for tensor cores", storage.name()));
@@ -92,7 +91,6 @@ impl BatchMma {
         let (vectors, define) = vectors_for(scene.domains.len());
         let defines: Vec<&str> = storage_define(storage).into_iter().chain(define).collect();
         let tiles = Tiles::new(scene.shape_of(0), storage);
-        let bytes = bytes(scene, &tiles).into_iter().filter(|(name, _)| *name != "scales");
         Ok(Self {
             name: format!("batch_mma{}_{}", scene.domains.len(), storage.name()),
             compiled: Compiled::new(device, &CODE, &defines)?,
@@ -106,7 +104,7 @@ impl BatchMma {
             args: args(scene, tiles.chunks()),
             vectors,
             tiles: tiles.count() as u32,
-            bytes: bytes.collect(),
+            bytes: bytes(scene, &tiles),
         })
     }
 
@@ -162,6 +160,28 @@ impl Trial for BatchMma {
     fn kernels(&self) -> Vec<KernelFacts> {
         vec![self.compiled.facts.clone()]
     }
+}
+
+/// Refuses scenes that are not one shape, used by at most [`MOST`] domains.
+fn check(scene: &Scene) -> Result<()> {
+    let (count, shape) = (scene.domains.len(), scene.domains[0].shape);
+    if count > MOST {
+        return Err(invalid("scene.domains", format!("at most {MOST}"), count));
+    }
+    if let Some(other) = scene.domains.iter().position(|domain| domain.shape != shape) {
+        return Err(invalid(
+            format!("domain {other}: shape"),
+            format!("{shape}, as the first"),
+            scene.domains[other].shape,
+        ));
+    }
+    if scene.deformation.compensated {
+        return Err(invalid("deform.compensated", "false for tensor cores", true));
+    }
+    if scene.needs.followers {
+        return Err(invalid("follows", "no followers for tensor cores", true));
+    }
+    Ok(())
 }
 
 fn check_device(device: &Device) -> Result<()> {
@@ -232,16 +252,58 @@ fn args(scene: &Scene, chunks: usize) -> BatchMmaArgs {
     args
 }
 
+/// What a launch must move, but for scales, which 16 bits do without.
+fn bytes(scene: &Scene, tiles: &Tiles) -> Vec<(&'static str, u64)> {
+    let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
+    vec![
+        ("U", tiles.bytes().len() as u64),
+        ("x0", 48 * tiles.quads() as u64),
+        ("q", 4 * domains * tiles.rank() as u64),
+        ("T", 48 * domains),
+        ("x", 12 * vertices),
+    ]
+}
+
 #[cfg(test)]
 mod tests {
-    use super::super::batch::tests::{SIZES, ensemble};
     use super::super::trial::tests::compile_all;
-    use super::super::turns::tests::x_of;
+    use super::super::turns::tests::{Random, scene as trial_scene, x_of};
     use super::*;
+    use crate::gpu::batch::placed;
+    use crate::scene::Parts;
     use crate::storage::{Plane, TILE_QUADS};
 
     const QUADS: usize = 8;
     const STRIDE: usize = 3 * QUADS + 2;
+
+    fn ensemble(vertices: usize, rank: usize, domains: usize, storage: Storage) -> (Arc<Scene>, State) {
+        let (one, _) = trial_scene(&[(vertices, rank, 1)]);
+        let mut parts = Parts::named("ensemble");
+        parts.shapes = vec![one.shapes[0].clone()];
+        parts.materials = one.materials.clone();
+        parts.domains = vec![one.domains[0].clone(); domains];
+        parts.deformation.storage = storage;
+        let scene = Scene::new(parts).expect("a scene");
+        let (mut random, mut state) = (Random(domains as u64), State::rest(&scene));
+        state.q.iter_mut().for_each(|coordinate| *coordinate = random.number());
+        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.number()));
+        (scene, state)
+    }
+
+    const SIZES: [(usize, usize, usize); 12] = [
+        (1, 3, 1),
+        (4, 1, 16),
+        (63, 13, 2),
+        (64, 4, 16),
+        (65, 16, 3),
+        (127, 0, 4),
+        (128, 32, 16),
+        (129, 5, 8),
+        (192, 17, 5),
+        (256, 33, 7),
+        (261, 12, 9),
+        (320, 50, 13),
+    ];
 
     /// What the kernel reads.
     struct Tables {
@@ -366,7 +428,7 @@ mod tests {
                         let sum = sums[2 * axis + vertex / 2][pass / 2][lane][2 * (vertex % 2) + of_pair] as f32;
                         rest[4 * axis + vertex] + sum * shrink
                     });
-                    [0, 1, 2].map(|row| super::super::batch::tests::placed(&rows[4 * row..], bent))
+                    [0, 1, 2].map(|row| placed(&rows[4 * row..], bent))
                 })
                 .collect();
             for (i, four) in world.chunks_exact(4).enumerate() {
@@ -429,7 +491,7 @@ mod tests {
         let vectors: Vec<usize> = [1, 8, 9, 16, 17, 32].map(|domains| vectors_for(domains).0).into();
         assert_eq!(vectors, [8, 8, 16, 16, 32, 32]);
         let (scene, _) = ensemble(9, 2, 33, Storage::F16);
-        assert!(check(&scene, MOST).expect_err("33 domains").to_string().contains("at most 32"));
+        assert!(check(&scene).expect_err("33 domains").to_string().contains("at most 32"));
     }
 
     #[test]

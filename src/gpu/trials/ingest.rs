@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::sync::Arc;
 
 use super::super::device::Device;
-use super::super::inputs::{Inputs, Packing, Pinned};
+use super::super::inputs::{Inputs, Listing, Packing, Pinned};
 use super::super::layout::Header;
 use super::super::work::Coordinates;
 use super::measure::{Cache, Timing, time};
@@ -41,7 +41,7 @@ pub fn ingest(device: &Device, scene: &Arc<Scene>, state: &State, replays: usize
     let coordinates = Coordinates::new(scene);
     // Only the amount counts here: factors and tiles are left empty.
     let factors = vec![Vec::new(); scene.shapes.len()];
-    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, spans: Vec::new(), tiles: 0 };
+    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() };
     let mut inputs = Inputs::new(device, &Arc::new(packing))?;
     let mut pinned = inputs.pinned(device)?;
     inputs.write(&mut pinned, &Header::default(), state)?;

@@ -8,14 +8,12 @@
 //! | [`measure`] | the stopwatch |
 //! | [`roof`] | the best rates of the device, to compare with |
 //! | [`ours`] | the deformer's own kernels as a trial |
-//! | [`mod@batch`] | many vectors q of one U at once |
-//! | [`mod@batch_mma`] | the same by tensor cores, with an order and a rounding of its own |
+//! | [`mod@batch_mma`] | many vectors q of one U at once by tensor cores, with an order and a rounding of its own |
 //! | [`mod@ingest`] | the way of a step's values to the device |
 //! | [`mod@overlap`] | steps that the host reads, one after the other and side by side |
 //! | [`cublas`], [`plain_update`] | a library's products, and the vertex update behind them |
 //! | [`thesis`] | the kernels of the thesis |
 
-mod batch;
 mod batch_mma;
 mod cublas;
 mod ingest;
@@ -28,7 +26,6 @@ mod thesis;
 mod trial;
 mod turns;
 
-pub use batch::Batch;
 pub use batch_mma::BatchMma;
 pub use cublas::{Cublas, Peer, cublas_version};
 pub use ingest::ingest;
@@ -39,3 +36,6 @@ pub use roof::{Roofs, roofs};
 pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
 pub use trial::{KernelFacts, Trial};
 pub use turns::Part;
+
+#[cfg(test)]
+pub(super) use turns::tests;

@@ -25,7 +25,7 @@ use crate::storage::modes_per_chunk;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Extent {
-    /// u = U q alone. For the judge, x = T (x0 + u) follows on the host, in f64.
+    /// u = U q alone, of scenes without batches. For the judge, x = T (x0 + u) follows on the host, in f64.
     Uq,
     /// Positions, and a box of each warp's.
     Positions,
@@ -75,7 +75,7 @@ impl Ours {
     /// Packs the scene and the values of each state onto the device.
     ///
     /// # Errors
-    /// `Invalid` when there is no state; `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
+    /// `Invalid` when there is no state, or u alone is asked of a scene with batches; `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], extent: Extent) -> Result<Self> {
         Self::of_changed(device, scene, states, (extent, None))
     }
@@ -92,11 +92,14 @@ impl Ours {
     ) -> Result<Self> {
         let tables = Tables::new(scene);
         let plan = plan_of(scene, &tables);
+        if extent == Extent::Uq && plan.kernel(Launch::Batch).is_some() {
+            return Err(invalid("deform.batches", "never, where u alone is computed", "batches"));
+        }
         let normals = plan.kernel(Launch::Normals).filter(|_| extent == Extent::Whole);
         let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
         let mut deform = plan.needed(Launch::Deform)?.clone();
         deform.shape_for(extent);
-        let deform = Deform::new(device, scene, &deform, tables)?;
+        let deform = Deform::new(device, scene, (&deform, plan.kernel(Launch::Batch)), tables)?;
         let outputs = room(device, outputs_of(&plan).iter().sum())?;
         let mut ours = Self {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
@@ -293,11 +296,11 @@ impl Trial for Ours {
 
     fn launches(&self) -> usize {
         let more = [self.extent == Extent::Whole, self.normals.is_some()].map(usize::from);
-        1 + more[0] + more[1]
+        self.deform.kernels().len() + more[0] + more[1]
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
-        let functions = [("deform", &self.deform.function), ("bounds", &self.bounds.function)].into_iter();
+        let functions = self.deform.kernels().into_iter().chain([("bounds", &self.bounds.function)]);
         let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
         functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
     }

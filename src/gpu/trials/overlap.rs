@@ -15,7 +15,7 @@ use serde::Serialize;
 
 use super::super::deformer::{CudaDeformer, MOST_UNDER_WAY};
 use super::super::device::Device;
-use super::super::inputs::{Inputs, Packing, Writer};
+use super::super::inputs::{Inputs, Listing, Packing, Writer};
 use super::super::layout::Header;
 use super::super::staging::{PARALLEL, copy_on_all_cores};
 use super::super::work::Coordinates;
@@ -194,7 +194,7 @@ fn alone(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<
 fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<(u64, [f64; 2])> {
     // Only the amount counts here: factors and tiles are left empty.
     let (coordinates, factors) = (Coordinates::new(scene), vec![Vec::new(); scene.shapes.len()]);
-    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, spans: Vec::new(), tiles: 0 };
+    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() };
     let packing = Arc::new(packing);
     let mut pinned = Inputs::new(device, &packing)?.pinned(device)?;
     let words = pinned.as_mut_slice().map_err(during("write"))?;

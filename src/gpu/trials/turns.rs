@@ -125,16 +125,16 @@ impl Turns {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(in super::super) mod tests {
     use super::*;
     use crate::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
     use crate::scene::Parts;
 
     /// Numbers between -1 and 1 that repeat (a linear congruential generator).
-    pub(in super::super) struct Random(pub(in super::super) u64);
+    pub(in super::super::super) struct Random(pub(in super::super::super) u64);
 
     impl Random {
-        pub(in super::super) fn number(&mut self) -> f32 {
+        pub(in super::super::super) fn number(&mut self) -> f32 {
             self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
         }
@@ -155,7 +155,7 @@ pub(super) mod tests {
     }
 
     /// One domain of each (vertices, rank, triangles), and a state of it.
-    pub(in super::super) fn scene(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, State) {
+    pub(in super::super::super) fn scene(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, State) {
         let mut random = Random(shapes.len() as u64);
         let mut parts = Parts::named("trial");
         parts.materials = vec![Material::default()];

@@ -4,13 +4,16 @@
 //! A shape of more than [`SMALL`] quads, or one with modes that several domains share, is cut into tiles of its own, and
 //! its U lies on the device once. The quads of smaller domains with the same number of chunks fill tiles together, so
 //! that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first: a long tile that began last would be
-//! waited for.
+//! waited for. Vertices of domains that [`batches`] puts into groups have tiles too, behind all others: a whole step leaves
+//! them to `batch`, and a list of changed domains names them.
 
+pub(super) mod batches;
 mod coordinates;
 mod quads;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 
+use batches::Batched;
 pub(super) use coordinates::Coordinates;
 pub(super) use quads::{Quads, rest_directions, rest_positions};
 
@@ -38,6 +41,11 @@ pub(super) enum Source {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Work {
     pub tiles: Vec<Tile>,
+    /// Of each shape, whether one lane has a vertex and its corner: different kernels compute those of batches.
+    pub alike: Vec<bool>,
+    /// Tiles before those that a whole step leaves to `batch`.
+    pub launched: usize,
+    pub batched: Batched,
     pub lanes: Vec<Lane>,
     /// The first scale of each lane; only with `Int8`.
     pub lane_scales: Vec<u32>,
@@ -55,7 +63,7 @@ pub(super) struct Work {
 }
 
 /// Whether corner i of a shape is its vertex i, so that one lane has both.
-pub(super) fn is_alike(shape: &Shape) -> bool {
+fn is_alike(shape: &Shape) -> bool {
     let corners = &shape.mesh.corners().vertices;
     corners.len() == shape.mesh.rest().len() && corners.iter().enumerate().all(|(at, vertex)| at as u32 == *vertex)
 }
@@ -81,9 +89,16 @@ enum Item {
 
 impl Work {
     pub(super) fn new(scene: &Scene, coordinates: &Coordinates) -> Self {
-        let mut items = items(scene);
-        items.sort_by_key(|(role, _)| std::cmp::Reverse(role.chunks));
-        let mut work = Self::empty(scene);
+        let batched = batches::shapes(scene);
+        let alike = scene.shapes.iter().zip(&batched).map(|(shape, batched)| !batched && is_alike(shape)).collect();
+        let mut work = Self::empty(scene, alike);
+        let mut items = items(scene, &work.alike);
+        let is_batched = |role: Role, item: &Item| match item {
+            Item::Own { domain, .. } => role.flags & TILE_VERTICES > 0 && batched[scene.domains[*domain].shape],
+            Item::Mixed(_) => false,
+        };
+        items.sort_by_key(|(role, item)| (is_batched(*role, item), std::cmp::Reverse(role.chunks)));
+        work.launched = items.partition_point(|(role, item)| !is_batched(*role, item));
         let mut first_words: Vec<Option<u64>> = vec![None; scene.shapes.len()];
         for (role, item) in items {
             let index = work.tiles.len() as u32;
@@ -105,11 +120,12 @@ impl Work {
         if scene.deformation.storage != Storage::Int8 {
             work.lane_scales.clear();
         }
+        work.batched = Batched::new(scene, (&work, coordinates), (&batched, &first_words));
         work
     }
 
     /// Room for scales of every shape, and no tiles yet.
-    fn empty(scene: &Scene) -> Self {
+    fn empty(scene: &Scene, alike: Vec<bool>) -> Self {
         let storage = scene.deformation.storage;
         let (mut scales, mut first_scale) = (0_u64, Vec::new());
         for shape in &scene.shapes {
@@ -121,11 +137,14 @@ impl Work {
         }
         Self {
             tiles: Vec::new(),
+            launched: 0,
+            batched: Batched::default(),
             lanes: Vec::new(),
             lane_scales: Vec::new(),
             sources: Vec::new(),
             words: 0,
-            quads: Quads::new(scene),
+            quads: Quads::new(scene, &alike),
+            alike,
             first_scale,
             scales,
             spans: vec![[(0, 0); 2]; scene.domains.len()],
@@ -241,9 +260,8 @@ fn own_tiles(scene: &Scene) -> Vec<bool> {
 }
 
 /// Every tile with its role, in the order of the domains.
-fn items(scene: &Scene) -> Vec<(Role, Item)> {
+fn items(scene: &Scene, alike: &[bool]) -> Vec<(Role, Item)> {
     let own = own_tiles(scene);
-    let alike: Vec<bool> = scene.shapes.iter().map(is_alike).collect();
     let mut items = Vec::new();
     // Per role, the domains that wait for their tile to fill up, and its quads.
     let mut open: std::collections::BTreeMap<Role, (Vec<usize>, usize)> = std::collections::BTreeMap::new();

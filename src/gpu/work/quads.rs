@@ -1,6 +1,6 @@
 //! Where x0, normals and tangents at rest lie on the device, in quads as `deform` reads them. Pure.
 
-use super::{QUAD, Work, has_own_tiles, is_alike, orients, own_tiles};
+use super::{QUAD, Work, has_own_tiles, orients, own_tiles};
 use crate::domain::Shape;
 use crate::scene::Scene;
 use crate::storage::TILE_QUADS;
@@ -21,27 +21,28 @@ pub(in super::super) struct Quads {
 }
 
 impl Quads {
-    pub(super) fn new(scene: &Scene) -> Self {
+    /// `alike`: of each shape, whether one lane has a vertex and its corner.
+    pub(super) fn new(scene: &Scene, alike: &[bool]) -> Self {
         let orients = orients(scene);
-        let places = |own: &dyn Fn(&Shape) -> Option<usize>, next: &mut u64| -> Vec<u32> {
-            let place = |shape| {
+        let places = |own: &dyn Fn(&Shape, bool) -> Option<usize>, next: &mut u64| -> Vec<u32> {
+            let place = |(shape, alike): (&Shape, &bool)| {
                 let first = *next;
-                *next += own(shape).map_or(0, |items| items.div_ceil(QUAD)) as u64;
+                *next += own(shape, *alike).map_or(0, |items| items.div_ceil(QUAD)) as u64;
                 first as u32
             };
-            scene.shapes.iter().map(place).collect()
+            scene.shapes.iter().zip(alike).map(place).collect()
         };
-        let (mut next, unlike) = (0, |shape: &Shape| !is_alike(shape));
         let vertices = |shape: &Shape| shape.mesh.rest().len();
-        let before = places(&|shape| unlike(shape).then(|| vertices(shape)), &mut next);
+        let mut next = 0;
+        let before = places(&|shape, alike| (!alike).then(|| vertices(shape)), &mut next);
         let directed = next;
-        let alike = places(&|shape| is_alike(shape).then(|| vertices(shape)), &mut next);
+        let both = places(&|shape, alike| alike.then(|| vertices(shape)), &mut next);
         let rest = next;
         let corners = |shape: &Shape| shape.mesh.corners().vertices.len();
-        let behind = places(&|shape| (orients && unlike(shape)).then(|| corners(shape)), &mut next);
+        let behind = places(&|shape, alike| (orients && !alike).then(|| corners(shape)), &mut next);
         let choose = |others: &[u32]| {
-            let each = scene.shapes.iter().zip(&alike).zip(others);
-            each.map(|((shape, alike), other)| if is_alike(shape) { *alike } else { *other }).collect()
+            let each = alike.iter().zip(&both).zip(others);
+            each.map(|((alike, both), other)| if *alike { *both } else { *other }).collect()
         };
         Self { vertices: choose(&before), corners: choose(&behind), rest, directed, end: next }
     }
@@ -70,7 +71,7 @@ pub(in super::super) fn rest_directions(scene: &Scene, work: &Work) -> [Vec<[f32
     let vertices = own_tiles(scene);
     for (index, shape) in scene.shapes.iter().enumerate() {
         let corners = &shape.mesh.corners().normals;
-        let own = if is_alike(shape) { vertices[index] } else { has_own_tiles(corners.len()) };
+        let own = if work.alike[index] { vertices[index] } else { has_own_tiles(corners.len()) };
         let first = (u64::from(work.quads.corners[index]) - work.quads.directed) as usize;
         let fours = arranged(&quads_of_items(corners), own);
         normals[3 * first..][..fours.len()].copy_from_slice(&fours);

@@ -6,14 +6,14 @@ use super::*;
 use std::sync::Arc;
 
 /// What lies in the words, scales and x0 of a scene, as `deform` loads them.
-struct Loaded {
-    words: Vec<Plane>,
-    scales: Vec<f32>,
-    rest: Vec<[f32; 4]>,
-    factors: Vec<Vec<f32>>,
+pub(in super::super) struct Loaded {
+    pub words: Vec<Plane>,
+    pub scales: Vec<f32>,
+    pub rest: Vec<[f32; 4]>,
+    pub factors: Vec<Vec<f32>>,
 }
 
-fn load(scene: &Scene, work: &Work) -> Loaded {
+pub(in super::super) fn load(scene: &Scene, work: &Work) -> Loaded {
     let tiles = |shape: usize| Tiles::new(&scene.shapes[shape], scene.deformation.storage);
     let mut loaded = Loaded {
         words: Vec::new(),

@@ -1,8 +1,14 @@
 //! A warp of `kernels/batch.cu` in step, with its ring, its stages and its ways out.
 
-use super::{BatchArgs, MOST, WARPS, amounts, transforms, vectors_for};
+use std::sync::Arc;
+
+use super::super::inputs::{Listing, Packing};
+use super::super::layout::{Block, Group, Member};
+use super::super::work::tests::{Loaded, load};
+use super::super::work::{Coordinates, Work};
+use super::{MOST, WARPS};
 use crate::scene::{Scene, State, Storage};
-use crate::storage::{Plane, TILE_QUADS, Tiles, modes_per_chunk};
+use crate::storage::{Plane, TILE_QUADS, modes_per_chunk};
 
 /// Quads and vertices of a warp, 16 byte words of a stage, and stages of its ring.
 const QUADS: usize = TILE_QUADS / WARPS;
@@ -14,47 +20,70 @@ const POISON: Plane = Plane([0xff; 16]);
 
 /// What the kernel reads.
 pub(super) struct Tables {
-    pub tiles: Tiles,
-    transforms: Vec<f32>,
+    pub scene: Arc<Scene>,
+    pub work: Work,
+    loaded: Loaded,
+    state: State,
     q: Vec<f32>,
-    vectors: usize,
 }
 
 impl Tables {
-    pub(super) fn of(scene: &Scene, state: &State) -> Self {
-        let tiles = Tiles::new(scene.shape_of(0), scene.deformation.storage);
-        let (vectors, modes) = (vectors_for(scene.domains.len()).0, tiles.chunks() * modes_per_chunk(tiles.storage()));
-        let q = amounts(scene, state, tiles.factors(), (vectors, modes));
-        Self { transforms: transforms(scene, state, vectors), q, vectors, tiles }
+    pub(super) fn of(scene: &Arc<Scene>, state: &State) -> Self {
+        let coordinates = Coordinates::new(scene);
+        let work = Work::new(scene, &coordinates);
+        let loaded = load(scene, &work);
+        let mut q = vec![f32::NAN; coordinates.total];
+        let packing = Packing {
+            scene: Arc::clone(scene),
+            coordinates,
+            factors: loaded.factors.clone(),
+            listing: Listing::default(),
+        };
+        for domain in 0..scene.domains.len() {
+            let mut at = packing.coordinates.first[domain] as usize;
+            packing.put_q(domain, state.q_of(scene, domain), |number| {
+                q[at] = number;
+                at += 1;
+            });
+        }
+        Self { scene: Arc::clone(scene), work, loaded, state: state.clone(), q }
     }
 }
 
 /// One warp of a block, in step.
 pub(super) struct Warp<'a> {
     tables: &'a Tables,
-    args: BatchArgs,
+    pub group: Group,
     tile: usize,
     first_word: usize,
     width: usize,
+    /// Quads of the tile before the warp's.
+    before: usize,
     pub quads: usize,
     first: usize,
     ring: Vec<Plane>,
 }
 
 impl<'a> Warp<'a> {
-    pub(super) fn new(tables: &'a Tables, args: BatchArgs, (tile, warp): (usize, usize)) -> Self {
-        let width = TILE_QUADS.min((args.vertices as usize).div_ceil(4) - TILE_QUADS * tile);
+    pub(super) fn new(tables: &'a Tables, block: Block, warp: usize) -> Self {
+        let (group, tile) = (tables.work.batched.groups[block.group as usize], block.tile as usize);
+        let width = TILE_QUADS.min((group.vertices as usize).div_ceil(4) - TILE_QUADS * tile);
         let before = QUADS * warp;
         Self {
             tables,
-            args,
+            group,
             tile,
-            first_word: 3 * args.chunks as usize * TILE_QUADS * tile + before,
+            first_word: group.first_word as usize + 3 * group.chunks as usize * TILE_QUADS * tile + before,
             width,
+            before,
             quads: width.saturating_sub(before).min(QUADS),
             first: 4 * (TILE_QUADS * tile + before),
             ring: vec![POISON; STAGES * STAGE],
         }
+    }
+
+    fn member(&self, index: usize) -> Member {
+        self.tables.work.batched.members[self.group.first_member as usize + index]
     }
 
     fn copy_stage(&mut self, stage: usize) {
@@ -62,9 +91,9 @@ impl<'a> Warp<'a> {
         self.ring[at..][..STAGE].fill(POISON);
         for (lane, i) in (0..32).flat_map(|lane| (0..STAGE / 32).map(move |i| (lane, i))) {
             let row = 12 * stage + lane / QUADS + i * (32 / QUADS);
-            if row < 3 * self.args.chunks as usize {
+            if row < 3 * self.group.chunks as usize {
                 let from = self.first_word + row * self.width + (lane % QUADS).min(self.quads - 1);
-                self.ring[at + lane + 32 * i] = self.tables.tiles.planes()[from];
+                self.ring[at + lane + 32 * i] = self.tables.loaded.words[from];
             }
         }
     }
@@ -72,7 +101,7 @@ impl<'a> Warp<'a> {
     fn entry(&self, byte: usize) -> f32 {
         let bytes: &[u8] = bytemuck::cast_slice(&self.ring);
         let two = [bytes[byte], bytes.get(byte + 1).copied().unwrap_or(0)];
-        match self.tables.tiles.storage() {
+        match self.tables.scene.deformation.storage {
             Storage::F32 => bytemuck::pod_read_unaligned(&bytes[byte..byte + 4]),
             Storage::F16 => half::f16::from_le_bytes(two).to_f32(),
             Storage::Bf16 => half::bf16::from_le_bytes(two).to_f32(),
@@ -80,11 +109,12 @@ impl<'a> Warp<'a> {
         }
     }
 
-    /// A lane's sums, [2 * axis + vertex][domain].
+    /// A lane's sums, [2 * axis + vertex][member].
     pub(super) fn sums(&mut self) -> Vec<[[f32; MOST]; 6]> {
-        let (chunks, vectors) = (self.args.chunks as usize, self.tables.vectors);
-        let per_chunk = modes_per_chunk(self.tables.tiles.storage());
-        let (size, scales) = (4 / per_chunk, self.tables.tiles.scales());
+        let chunks = self.group.chunks as usize;
+        let per_chunk = modes_per_chunk(self.tables.scene.deformation.storage);
+        let size = 4 / per_chunk;
+        let scales = &self.tables.loaded.scales[self.group.first_scale as usize..];
         let mut sums = vec![[[0.0_f32; MOST]; 6]; 32];
         (0..STAGES).for_each(|stage| self.copy_stage(stage));
         for stage in 0..chunks.div_ceil(4) {
@@ -97,8 +127,9 @@ impl<'a> Warp<'a> {
                         let byte = 4 * size * (3 * mode + axis);
                         let place = byte / 16 * (16 * QUADS) + byte % 16 + vertex * size;
                         let entry = self.entry(lanes + chunk * (3 * 16 * QUADS) + place);
-                        for (domain, sum) in sums[2 * axis + vertex].iter_mut().enumerate().take(vectors) {
-                            *sum = entry.mul_add(self.tables.q[at * vectors + domain] * scale, *sum);
+                        let members = self.group.members as usize;
+                        for (index, sum) in sums[2 * axis + vertex].iter_mut().enumerate().take(members) {
+                            *sum = entry.mul_add(self.tables.q[self.member(index).first_q as usize + at] * scale, *sum);
                         }
                     }
                 }
@@ -109,15 +140,20 @@ impl<'a> Warp<'a> {
     }
 
     /// What two domains stage, [domain][vertex][3].
-    pub(super) fn staged(&self, sums: &[[[f32; MOST]; 6]], domain: usize) -> Vec<f32> {
+    pub(super) fn staged(&self, sums: &[[[f32; MOST]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * VERTICES];
+        let tile = 3 * (self.group.rest as usize + TILE_QUADS * self.tile);
         for (lane, i) in (0..32).flat_map(|lane| (0..4).map(move |i| (lane, i))) {
             let (one, vertex) = (i / 2, i % 2);
-            let quad = (lane / 2).min(self.quads - 1);
-            let rest = self.tables.tiles.rest()[self.first / 4 + quad];
-            let bent = [0, 1, 2]
-                .map(|axis| rest[4 * axis + 2 * (lane % 2) + vertex] + sums[lane][2 * axis + vertex][domain + one]);
-            let rows = &self.tables.transforms[12 * (domain + one)..];
+            if member + one >= self.group.members as usize {
+                continue;
+            }
+            let quad = self.before + (lane / 2).min(self.quads - 1);
+            let bent = [0, 1, 2].map(|axis| {
+                let rest = self.tables.loaded.rest[tile + axis * self.width + quad][2 * (lane % 2) + vertex];
+                rest + sums[lane][2 * axis + vertex][member + one]
+            });
+            let rows = self.tables.state.transforms[self.member(member + one).domain as usize].0;
             for axis in 0..3 {
                 let at = one * 3 * VERTICES + 6 * lane + 3 * vertex + axis;
                 staged[at] = placed(&rows[4 * axis..], bent);
@@ -126,29 +162,30 @@ impl<'a> Warp<'a> {
         staged
     }
 
-    pub(super) fn store(&self, staged: &[f32], domain: usize, positions: &mut [f32]) {
-        let mut put = |domain: usize, number: usize, value: f32| {
-            let at = 3 * (self.args.first[domain] as usize + self.first) + number;
+    pub(super) fn store(&self, staged: &[f32], member: usize, positions: &mut [f32]) {
+        let mut put = |member: usize, number: usize, value: f32| {
+            let at = 3 * (self.member(member).first as usize + self.first) + number;
             assert!(positions[at].is_nan(), "number {at} is written once");
             positions[at] = value;
         };
-        let vertices = VERTICES.min(self.args.vertices as usize - self.first);
-        let domains = self.args.domains as usize;
-        if self.args.aligned == 1 && vertices == VERTICES && domain + 1 < domains {
+        let vertices = VERTICES.min(self.group.vertices as usize - self.first);
+        let members = self.group.members as usize;
+        let aligned = || (0..2).all(|one| self.member(member + one).first.is_multiple_of(4));
+        if vertices == VERTICES && member + 1 < members && aligned() {
             for (lane, i) in (0..32).flat_map(|lane| (0..12).map(move |i| (lane, i))) {
                 let (word, within) = (i / 4, i % 4);
                 let (to, first) = match word {
-                    0 => (domain, lane),
-                    1 if lane < 16 => (domain, 32 + lane),
-                    1 => (domain + 1, lane - 16),
-                    _ => (domain + 1, 16 + lane),
+                    0 => (member, lane),
+                    1 if lane < 16 => (member, 32 + lane),
+                    1 => (member + 1, lane - 16),
+                    _ => (member + 1, 16 + lane),
                 };
                 put(to, 4 * first + within, staged[4 * (32 * word + lane) + within]);
             }
             return;
         }
-        for one in (0..2).filter(|one| domain + one < domains) {
-            (0..3 * vertices).for_each(|k| put(domain + one, k, staged[one * 3 * VERTICES + k]));
+        for one in (0..2).filter(|one| member + one < members) {
+            (0..3 * vertices).for_each(|k| put(member + one, k, staged[one * 3 * VERTICES + k]));
         }
     }
 }
