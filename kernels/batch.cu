@@ -109,7 +109,10 @@ struct Part {
     unsigned first_member;
     unsigned first_scale; // of the tile
     unsigned tile;
-    unsigned reserved[3];
+    unsigned end;     // of the block's tiles
+    unsigned is_lost; // something is not finite
+    unsigned group;
+    float* positions; // of the domain that begins at packed vertex 0
 };
 
 // What the warps of a block share: T and the members themselves, zeros where there is no domain; q follows,
@@ -119,7 +122,7 @@ struct Common {
     Member members[VECTORS];
     Part parts[WARPS];
 };
-static_assert(sizeof(Common) == 64 * (VECTORS + WARPS), "Common differs from src/gpu/batch.rs");
+static_assert(sizeof(Part) == 72 && sizeof(Common) == 64 * VECTORS + 72 * WARPS, "Common differs from src/gpu/batch.rs");
 
 __device__ __forceinline__ Own& own_of(uint4* shared) {
     return ((Own*)shared)[threadIdx.x / 32];
@@ -133,34 +136,47 @@ __device__ __forceinline__ float4* q_of(uint4* shared) {
     return (float4*)(&common_of(shared) + 1);
 }
 
-__device__ __forceinline__ Part part_of(const BatchArgs& args) {
-    const uint2 block = __ldg((const uint2*)(args.blocks + blockIdx.x));
-    const uint4 head = __ldg((const uint4*)(args.groups + block.x));
-    const uint4 tail = __ldg((const uint4*)(args.groups + block.x) + 1);
-    const unsigned vertices = tail.x, before = QUADS * (threadIdx.x / 32), quad = TILE_QUADS * block.y;
+__device__ __forceinline__ Part part_of(const BatchArgs& args, unsigned group, unsigned tile, unsigned end) {
+    const uint4 head = __ldg((const uint4*)(args.groups + group));
+    const uint4 tail = __ldg((const uint4*)(args.groups + group) + 1);
+    const unsigned vertices = tail.x, before = QUADS * (threadIdx.x / 32), quad = TILE_QUADS * tile;
     Part part;
-    part.tile = block.y;
+    part.group = group;
+    part.tile = tile;
+    part.end = end;
+    part.is_lost = 0;
     part.chunks = tail.z;
     part.members = tail.w;
     part.first_member = tail.y;
-    part.first_scale = head.w + part.chunks * CHUNK_MODES * block.y;
+    part.first_scale = head.w + part.chunks * CHUNK_MODES * tile;
     part.width = min(TILE_QUADS, (vertices + 3) / 4 - quad);
     part.quads = part.width > before ? min(QUADS, part.width - before) : 0;
     part.first = 4 * (quad + before);
     part.vertices = part.quads > 0 ? min(VERTICES, vertices - part.first) : 0;
     part.words = args.words + (head.x | (unsigned long long)head.y << 32) + 3 * (size_t)part.chunks * quad + before;
+    part.positions = args.header->positions + 3 * (size_t)part.first;
     part.rest = args.rest + 3 * ((size_t)head.z + quad) + before;
     return part;
 }
 
 // Starts the copies of a stage, [row][quad]. Lanes beyond the last quad copy that one again.
 __device__ __forceinline__ void copy_stage(const Part& part, Own& own, unsigned stage) {
+    constexpr unsigned STEP = 32 / QUADS, COPIES = STAGE_WORDS / 32;
     const unsigned row = ROWS * stage + lane_of() / QUADS;
-    const uint4* from = part.words + (size_t)row * part.width + min(lane_of() % QUADS, part.quads - 1);
     uint4* to = own.ring + stage % STAGES * STAGE_WORDS + lane_of();
+    if (part.width == TILE_QUADS && ROWS * (stage + 1) <= 3 * part.chunks) {
+        // Nearly always, and with distances that are known when this is compiled.
+        const uint4* from = part.words + row * TILE_QUADS + lane_of() % QUADS;
 #pragma unroll
-    for (unsigned i = 0; i < STAGE_WORDS / 32; ++i) {
-        copy(to + 32 * i, from + i * (32 / QUADS) * part.width, row + i * (32 / QUADS) < 3 * part.chunks);
+        for (unsigned i = 0; i < COPIES; ++i) {
+            copy(to + 32 * i, from + i * STEP * TILE_QUADS, true);
+        }
+        return;
+    }
+    const uint4* from = part.words + (size_t)row * part.width + min(lane_of() % QUADS, part.quads - 1);
+#pragma unroll
+    for (unsigned i = 0; i < COPIES; ++i) {
+        copy(to + 32 * i, from + i * STEP * part.width, row + i * STEP < 3 * part.chunks);
     }
 }
 
@@ -173,22 +189,32 @@ __device__ __forceinline__ void copy_rest(const Part& part, Own& own) {
     }
 }
 
-// T, members and q, the same for all of a block.
-__device__ __forceinline__ void load_values(const BatchArgs& args, const Part& part, Common& common, float* q) {
-    const unsigned own = threadIdx.x % VECTORS;
+// Of the threads of a block, so many read the values of one domain, in runs.
+constexpr unsigned READERS = 32 * WARPS / VECTORS;
+
+// T and members, the same for all of a block. Returns where this thread's q begins.
+__device__ __forceinline__ unsigned load_members(const BatchArgs& args, const Part& part, Common& common) {
+    const unsigned own = threadIdx.x / READERS;
     Member member = {};
+    Affine t = {};
     if (own < part.members) {
         const uint4 words = __ldg((const uint4*)(args.members + part.first_member + own));
         member = {words.x, words.y, words.z, words.w};
+        t = place_of(transforms_of(args), member.domain);
     }
-    if (threadIdx.x < VECTORS) {
+    if (threadIdx.x % READERS == 0) {
         common.members[own] = member;
-        common.transforms[own] = own < part.members ? place_of(transforms_of(args), member.domain) : Affine{};
+        common.transforms[own] = t;
     }
-    const unsigned modes = part.chunks * CHUNK_MODES;
-#pragma unroll 4
-    for (unsigned mode = threadIdx.x / VECTORS; mode < modes; mode += 32 * WARPS / VECTORS) {
-        float amount = own < part.members ? __ldg(args.q + member.first_q + mode) : 0.0f;
+    return member.first_q;
+}
+
+// q of the member of this thread, all modes.
+__device__ __forceinline__ void load_q(const BatchArgs& args, const Part& part, unsigned first_q, float* q) {
+    const unsigned own = threadIdx.x / READERS, modes = part.chunks * CHUNK_MODES;
+#pragma unroll 8
+    for (unsigned mode = threadIdx.x % READERS; mode < modes; mode += READERS) {
+        float amount = own < part.members ? __ldg(args.q + first_q + mode) : 0.0f;
 #ifdef STORE_INT8
         amount *= __ldg(args.scales + part.first_scale + mode);
 #endif
@@ -251,12 +277,12 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const f
     }
 }
 
-// All modes, stage by stage; the ring is full when this begins.
+// All modes, stage by stage; the ring is full when this begins. With 16 bits a number all registers are taken, and the
+// count of stages goes to local memory: a few bytes, once a stage.
 __device__ __forceinline__ void sum_modes(const Part& part, Own& own, const float4* q, Sums& sums) {
     const unsigned offset = 16 * (lane_of() / 2) + 2 * ENTRY_BYTES * (lane_of() % 2);
-    const unsigned stages = (part.chunks + STAGE_CHUNKS - 1) / STAGE_CHUNKS;
 #pragma unroll 1
-    for (unsigned stage = 0; stage < stages; ++stage) {
+    for (unsigned stage = 0; STAGE_CHUNKS * stage < part.chunks; ++stage) {
         wait_for_all_but<STAGES - 1>();
         const char* chunk = (const char*)(own.ring + stage % STAGES * STAGE_WORDS) + offset;
         const unsigned count = min(STAGE_CHUNKS, part.chunks - STAGE_CHUNKS * stage);
@@ -267,7 +293,7 @@ __device__ __forceinline__ void sum_modes(const Part& part, Own& own, const floa
             q += CHUNK_MODES * (VECTORS / 4);
         }
         __syncwarp();
-        if (stage + STAGES < stages) {
+        if (STAGE_CHUNKS * (stage + STAGES) < part.chunks) {
             copy_stage(part, own, stage + STAGES);
         }
         end_group();
@@ -290,22 +316,14 @@ __device__ __forceinline__ unsigned count_of(const Part& part) {
     return part.vertices > 2 * lane_of() ? min(2u, part.vertices - 2 * lane_of()) : 0;
 }
 
-// The box of one domain's vertices of this warp, where `deform` puts those of the same half of the tile.
-__device__ __forceinline__ void store_box(const BatchArgs& args, const Part& part, const Member& member,
-                                          const unsigned (&keys)[6]) {
-    unsigned* boxes = args.boxes + 24 * (size_t)(member.first_tile + part.tile) + 12 * (threadIdx.x / 32);
-#pragma unroll
-    for (unsigned side = 0; side < 6; ++side) {
-        const unsigned key = warp_max(keys[side]);
-        if (lane_of() < 12 && lane_of() % 6 == side) {
-            boxes[lane_of()] = key;
-        }
-    }
+// Where `deform` puts the two boxes of a half of a tile.
+__device__ __forceinline__ unsigned* boxes_of(const BatchArgs& args, const Part& part, const Member& member) {
+    return args.boxes + 24 * (size_t)(member.first_tile + part.tile) + 12 * (threadIdx.x / 32);
 }
 
-// Puts x of a lane's two vertices at its place of a stage, [vertex][3]. `total` stays zero while all are finite.
+// Puts x of a lane's two vertices at its place of a stage, [vertex][3].
 __device__ __forceinline__ void stage_domain(const Base& base, const Common& common, const Sums& sums, unsigned domain,
-                                             float* staged, float& total) {
+                                             float* staged) {
     const Affine& t = common.transforms[domain];
     const float4 a = t.a, b = t.b, c = t.c;
     float world[6];
@@ -319,26 +337,53 @@ __device__ __forceinline__ void stage_domain(const Base& base, const Common& com
     }
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
-        total = fmaf(0.0f, world[2 * i], fmaf(0.0f, world[2 * i + 1], total));
         ((float2*)staged)[3 * lane_of() + i] = make_float2(world[2 * i], world[2 * i + 1]);
     }
 }
 
-// The box of what a lane staged, from there: while it staged, registers were short.
-__device__ __forceinline__ void box_domain(const BatchArgs& args, const Part& part, const Member& member,
-                                           const float* staged) {
-    unsigned keys[6] = {};
-    const unsigned count = count_of(part);
-    if (count > 0) {
-        const float* world = staged + 6 * lane_of();
+// The boxes of two domains that the warp staged. A half of the warp has a domain, a lane of it four vertices; then a lane
+// has either the lower or the upper sides, so that three numbers are left to be exchanged. A NaN is left to `mend`.
+__device__ __forceinline__ void box_both(const BatchArgs& args, Part& part, const Common& common, unsigned domain,
+                                         const float4* staged) {
+    const float LEAST = __uint_as_float(0xff800000u); // minus infinity
+    const unsigned own = domain + lane_of() / 16, within = lane_of() % 16;
+    const float4* from = staged + 48 * (lane_of() / 16) + 3 * within;
+    const float4 first = from[0], second = from[1], third = from[2];
+    const float numbers[12] = {first.x,  first.y,  first.z, first.w, second.x, second.y,
+                               second.z, second.w, third.x, third.y, third.z,  third.w};
+    float low[3] = {LEAST, LEAST, LEAST}, high[3] = {LEAST, LEAST, LEAST}, total = 0.0f;
+#pragma unroll
+    for (unsigned i = 0; i < 12; ++i) {
+        if (part.vertices == VERTICES || 4 * within + i / 3 < part.vertices) {
+            low[i % 3] = fmaxf(low[i % 3], -numbers[i]);
+            high[i % 3] = fmaxf(high[i % 3], numbers[i]);
+        }
+        // Zero, unless one of them is not finite.
+        total = fmaf(0.0f, numbers[i], total);
+    }
+    if (__any_sync(0xffffffffu, total != 0.0f) && lane_of() == 0) {
+        part.is_lost = 1;
+    }
+    const bool is_upper = within >= 8;
+    float sides[3];
+#pragma unroll
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        const float other = __shfl_xor_sync(0xffffffffu, is_upper ? low[axis] : high[axis], 8);
+        sides[axis] = fmaxf(is_upper ? high[axis] : low[axis], other);
+    }
+#pragma unroll
+    for (unsigned lanes = 4; lanes > 0; lanes /= 2) {
 #pragma unroll
         for (unsigned axis = 0; axis < 3; ++axis) {
-            const float first = world[axis], second = count > 1 ? world[3 + axis] : first;
-            keys[axis] = ordered(-fminf(first, second));
-            keys[3 + axis] = ordered(fmaxf(first, second));
+            sides[axis] = fmaxf(sides[axis], __shfl_xor_sync(0xffffffffu, sides[axis], lanes));
         }
     }
-    store_box(args, part, member, keys);
+    // Six of eight lanes write three sides of two boxes each.
+    const unsigned axis = within % 8 % 3, copy = within % 8 / 3;
+    if (copy < 2 && own < part.members) {
+        const float side = axis == 0 ? sides[0] : axis == 1 ? sides[1] : sides[2];
+        boxes_of(args, part, common.members[own])[6 * copy + (is_upper ? 3 : 0) + axis] = ordered_number(side);
+    }
 }
 
 // No load moves across: side by side, what they bring would take more registers than there are.
@@ -357,17 +402,17 @@ __device__ __forceinline__ void store_both(float* first, float* second, const fl
     __stcs(high + 16 + lane, staged[64 + lane]);
 }
 
-__device__ __forceinline__ float* home_of(const BatchArgs& args, const Part& part, const Member& member) {
-    return args.header->positions + 3 * ((size_t)member.first + part.first);
+__device__ __forceinline__ float* home_of(const Part& part, const Member& member) {
+    return part.positions + 3 * (size_t)member.first;
 }
 
 // The same, number by number.
-__device__ __forceinline__ void store_numbers(const BatchArgs& args, const Part& part, const Common& common,
-                                              unsigned domain, const float* staged) {
+__device__ __forceinline__ void store_numbers(const Part& part, const Common& common, unsigned domain,
+                                              const float* staged) {
     const unsigned numbers = 3 * part.vertices;
 #pragma unroll 1
     for (unsigned i = 0; i < 2 && domain + i < part.members; ++i) {
-        float* to = home_of(args, part, common.members[domain + i]);
+        float* to = home_of(part, common.members[domain + i]);
 #pragma unroll 1
         for (unsigned k = lane_of(); k < numbers; k += 32) {
             __stcs(to + k, staged[i * 3 * VERTICES + k]);
@@ -376,8 +421,8 @@ __device__ __forceinline__ void store_numbers(const BatchArgs& args, const Part&
 }
 
 // Two domains at a time, by turns through two halves of the ring: lanes write when all have read what was there.
-__device__ __forceinline__ void put(const BatchArgs& args, const Part& part, Own& own, const Common& common,
-                                      const Sums& sums, float& total) {
+__device__ __forceinline__ void put(const BatchArgs& args, Part& part, Own& own, const Common& common,
+                                    const Sums& sums) {
 #pragma unroll
     for (unsigned domain = 0; domain < VECTORS; domain += 2) {
         if (domain < part.members) {
@@ -385,24 +430,16 @@ __device__ __forceinline__ void put(const BatchArgs& args, const Part& part, Own
             float* staged = (float*)own.ring + domain / 2 % 2 * (2 * 3 * VERTICES);
             Base base;
             base.load(own);
-            stage_domain(base, common, sums, domain, staged, total);
-            part_loads();
-            if (CHUNK_MODES == 2) {
-                // Sums of two modes leave no registers to keep x0 in.
-                base.load(own);
-            }
+            stage_domain(base, common, sums, domain, staged);
             // Zeros, if it is not there.
-            stage_domain(base, common, sums, domain + 1, staged + 3 * VERTICES, total);
+            stage_domain(base, common, sums, domain + 1, staged + 3 * VERTICES);
             const Member &low = common.members[domain], &high = common.members[domain + 1];
-            box_domain(args, part, low, staged);
-            if (are_two) {
-                box_domain(args, part, high, staged + 3 * VERTICES);
-            }
             __syncwarp();
+            box_both(args, part, common, domain, (const float4*)staged);
             if (are_two && part.vertices == VERTICES && (low.first | high.first) % 4 == 0) {
-                store_both(home_of(args, part, low), home_of(args, part, high), (const float4*)staged);
+                store_both(home_of(part, low), home_of(part, high), (const float4*)staged);
             } else {
-                store_numbers(args, part, common, domain, staged);
+                store_numbers(part, common, domain, staged);
             }
         }
     }
@@ -427,13 +464,22 @@ __device__ __forceinline__ float3 summed_exactly(const BatchArgs& args, const Pa
     return placed_exactly(transforms_of(args), member.domain, bent);
 }
 
+// Of `mend`: the box of one domain's vertices of this warp, where `deform` puts those of the same half of the tile.
+__device__ __forceinline__ void store_box(const BatchArgs& args, const Part& part, const Member& member,
+                                          const unsigned (&keys)[6]) {
+    const unsigned key = warp_box(keys);
+    if (lane_of() < 12) {
+        boxes_of(args, part, member)[lane_of()] = key;
+    }
+}
+
 // Computes anew what a warp has that is not finite, over what it wrote, and the boxes of all its domains: a NaN wins.
 __device__ __noinline__ void mend(const BatchArgs& args, const Common& common, const float* q) {
     const Part& part = common.parts[threadIdx.x / 32];
     const unsigned count = count_of(part);
     for (unsigned domain = 0; domain < part.members; ++domain) {
         const Member& member = common.members[domain];
-        float* at = home_of(args, part, member) + 6 * lane_of();
+        float* at = home_of(part, member) + 6 * lane_of();
         unsigned keys[6] = {};
         for (unsigned vertex = 0; vertex < count; ++vertex, at += 3) {
             if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
@@ -451,27 +497,11 @@ __device__ __noinline__ void mend(const BatchArgs& args, const Common& common, c
     }
 }
 
-extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const __grid_constant__ BatchArgs args) {
-    extern __shared__ uint4 shared[];
+// A warp's part of a tile, whose copies are under way.
+__device__ __forceinline__ void compute(const BatchArgs& args, uint4* shared) {
     Own& own = own_of(shared);
     Common& common = common_of(shared);
-    const Part part = part_of(args);
-    if (part.quads > 0) {
-        // x0 belongs to the first group of copies, and groups of stages that are not there are empty.
-        copy_rest(part, own);
-#pragma unroll
-        for (unsigned stage = 0; stage < STAGES; ++stage) {
-            copy_stage(part, own, stage);
-            end_group();
-        }
-    }
-    Part& kept = common.parts[threadIdx.x / 32];
-    kept = part;
-    load_values(args, part, common, (float*)q_of(shared));
-    __syncthreads();
-    if (part.quads == 0) {
-        return;
-    }
+    Part& part = common.parts[threadIdx.x / 32];
     Sums sums;
 #pragma unroll
     for (unsigned i = 0; i < 6; ++i) {
@@ -480,13 +510,58 @@ extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const _
             sums[i][domain] = 0.0f;
         }
     }
-    sum_modes(kept, own, q_of(shared), sums);
+    sum_modes(part, own, q_of(shared), sums);
     wait_for_all_but<0>();
-    float total = 0.0f;
-    put(args, kept, own, common, sums, total);
-    // Others wrote some of what a lane now reads.
+    put(args, part, own, common, sums);
+    // Others wrote some of what a lane now reads, and read what the next tile overwrites.
     __syncwarp();
-    if (__any_sync(0xffffffffu, total != 0.0f)) {
+    if (part.is_lost) {
         mend(args, common, (const float*)q_of(shared));
     }
+}
+
+// What a warp needs before it can sum a tile: copies of U and x0 under way and, in shared memory, where they go; T and
+// members with the block's first tile, and q, whose scales may be the tile's.
+__device__ __forceinline__ void prepare(const BatchArgs& args, const Part& part, uint4* shared, bool is_first) {
+    Common& common = common_of(shared);
+    if (lane_of() == 0) {
+        common.parts[threadIdx.x / 32] = part;
+    }
+    if (part.quads > 0) {
+        // x0 belongs to the first group of copies, and groups of stages that are not there are empty.
+        copy_rest(part, own_of(shared));
+#pragma unroll
+        for (unsigned stage = 0; stage < STAGES; ++stage) {
+            copy_stage(part, own_of(shared), stage);
+            end_group();
+        }
+    }
+    if (is_first) {
+        load_q(args, part, load_members(args, part, common), (float*)q_of(shared));
+        __syncthreads();
+#ifdef STORE_INT8
+    } else {
+        __syncthreads();
+        load_q(args, part, common.members[threadIdx.x / READERS].first_q, (float*)q_of(shared));
+        __syncthreads();
+#endif
+    }
+    __syncwarp();
+}
+
+extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const __grid_constant__ BatchArgs args) {
+    extern __shared__ uint4 shared[];
+    const Part& last = common_of(shared).parts[threadIdx.x / 32];
+    uint4 block = __ldg((const uint4*)(args.blocks + blockIdx.x));
+    bool is_first = true;
+#pragma unroll 1
+    do {
+        prepare(args, part_of(args, block.x, block.y, block.z), shared, is_first);
+        if (last.quads > 0) {
+            compute(args, shared);
+        }
+        block = {last.group, last.tile + 1, last.end, 0};
+        is_first = false;
+        __syncwarp();
+    } while (block.y < block.z);
 }

@@ -302,8 +302,8 @@ __device__ __forceinline__ void box_of(const float (&world)[FLOATS], unsigned co
             low = fminf(low, number);
             high = fmaxf(high, number);
         }
-        keys[axis] = ordered(-low);
-        keys[3 + axis] = ordered(high);
+        keys[axis] = ordered_number(-low);
+        keys[3 + axis] = ordered_number(high);
     }
 }
 
@@ -379,12 +379,9 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
     }
     store(args.header->positions, shared.stage, part);
     // Four boxes a tile: one of each warp, or four times that of the only one.
-#pragma unroll
-    for (unsigned side = 0; side < 6; ++side) {
-        const unsigned key = warp_max(keys[side]);
-        if (lane_of() / 6 < SPAN && lane_of() % 6 == side) {
-            args.boxes[24 * (size_t)tile + 6 * share + lane_of()] = key;
-        }
+    const unsigned key = warp_box(keys);
+    if (lane_of() < 6 * SPAN) {
+        args.boxes[24 * (size_t)tile + 6 * share + lane_of()] = key;
     }
 }
 

@@ -134,9 +134,11 @@ static_assert(sizeof(Member) == 16, "Member differs from src/gpu/layout.rs");
 // The work of one block of `batch`.
 struct Block {
     unsigned group;
-    unsigned tile; // of its shape
+    unsigned tile; // of its shape, the first
+    unsigned end;  // the one after the last
+    unsigned reserved;
 };
-static_assert(sizeof(Block) == 8, "Block differs from src/gpu/layout.rs");
+static_assert(sizeof(Block) == 16, "Block differs from src/gpu/layout.rs");
 
 struct BatchArgs {
     const Header* header;

@@ -1,13 +1,15 @@
 // Maxima of floats as maxima of integers. Twin: src/gpu/bounds.rs.
 #pragma once
 
-// An integer that grows with x and is never 0; of a NaN it is the largest, so that a NaN wins every maximum.
-__device__ inline unsigned ordered(float x) {
+// An integer that grows with x and is never 0, of what is a number.
+__device__ inline unsigned ordered_number(float x) {
     const unsigned bits = __float_as_uint(x);
-    if (x != x) {
-        return 0xffffffffu;
-    }
-    return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
+    return bits ^ (unsigned)((int)bits >> 31 | (int)0x80000000u);
+}
+
+// The same of any x; of a NaN it is the largest, so that a NaN wins every maximum.
+__device__ inline unsigned ordered(float x) {
+    return x != x ? 0xffffffffu : ordered_number(x);
 }
 
 __device__ inline unsigned warp_max(unsigned key) {
@@ -19,4 +21,16 @@ __device__ inline unsigned warp_max(unsigned key) {
     }
     return key;
 #endif
+}
+
+// The maxima over a warp of six keys each: lane i has that of key i % 6.
+__device__ inline unsigned warp_box(const unsigned (&keys)[6]) {
+    const unsigned side = threadIdx.x % 32 % 6;
+    unsigned own = 0;
+#pragma unroll
+    for (unsigned i = 0; i < 6; ++i) {
+        const unsigned key = warp_max(keys[i]);
+        own = side == i ? key : own;
+    }
+    return own;
 }

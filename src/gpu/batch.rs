@@ -17,10 +17,10 @@ use crate::storage::modes_per_chunk;
 /// The other numbers of vectors that the kernel is compiled for, with their macros.
 const FEWER: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
 
-/// Warps of a block; bytes of shared memory of each, for each vector besides q, and for each warp's part.
+/// Warps of a block; bytes of shared memory of each, and for each vector besides q.
 const WARPS: usize = 2;
-const OWN: usize = 9984;
-const COMMON: usize = 64;
+const OWN: usize = 9984 + 72;
+const VECTOR: usize = 64;
 
 /// The kernel and its work.
 #[derive(Debug)]
@@ -125,7 +125,7 @@ fn shared_bytes(batched: &Batched, defines: &[&str]) -> usize {
     let storage =
         storages.into_iter().find(|storage| storage_define(*storage).is_some_and(|own| defines.contains(&own)));
     let (vectors, modes) = (vectors_of(defines), batched.chunks * modes_per_chunk(storage.unwrap_or_default()));
-    WARPS * OWN + COMMON * (vectors + WARPS) + 4 * vectors * modes
+    WARPS * OWN + VECTOR * vectors + 4 * vectors * modes
 }
 
 #[cfg(test)]
@@ -162,8 +162,10 @@ mod tests {
     /// `batch` block by block, with its rings, stages and ways out.
     fn twin_of_batch(tables: &Tables) -> Vec<f32> {
         let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
-        for (block, warp) in tables.work.batched.blocks.iter().flat_map(|block| [0, 1].map(|warp| (block, warp))) {
-            let mut warp = Warp::new(tables, *block, warp);
+        let tiles =
+            tables.work.batched.blocks.iter().flat_map(|block| (block.tile..block.end).map(|tile| (block.group, tile)));
+        for (place, warp) in tiles.flat_map(|place| [0, 1].map(|warp| (place, warp))) {
+            let mut warp = Warp::new(tables, place, warp);
             if warp.quads > 0 {
                 let sums = warp.sums();
                 for member in (0..warp.group.members as usize).step_by(2) {
@@ -248,6 +250,18 @@ mod tests {
     }
 
     #[test]
+    fn blocks_of_large_scenes_have_runs_of_tiles_that_cover_each_shape_once() {
+        let (scene, _) = ensemble(Storage::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
+        let batched = Work::new(&scene, &Coordinates::new(&scene)).batched;
+        assert!(batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))), "9001 tiles");
+        for (group, tiles) in [6001, 3000].into_iter().enumerate() {
+            let own = batched.blocks.iter().filter(|block| block.group == group as u32);
+            let covered: Vec<u32> = own.flat_map(|block| block.tile..block.end).collect();
+            assert_eq!(covered, (0..tiles).collect::<Vec<u32>>());
+        }
+    }
+
+    #[test]
     fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
         let defines = |instances: usize| {
             let plan = plan(&ensemble(Storage::F16, &[(261, 12)], instances).0);
@@ -267,7 +281,7 @@ mod tests {
         let longest = Batched { chunks: crate::domain::MAX_RANK, ..Batched::default() };
         // 64 KiB is what the smallest device has.
         assert!(shared_bytes(&longest, &[]) <= 64 << 10);
-        assert_eq!(shared_bytes(&Batched::default(), &["BATCH_4"]), 2 * OWN + 64 * 6);
+        assert_eq!(shared_bytes(&Batched::default(), &["BATCH_4"]), 2 * OWN + 64 * 4);
         let chunks = Batched { chunks: 3, ..Batched::default() };
         assert_eq!(shared_bytes(&chunks, &["STORE_INT8"]) - shared_bytes(&Batched::default(), &[]), 4 * 16 * 12);
     }

@@ -69,9 +69,12 @@ impl Deform {
         let (scales, factors) = (upload(device, &load.scales)?, load.factors);
         let [normals, tangents] = rest_directions(scene, &work);
         let has_lists = most_domains(scene) > 0;
+        // What turns no normals has nothing to do in tiles of corners alone.
+        let launched = if kernel.defines.contains(&"ORIENT") { work.launched } else { work.with_vertices };
+        let config = LaunchConfig { grid_dim: (blocks(kernel, launched), 1, 1), ..config(kernel) };
         Ok(Self {
             function: function(device, kernel)?,
-            config: config(kernel),
+            config,
             batch: batch.map(|kernel| Batch::new(device, kernel, &work.batched)).transpose()?,
             listed: has_lists.then(|| listed(device, kernel)).transpose()?,
             tiles: upload(device, &work.tiles)?,
@@ -86,7 +89,7 @@ impl Deform {
             list: room(device, if has_lists { 4 * work.tiles.len() as u64 } else { 0 })?,
             boxes: room(device, 96 * work.tiles.len() as u64)?,
             count: work.tiles.len() as u32,
-            launched: work.launched as u32,
+            launched: launched as u32,
             directed: work.quads.directed,
             pieces: scene.needs.boxes.then_some(pieces),
             packing: Arc::new(Packing {
@@ -188,6 +191,12 @@ impl Deform {
         unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
         Ok(())
     }
+}
+
+/// Blocks that so many tiles take.
+pub(super) fn blocks(kernel: &Kernel, tiles: usize) -> u32 {
+    let warps = tiles * if kernel.defines.contains(&"NARROW") { 4 } else { 1 };
+    warps.div_ceil(kernel.threads as usize / TILE_QUADS) as u32
 }
 
 /// The function of a kernel, refused when it is made for other blocks than were planned.

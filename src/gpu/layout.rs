@@ -139,6 +139,8 @@ pub(super) struct Member {
 pub(super) struct Block {
     pub group: u32,
     pub tile: u32,
+    pub end: u32,
+    pub reserved: u32,
 }
 
 /// Arguments of `batch`.
@@ -240,7 +242,7 @@ const _: () = assert!(size_of::<Following>() == 8, "Following differs from kerne
 const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Group>() == 32, "Group differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Member>() == 16, "Member differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Block>() == 8, "Block differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Block>() == 16, "Block differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BatchArgs>() == 96, "BatchArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Piece>() == 16, "Piece differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BoundsArgs>() == 48, "BoundsArgs differs from kernels/layout.cuh");
@@ -296,7 +298,7 @@ pub fn agreements() -> Vec<Agreement> {
         }
         Group { first_word, rest, first_scale, vertices, first_member, chunks, members }
         Member { first, first_q, domain, first_tile }
-        Block { group, tile }
+        Block { group, tile, end, reserved }
         BatchArgs {
             header, blocks, groups, members, words, rest, scales, transforms, following, frames, q, boxes
         }

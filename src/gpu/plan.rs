@@ -295,11 +295,9 @@ fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
     let [deform, batch, bounds, apply, normals] = KERNELS;
     let defines = deform_defines(scene, work);
     let threads = threads_of(&defines);
-    let warps = work.launched * if is_narrow(work) { 4 } else { 1 };
-    let blocks_of_tiles = warps.div_ceil(threads as usize / TILE_QUADS) as u32;
     let launch = Launch::Deform;
-    let deform =
-        Kernel { launch, name: deform.name, defines, blocks: blocks_of_tiles, threads, source: Source(deform.source) };
+    let mut deform = Kernel { launch, name: deform.name, defines, blocks: 0, threads, source: Source(deform.source) };
+    deform.blocks = super::deform::blocks(&deform, work.launched);
     let walk = |launch, kernel: &KernelSource, blocks: usize| {
         let defines = [
             ("NORMAL_MAPS", needs.normal_maps),

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::super::inputs::{Listing, Packing};
-use super::super::layout::{Block, Group, Member};
+use super::super::layout::{Group, Member};
 use super::super::work::tests::{Loaded, load};
 use super::super::work::{Coordinates, Work};
 use super::{MOST, WARPS};
@@ -65,8 +65,8 @@ pub(super) struct Warp<'a> {
 }
 
 impl<'a> Warp<'a> {
-    pub(super) fn new(tables: &'a Tables, block: Block, warp: usize) -> Self {
-        let (group, tile) = (tables.work.batched.groups[block.group as usize], block.tile as usize);
+    pub(super) fn new(tables: &'a Tables, (group, tile): (u32, u32), warp: usize) -> Self {
+        let (group, tile) = (tables.work.batched.groups[group as usize], tile as usize);
         let width = TILE_QUADS.min((group.vertices as usize).div_ceil(4) - TILE_QUADS * tile);
         let before = QUADS * warp;
         Self {

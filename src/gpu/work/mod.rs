@@ -45,6 +45,8 @@ pub(super) struct Work {
     pub alike: Vec<bool>,
     /// Tiles before those that a whole step leaves to `batch`.
     pub launched: usize,
+    /// Of those, the first that have vertices; tiles of corners alone follow.
+    pub with_vertices: usize,
     pub batched: Batched,
     pub lanes: Vec<Lane>,
     /// The first scale of each lane; only with `Int8`.
@@ -97,8 +99,11 @@ impl Work {
             Item::Own { domain, .. } => role.flags & TILE_VERTICES > 0 && batched[scene.domains[*domain].shape],
             Item::Mixed(_) => false,
         };
-        items.sort_by_key(|(role, item)| (is_batched(*role, item), std::cmp::Reverse(role.chunks)));
+        let has_vertices = |role: &Role| role.flags & TILE_VERTICES > 0;
+        items
+            .sort_by_key(|(role, item)| (is_batched(*role, item), std::cmp::Reverse(role.chunks), !has_vertices(role)));
         work.launched = items.partition_point(|(role, item)| !is_batched(*role, item));
+        work.with_vertices = items[..work.launched].partition_point(|(role, _)| has_vertices(role));
         let mut first_words: Vec<Option<u64>> = vec![None; scene.shapes.len()];
         for (role, item) in items {
             let index = work.tiles.len() as u32;
@@ -138,6 +143,7 @@ impl Work {
         Self {
             tiles: Vec::new(),
             launched: 0,
+            with_vertices: 0,
             batched: Batched::default(),
             lanes: Vec::new(),
             lane_scales: Vec::new(),
