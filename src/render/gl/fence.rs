@@ -32,8 +32,12 @@ impl Gl {
 impl Fence {
     /// Whether the commands are done, or will never be: then [`Self::wait`] says why.
     pub(in crate::render) fn is_over(&self) -> bool {
-        // SAFETY: the fence lives as long as this value; no time is waited.
-        unsafe { self.gl.on().client_wait_sync(self.name, 0, 0) != glow::TIMEOUT_EXPIRED }
+        self.is_over_within(Duration::ZERO)
+    }
+
+    /// The same after waiting for them, at most so long.
+    pub(in crate::render) fn is_over_within(&self, limit: Duration) -> bool {
+        self.state(limit) != glow::TIMEOUT_EXPIRED
     }
 
     /// Waits until the commands are done.
@@ -43,10 +47,7 @@ impl Fence {
     pub(in crate::render) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
         let begin = Instant::now();
         loop {
-            // SAFETY: the fence lives as long as this value; slices fit glow's 32-bit nanoseconds.
-            let state =
-                unsafe { self.gl.on().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, 1_000_000_000) };
-            match state {
+            match self.state(limit.saturating_sub(begin.elapsed())) {
                 glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => return Ok(()),
                 glow::TIMEOUT_EXPIRED if begin.elapsed() < limit => {}
                 glow::TIMEOUT_EXPIRED => {
@@ -55,6 +56,14 @@ impl Fence {
                 _ => return Err(during(stage)("the device was lost")),
             }
         }
+    }
+
+    /// What OpenGL says of it after at most this time, or a second.
+    fn state(&self, limit: Duration) -> u32 {
+        // A second fits glow's 32-bit nanoseconds.
+        let slice = limit.min(Duration::from_secs(1)).as_nanos() as i32;
+        // SAFETY: the fence lives as long as this value.
+        unsafe { self.gl.on().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) }
     }
 }
 
