@@ -62,6 +62,11 @@ impl Workbench {
         &self.info
     }
 
+    /// What the last frame really ran; none without a renderer.
+    pub fn ran(&self) -> Option<&render::Ran> {
+        self.renderer.as_ref().ok().map(Renderer::ran)
+    }
+
     /// Prepares a scene and deforms it at rest. OpenGL buffers are made now only when the deformer writes into them.
     ///
     /// # Errors

@@ -129,7 +129,8 @@ pub struct SharedBuffers {
 /// What the last frame really ran.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Ran {
-    /// Passes, in order.
+    /// Passes, in order. Of several frames of one step the first alone has "shadow" and "blur", where they can be shared:
+    /// see [`SceneBuffers::hold_step`].
     pub passes: Vec<&'static str>,
     /// Draw calls of the visibility and blended passes.
     pub draws: usize,
@@ -227,6 +228,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when the surface is not the scene's, or OpenGL reports an error.
     pub fn upload(&mut self, buffers: &SceneBuffers, surface: &Surface) -> Result<()> {
+        buffers.shared_shadow.forget();
         for (name, list) in
             [("positions", &surface.positions), ("normals", &surface.normals), ("tangents", &surface.tangents)]
         {
@@ -258,6 +260,7 @@ impl Renderer {
             Some(apart) => apart,
             None => Apart::new(&self.gl, buffers)?,
         };
+        buffers.shared_shadow.forget();
         apart.buffer.write(bytemuck::cast_slice(positions));
         buffers.apart = Some(apart);
         buffers.origin = origin;

@@ -155,9 +155,13 @@ impl Renderer {
         let timed = |pass, commands: &mut dyn FnMut() -> Result<()>| {
             gl.timed((pass, self.watchdog), commands).map(|stopwatch| (pass, stopwatch))
         };
-        Ok(vec![
-            timed("shadow", &mut || passes::shadow(gl, buffers, ran))?,
-            timed("blur", &mut || passes::blur(gl, buffers, ran))?,
+        let mut times = Vec::new();
+        buffers.shared_shadow.draw_unless_there(buffers.shadow_of(shot), || {
+            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
+            times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
+            Ok(())
+        })?;
+        times.extend([
             timed("visibility", &mut || {
                 passes::visibility(gl, buffers, target, sampled, ran)?;
                 passes::ground(gl, buffers, shot, ran)
@@ -166,7 +170,8 @@ impl Renderer {
             timed("shade", &mut || passes::shade(gl, buffers, target, sampled, ran))?,
             timed("bloom", &mut || buffers.post.bloom(gl, target, ran))?,
             timed("encode", &mut || buffers.post.encode(gl, target, ran))?,
-        ])
+        ]);
+        Ok(times)
     }
 
     /// Brings the pixels, and behind them what is told of lists, to where the host can read them.
@@ -238,7 +243,8 @@ impl Pixels {
 fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
     let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, stopwatch)| (*name, stopwatch.ms())).collect();
     let of_shadow = |name: &str| ["shadow", "blur"].contains(&name);
-    let sum = |wanted: &dyn Fn(&str) -> bool| all.iter().filter(|(name, _)| wanted(name)).map(|(_, ms)| ms).sum();
+    let sum =
+        |wanted: &dyn Fn(&str) -> bool| all.iter().filter(|(name, _)| wanted(name)).fold(0.0, |sum, (_, ms)| sum + ms);
     let mut times = vec![("shadow", sum(&of_shadow))];
     times.extend(all.iter().filter(|(name, _)| *name == "blur"));
     times.push(("draw", sum(&|name| !of_shadow(name) && name != "read")));
