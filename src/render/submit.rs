@@ -223,6 +223,13 @@ impl Ticket {
 }
 
 impl Pixels {
+    /// Notes a stage that came before the others, in milliseconds.
+    #[must_use]
+    pub fn after(mut self, stage: &'static str, ms: f64) -> Self {
+        self.passes.insert(0, (stage, ms));
+        self
+    }
+
     /// Copies the pixels, on several threads when they are many.
     pub fn into_image(self) -> Image {
         let begin = Instant::now();
