@@ -42,6 +42,8 @@ pub(super) struct Gl {
     pub(super) limits: Limits,
     /// Timer queries that nobody waits for.
     timers: RefCell<Vec<glow::Query>>,
+    /// Buffers that are to go once they were read.
+    retired: RefCell<Vec<staging::Retired>>,
 }
 
 impl Drop for Gl {
@@ -102,7 +104,7 @@ impl Gl {
         if context.is_debug {
             debug::listen(&mut glow);
         }
-        Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default() }))
+        Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default(), retired: RefCell::default() }))
     }
 
     /// The functions, with the context current.

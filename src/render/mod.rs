@@ -146,6 +146,8 @@ const MAX_SIDE: u32 = 8192;
 const TARGETS: usize = 4;
 /// Programs that are kept for scenes to come.
 const PROGRAMS: usize = 128;
+/// How long a renderer that goes waits for those who still copy pixels.
+const LAST_READERS: Duration = Duration::from_secs(1);
 /// How long the device may take for one frame.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
@@ -308,5 +310,12 @@ impl Renderer {
         let program = Rc::new(self.gl.program(&source.label, &stages)?);
         self.programs.insert(source, Rc::clone(&program));
         Ok(program)
+    }
+}
+
+impl Drop for Renderer {
+    fn drop(&mut self) {
+        self.targets.clear();
+        self.gl.bury(LAST_READERS);
     }
 }

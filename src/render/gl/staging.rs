@@ -2,6 +2,7 @@
 //! it is no command: any thread may copy out of it what a fence has passed.
 
 use std::cell::RefCell;
+use std::mem::{self, ManuallyDrop};
 use std::rc::Rc;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender, TryRecvError};
 use std::time::Duration;
@@ -14,12 +15,15 @@ use crate::error::{Result, during};
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
 pub(in crate::render) struct Staging {
-    pub(in crate::render) buffer: Buffer,
+    pub(in crate::render) buffer: ManuallyDrop<Buffer>,
     /// Where it is mapped; none where it cannot stay so.
     mapped: Option<*const u8>,
     /// Hears when whoever reads it has done.
     reader: RefCell<Option<Receiver<()>>>,
 }
+
+/// A buffer whose reader has outlived its use.
+pub(super) type Retired = (Buffer, Receiver<()>);
 
 /// Bytes of a staging buffer, to be copied by any thread. The device does not write them and they stay mapped while this
 /// lives, so it must not live long.
@@ -34,16 +38,18 @@ pub(in crate::render) enum Lent {
     Copied(Vec<u8>),
 }
 
-// SAFETY: the memory is mapped for reading, nobody writes it before the lender hears that this was dropped, and the lender
-// hears of it before the memory is unmapped.
+// SAFETY: the memory is mapped for reading, nobody writes it before the lender hears that this was dropped, and it is
+// unmapped after that or never.
 unsafe impl Send for Lent {}
 
 impl Gl {
     /// A buffer of so many bytes that the host may read.
     pub(in crate::render) fn staging(self: &Rc<Self>, bytes: u64) -> Result<Staging> {
+        self.bury(Duration::ZERO);
         let reader = RefCell::default();
         if !self.limits.persistent {
-            return Ok(Staging { buffer: self.buffer(bytes, glow::STREAM_READ, None)?, mapped: None, reader });
+            let buffer = ManuallyDrop::new(self.buffer(bytes, glow::STREAM_READ, None)?);
+            return Ok(Staging { buffer, mapped: None, reader });
         }
         let size = i32::try_from(bytes).map_err(during("readback"))?;
         let kept = glow::MAP_READ_BIT | glow::MAP_PERSISTENT_BIT | glow::MAP_COHERENT_BIT;
@@ -60,7 +66,15 @@ impl Gl {
         if mapped.is_null() {
             return Err(during("readback")(format!("{bytes} bytes cannot be mapped")));
         }
-        Ok(Staging { buffer, mapped: Some(mapped.cast_const()), reader })
+        Ok(Staging { buffer: ManuallyDrop::new(buffer), mapped: Some(mapped.cast_const()), reader })
+    }
+
+    /// Frees the buffers that were given up while somebody read them, after waiting for each reader at most so long. Those
+    /// that are read even then stay, and so does the context: better some memory is lost than read when it is gone.
+    pub(in crate::render) fn bury(&self, limit: Duration) {
+        let mut retired = mem::take(&mut *self.retired.borrow_mut());
+        retired.retain(|(_, reader)| !is_over(reader, limit));
+        self.retired.borrow_mut().extend(retired);
     }
 }
 
@@ -80,10 +94,7 @@ impl Staging {
     /// Waits until nobody reads it any more, at most `limit`; whether that is so.
     pub(in crate::render) fn is_read(&self, limit: Duration) -> bool {
         let mut reader = self.reader.borrow_mut();
-        let over = reader.as_ref().is_none_or(|reader| match limit {
-            Duration::ZERO => reader.try_recv() == Err(TryRecvError::Disconnected),
-            limit => reader.recv_timeout(limit) == Err(RecvTimeoutError::Disconnected),
-        });
+        let over = reader.as_ref().is_none_or(|reader| is_over(reader, limit));
         if over {
             *reader = None;
         }
@@ -98,11 +109,22 @@ impl Staging {
 }
 
 impl Drop for Staging {
+    /// Waits for nobody: the reader may be this very thread.
     fn drop(&mut self) {
-        if let Some(reader) = self.reader.take() {
-            // The reader copies memory and does nothing else, and its end is told as an error, as nothing is ever sent.
-            reader.recv().ok();
+        // SAFETY: taken once, here, and not used after this.
+        let buffer = unsafe { ManuallyDrop::take(&mut self.buffer) };
+        if let Some(reader) = self.reader.take().filter(|reader| !is_over(reader, Duration::ZERO)) {
+            let gl = Rc::clone(&buffer.gl);
+            gl.retired.borrow_mut().push((buffer, reader));
         }
+    }
+}
+
+/// Whether the reader has done, after waiting for it at most so long. Its end is told as an error, as nothing is ever sent.
+fn is_over(reader: &Receiver<()>, limit: Duration) -> bool {
+    match limit {
+        Duration::ZERO => reader.try_recv() == Err(TryRecvError::Disconnected),
+        limit => reader.recv_timeout(limit) == Err(RecvTimeoutError::Disconnected),
     }
 }
 
@@ -113,5 +135,13 @@ impl Lent {
             Self::Mapped { first, bytes, .. } => unsafe { std::slice::from_raw_parts(*first, *bytes) },
             Self::Copied(bytes) => bytes,
         }
+    }
+}
+
+#[cfg(test)]
+impl Gl {
+    /// Buffers that wait for their readers.
+    pub(in crate::render) fn retired(&self) -> usize {
+        self.retired.borrow().len()
     }
 }

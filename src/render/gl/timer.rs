@@ -91,3 +91,13 @@ impl Drop for Stopwatch {
         }
     }
 }
+
+#[cfg(test)]
+impl Gl {
+    /// A stopwatch of a stretch that the device never comes to.
+    pub(in crate::render) fn stopped_watch(self: &Rc<Self>) -> Stopwatch {
+        // SAFETY: a fresh name; asking for a query that was never begun is an error without a result.
+        let query = unsafe { self.on().create_query() }.expect("a query");
+        Stopwatch::Query(Rc::clone(self), query)
+    }
+}
