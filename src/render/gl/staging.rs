@@ -4,7 +4,7 @@
 use std::cell::RefCell;
 use std::mem::{self, ManuallyDrop};
 use std::rc::Rc;
-use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender, TryRecvError};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TryRecvError};
 use std::time::Duration;
 
 use glow::HasContext as _;
@@ -33,7 +33,7 @@ pub(in crate::render) enum Lent {
     Mapped {
         first: *const u8,
         bytes: usize,
-        _done: Sender<()>,
+        _done: SyncSender<()>,
     },
     Copied(Vec<u8>),
 }
@@ -86,7 +86,8 @@ impl Staging {
     /// `Fault` where the buffer cannot be mapped.
     pub(in crate::render) fn lend(&self, bytes: usize) -> Result<Lent> {
         let Some(first) = self.mapped else { return self.buffer.read(bytes).map(Lent::Copied) };
-        let (done, reader) = mpsc::channel();
+        // Nothing is ever sent: its end is all it tells.
+        let (done, reader) = mpsc::sync_channel(1);
         self.reader.replace(Some(reader));
         Ok(Lent::Mapped { first, bytes: bytes.min(self.buffer.bytes as usize), _done: done })
     }

@@ -5,7 +5,7 @@
 //! the reading. Rounds of the three take turns; the medians of their rounds are compared.
 
 use std::collections::VecDeque;
-use std::sync::mpsc::{self, Sender};
+use std::sync::mpsc::{self, SyncSender};
 use std::time::Instant;
 
 use serde::Serialize;
@@ -92,8 +92,9 @@ fn median(mut list: Vec<f64>) -> f64 {
 /// Frames through the full ring are those that are drawn one by one.
 fn validate(studio: &mut Studio, set: &Set, shot: &Shot) -> Result<()> {
     let alone = studio.renderer.draw(&set.buffers, shot)?;
-    let (images, taken) = mpsc::channel();
-    under_way(studio, set, shot, (2 * FRAMES_UNDER_WAY, Some(images)))?;
+    let frames = 2 * FRAMES_UNDER_WAY;
+    let (images, taken) = mpsc::sync_channel(frames);
+    under_way(studio, set, shot, (frames, Some(images)))?;
     let wrong = taken.iter().filter(|image| image.rgba != alone.rgba).count();
     match wrong {
         0 => Ok(()),
@@ -103,7 +104,8 @@ fn validate(studio: &mut Studio, set: &Set, shot: &Shot) -> Result<()> {
 
 /// Frames a second of one round. Whoever takes the images drops them, on a thread of its own.
 fn round(studio: &mut Studio, set: &Set, shot: &Shot, (way, frames): (Way, usize)) -> Result<f64> {
-    let (images, taken) = mpsc::channel::<Image>();
+    // Room for all, so that nobody who copies pixels waits.
+    let (images, taken) = mpsc::sync_channel::<Image>(frames);
     let begin = Instant::now();
     let taker = std::thread::spawn(move || taken.iter().filter(|image| !image.rgba.is_empty()).count());
     match way {
@@ -125,7 +127,12 @@ fn round(studio: &mut Studio, set: &Set, shot: &Shot, (way, frames): (Way, usize
 }
 
 /// Draws with as many frames under way as the ring has places. `to`: who gets their pixels, copied on other threads.
-fn under_way(studio: &mut Studio, set: &Set, shot: &Shot, (frames, to): (usize, Option<Sender<Image>>)) -> Result<()> {
+fn under_way(
+    studio: &mut Studio,
+    set: &Set,
+    shot: &Shot,
+    (frames, to): (usize, Option<SyncSender<Image>>),
+) -> Result<()> {
     let renderer = &mut studio.renderer;
     let mut tickets = VecDeque::new();
     for frame in 0..frames + FRAMES_UNDER_WAY {
@@ -193,7 +200,7 @@ mod tests {
         studio.pose(&mut set, &stage.state(STILL)).expect("poses");
         let shot = set.shot(stage.camera(size), size);
         validate(&mut studio, &set, &shot).expect("control: the same");
-        let (images, taken) = mpsc::channel();
+        let (images, taken) = mpsc::sync_channel(5);
         under_way(&mut studio, &set, &shot, (5, Some(images))).expect("draws");
         let frames: Vec<Image> = taken.iter().collect();
         studio.pose(&mut set, &stage.state(STILL + 7)).expect("poses");
