@@ -59,7 +59,8 @@ pub fn ms_since(begin: std::time::Instant) -> f64 {
     begin.elapsed().as_secs_f64() * 1e3
 }
 
-/// Sends the log to stderr; `RUST_LOG` chooses what is in it, else everything from `info` on.
+/// Sends the log to stderr; `RUST_LOG` chooses what is in it, else everything from `info` on. `RUST_LOG=info,opengl=debug`
+/// asks for what the OpenGL driver thinks of its use, too.
 ///
 /// A second call changes nothing.
 pub fn log_to_stderr() {

@@ -1,7 +1,8 @@
 //! One task per scene. It alone orders what happens to the scene: a step is deformed, shown to whoever waits for it, and
-//! then acknowledged. The next comes after that, but for one thing: while vertices leave the device, it is computed. It
-//! waits for the device, never for a client.
+//! then acknowledged. The next comes after that, but for what is late (`late`): while vertices and frames leave the device,
+//! it is computed. It waits for the device, never for a client.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -9,7 +10,7 @@ use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::keep::Keeper;
 use super::lane::{Lane, Place, Policy, Waiting};
-use super::show::Late;
+use super::late::Late;
 use super::viewer::{Delivery, Shown, StepName, View, Viewer};
 use super::worker::{SceneId, Worker};
 use crate::config::Config;
@@ -82,6 +83,8 @@ pub(super) struct Conductor {
     pending: Option<(Arc<Lane>, u64)>,
     /// Times of the current step until its vertices were there.
     pub(super) stages: StageTimes,
+    /// What leaves the device, oldest first: of the current step, and frames of the one before it.
+    pub(super) late: VecDeque<Late>,
     /// What somebody has asked for of the current vertices.
     pub(super) surface: Option<Held>,
     last_step: watch::Sender<Option<StepName>>,
@@ -126,6 +129,7 @@ impl Conductor {
             asks: Vec::new(),
             pending: None,
             stages: Vec::new(),
+            late: VecDeque::new(),
             surface: None,
             last_step,
             wake,
@@ -162,15 +166,18 @@ impl Conductor {
     async fn tend(&mut self) {
         self.answer_asks().await;
         let holds_back = self.holds_back();
-        let mut late = self.serve_viewers(holds_back).await;
+        self.serve_viewers(holds_back).await;
         if self.is_held() {
-            return self.settle(late).await;
+            return self.settle().await;
         }
         let done = self.pending.take().map(|(lane, step)| Done { lane, step, stages: self.stages.clone() });
-        match &mut late {
+        match self.late.back_mut().filter(|late| late.count == self.count) {
             // Acknowledged after what is late of it.
-            Some(late) => late.done = done,
-            None => acknowledge(done),
+            Some(late) => late.done = done.or(late.done.take()),
+            None => {
+                self.settle().await;
+                acknowledge(done);
+            }
         }
         if self.writer.as_ref().is_some_and(|writer| writer.lane.is_closed()) {
             self.writer = None;
@@ -178,32 +185,33 @@ impl Conductor {
         let lane = self.writer.as_ref().map(|writer| Arc::clone(&writer.lane));
         match lane.and_then(|lane| Some((lane.take()?, lane))) {
             Some((waiting, lane)) => {
-                self.step(lane, waiting, late).await;
+                self.step(lane, waiting).await;
                 // There may be more to do; messages get their turn first.
                 self.wake.notify_one();
             }
-            None => self.settle(late).await,
+            None => self.settle().await,
         }
     }
 
-    /// Hands over the vertices that are late, and then acknowledges their step.
-    async fn settle(&mut self, late: Option<Late>) {
-        if let Some(late) = late {
-            acknowledge(self.deliver(late).await);
-        }
-    }
-
-    /// Computes the next step while what is late of the one before arrives.
-    async fn step(&mut self, lane: Arc<Lane>, waiting: Waiting, late: Option<Late>) {
+    /// Computes the next step while what is late arrives. Only frames of the step before it may be late after that.
+    async fn step(&mut self, lane: Arc<Lane>, waiting: Waiting) {
         let mut stages = waiting.stages();
         let number = waiting.update.number;
         let mut next = State::clone(&self.state);
         next.run = self.run;
         next.apply(&self.scene, &waiting.update);
         let next = Arc::new(next);
-        let deforming = self.means.worker.deform(self.id, &next);
-        self.settle(late).await;
-        match deforming.wait().await {
+        let mut deforming = self.means.worker.deform(self.id, &next);
+        self.settle_vertices().await;
+        let deformed = loop {
+            tokio::select! {
+                biased;
+                deformed = deforming.there() => break deformed,
+                () = self.settle_oldest(), if !self.late.is_empty() => {}
+            }
+        };
+        self.settle_before(self.count).await;
+        match deformed {
             Ok(deformed) => {
                 stages.push((Stage::Deform, deformed.ms));
                 self.stages = stages;
@@ -214,7 +222,11 @@ impl Conductor {
                 self.count += 1 + waiting.merged;
                 self.pending = Some((lane, number));
             }
-            Err(error) => lane.report(number, Err(error)),
+            Err(error) => {
+                // After the acknowledgements of the steps before it.
+                self.settle().await;
+                lane.report(number, Err(error));
+            }
         }
     }
 
@@ -305,6 +317,7 @@ impl Conductor {
     }
 
     async fn end(mut self, error: Error) {
+        self.settle().await;
         if let Some(writer) = &self.writer {
             if let Some((lane, step)) = self.pending.take() {
                 lane.report(step, Ok(self.stages.clone()));
@@ -321,7 +334,7 @@ impl Conductor {
     }
 }
 
-fn acknowledge(done: Option<Done>) {
+pub(super) fn acknowledge(done: Option<Done>) {
     if let Some(Done { lane, step, stages }) = done {
         lane.report(step, Ok(stages));
     }

@@ -76,7 +76,7 @@ impl Drop for Place {
 #[derive(Debug, Default)]
 struct Inner {
     waiting: VecDeque<Waiting>,
-    /// Steps taken and not yet reported: two while the one's vertices leave the device beside the other.
+    /// Steps taken and not yet reported: more than one while what is late of the others leaves the device.
     in_work: usize,
     reports: VecDeque<Report>,
     skipped: u64,

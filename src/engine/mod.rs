@@ -5,10 +5,12 @@
 //! (`lane`), a subscriber through a bounded feed (`viewer`), and both are told when they are too fast or too slow.
 
 mod conductor;
+mod desk;
 mod encode;
 mod host;
 mod keep;
 mod lane;
+mod late;
 mod ledger;
 mod picked;
 mod registry;

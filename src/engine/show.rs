@@ -4,27 +4,13 @@ use std::mem;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::conductor::{Conductor, Done, Held};
+use super::conductor::{Conductor, Held};
+use super::late::Leaving;
 use super::picked::with_transforms;
 use super::viewer::{Body, Delivery, Showing, Shown, StepName, View, Viewer};
-use super::worker::{Asked, Copied};
 use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result};
-use crate::scene::Cells;
 use crate::telemetry::{Stage, StageTimes};
-
-/// Vertices of a step that leave the device while the next step is computed, and who waits for them.
-pub(super) struct Late {
-    copying: Asked<Copied>,
-    /// What is shown with them; `skipped` is each viewer's own.
-    step: StepName,
-    stages: StageTimes,
-    cells: Option<Arc<Cells>>,
-    /// With the steps that each has missed.
-    viewers: Vec<(Viewer, u64)>,
-    /// The step's acknowledgement, which comes after its vertices.
-    pub done: Option<Done>,
-}
 
 impl Conductor {
     /// Answers every request whose step is there or gone; forgets those that nobody waits for.
@@ -46,33 +32,39 @@ impl Conductor {
     }
 
     /// Gives the current step to every viewer that has room for it. A lossless viewer without room holds back the
-    /// writer while `holds_back`, and is cut off when it does so for too long. While a next step waits, vertices are only
-    /// begun: they are returned, and come to [`Self::deliver`] once that step is under way.
-    pub(super) async fn serve_viewers(&mut self, holds_back: bool) -> Option<Late> {
-        let mut late: Vec<(Viewer, u64)> = Vec::new();
+    /// writer while `holds_back`, and is cut off when it does so for too long. While a next step waits, vertices and a few
+    /// frames are only begun: they are late, and handed over once that step is under way.
+    pub(super) async fn serve_viewers(&mut self, holds_back: bool) {
         let viewers = mem::take(&mut self.viewers);
         let wanted = self.wanted(&viewers);
-        let beside = self.has_next() && !self.there().covers(wanted);
+        let beside = self.has_next();
+        let copied = beside && !self.there().covers(wanted);
+        let (mut readers, mut frames) = (Vec::new(), Vec::new());
         for mut viewer in viewers {
             if viewer.is_gone() {
                 continue;
             }
             // Room may have come only now.
-            if beside && self.wants(&viewer).is_some_and(|own| wanted.covers(own)) {
+            if copied && self.wants(&viewer).is_some_and(|own| wanted.covers(own)) {
                 let skipped = self.see(&mut viewer);
-                late.push((viewer, skipped));
-            } else if self.serve(&mut viewer, holds_back, wanted).await {
-                self.viewers.push(viewer);
+                readers.push((viewer.claim(), skipped));
+            } else if let Some(frame) =
+                Some(frames.len()).filter(|_| beside).and_then(|begun| self.begin_frame(&mut viewer, begun))
+            {
+                frames.push(frame);
+            } else {
+                self.settle_for(&viewer).await;
+                if !self.serve(&mut viewer, holds_back, wanted).await {
+                    continue;
+                }
             }
+            self.viewers.push(viewer);
         }
-        (!late.is_empty()).then(|| Late {
-            copying: self.means.worker.copy(self.id, wanted),
-            step: StepName::of(&self.state),
-            stages: self.stages.clone(),
-            cells: self.state.cells.clone(),
-            viewers: late,
-            done: None,
-        })
+        if !readers.is_empty() {
+            let copying = self.means.worker.copy(self.id, wanted);
+            self.late.push_back(self.late(Leaving::Vertices(copying), readers));
+        }
+        self.late.extend(frames);
     }
 
     /// What a viewer that has room for the current step wants of its vertices.
@@ -89,25 +81,8 @@ impl Conductor {
         there.filter_map(|viewer| self.wants(viewer)).fold(Wanted::default(), Wanted::or)
     }
 
-    /// Waits for vertices that were begun and hands them over; returns what is to be acknowledged then.
-    pub(super) async fn deliver(&mut self, late: Late) -> Option<Done> {
-        let Late { copying, step, mut stages, cells, viewers, done } = late;
-        let copied = copying.wait().await.map(|(surface, copy_ms)| {
-            stages.push((Stage::Copy, copy_ms));
-            surface
-        });
-        for (viewer, skipped) in viewers {
-            let body = copied.clone().map(Body::Vertices);
-            let (stages, cells) = (stages.clone(), cells.clone());
-            if viewer.deliver(body.map(|body| Shown { step, skipped, stages, cells, body })) {
-                self.viewers.push(viewer);
-            }
-        }
-        done
-    }
-
     /// Notes that a viewer gets the current step; how many it has missed.
-    fn see(&self, viewer: &mut Viewer) -> u64 {
+    pub(super) fn see(&self, viewer: &mut Viewer) -> u64 {
         let skipped = self.count - viewer.seen - 1;
         viewer.seen = self.count;
         viewer.stalled = None;
@@ -122,7 +97,7 @@ impl Conductor {
         if viewer.has_room() {
             let skipped = self.see(viewer);
             let shown = self.show(&viewer.view, skipped, others).await;
-            return viewer.deliver(shown);
+            return viewer.claim().deliver(shown);
         }
         if !(holds_back && viewer.delivery == Delivery::Lossless) {
             viewer.stalled = None;
@@ -143,7 +118,7 @@ impl Conductor {
         let mut stages = self.stages.clone();
         let body = match *view {
             View::Frame { camera, width, height, showing: Showing::Colour } => {
-                let image = self.means.worker.draw(self.id, camera, (width, height)).await?;
+                let image = self.means.worker.begin_draw(self.id, camera, (width, height)).wait().await?;
                 stages.extend(known(&image.passes));
                 Body::Frame(image)
             }
@@ -186,7 +161,7 @@ impl Conductor {
 
 /// The stages among the passes of a picture. Its pass "encode" makes bytes of light, and is part of the stage that draws;
 /// the stage of that name comes later.
-fn known(passes: &[(&'static str, f64)]) -> StageTimes {
+pub(super) fn known(passes: &[(&'static str, f64)]) -> StageTimes {
     let stage = |name: &str| Stage::named(name).filter(|stage| *stage != Stage::Encode);
     passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
 }

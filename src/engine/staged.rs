@@ -23,6 +23,8 @@ pub struct Staged {
     bounds: Bounds,
     /// What the deformer's output shows.
     shown: Arc<State>,
+    /// Counts what was deformed, refused states and their repair too: each is another content of the buffers.
+    turn: u64,
     /// The colour map whose values the buffers hold.
     mapped: Option<(Showing, Legend)>,
 }
@@ -38,13 +40,14 @@ impl Staged {
             filled: false,
             bounds: scene.rest_bounds,
             shown,
+            turn: 0,
             mapped: None,
         }
     }
 
     /// Deforms the rest state.
     pub(super) fn rest(&mut self) -> Result<()> {
-        let deformed = self.deformer.deform(&self.shown)?;
+        let deformed = self.run(&Arc::clone(&self.shown))?;
         if !is_near(&deformed.bounds) {
             return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
         }
@@ -74,11 +77,11 @@ impl Staged {
     /// [`Self::deform`] of a state that others hold too, without a copy of it.
     pub(super) fn deform_shared(&mut self, state: &Arc<State>) -> Result<Deformed> {
         self.filled = false;
-        let deformed = match self.deformer.deform(state) {
+        let deformed = match self.run(state) {
             Ok(deformed) => deformed,
             Err(error) => {
                 // The output may be half written. If this fails too, the first error tells more.
-                self.deformer.deform(&self.shown).ok();
+                self.run(&Arc::clone(&self.shown)).ok();
                 return Err(error);
             }
         };
@@ -88,8 +91,13 @@ impl Staged {
             return Ok(deformed);
         }
         let refusal = self.overflow(state)?;
-        self.deformer.deform(&self.shown)?;
+        self.run(&Arc::clone(&self.shown))?;
         Err(refusal)
+    }
+
+    fn run(&mut self, state: &State) -> Result<Deformed> {
+        self.turn += 1;
+        self.deformer.deform(state)
     }
 
     /// The vertices of the last deformation, in host memory.
@@ -110,6 +118,7 @@ impl Staged {
             // All domains have one origin, so what the deformer wrote is drawn as it is.
             cells => {
                 buffers.relative_to(cells.as_ref().map_or([0.0; 3], |cells| cells.shared()));
+                buffers.hold_step(self.turn);
                 return Ok((self.bounds, uploaded));
             }
         };

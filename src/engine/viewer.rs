@@ -2,7 +2,7 @@
 //! holds at most two pictures; `latest` ones are made only when the feed asks for them.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, watch};
@@ -121,7 +121,33 @@ pub(super) struct Viewer {
     pub stalled: Option<Instant>,
     credits: Arc<AtomicUsize>,
     items: mpsc::Sender<Result<Shown>>,
+    /// Whether it was given a refusal.
+    over: Arc<AtomicBool>,
     end: watch::Sender<Option<End>>,
+}
+
+/// A viewer's room for one picture.
+#[derive(Debug)]
+pub(super) struct Claim {
+    items: mpsc::Sender<Result<Shown>>,
+    over: Arc<AtomicBool>,
+}
+
+impl Claim {
+    /// Hands over a picture; a refusal ends the feed. False when the viewer is to be dropped.
+    pub(super) fn deliver(self, shown: Result<Shown>) -> bool {
+        let lives = shown.is_ok();
+        if !lives {
+            self.over.store(true, Ordering::Release);
+        }
+        // There is room for every credit, so this fails only when the other side has gone, or was refused before.
+        self.items.try_send(shown).is_ok() && lives
+    }
+
+    /// Whether it is this viewer's.
+    pub(super) fn is_of(&self, viewer: &Viewer) -> bool {
+        self.items.same_channel(&viewer.items)
+    }
 }
 
 impl Viewer {
@@ -130,17 +156,15 @@ impl Viewer {
         self.credits.load(Ordering::Acquire) > 0
     }
 
-    /// Whether the other side has gone.
+    /// Whether the other side has gone, or was told why it gets no more.
     pub(super) fn is_gone(&self) -> bool {
-        self.items.is_closed()
+        self.items.is_closed() || self.over.load(Ordering::Acquire)
     }
 
-    /// Hands over a picture; a refusal ends the feed. False when the viewer is to be dropped.
-    pub(super) fn deliver(&self, shown: Result<Shown>) -> bool {
-        let lives = shown.is_ok();
+    /// Takes the room for one picture, which comes now or later.
+    pub(super) fn claim(&self) -> Claim {
         self.credits.fetch_sub(1, Ordering::AcqRel);
-        // There is room for every credit, so this fails only when the other side has gone.
-        self.items.try_send(shown).is_ok() && lives
+        Claim { items: self.items.clone(), over: Arc::clone(&self.over) }
     }
 
     /// Ends the feed after what it holds.
@@ -172,7 +196,8 @@ impl Feed {
         let credits = Arc::new(AtomicUsize::new(ahead));
         let (items, inbox) = mpsc::channel(AHEAD);
         let (end, ended) = watch::channel(None);
-        let viewer = Viewer { view, delivery, seen: 0, stalled: None, credits: Arc::clone(&credits), items, end };
+        let (credit, over) = (Arc::clone(&credits), Arc::default());
+        let viewer = Viewer { view, delivery, seen: 0, stalled: None, credits: credit, items, over, end };
         (viewer, Self { delivery, asked: false, credits, items: inbox, end: ended, scene })
     }
 
@@ -236,7 +261,7 @@ mod tests {
     async fn a_lossless_viewer_has_room_for_two_and_gets_more_as_it_reads() {
         let (viewer, mut feed) = Feed::new(View::Vertices(Wanted::VERTICES), Delivery::Lossless, Arc::default());
         for number in 1..=2 {
-            assert!(viewer.has_room() && viewer.deliver(shown(number)));
+            assert!(viewer.has_room() && viewer.claim().deliver(shown(number)));
         }
         assert!(!viewer.has_room());
         assert_eq!(feed.next().await.expect("the first").step.number, 1);
@@ -251,14 +276,14 @@ mod tests {
             let given_up = tokio::time::timeout(std::time::Duration::ZERO, feed.next()).await;
             assert!(given_up.is_err());
         }
-        assert!(viewer.has_room() && viewer.deliver(shown(4)) && !viewer.has_room());
+        assert!(viewer.has_room() && viewer.claim().deliver(shown(4)) && !viewer.has_room());
         assert_eq!(feed.next().await.expect("the newest").step.number, 4);
     }
 
     #[tokio::test]
     async fn an_end_is_told_after_what_is_held_and_a_cut_at_once() {
         let (viewer, mut feed) = Feed::new(View::Vertices(Wanted::VERTICES), Delivery::Lossless, Arc::default());
-        viewer.deliver(shown(1));
+        viewer.claim().deliver(shown(1));
         let error = Error::NotFound { what: "scene", given: "gone".into() };
         viewer.end(error.clone());
         drop(viewer);

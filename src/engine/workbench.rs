@@ -1,7 +1,7 @@
 //! The tools of the device thread: a backend that deforms and, where there is one, a renderer. Scenes become [`Staged`].
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::staged::Staged;
 use super::viewer::Showing;
@@ -12,7 +12,7 @@ use crate::error::{Error, Result};
 use crate::frame::Legend;
 use crate::gpu::{self, CudaDeformer, GlBuffers};
 use crate::reference::ReferenceDeformer;
-use crate::render::{self, Field, Hit, Image, Pick, Prefer, Renderer, SceneBuffers, Shot, Survey};
+use crate::render::{self, Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Shot, Survey, Ticket};
 use crate::scene::{Camera, Rectangle, Scene};
 use crate::telemetry::{Stage, ms_since};
 
@@ -24,6 +24,21 @@ pub struct Info {
     pub device: String,
     /// What draws, or why nothing does.
     pub renderer: Result<render::Info>,
+}
+
+/// A frame under way.
+#[derive(Debug)]
+pub struct Drawing {
+    ticket: Ticket,
+    /// Milliseconds of bringing its vertices to the renderer, if they had to be.
+    upload_ms: Option<f64>,
+}
+
+impl Drawing {
+    /// Whether [`Workbench::finish_draw`] would not wait, after waiting for it at most so long.
+    pub fn is_ready_within(&self, limit: Duration) -> bool {
+        self.ticket.is_ready_within(limit)
+    }
 }
 
 /// Owns the device and the renderer. Lives on one thread; the command line's `render` uses it directly.
@@ -60,6 +75,11 @@ impl Workbench {
     /// What deforms and what draws.
     pub const fn info(&self) -> &Info {
         &self.info
+    }
+
+    /// What the last frame really ran; none without a renderer.
+    pub fn ran(&self) -> Option<&render::Ran> {
+        self.renderer.as_ref().ok().map(Renderer::ran)
     }
 
     /// Prepares a scene and deforms it at rest. OpenGL buffers are made now only when the deformer writes into them.
@@ -104,17 +124,35 @@ impl Workbench {
     /// # Errors
     /// `Unavailable` without a renderer, `Invalid` for a camera or size that makes no sense, `Fault` of OpenGL.
     pub fn draw(&mut self, staged: &mut Staged, camera: &Camera, width: u32, height: u32) -> Result<Image> {
+        let drawing = self.begin_draw(staged, camera, width, height)?;
+        self.finish_draw(drawing).map(Pixels::into_image)
+    }
+
+    /// Begins to draw the vertices of the last deformation, without waiting for the device; another may be deformed then.
+    ///
+    /// # Errors
+    /// As [`Self::draw`]; `Busy` when too many are under way.
+    pub fn begin_draw(&mut self, staged: &mut Staged, camera: &Camera, width: u32, height: u32) -> Result<Drawing> {
         let camera = camera.checked()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let begin = Instant::now();
         let (bounds, uploaded) = staged.fill_buffers(renderer, &camera)?;
-        let upload_ms = ms_since(begin);
+        let upload_ms = uploaded.then(|| ms_since(begin));
         let shot = Shot { camera, width, height, bounds };
-        let mut image = renderer.draw(staged.buffers()?, &shot)?;
-        if uploaded {
-            image.passes.insert(0, (Stage::Upload.name(), upload_ms));
-        }
-        Ok(image)
+        Ok(Drawing { ticket: renderer.submit(staged.buffers()?, &shot)?, upload_ms })
+    }
+
+    /// Waits for a frame; any thread may then take its pixels.
+    ///
+    /// # Errors
+    /// `Fault` when the device does not finish.
+    pub fn finish_draw(&mut self, drawing: Drawing) -> Result<Pixels> {
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let pixels = renderer.retrieve(drawing.ticket)?;
+        Ok(match drawing.upload_ms {
+            Some(ms) => pixels.after(Stage::Upload.name(), ms),
+            None => pixels,
+        })
     }
 
     /// Numbers in place of colours, and the legend when they are to be a colour map. For what shows colour, use

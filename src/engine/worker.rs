@@ -1,29 +1,26 @@
-//! The device thread: takes commands from a bounded queue, owns the workbench and every staged scene, answers each
-//! command once. Vertices are answered late: they leave the device while the command after theirs is obeyed.
+//! The device thread: takes commands from a bounded queue, owns the workbench and every staged scene (`desk`), answers each
+//! command once. Vertices, picks and frames are answered late: they leave the device while commands after theirs are
+//! obeyed.
 
-use std::collections::{HashMap, VecDeque};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::time::Instant;
 
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
-use super::staged::Staged;
+use super::desk::work;
 use super::viewer::Showing;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
-use crate::deform::{Deformed, Fetch, Surface, Wanted};
+use crate::deform::{Deformed, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::frame::Legend;
-use crate::render::{Hit, Image, Pick, Survey};
+use crate::render::{FRAMES_UNDER_WAY, Hit, Image, Survey};
 use crate::scene::{Camera, Rectangle, Scene, State};
-use crate::telemetry::ms_since;
 
 /// Names a staged scene on the device thread.
 pub(super) type SceneId = u64;
 
-type Reply<T> = oneshot::Sender<Result<T>>;
+pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
 
 /// What the device thread can be asked for.
 pub(super) enum Command {
@@ -83,9 +80,9 @@ pub(super) struct Worker {
 impl Worker {
     /// Starts the thread and waits until it has opened its devices.
     pub(super) async fn start(config: &Arc<Config>) -> Result<(Self, Info, std::thread::JoinHandle<()>)> {
-        // Each scene has at most two commands under way, a copy and the step after it, and each opening one more; so
+        // Each scene has at most a few frames, a copy and the step after them under way, and each opening one more; so
         // nobody is turned away by a full queue unless scenes are opened faster than the limit of open scenes allows.
-        let limit = 3 * config.open_scenes + 8;
+        let limit = (3 + FRAMES_UNDER_WAY) * config.open_scenes + 8;
         let (commands, inbox) = mpsc::channel(limit);
         let (tell, told) = oneshot::channel();
         let config = Arc::clone(config);
@@ -116,8 +113,9 @@ impl Worker {
         self.begin(|reply| Command::Deform { id, state, reply })
     }
 
-    pub(super) async fn draw(&self, id: SceneId, camera: Camera, size: (u32, u32)) -> Result<Image> {
-        self.ask(|reply| Command::Draw { id, camera, size, reply }).await
+    /// Begins to draw what was deformed last, whatever is asked of the scene next.
+    pub(super) fn begin_draw(&self, id: SceneId, camera: Camera, size: (u32, u32)) -> Asked<Image> {
+        self.begin(|reply| Command::Draw { id, camera, size, reply })
     }
 
     pub(super) async fn survey(
@@ -181,157 +179,20 @@ pub(super) type Copied = (Arc<Surface>, f64);
 pub(super) struct Asked<T>(Result<oneshot::Receiver<Result<T>>>);
 
 impl<T> Asked<T> {
-    pub(super) async fn wait(self) -> Result<T> {
-        self.0?.await.map_err(|_| gone())?
+    pub(super) async fn wait(mut self) -> Result<T> {
+        self.there().await
+    }
+
+    /// The same, safe to drop while it waits; not to be asked again once it has answered.
+    pub(super) async fn there(&mut self) -> Result<T> {
+        match &mut self.0 {
+            Ok(answer) => answer.await.map_err(|_| gone())?,
+            Err(error) => Err(error.clone()),
+        }
     }
 }
 
 /// A dropped reply means that the command panicked or that the thread has ended.
 fn gone() -> Error {
     during("device")("the device thread gave no answer")
-}
-
-/// The device thread's own.
-struct Desk {
-    workbench: Workbench,
-    scenes: HashMap<SceneId, Staged>,
-    /// Vertices on their way, oldest first.
-    arriving: VecDeque<Arriving>,
-    /// Picks on their way, likewise.
-    picks: VecDeque<(Pick, Reply<Vec<Hit>>)>,
-}
-
-struct Arriving {
-    id: SceneId,
-    fetch: Fetch,
-    begin: Instant,
-    reply: Reply<Copied>,
-}
-
-fn work(workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
-    let (arriving, picks) = (VecDeque::new(), VecDeque::new());
-    let mut desk = Desk { workbench, scenes: HashMap::new(), arriving, picks };
-    while let Some(command) = next(&mut desk, &mut inbox) {
-        if matches!(command, Command::Quit) {
-            break;
-        }
-        // They have had one command's time to arrive in; those that this one begins will have the next one's.
-        let arriving = desk.arriving.len();
-        guarded(|| desk.obey(command));
-        for _ in 0..arriving {
-            guarded(|| desk.hand_over());
-        }
-        while desk.picks.front().is_some_and(|(pick, _)| pick.is_ready()) {
-            guarded(|| desk.answer_pick());
-        }
-    }
-    desk.arriving.clear();
-    desk.picks.clear();
-    for (_, staged) in desk.scenes.drain() {
-        desk.workbench.unstage(staged);
-    }
-}
-
-/// The next command. While there is none, vertices are handed over and picks answered.
-fn next(desk: &mut Desk, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
-    while !desk.arriving.is_empty() || !desk.picks.is_empty() {
-        match inbox.try_recv() {
-            Ok(command) => return Some(command),
-            Err(_) if desk.arriving.is_empty() => guarded(|| desk.answer_pick()),
-            Err(_) => guarded(|| desk.hand_over()),
-        }
-    }
-    inbox.blocking_recv()
-}
-
-/// A panic costs the one command whose reply it drops; the thread and all scenes live on.
-fn guarded(act: impl FnOnce()) {
-    if catch_unwind(AssertUnwindSafe(act)).is_err() {
-        tracing::error!("a command panicked on the device thread");
-    }
-}
-
-impl Desk {
-    fn obey(&mut self, command: Command) {
-        let Self { workbench, scenes, .. } = self;
-        // Every ignored result below means: the asker has gone, and its answer goes with it.
-        match command {
-            Command::Stage { id, scene, reply } => {
-                let staged = workbench.stage(&scene).map(|staged| scenes.insert(id, staged));
-                // Nobody would ever put away a scene that nobody waits for.
-                if reply.send(staged.map(|_| ())).is_err()
-                    && let Some(staged) = scenes.remove(&id)
-                {
-                    workbench.unstage(staged);
-                }
-            }
-            Command::Deform { id, state, reply } => {
-                reply.send(find(scenes, id).and_then(|staged| staged.deform_shared(&state))).ok();
-            }
-            Command::Draw { id, camera, size: (width, height), reply } if !reply.is_closed() => {
-                let drawn = find(scenes, id).and_then(|staged| workbench.draw(staged, &camera, width, height));
-                reply.send(drawn).ok();
-            }
-            Command::Survey { id, camera, size, showing, reply } if !reply.is_closed() => {
-                reply.send(find(scenes, id).and_then(|staged| workbench.survey(staged, &camera, size, showing))).ok();
-            }
-            Command::Pick { id, camera, picture, rectangle, reply } if !reply.is_closed() => {
-                let pick = |staged| workbench.begin_pick(staged, &camera, picture, rectangle);
-                match find(scenes, id).and_then(pick) {
-                    Ok(pick) => self.picks.push_back((pick, reply)),
-                    Err(error) => {
-                        reply.send(Err(error)).ok();
-                    }
-                }
-            }
-            Command::Copy { id, wanted, reply } if !reply.is_closed() => self.copy((id, wanted), reply),
-            // Whoever asked has given up waiting: nothing is made.
-            Command::Draw { .. }
-            | Command::Survey { .. }
-            | Command::Pick { .. }
-            | Command::Copy { .. }
-            | Command::Quit => {}
-            Command::Unstage { id, reply } => {
-                if let Some(staged) = scenes.remove(&id) {
-                    workbench.unstage(staged);
-                }
-                reply.send(Ok(())).ok();
-            }
-        }
-    }
-
-    /// Begins to copy; what is there at once is handed over at once.
-    fn copy(&mut self, (id, wanted): (SceneId, Wanted), reply: Reply<Copied>) {
-        let begin = Instant::now();
-        match find(&mut self.scenes, id).and_then(|staged| staged.fetch(wanted)) {
-            Ok(fetch) => {
-                let is_there = fetch.is_there();
-                self.arriving.push_back(Arriving { id, fetch, begin, reply });
-                if is_there {
-                    self.arriving.rotate_right(1);
-                    self.hand_over();
-                }
-            }
-            Err(error) => {
-                reply.send(Err(error)).ok(); // The asker has gone, and its answer goes with it.
-            }
-        }
-    }
-
-    /// Waits for the pick that has been under way for the longest.
-    fn answer_pick(&mut self) {
-        let Some((pick, reply)) = self.picks.pop_front() else { return };
-        reply.send(self.workbench.finish_pick(pick)).ok(); // As above.
-    }
-
-    /// Waits for the vertices that have been under way for the longest.
-    fn hand_over(&mut self) {
-        let Some(Arriving { id, fetch, begin, reply }) = self.arriving.pop_front() else { return };
-        let surface = find(&mut self.scenes, id).and_then(|staged| staged.fetched(&fetch));
-        reply.send(surface.map(|surface| (surface, ms_since(begin)))).ok(); // As above.
-    }
-}
-
-fn find(scenes: &mut HashMap<SceneId, Staged>, id: SceneId) -> Result<&mut Staged> {
-    scenes.get_mut(&id).ok_or_else(|| during("device")(format!("scene {id} is not staged")))
 }

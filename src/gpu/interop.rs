@@ -1,4 +1,8 @@
 //! OpenGL buffers as device memory: registered once, mapped together for each step, unmapped before anything is drawn.
+//!
+//! Mapping orders the two APIs, so that nobody waits on the host: what OpenGL was told before a mapping ends before work that
+//! the stream is given after it, and what the stream was given before an unmapping ends before what OpenGL is told after it.
+//! A frame may therefore still be under way when the next step is given to the stream: that step waits for it on the device.
 
 use std::ffi::{c_int, c_uint};
 use std::sync::Arc;
@@ -83,7 +87,8 @@ impl Interop {
         self.announce(access).map_err(&fail)?;
         let stream = device.stream().cu_stream();
         let (count, resources) = (self.resources.len() as c_uint, self.resources.as_mut_ptr());
-        // SAFETY: all are registered and unmapped, and the stream is of the same device.
+        // SAFETY: all are registered and unmapped, and the stream is of the same device. Frames that OpenGL still draws from
+        // them end before the stream goes on.
         unsafe { sys::cuGraphicsMapResources(count, resources, stream) }.result().map_err(&fail)?;
         let worked = self.addresses().and_then(work);
         // SAFETY: they were mapped just now; work that was started on the stream ends before OpenGL goes on.

@@ -24,6 +24,9 @@ const PLATFORM_SURFACELESS: u32 = 0x31DD;
 const CUDA_DEVICE: i32 = 0x323A;
 const DRM_DEVICE_FILE: i32 = 0x3233;
 const DRIVER_NAME: i32 = 0x335E;
+/// EGL_CONTEXT_FLAGS_KHR and EGL_CONTEXT_OPENGL_DEBUG_BIT_KHR.
+const CONTEXT_FLAGS: i32 = 0x30FC;
+const DEBUG_BIT: i32 = 1;
 const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasteriser), or the NVIDIA \
                       driver's libEGL_nvidia.so.0 with its vendor file 10_nvidia.json in /usr/share/glvnd/egl_vendor.d";
 
@@ -55,6 +58,8 @@ pub(super) struct Context {
     number: u64,
     display: egl::Display,
     context: egl::Context,
+    /// Whether it was made to say what it thinks of its use.
+    pub(super) is_debug: bool,
 }
 
 struct Api {
@@ -191,13 +196,14 @@ pub(super) fn none_fits(wanted: &str, tried: &[String]) -> Error {
 impl Context {
     /// Makes a context on a candidate and makes it current on this thread.
     pub(super) fn open(candidate: &Candidate) -> Result<Self> {
-        let made = Self::make(candidate.display)?;
+        let is_debug = super::gl::is_debug_wanted();
+        let made = Self::make(candidate.display, is_debug)?;
         // Not under the lock: a failure here drops the context, which takes the lock itself.
         made.make_current()?;
         Ok(made)
     }
 
-    fn make(display: egl::Display) -> Result<Self> {
+    fn make(display: egl::Display, is_debug: bool) -> Result<Self> {
         let instance = &api()?.instance;
         let fail = during::<egl::Error>("EGL context");
         let _door = door();
@@ -215,10 +221,12 @@ impl Context {
             3,
             egl::CONTEXT_OPENGL_PROFILE_MASK,
             egl::CONTEXT_OPENGL_CORE_PROFILE_BIT,
+            if is_debug { CONTEXT_FLAGS } else { egl::NONE },
+            DEBUG_BIT,
             egl::NONE,
         ];
         let context = instance.create_context(display, config, None, &wanted).map_err(&fail)?;
-        Ok(Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context })
+        Ok(Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context, is_debug })
     }
 
     /// Makes it current on this thread unless it is so already.

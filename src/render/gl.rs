@@ -3,18 +3,26 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod debug;
 mod fence;
 mod layers;
+mod limits;
 mod lists;
 mod object;
+mod staging;
+mod timer;
 
+use std::cell::RefCell;
 use std::rc::Rc;
-use std::time::{Duration, Instant};
 
 use glow::HasContext as _;
 
+pub(super) use self::debug::is_wanted as is_debug_wanted;
 pub(super) use self::fence::Fence;
+pub(super) use self::limits::Limits;
 pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureKind, VertexArray};
+pub(super) use self::staging::{Lent, Staging};
+pub(super) use self::timer::Stopwatch;
 use super::egl::Context;
 use crate::error::{Error, Result, during};
 
@@ -26,34 +34,23 @@ pub(super) use glow::{
     TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
 };
 
-/// What the context can do.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Limits {
-    pub(super) renderer: String,
-    pub(super) version: String,
-    pub(super) software: bool,
-    pub(super) max_side: u32,
-    /// Samples that colour, depth and integer images may all have.
-    pub(super) max_samples: u32,
-    /// Textures that one compute shader may read.
-    pub(super) max_reads: u32,
-    pub(super) max_layers: u32,
-    /// Largest buffer texture.
-    pub(super) max_texels: u64,
-    /// Largest buffer that shaders write.
-    pub(super) max_storage: u64,
-    /// Whether fragments can know their samples that pass the depth test.
-    pub(super) post_depth: bool,
-    /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
-    pub(super) anisotropy: f32,
-}
-
 /// A current context and its functions.
 pub(super) struct Gl {
     // Declared before the context, so that it is dropped while the context still is.
     glow: glow::Context,
     context: Context,
     pub(super) limits: Limits,
+    /// Timer queries that nobody waits for.
+    timers: RefCell<Vec<glow::Query>>,
+    /// Buffers that are to go once they were read.
+    retired: RefCell<Vec<staging::Retired>>,
+}
+
+impl Drop for Gl {
+    fn drop(&mut self) {
+        // What is dropped with it takes its callback from the current context, which must be this one.
+        self.context.make_current().ok();
+    }
 }
 
 impl std::fmt::Debug for Gl {
@@ -97,23 +94,17 @@ pub(super) enum Clear {
     Nothing,
 }
 
-/// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around `glFinish` in software, where
-/// timer queries mean nothing.
-#[derive(Debug)]
-pub(super) enum Stopwatch {
-    Wall(f64),
-    Query(Rc<Gl>, glow::Query),
-}
-
 impl Gl {
     pub(super) fn new(context: Context) -> Result<Rc<Self>> {
         context.make_current()?;
         let address = |name: &std::ffi::CStr| name.to_str().map_or(std::ptr::null(), |name| context.address(name));
         // SAFETY: the context is current on this thread, and the addresses are those that its EGL gives.
         let mut glow = unsafe { glow::Context::from_loader_function_cstr(address) };
-        let limits = limits(&glow);
-        listen(&mut glow);
-        Ok(Rc::new(Self { glow, context, limits }))
+        let limits = Limits::of(&glow);
+        if context.is_debug {
+            debug::listen(&mut glow);
+        }
+        Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default(), retired: RefCell::default() }))
     }
 
     /// The functions, with the context current.
@@ -366,126 +357,19 @@ impl Gl {
     }
 
     pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
+        self.copy_to(from, (to, 0), bytes);
+    }
+
+    /// The same to a place that many bytes into the other buffer.
+    pub(super) fn copy_to(&self, from: &Buffer, (to, place): (&Buffer, u64), bytes: u64) {
         let gl = self.on();
+        let (read, write) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
         // SAFETY: OpenGL refuses ranges outside either buffer.
         unsafe {
-            gl.bind_buffer(glow::COPY_READ_BUFFER, Some(from.name));
-            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(to.name));
-            gl.copy_buffer_sub_data(glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER, 0, 0, bytes as i32);
+            gl.bind_buffer(read, Some(from.name));
+            gl.bind_buffer(write, Some(to.name));
+            gl.copy_buffer_sub_data(read, write, 0, place as i32, bytes as i32);
         }
-    }
-
-    /// Waits until all commands are done.
-    ///
-    /// # Errors
-    /// `Fault` of `stage` when the device did not finish within `limit`.
-    pub(super) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
-        let gl = self.on();
-        let begin = Instant::now();
-        // SAFETY: the fence is made here, waited for in slices that fit glow's 32-bit nanoseconds, and deleted here.
-        unsafe {
-            let fence = gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0).map_err(during(stage))?;
-            let done = loop {
-                match gl.client_wait_sync(fence, glow::SYNC_FLUSH_COMMANDS_BIT, 1_000_000_000) {
-                    glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => break Ok(()),
-                    glow::TIMEOUT_EXPIRED if begin.elapsed() < limit => {}
-                    glow::TIMEOUT_EXPIRED => break Err(format!("the device did not finish within {limit:?}")),
-                    _ => break Err("the device was lost".into()),
-                }
-            };
-            gl.delete_sync(fence);
-            done.map_err(during(stage))
-        }
-    }
-
-    /// Runs commands and tells how long they take; in software this waits for them.
-    pub(super) fn timed(self: &Rc<Self>, commands: impl FnOnce() -> Result<()>) -> Result<Stopwatch> {
-        let gl = self.on();
-        if self.limits.software {
-            // SAFETY: only waits.
-            unsafe { gl.finish() }
-            let begin = Instant::now();
-            commands()?;
-            // SAFETY: only waits.
-            unsafe { gl.finish() }
-            return Ok(Stopwatch::Wall(begin.elapsed().as_secs_f64() * 1e3));
-        }
-        // SAFETY: one query at a time: it is ended before this returns, whatever the commands did.
-        let query = unsafe {
-            let query = gl.create_query().map_err(during("timer"))?;
-            gl.begin_query(glow::TIME_ELAPSED, query);
-            query
-        };
-        let done = commands();
-        // SAFETY: ends the query that was begun above.
-        unsafe { self.on().end_query(glow::TIME_ELAPSED) }
-        let stopwatch = Stopwatch::Query(Rc::clone(self), query);
-        done.map(|()| stopwatch)
-    }
-}
-
-impl Stopwatch {
-    /// Milliseconds; for a stretch that was ended and waited for.
-    pub(super) fn ms(&self) -> f64 {
-        match self {
-            Self::Wall(ms) => *ms,
-            // SAFETY: the query was ended; its result is there or waited for.
-            Self::Query(gl, query) => unsafe {
-                gl.on().get_query_parameter_u64(*query, glow::QUERY_RESULT) as f64 * 1e-6
-            },
-        }
-    }
-}
-
-impl Drop for Stopwatch {
-    fn drop(&mut self) {
-        if let Self::Query(gl, query) = self {
-            // SAFETY: the name is ours alone and is not used after this.
-            unsafe { gl.on().delete_query(*query) }
-        }
-    }
-}
-
-fn limits(gl: &glow::Context) -> Limits {
-    // SAFETY: plain questions that every 4.3 core context answers.
-    unsafe {
-        let number = |name: u32| gl.get_parameter_i32(name).max(0) as u32;
-        let renderer = gl.get_parameter_string(glow::RENDERER);
-        let software = ["llvmpipe", "softpipe", "swrast", "SWR"].iter().any(|name| renderer.contains(name));
-        let anisotropic = gl.supported_extensions().contains("GL_EXT_texture_filter_anisotropic");
-        let mut viewport = [0; 2];
-        gl.get_parameter_i32_slice(glow::MAX_VIEWPORT_DIMS, &mut viewport);
-        let viewport = viewport[0].min(viewport[1]).max(0) as u32;
-        Limits {
-            renderer,
-            version: gl.get_parameter_string(glow::VERSION),
-            software,
-            max_side: number(glow::MAX_TEXTURE_SIZE).min(viewport),
-            max_samples: [glow::MAX_COLOR_TEXTURE_SAMPLES, glow::MAX_DEPTH_TEXTURE_SAMPLES, glow::MAX_INTEGER_SAMPLES]
-                .map(number)
-                .into_iter()
-                .fold(u32::MAX, u32::min),
-            max_reads: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
-            max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
-            max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
-            max_storage: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
-            post_depth: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
-            anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
-        }
-    }
-}
-
-/// Lets the driver's messages go to the log.
-fn listen(gl: &mut glow::Context) {
-    if !gl.supports_debug() {
-        return;
-    }
-    // SAFETY: the callback only logs and holds nothing of the context.
-    unsafe {
-        gl.debug_message_callback(|_, kind, _, severity, text| match (kind, severity) {
-            (glow::DEBUG_TYPE_ERROR, _) | (_, glow::DEBUG_SEVERITY_HIGH) => tracing::warn!(target: "opengl", "{text}"),
-            _ => tracing::trace!(target: "opengl", "{text}"),
-        });
     }
 }
 

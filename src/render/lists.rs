@@ -68,7 +68,7 @@ struct Ledger {
     commands: [[u32; 5]; 2],
 }
 
-const HEAD: usize = size_of::<Ledger>();
+pub(super) const HEAD: usize = size_of::<Ledger>();
 const COMMANDS: usize = 24;
 const LEDGER_BYTES: usize = HEAD + 4 * BINS;
 const _: () = assert!(HEAD == 64, "Ledger differs from shaders/shared/lists.glsl");
@@ -95,9 +95,7 @@ pub(super) struct ListTarget {
     /// Depth alone, to test against.
     behind: Framebuffer,
     records: Buffer,
-    ledger: Buffer,
-    /// The ledger's head where the host can read it.
-    told: Buffer,
+    pub(super) ledger: Buffer,
     tiles: Buffer,
 }
 
@@ -143,18 +141,8 @@ impl ListTarget {
             layers: image(gl::TEXTURE_2D_ARRAY, gl::RGBA16F, samples)?,
             records: gl.buffer(RECORD_BYTES * u64::from(budget), gl::STREAM_COPY, None)?,
             ledger: gl.buffer(LEDGER_BYTES as u64, gl::STREAM_COPY, None)?,
-            told: gl.buffer(HEAD as u64, gl::STREAM_READ, None)?,
             tiles: gl.buffer(16 + 4 * tiles, gl::STREAM_COPY, None)?,
         })
-    }
-
-    /// What the last frame's lists held, once its commands are done.
-    pub(super) fn tell(&self) -> Result<Lists> {
-        let bytes = self.told.read(HEAD)?;
-        let ledger: Ledger = bytemuck::pod_read_unaligned(&bytes);
-        let [low, high] = ledger.total.map(u64::from);
-        let bound = (ledger.most != u32::MAX).then_some(ledger.most);
-        Ok(Lists { fragments: high << 32 | low, kept: ledger.used.into(), deepest: ledger.deepest, bound })
     }
 
     fn bind(&self) {
@@ -179,6 +167,16 @@ impl ListTarget {
         self.ledger.write(&bytes);
         self.tiles.write(bytemuck::cast_slice(&NO_TILES));
     }
+}
+
+/// What a frame's lists held, from the head of its ledger.
+pub(super) fn told(head: &[u8]) -> Lists {
+    let mut ledger = Ledger::zeroed();
+    // Of as many bytes, because it is a copy of one.
+    bytemuck::bytes_of_mut(&mut ledger).iter_mut().zip(head).for_each(|(to, from)| *to = *from);
+    let [low, high] = ledger.total.map(u64::from);
+    let bound = (ledger.most != u32::MAX).then_some(ledger.most);
+    Lists { fragments: high << 32 | low, kept: ledger.used.into(), deepest: ledger.deepest, bound }
 }
 
 /// The layers of the blended triangles, before what is opaque, whose depth is there.
@@ -206,7 +204,6 @@ pub(super) fn draw(
     target.layers.bind_image(LAYERS);
     programs.resolve.bind(None);
     gl.dispatch_listed(&target.tiles);
-    gl.copy(&target.ledger, &target.told, HEAD as u64);
     ran.passes.extend(PASSES);
     gl.check("resolve")
 }

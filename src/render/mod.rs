@@ -14,6 +14,8 @@
 //! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
 //! | encode | light to sRGB bytes, top row first; smooths edges and mixes levels (compute) | always |
 //!
+//! A frame is submitted and collected apart, so that others may be under way meanwhile ([`Ticket`]).
+//!
 //! Two things are drawn only when asked for, with programs and buffers made then: what a few pixels see ([`Pick`]), and
 //! numbers in place of colours ([`Survey`]).
 //!
@@ -31,11 +33,13 @@ mod pick;
 mod plan;
 mod post;
 mod programs;
+mod ring;
 mod scene_buffers;
 mod seen;
 mod shaders;
 mod shadow;
 mod splits;
+mod submit;
 mod survey;
 mod target;
 mod textures;
@@ -43,7 +47,7 @@ mod textures;
 use std::collections::HashMap;
 use std::rc::Rc;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 pub use self::device::{EglDevice, devices};
 pub use self::frame::shadow_texel;
@@ -51,14 +55,16 @@ use self::gl::{Gl, Program};
 pub use self::lists::Lists;
 pub use self::pick::{Hit, Pick};
 pub use self::plan::{Allocation, Plan, Saving, plan};
+pub use self::ring::FRAMES_UNDER_WAY;
 use self::scene_buffers::Apart;
 pub use self::scene_buffers::SceneBuffers;
 pub use self::seen::Seen;
 use self::shaders::Source;
+pub use self::submit::{Pixels, Ticket};
 pub use self::survey::{Field, Survey};
 use self::target::{Form, Target};
 use crate::deform::Surface;
-use crate::error::{Result, during, invalid};
+use crate::error::{Result, during};
 use crate::scene::{Bounds, Camera, Scene};
 
 /// Which EGL device to draw on.
@@ -123,7 +129,8 @@ pub struct SharedBuffers {
 /// What the last frame really ran.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Ran {
-    /// Passes, in order.
+    /// Passes, in order. Of several frames of one step the first alone has "shadow" and "blur", where they can be shared:
+    /// see [`SceneBuffers::hold_step`].
     pub passes: Vec<&'static str>,
     /// Draw calls of the visibility and blended passes.
     pub draws: usize,
@@ -139,6 +146,8 @@ const MAX_SIDE: u32 = 8192;
 const TARGETS: usize = 4;
 /// Programs that are kept for scenes to come.
 const PROGRAMS: usize = 128;
+/// How long a renderer that goes waits for those who still copy pixels.
+const LAST_READERS: Duration = Duration::from_secs(1);
 /// How long the device may take for one frame.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
@@ -152,6 +161,7 @@ pub struct Renderer {
     /// The most recently used last.
     targets: Vec<Target>,
     ran: Ran,
+    watchdog: Duration,
     /// What picks are drawn into, once there was one.
     picker: Option<pick::Picker>,
     /// What the last survey was drawn into, once there was one.
@@ -180,6 +190,7 @@ impl Renderer {
             sample_places,
             targets: Vec::new(),
             ran: Ran::default(),
+            watchdog: WATCHDOG,
             picker: None,
             surveyor: None,
         })
@@ -219,6 +230,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when the surface is not the scene's, or OpenGL reports an error.
     pub fn upload(&mut self, buffers: &SceneBuffers, surface: &Surface) -> Result<()> {
+        buffers.shared_shadow.forget();
         for (name, list) in
             [("positions", &surface.positions), ("normals", &surface.normals), ("tangents", &surface.tangents)]
         {
@@ -250,70 +262,11 @@ impl Renderer {
             Some(apart) => apart,
             None => Apart::new(&self.gl, buffers)?,
         };
+        buffers.shared_shadow.forget();
         apart.buffer.write(bytemuck::cast_slice(positions));
         buffers.apart = Some(apart);
         buffers.origin = origin;
         self.gl.check("upload")
-    }
-
-    /// Draws one frame of what the shared buffers hold.
-    ///
-    /// # Errors
-    /// `Invalid` for a size above the limit or a camera that overflows, `Fault` naming the pass when OpenGL reports an
-    /// error or the device does not finish.
-    pub fn draw(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Image> {
-        let limit = self.info.max_side;
-        if ![shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
-            let given = format!("{} x {}", shot.width, shot.height);
-            return Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given));
-        }
-        let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
-        let look = &buffers.scene.look;
-        let size = [shot.width, shot.height];
-        let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
-        self.make_room(form)?;
-        let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
-        let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
-        let gl = &self.gl;
-        let mut ran = Ran { samples: form.samples, ..Ran::default() };
-        buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
-        passes::bind(buffers)?;
-        if let Some(splits) = buffers.buffers.get("splits") {
-            let fit = frame::sun_fit(&buffers.scene, shot, buffers.origin);
-            splits.write(bytemuck::bytes_of(&splits::Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
-        }
-        let shadow = gl.timed(|| passes::shadow(gl, buffers, &mut ran))?;
-        let blur = gl.timed(|| passes::blur(gl, buffers, &mut ran))?;
-        let visibility = gl.timed(|| {
-            passes::visibility(gl, buffers, target, &sampled, &mut ran)?;
-            passes::ground(gl, buffers, shot, &mut ran)
-        })?;
-        let blended = gl.timed(|| passes::blended(gl, buffers, target, &sampled, &mut ran))?;
-        let shade = gl.timed(|| passes::shade(gl, buffers, target, &sampled, &mut ran))?;
-        let bloom = gl.timed(|| buffers.post.bloom(gl, target, &mut ran))?;
-        let encode = gl.timed(|| buffers.post.encode(gl, target, &mut ran))?;
-        let bytes = 4 * shot.width as usize * shot.height as usize;
-        let copy = gl.timed(|| {
-            gl.copy(&target.packed, &target.staging, bytes as u64);
-            Ok(())
-        })?;
-        gl.wait("read", WATCHDOG)?;
-        let begin = Instant::now();
-        let rgba = target.staging.read(bytes)?;
-        let mapped = begin.elapsed().as_secs_f64() * 1e3;
-        let drawn = [("visibility", visibility), ("blended", blended), ("shade", shade)];
-        let drawn = drawn.into_iter().chain([("bloom", bloom), ("encode", encode)]);
-        let drawn: Vec<_> = drawn.map(|(name, stopwatch)| (name, stopwatch.ms())).collect();
-        let blur = blur.ms();
-        let mut passes = vec![("shadow", shadow.ms() + blur), ("blur", blur)];
-        passes.push(("draw", drawn.iter().map(|(_, ms)| ms).sum()));
-        passes.extend(drawn);
-        passes.push(("read", copy.ms() + mapped));
-        ran.lists = target.lists.as_ref().map(lists::ListTarget::tell).transpose()?;
-        gl.check("read")?;
-        warn_of_lists(&self.ran, &ran);
-        self.ran = ran;
-        Ok(Image { width: shot.width, height: shot.height, rgba, passes })
     }
 
     /// What the first sample of each pixel of the last frame sees, top row first.
@@ -326,10 +279,12 @@ impl Renderer {
         let program = self.program(shaders::seen(samples))?;
         let target = self.targets.last().ok_or_else(nothing)?;
         passes::seen(&self.gl, target, &program)?;
-        let bytes = 4 * target.form.width as usize * target.form.height as usize;
-        self.gl.copy(&target.packed, &target.staging, bytes as u64);
-        self.gl.wait("seen", WATCHDOG)?;
-        let words = target.staging.read(bytes)?;
+        // Not by the ring, which may be full of frames under way.
+        let bytes = target.form.bytes();
+        let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
+        self.gl.copy(&target.packed, &staging, bytes);
+        self.gl.wait("seen", self.watchdog)?;
+        let words = staging.read(bytes as usize)?;
         let id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
         Ok(words.chunks_exact(4).map(|word| Seen::from_id(id(word))).collect())
     }
@@ -358,15 +313,9 @@ impl Renderer {
     }
 }
 
-/// Says so when a frame lacks blended fragments and the one before did not.
-fn warn_of_lists(last: &Ran, ran: &Ran) {
-    let lacks = |ran: &Ran| ran.lists.filter(|lists| lists.dropped() > 0);
-    if let (Some(lists), None) = (lacks(ran), lacks(last)) {
-        let (dropped, kept) = (lists.dropped(), lists.kept);
-        tracing::warn!(
-            dropped,
-            kept,
-            "blended fragments are over the budget (look.fragments): the farthest are not drawn"
-        );
+impl Drop for Renderer {
+    fn drop(&mut self) {
+        self.targets.clear();
+        self.gl.bury(LAST_READERS);
     }
 }

@@ -16,7 +16,7 @@ use super::scene_buffers::SceneBuffers;
 use super::seen::Seen;
 use super::shaders;
 use super::target::{Blended, Form, image};
-use super::{Ran, Renderer, Shot, WATCHDOG, frame, passes};
+use super::{Ran, Renderer, Shot, frame, passes};
 use crate::error::Result;
 use crate::scene::{Camera, Rectangle, Scene};
 
@@ -127,7 +127,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when the device does not finish.
     pub fn finish_pick(&mut self, pick: Pick) -> Result<Vec<Hit>> {
-        pick.fence.wait("pick", WATCHDOG)?;
+        pick.fence.wait("pick", self.watchdog)?;
         let [width, height] = pick.rectangle.size();
         let words = WORDS * width as usize * height as usize;
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(&pick.staging.read(4 * words)?);

@@ -14,7 +14,7 @@ use super::plan::{Allocation, Plan, planned};
 use super::post::Post;
 use super::programs::{Compile, Programs, Sampled};
 use super::shaders::{self, OTHER_READS, Options, Used};
-use super::shadow::{ShadowMap, fitting};
+use super::shadow::{ShadowMap, Shared, fitting};
 use super::textures::{Array, Use, arrays, cutoff, levels, place, within_budget};
 use crate::domain::AlphaMode;
 use crate::error::{Result, during};
@@ -51,6 +51,7 @@ pub struct SceneBuffers {
     pub(super) colours: Vec<Texture>,
     pub(super) normals: Vec<Texture>,
     pub(super) shadow: Option<ShadowMap>,
+    pub(super) shared_shadow: Shared,
     pub(super) programs: Programs,
     pub(super) post: Post,
     /// For the samples a pixel that the look asks for.
@@ -141,6 +142,7 @@ impl SceneBuffers {
             colours: upload_arrays(gl, scene, &colours, Use::Colour)?,
             normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
             shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow)).transpose()?,
+            shared_shadow: Shared::default(),
             programs,
             post: Post::compile(&scene.look, compile)?,
             sampled,

@@ -10,8 +10,8 @@ use super::scene_buffers::{SceneBuffers, Values};
 use super::seen::Seen;
 use super::shaders::{self, VALUE_UNIT};
 use super::target::{Form, image};
-use super::{Ran, Renderer, Shot, WATCHDOG, frame, passes};
-use crate::error::{Result, during, invalid};
+use super::{Ran, Renderer, Shot, frame, passes};
+use crate::error::{Result, during};
 
 /// What is read off a frame. Blended triangles are not there: what stands behind them is.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -92,11 +92,7 @@ impl Renderer {
     /// `Invalid` for a size above the limit or a camera that overflows; `Fault` when no values were uploaded, OpenGL
     /// reports an error or the device does not finish.
     pub fn survey(&mut self, buffers: &SceneBuffers, shot: &Shot, field: Field) -> Result<Survey> {
-        let limit = self.info.max_side;
-        if ![shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
-            let given = format!("{} x {}", shot.width, shot.height);
-            return Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given));
-        }
+        self.check_size(shot)?;
         let samples = if matches!(field, Field::Values { .. }) { buffers.scene.look.samples_a_pixel() } else { 1 };
         let form = Form::plain(&self.gl, [shot.width, shot.height], samples);
         let words = if field == Field::Normals { 3 } else { u64::from(form.samples) };
@@ -120,7 +116,7 @@ impl Renderer {
             Field::Values { largest } => Some(largest.recip()),
             Field::Domains | Field::Normals => None,
         };
-        let drawn = gl.timed(|| {
+        let drawn = gl.timed(("survey", self.watchdog), || {
             let ran = &mut Ran::default();
             passes::identify(
                 gl,
@@ -139,7 +135,7 @@ impl Renderer {
         })?;
         let bytes = (4 * words) as usize * form.width as usize * form.height as usize;
         gl.copy(&surveyor.packed, &surveyor.staging, bytes as u64);
-        gl.wait("survey", WATCHDOG)?;
+        gl.wait("survey", self.watchdog)?;
         let begin = Instant::now();
         let bytes = surveyor.staging.read(bytes)?;
         gl.check("survey")?;

@@ -4,7 +4,8 @@
 use std::rc::Rc;
 
 use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
-use super::lists::ListTarget;
+use super::lists::{HEAD, ListTarget};
+use super::ring::Ring;
 use super::shaders::TILE;
 use crate::error::Result;
 use crate::scene::Look;
@@ -51,8 +52,8 @@ pub(super) struct Target {
     pub(super) glow: Vec<Texture>,
     /// RGBA8, top row first, as the encoder writes it.
     pub(super) packed: Buffer,
-    /// The same where the host can read it.
-    pub(super) staging: Buffer,
+    /// What brings it to the host.
+    pub(super) ring: Rc<Ring>,
     // Attached to framebuffers, which must not outlive it.
     _depth: Texture,
 }
@@ -76,6 +77,11 @@ impl Form {
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
         Self { width, height, samples: if fits { wanted } else { 1 }, blended: Blended::None, halvings: 0 }
     }
+
+    /// Bytes of its picture.
+    pub(super) fn bytes(&self) -> u64 {
+        4 * u64::from(self.width) * u64::from(self.height)
+    }
 }
 
 impl Target {
@@ -88,7 +94,8 @@ impl Target {
             Blended::Listed(budget) => Some(ListTarget::new(gl, form, budget, &depth)?),
             Blended::None | Blended::Drawn => None,
         };
-        let bytes = 4 * u64::from(width) * u64::from(height);
+        let bytes = form.bytes();
+        let told = if lists.is_some() { HEAD as u64 } else { 0 };
         Ok(Self {
             form: Form { samples, ..form },
             visible: gl.framebuffer(Some(&ids), &depth)?,
@@ -103,7 +110,7 @@ impl Target {
             picture: image(gl, Form { samples: 1, ..form }, gl::RGBA16F)?,
             glow: super::post::glow(gl, form)?,
             packed: gl.buffer(bytes, gl::STREAM_COPY, None)?,
-            staging: gl.buffer(bytes, gl::STREAM_READ, None)?,
+            ring: Ring::new(gl, bytes + told),
             _depth: depth,
         })
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast::deform::{Deformer, Wanted};
 use modalcast::gpu::{CudaDeformer, Device, GlBuffers};
-use modalcast::render::{Prefer, Renderer, SceneBuffers, Shot};
+use modalcast::render::{FRAMES_UNDER_WAY, Prefer, Renderer, SceneBuffers, Shot};
 use modalcast::scene::{Camera, Scene};
 
 use crate::judge::{check, same_bits};
@@ -90,6 +90,41 @@ fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
     direct.deform(&other).expect("deforms");
     let moved = renderer.draw(&to_share, &shot).expect("draws");
     assert_ne!(shown.rgba, moved.rgba, "the judge can fail");
+    drop(direct);
+    renderer.unload(to_share);
+    renderer.unload(to_fill);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_frames_under_way_keep_the_vertices_of_their_step_while_the_next_ones_overwrite_the_shared_buffers() {
+    let (mut renderer, device, scene) = stage();
+    let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
+    let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&to_share))).expect("a deformer");
+    let mut copied = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    assert!(direct.shares_buffers(), "interop was refused");
+    // Large, so that a frame takes longer than a step.
+    let shot = |bounds| Shot { camera: Camera::framing(&scene, 64, 64), width: 1920, height: 1080, bounds };
+    let (mut frames, mut wanted) = (std::collections::VecDeque::new(), Vec::new());
+    let mut images = Vec::new();
+    for seed in 0..30 {
+        let state = scenes::state(&scene, seed);
+        if frames.len() == FRAMES_UNDER_WAY {
+            images.extend(frames.pop_front().map(|frame| renderer.collect(frame).expect("draws").rgba));
+        }
+        let bounds = direct.deform(&state).expect("deforms").bounds;
+        frames.push_back(renderer.submit(&to_share, &shot(bounds)).expect("submits"));
+    }
+    images.extend(frames.into_iter().map(|frame| renderer.collect(frame).expect("draws").rgba));
+    for seed in 0..30 {
+        let bounds = copied.deform(&scenes::state(&scene, seed)).expect("deforms").bounds;
+        renderer.upload(&to_fill, copied.surface().expect("copies")).expect("uploads");
+        wanted.push(renderer.draw(&to_fill, &shot(bounds)).expect("draws").rgba);
+    }
+    for (seed, (image, want)) in images.iter().zip(&wanted).enumerate() {
+        assert!(image == want, "step {seed}");
+    }
+    assert!(images.len() == 30 && wanted.windows(2).all(|pair| pair[0] != pair[1]), "the judge can fail");
     drop(direct);
     renderer.unload(to_share);
     renderer.unload(to_fill);

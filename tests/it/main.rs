@@ -23,4 +23,5 @@ mod service_harness;
 mod stability;
 mod steps;
 mod storages;
+mod streams;
 mod tolerance;

@@ -11,6 +11,7 @@ mod shadow;
 mod shadow_extremes;
 mod shadow_ground;
 mod shadow_methods;
+mod shadow_shared;
 mod snapshots;
 mod surveys;
 mod visibility;

@@ -107,6 +107,10 @@ fn lines(report: &Report) -> Vec<String> {
         ];
         lines.push(format!("{:<18}{:<40}{}", row.load, row.name, cells.map(|cell| format!("{cell:>10}")).concat()));
     }
+    lines.extend(report.readback.iter().map(|row| {
+        let (load, none, all, loss) = (&row.load, row.unread_fps, row.ring_fps, row.ring_loss);
+        format!("{load:<18}{none:.1} frames/s when none is read, {all:.1} when each is: {loss:.1} % fewer")
+    }));
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
     lines
 }

@@ -32,8 +32,12 @@ impl Gl {
 impl Fence {
     /// Whether the commands are done, or will never be: then [`Self::wait`] says why.
     pub(in crate::render) fn is_over(&self) -> bool {
-        // SAFETY: the fence lives as long as this value; no time is waited.
-        unsafe { self.gl.on().client_wait_sync(self.name, 0, 0) != glow::TIMEOUT_EXPIRED }
+        self.is_over_within(Duration::ZERO)
+    }
+
+    /// The same after waiting for them, at most so long.
+    pub(in crate::render) fn is_over_within(&self, limit: Duration) -> bool {
+        self.state(limit) != glow::TIMEOUT_EXPIRED
     }
 
     /// Waits until the commands are done.
@@ -43,10 +47,7 @@ impl Fence {
     pub(in crate::render) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
         let begin = Instant::now();
         loop {
-            // SAFETY: the fence lives as long as this value; slices fit glow's 32-bit nanoseconds.
-            let state =
-                unsafe { self.gl.on().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, 1_000_000_000) };
-            match state {
+            match self.state(limit.saturating_sub(begin.elapsed())) {
                 glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => return Ok(()),
                 glow::TIMEOUT_EXPIRED if begin.elapsed() < limit => {}
                 glow::TIMEOUT_EXPIRED => {
@@ -56,11 +57,71 @@ impl Fence {
             }
         }
     }
+
+    /// What OpenGL says of it after at most this time, or a second.
+    fn state(&self, limit: Duration) -> u32 {
+        // A second fits glow's 32-bit nanoseconds.
+        let slice = limit.min(Duration::from_secs(1)).as_nanos() as i32;
+        // SAFETY: the fence lives as long as this value.
+        unsafe { self.gl.on().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) }
+    }
 }
 
 impl Drop for Fence {
     fn drop(&mut self) {
         // SAFETY: the name is ours alone and is not used after this.
         unsafe { self.gl.on().delete_sync(self.name) }
+    }
+}
+
+#[cfg(test)]
+impl Gl {
+    /// A fence that the device has lost.
+    pub(in crate::render) fn lost_fence(self: &Rc<Self>) -> Fence {
+        let fence = self.fence("test").expect("a fence");
+        // SAFETY: a name that OpenGL does not know any more is an error wherever it is used.
+        unsafe { self.on().delete_sync(fence.name) }
+        fence
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::target::{Blended, Form, image};
+    use super::super::super::{Prefer, device};
+    use super::*;
+
+    /// Draws a picture that takes long, on threads of the driver's own in software.
+    fn draw_for_long(gl: &Rc<Gl>, turns: u32) {
+        let form = Form { width: 2048, height: 2048, samples: 1, blended: Blended::None, halvings: 0 };
+        let colour = image(gl, form, glow::RGBA8).expect("an image");
+        let into = gl.colour_framebuffer(&colour).expect("complete");
+        let vertex = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \
+                      0, 1); }";
+        let fragment = format!(
+            "#version 430 core\nout vec4 colour;\nvoid main() {{ float x = gl_FragCoord.x; for (int i = 0; i < {turns}; ++i) \
+             x = sin(x); colour = vec4(x); }}"
+        );
+        let stages = [(glow::VERTEX_SHADER, vertex), (glow::FRAGMENT_SHADER, &fragment)];
+        let program = gl.program("long", &stages).expect("compiles");
+        let nothing = gl.vertex_array(None, &[]).expect("an array");
+        gl.set(super::super::Fixed::default());
+        program.bind(None);
+        gl.cover(&into, 2048, &nothing);
+    }
+
+    #[test]
+    fn what_takes_too_long_is_an_error_with_its_name_and_no_hang() {
+        let (gl, _) = device::open(Prefer::Any).expect("EGL");
+        draw_for_long(&gl, if gl.limits.software { 400 } else { 40_000 });
+        let fence = gl.fence("long").expect("a fence");
+        assert!(!fence.is_over(), "it has only begun");
+        let late = fence.wait("long", Duration::from_millis(1)).expect_err("too late").to_string();
+        assert!(late.contains("long") && late.contains("the device did not finish within 1ms"), "{late}");
+        fence.wait("long", Duration::from_secs(60)).expect("it ends");
+        assert!(fence.is_over() && fence.is_over_within(Duration::from_secs(9)));
+        fence.wait("long", Duration::ZERO).expect("what is over is never late");
+        let lost = gl.lost_fence().wait("gone", Duration::from_secs(60)).expect_err("lost").to_string();
+        assert!(lost.contains("gone") && lost.contains("the device was lost"), "{lost}");
     }
 }

@@ -1,10 +1,12 @@
 //! The shadow map of a scene and the passes that make it: depth from the sun and, for a variance map, its blurred
 //! moments. One layer for each split.
 
+mod shared;
 mod sources;
 
 use std::rc::Rc;
 
+pub(super) use self::shared::Shared;
 use self::sources::RUN;
 pub(super) use self::sources::{Tile, defines};
 use super::geometry::Kind;

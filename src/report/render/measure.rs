@@ -20,7 +20,7 @@ use crate::render::{Image, shadow_texel};
 use crate::scene::{Camera, Look, Scene, Shadow};
 
 /// The step of the motion that still pictures show.
-const STILL: usize = 10;
+pub(super) const STILL: usize = 10;
 /// Steps over which flicker is looked at.
 const STEPS: usize = 60;
 /// Pictures of moving scenes are smaller by this on each side.

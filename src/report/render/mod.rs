@@ -8,6 +8,7 @@
 //!   the boxes of the tree; solid surfaces and cut-outs by their nearest point, transparent ones sorted by depth along
 //!   every sample; the shadow by one ray a sample to the sun, or by rays over the blur's own footprint.
 //! - `studio`, `meter`: frames of the renderer, and the light in them.
+//! - `readback`: frames a second when each is read.
 //! - [`metrics`]: errors, light bleeding, flicker.
 
 pub mod loads;
@@ -21,6 +22,7 @@ mod pattern;
 mod picture;
 mod pictures;
 mod plot;
+mod readback;
 mod shade;
 mod soup;
 mod studio;
@@ -35,6 +37,7 @@ use serde::Serialize;
 use self::loads::Kind;
 pub use self::measure::Row;
 pub use self::pictures::File;
+pub use self::readback::Readback;
 use self::studio::Studio;
 pub use self::studio::{Pass, Size};
 use super::machine::Provenance;
@@ -89,6 +92,8 @@ pub struct Report {
     pub bounds: variants::Bounds,
     pub loads: Vec<Entry>,
     pub rows: Vec<Row>,
+    /// One a load.
+    pub readback: Vec<Readback>,
     /// Variants that did not pass though they should, or passed though they should not, as load: variant: why.
     pub failed: Vec<String>,
     /// Pictures to be looked at.
@@ -102,17 +107,19 @@ pub struct Report {
 /// `Unavailable` without OpenGL; those of loading and drawing a scene.
 pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Report> {
     let mut studio = Studio::open()?;
-    let (mut loads, mut rows, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut loads, mut rows, mut pictures, mut readback) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for kind in &request.loads {
         progress(&format!("{}: building", kind.name()));
         let (entry, measured, files) = measure::load(&mut studio, request, *kind, &mut progress)?;
         loads.push(entry);
         rows.extend(measured);
         pictures.extend(files);
+        progress(&format!("{}: reading back", kind.name()));
+        readback.push(readback::measure(&mut studio, request, *kind)?);
     }
     let failed = rows.iter().filter(|row: &&Row| !row.as_stated()).map(why).collect();
     let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::BOUNDS);
-    Ok(Report { made, renderer, size: request.size, bounds, loads, rows, failed, pictures })
+    Ok(Report { made, renderer, size: request.size, bounds, loads, rows, readback, failed, pictures })
 }
 
 fn why(row: &Row) -> String {

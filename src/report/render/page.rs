@@ -26,6 +26,7 @@ pub(super) fn markdown(report: &Report) -> String {
     for load in &report.loads {
         text.push_str(&section(load, report.rows.iter().filter(|row| row.load == load.name)));
     }
+    text.push_str(&super::readback::section(&report.readback));
     text
 }
 

@@ -87,7 +87,7 @@ impl Studio {
 
     /// The first frame of a size compiles and allocates, and the clock of a device that rested rises for a while: the same
     /// pass took six times as long on an H200 at first.
-    fn warm_up(&mut self, set: &Set, camera: Camera, size: Size) -> Result<()> {
+    pub(super) fn warm_up(&mut self, set: &Set, camera: Camera, size: Size) -> Result<()> {
         let begin = Instant::now();
         loop {
             self.draw(set, camera, size)?;

@@ -1,0 +1,136 @@
+//! What is late: vertices that leave the device while the next step is computed, and frames that are drawn and brought back
+//! while the next step is computed and its own frames are begun. Each is handed over, in order, as it arrives.
+//!
+//! ```text
+//! device   [draw k][deform k+1][draw k+1][deform k+2]
+//! frame k           [read       ]
+//! frame k+1                              [read       ]
+//! ```
+
+use std::sync::Arc;
+
+use super::conductor::{Conductor, Done, acknowledge};
+use super::show::known;
+use super::viewer::{Body, Claim, Shown, StepName, View, Viewer};
+use super::worker::{Asked, Copied};
+use crate::error::Result;
+use crate::render::{FRAMES_UNDER_WAY, Image};
+use crate::scene::Cells;
+use crate::telemetry::{Stage, StageTimes};
+
+/// Something of a step that leaves the device, and who waits for it.
+pub(super) struct Late {
+    leaving: Leaving,
+    /// How many steps the scene had counted then.
+    pub count: u64,
+    step: StepName,
+    stages: StageTimes,
+    cells: Option<Arc<Cells>>,
+    /// With the steps that each has missed.
+    claims: Vec<(Claim, u64)>,
+    /// The step's acknowledgement, which comes after all that is late of it: with the last.
+    pub done: Option<Done>,
+}
+
+pub(super) enum Leaving {
+    Vertices(Asked<Copied>),
+    Frame(Asked<Image>),
+}
+
+impl Leaving {
+    /// Waits until it is there, with the stages that this took. Safe to drop while it waits.
+    async fn there(&mut self) -> Result<(Body, StageTimes)> {
+        match self {
+            Self::Vertices(copying) => {
+                let (surface, ms) = copying.there().await?;
+                Ok((Body::Vertices(surface), vec![(Stage::Copy, ms)]))
+            }
+            Self::Frame(drawing) => {
+                let image = drawing.there().await?;
+                let stages = known(&image.passes);
+                Ok((Body::Frame(image), stages))
+            }
+        }
+    }
+}
+
+impl Conductor {
+    /// Something of the current step that was begun just now.
+    pub(super) fn late(&self, leaving: Leaving, claims: Vec<(Claim, u64)>) -> Late {
+        Late {
+            leaving,
+            count: self.count,
+            step: StepName::of(&self.state),
+            stages: self.stages.clone(),
+            cells: self.state.cells.clone(),
+            claims,
+            done: None,
+        }
+    }
+
+    /// Begins a viewer's frame of the current step, if it can be late: it waits for its frame and not so many others do.
+    pub(super) fn begin_frame(&self, viewer: &mut Viewer, begun: usize) -> Option<Late> {
+        let (camera, size) = viewer.view.frame().filter(|_| begun < FRAMES_UNDER_WAY)?;
+        if viewer.seen == self.count || !viewer.has_room() {
+            return None;
+        }
+        let skipped = self.see(viewer);
+        let drawing = self.means.worker.begin_draw(self.id, camera, size);
+        Some(self.late(Leaving::Frame(drawing), vec![(viewer.claim(), skipped)]))
+    }
+
+    /// Waits for what is late for the longest, and hands it over. Safe to drop while it waits.
+    pub(super) async fn settle_oldest(&mut self) {
+        let Some(late) = self.late.front_mut() else { return };
+        let there = late.leaving.there().await;
+        let Some(Late { step, stages, cells, claims, done, .. }) = self.late.pop_front() else { return };
+        for (claim, skipped) in claims {
+            let (before, cells) = (stages.clone(), cells.clone());
+            let shown = there.clone().map(|(body, own)| {
+                let stages = before.into_iter().chain(own).collect();
+                Shown { step, skipped, stages, cells, body }
+            });
+            claim.deliver(shown);
+        }
+        self.viewers.retain(|viewer| !viewer.is_gone());
+        acknowledge(done);
+    }
+
+    /// Hands over all that is late of steps before this one.
+    pub(super) async fn settle_before(&mut self, count: u64) {
+        while self.late.front().is_some_and(|late| late.count < count) {
+            self.settle_oldest().await;
+        }
+    }
+
+    /// Hands over all that is late.
+    pub(super) async fn settle(&mut self) {
+        self.settle_before(u64::MAX).await;
+    }
+
+    /// Hands over vertices, which the next step was not to wait for and nothing after it is to overtake.
+    pub(super) async fn settle_vertices(&mut self) {
+        while self.late.iter().any(|late| matches!(late.leaving, Leaving::Vertices(_))) {
+            self.settle_oldest().await;
+        }
+    }
+
+    /// Hands over what is late for a viewer, so that it can be served at once.
+    pub(super) async fn settle_for(&mut self, viewer: &Viewer) {
+        while self.late.iter().any(|late| late.claims.iter().any(|(claim, _)| claim.is_of(viewer))) {
+            self.settle_oldest().await;
+        }
+    }
+}
+
+impl View {
+    /// Camera and size of a frame of colours.
+    const fn frame(&self) -> Option<(crate::scene::Camera, (u32, u32))> {
+        match *self {
+            Self::Frame { camera, width, height, showing: super::viewer::Showing::Colour } => {
+                Some((camera, (width, height)))
+            }
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! What the driver says, to the log: target `opengl`, at the level of OpenGL's severity. A context says little unless it
+//! was made to be debugged, which may cost, so that one is made only where somebody listens.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+
+use glow::HasContext as _;
+use tracing::{Level, dispatcher};
+
+/// Different messages that are counted apart; all beyond them are counted as one.
+const KINDS: usize = 256;
+
+/// Source, type and id of a message.
+type Key = [u32; 3];
+
+/// Whether the log takes what a context that is debugged would say: `opengl` at `debug` or below (`RUST_LOG=opengl=debug`).
+pub(in crate::render) fn is_wanted() -> bool {
+    tracing::enabled!(target: "opengl", Level::DEBUG)
+}
+
+/// Sends the driver's messages to the log of this thread, whichever thread the driver speaks on. The callback lives as long
+/// as `gl`, which takes it back from the context before it goes.
+pub(super) fn listen(gl: &mut glow::Context) {
+    if !gl.supports_debug() {
+        return;
+    }
+    let (log, heard) = (dispatcher::get_default(Clone::clone), Repeats::default());
+    // SAFETY: the callback owns all that it uses, may be called on any thread, and does not panic; if a subscriber does, glow
+    // stops it there.
+    unsafe {
+        gl.enable(glow::DEBUG_OUTPUT);
+        // The driver need not stop for its messages.
+        gl.disable(glow::DEBUG_OUTPUT_SYNCHRONOUS);
+        gl.debug_message_callback(move |source, kind, id, severity, text| {
+            if let Some(times) = heard.again([source, kind, id]) {
+                dispatcher::with_default(&log, || tell((source, kind, id), severity, times, text));
+            }
+        });
+    }
+}
+
+/// How often each message was heard.
+#[derive(Debug, Default)]
+struct Repeats(Mutex<HashMap<Key, u64>>);
+
+impl Repeats {
+    /// Counts a message; how often it was heard by now when that is to be told: at 1, 2, 4, 8 and so on, so that a driver
+    /// that says the same in each frame is heard and fills no log.
+    fn again(&self, key: Key) -> Option<u64> {
+        let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = if counts.len() < KINDS || counts.contains_key(&key) { key } else { [0; 3] };
+        let times = counts.entry(key).or_default();
+        *times += 1;
+        times.is_power_of_two().then_some(*times)
+    }
+}
+
+fn tell((source, kind, id): (u32, u32, u32), severity: u32, times: u64, text: &str) {
+    let (source, kind, text) = (name_of_source(source), name_of_type(kind), text.trim_end());
+    match severity {
+        glow::DEBUG_SEVERITY_HIGH => tracing::error!(target: "opengl", source, kind, id, times, "{text}"),
+        glow::DEBUG_SEVERITY_MEDIUM => tracing::warn!(target: "opengl", source, kind, id, times, "{text}"),
+        glow::DEBUG_SEVERITY_LOW => tracing::debug!(target: "opengl", source, kind, id, times, "{text}"),
+        _ => tracing::trace!(target: "opengl", source, kind, id, times, "{text}"),
+    }
+}
+
+const fn name_of_source(source: u32) -> &'static str {
+    match source {
+        glow::DEBUG_SOURCE_API => "api",
+        glow::DEBUG_SOURCE_WINDOW_SYSTEM => "window system",
+        glow::DEBUG_SOURCE_SHADER_COMPILER => "shader compiler",
+        glow::DEBUG_SOURCE_THIRD_PARTY => "third party",
+        glow::DEBUG_SOURCE_APPLICATION => "application",
+        _ => "other",
+    }
+}
+
+const fn name_of_type(kind: u32) -> &'static str {
+    match kind {
+        glow::DEBUG_TYPE_ERROR => "error",
+        glow::DEBUG_TYPE_DEPRECATED_BEHAVIOR => "deprecated behaviour",
+        glow::DEBUG_TYPE_UNDEFINED_BEHAVIOR => "undefined behaviour",
+        glow::DEBUG_TYPE_PORTABILITY => "portability",
+        glow::DEBUG_TYPE_PERFORMANCE => "performance",
+        glow::DEBUG_TYPE_MARKER => "marker",
+        _ => "other",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+    use std::sync::Arc;
+
+    use super::super::super::{Prefer, device};
+    use super::*;
+
+    #[derive(Clone, Default)]
+    struct Lines(Arc<Mutex<Vec<u8>>>);
+
+    impl Write for Lines {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            self.0.lock().expect("whole").extend_from_slice(bytes);
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    /// What the log holds after a context was used wrongly so many times.
+    fn log_of(filter: &str, wrong: usize) -> String {
+        let lines = Lines::default();
+        let writer = lines.clone();
+        let log = tracing_subscriber::fmt()
+            .with_env_filter(tracing_subscriber::EnvFilter::new(filter))
+            .with_ansi(false)
+            .with_writer(move || writer.clone())
+            .finish();
+        tracing::subscriber::with_default(log, || {
+            let (gl, _) = device::open(Prefer::Any).expect("EGL");
+            for _ in 0..wrong {
+                // SAFETY: no such flag, which OpenGL refuses.
+                unsafe { gl.on().enable(0xFFFF) }
+                assert!(gl.check("test").is_err(), "the error is seen without the log too");
+            }
+            // SAFETY: only waits, so that a driver that speaks late has spoken.
+            unsafe { gl.on().finish() }
+        });
+        String::from_utf8(lines.0.lock().expect("whole").clone()).expect("text")
+    }
+
+    #[test]
+    fn an_error_of_opengl_is_in_the_log_with_its_source_and_type_where_somebody_listens() {
+        let log = log_of("opengl=debug", 1);
+        let line = log.lines().find(|line| line.contains("ERROR")).unwrap_or_else(|| panic!("no error in: {log}"));
+        for part in ["opengl: ", "source=\"api\"", "kind=\"error\"", " id=", "times=1"] {
+            assert!(line.contains(part), "{part} in {line}");
+        }
+        assert_eq!(log_of("opengl=debug", 0).matches("ERROR").count(), 0, "control: nothing wrong, nothing said");
+        assert_eq!(log_of("opengl=info", 1), "", "control: nobody listens");
+    }
+
+    #[test]
+    fn what_a_driver_repeats_is_told_less_and_less() {
+        let log = log_of("opengl=debug", 100);
+        let told = log.matches("ERROR").count();
+        assert_eq!(told, 7, "at 1, 2, 4 .. 64: {log}");
+    }
+
+    #[test]
+    fn no_number_of_different_messages_fills_the_memory() {
+        let heard = Repeats::default();
+        let told = (0..10_000).filter(|id| heard.again([1, 2, *id]).is_some()).count();
+        assert!(heard.0.lock().expect("whole").len() <= KINDS + 1);
+        assert!(told < KINDS + 20, "{told}");
+    }
+
+    #[test]
+    fn severities_sources_and_types_have_the_names_of_the_specification() {
+        assert_eq!(name_of_source(glow::DEBUG_SOURCE_SHADER_COMPILER), "shader compiler");
+        assert_eq!((name_of_type(glow::DEBUG_TYPE_PERFORMANCE), name_of_type(0)), ("performance", "other"));
+    }
+}

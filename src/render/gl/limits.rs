@@ -1,0 +1,68 @@
+//! What a context can do.
+
+use glow::HasContext as _;
+
+/// What the context can do.
+#[derive(Debug, Clone, Default)]
+pub(in crate::render) struct Limits {
+    pub(in crate::render) renderer: String,
+    pub(in crate::render) version: String,
+    pub(in crate::render) software: bool,
+    pub(in crate::render) max_side: u32,
+    /// Samples that colour, depth and integer images may all have.
+    pub(in crate::render) max_samples: u32,
+    /// Textures that one compute shader may read.
+    pub(in crate::render) max_reads: u32,
+    pub(in crate::render) max_layers: u32,
+    /// Largest buffer texture.
+    pub(in crate::render) max_texels: u64,
+    /// Largest buffer that shaders write.
+    pub(in crate::render) max_storage: u64,
+    /// Whether fragments can know their samples that pass the depth test.
+    pub(in crate::render) post_depth: bool,
+    /// Whether buffers can stay mapped while they are written (OpenGL 4.4).
+    pub(in crate::render) persistent: bool,
+    /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
+    pub(in crate::render) anisotropy: f32,
+}
+
+impl Limits {
+    pub(super) fn of(gl: &glow::Context) -> Self {
+        // SAFETY: plain questions that every 4.3 core context answers.
+        unsafe {
+            let number = |name: u32| gl.get_parameter_i32(name).max(0) as u32;
+            let renderer = gl.get_parameter_string(glow::RENDERER);
+            let software = ["llvmpipe", "softpipe", "swrast", "SWR"].iter().any(|name| renderer.contains(name));
+            let anisotropic = gl.supported_extensions().contains("GL_EXT_texture_filter_anisotropic");
+            let mut viewport = [0; 2];
+            gl.get_parameter_i32_slice(glow::MAX_VIEWPORT_DIMS, &mut viewport);
+            let viewport = viewport[0].min(viewport[1]).max(0) as u32;
+            Self {
+                renderer,
+                version: gl.get_parameter_string(glow::VERSION),
+                software,
+                max_side: number(glow::MAX_TEXTURE_SIZE).min(viewport),
+                max_samples: [
+                    glow::MAX_COLOR_TEXTURE_SAMPLES,
+                    glow::MAX_DEPTH_TEXTURE_SAMPLES,
+                    glow::MAX_INTEGER_SAMPLES,
+                ]
+                .map(number)
+                .into_iter()
+                .fold(u32::MAX, u32::min),
+                max_reads: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
+                max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
+                max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
+                max_storage: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
+                persistent: is_persistent(gl),
+                post_depth: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
+                anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
+            }
+        }
+    }
+}
+
+fn is_persistent(gl: &glow::Context) -> bool {
+    let version = gl.version();
+    (version.major, version.minor) >= (4, 4) || gl.supported_extensions().contains("GL_ARB_buffer_storage")
+}

@@ -1,0 +1,276 @@
+//! A frame in two halves: its commands are given to the device ([`Renderer::submit`]), and its pixels are taken once they
+//! are there ([`Renderer::collect`]). In between the host may do something else, or submit another.
+//!
+//! The numbers of a frame (`frame`, `splits`, the empty ledgers) are written with commands of OpenGL, which take their turn
+//! in the stream: a frame under way keeps its own, and so do vertices that are uploaded.
+
+use std::cell::Cell;
+use std::time::{Duration, Instant};
+
+use rayon::prelude::*;
+
+use super::gl::{Fence, Lent, Stopwatch};
+use super::lists::{self, ListTarget};
+use super::programs::Sampled;
+use super::ring::Slot;
+use super::scene_buffers::SceneBuffers;
+use super::splits::Splits;
+use super::target::{Form, Target};
+use super::{Image, Ran, Renderer, Shot, frame, passes};
+use crate::error::{Error, Result, during, invalid};
+
+/// Bytes that one thread copies at a time: enough that starting it costs little of that.
+const STRETCH: usize = 1 << 20;
+
+/// A frame under way. Dropping it gives the frame up.
+#[derive(Debug)]
+pub struct Ticket {
+    size: [u32; 2],
+    /// None of a frame that nobody reads.
+    slot: Option<Slot>,
+    fence: Fence,
+    /// In order, each with its time.
+    passes: Vec<(&'static str, Stopwatch)>,
+    ran: Ran,
+    limit: Duration,
+    /// When it was waited for first.
+    waited: Cell<Option<Instant>>,
+}
+
+/// The pixels of a frame that is done, where the device left them. Any thread may take them; it should at once, because the
+/// device has no other use for the memory until then.
+#[derive(Debug)]
+pub struct Pixels {
+    width: u32,
+    height: u32,
+    lent: Option<Lent>,
+    passes: Vec<(&'static str, f64)>,
+}
+
+impl Renderer {
+    /// Draws one frame of what the shared buffers hold, and waits for its pixels.
+    ///
+    /// # Errors
+    /// Those of [`Self::submit`] and [`Self::retrieve`].
+    pub fn draw(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Image> {
+        let ticket = self.submit(buffers, shot)?;
+        self.collect(ticket)
+    }
+
+    /// Gives the device one frame of what the shared buffers hold now, whatever they are made to hold next. At most
+    /// [`super::FRAMES_UNDER_WAY`] of one form may be under way: a further one is refused, and the oldest must be collected
+    /// first.
+    ///
+    /// # Errors
+    /// `Busy` when so many are under way, `Invalid` for a size above the limit or a camera that overflows, `Fault` naming
+    /// the pass when OpenGL reports an error.
+    pub fn submit(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Ticket> {
+        self.start(buffers, shot, true)
+    }
+
+    /// The same of a frame whose pixels stay on the device, as of one that is shown on a screen: its image has none. Any
+    /// number of them may be under way.
+    ///
+    /// # Errors
+    /// Those of [`Self::submit`] but for `Busy`.
+    pub fn submit_unread(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Ticket> {
+        self.start(buffers, shot, false)
+    }
+
+    /// Waits for a frame and copies its pixels.
+    ///
+    /// # Errors
+    /// Those of [`Self::retrieve`].
+    pub fn collect(&mut self, ticket: Ticket) -> Result<Image> {
+        self.retrieve(ticket).map(Pixels::into_image)
+    }
+
+    /// Waits for a frame, and leaves its pixels to be copied by whatever thread has time for it.
+    ///
+    /// # Errors
+    /// `Fault` naming the pass that did not end within the limit, or of OpenGL.
+    pub fn retrieve(&mut self, ticket: Ticket) -> Result<Pixels> {
+        ticket.wait()?;
+        let Ticket { size: [width, height], slot, passes, mut ran, .. } = ticket;
+        let bytes = 4 * width as usize * height as usize;
+        let staging = slot.as_ref().and_then(Slot::staging);
+        if let Some(staging) = staging.filter(|staging| staging.buffer.bytes as usize > bytes) {
+            ran.lists = Some(lists::told(&staging.read(bytes..bytes + lists::HEAD)?));
+        }
+        let lent = staging.map(|staging| staging.lend(bytes)).transpose()?;
+        self.gl.check("read")?;
+        warn_of_lists(&self.ran, &ran);
+        self.ran = ran;
+        Ok(Pixels { width, height, lent, passes: times(&passes) })
+    }
+
+    fn start(&mut self, buffers: &SceneBuffers, shot: &Shot, is_read: bool) -> Result<Ticket> {
+        self.check_size(shot)?;
+        let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
+        let look = &buffers.scene.look;
+        let size = [shot.width, shot.height];
+        let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
+        self.make_room(form)?;
+        let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
+        let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
+        let slot = if is_read { Some(target.ring.take(self.watchdog)?) } else { None };
+        buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
+        passes::bind(buffers)?;
+        if let Some(splits) = buffers.buffers.get("splits") {
+            let fit = frame::sun_fit(&buffers.scene, shot, buffers.origin);
+            splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
+        }
+        let mut ran = Ran { samples: form.samples, ..Ran::default() };
+        let mut passes = self.run(buffers, shot, (target, &sampled), &mut ran)?;
+        passes.extend(self.bring(target, slot.as_ref())?);
+        Ok(Ticket {
+            size,
+            slot,
+            fence: self.gl.fence("read")?,
+            passes,
+            ran,
+            limit: self.watchdog,
+            waited: Cell::new(None),
+        })
+    }
+
+    pub(super) fn check_size(&self, shot: &Shot) -> Result<()> {
+        let limit = self.info.max_side;
+        if [shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
+            return Ok(());
+        }
+        let given = format!("{} x {}", shot.width, shot.height);
+        Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given))
+    }
+
+    /// The passes that make the picture.
+    fn run(
+        &self,
+        buffers: &SceneBuffers,
+        shot: &Shot,
+        (target, sampled): (&Target, &Sampled),
+        ran: &mut Ran,
+    ) -> Result<Vec<(&'static str, Stopwatch)>> {
+        let gl = &self.gl;
+        let timed = |pass, commands: &mut dyn FnMut() -> Result<()>| {
+            gl.timed((pass, self.watchdog), commands).map(|stopwatch| (pass, stopwatch))
+        };
+        let mut times = Vec::new();
+        buffers.shared_shadow.draw_unless_there(buffers.shadow_of(shot), || {
+            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
+            times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
+            Ok(())
+        })?;
+        times.extend([
+            timed("visibility", &mut || {
+                passes::visibility(gl, buffers, target, sampled, ran)?;
+                passes::ground(gl, buffers, shot, ran)
+            })?,
+            timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
+            timed("shade", &mut || passes::shade(gl, buffers, target, sampled, ran))?,
+            timed("bloom", &mut || buffers.post.bloom(gl, target, ran))?,
+            timed("encode", &mut || buffers.post.encode(gl, target, ran))?,
+        ]);
+        Ok(times)
+    }
+
+    /// Brings the pixels, and behind them what is told of lists, to where the host can read them.
+    fn bring(&self, target: &Target, slot: Option<&Slot>) -> Result<Option<(&'static str, Stopwatch)>> {
+        let Some(staging) = slot.and_then(Slot::staging) else { return Ok(None) };
+        let bytes = target.form.bytes();
+        let copy = || {
+            self.gl.copy(&target.packed, &staging.buffer, bytes);
+            if let Some(ListTarget { ledger, .. }) = &target.lists {
+                self.gl.copy_to(ledger, (&staging.buffer, bytes), lists::HEAD as u64);
+            }
+            self.gl.check("read")
+        };
+        self.gl.timed(("read", self.watchdog), copy).map(|stopwatch| Some(("read", stopwatch)))
+    }
+}
+
+impl Ticket {
+    /// Whether [`Renderer::retrieve`] would not wait.
+    pub fn is_ready(&self) -> bool {
+        self.is_ready_within(Duration::ZERO)
+    }
+
+    /// The same after waiting for the frame, at most so long. A frame that is late by more than the watchdog's limit is
+    /// ready to be given up.
+    pub fn is_ready_within(&self, limit: Duration) -> bool {
+        self.left().is_zero() || self.fence.is_over_within(limit)
+    }
+
+    /// What is left of the watchdog's time, which begins with the first waiting.
+    fn left(&self) -> Duration {
+        let begin = self.waited.get().unwrap_or_else(Instant::now);
+        self.waited.set(Some(begin));
+        self.limit.saturating_sub(begin.elapsed())
+    }
+
+    fn wait(&self) -> Result<()> {
+        self.fence.wait("read", self.left()).map_err(|error| self.blame(error))
+    }
+
+    /// Names the pass at which the device stopped: the first that it has not done, behind the last one that it has.
+    fn blame(&self, error: Error) -> Error {
+        let Error::Fault { stage, reason } = error else { return error };
+        let over = self.passes.iter().take_while(|(_, stopwatch)| stopwatch.is_over()).count();
+        let stage = self.passes.get(over).map_or(stage, |(pass, _)| *pass);
+        let last = over.checked_sub(1).map_or("none".into(), |last| format!("'{}'", self.passes[last].0));
+        Error::Fault { stage, reason: format!("{reason} ({:?}); the last pass that it finished: {last}", self.limit) }
+    }
+}
+
+impl Pixels {
+    /// Notes a stage that came before the others, in milliseconds.
+    #[must_use]
+    pub fn after(mut self, stage: &'static str, ms: f64) -> Self {
+        self.passes.insert(0, (stage, ms));
+        self
+    }
+
+    /// Copies the pixels, on several threads when they are many.
+    pub fn into_image(self) -> Image {
+        let begin = Instant::now();
+        let Self { width, height, lent, mut passes } = self;
+        let bytes = lent.as_ref().map_or(&[][..], Lent::bytes);
+        let mut rgba = vec![0; bytes.len()];
+        let stretches = rgba.par_chunks_mut(STRETCH).zip(bytes.par_chunks(STRETCH));
+        stretches.for_each(|(to, from)| to.copy_from_slice(from));
+        drop(lent);
+        if let Some((_, ms)) = passes.iter_mut().find(|(name, _)| *name == "read") {
+            *ms += begin.elapsed().as_secs_f64() * 1e3;
+        }
+        Image { width, height, rgba, passes }
+    }
+}
+
+/// Milliseconds of the stages and of the passes that they are made of.
+fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
+    let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, stopwatch)| (*name, stopwatch.ms())).collect();
+    let of_shadow = |name: &str| ["shadow", "blur"].contains(&name);
+    let sum =
+        |wanted: &dyn Fn(&str) -> bool| all.iter().filter(|(name, _)| wanted(name)).fold(0.0, |sum, (_, ms)| sum + ms);
+    let mut times = vec![("shadow", sum(&of_shadow))];
+    times.extend(all.iter().filter(|(name, _)| *name == "blur"));
+    times.push(("draw", sum(&|name| !of_shadow(name) && name != "read")));
+    times.extend(all.iter().filter(|(name, _)| !of_shadow(name)));
+    times
+}
+
+/// Says so when a frame lacks blended fragments and the one before did not.
+fn warn_of_lists(last: &Ran, ran: &Ran) {
+    let lacks = |ran: &Ran| ran.lists.filter(|lists| lists.dropped() > 0);
+    if let (Some(lists), None) = (lacks(ran), lacks(last)) {
+        let (dropped, kept) = (lists.dropped(), lists.kept);
+        tracing::warn!(
+            dropped,
+            kept,
+            "blended fragments are over the budget (look.fragments): the farthest are not drawn"
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests;

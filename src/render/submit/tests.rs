@@ -1,0 +1,218 @@
+//! Frames under way: by a renderer that waits for nothing, as one on hardware does.
+
+use std::rc::Rc;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use super::super::geometry::tests::squares;
+use super::super::ring::FRAMES_UNDER_WAY;
+use super::super::{Image, Prefer, Renderer, SceneBuffers, Shot};
+use crate::deform::Surface;
+use crate::domain::{AlphaMode, Material};
+use crate::error::Error;
+use crate::scene::{Camera, Scene, Transparency};
+
+/// A renderer whose passes are timed by queries, whatever it draws on, so that its frames are under way when they were
+/// submitted.
+fn open() -> Renderer {
+    let mut renderer = Renderer::open(Prefer::Any).expect("EGL");
+    Rc::get_mut(&mut renderer.gl).expect("not shared yet").limits.software = false;
+    renderer
+}
+
+/// An opaque square, and one of glass before it.
+fn scene() -> Arc<Scene> {
+    let glass = Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, double_sided: true, ..Material::default() };
+    let red = Material { diffuse: [0.9, 0.2, 0.1], double_sided: true, ..Material::default() };
+    let mut parts = squares(vec![red, glass]);
+    parts.look.transparency = Transparency::Exact;
+    Scene::new(parts).expect("good")
+}
+
+/// Both squares, the glass wider by so much.
+fn surface(by: f32) -> Surface {
+    let square = |z: f32, wide: f32| [[0.0, 0.0, z], [wide, 0.0, z], [wide, 1.0, z], [0.0, 1.0, z]];
+    let positions = [square(0.0, 1.0), square(0.3, 0.25 + by)].concat();
+    let normals = [0.0, 0.0, 1.0].repeat(positions.len());
+    Surface { positions: positions.as_flattened().to_vec(), normals, ..Surface::default() }
+}
+
+fn shot(scene: &Scene, side: u32) -> Shot {
+    let camera = Camera::framing(scene, side, side);
+    Shot { camera, width: side, height: side, bounds: scene.rest_bounds }
+}
+
+/// A picture of one surface by itself, and how many blended fragments it has.
+fn alone(by: f32) -> (Vec<u8>, u64) {
+    let (mut renderer, scene) = (open(), scene());
+    let buffers = renderer.load(&scene).expect("loads");
+    renderer.upload(&buffers, &surface(by)).expect("uploads");
+    let image = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws");
+    (image.rgba, renderer.ran().lists.expect("exact").fragments)
+}
+
+fn loaded() -> (Renderer, Arc<Scene>, SceneBuffers) {
+    let (mut renderer, scene) = (open(), scene());
+    let buffers = renderer.load(&scene).expect("loads");
+    renderer.upload(&buffers, &surface(0.0)).expect("uploads");
+    (renderer, scene, buffers)
+}
+
+#[test]
+fn each_frame_under_way_keeps_its_vertices_camera_and_counts_whatever_comes_after_it() {
+    let (mut renderer, scene, buffers) = loaded();
+    let moved = [0.0, 0.2, 0.6];
+    let mut tickets = Vec::new();
+    for by in moved {
+        renderer.upload(&buffers, &surface(by)).expect("uploads");
+        tickets.push(renderer.submit(&buffers, &shot(&scene, 64)).expect("submits"));
+    }
+    // The last first: the order of waiting is the host's.
+    let mut seen = Vec::new();
+    for by in moved.into_iter().rev() {
+        let ticket = tickets.pop().expect("as many");
+        let image = renderer.collect(ticket).expect("draws");
+        let (rgba, fragments) = alone(by);
+        assert!(image.rgba == rgba, "{by}");
+        assert_eq!(renderer.ran().lists.expect("exact").fragments, fragments);
+        let names: Vec<&str> = image.passes.iter().map(|(name, _)| *name).collect();
+        assert_eq!(names[..3], ["shadow", "blur", "draw"]);
+        assert!(image.passes.iter().all(|(_, ms)| ms.is_finite() && *ms >= 0.0), "{:?}", image.passes);
+        seen.push((rgba, fragments));
+    }
+    assert!(seen[0] != seen[1] && seen[1] != seen[2] && seen[0].1 > seen[2].1, "control: the frames differ");
+}
+
+#[test]
+fn a_fourth_frame_of_a_form_is_refused_and_a_scene_that_is_read_at_once_has_one_buffer() {
+    let (mut renderer, scene, buffers) = loaded();
+    let shot = shot(&scene, 64);
+    let made = |renderer: &Renderer| renderer.targets.last().expect("drawn").ring.count();
+    for _ in 0..5 {
+        renderer.draw(&buffers, &shot).expect("draws");
+    }
+    assert_eq!(made(&renderer), 1);
+    let unread: Vec<_> =
+        (0..5).map(|_| renderer.submit_unread(&buffers, &shot).expect("as many as one likes")).collect();
+    for ticket in unread {
+        assert!(renderer.collect(ticket).expect("draws").rgba.is_empty());
+    }
+    assert_eq!(made(&renderer), 1, "what nobody reads takes none");
+    let mut tickets: Vec<_> = (0..3).map(|_| renderer.submit(&buffers, &shot).expect("has room")).collect();
+    assert_eq!((made(&renderer), FRAMES_UNDER_WAY), (3, 3));
+    let refusal = renderer.submit(&buffers, &shot).expect_err("full");
+    assert_eq!(refusal, Error::Busy { queue: "frames under way", limit: 3 });
+    let smaller = Shot { width: 32, height: 32, ..shot };
+    renderer.draw(&buffers, &smaller).expect("another form has its own");
+    let first = renderer.collect(tickets.remove(0)).expect("draws");
+    tickets.push(renderer.submit(&buffers, &shot).expect("there is room again"));
+    drop(tickets.remove(0));
+    tickets.push(renderer.submit(&buffers, &shot).expect("one that was given up makes room"));
+    for ticket in tickets {
+        assert!(renderer.collect(ticket).expect("draws").rgba == first.rgba);
+    }
+    assert!(!renderer.seen().expect("beside the ring").is_empty());
+}
+
+#[test]
+fn a_frame_that_does_not_end_is_an_error_with_the_name_of_the_pass_and_the_next_is_drawn() {
+    let (mut renderer, scene, buffers) = loaded();
+    let shot = shot(&scene, 64);
+    let passes = ["shadow", "blur", "visibility", "blended", "shade", "bloom", "encode", "read"];
+    for stuck in 0..passes.len() {
+        let mut ticket = renderer.submit(&buffers, &shot).expect("submits");
+        renderer.gl.wait("test", Duration::from_secs(60)).expect("all of it");
+        let names: Vec<&str> = ticket.passes.iter().map(|(name, _)| *name).collect();
+        assert_eq!(names, passes);
+        ticket.fence = renderer.gl.lost_fence();
+        for (_, stopwatch) in &mut ticket.passes[stuck..] {
+            *stopwatch = renderer.gl.stopped_watch();
+        }
+        assert!(ticket.is_ready(), "to be given up");
+        let Err(Error::Fault { stage, reason }) = renderer.collect(ticket) else { panic!("no fault") };
+        assert_eq!(stage, passes[stuck]);
+        let last = if stuck == 0 { "none".to_owned() } else { format!("'{}'", passes[stuck - 1]) };
+        assert!(reason.ends_with(&format!("the last pass that it finished: {last}")), "{reason}");
+        // Errors of asking for what is not there.
+        renderer.gl.check("test").ok();
+        renderer.draw(&buffers, &shot).expect("the next one is drawn");
+    }
+}
+
+#[test]
+fn a_frame_that_is_late_by_more_than_the_limit_is_ready_to_be_given_up() {
+    let (mut renderer, scene, buffers) = loaded();
+    renderer.watchdog = Duration::from_millis(5);
+    let ticket = renderer.submit_unread(&buffers, &shot(&scene, 64)).expect("submits");
+    ticket.is_ready();
+    thread::sleep(Duration::from_millis(6));
+    assert!(ticket.left().is_zero() && ticket.is_ready_within(Duration::from_secs(60)));
+}
+
+#[test]
+fn a_frame_comes_back_when_the_images_of_its_form_were_freed_meanwhile() {
+    let (mut renderer, scene, buffers) = loaded();
+    let early = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
+    for side in 32..40 {
+        renderer.draw(&buffers, &shot(&scene, side)).expect("draws");
+    }
+    assert!(renderer.targets.iter().all(|target| target.form.width != 64));
+    let pixels = renderer.retrieve(early).expect("draws");
+    renderer.draw(&buffers, &shot(&scene, 41)).expect("draws while somebody reads what was freed");
+    assert_eq!(renderer.gl.retired(), 1);
+    assert!(pixels.into_image().rgba == alone(0.0).0);
+    renderer.draw(&buffers, &shot(&scene, 42)).expect("draws");
+    assert_eq!(renderer.gl.retired(), 0);
+}
+
+#[test]
+fn pixels_outlive_a_renderer_whose_thread_holds_them() {
+    let (mut renderer, scene, buffers) = loaded();
+    let ticket = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
+    let pixels = renderer.retrieve(ticket).expect("draws");
+    drop(renderer);
+    drop(buffers);
+    assert!(pixels.into_image().rgba == alone(0.0).0);
+}
+
+#[test]
+fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_goes_meanwhile() {
+    let (want, _) = alone(0.0);
+    let (mut renderer, scene, buffers) = loaded();
+    let shot = shot(&scene, 64);
+    let slow = |renderer: &mut Renderer, buffers: &SceneBuffers| {
+        let ticket = renderer.submit(buffers, &shot).expect("has room");
+        let pixels = renderer.retrieve(ticket).expect("draws");
+        thread::spawn(move || {
+            thread::sleep(Duration::from_millis(50));
+            pixels.into_image()
+        })
+    };
+    // The fourth waits until the first was copied.
+    let readers: Vec<_> = (0..4).map(|_| slow(&mut renderer, &buffers)).collect();
+    renderer.unload(buffers);
+    drop(renderer);
+    for reader in readers {
+        let Image { rgba, .. } = reader.join().expect("lives");
+        assert!(rgba == want);
+    }
+}
+
+#[test]
+fn pixels_that_are_held_for_too_long_refuse_frames_and_block_none_for_ever() {
+    let (mut renderer, scene, buffers) = loaded();
+    renderer.watchdog = Duration::from_secs(20);
+    let shot = shot(&scene, 64);
+    let mut held = Vec::new();
+    for _ in 0..3 {
+        let ticket = renderer.submit(&buffers, &shot).expect("has room");
+        held.push(renderer.retrieve(ticket).expect("draws"));
+    }
+    renderer.watchdog = Duration::from_millis(20);
+    assert!(matches!(renderer.submit(&buffers, &shot), Err(Error::Busy { .. })));
+    renderer.watchdog = Duration::from_secs(20);
+    let images: Vec<Image> = held.into_iter().map(super::Pixels::into_image).collect();
+    let after = renderer.draw(&buffers, &shot).expect("there is room again");
+    assert!(images.iter().all(|image| image.rgba == after.rgba));
+}

@@ -1,0 +1,151 @@
+//! Frames of several cameras share the shadow of their step, and are the same as those of cameras alone.
+
+use std::sync::Arc;
+
+use modalcast::config::{BackendChoice, Config};
+use modalcast::deform::{Deformer as _, Surface};
+use modalcast::domain::{AlphaMode, Material};
+use modalcast::engine::Workbench;
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Renderer, SceneBuffers, Shot};
+use modalcast::scene::{Bounds, Camera, Lens, Scene, Shadow, State};
+
+use super::build::open;
+use super::shadow::{stage, with_square};
+
+/// A square that floats over the ground, and its cut-out.
+fn scene(splits: u32) -> Arc<Scene> {
+    let mut stage = with_square(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
+    stage.0.look.shadow = Some(Shadow { size: 256, splits, ..Shadow::default() });
+    stage.add(super::build::lying(0.5, 2.0), Material::default()).scene()
+}
+
+/// The scene at rest, all of it shifted along x.
+fn surface(scene: &Arc<Scene>, by: f32) -> (Surface, Bounds) {
+    let mut deformer = ReferenceDeformer::new(scene);
+    let mut bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let mut surface = deformer.surface().expect("there").clone();
+    surface.positions.chunks_exact_mut(3).for_each(|position| position[0] += by);
+    (bounds.min[0], bounds.max[0]) = (bounds.min[0] + f64::from(by), bounds.max[0] + f64::from(by));
+    (surface, bounds)
+}
+
+/// Two views of the same thing.
+fn cameras(scene: &Scene) -> [Camera; 2] {
+    let first = Camera::framing(scene, 64, 64);
+    [first, Camera { lens: Lens::FieldOfView(25.0), ..first }]
+}
+
+fn shot(camera: Camera, bounds: Bounds) -> Shot {
+    Shot { camera, width: 64, height: 64, bounds }
+}
+
+fn shadows(renderer: &Renderer) -> usize {
+    renderer.ran().passes.iter().filter(|pass| ["shadow", "blur"].contains(pass)).count()
+}
+
+/// By a renderer of its own.
+fn alone(scene: &Arc<Scene>, by: f32, camera: Camera) -> Vec<u8> {
+    let mut renderer = open();
+    let buffers = renderer.load(scene).expect("loads");
+    let (surface, bounds) = surface(scene, by);
+    renderer.upload(&buffers, &surface).expect("uploads");
+    renderer.draw(&buffers, &shot(camera, bounds)).expect("draws").rgba
+}
+
+/// Pictures of both cameras of two steps, and how many shadow passes each took.
+fn two_steps(scene: &Arc<Scene>, name: impl Fn(&SceneBuffers, u64)) -> Vec<(Vec<u8>, usize)> {
+    let mut renderer = open();
+    let buffers = renderer.load(scene).expect("loads");
+    let mut frames = Vec::new();
+    for (step, by) in [(1, 0.0), (2, 0.7)] {
+        let (surface, bounds) = surface(scene, by);
+        renderer.upload(&buffers, &surface).expect("uploads");
+        name(&buffers, step);
+        for camera in cameras(scene) {
+            let image = renderer.draw(&buffers, &shot(camera, bounds)).expect("draws");
+            frames.push((image.rgba, shadows(&renderer)));
+        }
+    }
+    frames
+}
+
+fn counts(frames: &[(Vec<u8>, usize)]) -> Vec<usize> {
+    frames.iter().map(|(_, count)| *count).collect()
+}
+
+#[test]
+fn cameras_of_one_step_share_its_shadow_and_their_pictures_are_those_of_renderers_of_their_own() {
+    let scene = scene(1);
+    let frames = two_steps(&scene, SceneBuffers::hold_step);
+    assert_eq!(counts(&frames), [2, 0, 2, 0], "shadow and blur, once a step");
+    let [first, second] = cameras(&scene);
+    for ((frame, _), (by, camera)) in frames.iter().zip([(0.0, first), (0.0, second), (0.7, first), (0.7, second)]) {
+        assert!(*frame == alone(&scene, by, camera), "{by}");
+    }
+    assert!(frames[0].0 != frames[1].0 && frames[1].0 != frames[3].0, "control: they differ");
+}
+
+#[test]
+fn a_shadow_that_hangs_on_the_camera_or_on_vertices_without_a_name_is_drawn_for_each_frame() {
+    assert_eq!(counts(&two_steps(&scene(1), |_, _| ())), [2; 4], "no name");
+    assert_eq!(counts(&two_steps(&scene(2), SceneBuffers::hold_step)), [2; 4], "split by the view");
+    let frames = two_steps(&scene(1), |buffers, _| buffers.hold_step(7));
+    assert_eq!(counts(&frames), [2, 0, 2, 0], "the bounds of the second step differ, whatever it is called");
+}
+
+#[test]
+fn an_upload_forgets_the_name_and_other_bounds_or_another_origin_have_another_shadow() {
+    let scene = scene(1);
+    let mut renderer = open();
+    let mut buffers = renderer.load(&scene).expect("loads");
+    let ((surface, bounds), [camera, _]) = (surface(&scene, 0.0), cameras(&scene));
+    renderer.upload(&buffers, &surface).expect("uploads");
+    buffers.hold_step(1);
+    let draw = |renderer: &mut Renderer, buffers: &SceneBuffers, bounds| {
+        renderer.draw(buffers, &shot(camera, bounds)).expect("draws");
+        shadows(renderer)
+    };
+    let wider = Bounds { min: bounds.min.map(|side| side - 1.0), ..bounds };
+    let drawn = [bounds, bounds, wider, wider, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds));
+    assert_eq!(drawn, [2, 0, 2, 0, 2]);
+    let nobody = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
+    assert_eq!([nobody, nobody].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 2], "no bounds are the same");
+    buffers.relative_to([1024.0, 0.0, 0.0]);
+    assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 0]);
+    renderer.upload(&buffers, &surface).expect("uploads");
+    assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 2]);
+}
+
+#[test]
+fn a_step_of_the_engine_has_one_shadow_for_all_cameras_and_a_refused_one_leaves_no_shadow_behind() {
+    let scene = scene(1);
+    let mut bench = Workbench::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("opens");
+    let mut staged = bench.stage(&scene).expect("stages");
+    let frames = |bench: &mut Workbench, staged: &mut modalcast::engine::Staged| {
+        cameras(&scene).map(|camera| {
+            let rgba = bench.draw(staged, &camera, 64, 64).expect("draws").rgba;
+            let ran = bench.ran().expect("draws").passes.clone();
+            (rgba, ran.iter().filter(|pass| **pass == "shadow").count())
+        })
+    };
+    let mut state = State::rest(&scene);
+    staged.deform(&state).expect("deforms");
+    let first = frames(&mut bench, &mut staged);
+    assert_eq!(counts(&first), [1, 0]);
+    assert_eq!(counts(&frames(&mut bench, &mut staged)), [0, 0], "the same step again");
+    let last = scene.domains.len() - 1;
+    let good = state.clone();
+    state.transforms[last].0[3] = 2.0;
+    staged.deform(&state).expect("deforms");
+    let second = frames(&mut bench, &mut staged);
+    assert_eq!(counts(&second), [1, 0], "a new step");
+    state.transforms[last].0[3] = 1e30;
+    staged.deform(&state).expect_err("out of range");
+    let third = frames(&mut bench, &mut staged);
+    assert!(third[0].0 == second[0].0 && third[1].0 == second[1].0, "the step before it is shown");
+    staged.deform(&good).expect("deforms");
+    let fourth = frames(&mut bench, &mut staged);
+    assert!(fourth[0].0 == first[0].0 && fourth[0].0 != second[0].0, "control");
+    bench.unstage(staged);
+}

@@ -1,0 +1,125 @@
+//! Frames of a stream while later steps are computed: each is that of its step, in order, and acknowledged after it.
+
+use std::sync::Arc;
+
+use modalcast::config::{BackendChoice, Config, RendererChoice};
+use modalcast::engine::{Body, Delivery, Showing, Shown, View, Workbench};
+use modalcast::scene::{Camera, Lens};
+use modalcast_proto::v1;
+use v1::Policy;
+use v1::drive_scene_response::Kind as Told;
+
+use crate::service_harness::{Server, kept_strips, state_after, step, within};
+
+const SIZE: (u32, u32) = (48, 32);
+const STEPS: u64 = 30;
+/// The step that is refused.
+const BAD: u64 = 13;
+
+fn cameras(count: usize) -> Vec<Camera> {
+    let first = Camera::framing(&kept_strips(), SIZE.0, SIZE.1);
+    (0..count).map(|at| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * at as f64), ..first }).collect()
+}
+
+fn view(camera: Camera) -> View {
+    View::Frame { camera, width: SIZE.0, height: SIZE.1, showing: Showing::Colour }
+}
+
+fn steps() -> Vec<v1::Step> {
+    let q = |number: u64| if number == BAD { 1e30 } else { 0.03 * number as f32 };
+    (0..STEPS).map(|number| step(number, &[1], &[q(number), 0.5])).collect()
+}
+
+/// The pictures of every good step, drawn one by one.
+fn expected(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
+    let (scene, steps) = (kept_strips(), steps());
+    let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
+    let mut bench = Workbench::open(&config).expect("opens");
+    let mut staged = bench.stage(&scene).expect("stages");
+    let mut pictures = Vec::new();
+    for step in steps.iter().filter(|step| step.number != BAD) {
+        staged.deform(&state_after(&scene, std::slice::from_ref(step))).expect("deforms");
+        let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE.0, SIZE.1).expect("draws").rgba;
+        pictures.push((step.number, cameras.iter().map(&mut draw).collect()));
+    }
+    bench.unstage(staged);
+    pictures
+}
+
+fn pixels(shown: &Shown) -> &[u8] {
+    let Body::Frame(image) = &shown.body else { panic!("no frame") };
+    &image.rgba
+}
+
+async fn server() -> Server {
+    let server =
+        Server::with(|config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, ..config }).await;
+    server.open("kept").await;
+    server
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn frames_of_more_cameras_than_can_be_under_way_are_each_that_of_its_step_and_acknowledged_in_order() {
+    let (server, cameras) = (server().await, cameras(5));
+    let host = server.engine.find("kept").expect("open");
+    let mut feeds = Vec::new();
+    for camera in &cameras {
+        feeds.push(host.watch(view(*camera), Delivery::Lossless).await.expect("a feed"));
+    }
+    let positions = modalcast::deform::Wanted { positions: true, ..Default::default() };
+    let mut vertices = host.watch(View::Vertices(positions), Delivery::Lossless).await.expect("a feed");
+    // One that leaves in the middle, and one that never reads.
+    let mut leaver = Some(host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed"));
+    let _idle = host.watch(view(cameras[0]), Delivery::Latest).await.expect("a feed");
+    let mut driver = server.drive("kept", Policy::Lossless, 40).await;
+    for step in steps() {
+        driver.step(step).await;
+    }
+    let want = expected(&cameras);
+    for (number, pictures) in &want {
+        if *number == 8 {
+            leaver = None;
+        }
+        if let Some(feed) = &mut leaver {
+            assert_eq!(within(feed.next()).await.expect("goes on").step.number, *number);
+        }
+        for (feed, picture) in feeds.iter_mut().zip(pictures) {
+            let shown = within(feed.next()).await.expect("goes on");
+            assert_eq!((shown.step.number, shown.skipped), (*number, 0));
+            assert!(pixels(&shown) == picture, "step {number}");
+        }
+        assert_eq!(within(vertices.next()).await.expect("goes on").step.number, *number);
+    }
+    for number in 0..STEPS {
+        match driver.reply().await {
+            Told::Ack(ack) => assert!(ack.step == number && number != BAD, "{ack:?}"),
+            Told::Rejection(_) => assert_eq!(number, BAD, "refused in its turn"),
+            other => panic!("{other:?}"),
+        }
+    }
+    assert!(want[0].1[0] != want[1].1[0] && want[0].1[0] != want[0].1[1], "control: steps and cameras differ");
+    driver.finish().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_is_closed_while_frames_are_under_way_hands_over_what_was_begun_and_ends() {
+    let (server, cameras) = (server().await, cameras(2));
+    let host = Arc::clone(&server.engine.find("kept").expect("open"));
+    let mut feed = host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed");
+    let driver = server.drive("kept", Policy::Lossless, 40).await;
+    for step in steps().into_iter().take(12) {
+        driver.step(step).await;
+    }
+    let want = expected(&cameras);
+    let shown = within(feed.next()).await.expect("the first");
+    assert!(pixels(&shown) == want[0].1[0]);
+    within(server.engine.close("kept")).await.expect("closes");
+    let mut next = 1;
+    while let Ok(shown) = within(feed.next()).await {
+        assert_eq!(shown.step.number, next);
+        assert!(pixels(&shown) == want[next as usize].1[0]);
+        next += 1;
+    }
+    assert!(next <= 12);
+    server.stop().await.expect("stops with nothing under way");
+}
