@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use super::loads::{Kind, Stage};
 use super::metrics::{self, Flicker, Light, Spread};
+use super::patience::{PATIENCE, Patience};
 use super::picture::{Detail, Picture, Term, trace};
 use super::pictures::{self, File};
 use super::soup::Soup;
@@ -47,8 +48,10 @@ pub struct Row {
     /// The light that arrives, against the hard rays and against what the variant means to show.
     pub light: Light,
     pub light_of_aim: Light,
-    /// None when the variant did not pass.
+    /// None when the variant did not pass, or when it was left out.
     pub flicker: Option<Spread>,
+    /// Why a variant that passed has no flicker.
+    pub no_flicker: Option<String>,
     /// "frame" is all but reading back; none when the variant did not pass.
     pub passes: Vec<Pass>,
     /// Device memory of the scene, and of it what the shadow takes.
@@ -86,9 +89,11 @@ struct Job<'a> {
     references: References,
     /// The light meter of the still picture without shadows.
     bright: Image,
-    /// References of the moving scene, unshadowed and hard.
-    moving: Vec<[Picture; 2]>,
+    moving: Moving,
 }
+
+/// References of the moving scene, unshadowed and hard; or why there are none.
+type Moving = std::result::Result<Vec<[Picture; 2]>, String>;
 
 /// Measures every variant that is wanted on one load.
 pub(super) fn load(
@@ -163,22 +168,31 @@ fn small(size: Size) -> Size {
 }
 
 /// The references of every step, with a quarter of the samples of a still one.
-fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Vec<[Picture; 2]>> {
+fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Moving> {
     let size = small(request.size);
     let camera = stage.camera(size);
     let mut set = studio.set(&stage.scene)?;
-    let mut all = Vec::new();
+    let (mut all, mut soup, mut too_long) = (Vec::new(), None::<Soup>, None);
+    let mut patience = Patience::new(PATIENCE, STEPS);
     for step in 0..STEPS {
         studio.pose(&mut set, &stage.state(step))?;
         let view = View::new(set.scene(), &set.shot(camera, size));
-        let soup = Soup::new(&stage.scene, set.surface()?);
+        let own = match soup.take() {
+            Some(soup) => soup.moved(&stage.scene, set.surface()?),
+            None => Soup::new(&stage.scene, set.surface()?),
+        };
         let detail = Detail { taps: 1, ..Detail::QUICK };
-        if let Ok(pair) = trace(&soup, &view, &[Term::Unshadowed, Term::Hard], detail).try_into() {
+        if let Ok(pair) = trace(&own, &view, &[Term::Unshadowed, Term::Hard], detail).try_into() {
             all.push(pair);
+        }
+        soup = Some(own);
+        too_long = patience.tick("references");
+        if too_long.is_some() {
+            break;
         }
     }
     studio.strike(set);
-    Ok(all)
+    Ok(too_long.map_or(Ok(all), Err))
 }
 
 /// The still picture of a scene.
@@ -201,7 +215,8 @@ impl Job<'_> {
             samples: detail.side * detail.side,
             taps: detail.taps,
             reference_ms,
-            steps: self.moving.len(),
+            steps: self.moving.as_ref().map_or(0, Vec::len),
+            no_flicker: self.moving.as_ref().err().cloned(),
             steps_size: small(self.request.size),
         }
     }
@@ -224,7 +239,10 @@ impl Job<'_> {
         row.shadow_bytes = shadow.map(|texture| texture.bytes).sum();
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
-            row.flicker = Some(self.flicker(studio, &mut set, variant)?);
+            match self.flicker(studio, &mut set, variant)? {
+                Ok(flicker) => row.flicker = Some(flicker),
+                Err(why) => row.no_flicker = Some(why),
+            }
         }
         studio.strike(set);
         let file = pictures::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colours))?;
@@ -251,6 +269,7 @@ impl Job<'_> {
             light: metrics::light(lit, &hard.light),
             light_of_aim,
             flicker: None,
+            no_flicker: None,
             passes: Vec::new(),
             bytes: 0,
             shadow_bytes: 0,
@@ -259,17 +278,31 @@ impl Job<'_> {
         }
     }
 
-    fn flicker(&self, studio: &mut Studio, set: &mut Set, variant: &Variant) -> Result<Spread> {
+    /// The flicker of a variant, or why there is none.
+    fn flicker(
+        &self,
+        studio: &mut Studio,
+        set: &mut Set,
+        variant: &Variant,
+    ) -> Result<std::result::Result<Spread, String>> {
+        let moving = match &self.moving {
+            Ok(moving) => moving,
+            Err(why) => return Ok(Err(why.clone())),
+        };
         let size = small(self.request.size);
         let camera = self.stage.camera(size);
         let mut flicker = Flicker::default();
-        for (step, [unshadowed, hard]) in self.moving.iter().enumerate() {
+        let mut patience = Patience::new(PATIENCE, STEPS);
+        for (step, [unshadowed, hard]) in moving.iter().enumerate() {
             studio.pose(set, &self.stage.state(step))?;
             let image = studio.draw(set, camera, size)?;
             let reference = if variant.aim == Aim::Unshadowed { unshadowed } else { hard };
             flicker.push(&image.rgba, &reference.colours);
+            if let Some(why) = patience.tick("frames") {
+                return Ok(Err(why));
+            }
         }
-        Ok(flicker.spread())
+        Ok(Ok(flicker.spread()))
     }
 
     fn file_name(&self, what: &str) -> String {

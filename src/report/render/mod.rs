@@ -17,6 +17,7 @@ pub mod metrics;
 mod output;
 mod page;
 mod paint;
+mod patience;
 mod pattern;
 mod picture;
 mod pictures;
@@ -77,6 +78,8 @@ pub struct Entry {
     /// Steps over which flicker was looked at, and the size of their pictures.
     pub steps: usize,
     pub steps_size: Size,
+    /// Why flicker was not looked at.
+    pub no_flicker: Option<String>,
 }
 
 /// A whole report.

@@ -9,7 +9,7 @@ use crate::error::{Result, during};
 use crate::report::plot::png;
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
-const COLUMNS: [(&str, &str); 48] = [
+const COLUMNS: [(&str, &str); 49] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -57,6 +57,7 @@ const COLUMNS: [(&str, &str); 48] = [
     ("lost", "/light_of_aim/lost"),
     ("flicker_mean", "/flicker/mean"),
     ("flicker_p99", "/flicker/p99"),
+    ("no_flicker", "/no_flicker"),
     ("faults", ""),
 ];
 

@@ -59,8 +59,11 @@ fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
     let Entry { name, vertices, triangles, domains, samples, taps, reference_ms, steps, .. } = load;
     let mut text = format!(
         "\n## {name}\n\n{vertices} vertices, {triangles} triangles, {domains} domains. References: {samples} samples a \
-         pixel, {taps} rays each over a footprint, {:.1} s; flicker over {steps} steps.\n\n",
-        reference_ms / 1e3
+         pixel, {taps} rays each over a footprint, {:.1} s; {}.\n\n",
+        reference_ms / 1e3,
+        load.no_flicker
+            .as_ref()
+            .map_or_else(|| format!("flicker over {steps} steps"), |why| format!("no flicker: {why}"))
     );
     text.push_str(&line(HEAD.map(String::from)));
     text.push_str(&rule(HEAD.len()));
@@ -89,7 +92,11 @@ fn cells(row: &Row) -> [String; 17] {
         small(row.light_of_aim.all.mean),
         small(row.light_of_aim.penumbra.mean),
         row.light_of_aim.in_umbra.map_or_else(dash, small),
-        row.flicker.map_or_else(dash, |flicker| format!("{:.3}", flicker.mean)),
+        match (row.flicker, &row.no_flicker) {
+            (Some(flicker), _) => format!("{:.3}", flicker.mean),
+            (None, Some(why)) => format!("left out: {why}"),
+            (None, None) => dash(),
+        },
         match (row.passed, row.to_fail) {
             (true, _) => "yes".into(),
             (false, true) => format!("no, as stated: {}", row.faults.join("; ")),

@@ -290,3 +290,20 @@ fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farthe
     assert!(near < 1.0 && far > 3.0 * near, "{near} and {far} levels");
     assert!(report.passed(), "{:?}", report.failed);
 }
+
+#[test]
+fn a_tree_of_boxes_that_moves_along_meets_what_one_built_anew_does() {
+    let stage = Kind::Triangles(2_000).stage().expect("built");
+    let at = |step: usize| {
+        let mut deformer = ReferenceDeformer::new(&stage.scene);
+        let bounds = deformer.deform(&stage.state(step)).expect("deforms").bounds;
+        (deformer.surface().expect("there").clone(), bounds)
+    };
+    let ((first, _), (later, bounds)) = (at(0), at(30));
+    let size = Size { width: 48, height: 32 };
+    let view = View::new(&stage.scene, &Shot { camera: stage.camera(size), width: 48, height: 32, bounds });
+    let traced = |soup: &Soup| trace(soup, &view, &[Term::Hard], Detail::QUICK);
+    let anew = traced(&Soup::new(&stage.scene, &later));
+    assert_eq!(traced(&Soup::new(&stage.scene, &first).moved(&stage.scene, &later)), anew);
+    assert_ne!(traced(&Soup::new(&stage.scene, &first)), anew, "control: the step before");
+}
