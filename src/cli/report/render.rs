@@ -19,7 +19,9 @@ Examples:
   modalcast report render --out report
   modalcast report render --out report --quick
   modalcast report render --out report --load tree --load triangles-3000000 --size 1920x1080
-  modalcast report render --out report --load square --variant 'variance 512*'";
+  modalcast report render --out report --load square --variant 'variance 512*'
+  modalcast report render --out figures --figures
+  modalcast report render --out figures --figures --scene path/to/plant --size 1280x960";
 
 /// Error against run time of the renderer: validates every variant against references by brute force, then times it.
 ///
@@ -37,21 +39,34 @@ pub(super) struct Args {
     /// Only this variant, or all whose names begin so: "variance 512*"; may be repeated.
     #[arg(long = "variant", value_name = "GLOB")]
     variants: Vec<String>,
-    /// The size of still pictures in pixels; those of moving ones are a quarter of it on each side.
-    #[arg(long, default_value = "640x360")]
-    size: Size,
+    /// The size of still pictures in pixels, 640x360 without it; those of moving ones are a quarter of it on each side. Of
+    /// a figure's single pictures, 640x480 without it.
+    #[arg(long)]
+    size: Option<Size>,
     /// Frames per median, at least 20; 100 without it, 20 with --quick.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
     /// Fewer variants, 16 samples a pixel and a smaller field, for machines without a GPU.
     #[arg(long)]
     quick: bool,
+    /// Draws the figures of the thesis's chapter 4.2 instead, from our own scenes: nothing is measured.
+    #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
+    figures: bool,
+    /// With --figures, a picture of this scene too: a path to a model or a scene folder; may be repeated.
+    #[arg(long = "scene", value_name = "PATH", requires = "figures")]
+    scenes: Vec<String>,
 }
+
+/// Sizes that nobody asked for: of the report, and of the figures' pictures.
+const USUAL: [Size; 2] = [Size { width: 640, height: 360 }, Size { width: 640, height: 480 }];
 
 /// The largest side of a picture: each of its pixels is traced by 64 rays and more.
 const LARGEST: u32 = 4096;
 
 pub(super) fn run(args: &Args) -> Outcome {
+    if args.figures {
+        return figures(args);
+    }
     let request = request(args)?;
     let report = working("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
     report.write(&args.out)?;
@@ -60,19 +75,36 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(report.passed())
 }
 
+fn figures(args: &Args) -> Outcome {
+    let request = render::figures::Request { size: size(args, USUAL[1])?, scenes: args.scenes.clone() };
+    let hear = |what: &str| tracing::info!(what, "drawing");
+    let figures = working("drawing", || render::figures::figures(&request, hear))?;
+    figures.write(&args.out)?;
+    for figure in &figures.figures {
+        say(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.shows.join("; ")));
+    }
+    say(format!("written to {}", args.out.display()));
+    Ok(true)
+}
+
+/// The size that was asked for, in bounds.
+fn size(args: &Args, usual: Size) -> Result<render::Size> {
+    let Size { width, height } = args.size.unwrap_or(usual);
+    match [width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
+        true => Ok(render::Size { width, height }),
+        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), Size { width, height })),
+    }
+}
+
 fn request(args: &Args) -> Result<Request> {
     let mut loads = args.loads.iter().map(|name| Kind::named(name)).collect::<Result<Vec<_>>>()?;
     if loads.is_empty() {
         loads = Kind::all(args.quick);
     }
-    let Size { width, height } = args.size;
-    if ![width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
-        return Err(invalid("size", format!("1 to {LARGEST} pixels a side"), args.size));
-    }
     let request = Request {
         loads,
         variants: args.variants.clone(),
-        size: render::Size { width, height },
+        size: size(args, USUAL[0])?,
         quick: args.quick,
         replays: args.replays.map_or(if args.quick { 20 } else { 100 }, |replays| replays as usize),
     };
@@ -116,8 +148,17 @@ mod tests {
     use super::*;
 
     fn args() -> Args {
-        let size = Size { width: 64, height: 48 };
-        Args { out: PathBuf::from("out"), loads: vec![], variants: vec![], size, replays: None, quick: true }
+        let size = Some(Size { width: 64, height: 48 });
+        Args {
+            out: PathBuf::from("out"),
+            loads: vec![],
+            variants: vec![],
+            size,
+            replays: None,
+            quick: true,
+            figures: false,
+            scenes: vec![],
+        }
     }
 
     #[test]
@@ -129,8 +170,8 @@ mod tests {
         for wrong in [
             Args { loads: vec!["cube".into()], ..args() },
             Args { variants: vec!["varience*".into()], ..args() },
-            Args { size: Size { width: 0, height: 5 }, ..args() },
-            Args { size: Size { width: 5, height: 5000 }, ..args() },
+            Args { size: Some(Size { width: 0, height: 5 }), ..args() },
+            Args { size: Some(Size { width: 5, height: 5000 }), ..args() },
         ] {
             assert!(request(&wrong).is_err(), "{wrong:?}");
         }

@@ -146,6 +146,18 @@ impl Stage {
     }
 }
 
+/// A scene as a light wind holds it.
+pub(super) fn swaying(scene: &Arc<Scene>) -> State {
+    let load =
+        Load { name: scene.name.clone(), scene: Arc::clone(scene), paired: false, species: None, remarks: vec![] };
+    let mut state = State::rest(scene);
+    for (own, swing) in state.q.iter_mut().zip(Motion::new(&load, None).step(10).q) {
+        *own += (SWAY * swing) as f32;
+    }
+    state.touch();
+    state
+}
+
 /// Adds a rigid domain with a shape and a material of its own.
 pub(super) fn add(parts: &mut Parts, name: &str, mesh: Mesh, material: Material) -> Result<()> {
     parts.shapes.push(Shape::new(mesh, Modes::rigid())?);

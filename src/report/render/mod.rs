@@ -9,7 +9,9 @@
 //!   every sample; the shadow by one ray a sample to the sun, or by rays over the blur's own footprint.
 //! - `studio`, `meter`: frames of the renderer, and the light in them.
 //! - [`metrics`]: errors, light bleeding, flicker.
+//! - [`figures`]: pictures to be looked at, after those of the thesis.
 
+pub mod figures;
 pub mod loads;
 mod measure;
 mod meter;
