@@ -7,13 +7,17 @@ use crate::cli::{Outcome, say};
 use crate::error::{Result, invalid};
 use crate::report::render::loads::Kind;
 use crate::report::render::{self, Report, Request, variants};
+use crate::report::thesis::PLANTS;
 
 const LOADS: &str = "Loads:
   square       a square that floats over the ground
   shelf        a shelf just above the ground, from nearby
   panes        three translucent panes, listed in the wrong order
+  images       panels with images of many sizes, each repeated
   tree, grove  the built-in tree, and four of them
   triangles-N  a rolling field of about N triangles with poles on it
+  plants, plant-1 .. plant-12
+               the plants of table 4.5 of the thesis, deformed and drawn: times and memory, no references
 
 Examples:
   modalcast report render --out report
@@ -97,12 +101,19 @@ fn size(args: &Args, usual: Size) -> Result<render::Size> {
 }
 
 fn request(args: &Args) -> Result<Request> {
-    let mut loads = args.loads.iter().map(|name| Kind::named(name)).collect::<Result<Vec<_>>>()?;
-    if loads.is_empty() {
-        loads = Kind::all(args.quick);
+    let (mut loads, mut plants) = (Vec::new(), Vec::new());
+    for name in &args.loads {
+        match plants_named(name) {
+            Some(named) => plants.extend(named),
+            None => loads.push(Kind::named(name)?),
+        }
+    }
+    if args.loads.is_empty() {
+        (loads, plants) = (Kind::all(args.quick), (0..PLANTS.len()).collect());
     }
     let request = Request {
         loads,
+        plants,
         variants: args.variants.clone(),
         size: size(args, USUAL[0])?,
         quick: args.quick,
@@ -115,6 +126,15 @@ fn request(args: &Args) -> Result<Request> {
             Err(invalid("variant", format!("one or more of: {}", names.join("; ")), args.variants.join("; ")))
         }
     }
+}
+
+/// The plants that a name stands for, counted from 0; none when it is another load's.
+fn plants_named(name: &str) -> Option<Vec<usize>> {
+    if name == "plants" {
+        return Some((0..PLANTS.len()).collect());
+    }
+    let number: usize = name.strip_prefix("plant-")?.parse().ok()?;
+    (1..=PLANTS.len()).contains(&number).then(|| vec![number - 1])
 }
 
 fn lines(report: &Report) -> Vec<String> {
@@ -138,6 +158,24 @@ fn lines(report: &Report) -> Vec<String> {
             },
         ];
         lines.push(format!("{:<18}{:<40}{}", row.load, row.name, cells.map(|cell| format!("{cell:>10}")).concat()));
+    }
+    for plant in &report.plants {
+        lines.push(format!(
+            "{:<18}{:<24}t_vbr {:>9.3} ms{:>10.1} FPS{:>9.1} MB  O_vbr {:>5.1} %",
+            plant.load,
+            plant.thesis.name,
+            plant.vbr.median_us / 1e3,
+            plant.fps,
+            plant.bytes as f64 / 1e6,
+            100.0 * plant.occupation
+        ));
+    }
+    for bare in &report.bare {
+        let (depth, visibility) = (bare.depth.median_us, bare.visibility.median_us);
+        lines.push(format!(
+            "{:<18}bare depth {depth:.1} us, bare visibility {visibility:.1} us; {} takes {:.1} us beyond both",
+            bare.load, bare.variant, bare.beyond_us
+        ));
     }
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
     lines
@@ -164,11 +202,15 @@ mod tests {
     #[test]
     fn nothing_named_means_every_load_and_wrong_names_and_sizes_are_refused() {
         let all = request(&args()).expect("fits");
-        assert_eq!((all.loads.len(), all.replays), (Kind::all(true).len(), 20));
+        assert_eq!((all.loads.len(), all.plants.len(), all.replays), (Kind::all(true).len(), 12, 20));
+        let plants = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
+        let plants = request(&plants).expect("fits");
+        assert_eq!((plants.loads.len(), plants.plants.len(), plants.plants[0]), (1, 13, 2));
         let named = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
         assert_eq!(request(&named).expect("fits").loads, [Kind::Square, Kind::Triangles(10)]);
         for wrong in [
             Args { loads: vec!["cube".into()], ..args() },
+            Args { loads: vec!["plant-13".into()], ..args() },
             Args { variants: vec!["varience*".into()], ..args() },
             Args { size: Some(Size { width: 0, height: 5 }), ..args() },
             Args { size: Some(Size { width: 5, height: 5000 }), ..args() },

@@ -6,8 +6,10 @@ use std::time::Instant;
 use nalgebra::Vector3;
 use serde::Serialize;
 
+use super::bare::{self, Bare};
 use super::loads::{Kind, Stage};
 use super::metrics::{self, Flicker, Light, Spread};
+use super::packing::{Packing, packed};
 use super::patience::{PATIENCE, Patience};
 use super::picture::{Detail, Picture, Term, trace};
 use super::pictures::{self, File};
@@ -34,6 +36,8 @@ pub struct Row {
     pub name: String,
     pub method: Method,
     pub shadow: Option<Shadow>,
+    /// How images lie in arrays, where that is what is compared.
+    pub packing: Option<Packing>,
     /// What it must keep against what it means to show, and whether it does.
     pub bounds: Bounds,
     pub passed: bool,
@@ -57,6 +61,8 @@ pub struct Row {
     /// Device memory of the scene, and of it what the shadow takes.
     pub bytes: u64,
     pub shadow_bytes: u64,
+    /// And what its images take, with all levels.
+    pub image_bytes: u64,
     pub samples: u32,
     pub draws: usize,
 }
@@ -95,13 +101,22 @@ struct Job<'a> {
 /// References of the moving scene, unshadowed and hard; or why there are none.
 type Moving = std::result::Result<Vec<[Picture; 2]>, String>;
 
+/// All that came of one load.
+pub(super) struct Measured {
+    pub(super) entry: Entry,
+    pub(super) rows: Vec<Row>,
+    /// None when no row is there to be held against it.
+    pub(super) bare: Option<Bare>,
+    pub(super) files: Vec<File>,
+}
+
 /// Measures every variant that is wanted on one load.
 pub(super) fn load(
     studio: &mut Studio,
     request: &Request,
     kind: Kind,
     progress: &mut dyn FnMut(&str),
-) -> Result<(Entry, Vec<Row>, Vec<File>)> {
+) -> Result<Measured> {
     let stage = kind.stage()?;
     let camera = stage.camera(request.size);
     let wanted = |variant: &Variant| variant.suits(kind) && request.wants(&variant.name);
@@ -124,7 +139,9 @@ pub(super) fn load(
         rows.push(row);
         files.push(file);
     }
-    Ok((job.entry(reference_ms), rows, files))
+    progress(&format!("{}: bare passes", job.stage.name));
+    let bare = job.bare(studio, &rows)?;
+    Ok(Measured { entry: job.entry(reference_ms), rows, bare, files })
 }
 
 fn detail(request: &Request) -> Detail {
@@ -224,7 +241,10 @@ impl Job<'_> {
     /// One variant: its still picture and its light against the references, then its times and its flicker if it passed.
     fn measure(&self, studio: &mut Studio, at: usize) -> Result<(Row, File)> {
         let (variant, aim) = (&self.variants[at], &self.references.aims[at]);
-        let scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+        let mut scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+        if let Some(packing) = variant.packing {
+            scene = packed(&scene, packing)?;
+        }
         let dark = frame(studio, &meter::meter(&scene)?, &self.stage, self.request)?;
         let lit = meter::read(&dark.rgba, &self.bright.rgba);
         let mut set = studio.set(&scene)?;
@@ -235,8 +255,11 @@ impl Job<'_> {
         (row.samples, row.draws) = (ran.samples, ran.draws);
         let plan = set.buffers.plan();
         row.bytes = plan.bytes();
-        let shadow = plan.textures.iter().filter(|texture| texture.name.starts_with("shadow"));
-        row.shadow_bytes = shadow.map(|texture| texture.bytes).sum();
+        let of = |begins: &[&str]| -> u64 {
+            let own = plan.textures.iter().filter(|texture| begins.iter().any(|begin| texture.name.starts_with(begin)));
+            own.map(|texture| texture.bytes).sum()
+        };
+        (row.shadow_bytes, row.image_bytes) = (of(&["shadow"]), of(&["colour", "normal"]));
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
             match self.flicker(studio, &mut set, variant)? {
@@ -247,6 +270,41 @@ impl Job<'_> {
         studio.strike(set);
         let file = pictures::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colours))?;
         Ok((row, file))
+    }
+
+    /// The passes of a minimal program, beside the row of the largest usual variance map that was timed.
+    fn bare(&self, studio: &mut Studio, rows: &[Row]) -> Result<Option<Bare>> {
+        let usual = |row: &&Row| {
+            let own = |shadow: Shadow| Shadow { size: shadow.size, ..Shadow::default() } == shadow;
+            row.shadow.is_some_and(own) && row.median_us().is_some()
+        };
+        let largest = rows.iter().filter(usual).max_by_key(|row| row.shadow.map(|shadow| shadow.size));
+        let Some(((row, shadow), frame_us)) =
+            largest.and_then(|row| row.shadow.map(|own| (row, own)).zip(row.median_us()))
+        else {
+            return Ok(None);
+        };
+        let scene = meter::relit(&self.stage.scene, Look { shadow: Some(shadow), ..self.stage.scene.look })?;
+        let mut set = studio.set(&scene)?;
+        studio.pose(&mut set, &self.stage.state(STILL))?;
+        // Leaves the context current, and every program compiled.
+        studio.draw(&set, self.camera, self.request.size)?;
+        let (shot, software) = (set.shot(self.camera, self.request.size), studio.renderer.info().software);
+        let sitter = bare::Sitter { scene: &scene, surface: set.surface()?, shot: &shot, software };
+        let times = bare::time(&sitter, [shadow.size, row.samples], self.request.replays);
+        studio.strike(set);
+        let [depth, visibility] = times?;
+        Ok(Some(Bare {
+            load: self.stage.name.clone(),
+            triangles: scene.layout.triangles,
+            map: shadow.size,
+            samples: row.samples,
+            depth,
+            visibility,
+            variant: row.name.clone(),
+            frame_us,
+            beyond_us: frame_us - depth.median_us - visibility.median_us,
+        }))
     }
 
     fn compared(&self, variant: &Variant, (image, lit): (&Image, &[Option<f32>]), aim: &Picture) -> Row {
@@ -260,6 +318,7 @@ impl Job<'_> {
             name: variant.name.clone(),
             method: variant.method,
             shadow: variant.shadow,
+            packing: variant.packing,
             bounds,
             passed: faults.is_empty(),
             to_fail: variant.is_to_fail(self.stage.kind),
@@ -273,6 +332,7 @@ impl Job<'_> {
             passes: Vec::new(),
             bytes: 0,
             shadow_bytes: 0,
+            image_bytes: 0,
             samples: 0,
             draws: 0,
         }

@@ -1,6 +1,6 @@
 //! `report.md`: the report as tables for people.
 
-use super::{Entry, Report, Row};
+use super::{Entry, Report, Row, beside};
 use crate::report::peers::{dash, line, rule};
 
 /// The whole page.
@@ -26,7 +26,7 @@ pub(super) fn markdown(report: &Report) -> String {
     for load in &report.loads {
         text.push_str(&section(load, report.rows.iter().filter(|row| row.load == load.name)));
     }
-    text
+    text + &beside::markdown(report)
 }
 
 const EXPLAINED: &str = "Colours are compared as a display shows them, of 255, the largest difference of three channels: \

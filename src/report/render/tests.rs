@@ -243,6 +243,7 @@ fn a_drawn_scene_is_near_its_reference_and_a_sun_in_another_place_is_noticed() {
 #[test]
 fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
     let request = Request {
+        plants: vec![],
         loads: vec![Kind::Square],
         variants: vec!["none".into(), "variance 512, blur 4".into()],
         size: Size { width: 96, height: 54 },
@@ -278,6 +279,7 @@ fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
 #[test]
 fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farther_in_the_order_of_the_file() {
     let request = Request {
+        plants: vec![],
         loads: vec![Kind::Panes, Kind::Square],
         variants: vec!["exact transparency".into(), "two-pass transparency".into()],
         size: Size { width: 96, height: 54 },

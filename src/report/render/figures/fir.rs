@@ -51,12 +51,12 @@ pub(super) const FIR: Habit = Habit {
 pub(super) const HEMLOCK: Habit = Habit {
     name: "hemlock",
     height: 8.5,
-    bare: 1.3,
+    bare: 1.6,
     reach: 2.1,
     whorls: 28,
     boughs: 7,
     rise: 0.30,
-    hang: 0.85,
+    hang: 0.62,
     needles: [108.0, 142.0, 70.0],
     seed: 11,
 };
