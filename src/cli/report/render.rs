@@ -56,8 +56,9 @@ pub(super) struct Args {
     /// Draws the figures of the thesis's chapter 4.2 instead, from our own scenes: nothing is measured.
     #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
     figures: bool,
-    /// With --figures, a picture of this scene too: a path to a model or a scene folder; may be repeated.
-    #[arg(long = "scene", value_name = "PATH", requires = "figures")]
+    /// A scene of your own, a path to a model or a scene folder; may be repeated. With --figures a picture of it too;
+    /// alone its frame times and nothing else: times.json and a picture.
+    #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["loads", "variants", "quick"])]
     scenes: Vec<String>,
 }
 
@@ -70,6 +71,9 @@ const LARGEST: u32 = 4096;
 pub(super) fn run(args: &Args) -> Outcome {
     if args.figures {
         return figures(args);
+    }
+    if !args.scenes.is_empty() {
+        return timed(args);
     }
     let request = request(args)?;
     let report = working("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
@@ -86,6 +90,19 @@ fn figures(args: &Args) -> Outcome {
     figures.write(&args.out)?;
     for figure in &figures.figures {
         say(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.shows.join("; ")));
+    }
+    say(format!("written to {}", args.out.display()));
+    Ok(true)
+}
+
+fn timed(args: &Args) -> Outcome {
+    let replays = args.replays.map_or(100, |replays| replays as usize);
+    let request = render::timed::Request { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
+    let timed = working("measuring", || render::timed::timed(&request, |what| tracing::info!(what, "timing")))?;
+    timed.write(&args.out)?;
+    for scene in &timed.scenes {
+        let frame = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
+        say(format!("{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us", scene.name, scene.whole.median_us));
     }
     say(format!("written to {}", args.out.display()));
     Ok(true)

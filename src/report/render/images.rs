@@ -7,12 +7,13 @@ use crate::domain::{Material, Mesh, Texture};
 use crate::error::Result;
 use crate::scene::{Look, Parts};
 
-/// Sizes of the images of the upright panels, from left to right, the lower row first.
-const SIZES: [[u32; 2]; 6] = [[64, 64], [100, 60], [128, 128], [256, 256], [300, 200], [512, 512]];
+/// Sizes of the images of the upright panels, from left to right, the lower row first: in a picture of usual size their
+/// texels are from four pixels to half a pixel wide.
+const SIZES: [[u32; 2]; 6] = [[16, 16], [25, 15], [32, 32], [64, 64], [75, 50], [128, 128]];
 /// Repetitions along each side of an upright panel, and of the floor.
-const TURNS: (usize, usize) = (3, 24);
+const TURNS: (usize, usize) = (2, 24);
 /// Size of the floor's image.
-const FLOOR: [u32; 2] = [96, 96];
+const FLOOR: [u32; 2] = [24, 24];
 
 /// The scene.
 ///
@@ -64,7 +65,7 @@ fn weave(name: &str, width: u32, height: u32) -> Result<Texture> {
     let pixel = |at: u32| {
         let (x, y) = (at % width, at / width);
         let (u, v) = ((x as f32 + 0.5) / width as f32, (y as f32 + 0.5) / height as f32);
-        let rim = x < width / 32 || y < height / 32;
+        let rim = x < width.div_ceil(32) || y < height.div_ceil(32);
         let light = if rim { 0.15 } else { 0.35 + 0.65 * wave(3.0 * u + 2.0 * wave(v)) };
         let colour = [0.9 - 0.4 * wave(v), 0.45 + 0.4 * wave(u + v), 0.35 + 0.5 * wave(2.0 * v - u)];
         let [r, g, b] = colour.map(|channel| (255.0 * channel * light) as u8);

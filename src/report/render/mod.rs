@@ -12,6 +12,7 @@
 //! - `bare`: the passes of a minimal program, timed in the same run; `blurs`: moments and blur in compute and in fragments.
 //! - [`packing`]: images in one array as equation 3.13 packs them, against arrays by size.
 //! - [`plants`]: the plants of table 4.5 with rendering.
+//! - [`timed`]: frame times of a scene of the user, for programs that draw the same.
 //! - [`figures`]: pictures to be looked at, after those of the thesis.
 
 mod bare;
@@ -39,6 +40,7 @@ mod studio;
 #[cfg(test)]
 mod tests;
 mod texels;
+pub mod timed;
 pub mod variants;
 mod view;
 
