@@ -70,9 +70,9 @@ def knot():
     circle = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * above[:, None]
     points = (line(t)[:, None] + 0.16 * circle).reshape(-1, 3)
     u, v = np.meshgrid(np.linspace(0, 30, along + 1), np.linspace(0, 2, around + 1), indexing="ij")
-    triangles, normals = grid(points, along, around)
+    triangles, _ = grid(points, along, around)
     # The two ends of the tube lie in one place: normals come from its own roundness.
-    return points, circle.reshape(-1, 3), np.stack([u, v], axis=-1).reshape(-1, 2), triangles[:, ::-1]
+    return points, circle.reshape(-1, 3), np.stack([u, v], axis=-1).reshape(-1, 2), triangles
 
 
 def image():
