@@ -50,32 +50,41 @@ def unfiltered(kind, line, above):
     return own[3:].astype(np.uint8)
 
 
-def main(folder):
-    folder = Path(folder)
-    ours, peer = (json.loads((folder / name).read_text()) for name in ("times.json", "peer.json"))
-    rows = []
-    for scene in ours["scenes"]:
+def middle(timings):
+    """The round whose median is the middle one."""
+    return sorted(timings, key=lambda timing: timing["median_us"])[len(timings) // 2]
+
+
+def main(out, folders):
+    out, rounds = Path(out), []
+    for folder in map(Path, folders):
+        rounds.append(tuple(json.loads((folder / name).read_text()) for name in ("times.json", "peer.json")))
+    (ours, peer), last, rows = rounds[-1], Path(folders[-1]), []
+    for at, scene in enumerate(ours["scenes"]):
         name = scene["name"]
-        own, other = read(folder / f"{name}.png"), read(folder / f"{name}-peer.png")
+        own, other = read(last / f"{name}.png"), read(last / f"{name}-peer.png")
         apart = np.abs(own.astype(int) - other).max(axis=2)
         loud = np.repeat(np.clip(4 * apart, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-        png(folder / f"{name}-beside.png", np.concatenate([own, other, loud], axis=1))
-        frame = next(one["timing"] for one in scene["passes"] if one["name"] == "frame")
-        theirs = peer["scenes"][name]
-        passes = {one["name"]: one["timing"]["median_us"] for one in scene["passes"]}
+        png(out / f"{name}-beside.png", np.concatenate([own, other, loud], axis=1))
+        whole = middle([one["scenes"][at]["whole"] for one, _ in rounds])
+        theirs = {key: middle([other["scenes"][name][key] for _, other in rounds]) for key in ("frame", "whole")}
+        frame = [next(own["timing"] for own in one["scenes"][at]["passes"] if own["name"] == "frame") for one, _ in rounds]
         rows.append({
             "shadow": name, "triangles": scene["triangles"], "map": scene["look"]["shadow"]["size"], "samples": scene["samples"],
-            "ours_us": {"frame": frame, "with_pixels": scene["whole"]}, "our_passes_us": passes,
+            "ours_us": {"frame": middle(frame), "with_pixels": whole},
             "peer_us": {"frame": theirs["frame"], "with_pixels": theirs["whole"]},
-            "peer_over_ours": theirs["whole"]["median_us"] / scene["whole"]["median_us"],
+            "peer_over_ours": theirs["whole"]["median_us"] / whole["median_us"],
+            "peer_over_ours_by_round": [
+                other["scenes"][name]["whole"]["median_us"] / one["scenes"][at]["whole"]["median_us"] for one, other in rounds
+            ],
             "mean_difference_of_255": float(apart.mean()), "pixels_apart_by_more_than_16": float((apart > 16).mean()),
         })
         print("%-10s ours %9.1f us, peer %9.1f us with pixels: %.2f times; mean difference %.2f of 255" % (
-            name, scene["whole"]["median_us"], theirs["whole"]["median_us"], rows[-1]["peer_over_ours"], apart.mean()))
+            name, whole["median_us"], theirs["whole"]["median_us"], rows[-1]["peer_over_ours"], apart.mean()))
     made = ours["made"]
     together = {
         "what": "one mesh, one view, a shadow map of equal size and 4 samples a pixel, by modalcast and by a plain moderngl "
-        "program; microseconds, medians; with_pixels is the wall clock around a frame and its pixels in host memory",
+        "program; microseconds, medians of the middle of three rounds taken in turns; with_pixels is the wall clock around a frame and its pixels in host memory",
         "command": "tests/bench/peers/run", "commit": made["commit"], "size": ours["size"],
         "machine": {"cpu": made["cpu"], "threads": made["threads"], "release": made["release"]},
         "renderer": ours["renderer"], "peer": {key: peer[key] for key in ("renderer", "moderngl")},
@@ -88,8 +97,8 @@ def main(folder):
         ],
         "rows": rows,
     }
-    (folder / "peers.json").write_text(json.dumps(together, indent=1) + "\n")
+    (out / "peers.json").write_text(json.dumps(together, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1], sys.argv[2:])
