@@ -20,6 +20,9 @@ use crate::scene::{Bounds, Scene};
 /// What boxes are widened by, of the scene's radius.
 const PADDING: f64 = 2e-6;
 
+/// Triangles that one thread takes at a time.
+const LEAST: usize = 4096;
+
 /// Points `from + t along`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ray {
@@ -285,8 +288,12 @@ impl Soup {
 
 /// Middle and radius of a ball around some triangles.
 fn ball(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
-    let mut bounds = Bounds::EMPTY;
-    triangles.iter().flat_map(Triangle::points).for_each(|point| bounds.include(point.into()));
+    let held = |mut bounds: Bounds, triangle: &Triangle| {
+        triangle.points().iter().for_each(|point| bounds.include((*point).into()));
+        bounds
+    };
+    let each = triangles.par_iter().with_min_len(LEAST).fold(|| Bounds::EMPTY, held);
+    let bounds = each.reduce(|| Bounds::EMPTY, Bounds::union);
     match triangles.is_empty() {
         true => (Vector3::zeros(), 1.0),
         false => (bounds.centre().coords, (0.5 * bounds.diagonal()).max(1e-9)),
@@ -319,7 +326,7 @@ fn triangles(scene: &Scene, surface: &Surface) -> Vec<Triangle> {
         let mesh = &scene.shape_of(index).mesh;
         let mirrored = domain.placement.linear().determinant() < 0.0;
         let vertices = &mesh.corners().vertices;
-        mesh.triangles().iter().enumerate().filter_map(move |(at, corners)| {
+        mesh.triangles().par_iter().with_min_len(LEAST).enumerate().filter_map(move |(at, corners)| {
             let run = domain.runs.iter().rev().find(|run| run.first_triangle <= at);
             let material = run.map_or(domain.material, |run| run.material);
             // Which side of a double-sided triangle is seen follows its normals at rest.
@@ -342,7 +349,7 @@ fn triangles(scene: &Scene, surface: &Surface) -> Vec<Triangle> {
             })
         })
     };
-    (0..scene.domains.len()).into_par_iter().flat_map_iter(of_domain).collect()
+    (0..scene.domains.len()).into_par_iter().flat_map(of_domain).collect()
 }
 
 fn disagrees(mesh: &Mesh, [a, b, c]: [u32; 3]) -> bool {
