@@ -27,8 +27,8 @@ fn bare(list: &[Bare]) -> String {
         "beyond us",
     ];
     let mut text = format!(
-        "\n## Bare passes\n\nA minimal program in the same run: all triangles in one draw into the depth of the map, and in \
-         one draw into ids and depth of the frame; no culling, no materials, no holes. What a frame takes beyond both, \
+        "\n## Bare passes\n\nThe same scene in the same run, stripped to one opaque material: all triangles in one draw into \
+         the depth of the map, and in one draw into ids and depth of the frame; no culling, no images, no holes. What a frame takes beyond both, \
          which is to be {BEYOND_US} us at most for 3,000,000 triangles and a map of 4096 on an H200 at 1920 x 1080.\n\n"
     );
     text.push_str(&line(head.map(String::from)));

@@ -45,3 +45,55 @@ impl Blurs {
 fn blur_us(row: &Row) -> Option<f64> {
     row.passes.iter().find(|pass| pass.name == "blur").map(|pass| pass.timing.median_us)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::render::Pass;
+    use crate::report::render::metrics::{Light, Spread};
+    use crate::report::render::variants::{BOUNDS, Method};
+    use crate::report::timing::Timing;
+
+    fn row(load: &str, shadow: Shadow, us: f64) -> Row {
+        let timing = Timing::of(vec![us]).expect("one");
+        Row {
+            load: load.into(),
+            name: String::new(),
+            method: Method::Variance,
+            shadow: Some(shadow),
+            packing: None,
+            bounds: BOUNDS,
+            passed: true,
+            to_fail: false,
+            faults: Vec::new(),
+            colour: Spread::default(),
+            colour_of_aim: Spread::default(),
+            light: Light::default(),
+            light_of_aim: Light::default(),
+            flicker: None,
+            no_flicker: None,
+            passes: vec![Pass { name: "blur", timing }],
+            bytes: 0,
+            shadow_bytes: 0,
+            image_bytes: 0,
+            samples: 4,
+            draws: 1,
+        }
+    }
+
+    #[test]
+    fn fragments_stand_beside_the_fastest_compute_that_makes_the_same_map_and_no_other() {
+        let map = |size: u32, blurring: Blurring| Shadow { size, blur: 2.3, blurring, ..Shadow::default() };
+        let rows = [
+            row("a", map(4096, Blurring::Tiles), 200.0),
+            row("a", map(4096, Blurring::Rows), 400.0),
+            row("a", map(4096, Blurring::Fragments), 9000.0),
+            row("a", map(1024, Blurring::Tiles), 1.0),
+            row("b", map(4096, Blurring::Tiles), 1.0),
+            row("b", map(1024, Blurring::Fragments), 50.0),
+        ];
+        let [only] = &Blurs::of(&rows)[..] else { panic!("one map was made both ways") };
+        assert_eq!((only.load.as_str(), only.size, only.taps), ("a", 4096, 15));
+        assert_eq!((only.compute_us, only.fragments_us, only.ratio), (200.0, 9000.0, 45.0));
+    }
+}

@@ -272,7 +272,7 @@ impl Job<'_> {
         Ok((row, file))
     }
 
-    /// The passes of a minimal program, beside the row of the largest usual variance map that was timed.
+    /// The passes of the scene stripped bare, beside the row of the largest usual variance map that was timed.
     fn bare(&self, studio: &mut Studio, rows: &[Row]) -> Result<Option<Bare>> {
         let usual = |row: &&Row| {
             let own = |shadow: Shadow| Shadow { size: shadow.size, ..Shadow::default() } == shadow;
@@ -284,16 +284,17 @@ impl Job<'_> {
         else {
             return Ok(None);
         };
-        let scene = meter::relit(&self.stage.scene, Look { shadow: Some(shadow), ..self.stage.scene.look })?;
+        let scene = bare::stripped(&self.stage.scene, shadow.size)?;
         let mut set = studio.set(&scene)?;
         studio.pose(&mut set, &self.stage.state(STILL))?;
-        // Leaves the context current, and every program compiled.
-        studio.draw(&set, self.camera, self.request.size)?;
-        let (shot, software) = (set.shot(self.camera, self.request.size), studio.renderer.info().software);
-        let sitter = bare::Sitter { scene: &scene, surface: set.surface()?, shot: &shot, software };
-        let times = bare::time(&sitter, [shadow.size, row.samples], self.request.replays);
+        let passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
         studio.strike(set);
-        let [depth, visibility] = times?;
+        let timing = |name: &str| passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
+        let Some((depth, visibility)) = timing("shadow").zip(timing("visibility")) else { return Ok(None) };
+        if !bare::is_bare(studio.renderer.ran()) {
+            tracing::warn!(load = self.stage.name, "the stripped scene was not one draw a pass: no bare passes");
+            return Ok(None);
+        }
         Ok(Some(Bare {
             load: self.stage.name.clone(),
             triangles: scene.layout.triangles,

@@ -9,7 +9,7 @@
 //!   every sample; the shadow by one ray a sample to the sun, or by rays over the blur's own footprint.
 //! - `studio`, `meter`: frames of the renderer, and the light in them.
 //! - [`metrics`]: errors, light bleeding, flicker.
-//! - `bare`: the passes of a minimal program, timed in the same run; `blurs`: moments and blur in compute and in fragments.
+//! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur in compute and in fragments.
 //! - [`packing`]: images in one array as equation 3.13 packs them, against arrays by size.
 //! - [`plants`]: the plants of table 4.5 with rendering.
 //! - [`timed`]: frame times of a scene of the user, for programs that draw the same.
@@ -110,7 +110,7 @@ pub struct Report {
     pub bounds: variants::Bounds,
     pub loads: Vec<Entry>,
     pub rows: Vec<Row>,
-    /// What a minimal program's passes take on each load.
+    /// What the bare passes take on each load.
     pub bare: Vec<Bare>,
     /// What the passes that make the same map of moments take, in compute and in fragments.
     pub blurs: Vec<Blurs>,
