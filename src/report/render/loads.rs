@@ -5,6 +5,7 @@
 //! | `square` | a square that floats over the ground: umbra and penumbra are known |
 //! | `shelf` | the narrow shadow of a square just above the ground, from nearby and far from the middle of all depths |
 //! | `panes` | three translucent panes before each other and a solid one behind, listed in the wrong order |
+//! | `images` | panels with images of many sizes, each repeated |
 //! | `tree` | the built-in tree |
 //! | `grove` | four of them |
 //! | `triangles-N` | a rolling field of about N triangles with poles on it |
@@ -14,6 +15,7 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
+use super::images;
 use super::studio::Size;
 use crate::domain::{AlphaMode, Domain, Material, Mesh, Metadata, Modes, Shape, Transform, smooth_normals};
 use crate::error::{Result, invalid};
@@ -28,6 +30,7 @@ pub enum Kind {
     Square,
     Shelf,
     Panes,
+    Images,
     Tree,
     Grove,
     /// About so many.
@@ -58,7 +61,7 @@ impl Kind {
     /// Every load, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
         let field = Self::Triangles(if quick { FIELD.1 } else { FIELD.0 });
-        vec![Self::Square, Self::Shelf, Self::Panes, Self::Tree, Self::Grove, field]
+        vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
     /// The load of this name.
@@ -70,6 +73,7 @@ impl Kind {
             "square" => Some(Self::Square),
             "shelf" => Some(Self::Shelf),
             "panes" => Some(Self::Panes),
+            "images" => Some(Self::Images),
             "tree" => Some(Self::Tree),
             "grove" => Some(Self::Grove),
             _ => {
@@ -77,7 +81,7 @@ impl Kind {
                 count.filter(|count| (2..=MOST).contains(count)).map(Self::Triangles)
             }
         };
-        let expected = format!("square, shelf, panes, tree, grove, or triangles-N (2 to {MOST})");
+        let expected = format!("square, shelf, panes, images, tree, grove, or triangles-N (2 to {MOST})");
         found.ok_or_else(|| invalid("load", expected, name))
     }
 
@@ -87,6 +91,7 @@ impl Kind {
             Self::Square => "square".into(),
             Self::Shelf => "shelf".into(),
             Self::Panes => "panes".into(),
+            Self::Images => "images".into(),
             Self::Tree => "tree".into(),
             Self::Grove => "grove".into(),
             Self::Triangles(count) => format!("triangles-{count}"),
@@ -102,6 +107,7 @@ impl Kind {
             Self::Square => (Scene::new(square()?)?, Some(1)),
             Self::Shelf => (Scene::new(shelf()?)?, None),
             Self::Panes => (Scene::new(panes()?)?, Some(1)),
+            Self::Images => (Scene::new(images::panels()?)?, Some(0)),
             Self::Tree => (load::open("tree")?, None),
             Self::Grove => (Scene::new(grove(load::open("tree")?.as_ref()))?, None),
             Self::Triangles(count) => (Scene::new(field(count)?)?, Some(1)),
@@ -119,8 +125,14 @@ impl Stage {
 
     /// What its pictures are seen through: all of the scene, but of the shelf the shadow alone.
     pub(super) fn camera(&self, size: Size) -> Camera {
-        if self.kind != Kind::Shelf {
-            return Camera::framing(&self.scene, size.width, size.height);
+        match self.kind {
+            Kind::Shelf => {}
+            // The panels fill the picture, and the floor goes out of it.
+            Kind::Images => {
+                let view = View::LookAt { eye: [0.5, 1.5, 4.6], target: [0.0, 1.05, 0.0], up: [0.0, 1.0, 0.0] };
+                return Camera { view, lens: Lens::FieldOfView(34.0), near: 0.0, far: 0.0 };
+            }
+            _ => return Camera::framing(&self.scene, size.width, size.height),
         }
         let eye = |height: f64| [f64::from(SHELF_EDGE) - 0.06, height, 0.0];
         let view = View::LookAt { eye: eye(2.0), target: eye(0.0), up: [0.0, 0.0, -1.0] };
@@ -144,6 +156,18 @@ impl Stage {
         state.touch();
         state
     }
+}
+
+/// A scene as a light wind holds it.
+pub(super) fn swaying(scene: &Arc<Scene>) -> State {
+    let load =
+        Load { name: scene.name.clone(), scene: Arc::clone(scene), paired: false, species: None, remarks: vec![] };
+    let mut state = State::rest(scene);
+    for (own, swing) in state.q.iter_mut().zip(Motion::new(&load, None).step(10).q) {
+        *own += (SWAY * swing) as f32;
+    }
+    state.touch();
+    state
 }
 
 /// Adds a rigid domain with a shape and a material of its own.

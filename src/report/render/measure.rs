@@ -6,8 +6,11 @@ use std::time::Instant;
 use nalgebra::Vector3;
 use serde::Serialize;
 
+use super::bare::{self, Bare};
 use super::loads::{Kind, Stage};
 use super::metrics::{self, Flicker, Light, Spread};
+use super::packing::{Packing, packed};
+use super::patience::{PATIENCE, Patience};
 use super::picture::{Detail, Picture, Term, trace};
 use super::pictures::{self, File};
 use super::soup::Soup;
@@ -33,6 +36,8 @@ pub struct Row {
     pub name: String,
     pub method: Method,
     pub shadow: Option<Shadow>,
+    /// How images lie in arrays, where that is what is compared.
+    pub packing: Option<Packing>,
     /// What it must keep against what it means to show, and whether it does.
     pub bounds: Bounds,
     pub passed: bool,
@@ -47,13 +52,17 @@ pub struct Row {
     /// The light that arrives, against the hard rays and against what the variant means to show.
     pub light: Light,
     pub light_of_aim: Light,
-    /// None when the variant did not pass.
+    /// None when the variant did not pass, or when it was left out.
     pub flicker: Option<Spread>,
+    /// Why a variant that passed has no flicker.
+    pub no_flicker: Option<String>,
     /// "frame" is all but reading back; none when the variant did not pass.
     pub passes: Vec<Pass>,
     /// Device memory of the scene, and of it what the shadow takes.
     pub bytes: u64,
     pub shadow_bytes: u64,
+    /// And what its images take, with all levels.
+    pub image_bytes: u64,
     pub samples: u32,
     pub draws: usize,
 }
@@ -86,8 +95,19 @@ struct Job<'a> {
     references: References,
     /// The light meter of the still picture without shadows.
     bright: Image,
-    /// References of the moving scene, unshadowed and hard.
-    moving: Vec<[Picture; 2]>,
+    moving: Moving,
+}
+
+/// References of the moving scene, unshadowed and hard; or why there are none.
+type Moving = std::result::Result<Vec<[Picture; 2]>, String>;
+
+/// All that came of one load.
+pub(super) struct Measured {
+    pub(super) entry: Entry,
+    pub(super) rows: Vec<Row>,
+    /// None when no row is there to be held against it.
+    pub(super) bare: Option<Bare>,
+    pub(super) files: Vec<File>,
 }
 
 /// Measures every variant that is wanted on one load.
@@ -96,7 +116,7 @@ pub(super) fn load(
     request: &Request,
     kind: Kind,
     progress: &mut dyn FnMut(&str),
-) -> Result<(Entry, Vec<Row>, Vec<File>)> {
+) -> Result<Measured> {
     let stage = kind.stage()?;
     let camera = stage.camera(request.size);
     let wanted = |variant: &Variant| variant.suits(kind) && request.wants(&variant.name);
@@ -119,7 +139,9 @@ pub(super) fn load(
         rows.push(row);
         files.push(file);
     }
-    Ok((job.entry(reference_ms), rows, files))
+    progress(&format!("{}: bare passes", job.stage.name));
+    let bare = job.bare(studio, &rows)?;
+    Ok(Measured { entry: job.entry(reference_ms), rows, bare, files })
 }
 
 fn detail(request: &Request) -> Detail {
@@ -163,22 +185,31 @@ fn small(size: Size) -> Size {
 }
 
 /// The references of every step, with a quarter of the samples of a still one.
-fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Vec<[Picture; 2]>> {
+fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Moving> {
     let size = small(request.size);
     let camera = stage.camera(size);
     let mut set = studio.set(&stage.scene)?;
-    let mut all = Vec::new();
+    let (mut all, mut soup, mut too_long) = (Vec::new(), None::<Soup>, None);
+    let mut patience = Patience::new(PATIENCE, STEPS);
     for step in 0..STEPS {
         studio.pose(&mut set, &stage.state(step))?;
         let view = View::new(set.scene(), &set.shot(camera, size));
-        let soup = Soup::new(&stage.scene, set.surface()?);
+        let own = match soup.take() {
+            Some(soup) => soup.moved(&stage.scene, set.surface()?),
+            None => Soup::new(&stage.scene, set.surface()?),
+        };
         let detail = Detail { taps: 1, ..Detail::QUICK };
-        if let Ok(pair) = trace(&soup, &view, &[Term::Unshadowed, Term::Hard], detail).try_into() {
+        if let Ok(pair) = trace(&own, &view, &[Term::Unshadowed, Term::Hard], detail).try_into() {
             all.push(pair);
+        }
+        soup = Some(own);
+        too_long = patience.tick("references");
+        if too_long.is_some() {
+            break;
         }
     }
     studio.strike(set);
-    Ok(all)
+    Ok(too_long.map_or(Ok(all), Err))
 }
 
 /// The still picture of a scene.
@@ -201,7 +232,8 @@ impl Job<'_> {
             samples: detail.side * detail.side,
             taps: detail.taps,
             reference_ms,
-            steps: self.moving.len(),
+            steps: self.moving.as_ref().map_or(0, Vec::len),
+            no_flicker: self.moving.as_ref().err().cloned(),
             steps_size: small(self.request.size),
         }
     }
@@ -209,7 +241,10 @@ impl Job<'_> {
     /// One variant: its still picture and its light against the references, then its times and its flicker if it passed.
     fn measure(&self, studio: &mut Studio, at: usize) -> Result<(Row, File)> {
         let (variant, aim) = (&self.variants[at], &self.references.aims[at]);
-        let scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+        let mut scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+        if let Some(packing) = variant.packing {
+            scene = packed(&scene, packing)?;
+        }
         let dark = frame(studio, &meter::meter(&scene)?, &self.stage, self.request)?;
         let lit = meter::read(&dark.rgba, &self.bright.rgba);
         let mut set = studio.set(&scene)?;
@@ -220,15 +255,57 @@ impl Job<'_> {
         (row.samples, row.draws) = (ran.samples, ran.draws);
         let plan = set.buffers.plan();
         row.bytes = plan.bytes();
-        let shadow = plan.textures.iter().filter(|texture| texture.name.starts_with("shadow"));
-        row.shadow_bytes = shadow.map(|texture| texture.bytes).sum();
+        let of = |begins: &[&str]| -> u64 {
+            let own = plan.textures.iter().filter(|texture| begins.iter().any(|begin| texture.name.starts_with(begin)));
+            own.map(|texture| texture.bytes).sum()
+        };
+        (row.shadow_bytes, row.image_bytes) = (of(&["shadow"]), of(&["colour", "normal"]));
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
-            row.flicker = Some(self.flicker(studio, &mut set, variant)?);
+            match self.flicker(studio, &mut set, variant)? {
+                Ok(flicker) => row.flicker = Some(flicker),
+                Err(why) => row.no_flicker = Some(why),
+            }
         }
         studio.strike(set);
         let file = pictures::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colours))?;
         Ok((row, file))
+    }
+
+    /// The passes of the scene stripped bare, beside the row of the largest usual variance map that was timed.
+    fn bare(&self, studio: &mut Studio, rows: &[Row]) -> Result<Option<Bare>> {
+        let usual = |row: &&Row| {
+            let own = |shadow: Shadow| Shadow { size: shadow.size, ..Shadow::default() } == shadow;
+            row.shadow.is_some_and(own) && row.median_us().is_some()
+        };
+        let largest = rows.iter().filter(usual).max_by_key(|row| row.shadow.map(|shadow| shadow.size));
+        let Some(((row, shadow), frame_us)) =
+            largest.and_then(|row| row.shadow.map(|own| (row, own)).zip(row.median_us()))
+        else {
+            return Ok(None);
+        };
+        let scene = bare::stripped(&self.stage.scene, shadow.size)?;
+        let mut set = studio.set(&scene)?;
+        studio.pose(&mut set, &self.stage.state(STILL))?;
+        let passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
+        studio.strike(set);
+        let timing = |name: &str| passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
+        let Some((depth, visibility)) = timing("shadow").zip(timing("visibility")) else { return Ok(None) };
+        if !bare::is_bare(studio.renderer.ran()) {
+            tracing::warn!(load = self.stage.name, "the stripped scene was not one draw a pass: no bare passes");
+            return Ok(None);
+        }
+        Ok(Some(Bare {
+            load: self.stage.name.clone(),
+            triangles: scene.layout.triangles,
+            map: shadow.size,
+            samples: row.samples,
+            depth,
+            visibility,
+            variant: row.name.clone(),
+            frame_us,
+            beyond_us: frame_us - depth.median_us - visibility.median_us,
+        }))
     }
 
     fn compared(&self, variant: &Variant, (image, lit): (&Image, &[Option<f32>]), aim: &Picture) -> Row {
@@ -242,6 +319,7 @@ impl Job<'_> {
             name: variant.name.clone(),
             method: variant.method,
             shadow: variant.shadow,
+            packing: variant.packing,
             bounds,
             passed: faults.is_empty(),
             to_fail: variant.is_to_fail(self.stage.kind),
@@ -251,25 +329,41 @@ impl Job<'_> {
             light: metrics::light(lit, &hard.light),
             light_of_aim,
             flicker: None,
+            no_flicker: None,
             passes: Vec::new(),
             bytes: 0,
             shadow_bytes: 0,
+            image_bytes: 0,
             samples: 0,
             draws: 0,
         }
     }
 
-    fn flicker(&self, studio: &mut Studio, set: &mut Set, variant: &Variant) -> Result<Spread> {
+    /// The flicker of a variant, or why there is none.
+    fn flicker(
+        &self,
+        studio: &mut Studio,
+        set: &mut Set,
+        variant: &Variant,
+    ) -> Result<std::result::Result<Spread, String>> {
+        let moving = match &self.moving {
+            Ok(moving) => moving,
+            Err(why) => return Ok(Err(why.clone())),
+        };
         let size = small(self.request.size);
         let camera = self.stage.camera(size);
         let mut flicker = Flicker::default();
-        for (step, [unshadowed, hard]) in self.moving.iter().enumerate() {
+        let mut patience = Patience::new(PATIENCE, STEPS);
+        for (step, [unshadowed, hard]) in moving.iter().enumerate() {
             studio.pose(set, &self.stage.state(step))?;
             let image = studio.draw(set, camera, size)?;
             let reference = if variant.aim == Aim::Unshadowed { unshadowed } else { hard };
             flicker.push(&image.rgba, &reference.colours);
+            if let Some(why) = patience.tick("frames") {
+                return Ok(Err(why));
+            }
         }
-        Ok(flicker.spread())
+        Ok(Ok(flicker.spread()))
     }
 
     fn file_name(&self, what: &str) -> String {

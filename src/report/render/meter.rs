@@ -50,7 +50,7 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-fn parts(scene: &Scene) -> Parts {
+pub(super) fn parts(scene: &Scene) -> Parts {
     Parts {
         name: scene.name.clone(),
         shapes: scene.shapes.clone(),

@@ -10,17 +10,30 @@
 //! - `studio`, `meter`: frames of the renderer, and the light in them.
 //! - `readback`: frames a second when each is read.
 //! - [`metrics`]: errors, light bleeding, flicker.
+//! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur in compute and in fragments.
+//! - [`packing`]: images in one array as equation 3.13 packs them, against arrays by size.
+//! - [`plants`]: the plants of table 4.5 with rendering.
+//! - [`timed`]: frame times of a scene of the user, for programs that draw the same.
+//! - [`figures`]: pictures to be looked at, after those of the thesis.
 
+mod bare;
+mod beside;
+mod blurs;
+pub mod figures;
+mod images;
 pub mod loads;
 mod measure;
 mod meter;
 pub mod metrics;
 mod output;
+pub mod packing;
 mod page;
 mod paint;
+mod patience;
 mod pattern;
 mod picture;
 mod pictures;
+pub mod plants;
 mod plot;
 mod readback;
 mod shade;
@@ -29,14 +42,18 @@ mod studio;
 #[cfg(test)]
 mod tests;
 mod texels;
+pub mod timed;
 pub mod variants;
 mod view;
 
 use serde::Serialize;
 
+pub use self::bare::Bare;
+pub use self::blurs::Blurs;
 use self::loads::Kind;
 pub use self::measure::Row;
 pub use self::pictures::File;
+use self::plants::Plant;
 pub use self::readback::Readback;
 use self::studio::Studio;
 pub use self::studio::{Pass, Size};
@@ -49,6 +66,8 @@ use crate::render::Info;
 #[derive(Debug, Clone)]
 pub struct Request {
     pub loads: Vec<Kind>,
+    /// Plants of table 4.5 to deform and draw, counted from 0.
+    pub plants: Vec<usize>,
     /// Which variants, by name or by its beginning and a `*`; empty: all.
     pub variants: Vec<String>,
     pub size: Size,
@@ -80,6 +99,8 @@ pub struct Entry {
     /// Steps over which flicker was looked at, and the size of their pictures.
     pub steps: usize,
     pub steps_size: Size,
+    /// Why flicker was not looked at.
+    pub no_flicker: Option<String>,
 }
 
 /// A whole report.
@@ -94,6 +115,12 @@ pub struct Report {
     pub rows: Vec<Row>,
     /// One a load.
     pub readback: Vec<Readback>,
+    /// What the bare passes take on each load.
+    pub bare: Vec<Bare>,
+    /// What the passes that make the same map of moments take, in compute and in fragments.
+    pub blurs: Vec<Blurs>,
+    /// Plants of table 4.5, deformed and drawn.
+    pub plants: Vec<Plant>,
     /// Variants that did not pass though they should, or passed though they should not, as load: variant: why.
     pub failed: Vec<String>,
     /// Pictures to be looked at.
@@ -107,19 +134,29 @@ pub struct Report {
 /// `Unavailable` without OpenGL; those of loading and drawing a scene.
 pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Report> {
     let mut studio = Studio::open()?;
-    let (mut loads, mut rows, mut pictures, mut readback) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut loads, mut rows, mut bare, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let mut readback = Vec::new();
     for kind in &request.loads {
         progress(&format!("{}: building", kind.name()));
-        let (entry, measured, files) = measure::load(&mut studio, request, *kind, &mut progress)?;
-        loads.push(entry);
-        rows.extend(measured);
-        pictures.extend(files);
+        let measured = measure::load(&mut studio, request, *kind, &mut progress)?;
+        loads.push(measured.entry);
+        rows.extend(measured.rows);
+        bare.extend(measured.bare);
+        pictures.extend(measured.files);
         progress(&format!("{}: reading back", kind.name()));
         readback.push(readback::measure(&mut studio, request, *kind)?);
     }
+    let device = if request.plants.is_empty() { None } else { plants::device() };
+    let mut plants = Vec::new();
+    for index in &request.plants {
+        progress(&format!("plant-{}", index + 1));
+        plants.push(plants::measure(&mut studio, device.as_ref(), request, *index)?);
+    }
     let failed = rows.iter().filter(|row: &&Row| !row.as_stated()).map(why).collect();
     let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::BOUNDS);
-    Ok(Report { made, renderer, size: request.size, bounds, loads, rows, readback, failed, pictures })
+    let blurs = Blurs::of(&rows);
+    let size = request.size;
+    Ok(Report { made, renderer, size, bounds, loads, rows, readback, bare, blurs, plants, failed, pictures })
 }
 
 fn why(row: &Row) -> String {

@@ -4,12 +4,14 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use super::plants::Plant;
 use super::{Report, Row, page, plot};
 use crate::error::{Result, during};
 use crate::report::plot::png;
+use crate::report::timing::Timing;
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
-const COLUMNS: [(&str, &str); 48] = [
+const COLUMNS: [(&str, &str); 50] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -34,6 +36,7 @@ const COLUMNS: [(&str, &str); 48] = [
     ("read_us", "read"),
     ("bytes", "/bytes"),
     ("shadow_bytes", "/shadow_bytes"),
+    ("image_bytes", "/image_bytes"),
     ("samples", "/samples"),
     ("draws", "/draws"),
     ("colour_mean", "/colour/mean"),
@@ -57,12 +60,13 @@ const COLUMNS: [(&str, &str); 48] = [
     ("lost", "/light_of_aim/lost"),
     ("flicker_mean", "/flicker/mean"),
     ("flicker_p99", "/flicker/p99"),
+    ("no_flicker", "/no_flicker"),
     ("faults", ""),
 ];
 
 impl Report {
-    /// Writes `report.json`, `report.csv`, `report.md`, `report.svg`, `report.png` and `pictures/` into a folder, which is
-    /// made.
+    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes, and blurs both ways), `plants.csv`, `report.md`,
+    /// `report.svg`, `report.png` and `pictures/` into a folder, which is made.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -73,6 +77,8 @@ impl Report {
         let files = [
             ("report.json", serde_json::to_vec_pretty(self).map_err(during("report"))?),
             ("report.csv", csv(&self.rows)?),
+            ("passes.csv", passes_csv(self)?),
+            ("plants.csv", plants_csv(&self.plants)?),
             ("report.md", page::markdown(self).into_bytes()),
             ("report.png", png(&svg)?),
             ("report.svg", svg.into_bytes()),
@@ -88,11 +94,70 @@ impl Report {
 }
 
 fn csv(rows: &[Row]) -> Result<Vec<u8>> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(COLUMNS.map(|(name, _)| name)).map_err(during("report"))?;
+    let mut lines = Vec::new();
     for row in rows {
         let value = serde_json::to_value(row).map_err(during("report"))?;
-        writer.write_record(COLUMNS.map(|column| cell(row, &value, column))).map_err(during("report"))?;
+        lines.push(COLUMNS.map(|column| cell(row, &value, column)));
+    }
+    table(COLUMNS.map(|(name, _)| name.to_owned()), lines)
+}
+
+/// Bare passes and blurs: a line each, with the row that they stand beside.
+fn passes_csv(report: &Report) -> Result<Vec<u8>> {
+    let head =
+        ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
+    let mut lines = Vec::new();
+    for bare in &report.bare {
+        let passes =
+            [("bare depth pass", bare.map, bare.depth), ("bare visibility pass", bare.samples, bare.visibility)];
+        for (what, number, timing) in passes {
+            let [size, many] = if what == "bare depth pass" {
+                [number.to_string(), "1".into()]
+            } else {
+                [format!("{}x{}", report.size.width, report.size.height), number.to_string()]
+            };
+            let [median, frame, beyond] = [timing.median_us, bare.frame_us, bare.beyond_us].map(|us| us.to_string());
+            lines.push([&bare.load, what, &size, &many, &median, &bare.variant, &frame, &beyond, ""].map(String::from));
+        }
+    }
+    for blurs in &report.blurs {
+        let [size, taps] = [blurs.size, blurs.taps].map(|number| number.to_string());
+        let [own, other, ratio] = [blurs.compute_us, blurs.fragments_us, blurs.ratio].map(|number| number.to_string());
+        let what = "moments and blur in compute";
+        lines.push([&blurs.load, what, &size, &taps, &own, "in fragments", &other, "", &ratio].map(String::from));
+    }
+    table(head.map(String::from), lines)
+}
+
+/// Ours and the thesis's, a plant a line.
+fn plants_csv(plants: &[Plant]) -> Result<Vec<u8>> {
+    let head =
+        ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
+    let head = head.into_iter().chain(["render_ms", "t_vbr_ms", "frame_ms", "fps", "memory_mb", "o_vbr"]);
+    let head = head.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
+    let line = |plant: &Plant| {
+        let ms = |timing: Timing| (timing.median_us / 1e3).to_string();
+        let printed = plant.thesis.drawn;
+        let (backend, shared, full) = (plant.backend.name(), plant.shared, plant.full);
+        let own = [plant.load.clone(), plant.thesis.name.into(), full.to_string(), backend.into(), shared.to_string()];
+        let sizes = [plant.triangles, plant.domains, plant.map as usize].map(|number| number.to_string());
+        let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(ms);
+        let rest = [plant.fps, plant.bytes as f64 / 1e6, plant.occupation];
+        let thesis = [printed.gpu_vbr_ms, printed.gpu_fps, printed.gpu_mb, printed.gpu_vbr_occupation];
+        let numbers = rest.iter().chain(&thesis).map(|number| number.to_string());
+        own.into_iter().chain(sizes).chain(times).chain(numbers).collect::<Vec<String>>()
+    };
+    table(head.map(String::from), plants.iter().map(line))
+}
+
+fn table<L: IntoIterator<Item = String>>(
+    head: impl IntoIterator<Item = String>,
+    lines: impl IntoIterator<Item = L>,
+) -> Result<Vec<u8>> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    writer.write_record(head).map_err(during("report"))?;
+    for line in lines {
+        writer.write_record(line).map_err(during("report"))?;
     }
     writer.into_inner().map_err(during("report"))
 }

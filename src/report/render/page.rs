@@ -1,6 +1,6 @@
 //! `report.md`: the report as tables for people.
 
-use super::{Entry, Report, Row};
+use super::{Entry, Report, Row, beside};
 use crate::report::peers::{dash, line, rule};
 
 /// The whole page.
@@ -27,7 +27,7 @@ pub(super) fn markdown(report: &Report) -> String {
         text.push_str(&section(load, report.rows.iter().filter(|row| row.load == load.name)));
     }
     text.push_str(&super::readback::section(&report.readback));
-    text
+    text + &beside::markdown(report)
 }
 
 const EXPLAINED: &str = "Colours are compared as a display shows them, of 255, the largest difference of three channels: \
@@ -60,8 +60,11 @@ fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
     let Entry { name, vertices, triangles, domains, samples, taps, reference_ms, steps, .. } = load;
     let mut text = format!(
         "\n## {name}\n\n{vertices} vertices, {triangles} triangles, {domains} domains. References: {samples} samples a \
-         pixel, {taps} rays each over a footprint, {:.1} s; flicker over {steps} steps.\n\n",
-        reference_ms / 1e3
+         pixel, {taps} rays each over a footprint, {:.1} s; {}.\n\n",
+        reference_ms / 1e3,
+        load.no_flicker
+            .as_ref()
+            .map_or_else(|| format!("flicker over {steps} steps"), |why| format!("no flicker: {why}"))
     );
     text.push_str(&line(HEAD.map(String::from)));
     text.push_str(&rule(HEAD.len()));
@@ -90,7 +93,11 @@ fn cells(row: &Row) -> [String; 17] {
         small(row.light_of_aim.all.mean),
         small(row.light_of_aim.penumbra.mean),
         row.light_of_aim.in_umbra.map_or_else(dash, small),
-        row.flicker.map_or_else(dash, |flicker| format!("{:.3}", flicker.mean)),
+        match (row.flicker, &row.no_flicker) {
+            (Some(flicker), _) => format!("{:.3}", flicker.mean),
+            (None, Some(why)) => format!("left out: {why}"),
+            (None, None) => dash(),
+        },
         match (row.passed, row.to_fail) {
             (true, _) => "yes".into(),
             (false, true) => format!("no, as stated: {}", row.faults.join("; ")),

@@ -35,6 +35,27 @@ pub(super) fn strip(name: &str, size: Size, (rendered, reference): (&[u8], &[[f3
     encode(name, (3 * size.width, size.height), rgb)
 }
 
+/// Pixels between the pictures of a sheet.
+const GUTTER: usize = 8;
+
+/// RGBA pictures of one size in rows of `columns` with white between them.
+pub(super) fn sheet(name: &str, size: Size, columns: usize, drawn: &[Vec<u8>]) -> Result<File> {
+    let (width, height) = (size.width as usize, size.height as usize);
+    let along = |count: usize, side: usize| count * side + count.saturating_sub(1) * GUTTER;
+    let [wide, tall] = [along(columns, width), along(drawn.len().div_ceil(columns), height)];
+    let mut rgb = vec![255; 3 * wide * tall];
+    for (index, rgba) in drawn.iter().enumerate() {
+        let (left, top) = (index % columns * (width + GUTTER), index / columns * (height + GUTTER));
+        for (row, pixels) in rgba.chunks_exact(4 * width).enumerate() {
+            let into = &mut rgb[3 * ((top + row) * wide + left)..][..3 * width];
+            for (to, from) in into.chunks_exact_mut(3).zip(pixels.chunks_exact(4)) {
+                to.copy_from_slice(&from[..3]);
+            }
+        }
+    }
+    encode(name, (wide as u32, tall as u32), rgb)
+}
+
 fn byte(level: f32) -> u8 {
     level.round().clamp(0.0, 255.0) as u8
 }
@@ -45,4 +66,21 @@ fn encode(name: &str, (width, height): (u32, u32), rgb: Vec<u8>) -> Result<File>
     let mut png = std::io::Cursor::new(Vec::new());
     image::DynamicImage::from(image).write_to(&mut png, image::ImageFormat::Png).map_err(during("pictures"))?;
     Ok(File { name: format!("{name}.png"), png: png.into_inner() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sheet_has_its_pictures_in_rows_and_white_between_them() {
+        let size = Size { width: 2, height: 1 };
+        let drawn = [10, 20, 30].map(|level| [level, level, level, 255].repeat(2));
+        let file = sheet("three", size, 2, &drawn).expect("made");
+        let image = image::load_from_memory(&file.png).expect("reads").into_rgb8();
+        assert_eq!(image.dimensions(), (2 * 2 + 8, 2 + 8));
+        let at = |x, y| image.get_pixel(x, y).0[0];
+        assert_eq!([at(0, 0), at(10, 0), at(1, 9), at(11, 9)], [10, 20, 30, 255]);
+        assert_eq!([at(5, 0), at(0, 4)], [255, 255]);
+    }
 }

@@ -180,8 +180,14 @@ mod tests {
 
     #[test]
     fn a_load_is_drawn_in_three_ways_and_its_table_has_a_row() {
-        let request =
-            Request { loads: vec![], variants: vec![], size: Size { width: 64, height: 36 }, quick: true, replays: 20 };
+        let request = Request {
+            loads: vec![],
+            plants: vec![],
+            variants: vec![],
+            size: Size { width: 64, height: 36 },
+            quick: true,
+            replays: 20,
+        };
         let mut studio = Studio::open().expect("EGL");
         let row = measure(&mut studio, &request, Kind::Square).expect("measured");
         assert!(row.unread_fps > 0.0 && row.at_once_fps > 0.0 && row.ring_fps > 0.0, "{row:?}");

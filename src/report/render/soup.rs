@@ -20,6 +20,9 @@ use crate::scene::{Bounds, Scene};
 /// What boxes are widened by, of the scene's radius.
 const PADDING: f64 = 2e-6;
 
+/// Triangles that one thread takes at a time.
+const LEAST: usize = 4096;
+
 /// Points `from + t along`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ray {
@@ -119,22 +122,16 @@ impl Soup {
     pub(super) fn new(scene: &Scene, surface: &Surface) -> Self {
         let paints = Paint::all(scene);
         let triangles = triangles(scene, surface);
-        let mut bounds = Bounds::EMPTY;
-        triangles.iter().flat_map(Triangle::points).for_each(|point| bounds.include(point.into()));
-        let (centre, radius) = match triangles.is_empty() {
-            true => (Vector3::zeros(), 1.0),
-            false => (bounds.centre().coords, (0.5 * bounds.diagonal()).max(1e-9)),
-        };
+        let (centre, radius) = ball(&triangles);
         let padded: Vec<Padded<'_>> =
             triangles.iter().map(|triangle| Padded(triangle, &centre, PADDING * radius)).collect();
         let boxes = build_bvh2(&padded, BvhBuildParams::medium_build(), &mut std::time::Duration::default());
         // In the order of the tree, so that a leaf's triangles lie side by side.
         let ordered = boxes.primitive_indices.iter().map(|index| triangles[*index as usize]).collect();
-        let vector = |three: &[f32]| Vector3::new(three[0], three[1], three[2]).cast::<f64>();
         Self {
             triangles: ordered,
-            normals: surface.normals.chunks_exact(3).map(vector).collect(),
-            tangents: surface.tangents.chunks_exact(4).map(|four| [0, 1, 2, 3].map(|at| f64::from(four[at]))).collect(),
+            normals: normals(surface),
+            tangents: tangents(surface),
             uvs: uvs(scene),
             has_blended: triangles.iter().any(|triangle| paints[triangle.paint as usize].kind == Kind::Blend),
             paints,
@@ -142,6 +139,28 @@ impl Soup {
             radius,
             boxes,
         }
+    }
+
+    /// The same scene after another step: the tree keeps its form and its boxes move along, images and texture coordinates
+    /// stay. What rays meet is the same as in a tree built anew; where triangles went far, they only take longer.
+    pub(super) fn moved(self, scene: &Scene, surface: &Surface) -> Self {
+        let triangles = triangles(scene, surface);
+        // One that overflowed is missing now, or one that had is back: another tree.
+        if triangles.len() != self.triangles.len() {
+            return Self::new(scene, surface);
+        }
+        let (centre, radius) = ball(&triangles);
+        let mut boxes = self.boxes;
+        let ordered: Vec<Triangle> =
+            boxes.primitive_indices.par_iter().map(|index| triangles[*index as usize]).collect();
+        boxes.nodes.par_iter_mut().filter(|node| node.is_leaf()).for_each(|leaf| {
+            let own = &ordered[leaf.first_index as usize..][..leaf.prim_count as usize];
+            let each = own.iter().map(|triangle| Padded(triangle, &centre, PADDING * radius).aabb());
+            leaf.set_aabb(each.fold(Aabb::empty(), |whole, own| whole.union(&own)));
+        });
+        boxes.refit_all();
+        let (normals, tangents) = (normals(surface), tangents(surface));
+        Self { triangles: ordered, normals, tangents, centre, radius, boxes, ..self }
     }
 
     /// The ray as the tree sees it, and how far along it begins.
@@ -267,6 +286,29 @@ impl Soup {
     }
 }
 
+/// Middle and radius of a ball around some triangles.
+fn ball(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
+    let held = |mut bounds: Bounds, triangle: &Triangle| {
+        triangle.points().iter().for_each(|point| bounds.include((*point).into()));
+        bounds
+    };
+    let each = triangles.par_iter().with_min_len(LEAST).fold(|| Bounds::EMPTY, held);
+    let bounds = each.reduce(|| Bounds::EMPTY, Bounds::union);
+    match triangles.is_empty() {
+        true => (Vector3::zeros(), 1.0),
+        false => (bounds.centre().coords, (0.5 * bounds.diagonal()).max(1e-9)),
+    }
+}
+
+fn normals(surface: &Surface) -> Vec<Vector3<f64>> {
+    let vector = |three: &[f32]| Vector3::new(three[0], three[1], three[2]).cast::<f64>();
+    surface.normals.par_chunks_exact(3).map(vector).collect()
+}
+
+fn tangents(surface: &Surface) -> Vec<[f64; 4]> {
+    surface.tangents.par_chunks_exact(4).map(|four| [0, 1, 2, 3].map(|at| f64::from(four[at]))).collect()
+}
+
 /// Texture coordinates per corner; (0, 0) where a mesh has none.
 fn uvs(scene: &Scene) -> Vec<[f64; 2]> {
     let mut uvs = Vec::with_capacity(scene.layout.corners);
@@ -284,7 +326,7 @@ fn triangles(scene: &Scene, surface: &Surface) -> Vec<Triangle> {
         let mesh = &scene.shape_of(index).mesh;
         let mirrored = domain.placement.linear().determinant() < 0.0;
         let vertices = &mesh.corners().vertices;
-        mesh.triangles().iter().enumerate().filter_map(move |(at, corners)| {
+        mesh.triangles().par_iter().with_min_len(LEAST).enumerate().filter_map(move |(at, corners)| {
             let run = domain.runs.iter().rev().find(|run| run.first_triangle <= at);
             let material = run.map_or(domain.material, |run| run.material);
             // Which side of a double-sided triangle is seen follows its normals at rest.
@@ -307,7 +349,7 @@ fn triangles(scene: &Scene, surface: &Surface) -> Vec<Triangle> {
             })
         })
     };
-    (0..scene.domains.len()).into_par_iter().flat_map_iter(of_domain).collect()
+    (0..scene.domains.len()).into_par_iter().flat_map(of_domain).collect()
 }
 
 fn disagrees(mesh: &Mesh, [a, b, c]: [u32; 3]) -> bool {

@@ -27,7 +27,7 @@ pub struct Pass {
 }
 
 /// How long a device draws before the stopwatch counts.
-const WARM_UP: Duration = Duration::from_millis(500);
+pub(super) const WARM_UP: Duration = Duration::from_millis(500);
 
 /// Everything that draws.
 pub(super) struct Studio {

@@ -243,6 +243,7 @@ fn a_drawn_scene_is_near_its_reference_and_a_sun_in_another_place_is_noticed() {
 #[test]
 fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
     let request = Request {
+        plants: vec![],
         loads: vec![Kind::Square],
         variants: vec!["none".into(), "variance 512, blur 4".into()],
         size: Size { width: 96, height: 54 },
@@ -278,6 +279,7 @@ fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
 #[test]
 fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farther_in_the_order_of_the_file() {
     let request = Request {
+        plants: vec![],
         loads: vec![Kind::Panes, Kind::Square],
         variants: vec!["exact transparency".into(), "two-pass transparency".into()],
         size: Size { width: 96, height: 54 },
@@ -289,4 +291,21 @@ fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farthe
     let [near, far] = [exact, passes].map(|row| row.colour_of_aim.mean);
     assert!(near < 1.0 && far > 3.0 * near, "{near} and {far} levels");
     assert!(report.passed(), "{:?}", report.failed);
+}
+
+#[test]
+fn a_tree_of_boxes_that_moves_along_meets_what_one_built_anew_does() {
+    let stage = Kind::Triangles(2_000).stage().expect("built");
+    let at = |step: usize| {
+        let mut deformer = ReferenceDeformer::new(&stage.scene);
+        let bounds = deformer.deform(&stage.state(step)).expect("deforms").bounds;
+        (deformer.surface().expect("there").clone(), bounds)
+    };
+    let ((first, _), (later, bounds)) = (at(0), at(30));
+    let size = Size { width: 48, height: 32 };
+    let view = View::new(&stage.scene, &Shot { camera: stage.camera(size), width: 48, height: 32, bounds });
+    let traced = |soup: &Soup| trace(soup, &view, &[Term::Hard], Detail::QUICK);
+    let anew = traced(&Soup::new(&stage.scene, &later));
+    assert_eq!(traced(&Soup::new(&stage.scene, &first).moved(&stage.scene, &later)), anew);
+    assert_ne!(traced(&Soup::new(&stage.scene, &first)), anew, "control: the step before");
 }

@@ -5,6 +5,7 @@
 use serde::Serialize;
 
 use super::loads::Kind;
+use super::packing::Packing;
 use crate::scene::{Blurring, Look, Moments, Shadow, ShadowMethod, Transparency};
 
 /// How shadows are made.
@@ -53,6 +54,8 @@ pub struct Variant {
     pub shadow: Option<Shadow>,
     /// How blended triangles are drawn, where that is what is compared; else as the look of the load says.
     pub transparency: Option<Transparency>,
+    /// How images lie in arrays, where that is what is compared.
+    pub packing: Option<Packing>,
     pub aim: Aim,
 }
 
@@ -78,7 +81,7 @@ impl Variant {
 
     /// Whether a load has what it is about.
     pub fn suits(&self, load: Kind) -> bool {
-        self.transparency.is_none() || load == Kind::Panes
+        self.packing.is_some() == (load == Kind::Images) && (self.transparency.is_none() || load == Kind::Panes)
     }
 
     /// What it must keep on a load.
@@ -98,7 +101,14 @@ impl Variant {
     }
 
     fn unshadowed() -> Self {
-        Self { name: "none".into(), method: Method::None, shadow: None, transparency: None, aim: Aim::Unshadowed }
+        Self {
+            name: "none".into(),
+            method: Method::None,
+            shadow: None,
+            transparency: None,
+            packing: None,
+            aim: Aim::Unshadowed,
+        }
     }
 
     /// One map, hard: it means to show the hard shadow, whatever its texels.
@@ -109,6 +119,7 @@ impl Variant {
             method: Method::Standard,
             shadow: Some(shadow),
             transparency: None,
+            packing: None,
             aim: Aim::Hard,
         }
     }
@@ -137,16 +148,16 @@ impl Variant {
     }
 
     /// The same picture, blurred by other passes: a baseline of time.
-    fn blurred(size: u32, (name, blurring): (&str, Blurring)) -> Self {
-        let shadow = Shadow { size, blur: 4.0, blurring, ..Shadow::default() };
-        Self::soft(format!("variance {size}, blur 4, {name}"), Method::Variance, shadow)
+    fn blurred((size, blur): (u32, f32), (name, blurring): (&str, Blurring)) -> Self {
+        let shadow = Shadow { size, blur, blurring, ..Shadow::default() };
+        Self::soft(format!("variance {size}, blur {blur}, {name}"), Method::Variance, shadow)
     }
 
     /// Maps split by distance: the nearer the sharper, so that all of them mean to show the hard shadow.
     fn split(size: u32, splits: u32) -> Self {
         let shadow = Shadow { size, splits, ..Shadow::default() };
         let name = format!("variance {size}, {splits} splits");
-        Self { name, method: Method::Variance, shadow: Some(shadow), transparency: None, aim: Aim::Hard }
+        Self { name, method: Method::Variance, shadow: Some(shadow), transparency: None, packing: None, aim: Aim::Hard }
     }
 
     /// Panes as this method blends them, without shadows.
@@ -154,9 +165,14 @@ impl Variant {
         Self { name: name.into(), transparency: Some(transparency), ..Self::unshadowed() }
     }
 
+    /// Images packed so, without shadows.
+    fn packed(name: &str, packing: Packing) -> Self {
+        Self { name: name.into(), packing: Some(packing), ..Self::unshadowed() }
+    }
+
     fn soft(name: String, method: Method, shadow: Shadow) -> Self {
         let aim = Aim::Filtered { texels: shadow.deviation() };
-        Self { name, method, shadow: Some(shadow), transparency: None, aim }
+        Self { name, method, shadow: Some(shadow), transparency: None, packing: None, aim }
     }
 }
 
@@ -175,16 +191,26 @@ pub fn all(quick: bool) -> Vec<Variant> {
     all.extend(BLURS[1..].iter().map(|blur| Variant::uncut(1024, *blur)));
     all.extend((2..=4).map(|splits| Variant::split(1024, splits)));
     let passes = [("tiles", Blurring::Tiles), ("rows", Blurring::Rows), ("fragments", Blurring::Fragments)];
-    for size in [1024, 4096] {
-        all.extend(passes.map(|pass| Variant::blurred(size, pass)));
+    // 25 depths in each direction, and 15.
+    for map in [(1024, 4.0), (4096, 4.0), (4096, 2.3)] {
+        all.extend(passes.map(|pass| Variant::blurred(map, pass)));
     }
     all.push(Variant::blended("exact transparency", Transparency::Exact));
     all.push(Variant::blended("two-pass transparency", Transparency::TwoPass));
+    all.extend(packings());
     all
 }
 
+fn packings() -> [Variant; 3] {
+    [
+        Variant::packed("images by size", Packing::Classes),
+        Variant::packed("images repeat-filled", Packing::Repeated),
+        Variant::packed("images repeat-filled, whole", Packing::RepeatedWhole),
+    ]
+}
+
 fn few() -> Vec<Variant> {
-    vec![
+    let mut few = vec![
         Variant::unshadowed(),
         Variant::variance(512, BLURS[1]),
         Variant::variance(512, BLURS[2]),
@@ -195,7 +221,9 @@ fn few() -> Vec<Variant> {
         Variant::split(1024, 3),
         Variant::blended("exact transparency", Transparency::Exact),
         Variant::blended("two-pass transparency", Transparency::TwoPass),
-    ]
+    ];
+    few.extend(packings());
+    few
 }
 
 #[cfg(test)]
@@ -207,12 +235,14 @@ mod tests {
         for quick in [false, true] {
             let all = all(quick);
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
-            assert_eq!((names.len(), all.len()), if quick { (10, 10) } else { (40, 40) });
+            assert_eq!((names.len(), all.len()), if quick { (13, 13) } else { (46, 46) });
             for variant in &all {
                 let look = variant.look(Look::default());
                 let transparency = variant.transparency.unwrap_or_default();
                 assert_eq!(Look { shadow: None, ..look }, Look { shadow: None, transparency, ..Look::default() });
-                assert!(variant.suits(Kind::Panes) && variant.suits(Kind::Tree) == variant.transparency.is_none());
+                let (blends, packs) = (variant.transparency.is_some(), variant.packing.is_some());
+                let suits = [Kind::Panes, Kind::Tree, Kind::Images].map(|load| variant.suits(load));
+                assert_eq!(suits, [!packs, !packs && !blends, packs], "{}", variant.name);
                 assert_eq!(look.shadow.is_none(), variant.aim == Aim::Unshadowed);
             }
         }
