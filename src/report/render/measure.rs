@@ -16,7 +16,7 @@ use super::variants::{self, Aim, Bounds, Method, Variant};
 use super::view::View;
 use super::{Entry, Request, meter};
 use crate::error::Result;
-use crate::render::{Image, shadow_texel};
+use crate::render::{Culled, Image, shadow_texel};
 use crate::scene::{Camera, Look, Scene, Shadow};
 
 /// The step of the motion that still pictures show.
@@ -56,6 +56,8 @@ pub struct Row {
     pub shadow_bytes: u64,
     pub samples: u32,
     pub draws: usize,
+    /// What was left out of the last frame that was timed, where triangles are culled.
+    pub culled: Option<Culled>,
 }
 
 impl Row {
@@ -224,6 +226,7 @@ impl Job<'_> {
         row.shadow_bytes = shadow.map(|texture| texture.bytes).sum();
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
+            row.culled = studio.renderer.ran().culled;
             row.flicker = Some(self.flicker(studio, &mut set, variant)?);
         }
         studio.strike(set);
@@ -256,6 +259,7 @@ impl Job<'_> {
             shadow_bytes: 0,
             samples: 0,
             draws: 0,
+            culled: None,
         }
     }
 

@@ -5,7 +5,7 @@
 use serde::Serialize;
 
 use super::loads::Kind;
-use crate::scene::{Blurring, Look, Moments, Shadow, ShadowMethod, Transparency};
+use crate::scene::{Blurring, Culling, Look, Moments, Shadow, ShadowMethod, Transparency};
 
 /// How shadows are made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -53,6 +53,8 @@ pub struct Variant {
     pub shadow: Option<Shadow>,
     /// How blended triangles are drawn, where that is what is compared; else as the look of the load says.
     pub transparency: Option<Transparency>,
+    /// What is left out before it is drawn, where that is what is compared: the picture is the same.
+    pub culling: Option<Culling>,
     pub aim: Aim,
 }
 
@@ -73,12 +75,15 @@ const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
 impl Variant {
     /// The look of a scene as this variant draws it.
     pub fn look(&self, look: Look) -> Look {
-        Look { shadow: self.shadow, transparency: self.transparency.unwrap_or(look.transparency), ..look }
+        let (transparency, culling) =
+            (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
+        Look { shadow: self.shadow, transparency, culling, ..look }
     }
 
     /// Whether a load has what it is about.
     pub fn suits(&self, load: Kind) -> bool {
-        self.transparency.is_none() || load == Kind::Panes
+        let is_large = matches!(load, Kind::Tree | Kind::Grove | Kind::Triangles(_));
+        (self.transparency.is_none() || load == Kind::Panes) && (self.culling.is_none() || is_large)
     }
 
     /// What it must keep on a load.
@@ -98,7 +103,14 @@ impl Variant {
     }
 
     fn unshadowed() -> Self {
-        Self { name: "none".into(), method: Method::None, shadow: None, transparency: None, aim: Aim::Unshadowed }
+        Self {
+            name: "none".into(),
+            method: Method::None,
+            shadow: None,
+            transparency: None,
+            culling: None,
+            aim: Aim::Unshadowed,
+        }
     }
 
     /// One map, hard: it means to show the hard shadow, whatever its texels.
@@ -109,6 +121,7 @@ impl Variant {
             method: Method::Standard,
             shadow: Some(shadow),
             transparency: None,
+            culling: None,
             aim: Aim::Hard,
         }
     }
@@ -146,7 +159,7 @@ impl Variant {
     fn split(size: u32, splits: u32) -> Self {
         let shadow = Shadow { size, splits, ..Shadow::default() };
         let name = format!("variance {size}, {splits} splits");
-        Self { name, method: Method::Variance, shadow: Some(shadow), transparency: None, aim: Aim::Hard }
+        Self { name, method: Method::Variance, shadow: Some(shadow), transparency: None, culling: None, aim: Aim::Hard }
     }
 
     /// Panes as this method blends them, without shadows.
@@ -154,9 +167,14 @@ impl Variant {
         Self { name: name.into(), transparency: Some(transparency), ..Self::unshadowed() }
     }
 
+    /// The same picture from fewer triangles.
+    fn culled((name, culling): (&str, Culling)) -> Self {
+        Self { name: format!("culling {name}"), culling: Some(culling), ..Self::variance(2048, BLURS[1]) }
+    }
+
     fn soft(name: String, method: Method, shadow: Shadow) -> Self {
         let aim = Aim::Filtered { texels: shadow.deviation() };
-        Self { name, method, shadow: Some(shadow), transparency: None, aim }
+        Self { name, method, shadow: Some(shadow), transparency: None, culling: None, aim }
     }
 }
 
@@ -180,11 +198,16 @@ pub fn all(quick: bool) -> Vec<Variant> {
     }
     all.push(Variant::blended("exact transparency", Transparency::Exact));
     all.push(Variant::blended("two-pass transparency", Transparency::TwoPass));
+    all.extend(cullings());
     all
 }
 
+fn cullings() -> [Variant; 3] {
+    [("none", Culling::None), ("triangles", Culling::Triangles), ("depth", Culling::Depth)].map(Variant::culled)
+}
+
 fn few() -> Vec<Variant> {
-    vec![
+    let mut few = vec![
         Variant::unshadowed(),
         Variant::variance(512, BLURS[1]),
         Variant::variance(512, BLURS[2]),
@@ -195,7 +218,9 @@ fn few() -> Vec<Variant> {
         Variant::split(1024, 3),
         Variant::blended("exact transparency", Transparency::Exact),
         Variant::blended("two-pass transparency", Transparency::TwoPass),
-    ]
+    ];
+    few.extend(cullings());
+    few
 }
 
 #[cfg(test)]
@@ -207,12 +232,15 @@ mod tests {
         for quick in [false, true] {
             let all = all(quick);
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
-            assert_eq!((names.len(), all.len()), if quick { (10, 10) } else { (40, 40) });
+            assert_eq!((names.len(), all.len()), if quick { (13, 13) } else { (43, 43) });
             for variant in &all {
                 let look = variant.look(Look::default());
                 let transparency = variant.transparency.unwrap_or_default();
-                assert_eq!(Look { shadow: None, ..look }, Look { shadow: None, transparency, ..Look::default() });
-                assert!(variant.suits(Kind::Panes) && variant.suits(Kind::Tree) == variant.transparency.is_none());
+                let culling = variant.culling.unwrap_or_default();
+                let plain = Look { shadow: None, transparency, culling, ..Look::default() };
+                assert_eq!(Look { shadow: None, ..look }, plain);
+                assert_eq!(variant.suits(Kind::Panes), variant.culling.is_none());
+                assert_eq!(variant.suits(Kind::Tree), variant.transparency.is_none());
                 assert_eq!(look.shadow.is_none(), variant.aim == Aim::Unshadowed);
             }
         }
