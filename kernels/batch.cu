@@ -21,17 +21,9 @@
 // 24 of arithmetic, so both fit. It has 96 sums and about 128 registers: 16 warps a multiprocessor. So few warps keep
 // the memory busy only if loads in flight need no registers: U goes to shared memory by asynchronous copies,
 // STAGES * 3 KB a warp ahead, 144 KB a multiprocessor, where a latency of 1 us at 5 TB/s needs 38 KB.
-#include "chunk.cuh"
-#include "follow.cuh"
+#include "batch_load.cuh"
 #include "ordered.cuh"
 
-#if defined(BATCH_4)
-constexpr unsigned VECTORS = 4;
-#elif defined(BATCH_8)
-constexpr unsigned VECTORS = 8;
-#else
-constexpr unsigned VECTORS = 16;
-#endif
 // Blocks that a multiprocessor is to hold: as many as registers allow, where shared memory is as large as that.
 #if __CUDA_ARCH__ == 900
 constexpr unsigned RESIDENT = VECTORS == 16 ? 8 : 10;
@@ -42,185 +34,8 @@ constexpr unsigned RESIDENT = 6;
 constexpr unsigned RESIDENT = 4;
 #endif
 
-// A warp has half a tile: 16 quads, two vertices a lane.
-constexpr unsigned WARPS = 2;
-constexpr unsigned QUADS = TILE_QUADS / WARPS;
-constexpr unsigned VERTICES = 4 * QUADS;
-// Chunks that are copied together, and such stages that are on their way at once.
-constexpr unsigned STAGE_CHUNKS = 4;
-constexpr unsigned STAGES = 3;
-constexpr unsigned ROWS = 3 * STAGE_CHUNKS;
-constexpr unsigned STAGE_WORDS = ROWS * QUADS;
 // Chunks whose loads and sums are interleaved: two modes at least.
 constexpr unsigned TOGETHER = CHUNK_MODES < 2 ? 2 : 1;
-
-// What a warp has of shared memory: a ring of stages, which leaves when x comes, and x0.
-struct Own {
-    uint4 ring[STAGES * STAGE_WORDS];
-    float4 rest[3 * QUADS];
-};
-static_assert(sizeof(Own) == 9984, "Own differs from src/gpu/batch.rs");
-
-__device__ __forceinline__ unsigned lane_of() {
-    return threadIdx.x % 32;
-}
-
-// 16 bytes to shared memory, if they are there; the lane waits for them in `wait_for_all_but`.
-__device__ __forceinline__ void copy(void* to, const void* from, bool is_there) {
-#if __CUDA_ARCH__ >= 800
-    const unsigned shared = (unsigned)__cvta_generic_to_shared(to);
-    asm volatile("{ .reg .pred there; setp.ne.u32 there, %2, 0; @there cp.async.cg.shared.global [%0], [%1], 16; }" ::"r"(
-                     shared),
-                 "l"(from), "r"((unsigned)is_there)
-                 : "memory");
-#else
-    if (is_there) {
-        *(uint4*)to = __ldcs((const uint4*)from);
-    }
-#endif
-}
-
-// Ends a group of copies.
-__device__ __forceinline__ void end_group() {
-#if __CUDA_ARCH__ >= 800
-    asm volatile("cp.async.commit_group;" ::: "memory");
-#endif
-}
-
-// Until the warp sees all groups but the last `GROUPS`.
-template <unsigned GROUPS>
-__device__ __forceinline__ void wait_for_all_but() {
-#if __CUDA_ARCH__ >= 800
-    asm volatile("cp.async.wait_group %0;" ::"n"(GROUPS) : "memory");
-#endif
-    __syncwarp();
-}
-
-// A warp's part of a tile. It lies in shared memory and is read anew between barriers: summing takes all registers.
-struct Part {
-    const uint4* words; // of its first quad
-    const float4* rest; // likewise
-    unsigned width;     // quads of the tile
-    unsigned quads;     // of the part; 0 without any
-    unsigned first;     // its first vertex in the shape
-    unsigned vertices;
-    unsigned chunks;
-    unsigned members;
-    unsigned first_member;
-    unsigned first_scale; // of the tile
-    unsigned tile;
-    unsigned end;     // of the block's tiles
-    unsigned is_lost; // something is not finite
-    unsigned group;
-    float* positions; // of the domain that begins at packed vertex 0
-};
-
-// What the warps of a block share: T and the members themselves, zeros where there is no domain; q follows,
-// [modes][VECTORS] numbers times the tile's scales.
-struct Common {
-    Affine transforms[VECTORS];
-    Member members[VECTORS];
-    Part parts[WARPS];
-};
-static_assert(sizeof(Part) == 72 && sizeof(Common) == 64 * VECTORS + 72 * WARPS, "Common differs from src/gpu/batch.rs");
-
-__device__ __forceinline__ Own& own_of(uint4* shared) {
-    return ((Own*)shared)[threadIdx.x / 32];
-}
-
-__device__ __forceinline__ Common& common_of(uint4* shared) {
-    return *(Common*)((Own*)shared + WARPS);
-}
-
-__device__ __forceinline__ float4* q_of(uint4* shared) {
-    return (float4*)(&common_of(shared) + 1);
-}
-
-__device__ __forceinline__ Part part_of(const BatchArgs& args, unsigned group, unsigned tile, unsigned end) {
-    const uint4 head = __ldg((const uint4*)(args.groups + group));
-    const uint4 tail = __ldg((const uint4*)(args.groups + group) + 1);
-    const unsigned vertices = tail.x, before = QUADS * (threadIdx.x / 32), quad = TILE_QUADS * tile;
-    Part part;
-    part.group = group;
-    part.tile = tile;
-    part.end = end;
-    part.is_lost = 0;
-    part.chunks = tail.z;
-    part.members = tail.w;
-    part.first_member = tail.y;
-    part.first_scale = head.w + part.chunks * CHUNK_MODES * tile;
-    part.width = min(TILE_QUADS, (vertices + 3) / 4 - quad);
-    part.quads = part.width > before ? min(QUADS, part.width - before) : 0;
-    part.first = 4 * (quad + before);
-    part.vertices = part.quads > 0 ? min(VERTICES, vertices - part.first) : 0;
-    part.words = args.words + (head.x | (unsigned long long)head.y << 32) + 3 * (size_t)part.chunks * quad + before;
-    part.positions = args.header->positions + 3 * (size_t)part.first;
-    part.rest = args.rest + 3 * ((size_t)head.z + quad) + before;
-    return part;
-}
-
-// Starts the copies of a stage, [row][quad]. Lanes beyond the last quad copy that one again.
-__device__ __forceinline__ void copy_stage(const Part& part, Own& own, unsigned stage) {
-    constexpr unsigned STEP = 32 / QUADS, COPIES = STAGE_WORDS / 32;
-    const unsigned row = ROWS * stage + lane_of() / QUADS;
-    uint4* to = own.ring + stage % STAGES * STAGE_WORDS + lane_of();
-    if (part.width == TILE_QUADS && ROWS * (stage + 1) <= 3 * part.chunks) {
-        // Nearly always, and with distances that are known when this is compiled.
-        const uint4* from = part.words + row * TILE_QUADS + lane_of() % QUADS;
-#pragma unroll
-        for (unsigned i = 0; i < COPIES; ++i) {
-            copy(to + 32 * i, from + i * STEP * TILE_QUADS, true);
-        }
-        return;
-    }
-    const uint4* from = part.words + (size_t)row * part.width + min(lane_of() % QUADS, part.quads - 1);
-#pragma unroll
-    for (unsigned i = 0; i < COPIES; ++i) {
-        copy(to + 32 * i, from + i * STEP * part.width, row + i * STEP < 3 * part.chunks);
-    }
-}
-
-// x0, [axis][quad].
-__device__ __forceinline__ void copy_rest(const Part& part, Own& own) {
-#pragma unroll
-    for (unsigned i = lane_of(); i < lane_of() + 3 * QUADS; i += 32) {
-        const float4* from = part.rest + i / QUADS * part.width + min(i % QUADS, part.quads - 1);
-        copy(own.rest + i, from, i < 3 * QUADS);
-    }
-}
-
-// Of the threads of a block, so many read the values of one domain, in runs.
-constexpr unsigned READERS = 32 * WARPS / VECTORS;
-
-// T and members, the same for all of a block. Returns where this thread's q begins.
-__device__ __forceinline__ unsigned load_members(const BatchArgs& args, const Part& part, Common& common) {
-    const unsigned own = threadIdx.x / READERS;
-    Member member = {};
-    Affine t = {};
-    if (own < part.members) {
-        const uint4 words = __ldg((const uint4*)(args.members + part.first_member + own));
-        member = {words.x, words.y, words.z, words.w};
-        t = place_of(transforms_of(args), member.domain);
-    }
-    if (threadIdx.x % READERS == 0) {
-        common.members[own] = member;
-        common.transforms[own] = t;
-    }
-    return member.first_q;
-}
-
-// q of the member of this thread, all modes.
-__device__ __forceinline__ void load_q(const BatchArgs& args, const Part& part, unsigned first_q, float* q) {
-    const unsigned own = threadIdx.x / READERS, modes = part.chunks * CHUNK_MODES;
-#pragma unroll 8
-    for (unsigned mode = threadIdx.x % READERS; mode < modes; mode += READERS) {
-        float amount = own < part.members ? __ldg(args.q + first_q + mode) : 0.0f;
-#ifdef STORE_INT8
-        amount *= __ldg(args.scales + part.first_scale + mode);
-#endif
-        q[mode * VECTORS + own] = amount;
-    }
-}
 
 // One axis of a lane's two vertices.
 struct Pair {
@@ -518,35 +333,6 @@ __device__ __forceinline__ void compute(const BatchArgs& args, uint4* shared) {
     if (part.is_lost) {
         mend(args, common, (const float*)q_of(shared));
     }
-}
-
-// What a warp needs before it can sum a tile: copies of U and x0 under way and, in shared memory, where they go; T and
-// members with the block's first tile, and q, whose scales may be the tile's.
-__device__ __forceinline__ void prepare(const BatchArgs& args, const Part& part, uint4* shared, bool is_first) {
-    Common& common = common_of(shared);
-    if (lane_of() == 0) {
-        common.parts[threadIdx.x / 32] = part;
-    }
-    if (part.quads > 0) {
-        // x0 belongs to the first group of copies, and groups of stages that are not there are empty.
-        copy_rest(part, own_of(shared));
-#pragma unroll
-        for (unsigned stage = 0; stage < STAGES; ++stage) {
-            copy_stage(part, own_of(shared), stage);
-            end_group();
-        }
-    }
-    if (is_first) {
-        load_q(args, part, load_members(args, part, common), (float*)q_of(shared));
-        __syncthreads();
-#ifdef STORE_INT8
-    } else {
-        __syncthreads();
-        load_q(args, part, common.members[threadIdx.x / READERS].first_q, (float*)q_of(shared));
-        __syncthreads();
-#endif
-    }
-    __syncwarp();
 }
 
 extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const __grid_constant__ BatchArgs args) {

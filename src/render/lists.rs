@@ -10,9 +10,10 @@ use std::rc::Rc;
 use bytemuck::{Pod, Zeroable};
 
 use super::Ran;
+use super::cull::command;
 use super::geometry::Kind;
 use super::gl::{self, Buffer, Clear, Fixed, Framebuffer, Gl, Limits, Program, Texture, TextureKind};
-use super::passes::{NO_TILES, TILES, bind_shadow};
+use super::passes::{NO_TILES, TILES, begins, bind_shadow, draw_group, listed};
 use super::scene_buffers::SceneBuffers;
 use super::shaders::lists::{BINS, TALLY};
 use super::shaders::{self, Options, TILE};
@@ -154,7 +155,7 @@ impl ListTarget {
     }
 
     /// An empty ledger: nothing is counted yet, and no pixel has more than it may.
-    fn empty(&self, buffers: &SceneBuffers) {
+    fn empty(&self, gl: &Gl, buffers: &SceneBuffers) {
         let mut commands = [[0; 5]; 2];
         let blended = buffers.groups.iter().filter(|group| group.kind == Kind::Blend);
         for (command, group) in commands.iter_mut().zip(blended) {
@@ -165,6 +166,14 @@ impl ListTarget {
         let mut bytes = vec![0; LEDGER_BYTES];
         bytes[..HEAD].copy_from_slice(bytemuck::bytes_of(&head));
         self.ledger.write(&bytes);
+        let blended = buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == Kind::Blend);
+        for (index, (place, _)) in blended.enumerate() {
+            // Of a culled scene only as many indices as are listed.
+            if let Some((_, listed)) = buffers.listed(Kind::Blend) {
+                let to = COMMANDS + size_of::<[u32; 5]>() * index;
+                gl.copy_part((listed, command(place)), (&self.ledger, to), size_of::<u32>());
+            }
+        }
         self.tiles.write(bytemuck::cast_slice(&NO_TILES));
     }
 }
@@ -187,7 +196,7 @@ pub(super) fn draw(
     programs: &ListPrograms,
     ran: &mut Ran,
 ) -> Result<()> {
-    target.empty(buffers);
+    target.empty(gl, buffers);
     gl.begin(&target.counted, form.width, form.height, Clear::Words);
     target.bind();
     gather(gl, buffers, (target, form), (programs, COUNT), ran);
@@ -219,17 +228,19 @@ fn gather(
     (programs, turn): (&ListPrograms, i32),
     ran: &mut Ran,
 ) {
-    let Some(array) = buffers.array(Kind::Blend) else { return };
+    let (all, drawn) = (buffers.array(Kind::Blend), listed(buffers));
+    let array = buffers.listed(Kind::Blend).map(|(array, _)| array).or(all);
+    let Some(array) = array else { return };
     gl.begin(&target.behind, form.width, form.height, Clear::Nothing);
-    let groups = buffers.groups.iter().filter(|group| group.kind == Kind::Blend);
-    for (index, group) in groups.enumerate() {
+    let groups = buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == Kind::Blend);
+    for (index, (place, group)) in groups.enumerate() {
         gl.set(Fixed { cull: !group.double_sided, ..Fixed::default() });
-        programs.gather.bind(Some(group.first_triangle as u32));
+        programs.gather.bind(Some(begins(group, drawn)));
         programs.gather.turn(turn);
         if turn == JOIN {
             gl.draw_told(array, &target.ledger, COMMANDS + size_of::<[u32; 5]>() * index);
         } else {
-            gl.draw_indexed(array, group.first_triangle, group.triangles);
+            draw_group(gl, buffers, place, drawn);
         }
         ran.draws += 1;
     }

@@ -2,8 +2,11 @@
 //!
 //! | pass | what it does | runs when |
 //! |---|---|---|
+//! | shadow cull | lists of the triangles that the shadow map may show (compute) | triangles are culled |
 //! | shadow | depth from the sun; cut-outs leave holes | the look has a shadow |
 //! | blur | depth to moments, blurred in x and in y (compute) | that shadow is a variance map |
+//! | occluders | depth of what the last frame saw, and its pyramid (compute) | hidden triangles are culled |
+//! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
 //! | ground | the same of the ground | the look has a ground, and the camera is above it |
 //! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
@@ -21,6 +24,7 @@
 //!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
 
+mod cull;
 mod device;
 mod egl;
 mod frame;
@@ -49,6 +53,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
+pub use self::cull::{Culled, Sifted};
 pub use self::device::{EglDevice, devices};
 pub use self::frame::shadow_texel;
 use self::gl::{Gl, Program};
@@ -110,7 +115,7 @@ pub struct Image {
     pub height: u32,
     pub rgba: Vec<u8>,
     /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "blur" of the shadow,
-    /// "visibility" (with the ground), "blended" (lists and all), "shade" (with the backdrop), "bloom" and "encode" of
+    /// "cull" (of a culled scene, with the occluders), "visibility" (with the ground), "blended" (lists and all), "shade" (with the backdrop), "bloom" and "encode" of
     /// drawing.
     pub passes: Vec<(&'static str, f64)>,
 }
@@ -138,6 +143,8 @@ pub struct Ran {
     pub samples: u32,
     /// Of exact transparency: how many fragments were blended, and whether all fitted.
     pub lists: Option<Lists>,
+    /// What was left out before it was drawn, where triangles are culled.
+    pub culled: Option<Culled>,
 }
 
 /// The largest side of a frame, whatever the device can do.

@@ -1,7 +1,8 @@
 //! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade; then those of `post.rs`.
 
+use super::cull::{SHADOW_CULL, command};
 use super::frame::{Frame, above_ground};
-use super::geometry::Kind;
+use super::geometry::{Group, Kind};
 use super::gl::{Buffer, Clear, Fixed, Framebuffer, Gl, Program, Texture};
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
@@ -21,6 +22,14 @@ const FRAME: u32 = 0;
 const SPLITS: u32 = 2;
 /// Nothing is blended yet: no light, and all that lies behind comes through.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
+
+/// Which triangles of a kind a pass draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Drawn {
+    All,
+    /// Those that culling has listed.
+    Listed,
+}
 
 /// Binds what all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
@@ -45,6 +54,7 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
 pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
     let Some(map) = &buffers.shadow else { return Ok(()) };
     super::shadow::depth(gl, buffers, map)?;
+    ran.passes.extend(buffers.culler.as_ref().map(|_| SHADOW_CULL));
     ran.passes.push("shadow");
     Ok(())
 }
@@ -67,7 +77,9 @@ pub(super) fn visibility(
     ran: &mut Ran,
 ) -> Result<()> {
     let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
-    identify(gl, buffers, (&target.visible, [target.form.width, target.form.height]), programs, ran)
+    let into = (&target.visible, [target.form.width, target.form.height], listed(buffers));
+    identify(gl, buffers, into, programs, ran)?;
+    super::cull::remember(gl, buffers, target, sampled)
 }
 
 /// Ids and depth into a framebuffer of this width and height or larger: of what is opaque; of what is cut out, by the first
@@ -75,7 +87,7 @@ pub(super) fn visibility(
 pub(super) fn identify(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (into, [width, height]): (&Framebuffer, [u32; 2]),
+    (into, [width, height], drawn): (&Framebuffer, [u32; 2], Drawn),
     (cut_out, parts): (Option<&Program>, Option<&Program>),
     ran: &mut Ran,
 ) -> Result<()> {
@@ -86,7 +98,7 @@ pub(super) fn identify(
     let mut any = false;
     for (kind, program) in kinds {
         if let Some(program) = program {
-            draw(gl, buffers, (kind, program), written, ran);
+            draw(gl, buffers, (kind, program, drawn), written, ran);
             any = true;
         }
     }
@@ -122,7 +134,8 @@ pub(super) fn blended(
     let (Some(program), Some(layer)) = (&sampled.blended, &target.layer) else { return Ok(()) };
     gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
     bind_shadow(buffers);
-    draw(gl, buffers, (Kind::Blend, program), Fixed { blend: true, ..Fixed::default() }, ran);
+    let program = (Kind::Blend, program.as_ref(), listed(buffers));
+    draw(gl, buffers, program, Fixed { blend: true, ..Fixed::default() }, ran);
     ran.passes.push("blended");
     gl.check("blended")
 }
@@ -180,13 +193,75 @@ pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
 }
 
 /// Draws the triangles of one kind: a call for those with one side, and one for those with two.
-fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), fixed: Fixed, ran: &mut Ran) {
-    let Some(array) = buffers.array(kind) else { return };
-    for group in buffers.groups.iter().filter(|group| group.kind == kind) {
+fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program, drawn): (Kind, &Program, Drawn), fixed: Fixed, ran: &mut Ran) {
+    for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == kind) {
         gl.set(Fixed { cull: !group.double_sided, ..fixed });
-        program.bind(Some(group.first_triangle as u32));
-        gl.draw_indexed(array, group.first_triangle, group.triangles);
+        program.bind(Some(begins(group, drawn)));
+        draw_group(gl, buffers, index, drawn);
         ran.draws += 1;
+    }
+}
+
+/// Depth of the triangles of one kind into a framebuffer that is bound.
+pub(super) fn draw_depth(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    (kind, program): (Kind, &Program),
+    drawn: Drawn,
+    ran: &mut Ran,
+) {
+    draw(gl, buffers, (kind, program, drawn), Fixed { depth_write: true, ..Fixed::default() }, ran);
+}
+
+/// Draws the triangles of one kind, those with one side and those with two alike, with a program in use: in one call, or
+/// a call for each list.
+pub(super) fn draw_kind(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), drawn: Drawn) {
+    let has_fragments = kind != Kind::Opaque;
+    if drawn == Drawn::All {
+        let (first, count) = buffers.triangles(kind);
+        if has_fragments {
+            program.first(first as u32);
+        }
+        if let Some(array) = buffers.array(kind) {
+            gl.draw_indexed(array, first, count);
+        }
+        return;
+    }
+    for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == kind) {
+        if has_fragments {
+            program.first(begins(group, drawn));
+        }
+        draw_group(gl, buffers, index, drawn);
+    }
+}
+
+/// What a culled scene's passes draw, and any other's.
+pub(super) fn listed(buffers: &SceneBuffers) -> Drawn {
+    if buffers.culler.is_some() { Drawn::Listed } else { Drawn::All }
+}
+
+/// Where the triangles of a group, or its list, begin, as the shaders take it.
+pub(super) const fn begins(group: &Group, drawn: Drawn) -> u32 {
+    match drawn {
+        Drawn::All => group.first_triangle as u32,
+        Drawn::Listed => !(group.first_triangle as u32),
+    }
+}
+
+/// Draws a group, or its list.
+pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: Drawn) {
+    let group = buffers.groups[index];
+    match drawn {
+        Drawn::All => {
+            if let Some(array) = buffers.array(group.kind) {
+                gl.draw_indexed(array, group.first_triangle, group.triangles);
+            }
+        }
+        Drawn::Listed => {
+            if let Some((array, ledger)) = buffers.listed(group.kind) {
+                gl.draw_told(array, ledger, command(index));
+            }
+        }
     }
 }
 

@@ -15,7 +15,7 @@ use super::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
 use super::scene_buffers::SceneBuffers;
 use super::seen::Seen;
 use super::shaders;
-use super::target::{Blended, Form, image};
+use super::target::{Form, image};
 use super::{Ran, Renderer, Shot, frame, passes};
 use crate::error::Result;
 use crate::scene::{Camera, Rectangle, Scene};
@@ -72,7 +72,7 @@ pub struct Pick {
 
 impl Picker {
     fn new(gl: &Rc<Gl>) -> Result<Self> {
-        let form = Form { width: LARGEST, height: LARGEST, samples: 1, blended: Blended::None, halvings: 0 };
+        let form = Form { width: LARGEST, height: LARGEST, samples: 1, ..Form::EMPTY };
         let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
         let visible = gl.framebuffer(Some(&ids), &depth)?;
         let packed = gl.buffer(BYTES, gl::STREAM_COPY, None)?;
@@ -106,7 +106,13 @@ impl Renderer {
         buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
         let ran = &mut Ran::default();
-        passes::identify(gl, buffers, (&picker.visible, [width, height]), (cut_out.as_deref(), None), ran)?;
+        passes::identify(
+            gl,
+            buffers,
+            (&picker.visible, [width, height], passes::Drawn::All),
+            (cut_out.as_deref(), None),
+            ran,
+        )?;
         passes::ground(gl, buffers, &shot, ran)?;
         let size = Some(width | height << 16);
         passes::words(gl, (&picker.ids, &picker.packed), (&program, size), [width, height])?;

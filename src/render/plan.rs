@@ -3,10 +3,11 @@
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
 
+use super::cull::{self, allocations, chosen};
 use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
 use super::shadow::fitting;
 use super::textures::{Use, arrays};
-use crate::scene::{Antialias, Scene, Shadow, Tone, Transparency};
+use crate::scene::{Antialias, Culling, Scene, Shadow, Tone, Transparency};
 
 /// A buffer or texture and its size.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -37,7 +38,7 @@ pub struct Plan {
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in order.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the visibility and blended passes together, ten at most: domains and materials do not matter.
+    /// Draw calls of the visibility and blended passes together, fourteen at most: domains and materials do not matter.
     pub draws: usize,
     /// Branches that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -66,11 +67,14 @@ pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
     let (groups, _) = groups(scene);
     let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
     let mut passes = Vec::new();
+    let culling = chosen(scene, software);
     if let Some(shadow) = scene.look.shadow {
+        passes.extend((culling != Culling::None).then_some(cull::SHADOW_CULL));
         passes.push("shadow");
         passes.extend(shadow.has_moments().then_some("blur"));
     }
     let seen = has(Kind::Opaque) || has(Kind::Mask) || opaque_parts(scene);
+    passes.extend(cull::passes(culling));
     if seen {
         passes.push("visibility");
     }
@@ -85,12 +89,12 @@ pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
     passes.extend(scene.look.bloom.map(|_| "bloom"));
     passes.push("encode");
     Plan {
-        buffers: buffers(scene),
+        buffers: [buffers(scene), allocations(scene, culling)].concat(),
         textures: textures(scene, software),
         passes,
-        draws: draws(scene, &groups),
-        defines: defines(scene),
-        left_out: left_out(scene),
+        draws: draws(scene, &groups) + occluders(&groups, culling),
+        defines: [defines(scene), culled(culling)].concat(),
+        left_out: left_out(scene, culling),
     }
 }
 
@@ -110,6 +114,20 @@ fn opaque_parts(scene: &Scene) -> bool {
         kind(material) == Kind::Blend && material.alpha >= look.opaque_alpha
     };
     look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
+}
+
+/// What hides others is drawn twice.
+fn occluders(groups: &[Group], culling: Culling) -> usize {
+    let hiding = groups.iter().filter(|group| group.kind != Kind::Blend).count();
+    if culling == Culling::Depth { hiding } else { 0 }
+}
+
+fn culled(culling: Culling) -> Vec<&'static str> {
+    match culling {
+        Culling::Depth => vec!["CULLED", "REMEMBERS"],
+        Culling::Triangles => vec!["CULLED"],
+        Culling::None | Culling::Fitting => vec![],
+    }
 }
 
 /// Blended triangles take three turns for their lists, the third as often as the device finds it needed; with two passes
@@ -191,7 +209,7 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).chain(shadows).collect()
 }
 
-fn left_out(scene: &Scene) -> Vec<Saving> {
+fn left_out(scene: &Scene, culling: Culling) -> Vec<Saving> {
     let (needs, layout, look) = (scene.needs, &scene.layout, &scene.look);
     let map: u64 = shadow_textures(look.shadow.unwrap_or_default()).iter().map(|part| part.bytes).sum();
     let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
@@ -207,6 +225,13 @@ fn left_out(scene: &Scene) -> Vec<Saving> {
         (look.bloom.is_some(), "bloom", 0, vec!["bloom"], "what glows is not kept, 10.7 bytes a pixel less"),
         (look.tone != Tone::None, "tone curve", 0, vec![], "light is shown as it is"),
         (look.antialias == Antialias::Fxaa, "fxaa", 0, vec![], "no search for edges in the picture"),
+        (
+            culling != Culling::None,
+            "culling",
+            allocations(scene, Culling::Triangles).iter().map(|part| part.bytes).sum(),
+            cull::passes(Culling::Triangles),
+            "fragments know their triangle without a lookup",
+        ),
         (look.dither, "dither", 0, vec![], "levels are rounded without a pattern"),
     ];
     let unneeded = all.into_iter().filter(|row| !row.0);
@@ -233,7 +258,7 @@ mod tests {
         let mut parts = squares(materials);
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
         let look = Look { bloom: Some(Bloom::default()), tone: Tone::Aces, dither: true, ..parts.look };
-        parts.look = Look { antialias: Antialias::Fxaa, ..look };
+        parts.look = Look { antialias: Antialias::Fxaa, culling: Culling::Depth, ..look };
         parts
     }
 
@@ -250,7 +275,7 @@ mod tests {
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
         let materials = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
-        assert_eq!(left, [&materials[..], &["bloom", "tone curve", "fxaa", "dither"]].concat());
+        assert_eq!(left, [&materials[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
         assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
         assert_eq!(plan.left_out[4].bytes, 12 * 1024 * 1024, "map and moments");
     }
@@ -285,7 +310,11 @@ mod tests {
         let plan = plan(&Scene::new(parts).expect("good"));
         assert_eq!(
             plan.passes,
-            ["shadow", "blur", "visibility", "ground", "blended", "backdrop", "shade", "bloom", "encode"]
+            [
+                &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility", "ground", "blended"][..],
+                &["backdrop", "shade", "bloom", "encode"]
+            ]
+            .concat()
         );
         assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));

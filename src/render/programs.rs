@@ -2,6 +2,7 @@
 
 use std::rc::Rc;
 
+use super::cull::{CullPrograms, SunPrograms};
 use super::geometry::{Group, Kind};
 use super::gl::Program;
 use super::lists::ListPrograms;
@@ -21,6 +22,8 @@ pub(super) struct Programs {
     pub(super) shadow: [Option<Rc<Program>>; 3],
     pub(super) opaque: Option<Rc<Program>>,
     pub(super) ground: Option<Rc<Program>>,
+    /// Lists casters, where triangles are culled.
+    pub(super) sun: Option<SunPrograms>,
 }
 
 /// Programs for one number of samples a pixel.
@@ -35,6 +38,8 @@ pub(super) struct Sampled {
     pub(super) lists: Option<ListPrograms>,
     pub(super) backdrop: Rc<Program>,
     pub(super) shade: Option<Rc<Program>>,
+    /// Where triangles are culled.
+    pub(super) cull: Option<CullPrograms>,
 }
 
 impl Programs {
@@ -54,6 +59,7 @@ impl Programs {
             shadow,
             opaque: when(any(Kind::Opaque), &|| options.visibility(Kind::Opaque, 1))?,
             ground: when(has("ground"), &|| options.ground())?,
+            sun: if has("shadow") && options.culls() { Some(SunPrograms::compile(options, compile)?) } else { None },
         })
     }
 }
@@ -80,6 +86,7 @@ impl Sampled {
             lists: if listed { Some(ListPrograms::compile(options, samples, compile)?) } else { None },
             backdrop: compile(options.backdrop(samples))?,
             shade: if triangles { Some(compile(options.shade(samples))?) } else { None },
+            cull: CullPrograms::compile(options, samples, compile)?,
         })
     }
 }

@@ -8,6 +8,7 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::SharedBuffers;
+use super::cull::{Culler, LISTED};
 use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials, whose};
 use super::gl::{self, Attribute, Buffer, Gl, Program, Texture, TextureKind, VertexArray};
 use super::plan::{Allocation, Plan, planned};
@@ -54,6 +55,8 @@ pub struct SceneBuffers {
     pub(super) shared_shadow: Shared,
     pub(super) programs: Programs,
     pub(super) post: Post,
+    /// Lists of triangles, where they are culled.
+    pub(super) culler: Option<Culler>,
     /// For the samples a pixel that the look asks for.
     sampled: Sampled,
     options: Options,
@@ -73,14 +76,17 @@ pub(super) struct Apart {
     pub(super) buffer: Buffer,
     view: Texture,
     solids: VertexArray,
+    /// Of lists, where triangles are culled.
+    listed: Option<VertexArray>,
 }
 
 impl Apart {
     pub(super) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
         let buffer = gl.buffer(scene.buffer("positions")?.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.view(&buffer, gl::RGB32F)?;
-        let solids = solids(gl, &scene.buffers, &buffer)?;
-        Ok(Self { buffer, view, solids })
+        let array = |index: &Buffer| gl.vertex_array(Some(index), &[attribute(0, &buffer, 3, false)]);
+        let (solids, listed) = (array(scene.buffer("triangle vertices")?)?, scene.buffers.get(LISTED).map(array));
+        Ok(Self { view, solids, listed: listed.transpose()?, buffer })
     }
 }
 
@@ -134,8 +140,9 @@ impl SceneBuffers {
             shared,
             scene: Arc::clone(scene),
             views,
-            solids: solids(gl, &buffers, named(&buffers, "positions")?)?,
-            corners: corners(gl, &buffers)?,
+            solids: solids(gl, &buffers, "triangle vertices")?,
+            corners: corners(gl, &buffers, "triangles")?,
+            culler: culler(gl, &buffers, &geometry.groups)?,
             buffers,
             groups: geometry.groups,
             nothing: gl.vertex_array(None, &[])?,
@@ -207,6 +214,13 @@ impl SceneBuffers {
             Kind::Opaque => Some(self.apart.as_ref().map_or(&self.solids, |apart| &apart.solids)),
             Kind::Mask | Kind::Blend => self.corners.as_ref(),
         }
+    }
+
+    /// What listed triangles of a kind are made from, and where their draws lie; none where triangles are not culled.
+    pub(super) fn listed(&self, kind: Kind) -> Option<(&VertexArray, &Buffer)> {
+        let (culler, ledger) = (self.culler.as_ref()?, self.buffers.get("cull ledger")?);
+        let apart = self.apart.as_ref().and_then(|apart| apart.listed.as_ref()).filter(|_| kind == Kind::Opaque);
+        apart.or_else(|| culler.array(kind)).map(|array| (array, ledger))
     }
 
     /// The plan that was followed.
@@ -334,17 +348,25 @@ const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: boo
 }
 
 /// Vertices of triangles that are nothing but solid.
-fn solids(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, positions: &Buffer) -> Result<VertexArray> {
-    gl.vertex_array(Some(named(buffers, "triangle vertices")?), &[attribute(0, positions, 3, false)])
+fn solids(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<VertexArray> {
+    gl.vertex_array(Some(named(buffers, index)?), &[attribute(0, named(buffers, "positions")?, 3, false)])
+}
+
+/// The lists of a scene whose plan has room for them.
+fn culler(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, groups: &[Group]) -> Result<Option<Culler>> {
+    if !buffers.contains_key(LISTED) {
+        return Ok(None);
+    }
+    Culler::new(gl, buffers, groups, (solids(gl, buffers, LISTED)?, corners(gl, buffers, LISTED)?))
 }
 
 /// Corners of cut-out and blended triangles, where there are any.
-fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>) -> Result<Option<VertexArray>> {
+fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<Option<VertexArray>> {
     let Some(vertices) = buffers.get("corner vertices") else { return Ok(None) };
     let mut from = vec![attribute(0, vertices, 1, true), attribute(1, named(buffers, "normals")?, 3, false)];
     from.extend(buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false)));
     from.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
-    gl.vertex_array(Some(named(buffers, "triangles")?), &from).map(Some)
+    gl.vertex_array(Some(named(buffers, index)?), &from).map(Some)
 }
 
 fn upload_arrays(gl: &Rc<Gl>, scene: &Scene, arrays: &[Array], purpose: Use) -> Result<Vec<Texture>> {

@@ -17,7 +17,7 @@ pub(super) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
 const CLIP: &str = include_str!("../../shaders/shared/clip.glsl");
 const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
 pub(super) const DRAWN: &str = include_str!("../../shaders/shared/drawn.glsl");
-const IDS: &str = include_str!("../../shaders/shared/ids.glsl");
+pub(super) const IDS: &str = include_str!("../../shaders/shared/ids.glsl");
 const CUT_OUT: &str = include_str!("../../shaders/shared/cut_out.glsl");
 pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
 const LISTS: &str = include_str!("../../shaders/shared/lists.glsl");
@@ -139,7 +139,7 @@ impl Options {
     }
 
     /// What depends on the samples a pixel.
-    fn sampling(&self, samples: u32) -> String {
+    pub(super) fn sampling(&self, samples: u32) -> String {
         let middle = vec![[0.5; 2]];
         let places = if samples > 1 { &self.sample_places } else { &middle };
         let places: Vec<String> = places.iter().map(|[x, y]| format!("vec2({x:?}, {y:?})")).collect();

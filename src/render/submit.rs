@@ -5,18 +5,19 @@
 //! in the stream: a frame under way keeps its own, and so do vertices that are uploaded.
 
 use std::cell::Cell;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
 use super::gl::{Fence, Lent, Stopwatch};
-use super::lists::{self, ListTarget};
+use super::lists;
 use super::programs::Sampled;
 use super::ring::Slot;
 use super::scene_buffers::SceneBuffers;
 use super::splits::Splits;
 use super::target::{Form, Target};
-use super::{Image, Ran, Renderer, Shot, frame, passes};
+use super::{Image, Ran, Renderer, Shot, cull, frame, passes};
 use crate::error::{Error, Result, during, invalid};
 
 /// Bytes that one thread copies at a time: enough that starting it costs little of that.
@@ -25,7 +26,7 @@ const STRETCH: usize = 1 << 20;
 /// A frame under way. Dropping it gives the frame up.
 #[derive(Debug)]
 pub struct Ticket {
-    size: [u32; 2],
+    form: Form,
     /// None of a frame that nobody reads.
     slot: Option<Slot>,
     fence: Fence,
@@ -91,17 +92,22 @@ impl Renderer {
     /// `Fault` naming the pass that did not end within the limit, or of OpenGL.
     pub fn retrieve(&mut self, ticket: Ticket) -> Result<Pixels> {
         ticket.wait()?;
-        let Ticket { size: [width, height], slot, passes, mut ran, .. } = ticket;
-        let bytes = 4 * width as usize * height as usize;
+        let Ticket { form, slot, passes, mut ran, .. } = ticket;
         let staging = slot.as_ref().and_then(Slot::staging);
-        if let Some(staging) = staging.filter(|staging| staging.buffer.bytes as usize > bytes) {
-            ran.lists = Some(lists::told(&staging.read(bytes..bytes + lists::HEAD)?));
+        if let Some(staging) = staging {
+            let [listed, culled] = form.told().map(|part| part.start as usize..part.end as usize);
+            let told = |part: Range<usize>| if part.is_empty() { Ok(None) } else { staging.read(part).map(Some) };
+            (ran.lists, ran.culled) =
+                (told(listed)?.map(|head| lists::told(&head)), told(culled)?.map(|counts| cull::told(&counts)));
         }
-        let lent = staging.map(|staging| staging.lend(bytes)).transpose()?;
+        let lent = staging.map(|staging| staging.lend(form.bytes() as usize)).transpose()?;
         self.gl.check("read")?;
         warn_of_lists(&self.ran, &ran);
+        if let Some(culled) = &ran.culled {
+            tracing::trace!(?culled, "triangles before they were drawn");
+        }
         self.ran = ran;
-        Ok(Pixels { width, height, lent, passes: times(&passes) })
+        Ok(Pixels { width: form.width, height: form.height, lent, passes: times(&passes) })
     }
 
     fn start(&mut self, buffers: &SceneBuffers, shot: &Shot, is_read: bool) -> Result<Ticket> {
@@ -110,21 +116,23 @@ impl Renderer {
         let look = &buffers.scene.look;
         let size = [shot.width, shot.height];
         let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
+        let form = Form { culling: cull::of(buffers.plan()), ..form };
         self.make_room(form)?;
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let slot = if is_read { Some(target.ring.take(self.watchdog)?) } else { None };
         buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
+        cull::begin(buffers);
         if let Some(splits) = buffers.buffers.get("splits") {
             let fit = frame::sun_fit(&buffers.scene, shot, buffers.origin);
             splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
         let mut passes = self.run(buffers, shot, (target, &sampled), &mut ran)?;
-        passes.extend(self.bring(target, slot.as_ref())?);
+        passes.extend(self.bring(buffers, target, slot.as_ref())?);
         Ok(Ticket {
-            size,
+            form,
             slot,
             fence: self.gl.fence("read")?,
             passes,
@@ -161,6 +169,9 @@ impl Renderer {
             times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
             Ok(())
         })?;
+        if buffers.culler.is_some() {
+            times.push(timed("cull", &mut || cull::camera(gl, buffers, target, sampled, ran))?);
+        }
         times.extend([
             timed("visibility", &mut || {
                 passes::visibility(gl, buffers, target, sampled, ran)?;
@@ -174,14 +185,22 @@ impl Renderer {
         Ok(times)
     }
 
-    /// Brings the pixels, and behind them what is told of lists, to where the host can read them.
-    fn bring(&self, target: &Target, slot: Option<&Slot>) -> Result<Option<(&'static str, Stopwatch)>> {
+    /// Brings the pixels, and behind them what is told of lists and of what was culled, to where the host can read them.
+    fn bring(
+        &self,
+        buffers: &SceneBuffers,
+        target: &Target,
+        slot: Option<&Slot>,
+    ) -> Result<Option<(&'static str, Stopwatch)>> {
         let Some(staging) = slot.and_then(Slot::staging) else { return Ok(None) };
         let bytes = target.form.bytes();
         let copy = || {
             self.gl.copy(&target.packed, &staging.buffer, bytes);
-            if let Some(ListTarget { ledger, .. }) = &target.lists {
-                self.gl.copy_to(ledger, (&staging.buffer, bytes), lists::HEAD as u64);
+            let ledger = target.lists.as_ref().map(|lists| &lists.ledger);
+            for (from, to) in [ledger, buffers.buffers.get(cull::COUNTED)].into_iter().zip(target.form.told()) {
+                if let Some(from) = from.filter(|_| !to.is_empty()) {
+                    self.gl.copy_to(from, (&staging.buffer, to.start), to.end - to.start);
+                }
             }
             self.gl.check("read")
         };

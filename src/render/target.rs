@@ -1,14 +1,16 @@
 //! Where a frame is drawn: ids, depth and blended layer of every sample, the picture, and the buffers through which its
 //! pixels come back.
 
+use std::ops::Range;
 use std::rc::Rc;
 
+use super::cull::{COUNT_BYTES, Pyramid};
 use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
 use super::lists::{HEAD, ListTarget};
 use super::ring::Ring;
 use super::shaders::TILE;
 use crate::error::Result;
-use crate::scene::Look;
+use crate::scene::{Culling, Look};
 
 /// Pixels of a multisampled frame, at most: with depth, ids and a blended layer they take 704 MiB of device memory. A
 /// larger frame is drawn with one sample a pixel.
@@ -23,6 +25,8 @@ pub(super) struct Form {
     pub(super) blended: Blended,
     /// Halvings of the picture through which light glows.
     pub(super) halvings: u32,
+    /// How triangles are culled; never what is to be chosen yet.
+    pub(super) culling: Culling,
 }
 
 /// What a frame needs for blended triangles.
@@ -54,8 +58,10 @@ pub(super) struct Target {
     pub(super) packed: Buffer,
     /// What brings it to the host.
     pub(super) ring: Rc<Ring>,
+    /// Of culling by depth.
+    pub(super) pyramid: Option<Pyramid>,
     // Attached to framebuffers, which must not outlive it.
-    _depth: Texture,
+    pub(super) depth: Texture,
 }
 
 /// Light of the blended triangles of every sample, and the share of what lies behind that they let by.
@@ -66,6 +72,10 @@ pub(super) struct Layer {
 }
 
 impl Form {
+    /// No pixels and nothing but them.
+    pub(super) const EMPTY: Self =
+        Self { width: 0, height: 0, samples: 1, blended: Blended::None, halvings: 0, culling: Culling::None };
+
     /// The form of a frame of a look.
     pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &Look, blended: Blended) -> Self {
         let halvings = look.bloom.map_or(0, |bloom| bloom.levels);
@@ -75,12 +85,20 @@ impl Form {
     /// The form of a frame of ids and depth alone, with as many samples a pixel as are wanted and fit.
     pub(super) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
-        Self { width, height, samples: if fits { wanted } else { 1 }, blended: Blended::None, halvings: 0 }
+        Self { width, height, samples: if fits { wanted } else { 1 }, ..Self::EMPTY }
     }
 
     /// Bytes of its picture.
     pub(super) fn bytes(&self) -> u64 {
         4 * u64::from(self.width) * u64::from(self.height)
+    }
+
+    /// Where behind the picture is told what its lists held, and what was culled; empty where there is no such thing.
+    pub(super) fn told(&self) -> [Range<u64>; 2] {
+        let lists = if matches!(self.blended, Blended::Listed(_)) { HEAD as u64 } else { 0 };
+        let culled = if self.culling == Culling::None { 0 } else { COUNT_BYTES as u64 };
+        let (first, second) = (self.bytes(), self.bytes() + lists);
+        [first..second, second..second + culled]
     }
 }
 
@@ -95,7 +113,6 @@ impl Target {
             Blended::None | Blended::Drawn => None,
         };
         let bytes = form.bytes();
-        let told = if lists.is_some() { HEAD as u64 } else { 0 };
         Ok(Self {
             form: Form { samples, ..form },
             visible: gl.framebuffer(Some(&ids), &depth)?,
@@ -110,15 +127,16 @@ impl Target {
             picture: image(gl, Form { samples: 1, ..form }, gl::RGBA16F)?,
             glow: super::post::glow(gl, form)?,
             packed: gl.buffer(bytes, gl::STREAM_COPY, None)?,
-            ring: Ring::new(gl, bytes + told),
-            _depth: depth,
+            ring: Ring::new(gl, form.told()[1].end),
+            pyramid: if form.culling == Culling::Depth { Some(Pyramid::new(gl, form, &depth)?) } else { None },
+            depth,
         })
     }
 }
 
 /// Where the samples of a pixel of four lie in it; empty on a device that has no four.
 pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
-    let form = Form { width: 1, height: 1, samples: 4, blended: Blended::None, halvings: 0 };
+    let form = Form { width: 1, height: 1, samples: 4, ..Form::EMPTY };
     if gl.limits.max_samples < form.samples {
         return Ok(Vec::new());
     }

@@ -64,6 +64,22 @@ pub enum Transparency {
     Exact,
 }
 
+/// Which triangles are left out before the rasteriser sees them. The picture is the same to the bit, whichever it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Culling {
+    /// Chosen by the number of triangles and by the device.
+    #[default]
+    Fitting,
+    /// None: nothing is compiled, allocated or run for it.
+    None,
+    /// Those outside the view, back faces of what has one side, and those in which no sample lies; for shadow maps too.
+    Triangles,
+    /// Those, and what is hidden behind the triangles that the last frame saw. A rasteriser in software leaves hidden
+    /// triangles in where cut-outs have images and several samples a pixel: there they change where images are read.
+    Depth,
+}
+
 /// Light, shadow, ground and sky. Colours are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -98,6 +114,8 @@ pub struct Look {
     /// least), as far as the device has buffers so large. Where a frame has more, every pixel keeps as many of its
     /// nearest as all pixels can.
     pub fragments: Option<u32>,
+    /// What is left out before it is drawn.
+    pub culling: Culling,
 }
 
 impl Default for Look {
@@ -120,6 +138,7 @@ impl Default for Look {
             transparency: Transparency::default(),
             opaque_alpha: 0.95,
             fragments: None,
+            culling: Culling::default(),
         }
     }
 }

@@ -1,6 +1,8 @@
 //! Pictures against arithmetic, each with a negative control. Runs on whatever EGL gives, Mesa's llvmpipe included.
 
 mod build;
+mod culling;
+mod culling_real;
 mod far;
 mod layers;
 mod limits;

@@ -87,13 +87,13 @@ impl Gl {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::target::{Blended, Form, image};
+    use super::super::super::target::{Form, image};
     use super::super::super::{Prefer, device};
     use super::*;
 
     /// Draws a picture that takes long, on threads of the driver's own in software.
     fn draw_for_long(gl: &Rc<Gl>, turns: u32) {
-        let form = Form { width: 2048, height: 2048, samples: 1, blended: Blended::None, halvings: 0 };
+        let form = Form { width: 2048, height: 2048, samples: 1, ..Form::EMPTY };
         let colour = image(gl, form, glow::RGBA8).expect("an image");
         let into = gl.colour_framebuffer(&colour).expect("complete");
         let vertex = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \

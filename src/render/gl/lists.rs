@@ -16,7 +16,8 @@ impl Gl {
     /// Draws triangles of an array's index buffer as a command in a buffer says, which a shader may have written.
     pub(in crate::render) fn draw_told(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
         let gl = self.on();
-        // SAFETY: the command names a checked range of the index buffer; shaders change its number of instances alone.
+        // SAFETY: the command names a checked range of the index buffer; of it shaders change the number of instances, or
+        // of indices, which they have written themselves from checked ones and never beyond the range.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
             gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name));

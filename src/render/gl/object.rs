@@ -178,6 +178,12 @@ impl Program {
 }
 
 impl Program {
+    /// Gives the program in use, which is this one, where its triangles begin: location 0.
+    pub(in crate::render) fn first(&self, number: u32) {
+        // SAFETY: location 0 is declared by the shaders that are given a number.
+        unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
+    }
+
     /// Says which turn it takes: location 1 of those programs that take several, while it is in use.
     pub(in crate::render) fn turn(&self, turn: i32) {
         // SAFETY: a linked program, in use; location 1 is declared by the shaders that are given a turn.

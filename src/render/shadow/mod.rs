@@ -11,6 +11,7 @@ use self::sources::RUN;
 pub(super) use self::sources::{Tile, defines};
 use super::geometry::Kind;
 use super::gl::{self, Clear, Fixed, Framebuffer, Gl, Program, Texture, TextureKind};
+use super::passes::{draw_kind, listed};
 use super::scene_buffers::SceneBuffers;
 use super::shaders::LANES;
 use crate::error::{Result, during};
@@ -118,15 +119,16 @@ fn image(gl: &Rc<Gl>, shadow: &Shadow, format: u32, filter: u32, layers: u32) ->
 /// Depth from the sun, layer by layer.
 pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<()> {
     let size = map.shadow.size;
+    let drawn = listed(buffers);
     for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
+        super::cull::sun(gl, buffers, size, |program| choose(program, map, layer))?;
         gl.begin(framebuffer, size, size, Clear::Depth);
         gl.set(Fixed { depth_write: true, ..Fixed::default() });
         for (kind, program) in [Kind::Opaque, Kind::Mask, Kind::Blend].into_iter().zip(&buffers.programs.shadow) {
-            let Some((program, array)) = program.as_ref().zip(buffers.array(kind)) else { continue };
-            let (first, count) = buffers.triangles(kind);
-            program.bind((kind != Kind::Opaque).then_some(first as u32));
+            let Some(program) = program else { continue };
+            program.bind(None);
             choose(program, map, layer);
-            gl.draw_indexed(array, first, count);
+            draw_kind(gl, buffers, (kind, program), drawn);
         }
     }
     gl.check("shadow")

@@ -79,7 +79,7 @@ impl Options {
         text + self.splits() + SUN
     }
 
-    fn splits(&self) -> &'static str {
+    pub(in crate::render) fn splits(&self) -> &'static str {
         if self.shadow.splits > 1 && self.has("SHADOWS") { SPLITS } else { "" }
     }
 

@@ -11,7 +11,7 @@ use crate::domain::Material;
 use crate::error::Result;
 use crate::render::Ran;
 use crate::report::timing::Timing;
-use crate::scene::{Look, Parts, Scene, Shadow, ShadowMethod};
+use crate::scene::{Culling, Look, Parts, Scene, Shadow, ShadowMethod};
 
 /// Both passes on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -39,7 +39,7 @@ pub(super) const BEYOND_US: f64 = 600.0;
 /// None that the scene itself would not have caused.
 pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
     let shadow = Shadow { method: ShadowMethod::Standard, size: map, ..Shadow::default() };
-    let look = Look { shadow: Some(shadow), ground: None, bloom: None, ..scene.look };
+    let look = Look { shadow: Some(shadow), ground: None, bloom: None, culling: Culling::None, ..scene.look };
     let materials = vec![Material { double_sided: true, ..Material::default() }];
     let mut parts = Parts { look, materials, textures: Vec::new(), ..meter::parts(scene) };
     for domain in &mut parts.domains {

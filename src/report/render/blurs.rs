@@ -78,6 +78,7 @@ mod tests {
             image_bytes: 0,
             samples: 4,
             draws: 1,
+            culled: None,
         }
     }
 

@@ -19,7 +19,7 @@ use super::variants::{self, Aim, Bounds, Method, Variant};
 use super::view::View;
 use super::{Entry, Request, meter};
 use crate::error::Result;
-use crate::render::{Image, shadow_texel};
+use crate::render::{Culled, Image, shadow_texel};
 use crate::scene::{Camera, Look, Scene, Shadow};
 
 /// The step of the motion that still pictures show.
@@ -65,6 +65,8 @@ pub struct Row {
     pub image_bytes: u64,
     pub samples: u32,
     pub draws: usize,
+    /// What was left out of the last frame that was timed, where triangles are culled.
+    pub culled: Option<Culled>,
 }
 
 impl Row {
@@ -262,6 +264,7 @@ impl Job<'_> {
         (row.shadow_bytes, row.image_bytes) = (of(&["shadow"]), of(&["colour", "normal"]));
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
+            row.culled = studio.renderer.ran().culled;
             match self.flicker(studio, &mut set, variant)? {
                 Ok(flicker) => row.flicker = Some(flicker),
                 Err(why) => row.no_flicker = Some(why),
@@ -336,6 +339,7 @@ impl Job<'_> {
             image_bytes: 0,
             samples: 0,
             draws: 0,
+            culled: None,
         }
     }
 

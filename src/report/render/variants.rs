@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::loads::Kind;
 use super::packing::Packing;
-use crate::scene::{Blurring, Look, Moments, Shadow, ShadowMethod, Transparency};
+use crate::scene::{Blurring, Culling, Look, Moments, Shadow, ShadowMethod, Transparency};
 
 /// How shadows are made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -56,6 +56,8 @@ pub struct Variant {
     pub transparency: Option<Transparency>,
     /// How images lie in arrays, where that is what is compared.
     pub packing: Option<Packing>,
+    /// What is left out before it is drawn, where that is what is compared: the picture is the same.
+    pub culling: Option<Culling>,
     pub aim: Aim,
 }
 
@@ -76,12 +78,16 @@ const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
 impl Variant {
     /// The look of a scene as this variant draws it.
     pub fn look(&self, look: Look) -> Look {
-        Look { shadow: self.shadow, transparency: self.transparency.unwrap_or(look.transparency), ..look }
+        let (transparency, culling) =
+            (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
+        Look { shadow: self.shadow, transparency, culling, ..look }
     }
 
     /// Whether a load has what it is about.
     pub fn suits(&self, load: Kind) -> bool {
-        self.packing.is_some() == (load == Kind::Images) && (self.transparency.is_none() || load == Kind::Panes)
+        let is_large = matches!(load, Kind::Tree | Kind::Grove | Kind::Triangles(_));
+        let has_images = self.packing.is_some() == (load == Kind::Images);
+        has_images && (self.transparency.is_none() || load == Kind::Panes) && (self.culling.is_none() || is_large)
     }
 
     /// What it must keep on a load.
@@ -107,6 +113,7 @@ impl Variant {
             shadow: None,
             transparency: None,
             packing: None,
+            culling: None,
             aim: Aim::Unshadowed,
         }
     }
@@ -120,6 +127,7 @@ impl Variant {
             shadow: Some(shadow),
             transparency: None,
             packing: None,
+            culling: None,
             aim: Aim::Hard,
         }
     }
@@ -157,7 +165,15 @@ impl Variant {
     fn split(size: u32, splits: u32) -> Self {
         let shadow = Shadow { size, splits, ..Shadow::default() };
         let name = format!("variance {size}, {splits} splits");
-        Self { name, method: Method::Variance, shadow: Some(shadow), transparency: None, packing: None, aim: Aim::Hard }
+        Self {
+            name,
+            method: Method::Variance,
+            shadow: Some(shadow),
+            transparency: None,
+            packing: None,
+            culling: None,
+            aim: Aim::Hard,
+        }
     }
 
     /// Panes as this method blends them, without shadows.
@@ -170,9 +186,14 @@ impl Variant {
         Self { name: name.into(), packing: Some(packing), ..Self::unshadowed() }
     }
 
+    /// The same picture from fewer triangles.
+    fn culled((name, culling): (&str, Culling)) -> Self {
+        Self { name: format!("culling {name}"), culling: Some(culling), ..Self::variance(2048, BLURS[1]) }
+    }
+
     fn soft(name: String, method: Method, shadow: Shadow) -> Self {
         let aim = Aim::Filtered { texels: shadow.deviation() };
-        Self { name, method, shadow: Some(shadow), transparency: None, packing: None, aim }
+        Self { name, method, shadow: Some(shadow), transparency: None, packing: None, culling: None, aim }
     }
 }
 
@@ -198,6 +219,7 @@ pub fn all(quick: bool) -> Vec<Variant> {
     all.push(Variant::blended("exact transparency", Transparency::Exact));
     all.push(Variant::blended("two-pass transparency", Transparency::TwoPass));
     all.extend(packings());
+    all.extend(cullings());
     all
 }
 
@@ -207,6 +229,10 @@ fn packings() -> [Variant; 3] {
         Variant::packed("images repeat-filled", Packing::Repeated),
         Variant::packed("images repeat-filled, whole", Packing::RepeatedWhole),
     ]
+}
+
+fn cullings() -> [Variant; 3] {
+    [("none", Culling::None), ("triangles", Culling::Triangles), ("depth", Culling::Depth)].map(Variant::culled)
 }
 
 fn few() -> Vec<Variant> {
@@ -223,6 +249,7 @@ fn few() -> Vec<Variant> {
         Variant::blended("two-pass transparency", Transparency::TwoPass),
     ];
     few.extend(packings());
+    few.extend(cullings());
     few
 }
 
@@ -235,14 +262,17 @@ mod tests {
         for quick in [false, true] {
             let all = all(quick);
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
-            assert_eq!((names.len(), all.len()), if quick { (13, 13) } else { (46, 46) });
+            assert_eq!((names.len(), all.len()), if quick { (16, 16) } else { (49, 49) });
             for variant in &all {
                 let look = variant.look(Look::default());
                 let transparency = variant.transparency.unwrap_or_default();
-                assert_eq!(Look { shadow: None, ..look }, Look { shadow: None, transparency, ..Look::default() });
+                let culling = variant.culling.unwrap_or_default();
+                let plain = Look { shadow: None, transparency, culling, ..Look::default() };
+                assert_eq!(Look { shadow: None, ..look }, plain);
                 let (blends, packs) = (variant.transparency.is_some(), variant.packing.is_some());
                 let suits = [Kind::Panes, Kind::Tree, Kind::Images].map(|load| variant.suits(load));
-                assert_eq!(suits, [!packs, !packs && !blends, packs], "{}", variant.name);
+                let culls = variant.culling.is_some();
+                assert_eq!(suits, [!packs && !culls, !packs && !blends, packs], "{}", variant.name);
                 assert_eq!(look.shadow.is_none(), variant.aim == Aim::Unshadowed);
             }
         }

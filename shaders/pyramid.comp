@@ -1,0 +1,56 @@
+// Depth to the farthest depth of ever larger squares: four levels a turn, a workgroup for 16 x 16 texels of the level that
+// it begins with. Levels follow each other, each half as wide and high, rounded up. Texels beyond the picture hide nothing
+// and show nothing: they count as 0.
+layout(local_size_x = 16, local_size_y = 16) in;
+layout(location = 0) uniform int size_packed;
+layout(std430, binding = 4) buffer Pyramid { float depths[]; };
+#ifdef FIRST
+#if SAMPLES > 1
+layout(binding = 26) uniform sampler2DMS depth;
+#else
+layout(binding = 26) uniform sampler2D depth;
+#endif
+const int BEGIN = 0;
+#else
+const int BEGIN = 4;
+#endif
+shared float farthest[16][16];
+
+void main() {
+    ivec2 size = ivec2(size_packed & 0xFFFF, size_packed >> 16), at = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 lane = ivec2(gl_LocalInvocationID.xy);
+    int base = 0;
+    for (int level = 0; level < BEGIN; level++) {
+        base += size.x * size.y;
+        size = (size + 1) / 2;
+    }
+    float far = 0.0;
+    if (all(lessThan(at, size))) {
+#ifdef FIRST
+        for (int index = 0; index < SAMPLES; index++) far = max(far, texelFetch(depth, at, index).x);
+        depths[base + at.y * size.x + at.x] = far;
+#else
+        far = depths[base + at.y * size.x + at.x];
+#endif
+    }
+    farthest[lane.y][lane.x] = far;
+    for (int side = 8; side > 0; side /= 2) {
+        memoryBarrierShared();
+        barrier();
+        bool own = all(lessThan(lane, ivec2(side)));
+        if (own) {
+            ivec2 from = 2 * lane;
+            far = max(max(farthest[from.y][from.x], farthest[from.y][from.x + 1]),
+                max(farthest[from.y + 1][from.x], farthest[from.y + 1][from.x + 1]));
+        }
+        memoryBarrierShared();
+        barrier();
+        base += size.x * size.y;
+        size = (size + 1) / 2;
+        at = ivec2(gl_WorkGroupID.xy) * side + lane;
+        if (own) {
+            farthest[lane.y][lane.x] = far;
+            if (all(lessThan(at, size))) depths[base + at.y * size.x + at.x] = far;
+        }
+    }
+}

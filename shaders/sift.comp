@@ -1,0 +1,201 @@
+// Which triangles the rasteriser must see: all but those that it is certain to make nothing of. Each bound is widened by
+// what rounding may do on the way from a vertex to a place on the device's grid, so that what is left out changes no bit
+// of the picture. A triangle that the rasteriser may have to clip is only left out as a whole, outside one plane.
+layout(local_size_x = LANES) in;
+layout(location = 0) uniform int size_packed;
+layout(binding = 13) uniform samplerBuffer positions;
+layout(binding = 18) uniform usamplerBuffer triangle_vertices;
+
+const uint LISTED_IN = 0u;
+const uint OUTSIDE = 1u;
+const uint FACING = 2u;
+const uint NO_SAMPLE = 3u;
+const uint HIDDEN_BEHIND = 4u;
+const uint VERDICTS = 5u;
+
+#ifndef REMEMBERED
+layout(std430, binding = 2) buffer Counts { uint counted[2u * VERDICTS]; };
+#endif
+#if defined(REMEMBERED) || defined(HIDDEN)
+layout(std430, binding = 3) buffer Seen { uint seen[]; };
+#endif
+
+shared uint words[WORDS];
+shared uint tally[VERDICTS];
+
+#ifndef REMEMBERED
+// Two evaluations of a matrix by a vector differ by less than this share of the sum of the terms' sizes: four products and
+// three sums round by 2^-24 of it each, in each evaluation.
+const float ROUNDING = 1.0 / 1048576.0;
+// What a float of the size of 1 may be off after a few operations.
+const float FEW = 1.0 / 4194304.0;
+// Where terms are larger than this, one evaluation may overflow and another may not.
+const float LARGE = 1e30;
+
+struct Corner {
+    vec4 clip;
+    vec4 slack; // how far the rasteriser's own may be from it
+};
+
+#ifdef SUN
+#ifdef SPLITS
+layout(location = 1) uniform int layer;
+#endif
+Corner corner_at(vec3 world) {
+    mat4 m = frame.map_from_world;
+    vec3 at = (m * vec4(world, 1.0)).xyz;
+    vec3 size = (abs(m[0]) * abs(world.x) + abs(m[1]) * abs(world.y) + abs(m[2]) * abs(world.z) + abs(m[3])).xyz;
+#ifdef SPLITS
+    at.xy = in_layer(at.xy, layer);
+    size.xy = size.xy * abs(splits.places[layer].xy) + abs(splits.places[layer].zw);
+#endif
+    return Corner(vec4(2.0 * at - 1.0, 1.0), vec4(ROUNDING * (2.0 * size + 1.0), 0.0));
+}
+#else
+Corner corner_at(vec3 world) {
+    mat4 m = frame.clip_from_world;
+    vec4 size = abs(m[0]) * abs(world.x) + abs(m[1]) * abs(world.y) + abs(m[2]) * abs(world.z) + abs(m[3]);
+    return Corner(m * vec4(world, 1.0), ROUNDING * size);
+}
+#endif
+
+// A vertex without a place is put before the near plane, as the vertex shaders do.
+Corner corner_of(vec3 world) {
+    bool bad = any(isnan(world)) || any(isinf(world));
+    if (bad) return Corner(vec4(0.0, 0.0, -2.0, 1.0), vec4(0.0));
+    return corner_at(world);
+}
+
+#ifdef HIDDEN
+layout(std430, binding = 4) readonly buffer Pyramid { float depths[]; };
+
+// Whether all of a rectangle of pixels is nearer than a depth.
+bool all_nearer(uvec2 low, uvec2 high, uvec2 size, float depth) {
+    uint level = 0u, base = 0u;
+    while (level < TOP && any(greaterThan((high >> level) - (low >> level), uvec2(3u)))) {
+        base += size.x * size.y;
+        size = size + 1u >> 1;
+        level++;
+    }
+    low >>= level;
+    high >>= level;
+    if (any(greaterThan(high - low, uvec2(3u)))) return false;
+    for (uint y = low.y; y <= high.y; y++) {
+        for (uint x = low.x; x <= high.x; x++) {
+            if (!(depths[base + y * size.x + x] < depth)) return false;
+        }
+    }
+    return true;
+}
+#endif
+
+// A triangle of which no corner is outside any plane.
+uint verdict_inside(Corner corners[3], bool one_sided) {
+    vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16), at[3];
+    float nearest = 1.0, farthest = 0.0, depth[3], blurred = 0.0, off = 0.0;
+    for (int index = 0; index < 3; index++) {
+        vec4 clip = corners[index].clip, slack = corners[index].slack;
+        vec3 ndc = clip.xyz / clip.w;
+        vec3 moved = (slack.xyz + abs(ndc) * slack.w) / (clip.w - slack.w) + FEW * abs(ndc);
+        at[index] = (0.5 * ndc.xy + 0.5) * size;
+        depth[index] = 0.5 * ndc.z + 0.5;
+        vec2 pixels = 0.5 * moved.xy * size;
+        off = max(off, max(pixels.x, pixels.y));
+        blurred = max(blurred, 0.5 * moved.z);
+        nearest = min(nearest, depth[index]);
+        farthest = max(farthest, depth[index]);
+    }
+    off += max(size.x, size.y) * FEW + groups.grid.x;
+    vec2 low = min(at[0], min(at[1], at[2])) - off, high = max(at[0], max(at[1], at[2])) + off;
+    bool hit = false;
+    for (int index = 0; index < SAMPLES; index++) {
+        vec2 place = SAMPLE_PLACES[index];
+        if (all(greaterThanEqual(floor(high - place), ceil(low - place)))) hit = true;
+    }
+    if (!hit) return NO_SAMPLE;
+    vec2 a = at[1] - at[0], b = at[2] - at[0];
+    float area = a.x * b.y - a.y * b.x, products = abs(a.x * b.y) + abs(a.y * b.x);
+    float unsure = 2.0 * off * (abs(a.x) + abs(a.y) + abs(b.x) + abs(b.y)) + 8.0 * off * off + FEW * products;
+    if (one_sided && area < -unsure) return FACING;
+#ifdef HIDDEN
+    float safe = abs(area) - unsure;
+    if (!(safe > 0.0)) return LISTED_IN;
+    // The slope of depth at most, a pixel; and how far a plane through rounded corners may be from the surface, at a sample
+    // that lies up to the rounding outside of it.
+    vec2 dz = abs(vec2(depth[1], depth[2]) - depth[0]) + 2.0 * blurred;
+    float slope = (dz.x * (abs(b.x) + abs(b.y)) + dz.y * (abs(a.x) + abs(a.y))) / safe;
+    vec2 extent = high - low;
+    float reach = size.x + size.y + (extent.x + extent.y) * (1.0 + products / safe);
+    float margin = blurred + 2.0 * off * slope + ROUNDING * (1.0 + slope * reach);
+    uvec2 most = uvec2(size) - 1u, first = uvec2(clamp(low, vec2(0.0), size)), last = uvec2(clamp(high, vec2(0.0), size));
+    if (all_nearer(min(first, most), min(last, most), uvec2(size), nearest - margin)) return HIDDEN_BEHIND;
+#endif
+    return LISTED_IN;
+}
+
+uint verdict(uint triangle, bool one_sided) {
+    uvec3 vertices = texelFetch(triangle_vertices, int(triangle)).xyz;
+    Corner corners[3];
+    vec3 world[3];
+    bvec3 below = bvec3(true), above = bvec3(true);
+    bool inside = true;
+    for (int index = 0; index < 3; index++) {
+        world[index] = texelFetch(positions, int(vertices[index])).xyz;
+        corners[index] = corner_of(world[index]);
+        vec4 clip = corners[index].clip, slack = corners[index].slack;
+        if (!all(lessThan(slack, vec4(LARGE)))) return LISTED_IN;
+        vec3 margin = slack.xyz + slack.w, low = clip.xyz + clip.w, high = clip.w - clip.xyz;
+        for (int axis = 0; axis < 3; axis++) {
+            below[axis] = below[axis] && low[axis] < -margin[axis];
+            above[axis] = above[axis] && high[axis] < -margin[axis];
+        }
+        inside = inside && all(greaterThan(low, margin)) && all(greaterThan(high, margin)) && clip.w > 2.0 * slack.w;
+    }
+    if (any(below) || any(above)) return OUTSIDE;
+    if (!inside) return LISTED_IN;
+    if (world[0] == world[1] || world[1] == world[2] || world[2] == world[0]) return NO_SAMPLE;
+    return verdict_inside(corners, one_sided);
+}
+#endif
+
+void main() {
+    if (own_work() >= groups.count.y) return;
+    uint lane = gl_LocalInvocationIndex;
+    if (lane < WORDS) words[lane] = 0u;
+    if (lane < VERDICTS) tally[lane] = 0u;
+    Block block = own_block();
+    memoryBarrierShared();
+    barrier();
+    uint word = block.place * WORDS + lane / 32u, bit = 1u << (lane & 31u);
+    if (block.is_there) {
+#ifdef REMEMBERED
+        uint found = (seen[word] & bit) != 0u ? LISTED_IN : OUTSIDE;
+#else
+        uint triangle = groups.places[block.group].x + block.triangle;
+#ifdef SUN
+        uint found = verdict(triangle, false);
+#else
+        uint found = verdict(triangle, groups.ways[block.group].x != 0u);
+#endif
+#endif
+        atomicAdd(tally[found], 1u);
+        if (found == LISTED_IN) atomicOr(words[lane / 32u], bit);
+    }
+    memoryBarrierShared();
+    barrier();
+    if (lane < WORDS) {
+        bits[block.place * WORDS + lane] = words[lane];
+#ifdef HIDDEN
+        // What is remembered was used: the ids of this frame come next.
+        seen[block.place * WORDS + lane] = 0u;
+#endif
+    }
+    // Sums of whole numbers: whoever comes first.
+    if (lane == 0u && tally[LISTED_IN] > 0u) {
+        atomicAdd(ledger.commands[5u * block.group], 3u * tally[LISTED_IN]);
+        atomicAdd(ledger.totals[block.place / SUPER], tally[LISTED_IN]);
+    }
+#ifndef REMEMBERED
+    if (lane < VERDICTS && tally[lane] > 0u) atomicAdd(counted[FIRST_COUNT + lane], tally[lane]);
+#endif
+}

@@ -1,0 +1,75 @@
+//! The farthest depth of ever larger squares of a frame.
+
+use std::rc::Rc;
+
+use super::super::gl::{self, Buffer, Framebuffer, Gl, Texture};
+use super::super::programs::Sampled;
+use super::super::target::Form;
+use crate::error::Result;
+
+/// The coarsest level: squares of 2^8 pixels.
+pub(super) const TOP: u32 = 8;
+/// Levels that one turn makes besides the one that it begins with, and the side of what a workgroup takes.
+const TURN: u32 = 4;
+const SIDE: u32 = 1 << TURN;
+const PYRAMID: u32 = 4;
+const DEPTH_UNIT: u32 = 26;
+
+/// What occluders are drawn into, and the pyramid of it. For frames of one form.
+#[derive(Debug)]
+pub(in crate::render) struct Pyramid {
+    /// The frame's depth alone.
+    pub(super) occluders: Framebuffer,
+    depths: Buffer,
+}
+
+/// Texels of all levels.
+fn texels([mut width, mut height]: [u32; 2]) -> u64 {
+    let mut sum = 0;
+    for _ in 0..=TOP {
+        sum += u64::from(width) * u64::from(height);
+        (width, height) = (width.div_ceil(2), height.div_ceil(2));
+    }
+    sum
+}
+
+impl Pyramid {
+    pub(in crate::render) fn new(gl: &Rc<Gl>, form: Form, depth: &Texture) -> Result<Self> {
+        let depths = gl.buffer(4 * texels([form.width, form.height]), gl::STREAM_COPY, None)?;
+        Ok(Self { occluders: gl.framebuffer(None, depth)?, depths })
+    }
+
+    /// Makes all levels of the depth that is there.
+    pub(super) fn build(&self, gl: &Gl, (depth, form): (&Texture, Form), sampled: &Sampled) {
+        let Some([fine, coarse]) = sampled.cull.as_ref().and_then(|cull| cull.pyramid.as_ref()) else { return };
+        let groups = [form.width, form.height].map(|side| side.div_ceil(SIDE));
+        self.bind();
+        depth.bind(DEPTH_UNIT);
+        fine.bind(Some(packed(form)));
+        gl.dispatch(groups[0], groups[1]);
+        coarse.bind(Some(packed(form)));
+        gl.dispatch(groups[0].div_ceil(SIDE), groups[1].div_ceil(SIDE));
+    }
+
+    pub(super) fn bind(&self) {
+        self.depths.bind_storage(PYRAMID);
+    }
+}
+
+/// Width and height in one number, as the shaders take them.
+pub(super) const fn packed(form: Form) -> u32 {
+    form.width | form.height << 16
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_turns_reach_the_top_and_each_level_is_half_as_wide() {
+        assert_eq!(2 * TURN, TOP);
+        assert_eq!(texels([1, 1]), 9);
+        assert_eq!(texels([256, 256]), (0..=8).map(|level| 1 << (2 * level)).sum::<u64>());
+        assert_eq!(texels([3, 5]), 15 + 6 + 2 + 6);
+    }
+}

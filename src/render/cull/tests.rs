@@ -1,0 +1,79 @@
+//! Negative controls: a test that is a little too greedy changes the picture.
+
+use std::rc::Rc;
+use std::sync::Arc;
+
+use super::super::geometry::tests::squares;
+use super::super::shaders::Source;
+use super::super::{Prefer, Renderer, SceneBuffers, Shot};
+use crate::deform::Surface;
+use crate::domain::{Material, Mesh, Modes, Shape};
+use crate::scene::{Camera, Culling, Lens, Scene, View};
+
+/// A sheet of 24 x 24 squares in front of which a smaller sheet stands, both of one side.
+fn sheets() -> Arc<Scene> {
+    let mut rest = Vec::new();
+    let mut indices = Vec::new();
+    for (half, z) in [(2.0, 0.0), (1.0, 0.5)] {
+        for index in 0..24_u32 * 24 {
+            let [x, y] = [index % 24, index / 24].map(|step| half * (step as f32 / 12.0 - 1.0));
+            let (first, side) = (rest.len() as u32, half / 12.0);
+            rest.extend([[x, y, z], [x + side, y, z], [x + side, y + side, z], [x, y + side, z]]);
+            indices.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+        }
+    }
+    let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
+    let mesh = Mesh::indexed(rest, normals, vec![], indices).expect("sheets");
+    let mut parts = squares(vec![Material::default()]);
+    parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
+    parts.look.culling = Culling::Depth;
+    (parts.look.shadow, parts.look.ground) = (None, None);
+    Scene::new(parts).expect("good")
+}
+
+/// The second frame of a scene whose sifting says `greedy` in place of `just`.
+fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
+    let mut renderer = Renderer::open(Prefer::Any).expect("EGL and OpenGL 4.3");
+    let (gl, places) = (Rc::clone(&renderer.gl), renderer.sample_places.clone());
+    let mut found = false;
+    let compile = &mut |mut source: Source| {
+        for (_, text) in &mut source.stages {
+            found |= source.label.starts_with("sift, 4") && text.contains(just);
+            *text = text.replace(just, greedy);
+        }
+        renderer.program(source)
+    };
+    let buffers = SceneBuffers::new(&gl, scene, &places, compile).expect("loads");
+    assert!(found, "the shader says no '{just}'");
+    let corners = scene.shapes[0].mesh.corners();
+    let (positions, normals) = (scene.shapes[0].mesh.rest().as_flattened(), corners.normals.as_flattened());
+    let surface = Surface { positions: positions.to_vec(), normals: normals.to_vec(), ..Surface::default() };
+    renderer.upload(&buffers, &surface).expect("uploads");
+    let view = View::LookAt { eye: [0.3, 0.2, 4.0], target: [0.1, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
+    let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
+    let camera = Camera { view, lens, near: 0.0, far: 0.0 };
+    let shot = Shot { camera, width: 64, height: 64, bounds: scene.rest_bounds };
+    renderer.draw(&buffers, &shot).expect("draws");
+    let second = renderer.draw(&buffers, &shot).expect("draws").rgba;
+    assert!(renderer.ran().culled.is_some_and(|culled| culled.camera.left_out() > 0));
+    second
+}
+
+#[test]
+fn each_test_that_is_too_greedy_is_seen_in_the_picture() {
+    let scene = sheets();
+    let just = picture(&scene, ("shared", "shared"));
+    for greedy in [
+        ("below[axis] && low[axis] < -margin[axis]", "below[axis] && low[axis] < 2.0"),
+        ("above[axis] && high[axis] < -margin[axis]", "above[axis] && high[axis] < 2.0"),
+        ("area < -unsure", "area < unsure + 20.0"),
+        ("ceil(low - place)", "ceil(low - place + 8.0)"),
+        ("nearest - margin))", "nearest + 0.5))"),
+        (
+            "if (!(depths[base + y * size.x + x] < depth)) return false;",
+            "if (depths[base + y * size.x + x] < depth) return true;",
+        ),
+    ] {
+        assert!(picture(&scene, greedy) != just, "{greedy:?} changes nothing");
+    }
+}

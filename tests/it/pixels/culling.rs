@@ -1,0 +1,365 @@
+//! A culled picture is the picture to the bit, whatever was drawn before; and what was left out is what arithmetic says.
+
+use std::sync::Arc;
+
+use modalcast::deform::Surface;
+use modalcast::domain::{AlphaMode, Material, Mesh};
+use modalcast::render::{Culled, Field, Ran, Renderer, SceneBuffers, Seen, Shot};
+use modalcast::scene::{Camera, Culling, Ground, Lens, Rectangle, Scene, Shadow, ShadowMethod, Transparency, View};
+
+use super::build::{Stage, camera, facing, open};
+
+const ALL: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Depth];
+const SIZE: u32 = 96;
+
+/// One frame: its bytes, what its samples see, and what ran.
+struct Frame {
+    rgba: Vec<u8>,
+    seen: Vec<Seen>,
+    ran: Ran,
+}
+
+impl Frame {
+    fn culled(&self) -> Culled {
+        self.ran.culled.expect("a culled frame")
+    }
+}
+
+/// A scene under one way of culling, and where its vertices are.
+struct Show {
+    renderer: Renderer,
+    buffers: SceneBuffers,
+    scene: Arc<Scene>,
+}
+
+impl Show {
+    fn new(mut stage: Stage, culling: Culling) -> Self {
+        stage.0.look.culling = culling;
+        let (scene, mut renderer) = (stage.scene(), open());
+        let buffers = renderer.load(&scene).expect("loads");
+        let mut show = Self { renderer, buffers, scene };
+        show.place(|point| point);
+        show
+    }
+
+    /// Puts every vertex where a function of its place at rest says.
+    fn place(&mut self, to: impl Fn([f32; 3]) -> [f32; 3]) {
+        let mut surface = Surface::default();
+        for domain in &self.scene.domains {
+            let mesh = &self.scene.shapes[domain.shape].mesh;
+            surface.positions.extend(mesh.rest().iter().flat_map(|point| to(*point)));
+            surface.normals.extend(mesh.corners().normals.as_flattened());
+        }
+        self.renderer.upload(&self.buffers, &surface).expect("uploads");
+    }
+
+    fn frame(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
+        let shot = Shot { camera, width, height, bounds: self.scene.rest_bounds };
+        let rgba = self.renderer.draw(&self.buffers, &shot).expect("draws").rgba;
+        let ran = self.renderer.ran().clone();
+        Frame { rgba, seen: self.renderer.seen().expect("ids"), ran }
+    }
+}
+
+fn at(eye: [f64; 3], target: [f64; 3]) -> Camera {
+    let view = View::LookAt { eye, target, up: [0.0, 1.0, 0.0] };
+    Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 48.0, cy: 48.0 }, near: 0.0, far: 0.0 }
+}
+
+/// Triangles of one mesh, each with corners of its own.
+fn loose(triangles: &[[[f32; 3]; 3]]) -> Mesh {
+    let rest = triangles.as_flattened().to_vec();
+    let count = rest.len() as u32;
+    let uvs = (0..count).map(|corner| [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]][corner as usize % 3]).collect();
+    let indices = (0..count / 3).map(|first| [3 * first, 3 * first + 1, 3 * first + 2]).collect();
+    Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("triangles")
+}
+
+/// Triangles of all sizes, some without area, about the origin.
+fn soup(seed: u64, count: usize, spread: f32) -> Mesh {
+    let mut random = fastrand::Rng::with_seed(seed);
+    let mut triangles = Vec::new();
+    for _ in 0..count {
+        let mut number = |size: f32| size * (2.0 * random.f32() - 1.0);
+        let size = 10.0_f32.powf(number(1.5) - 1.0);
+        let middle: [f32; 3] = [number(spread), number(spread), number(spread)];
+        let mut corner = || [0, 1, 2].map(|axis| middle[axis] + number(size));
+        let [a, b, c] = [corner(), corner(), corner()];
+        triangles.push(if number(1.0) > 0.95 { [a, b, b] } else { [a, b, c] });
+    }
+    loose(&triangles)
+}
+
+fn material(alpha_mode: AlphaMode, double_sided: bool, colour: [f32; 3]) -> Material {
+    Material { alpha_mode, double_sided, diffuse: colour, ambient: colour, ..Material::default() }
+}
+
+/// Every kind of material with one side and with two, and a closed ball's worth of coplanar twins.
+fn mixed(samples: u32, transparency: Transparency) -> Stage {
+    let mut stage = Stage::new();
+    (stage.0.look.samples, stage.0.look.transparency) = (samples, transparency);
+    stage.0.look.ground = Some(Ground::default());
+    stage.0.look.shadow = Some(Shadow { size: 256, ..Shadow::default() });
+    let leaf = stage.texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
+    let mask = AlphaMode::Mask { cutoff: 0.5 };
+    for (seed, double_sided) in [(1, false), (2, true)] {
+        // With several samples software reads images where what is hidden says: see `Culling::Depth`.
+        let image = (samples == 1).then_some(leaf);
+        let leaves = Material { colour_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
+        let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
+        stage = stage
+            .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
+            .add(soup(seed + 2, 400, 3.0), leaves)
+            .add(soup(seed + 4, 60, 3.0), glass)
+            // The same again in other colours: every depth is there twice.
+            .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
+    }
+    stage
+}
+
+/// Frames of all ways of culling that must not differ; those of the deepest are returned.
+fn same(stage: &dyn Fn() -> Stage, frames: &dyn Fn(&mut Show) -> Vec<Frame>) -> Vec<Frame> {
+    let [none, triangles, depth] = ALL.map(|culling| frames(&mut Show::new(stage(), culling)));
+    for (index, plain) in none.iter().enumerate() {
+        assert!(plain.ran.culled.is_none(), "control: nothing is culled");
+        for culled in [&triangles[index], &depth[index]] {
+            assert!(culled.seen == plain.seen, "frame {index}: other triangles are seen");
+            assert!(culled.rgba == plain.rgba, "frame {index}: other colours");
+            assert!(culled.ran.lists == plain.ran.lists, "frame {index}: other lists");
+        }
+    }
+    depth
+}
+
+const CAMERAS: [([f64; 3], [f64; 3]); 5] = [
+    ([0.0, 1.0, 9.0], [0.0; 3]),
+    ([0.0, 1.2, 9.0], [0.1, 0.0, 0.0]),
+    // A jump to the other side, one into the middle, and one up close.
+    ([-1.0, 2.0, -9.0], [0.0; 3]),
+    ([0.1, 0.0, 0.2], [1.0, 0.2, -3.0]),
+    ([2.0, 2.0, 2.0], [2.4, 2.0, 1.0]),
+];
+
+#[test]
+fn a_culled_picture_is_the_picture_to_the_bit_whatever_the_camera_saw_before() {
+    for (samples, transparency) in [(1, Transparency::Exact), (4, Transparency::Exact), (4, Transparency::TwoPass)] {
+        let frames = same(&|| mixed(samples, transparency), &|show| {
+            let there = CAMERAS.into_iter().chain([CAMERAS[0]]);
+            there.map(|(eye, target)| show.frame(at(eye, target), [SIZE, SIZE])).collect()
+        });
+        let camera: Vec<_> = frames.iter().map(|frame| frame.culled().camera).collect();
+        assert_eq!(camera[0].hidden, 0, "nothing is remembered yet");
+        assert!(camera[1].hidden > 100, "{camera:?}");
+        assert!(camera.iter().all(|sifted| sifted.listed > 0 && sifted.no_sample > 50), "{camera:?}");
+        assert!(camera[0].facing > 100 && camera[3].outside > 500, "{camera:?}");
+        assert!(frames[0].rgba == frames[5].rgba, "the same camera again");
+        let all = camera[0].listed + camera[0].left_out();
+        assert!(camera.iter().all(|sifted| sifted.listed + sifted.left_out() == all), "each has one verdict");
+        assert_eq!(all as usize, 2 * (700 + 400 + 60 + 700));
+    }
+}
+
+#[test]
+fn lists_of_many_blocks_and_super_blocks_keep_the_order_of_their_triangles() {
+    let field = || {
+        let mut stage = Stage::new();
+        stage.0.look.samples = 1;
+        let mask = AlphaMode::Mask { cutoff: 0.5 };
+        stage
+            .add(soup(7, 45_000, 4.0), material(AlphaMode::Opaque, false, [0.8, 0.3, 0.2]))
+            .add(soup(7, 20_000, 4.0), material(AlphaMode::Opaque, true, [0.2, 0.3, 0.9]))
+            .add(soup(8, 17_000, 4.0), material(mask, true, [0.3, 0.8, 0.2]))
+    };
+    let frames = same(&field, &|show| {
+        [0.0, 0.1, 0.2].map(|x| show.frame(at([x, 1.0, 14.0], [x, 0.0, 0.0]), [SIZE, SIZE])).into()
+    });
+    let camera = frames[2].culled().camera;
+    assert_eq!(camera.listed + camera.left_out(), 82_000);
+    assert!(camera.hidden > 10_000 && camera.listed < 40_000, "{camera:?}");
+}
+
+#[test]
+fn a_culled_scene_that_moves_is_the_scene_that_moves() {
+    let moved = |step: usize| {
+        move |[x, y, z]: [f32; 3]| {
+            let (sin, cos) = (0.2 * step as f32).sin_cos();
+            [x * cos - z * sin, y + 0.3 * (x + step as f32).sin(), x * sin + z * cos]
+        }
+    };
+    same(&|| mixed(4, Transparency::Exact), &|show| {
+        let mut frames = Vec::new();
+        for step in 0..5 {
+            show.place(moved(step));
+            frames.push(show.frame(at([0.0, 1.0, 9.0], [0.0; 3]), [SIZE, SIZE - 7]));
+        }
+        frames
+    });
+}
+
+#[test]
+fn places_that_are_none_or_overflow_or_are_far_apart_are_culled_without_a_trace() {
+    let spoil = |what: f32, every: u32| {
+        move |[x, y, z]: [f32; 3]| if (x.to_bits() / 8).is_multiple_of(every) { [x, what, z] } else { [x, y, z] }
+    };
+    same(&|| mixed(4, Transparency::Exact), &|show| {
+        let mut frames = Vec::new();
+        for what in [f32::NAN, f32::INFINITY, 3e38, -1e30, 1e19, 1e6] {
+            for every in [1, 3] {
+                show.place(spoil(what, every));
+                frames.push(show.frame(at([0.0, 1.0, 9.0], [0.0; 3]), [SIZE, SIZE]));
+            }
+        }
+        frames
+    });
+}
+
+#[test]
+fn scenes_far_from_the_origin_or_within_strange_planes_are_culled_without_a_trace() {
+    for (shift, near, far) in [(1e4, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
+        same(&|| mixed(4, Transparency::Exact), &|show| {
+            show.place(|[x, y, z]| [x + shift as f32, y, z]);
+            let camera = Camera { near, far, ..at([shift, 1.0, 9.0], [shift, 0.0, 0.0]) };
+            (0..3).map(|_| show.frame(camera, [SIZE, SIZE])).collect()
+        });
+    }
+}
+
+#[test]
+fn huge_triangles_across_every_plane_and_one_alone_are_drawn() {
+    let huge = || {
+        let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
+        let crossing = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
+        let mesh = loose(&[wall(-2.0), wall(-2.5), crossing, [[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, 1e9, 0.0]]]);
+        Stage::new().add(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
+    };
+    let one =
+        || Stage::new().add(loose(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]), Material::default());
+    for stage in [&huge as &dyn Fn() -> Stage, &one] {
+        let frames = same(stage, &|show| {
+            let camera = Camera { near: 0.01, far: 1e3, ..camera(64) };
+            (0..3).map(|_| show.frame(camera, [64, 64])).collect()
+        });
+        assert!(frames[2].seen.iter().any(|seen| matches!(seen, Seen::Triangle(_))));
+    }
+}
+
+/// A square before a grid of 32 x 32 small ones behind it, half of them in its shade.
+fn curtain(culling: Culling) -> Stage {
+    let small = |index: usize| {
+        let (x, y) = ((index % 32) as f32 * 0.25 - 4.0, (index / 32) as f32 * 0.25 - 4.0);
+        [[x + 0.02, y + 0.02, -1.0], [x + 0.22, y + 0.02, -1.0], [x + 0.02, y + 0.22, -1.0]]
+    };
+    let grid: Vec<_> = (0..32 * 32).map(small).collect();
+    let mut stage = Stage::new()
+        .add(loose(&grid), material(AlphaMode::Opaque, true, [0.9, 0.2, 0.1]))
+        .add(facing(-4.5, -4.5, 0.0, 4.5, 0.0), material(AlphaMode::Opaque, false, [0.1, 0.2, 0.9]));
+    (stage.0.look.samples, stage.0.look.culling) = (1, culling);
+    stage
+}
+
+#[test]
+fn as_many_triangles_are_hidden_as_stand_behind_the_square() {
+    let mut show = Show::new(curtain(Culling::Depth), Culling::Depth);
+    let first = show.frame(camera(128), [128, 128]).culled().camera;
+    assert_eq!((first.hidden, first.listed), (0, 1024 + 2));
+    let second = show.frame(camera(128), [128, 128]).culled().camera;
+    // At a tenth deeper the square hides what lies left of x = 0; the column beside its edge shares a pixel with what is
+    // not hidden.
+    assert_eq!((second.outside, second.facing, second.no_sample), (0, 0, 0));
+    assert!((15 * 32..=16 * 32).contains(&second.hidden), "{second:?}");
+    assert_eq!(second.listed + second.hidden, 1024 + 2);
+    // From behind: nothing hides, and the square turns its back.
+    let behind = show.frame(at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
+    assert_eq!((behind.facing, behind.hidden), (2, 0));
+    // Aside: all is outside.
+    let aside = show.frame(at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
+    assert_eq!((aside.outside, aside.listed), (1026, 0));
+}
+
+#[test]
+fn what_is_smaller_than_the_gaps_between_samples_is_left_out_and_what_holds_one_is_not() {
+    let dot = |x: f32, y: f32| [[x, y, 0.0], [x + 0.002, y, 0.0], [x, y + 0.002, 0.0]];
+    // Ten pixels a unit: pixel middles lie at 0.05 + 0.1 i; the second holds one, the first none.
+    let mesh = loose(&[dot(0.0, 0.0), dot(0.0492, 0.0492)]);
+    let mut stage = Stage::new().add(mesh, Material::default());
+    stage.0.look.samples = 1;
+    let frame = Show::new(stage, Culling::Triangles).frame(camera(64), [64, 64]);
+    let camera = frame.culled().camera;
+    assert_eq!((camera.no_sample, camera.listed), (1, 1), "{camera:?}");
+    assert_eq!(frame.seen.iter().filter(|seen| **seen == Seen::Triangle(1)).count(), 1, "control: it is seen");
+}
+
+#[test]
+fn shadows_of_listed_casters_are_those_of_all_and_splits_too() {
+    for (method, splits) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
+        let stage = || {
+            let mut stage = mixed(1, Transparency::Exact);
+            stage.0.look.sun = [0.3, 0.8, 0.4];
+            stage.0.look.shadow = Some(Shadow { size: 128, method, splits, ..Shadow::default() });
+            stage
+        };
+        let frames =
+            same(&stage, &|show| (0..2).map(|_| show.frame(at([0.0, 4.0, 12.0], [0.0; 3]), [SIZE, SIZE])).collect());
+        let sun = frames[0].culled().sun;
+        assert!(sun.no_sample > 100 * splits && sun.facing == 0 && sun.hidden == 0, "{sun:?}");
+        assert_eq!(sun.listed + sun.left_out(), splits * 2 * (700 + 400 + 60 + 700));
+    }
+}
+
+#[test]
+fn software_leaves_hidden_triangles_in_where_they_move_the_centroids_of_cut_outs() {
+    for (samples, alpha_mode, falls) in [
+        (4, AlphaMode::Mask { cutoff: 0.5 }, true),
+        (1, AlphaMode::Mask { cutoff: 0.5 }, false),
+        (4, AlphaMode::Opaque, false),
+    ] {
+        let mut stage = Stage::new();
+        stage.0.look.samples = samples;
+        let image = Some(stage.texture(1, 1, |_, _| [255; 4]));
+        let paint = Material { colour_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
+        let mut show = Show::new(stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), paint), Culling::Depth);
+        let hides = show.frame(camera(64), [64, 64]).ran.passes.contains(&"occluders");
+        assert_eq!(hides, !(falls && show.renderer.info().software));
+    }
+}
+
+#[test]
+fn picks_and_pictures_of_numbers_do_not_know_of_culling_and_neither_do_places_of_another_origin() {
+    let shown = ALL.map(|culling| {
+        let mut show = Show::new(mixed(4, Transparency::Exact), culling);
+        let camera = at([0.0, 1.0, 9.0], [0.0; 3]);
+        let shot = Shot { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds };
+        show.frame(camera, [SIZE, SIZE]);
+        let rectangle = Rectangle::within([SIZE; 2], [40; 2], [8; 2]).expect("inside");
+        let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("picks");
+        let hits = show.renderer.finish_pick(pick).expect("hits");
+        let depth = show.renderer.survey(&show.buffers, &shot, Field::Depth).expect("surveys").bytes;
+        // Everything a little aside, with an origin of its own.
+        let rest = show.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
+        let aside: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
+        show.renderer.upload_apart(&mut show.buffers, &aside, [0.25, 0.0, 0.0]).expect("uploads");
+        let apart = [show.frame(camera, [SIZE, SIZE]), show.frame(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
+        (hits, depth, apart)
+    });
+    assert!(!shown[0].0.is_empty() && shown[0].2[0] == shown[0].2[1]);
+    assert!(shown[1] == shown[0] && shown[2] == shown[0]);
+}
+
+#[test]
+fn culled_draws_do_not_grow_with_domains_and_a_small_scene_makes_nothing_for_it() {
+    let plain = Show::new(curtain(Culling::Fitting), Culling::Fitting);
+    assert!(plain.buffers.allocated().iter().all(|part| !part.name.contains("cull") && !part.name.contains("listed")));
+    let draws = |domains: usize| {
+        let mut stage = Stage::new();
+        for index in 0..domains {
+            stage =
+                stage.add(facing(-1.0, -1.0, 1.0, 1.0, -(index as f32)), material(AlphaMode::Opaque, true, [0.5; 3]));
+        }
+        let mut show = Show::new(stage, Culling::Depth);
+        let frame = show.frame(camera(64), [64, 64]);
+        assert_eq!(frame.ran.passes, show.buffers.plan().passes);
+        assert_eq!(frame.ran.draws, show.buffers.plan().draws);
+        frame.ran.draws
+    };
+    assert_eq!((draws(1), draws(40)), (2, 2));
+}

@@ -1,0 +1,73 @@
+//! The almond tree, culled: the same picture, and what that takes.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use modalcast::deform::Deformer as _;
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Culled, Renderer, Shot};
+use modalcast::scene::{Camera, Culling, Look, Parts, Scene, Shadow, State, Transparency};
+
+use super::build::open;
+
+const SIZE: [u32; 2] = [1920, 1080];
+const FRAMES: usize = 9;
+
+/// The same scene under another look.
+fn under(scene: &Scene, look: Look) -> Arc<Scene> {
+    let parts = Parts {
+        name: scene.name.clone(),
+        shapes: scene.shapes.clone(),
+        materials: scene.materials.clone(),
+        textures: scene.textures.clone(),
+        domains: scene.domains.clone(),
+        up: scene.up,
+        unit: scene.unit,
+        origin: scene.origin,
+        look,
+        deformation: scene.deformation,
+        rigid_transforms: scene.rigid_transforms,
+        remarks: vec![],
+    };
+    Scene::new(parts).expect("a good scene")
+}
+
+/// The picture, the median milliseconds of some passes, and what was culled.
+fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<Culled>) {
+    let mut deformer = ReferenceDeformer::new(scene);
+    let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let buffers = renderer.load(scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let camera = Camera::framing(scene, SIZE[0], SIZE[1]);
+    let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds };
+    let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("draws")).collect();
+    assert!(images.iter().all(|image| image.rgba == images[0].rgba), "frames differ");
+    let median = |name: &'static str| {
+        let of = |passes: &[(&'static str, f64)]| passes.iter().find(|pass| pass.0 == name).map_or(0.0, |pass| pass.1);
+        let mut all: Vec<f64> = images[1..].iter().map(|image| of(&image.passes)).collect();
+        all.sort_by(f64::total_cmp);
+        (name, all[all.len() / 2])
+    };
+    let passes = ["shadow", "blur", "cull", "visibility", "blended", "draw"].map(median).to_vec();
+    let culled = renderer.ran().culled;
+    renderer.unload(buffers);
+    (images[0].rgba.clone(), passes, culled)
+}
+
+#[test]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+fn real_almond_culled_is_the_same_picture() {
+    let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
+    let scene = modalcast::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond");
+    let mut renderer = open();
+    for transparency in [Transparency::Exact, Transparency::TwoPass] {
+        let look = Look { transparency, shadow: Some(Shadow { size: 2048, ..Shadow::default() }), ..scene.look };
+        let mut plain = None;
+        for culling in [Culling::None, Culling::Triangles, Culling::Depth] {
+            let (rgba, passes, culled) = frames(&mut renderer, &under(&scene, Look { culling, ..look }));
+            println!("{transparency:?}, {culling:?}: {passes:.3?} {culled:?}");
+            assert!(plain.get_or_insert_with(|| rgba.clone()) == &rgba, "{culling:?} changes the picture");
+            assert_eq!(culled.is_some_and(|culled| culled.camera.left_out() > 0), culling != Culling::None);
+        }
+    }
+}
