@@ -56,6 +56,10 @@ pub(super) fn trials(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wa
     if has_normals(scene) {
         offers.extend(storages.iter().map(|storage| stored(*storage, Extent::Whole)));
     }
+    for (name, kept) in readers(scene) {
+        let extent = if has_normals(scene) { Extent::Whole } else { Extent::Positions };
+        offers.push(ours(device, stock, wanted, (name, kept, extent)));
+    }
     if scene.domains.len() >= MANY {
         offers.push(changed(device, scene, wanted));
     }
@@ -66,6 +70,17 @@ pub(super) fn trials(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wa
         offers.extend(cublas(device, scene, wanted));
     }
     offers
+}
+
+/// What a scene may keep for readers, by name, where it keeps neither.
+fn readers(scene: &Scene) -> Vec<(String, Deformation)> {
+    let plain = scene.deformation;
+    if plain.displacements || plain.boxes {
+        return Vec::new();
+    }
+    let u = ("cuda f32, displacements kept".to_owned(), Deformation { displacements: true, ..plain });
+    let boxes = ("cuda f32, boxes kept".to_owned(), Deformation { boxes: true, ..plain });
+    vec![u, boxes]
 }
 
 /// Whether a deformation sums other modes than all, or in another way: its kernel then has its own rows.

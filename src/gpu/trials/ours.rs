@@ -284,6 +284,9 @@ impl Trial for Ours {
         let words = self.kept().map_or(("U", words), |share| ("U kept", (share * words as f64) as u64));
         let mut bytes = vec![words, ("scales", self.plan.bytes(Role::Scales)), ("q", 4 * coordinates)];
         bytes.push(("u or x", 12 * vertices));
+        if self.scene.needs.displacements && self.extent != Extent::Uq {
+            bytes.push(("u kept", 12 * vertices));
+        }
         if self.extent != Extent::Uq {
             bytes.extend([("x0", rest), ("T", transforms)]);
         }
