@@ -1,5 +1,5 @@
 // x = T_b (x0 + U q_b) for domains b that share a shape, up to VECTORS at once: their U is read once for all of them.
-//   blocks     the work of each block: a group of domains, and a tile of their shape (layout.cuh)       (in)
+//   blocks     the work of each block: a group of domains, and some tiles of their shape (layout.cuh)   (in)
 //   groups     domains of one shape, and where its U and x0 lie                                         (in)
 //   members    the domains of all groups                                                                (in)
 //   words      U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                             (in)
@@ -7,8 +7,9 @@
 //   scales     with STORE_INT8: per tile of U and mode                                                  (in)
 //   transforms, following, frames, q   as `deform` has them                                             (in)
 //   positions  [vertices][3] f32, in the header                                                         (out)
-//   boxes      [tiles of deform][4][6] u32, as `deform` writes them                                     (out)
-// Launch: a block of WARPS warps for each tile of each group, with shared memory for WARPS Own, T, members and q.
+//   boxes      [tiles of deform][4][6] u32, as `deform` writes them; those of a half of a tile that has no
+//              vertices stay zeros, as they were made                                                   (out)
+// Launch: a block of WARPS warps for each run of tiles of a group, with shared memory for WARPS Own, Common and q.
 // CPU twin: the tests of src/gpu/batch.rs.
 //
 // The modes are summed in their order, from +0, by fused multiply-adds, as `deform` does: the same bits. What is not

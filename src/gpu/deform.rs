@@ -17,8 +17,8 @@ use crate::error::{Error, Result, during};
 use crate::scene::Scene;
 use crate::storage::{Plane, TILE_QUADS, Tiles};
 
-/// Tiles of `deform` that take as long as a block of `batch`, about.
-const WORK_OF_BLOCK: usize = 2;
+/// Tiles of `deform` that take as long as `batch` does for a tile of a group, about.
+const WORK_OF_TILE: usize = 2;
 
 /// Words of U that go to the device in one piece while packing, so that packing needs little memory of its own.
 const PIECE: usize = 1 << 22;
@@ -99,7 +99,7 @@ impl Deform {
                 listing: Listing {
                     spans: work.spans,
                     tiles: work.tiles.len(),
-                    whole: work.launched + WORK_OF_BLOCK * work.batched.blocks.len(),
+                    whole: work.launched + WORK_OF_TILE * work.batched.tiles(),
                 },
             }),
         })

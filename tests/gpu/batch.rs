@@ -90,6 +90,19 @@ fn gpu_a_batch_has_the_bits_of_domains_apart_at_every_size_rank_count_and_storag
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
+fn gpu_blocks_with_several_tiles_have_the_bits_of_domains_apart() {
+    // More than 8,192 tiles, so that a block has two or three of them; the last is not whole.
+    for (storage, vertices) in [(Storage::F32, 1_100_007), (Storage::Int8, 1_100_007), (Storage::F16, 1_600_001)] {
+        let name = format!("{} n {vertices}", storage.name());
+        let scenes = both(|| ensemble((vertices, 5, 3), Deformation { boxes: true, ..stored(storage) }));
+        let blocks = modalcast::gpu::plan(&scenes[0]).kernel(Launch::Batch).expect("a batch").blocks as usize;
+        assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
+        assert_eq!(differences(&name, &scenes), 0, "{name}");
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
 fn gpu_batches_among_other_domains_agree_with_all_that_a_scene_may_ask_for() {
     let exact = |storage| Deformation { normals: Normals::Exact, ..stored(storage) };
     let crowd = |deformation: Deformation, normal_maps: bool| {

@@ -132,7 +132,8 @@ impl Ours {
 
     /// Makes the values of each turn those of a step that changed these domains.
     fn apply(&mut self, device: &Device, states: &[State], changed: &[u32]) -> Result<()> {
-        let too_many = || invalid("changed", "a quarter of the domains at most, and no truncation", changed.len());
+        let allowed = "a quarter of the domains at most, no truncation, and less work than a whole step";
+        let too_many = || invalid("changed", allowed, changed.len());
         let mut apply =
             Apply::new(device, self.deform.packing(), self.plan.kernel(Launch::Apply).ok_or_else(too_many)?)?;
         let mut list = apply.list(device)?;

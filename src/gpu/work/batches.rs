@@ -54,6 +54,11 @@ pub(in super::super) fn shapes(scene: &Scene) -> Vec<bool> {
 }
 
 impl Batched {
+    /// Tiles of all groups.
+    pub(in super::super) fn tiles(&self) -> usize {
+        self.blocks.iter().map(|block| (block.end - block.tile) as usize).sum()
+    }
+
     /// Of the tiles that are there; `first_words` are those of the shapes.
     pub(super) fn new(
         scene: &Scene,

@@ -19,6 +19,7 @@
 //! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }   # variance, standard, filtered; maps, 1 to 4
 //!                            # and bleeding, least_variance, alpha_threshold, moments (f32, f16)
 //! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
+//! deform.batches = "never"   # or "always": whether domains that share a U are deformed together; else where it pays
 //! deform.boxes = true        # keep a box of each domain for readers, and with displacements u = U q of each vertex
 //!
 //! model = "fern_02.glb"      # a scene of one model, or a [[domain]] for each of several

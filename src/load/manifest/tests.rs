@@ -4,7 +4,9 @@ use std::path::Path;
 
 use super::*;
 use crate::domain::{AlphaMode, Transform};
-use crate::scene::{Antialias, Bloom, Culling, Deformation, Moments, Normals, Shadow, ShadowMethod, Storage, Tone};
+use crate::scene::{
+    Antialias, Batches, Bloom, Culling, Deformation, Moments, Normals, Shadow, ShadowMethod, Storage, Tone,
+};
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
@@ -31,7 +33,7 @@ fn one_model_with_everything_said_about_the_scene() {
          model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n\
          look.antialias = 'fxaa'\nlook.bloom.strength = 0.25\nlook.tone = 'aces'\nlook.exposure = 1.5\n\
          look.dither = true\nlook.culling = 'depth'\n\
-         deform = { storage = 'int8', normals = 'exact', truncation = 1e-4, displacements = true }\n",
+         deform = { storage = 'int8', normals = 'exact', truncation = 1e-4, displacements = true, batches = 'never' }\n",
     )
     .expect("good");
     assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
@@ -47,7 +49,7 @@ fn one_model_with_everything_said_about_the_scene() {
         truncation: Some(1e-4),
         ..Deformation::default()
     };
-    let deformation = Deformation { displacements: true, ..deformation };
+    let deformation = Deformation { displacements: true, batches: Batches::Never, ..deformation };
     assert_eq!(parts.deformation, deformation);
     assert_eq!(parts.shapes[0].modes.rank(), 2);
     assert_eq!(parts.domains[0].placement.translation(), nalgebra::Vector3::new(1.0, 2.0, 3.0));
