@@ -9,6 +9,7 @@
 use std::sync::Arc;
 
 use cudarc::driver::{CudaSlice, PinnedHostSlice, result};
+use rayon::prelude::*;
 
 use super::device::Device;
 use super::layout::{Following, Header};
@@ -233,6 +234,9 @@ impl Packing {
     }
 }
 
+/// Domains that a core decides about at a time: a few microseconds each.
+const DECIDED_TOGETHER: usize = 64;
+
 /// Which chunks of modes each domain sums.
 #[derive(Debug)]
 struct Choice {
@@ -270,13 +274,17 @@ impl Choice {
         self.chunks.resize((packing.coordinates.total / per_chunk).next_multiple_of(8) / 2, 0);
         let chunks: &mut [u16] = bytemuck::cast_slice_mut(&mut self.chunks);
         self.bound = 0.0;
-        for (domain, truncation) in self.truncations.iter_mut().enumerate() {
-            let amounts = Amounts {
-                q: state.q_of(scene, domain),
-                reaches: &self.reaches[scene.domains[domain].shape],
-                norm: bound::norm(&state.composed(scene, domain)),
-            };
-            truncation.update(amounts, self.budget);
+        let (reaches, budget) = (&self.reaches, self.budget);
+        let decide = |(domain, truncation): (usize, &mut Truncation)| {
+            // Nothing is left out of nothing, whatever T.
+            if scene.rank_of(domain) > 0 {
+                let reaches = &reaches[scene.domains[domain].shape];
+                let norm = bound::norm(&state.composed(scene, domain));
+                truncation.update(Amounts { q: state.q_of(scene, domain), reaches, norm }, budget);
+            }
+        };
+        self.truncations.par_iter_mut().enumerate().with_min_len(DECIDED_TOGETHER).for_each(decide);
+        for (domain, truncation) in self.truncations.iter().enumerate() {
             self.bound = self.bound.max(truncation.bound());
             let first = packing.coordinates.first[domain] as usize / per_chunk;
             let mut count = 0;
