@@ -1,10 +1,21 @@
 //! What is late: vertices that leave the device while the next step is computed, and frames that are drawn and brought back
-//! while the next step is computed and its own frames are begun. Each is handed over, in order, as it arrives.
+//! while the next step is computed and its own frames are begun. Each is handed over, in order, as it arrives. `read` is the
+//! way of the pixels to memory that the host reads.
+//!
+//! A deformer with vertices of its own computes beside the frames that are under way:
 //!
 //! ```text
-//! device   [draw k][deform k+1][draw k+1][deform k+2]
-//! frame k           [read       ]
-//! frame k+1                              [read       ]
+//! deformer  [deform k+1  ]          [deform k+2  ]
+//! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
+//! ```
+//!
+//! One that writes into OpenGL's buffers does not: to map them waits for all that OpenGL was told before (`gpu::interop`),
+//! and so for reading frame k too. What overlaps is the host's: the next step and its frames are given to the device
+//! meanwhile, which goes from one to the other without waiting for the host, and pixels are copied out beside them.
+//!
+//! ```text
+//! device    [draw k][read k][deform k+1][draw k+1][read k+1][deform k+2]
+//! host      [parse k+2, give it        ][copy out, encode, send k      ]
 //! ```
 
 use std::sync::Arc;
