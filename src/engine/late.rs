@@ -10,12 +10,13 @@
 //! ```
 //!
 //! One that writes into OpenGL's buffers does not: to map them waits for all that OpenGL was told before (`gpu::interop`),
-//! and so for reading frame k too. What overlaps is the host's: the next step and its frames are given to the device
-//! meanwhile, which goes from one to the other without waiting for the host, and pixels are copied out beside them.
+//! and so for reading frame k too. What overlaps is the host's part. Step k+1 is written and given to the device while
+//! frame k is drawn, and begins as soon as that is read; frame k is copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
-//! device    [draw k][read k][deform k+1][draw k+1][read k+1][deform k+2]
-//! host      [parse k+2, give it        ][copy out, encode, send k      ]
+//! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]
+//! host      [give k+1 ]                  [give k+2 ]
+//! frame k                                [copy out, encode, send]
 //! ```
 
 use std::sync::Arc;
