@@ -2,7 +2,7 @@
 // it begins with. Levels follow each other, each half as wide and high, rounded up. Texels beyond the picture hide nothing
 // and show nothing: they count as 0.
 layout(local_size_x = 16, local_size_y = 16) in;
-layout(location = 0) uniform int size_packed;
+layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
 layout(std430, binding = 4) buffer Pyramid { float depths[]; };
 #ifdef FIRST
 #if SAMPLES > 1
@@ -17,7 +17,7 @@ const int BEGIN = 4;
 shared float farthest[16][16];
 
 void main() {
-    ivec2 size = ivec2(size_packed & 0xFFFF, size_packed >> 16), at = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 size = ivec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), at = ivec2(gl_GlobalInvocationID.xy);
     ivec2 lane = ivec2(gl_LocalInvocationID.xy);
     int base = 0;
     for (int level = 0; level < BEGIN; level++) {

@@ -2,7 +2,7 @@
 // what rounding may do on the way from a vertex to a place on the device's grid, so that what is left out changes no bit
 // of the picture. A triangle that the rasteriser may have to clip is only left out as a whole, outside one plane.
 layout(local_size_x = LANES) in;
-layout(location = 0) uniform int size_packed;
+layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 18) uniform usamplerBuffer triangle_vertices;
 
@@ -91,7 +91,7 @@ bool all_nearer(uvec2 low, uvec2 high, uvec2 size, float depth) {
 
 // A triangle of which no corner is outside any plane.
 uint verdict_inside(Corner corners[3], bool one_sided) {
-    vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16), at[3];
+    vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), at[3];
     float nearest = 1.0, farthest = 0.0, depth[3], blurred = 0.0, off = 0.0;
     for (int index = 0; index < 3; index++) {
         vec4 clip = corners[index].clip, slack = corners[index].slack;

@@ -132,7 +132,8 @@ pub struct Deformed {
     /// Bounds of all deformed positions as they are in [`Surface`]. Not finite when f32 overflowed somewhere, in a
     /// displacement that is kept too.
     pub bounds: Bounds,
-    /// Milliseconds from the call until the vertices were there.
+    /// Milliseconds from the call until the vertices were there; with vertices in the renderer's own buffers, without the
+    /// wait for frames that are still drawn from them.
     pub ms: f64,
 }
 

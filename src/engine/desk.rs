@@ -1,17 +1,20 @@
 //! What the device thread does with commands, and in which order it answers them.
 //!
 //! Frames go through the renderer's ring: one is begun, the commands after it are obeyed, and it is answered once the device
-//! has drawn it, or before a further one when as many are under way as the ring has places. Its pixels are copied on
-//! another thread, so that the device's next command does not wait for that.
+//! has drawn it, or before a further one when as many are under way as the ring has places. Its pixels are copied by two
+//! threads of the desk's own, so that the device's next command does not wait for that. They are not those that all work
+//! shares: a long job there, such as growing a scene, would keep the copies waiting, and the ring's places with them, and
+//! so the frames of all scenes.
 
 use std::collections::{HashMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
+use rayon::{ThreadPool, ThreadPoolBuilder};
 use tokio::sync::mpsc;
 
 use super::staged::Staged;
-use super::workbench::{Drawing, Workbench};
+use super::workbench::{Drawing, Info, Workbench};
 use super::worker::{Command, Copied, Reply, SceneId};
 use crate::deform::{Fetch, Wanted};
 use crate::error::{Result, during};
@@ -21,10 +24,13 @@ use crate::telemetry::ms_since;
 
 /// How long the thread waits for a frame before it looks for a command again.
 const SLICE: Duration = Duration::from_micros(100);
+/// Threads that copy pixels.
+const COPIERS: usize = 2;
 
 /// The device thread's own.
-struct Desk {
+pub(super) struct Desk {
     workbench: Workbench,
+    copiers: ThreadPool,
     scenes: HashMap<SceneId, Staged>,
     /// Vertices on their way, oldest first.
     arriving: VecDeque<Arriving>,
@@ -42,9 +48,7 @@ struct Arriving {
 }
 
 /// Obeys commands until one ends the thread or nobody can give any.
-pub(super) fn work(workbench: Workbench, mut inbox: mpsc::Receiver<Command>) {
-    let (arriving, picks, frames) = (VecDeque::new(), VecDeque::new(), VecDeque::new());
-    let mut desk = Desk { workbench, scenes: HashMap::new(), arriving, picks, frames };
+pub(super) fn work(mut desk: Desk, mut inbox: mpsc::Receiver<Command>) {
     while let Some(command) = next(&mut desk, &mut inbox) {
         if matches!(command, Command::Quit) {
             break;
@@ -89,6 +93,19 @@ fn guarded(act: impl FnOnce()) {
 }
 
 impl Desk {
+    /// Starts the threads that copy.
+    pub(super) fn new(workbench: Workbench) -> Result<Self> {
+        let copiers = ThreadPoolBuilder::new().num_threads(COPIERS).thread_name(|index| format!("pixels {index}"));
+        let copiers = copiers.build().map_err(during("threads that copy pixels"))?;
+        let (arriving, picks, frames) = (VecDeque::new(), VecDeque::new(), VecDeque::new());
+        Ok(Self { workbench, copiers, scenes: HashMap::new(), arriving, picks, frames })
+    }
+
+    /// What deforms and what draws.
+    pub(super) const fn info(&self) -> &Info {
+        self.workbench.info()
+    }
+
     fn obey(&mut self, command: Command) {
         let Self { workbench, scenes, .. } = self;
         // Every ignored result below means: the asker has gone, and its answer goes with it.
@@ -194,7 +211,7 @@ impl Desk {
             return; // Nobody waits for it.
         }
         match self.workbench.finish_draw(drawing) {
-            Ok(pixels) => rayon::spawn(move || {
+            Ok(pixels) => self.copiers.spawn(move || {
                 guarded(|| {
                     reply.send(Ok(pixels.into_image())).ok(); // As above.
                 });

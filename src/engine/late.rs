@@ -1,10 +1,22 @@
 //! What is late: vertices that leave the device while the next step is computed, and frames that are drawn and brought back
-//! while the next step is computed and its own frames are begun. Each is handed over, in order, as it arrives.
+//! while the next step is computed and its own frames are begun. Each is handed over, in order, as it arrives. `read` is the
+//! way of the pixels to memory that the host reads.
+//!
+//! A deformer with vertices of its own computes beside the frames that are under way:
 //!
 //! ```text
-//! device   [draw k][deform k+1][draw k+1][deform k+2]
-//! frame k           [read       ]
-//! frame k+1                              [read       ]
+//! deformer  [deform k+1  ]          [deform k+2  ]
+//! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
+//! ```
+//!
+//! One that writes into OpenGL's buffers does not: to map them waits for all that OpenGL was told before (`gpu::interop`),
+//! and so for reading frame k too. What overlaps is the host's part. Step k+1 is written and given to the device while
+//! frame k is drawn, and begins as soon as that is read; frame k is copied out, encoded and sent while frame k+1 is drawn.
+//!
+//! ```text
+//! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]
+//! host      [give k+1 ]                  [give k+2 ]
+//! frame k                                [copy out, encode, send]
 //! ```
 
 use std::sync::Arc;

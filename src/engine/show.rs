@@ -53,7 +53,6 @@ impl Conductor {
             {
                 frames.push(frame);
             } else {
-                self.settle_for(&viewer).await;
                 if !self.serve(&mut viewer, holds_back, wanted).await {
                     continue;
                 }
@@ -94,7 +93,9 @@ impl Conductor {
         if viewer.seen == self.count {
             return true;
         }
+        // Nobody waits for what is late for a viewer that could not take more.
         if viewer.has_room() {
+            self.settle_for(viewer).await;
             let skipped = self.see(viewer);
             let shown = self.show(&viewer.view, skipped, others).await;
             return viewer.claim().deliver(shown);
@@ -164,4 +165,101 @@ impl Conductor {
 pub(super) fn known(passes: &[(&'static str, f64)]) -> StageTimes {
     let stage = |name: &str| Stage::named(name).filter(|stage| *stage != Stage::Encode);
     passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use tokio::sync::{Notify, mpsc};
+    use tokio::time::timeout;
+
+    use super::super::conductor::{Beginning, Means};
+    use super::super::keep::Keeper;
+    use super::super::viewer::Feed;
+    use super::super::worker::{Command, Worker};
+    use super::super::{testing, worker::Reply};
+    use super::*;
+    use crate::config::Config;
+    use crate::render::Image;
+    use crate::scene::{Camera, State};
+
+    /// A scene at its first step, and what it asks of the device.
+    fn scene(folder: &std::path::Path) -> (Conductor, mpsc::Receiver<Command>) {
+        let scene = testing::two_strips();
+        let state = Arc::new(State { run: 1, step: 1, ..State::rest(&scene) });
+        let (worker, device) = Worker::played();
+        let keeper = Arc::new(Keeper::start(folder.to_owned()).expect("starts"));
+        let means = Means { worker, keeper, config: Arc::new(Config::default()) };
+        let beginning = Beginning { name: "strips".into(), id: 1, scene, state, wake: Arc::new(Notify::new()) };
+        (Conductor::new(beginning, means).0, device)
+    }
+
+    /// A subscriber of frames of this width.
+    fn viewer(delivery: Delivery, width: u32) -> (Viewer, Feed) {
+        let camera = Camera::framing(&testing::two_strips(), width, 8);
+        Feed::new(View::Frame { camera, width, height: 8, showing: Showing::Colour }, delivery, Arc::default())
+    }
+
+    /// The next frame that the device is asked for within a while: its width, and who is answered.
+    async fn asked(device: &mut mpsc::Receiver<Command>, ms: u64) -> Option<(u32, Reply<Image>)> {
+        match timeout(Duration::from_millis(ms), device.recv()).await.ok()?? {
+            Command::Draw { size, reply, .. } => Some((size.0, reply)),
+            _ => None,
+        }
+    }
+
+    fn answer((width, reply): (u32, Reply<Image>)) {
+        reply.send(Ok(Image { width, height: 8, rgba: vec![], passes: vec![] })).expect("somebody waits");
+    }
+
+    /// Shows the second step to a viewer whose frame of the first is late, and then to one that has room: how soon the device
+    /// is asked for what, and the widths and steps that both get.
+    async fn served(late: Delivery) -> (Option<u32>, Vec<(u32, u64)>) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mut conductor, mut device) = scene(folder.path());
+        let ((mut slow, mut slow_feed), (fast, mut fast_feed)) = (viewer(late, 16), viewer(Delivery::Lossless, 24));
+        // It asks, and has what a lossless one has beforehand.
+        timeout(Duration::ZERO, slow_feed.next()).await.expect_err("nothing yet");
+        let first = conductor.begin_frame(&mut slow, 0);
+        conductor.late.extend(first);
+        let first = asked(&mut device, 10_000).await.expect("the first frame");
+        (conductor.count, conductor.viewers) = (2, vec![slow, fast]);
+        let state = State { step: 2, ..State::clone(&conductor.state) };
+        conductor.state = Arc::new(state);
+        let serving = async {
+            conductor.serve_viewers(false).await;
+            conductor.settle().await;
+        };
+        let playing = async {
+            let before = asked(&mut device, 500).await;
+            let soon = before.as_ref().map(|(width, _)| *width);
+            answer(first);
+            before.into_iter().for_each(answer);
+            while let Some(next) = asked(&mut device, 500).await {
+                answer(next);
+            }
+            soon
+        };
+        let (_, soon) = tokio::join!(serving, playing);
+        let mut got = Vec::new();
+        for feed in [&mut slow_feed, &mut fast_feed] {
+            while let Ok(Ok(Shown { step, body: Body::Frame(image), .. })) = timeout(Duration::ZERO, feed.next()).await
+            {
+                got.push((image.width, step.number));
+            }
+        }
+        (soon, got)
+    }
+
+    #[tokio::test]
+    async fn a_viewer_whose_frame_is_late_and_who_has_no_room_keeps_nobody_waiting() {
+        assert_eq!(served(Delivery::Latest).await, (Some(24), vec![(16, 1), (24, 2)]));
+    }
+
+    #[tokio::test]
+    async fn a_viewer_who_has_room_gets_what_is_late_first() {
+        let (soon, got) = served(Delivery::Lossless).await;
+        assert_eq!((soon, got), (None, vec![(16, 1), (16, 2), (24, 2)]));
+    }
 }

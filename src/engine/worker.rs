@@ -7,7 +7,7 @@ use std::sync::Arc;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
-use super::desk::work;
+use super::desk::{Desk, work};
 use super::viewer::Showing;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
@@ -88,10 +88,10 @@ impl Worker {
         let config = Arc::clone(config);
         let thread = std::thread::Builder::new()
             .name("device".into())
-            .spawn(move || match Workbench::open(&config) {
-                Ok(workbench) => {
-                    tell.send(Ok(workbench.info().clone())).ok(); // The starter has gone; the queue is closed then too.
-                    work(workbench, inbox);
+            .spawn(move || match Workbench::open(&config).and_then(Desk::new) {
+                Ok(desk) => {
+                    tell.send(Ok(desk.info().clone())).ok(); // The starter has gone; the queue is closed then too.
+                    work(desk, inbox);
                 }
                 Err(error) => {
                     tell.send(Err(error)).ok(); // As above.
@@ -100,6 +100,13 @@ impl Worker {
             .map_err(during("device thread"))?;
         let info = told.await.map_err(|_| gone())??;
         Ok((Self { commands, limit }, info, thread))
+    }
+
+    /// The way to somebody who plays the device, and the commands that he is given.
+    #[cfg(test)]
+    pub(super) fn played() -> (Self, mpsc::Receiver<Command>) {
+        let (commands, inbox) = mpsc::channel(16);
+        (Self { commands, limit: 16 }, inbox)
     }
 
     pub(super) async fn stage(&self, id: SceneId, scene: &Arc<Scene>) -> Result<()> {

@@ -27,6 +27,7 @@ use super::rotation::{Rotation, Turn};
 use crate::deform::{Backend, Deformed, Deformer, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::scene::{Changed, Scene, State};
+use crate::telemetry::ms_since;
 
 /// Steps that may be under way at once.
 pub const MOST_UNDER_WAY: usize = 2;
@@ -81,7 +82,7 @@ impl CudaDeformer {
         // Tables were copied from memory that is gone by now; wait here, so that a fault of theirs shows here.
         device.stream().synchronize().map_err(during("upload"))?;
         Ok(Self {
-            flights: vec![Flight::new(device, &kernels, &inputs)?],
+            flights: vec![Flight::new(device, &kernels, &inputs, output.is_shared())?],
             rotation: Rotation::new(output.most(), most_domains(scene)),
             inputs,
             kernels,
@@ -130,7 +131,7 @@ impl CudaDeformer {
         self.fresh = Wanted::default();
         self.fetch = None;
         let begin = Instant::now();
-        let started = self.start(state).inspect_err(|_| self.forget())?;
+        let started = self.start(state, begin).inspect_err(|_| self.forget())?;
         self.under_way.push_back((started, begin));
         self.last = started;
         Ok(())
@@ -144,7 +145,9 @@ impl CudaDeformer {
         let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
         let (flight, begin) = self.under_way.pop_front().ok_or_else(none)?;
         let bounds = self.flights[flight].wait().inspect_err(|_| self.forget())?;
-        Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        let whole = ms_since(begin);
+        let own = self.flights[flight].own_ms().inspect_err(|_| self.forget())?;
+        Ok(Deformed { bounds, ms: own.unwrap_or(whole) })
     }
 
     /// Starts the whole graph of the last step once more, for measuring it alone: outputs of our own stay where they are.
@@ -152,8 +155,8 @@ impl CudaDeformer {
         self.flights[self.last].launch(false)
     }
 
-    /// Writes a step's values and starts its graph; the flight that it took.
-    fn start(&mut self, state: &State) -> Result<usize> {
+    /// Writes a step's values and starts its graph; the flight that it took. `begin`: when the step was submitted.
+    fn start(&mut self, state: &State, begin: Instant) -> Result<usize> {
         let set = self.rotation.next_output();
         if let Err(error) = self.output.ensure(&self.device, &self.plan, set) {
             tracing::warn!(%error, "no room for a second output: steps wait until the vertices before them are read");
@@ -179,7 +182,9 @@ impl CudaDeformer {
         let displacements = self.displacements.as_ref().map_or(0, |buffer| address(&self.device, buffer));
         let header = Header { displacements, ..header };
         let access = if keep { Access::WriteSome } else { Access::WriteAll };
+        flight.before_ms = ms_since(begin);
         self.output.with(&self.device, Use { set: turn.output, access }, |to| {
+            flight.mark_mapped(&self.device)?;
             let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
             match some {
                 Some(_) => Inputs::write_header(&mut flight.values, &header)?,
@@ -198,7 +203,7 @@ impl CudaDeformer {
         if let Some(at) = (0..self.flights.len()).find(is_free) {
             return Ok(at);
         }
-        self.flights.push(Flight::new(&self.device, &self.kernels, &self.inputs)?);
+        self.flights.push(Flight::new(&self.device, &self.kernels, &self.inputs, self.output.is_shared())?);
         Ok(self.flights.len() - 1)
     }
 

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use cudarc::driver::sys::{CUgraphInstantiate_flags, CUstreamCaptureMode};
+use cudarc::driver::sys::{CUevent_flags, CUgraphInstantiate_flags, CUstreamCaptureMode};
 use cudarc::driver::{CudaEvent, CudaGraph, PinnedHostSlice, result};
 
 use super::apply::{Apply, List};
@@ -37,10 +37,15 @@ pub(super) struct Flight {
     answer: PinnedHostSlice<u32>,
     /// Recorded behind each step.
     pub done: CudaEvent,
+    /// With OpenGL's buffers, recorded behind each mapping, which waits for frames.
+    mapped: Option<CudaEvent>,
+    /// Host milliseconds of the step before it asked for the mapping.
+    pub before_ms: f64,
 }
 
 impl Flight {
-    pub(super) fn new(device: &Device, kernels: &Kernels, inputs: &Inputs) -> Result<Self> {
+    /// `is_timed`: on the device, from behind the mapping on.
+    pub(super) fn new(device: &Device, kernels: &Kernels, inputs: &Inputs, is_timed: bool) -> Result<Self> {
         let mut values = inputs.pinned(device)?;
         let mut list = kernels.apply.as_ref().map(|apply| apply.list(device)).transpose()?;
         // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
@@ -52,8 +57,26 @@ impl Flight {
             Some(list) => Some(capture(device, || start(device, parts, (&mut values, Some(list)), &mut answer))?),
             None => None,
         };
-        let done = device.context().new_event(None).map_err(during("allocate"))?;
-        Ok(Self { whole, some, values, list, answer, done })
+        let event = |flags| device.context().new_event(flags).map_err(during("allocate"));
+        let flags = is_timed.then_some(CUevent_flags::CU_EVENT_DEFAULT);
+        let (mapped, done) = (flags.map(|flags| event(Some(flags))).transpose()?, event(flags)?);
+        Ok(Self { whole, some, values, list, answer, done, mapped, before_ms: 0.0 })
+    }
+
+    /// Marks on the stream that the step's outputs may be written from here on.
+    pub(super) fn mark_mapped(&self, device: &Device) -> Result<()> {
+        match &self.mapped {
+            Some(mapped) => mapped.record(device.stream()).map_err(during("deform")),
+            None => Ok(()),
+        }
+    }
+
+    /// Milliseconds of a step that was waited for, without the wait for frames; none where that is not timed. The host's
+    /// work behind the mapping counts as far as the device had to wait for it.
+    pub(super) fn own_ms(&self) -> Result<Option<f64>> {
+        let Some(mapped) = &self.mapped else { return Ok(None) };
+        let ms = mapped.elapsed_ms(&self.done).map_err(during("deform"))?;
+        Ok(Some(self.before_ms + f64::from(ms)))
     }
 
     /// Starts the step's graph on the device's stream; its values are written. `some`: of the list.

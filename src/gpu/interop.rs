@@ -2,7 +2,8 @@
 //!
 //! Mapping orders the two APIs, so that nobody waits on the host: what OpenGL was told before a mapping ends before work that
 //! the stream is given after it, and what the stream was given before an unmapping ends before what OpenGL is told after it.
-//! A frame may therefore still be under way when the next step is given to the stream: that step waits for it on the device.
+//! A frame may therefore still be under way when the next step is given to the stream: that step waits on the device until it
+//! is drawn and its pixels have left. It never runs beside a frame; nor is that wait part of the step's time (`flight`).
 
 use std::ffi::{c_int, c_uint};
 use std::sync::Arc;

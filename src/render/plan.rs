@@ -5,6 +5,7 @@
 
 use super::cull::{self, allocations, chosen};
 use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
+use super::gl::Limits;
 use super::shadow::fitting;
 use super::textures::{Use, arrays};
 use crate::scene::{Antialias, Culling, Scene, Shadow, Tone, Transparency};
@@ -59,15 +60,15 @@ impl Plan {
 
 /// What a scene needs of a GPU.
 pub fn plan(scene: &Scene) -> Plan {
-    planned(scene, false)
+    planned(scene, &Limits { max_storage: u64::MAX, ..Limits::default() })
 }
 
 /// What a scene needs of a device, which may be a rasteriser in software.
-pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
+pub(super) fn planned(scene: &Scene, limits: &Limits) -> Plan {
     let (groups, _) = groups(scene);
     let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
     let mut passes = Vec::new();
-    let culling = chosen(scene, software);
+    let culling = chosen(scene, limits);
     if let Some(shadow) = scene.look.shadow {
         passes.extend((culling != Culling::None).then_some(cull::SHADOW_CULL));
         passes.push("shadow");
@@ -90,7 +91,7 @@ pub(super) fn planned(scene: &Scene, software: bool) -> Plan {
     passes.push("encode");
     Plan {
         buffers: [buffers(scene), allocations(scene, culling)].concat(),
-        textures: textures(scene, software),
+        textures: textures(scene, limits.software),
         passes,
         draws: draws(scene, &groups) + occluders(&groups, culling),
         defines: [defines(scene), culled(culling)].concat(),

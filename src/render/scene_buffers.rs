@@ -113,7 +113,7 @@ impl SceneBuffers {
         sample_places: &[[f32; 2]],
         compile: &mut Compile<'_>,
     ) -> Result<Self> {
-        let plan = planned(scene, gl.limits.software);
+        let plan = planned(scene, &gl.limits);
         let shadow = scene.look.shadow.map(|shadow| fitting(shadow, gl.limits.software));
         let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
         within_budget(&images)?;

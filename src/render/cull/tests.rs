@@ -1,11 +1,14 @@
-//! Negative controls: a test that is a little too greedy changes the picture.
+//! Negative controls: a test that is a little too greedy changes the picture. And which scenes are culled at all.
 
 use std::rc::Rc;
 use std::sync::Arc;
 
 use super::super::geometry::tests::squares;
+use super::super::gl::Limits;
+use super::super::plan::planned;
 use super::super::shaders::Source;
 use super::super::{Prefer, Renderer, SceneBuffers, Shot};
+use super::{LISTED, allocations, chosen};
 use crate::deform::Surface;
 use crate::domain::{Material, Mesh, Modes, Shape};
 use crate::scene::{Camera, Culling, Lens, Scene, View};
@@ -57,6 +60,24 @@ fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
     let second = renderer.draw(&buffers, &shot).expect("draws").rgba;
     assert!(renderer.ran().culled.is_some_and(|culled| culled.camera.left_out() > 0));
     second
+}
+
+#[test]
+fn a_scene_whose_lists_are_larger_than_a_buffer_may_be_is_not_culled_and_says_so() {
+    let mut parts = squares(vec![Material::default()]);
+    for culling in [Culling::Triangles, Culling::Depth] {
+        parts.look.culling = culling;
+        let scene = Scene::new(parts.clone()).expect("good");
+        let named = allocations(&scene, culling);
+        let largest = named.iter().map(|part| part.bytes).max().expect("lists");
+        let listed = named.iter().find(|part| part.name == LISTED).expect("listed").bytes;
+        assert_eq!(listed, 12 * scene.layout.triangles as u64);
+        let on = |max_storage: u64| chosen(&scene, &Limits { max_storage, ..Limits::default() });
+        assert_eq!((on(largest), on(largest - 1)), (culling, Culling::None));
+        let plan = planned(&scene, &Limits { max_storage: largest - 1, ..Limits::default() });
+        assert!(!plan.defines("CULLED") && !plan.passes.contains(&"cull"));
+        assert!(plan.left_out.iter().any(|saving| saving.feature == "culling"));
+    }
 }
 
 #[test]

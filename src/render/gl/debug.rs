@@ -91,7 +91,9 @@ const fn name_of_type(kind: u32) -> &'static str {
 #[cfg(test)]
 mod tests {
     use std::io::Write;
-    use std::sync::Arc;
+    use std::sync::{Arc, OnceLock};
+
+    use tracing::Dispatch;
 
     use super::super::super::{Prefer, device};
     use super::*;
@@ -110,8 +112,18 @@ mod tests {
         }
     }
 
+    /// While a process has one log alone, whether a place in the code is listened to is decided once, by the log of the thread
+    /// that comes there first: a test beside this one, without a log, would decide that nobody is. With two it is asked of
+    /// each thread. The place is passed before, so that it is known when the second comes.
+    fn keep_a_second_log() {
+        static SECOND: OnceLock<Dispatch> = OnceLock::new();
+        is_wanted();
+        SECOND.get_or_init(|| Dispatch::new(tracing_subscriber::registry()));
+    }
+
     /// What the log holds after a context was used wrongly so many times.
     fn log_of(filter: &str, wrong: usize) -> String {
+        keep_a_second_log();
         let lines = Lines::default();
         let writer = lines.clone();
         let log = tracing_subscriber::fmt()
@@ -141,6 +153,18 @@ mod tests {
         }
         assert_eq!(log_of("opengl=debug", 0).matches("ERROR").count(), 0, "control: nothing wrong, nothing said");
         assert_eq!(log_of("opengl=info", 1), "", "control: nobody listens");
+    }
+
+    #[test]
+    fn a_thread_without_a_log_does_not_decide_that_no_thread_has_one() {
+        keep_a_second_log();
+        let log = tracing_subscriber::fmt().with_max_level(Level::TRACE).with_writer(std::io::sink).finish();
+        // A place in the code that no thread has come to yet.
+        let asks = || tracing::enabled!(target: "opengl", Level::WARN);
+        tracing::subscriber::with_default(log, || {
+            let other = std::thread::spawn(asks).join().expect("asks");
+            assert!(!other && asks());
+        });
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! A culled picture is the picture to the bit, whatever was drawn before; and what was left out is what arithmetic says.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use modalcast::deform::Surface;
 use modalcast::domain::{AlphaMode, Material, Mesh};
@@ -94,6 +94,12 @@ fn material(alpha_mode: AlphaMode, double_sided: bool, colour: [f32; 3]) -> Mate
     Material { alpha_mode, double_sided, diffuse: colour, ambient: colour, ..Material::default() }
 }
 
+/// Whether the CPU draws.
+fn is_software() -> bool {
+    static SOFTWARE: OnceLock<bool> = OnceLock::new();
+    *SOFTWARE.get_or_init(|| open().info().software)
+}
+
 /// Every kind of material with one side and with two, and a closed ball's worth of coplanar twins.
 fn mixed(samples: u32, transparency: Transparency) -> Stage {
     let mut stage = Stage::new();
@@ -104,7 +110,7 @@ fn mixed(samples: u32, transparency: Transparency) -> Stage {
     let mask = AlphaMode::Mask { cutoff: 0.5 };
     for (seed, double_sided) in [(1, false), (2, true)] {
         // With several samples software reads images where what is hidden says: see `Culling::Depth`.
-        let image = (samples == 1).then_some(leaf);
+        let image = (samples == 1 || !is_software()).then_some(leaf);
         let leaves = Material { colour_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
         stage = stage
