@@ -183,14 +183,19 @@ impl Linear {
         self.texels[(y.min(self.height - 1) * self.width + x.min(self.width - 1)) as usize]
     }
 
-    /// The next level: each texel averages four, colours weighed by alpha, so that what is cut away tints nothing.
+    /// The next level: each texel averages what lies below it, four texels or, of odd sides, parts of up to nine; colours
+    /// weighed by alpha, so that what is cut away tints nothing.
     fn halved(&self) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
+        let (across, down) = (shares(self.width), shares(self.height));
         let mut texels = Vec::with_capacity((width * height) as usize);
-        for y in 0..height {
-            for x in 0..width {
-                let four = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| self.at(2 * x + dx, 2 * y + dy));
-                texels.push(weighed(&four.map(|texel| (texel, 0.25))));
+        for (y, own) in down.iter().enumerate() {
+            for (x, beside) in across.iter().enumerate() {
+                let nine = std::array::from_fn::<_, 9, _>(|at| {
+                    let (dx, dy) = (at % 3, at / 3);
+                    (self.at((2 * x + dx) as u32, (2 * y + dy) as u32), beside[dx] * own[dy])
+                });
+                texels.push(weighed(&nine));
             }
         }
         Self { width, height, texels }
@@ -236,11 +241,23 @@ impl Linear {
     }
 }
 
+/// How much of each texel of half a side lies on the texels 2x, 2x + 1 and 2x + 2 of the side. An odd side's texels are
+/// wider than two: taking two of them would drop the last column and shift the rest.
+fn shares(side: u32) -> Vec<[f32; 3]> {
+    let half = (side / 2).max(1);
+    let share = |x: u32| match side {
+        1 => [1.0, 0.0, 0.0],
+        side if side % 2 == 0 => [0.5, 0.5, 0.0],
+        side => [half - x, half, x + 1].map(|part| part as f32 / side as f32),
+    };
+    (0..half).map(share).collect()
+}
+
 fn byte(value: f32) -> u8 {
     (value * 255.0 + 0.5) as u8
 }
 
-fn weighed(parts: &[([f32; 4], f32); 4]) -> [f32; 4] {
+fn weighed(parts: &[([f32; 4], f32)]) -> [f32; 4] {
     let alpha: f32 = parts.iter().map(|(texel, weight)| texel[3] * weight).sum();
     let mut mean = [0.0, 0.0, 0.0, alpha];
     for (channel, sum) in mean[..3].iter_mut().enumerate() {
@@ -328,6 +345,31 @@ mod tests {
             assert!(rgba.chunks_exact(4).all(|texel| texel[..3] == [0, 200, 0]), "level {level}: {rgba:?}");
         }
         assert_eq!(chain[2], [0, 200, 0, 64]);
+    }
+
+    #[test]
+    fn every_level_of_an_odd_side_keeps_the_mean_of_the_image_and_its_centre() {
+        for (width, height) in [(25, 15), (3, 1), (1, 7), (24, 24), (75, 50), (2, 3)] {
+            // A ramp, and a last column and row that stand out: halving by pairs would drop them.
+            let level = |at: u32, side: u32| 100 * u32::from(at + 1 == side) + 3 * at % 100;
+            let texel = |at: u32| [level(at % width, width) as f32, level(at / width, height) as f32, 1.0, 1.0];
+            let texels: Vec<[f32; 4]> = (0..width * height).map(texel).collect();
+            let mean = |image: &Linear| {
+                let sum = |channel: usize| image.texels.iter().map(|texel| f64::from(texel[channel])).sum::<f64>();
+                [0, 1, 2, 3].map(|channel| sum(channel) / image.texels.len() as f64)
+            };
+            let mut image = Linear { width, height, texels };
+            let wanted = mean(&image);
+            while image.width > 1 || image.height > 1 {
+                image = image.halved();
+                let found = mean(&image);
+                let off = found.iter().zip(wanted).map(|(found, wanted)| (found - wanted).abs()).fold(0.0, f64::max);
+                assert!(off < 1e-3, "{width} x {height}: {found:?} is not {wanted:?}");
+            }
+            assert_eq!(image.texels.len(), 1);
+        }
+        assert_eq!(shares(5), [[0.4, 0.4, 0.2], [0.2, 0.4, 0.4]]);
+        assert!(shares(6).iter().all(|share| *share == [0.5, 0.5, 0.0]), "even sides stay averages of pairs");
     }
 
     #[test]

@@ -18,19 +18,39 @@ use crate::scene::{Culling, Look, Parts, Scene, Shadow, ShadowMethod};
 pub struct Bare {
     pub load: String,
     pub triangles: usize,
-    /// Side of the map that depth is drawn into, and samples a pixel of ids and depth: those of the row beside it.
+    /// Side of the map that depth is drawn into, and samples a pixel of ids and depth: those of the frames beside it.
     pub map: u32,
     pub samples: u32,
     pub depth: Timing,
     pub visibility: Timing,
-    /// The row of the renderer that it is held against: its name, its frame, and what that takes beyond both passes,
-    /// microseconds.
-    pub variant: String,
+    /// The frame that is as little culled as both passes: what it takes beyond them is what the renderer adds.
+    pub unculled: Beside,
+    /// The frame as the load's own look culls it.
+    pub usual: Beside,
+}
+
+/// A frame of the renderer with the same map that both passes are held against.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Beside {
+    /// What is drawn, in words.
+    pub name: String,
+    /// Microseconds: its frame, and what that takes beyond both passes.
     pub frame_us: f64,
     pub beyond_us: f64,
 }
 
-/// Microseconds beyond both passes that a frame of three million triangles may take on an H200.
+impl Bare {
+    /// The same with what each frame takes beyond both passes.
+    pub(super) fn compared(mut self) -> Self {
+        let both = self.depth.median_us + self.visibility.median_us;
+        for frame in [&mut self.unculled, &mut self.usual] {
+            frame.beyond_us = frame.frame_us - both;
+        }
+        self
+    }
+}
+
+/// Microseconds beyond both passes that a frame without culling of three million triangles may take on an H200.
 pub(super) const BEYOND_US: f64 = 600.0;
 
 /// The scene with one material and a plain depth map of this size.

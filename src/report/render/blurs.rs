@@ -53,6 +53,7 @@ mod tests {
     use crate::report::render::metrics::{Light, Spread};
     use crate::report::render::variants::{BOUNDS, Method};
     use crate::report::timing::Timing;
+    use crate::scene::Culling;
 
     fn row(load: &str, shadow: Shadow, us: f64) -> Row {
         let timing = Timing::of(vec![us]).expect("one");
@@ -62,6 +63,7 @@ mod tests {
             method: Method::Variance,
             shadow: Some(shadow),
             packing: None,
+            culling: Culling::default(),
             bounds: BOUNDS,
             passed: true,
             to_fail: false,

@@ -6,7 +6,7 @@ use std::time::Instant;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use super::bare::{self, Bare};
+use super::bare::{self, Bare, Beside};
 use super::loads::{Kind, Stage};
 use super::metrics::{self, Flicker, Light, Spread};
 use super::packing::{Packing, packed};
@@ -15,12 +15,12 @@ use super::picture::{Detail, Picture, Term, trace};
 use super::pictures::{self, File};
 use super::soup::Soup;
 use super::studio::{Pass, Set, Size, Studio};
-use super::variants::{self, Aim, Bounds, Method, Variant};
+use super::variants::{Aim, Bounds, Method, Variant};
 use super::view::View;
 use super::{Entry, Request, meter};
 use crate::error::Result;
 use crate::render::{Culled, Image, shadow_texel};
-use crate::scene::{Camera, Look, Scene, Shadow};
+use crate::scene::{Camera, Culling, Look, Scene, Shadow};
 
 /// The step of the motion that still pictures show.
 pub(super) const STILL: usize = 10;
@@ -38,6 +38,8 @@ pub struct Row {
     pub shadow: Option<Shadow>,
     /// How images lie in arrays, where that is what is compared.
     pub packing: Option<Packing>,
+    /// What its look leaves out before it is drawn.
+    pub culling: Culling,
     /// What it must keep against what it means to show, and whether it does.
     pub bounds: Bounds,
     pub passed: bool,
@@ -121,8 +123,8 @@ pub(super) fn load(
 ) -> Result<Measured> {
     let stage = kind.stage()?;
     let camera = stage.camera(request.size);
-    let wanted = |variant: &Variant| variant.suits(kind) && request.wants(&variant.name);
-    let variants: Vec<Variant> = variants::all(request.quick).into_iter().filter(wanted).collect();
+    let mut variants = request.wanted();
+    variants.retain(|variant| variant.suits(kind));
     progress(&format!("{}: tracing the references", stage.name));
     let begin = Instant::now();
     let references = references(studio, request, &stage, camera, &variants)?;
@@ -275,40 +277,63 @@ impl Job<'_> {
         Ok((row, file))
     }
 
-    /// The passes of the scene stripped bare, beside the row of the largest usual variance map that was timed.
+    /// The passes of the scene stripped bare, beside frames with the largest usual variance map that was timed.
     fn bare(&self, studio: &mut Studio, rows: &[Row]) -> Result<Option<Bare>> {
-        let usual = |row: &&Row| {
-            let own = |shadow: Shadow| Shadow { size: shadow.size, ..Shadow::default() } == shadow;
-            row.shadow.is_some_and(own) && row.median_us().is_some()
+        let usual = |row: &Row| {
+            let own = row.shadow.filter(|own| Shadow { size: own.size, ..Shadow::default() } == *own);
+            own.filter(|_| row.median_us().is_some())
         };
-        let largest = rows.iter().filter(usual).max_by_key(|row| row.shadow.map(|shadow| shadow.size));
-        let Some(((row, shadow), frame_us)) =
-            largest.and_then(|row| row.shadow.map(|own| (row, own)).zip(row.median_us()))
-        else {
-            return Ok(None);
-        };
+        let Some(shadow) = rows.iter().filter_map(usual).max_by_key(|own| own.size) else { return Ok(None) };
         let scene = bare::stripped(&self.stage.scene, shadow.size)?;
-        let mut set = studio.set(&scene)?;
-        studio.pose(&mut set, &self.stage.state(STILL))?;
-        let passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
-        studio.strike(set);
+        let passes = self.timed(studio, &scene)?;
+        let ran = studio.renderer.ran().clone();
         let timing = |name: &str| passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
         let Some((depth, visibility)) = timing("shadow").zip(timing("visibility")) else { return Ok(None) };
-        if !bare::is_bare(studio.renderer.ran()) {
+        if !bare::is_bare(&ran) {
             tracing::warn!(load = self.stage.name, "the stripped scene was not one draw a pass: no bare passes");
             return Ok(None);
         }
-        Ok(Some(Bare {
+        let own = Bare {
             load: self.stage.name.clone(),
             triangles: scene.layout.triangles,
             map: shadow.size,
-            samples: row.samples,
+            samples: ran.samples,
             depth,
             visibility,
-            variant: row.name.clone(),
-            frame_us,
-            beyond_us: frame_us - depth.median_us - visibility.median_us,
-        }))
+            unculled: self.beside(studio, rows, (shadow, Culling::None))?,
+            usual: self.beside(studio, rows, (shadow, self.stage.scene.look.culling))?,
+        };
+        Ok(Some(own.compared()))
+    }
+
+    /// A frame with this map, culled so: its row's, or one that is timed now where there is no such row.
+    fn beside(&self, studio: &mut Studio, rows: &[Row], (shadow, culling): (Shadow, Culling)) -> Result<Beside> {
+        // A row under the load's own look may have culled nothing.
+        let is = |row: &&Row| {
+            let culls_so = row.culling == culling || culling == Culling::None && row.culled.is_none();
+            row.shadow == Some(shadow) && culls_so
+        };
+        let found = rows.iter().filter(is).find_map(|row| Some((row.name.clone(), row.median_us()?)));
+        let (name, frame_us) = match found {
+            Some(found) => found,
+            None => {
+                let look = Look { shadow: Some(shadow), culling, ..self.stage.scene.look };
+                let passes = self.timed(studio, &meter::relit(&self.stage.scene, look)?)?;
+                let frame = passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
+                (format!("variance {}, blur {}", shadow.size, shadow.blur), frame)
+            }
+        };
+        let way = if culling == Culling::None { "without culling" } else { "as the load culls" };
+        Ok(Beside { name: format!("{name}: {way}"), frame_us, beyond_us: 0.0 })
+    }
+
+    /// The passes of the still picture of a scene.
+    fn timed(&self, studio: &mut Studio, scene: &Arc<Scene>) -> Result<Vec<Pass>> {
+        let mut set = studio.set(scene)?;
+        studio.pose(&mut set, &self.stage.state(STILL))?;
+        let passes = studio.time(&set, self.camera, self.request.size, self.request.replays);
+        studio.strike(set);
+        passes
     }
 
     fn compared(&self, variant: &Variant, (image, lit): (&Image, &[Option<f32>]), aim: &Picture) -> Row {
@@ -323,6 +348,7 @@ impl Job<'_> {
             method: variant.method,
             shadow: variant.shadow,
             packing: variant.packing,
+            culling: variant.look(self.stage.scene.look).culling,
             bounds,
             passed: faults.is_empty(),
             to_fail: variant.is_to_fail(self.stage.kind),

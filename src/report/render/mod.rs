@@ -48,7 +48,7 @@ mod view;
 
 use serde::Serialize;
 
-pub use self::bare::Bare;
+pub use self::bare::{Bare, Beside};
 pub use self::blurs::Blurs;
 use self::loads::Kind;
 pub use self::measure::Row;
@@ -57,6 +57,7 @@ use self::plants::Plant;
 pub use self::readback::Readback;
 use self::studio::Studio;
 pub use self::studio::{Pass, Size};
+use self::variants::Variant;
 use super::machine::Provenance;
 use super::wants;
 use crate::error::Result;
@@ -78,9 +79,14 @@ pub struct Request {
 }
 
 impl Request {
-    /// Whether a variant is to be measured.
-    pub fn wants(&self, name: &str) -> bool {
-        wants(&self.variants, name)
+    /// The variants to measure. A quick run has fewer, and those that are named in full whether or not they are of these.
+    pub fn wanted(&self) -> Vec<Variant> {
+        let (few, mut all) = (variants::all(self.quick), variants::all(false));
+        all.retain(|variant| {
+            let is_named = self.variants.contains(&variant.name);
+            is_named || wants(&self.variants, &variant.name) && few.iter().any(|own| own.name == variant.name)
+        });
+        all
     }
 }
 

@@ -11,7 +11,7 @@ use crate::report::plot::png;
 use crate::report::timing::Timing;
 
 /// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
-const COLUMNS: [(&str, &str); 50] = [
+const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -29,9 +29,11 @@ const COLUMNS: [(&str, &str); 50] = [
     ("shadow_us", "shadow"),
     ("blur_us", "blur"),
     ("draw_us", "draw"),
+    ("cull_us", "cull"),
     ("visibility_us", "visibility"),
     ("blended_us", "blended"),
     ("shade_us", "shade"),
+    ("bloom_us", "bloom"),
     ("encode_us", "encode"),
     ("read_us", "read"),
     ("bytes", "/bytes"),
@@ -39,6 +41,9 @@ const COLUMNS: [(&str, &str); 50] = [
     ("image_bytes", "/image_bytes"),
     ("samples", "/samples"),
     ("draws", "/draws"),
+    ("culling", "/culling"),
+    ("listed", "/culled/camera/listed"),
+    ("hidden", "/culled/camera/hidden"),
     ("colour_mean", "/colour/mean"),
     ("colour_p99", "/colour/p99"),
     ("colour_largest", "/colour/largest"),
@@ -116,8 +121,14 @@ fn passes_csv(report: &Report) -> Result<Vec<u8>> {
             } else {
                 [format!("{}x{}", report.size.width, report.size.height), number.to_string()]
             };
-            let [median, frame, beyond] = [timing.median_us, bare.frame_us, bare.beyond_us].map(|us| us.to_string());
-            lines.push([&bare.load, what, &size, &many, &median, &bare.variant, &frame, &beyond, ""].map(String::from));
+            let median = timing.median_us.to_string();
+            lines.push([&bare.load, what, &size, &many, &median, "", "", "", ""].map(String::from));
+        }
+        let both = (bare.depth.median_us + bare.visibility.median_us).to_string();
+        for frame in [&bare.unculled, &bare.usual] {
+            let [own, beyond, size] = [frame.frame_us.to_string(), frame.beyond_us.to_string(), bare.map.to_string()];
+            let what = "both bare passes";
+            lines.push([&bare.load, what, &size, "", &both, &frame.name, &own, &beyond, ""].map(String::from));
         }
     }
     for blurs in &report.blurs {
@@ -179,5 +190,33 @@ fn cell(row: &Row, value: &Value, (name, place): (&str, &str)) -> String {
         None | Some(Value::Null) => String::new(),
         Some(Value::String(text)) => text.clone(),
         Some(other) => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::render::loads::Kind;
+    use crate::report::render::meter::relit;
+    use crate::report::render::studio::{Size, Studio};
+    use crate::scene::{Bloom, Culling, Look};
+
+    #[test]
+    fn every_pass_of_a_frame_has_a_column_and_the_parts_of_drawing_add_up_to_it() {
+        let stage = Kind::Triangles(2_000).stage().expect("built");
+        let look = Look { culling: Culling::Depth, bloom: Some(Bloom::default()), ..stage.scene.look };
+        let mut studio = Studio::open().expect("OpenGL");
+        let mut set = studio.set(&relit(&stage.scene, look).expect("fits")).expect("loads");
+        studio.pose(&mut set, &stage.state(0)).expect("poses");
+        let size = Size { width: 64, height: 36 };
+        let passes = studio.draw(&set, stage.camera(size), size).expect("draws").passes;
+        for (name, _) in &passes {
+            assert!(COLUMNS.iter().any(|(_, place)| place == name), "{name}");
+        }
+        let sum =
+            |names: &[&str]| -> f64 { passes.iter().filter(|pass| names.contains(&pass.0)).map(|pass| pass.1).sum() };
+        let (draw, parts) = (sum(&["draw"]), ["cull", "visibility", "blended", "shade", "bloom", "encode"]);
+        assert!((draw - sum(&parts)).abs() < 1e-9 * draw, "{passes:?}");
+        assert!(sum(&parts[1..]) < draw && sum(&["bloom"]) > 0.0, "control: culling takes time");
     }
 }

@@ -7,6 +7,11 @@
 //! the thesis does: every image is filled by repetition and the corners of every triangle have the coordinates that the
 //! equation gives. It wraps each fragment; the same comes of wrapping whole triangles, where none crosses the rim of its
 //! image.
+//!
+//! On the load of images the right scale ends up a little nearer to the reference than arrays by size: 3.93 against 4.24 of
+//! 255 in software at 640 x 360. The load has seven sizes and the renderer six arrays, so the two smallest, 16 x 16 and
+//! 25 x 15, share one of 25 x 16 and are stretched to it: their panels, seen with several pixels a texel, are
+//! where it loses, by up to 7 of 255. On the floor arrays by size are nearer, by up to half a level.
 
 use std::sync::Arc;
 

@@ -1,6 +1,7 @@
 //! `report.md`: the report as tables for people.
 
 use super::{Entry, Report, Row, beside};
+use crate::render::Sifted;
 use crate::report::peers::{dash, line, rule};
 
 /// The whole page.
@@ -34,15 +35,24 @@ const EXPLAINED: &str = "Colours are compared as a display shows them, of 255, t
 against hard shadow rays, and against what the variant means to show (no shadow, or the hard shadow under the blur's own \
 footprint). Light is the share of the unshadowed sunlight that arrives, against the same two. Bleeding is the mean light \
 where the filtered reference has none. Flicker is the change of the error from step to step. `frame` is all passes but \
-reading back.\n";
+reading back. Of the triangles that culling looks at for the camera, `listed` are left to the rasteriser and `hidden` lie \
+behind what the last frame saw.\n";
 
-const HEAD: [&str; 17] = [
+const HEAD: [&str; 25] = [
     "variant",
     "frame us",
     "quartiles us",
     "shadow us",
     "of it blur us",
     "draw us",
+    "of it cull us",
+    "visibility us",
+    "blended us",
+    "shade us",
+    "bloom us",
+    "encode us",
+    "triangles listed",
+    "hidden",
     "MB",
     "shadow MB",
     "colour mean",
@@ -72,10 +82,11 @@ fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
     text
 }
 
-fn cells(row: &Row) -> [String; 17] {
+fn cells(row: &Row) -> [String; 25] {
     let timing = |name: &str| row.passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
     let median = |name: &str| timing(name).map_or_else(dash, |timing| format!("{:.1}", timing.median_us));
     let small = |value: f64| format!("{value:.4}");
+    let count = |of: fn(&Sifted) -> u32| row.culled.map_or_else(dash, |culled| of(&culled.camera).to_string());
     let megabytes = |bytes: u64| format!("{:.1}", bytes as f64 / 1e6);
     [
         row.name.clone(),
@@ -84,6 +95,14 @@ fn cells(row: &Row) -> [String; 17] {
         median("shadow"),
         median("blur"),
         median("draw"),
+        median("cull"),
+        median("visibility"),
+        median("blended"),
+        median("shade"),
+        median("bloom"),
+        median("encode"),
+        count(|camera| camera.listed),
+        count(|camera| camera.hidden),
         megabytes(row.bytes),
         megabytes(row.shadow_bytes),
         format!("{:.3}", row.colour.mean),

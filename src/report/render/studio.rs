@@ -107,6 +107,11 @@ impl Set {
         Shot { camera, width: size.width, height: size.height, bounds: self.bounds }
     }
 
+    /// Bounds of the vertices that were drawn last.
+    pub(super) const fn bounds(&self) -> Bounds {
+        self.bounds
+    }
+
     pub(super) fn scene(&self) -> &Arc<Scene> {
         &self.scene
     }

@@ -277,6 +277,31 @@ fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
 }
 
 #[test]
+fn bare_passes_stand_beside_a_frame_without_culling_even_where_the_only_row_has_another() {
+    let request = Request {
+        plants: vec![],
+        loads: vec![Kind::Triangles(800)],
+        variants: vec!["culling triangles".into()],
+        size: Size { width: 48, height: 27 },
+        quick: true,
+        replays: 20,
+    };
+    let report = render(&request, |_| {}).expect("a report");
+    let ([row], [bare]) = (&report.rows[..], &report.bare[..]) else { panic!("one each: {report:?}") };
+    assert!(row.culled.is_some() && bare.map == 2048, "control: the row culls");
+    assert_eq!(bare.unculled.name, "variance 2048, blur 1.5: without culling");
+    assert_eq!(bare.usual.name, "variance 2048, blur 1.5: as the load culls");
+    let both = bare.depth.median_us + bare.visibility.median_us;
+    for frame in [&bare.unculled, &bare.usual] {
+        assert!((frame.frame_us - both - frame.beyond_us).abs() < 1e-6 && Some(frame.frame_us) != row.median_us());
+    }
+    let request = Request { variants: vec!["culling none".into(), "culling triangles".into()], ..request };
+    let report = render(&request, |_| {}).expect("a report");
+    assert_eq!(report.bare[0].unculled.name, "culling none: without culling", "its own row is taken");
+    assert_eq!(Some(report.bare[0].unculled.frame_us), report.rows[0].median_us());
+}
+
+#[test]
 fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farther_in_the_order_of_the_file() {
     let request = Request {
         plants: vec![],

@@ -66,25 +66,24 @@ def main(out, folders):
         apart = np.abs(own.astype(int) - other).max(axis=2)
         loud = np.repeat(np.clip(4 * apart, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
         png(out / f"{name}-beside.png", np.concatenate([own, other, loud], axis=1))
-        whole = middle([one["scenes"][at]["whole"] for one, _ in rounds])
-        theirs = {key: middle([other["scenes"][name][key] for _, other in rounds]) for key in ("frame", "whole")}
-        frame = [next(own["timing"] for own in one["scenes"][at]["passes"] if own["name"] == "frame") for one, _ in rounds]
+        whole = [one["scenes"][at]["whole"] for one, _ in rounds]
+        theirs = [other["scenes"][name]["whole"] for _, other in rounds]
+        ratios = [other["median_us"] / one["median_us"] for one, other in zip(whole, theirs)]
         rows.append({
             "shadow": name, "triangles": scene["triangles"], "map": scene["look"]["shadow"]["size"], "samples": scene["samples"],
-            "ours_us": {"frame": middle(frame), "with_pixels": whole},
-            "peer_us": {"frame": theirs["frame"], "with_pixels": theirs["whole"]},
-            "peer_over_ours": theirs["whole"]["median_us"] / whole["median_us"],
-            "peer_over_ours_by_round": [
-                other["scenes"][name]["whole"]["median_us"] / one["scenes"][at]["whole"]["median_us"] for one, other in rounds
-            ],
+            "ours_us": {"with_pixels": middle(whole)},
+            "peer_us": {"with_pixels": middle(theirs)},
+            "rounds": [{"ours_us": one, "peer_us": other} for one, other in zip(whole, theirs)],
+            "peer_over_ours": float(np.median(ratios)), "peer_over_ours_by_round": ratios,
             "mean_difference_of_255": float(apart.mean()), "pixels_apart_by_more_than_16": float((apart > 16).mean()),
         })
         print("%-10s ours %9.1f us, peer %9.1f us with pixels: %.2f times; mean difference %.2f of 255" % (
-            name, whole["median_us"], theirs["whole"]["median_us"], rows[-1]["peer_over_ours"], apart.mean()))
+            name, middle(whole)["median_us"], middle(theirs)["median_us"], rows[-1]["peer_over_ours"], apart.mean()))
     made = ours["made"]
     together = {
         "what": "one mesh, one view, a shadow map of equal size and 4 samples a pixel, by modalcast and by a plain moderngl "
-        "program; microseconds, medians of the middle of three rounds taken in turns; with_pixels is the wall clock around a frame and its pixels in host memory",
+        "program; microseconds, by the wall clock around a frame and its pixels in host memory for both; with_pixels is the "
+        "middle of three rounds taken in turns, peer_over_ours the median of the ratios of the rounds",
         "command": "tests/bench/peers/run", "commit": made["commit"], "size": ours["size"],
         "machine": {"cpu": made["cpu"], "threads": made["threads"], "release": made["release"]},
         "renderer": ours["renderer"], "peer": {key: peer[key] for key in ("renderer", "moderngl")},
