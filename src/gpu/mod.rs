@@ -61,9 +61,9 @@ pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use report::device_values;
 pub use trials::{
-    BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Roofs, Split, Thesis,
-    Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes, idle_in_warp, ingest, lanes,
-    overlap, roofs, time,
+    BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Raster, RasterCounts,
+    RasterForm, RasterMesh, Roofs, Split, Spread, Thesis, Timing, Trial, cublas_version, empty_replay,
+    gigabytes_per_second, host_writes, idle_in_warp, ingest, lanes, overlap, roofs, time,
 };
 
 /// OpenGL buffers to write into, by name.

@@ -3,6 +3,7 @@
 mod deform;
 mod normals;
 mod orient;
+pub mod raster;
 
 use std::sync::Arc;
 use std::time::Instant;

@@ -136,9 +136,10 @@ fn is_walked_in_tests(name: &str) -> bool {
 }
 
 /// Kernels that put into one place what deformers on the host find there: their twin is a method of the scene's values.
-const TWINS_ELSEWHERE: [(&str, Twin); 2] = [
+const TWINS_ELSEWHERE: [(&str, Twin); 3] = [
     ("apply", Twin { file: "src/scene/state.rs", of: "State", method: "apply" }),
     ("bounds", Twin { file: "src/scene/camera.rs", of: "Bounds", method: "union" }),
+    ("raster", Twin { file: "src/reference/raster.rs", of: "Raster", method: "draw" }),
 ];
 
 #[derive(Clone, Copy)]

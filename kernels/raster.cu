@@ -1,0 +1,284 @@
+// Triangles to samples, one a pixel: the least depth of each and whose it is, by one atomic minimum of both. The result
+// does not depend on the order of anything.
+//   raster        a thread a triangle of a group: drops it, draws it if few samples are near, or hands it on
+//   raster_warps  a warp a triangle of the medium queue
+//   raster_tiles  a block a tile of a triangle of the large queue; clipped ones come here too
+// Macros: DEPTH   depth alone, f32, no ids: a shadow map
+//         COUNT   how many triangles took each path, and why others were dropped
+//         FEW     samples near a triangle that a thread draws, at most
+//         NARROW  1/256 pixels of a triangle that a warp draws, at most 16384: its edges fit 32 bits
+// Launch: BLOCK threads a block; of raster as many as triangles need, of the others any number: they take turns.
+// No holes: triangles of materials with alpha masks are drawn whole.
+// CPU twin: Raster::draw.
+#include "raster.cuh"
+
+#ifndef FEW
+#define FEW 32
+#endif
+#ifndef NARROW
+#define NARROW 16384
+#endif
+
+constexpr unsigned BLOCK = 256;
+constexpr int TILE = 64;
+constexpr unsigned TILES_BITS = 40;
+
+// Where a triangle goes, and what drawing it there needs.
+struct Aim {
+    Path path;
+    Box box;
+    bool turned;
+    long long area;
+    Corner a, b, c;
+};
+
+__device__ inline bool is_empty(const Box& box) {
+    return box.x0 > box.x1 || box.y0 > box.y1;
+}
+
+// What sign the area says of a triangle.
+__device__ inline Path judge(const RasterArgs& args, long long area, const Box& box) {
+    return area == 0                     ? FLAT
+           : args.faces == 1 && area > 0 ? BACK
+           : is_empty(box)               ? MISSED
+                                         : LARGE;
+}
+
+// What becomes of a clipped triangle. Apart, and with its own memory: few triangles come here, and the others keep theirs
+// in registers.
+struct Clipped {
+    Path path;
+    Box box;
+};
+
+__device__ __noinline__ void aim_clipped(const RasterArgs& args, float4 a, float4 b, float4 c, Clipped& clipped) {
+    Polygon polygon;
+    clip_triangle(args, a, b, c, polygon);
+    if (polygon.count == 0) {
+        clipped.path = OUTSIDE;
+        return;
+    }
+    const Corner first = polygon.corners[0];
+    int x0 = first.x, x1 = first.x, y0 = first.y, y1 = first.y;
+    long long area = 0;
+    for (unsigned i = 1; i < polygon.count; ++i) {
+        const Corner corner = polygon.corners[i];
+        x0 = min(x0, corner.x);
+        x1 = max(x1, corner.x);
+        y0 = min(y0, corner.y);
+        y1 = max(y1, corner.y);
+        if (i + 1 < polygon.count) {
+            area += area_of(first, corner, polygon.corners[i + 1]);
+        }
+    }
+    clipped.box = box_of(args, x0, y0, x1, y1);
+    clipped.path = judge(args, area, clipped.box);
+}
+
+__device__ inline void aim_whole(const RasterArgs& args, const float4 (&corners)[3], Aim& aim) {
+    const Corner a = snap(args, corners[0]), b = snap(args, corners[1]), c = snap(args, corners[2]);
+    const int x0 = min(a.x, min(b.x, c.x)), x1 = max(a.x, max(b.x, c.x));
+    const int y0 = min(a.y, min(b.y, c.y)), y1 = max(a.y, max(b.y, c.y));
+    aim.box = box_of(args, x0, y0, x1, y1);
+    aim.area = area_of(a, b, c);
+    aim.path = judge(args, aim.area, aim.box);
+    if (aim.path == LARGE && x1 - x0 <= NARROW && y1 - y0 <= NARROW) {
+        const int samples = (aim.box.x1 - aim.box.x0 + 1) * (aim.box.y1 - aim.box.y0 + 1);
+        aim.path = samples <= FEW ? SMALL : MEDIUM;
+    }
+    aim.turned = aim.area < 0;
+    aim.area = aim.turned ? -aim.area : aim.area;
+    aim.a = a;
+    aim.b = b;
+    aim.c = c;
+}
+
+__device__ inline void aim_at(const RasterArgs& args, unsigned triangle, Aim& aim) {
+    float4 corners[3];
+    load_triangle(args, triangle, corners);
+    if (!is_finite(corners[0]) || !is_finite(corners[1]) || !is_finite(corners[2])) {
+        aim.path = NOT_FINITE;
+    } else if (is_outside(corners)) {
+        aim.path = OUTSIDE;
+    } else if (is_whole(args, corners[0]) && is_whole(args, corners[1]) && is_whole(args, corners[2])) {
+        aim_whole(args, corners, aim);
+    } else {
+        Clipped clipped;
+        aim_clipped(args, corners[0], corners[1], corners[2], clipped);
+        aim.path = clipped.path;
+        aim.box = clipped.box;
+    }
+}
+
+__device__ inline void draw_small(const RasterArgs& args, const Aim& aim, unsigned triangle) {
+    const Piece<int> piece(aim.a, aim.b, aim.c, aim.turned, (int)aim.area);
+    for (int row = aim.box.y0; row <= aim.box.y1; ++row) {
+        for (int column = aim.box.x0; column <= aim.box.x1; ++column) {
+            float depth;
+            if (piece.covers(column, row, depth)) {
+                put(args, column, row, depth, triangle);
+            }
+        }
+    }
+}
+
+// One atomic a warp. All its lanes come here.
+__device__ inline void push_medium(const RasterArgs& args, bool wanted, unsigned triangle) {
+    const unsigned lanes = __ballot_sync(0xffffffffu, wanted), lane = threadIdx.x % 32;
+    if (lanes == 0) {
+        return;
+    }
+    unsigned first = 0;
+    if (lane == 0) {
+        first = atomicAdd(&((Tally*)args.tally)->medium, __popc(lanes));
+    }
+    first = __shfl_sync(0xffffffffu, first, 0);
+    if (wanted) {
+        ((unsigned*)args.medium)[first + __popc(lanes & ((1u << lane) - 1))] = triangle;
+    }
+}
+
+// One atomic gives both the place and the first tile, so that first tiles ascend with places.
+__device__ inline void push_large(const RasterArgs& args, const Box& box, unsigned triangle) {
+    const unsigned x = box.x0 / TILE, y = box.y0 / TILE;
+    const unsigned across = box.x1 / TILE - x + 1, down = box.y1 / TILE - y + 1;
+    const unsigned long long own = 1ull << TILES_BITS | (unsigned long long)across * down;
+    const unsigned long long before = atomicAdd(&((Tally*)args.tally)->large, own);
+    Large entry;
+    entry.first = before & ((1ull << TILES_BITS) - 1);
+    entry.triangle = triangle;
+    entry.box = x | y << 8 | (across - 1) << 16;
+    ((Large*)args.large)[before >> TILES_BITS] = entry;
+}
+
+__device__ inline void count(const RasterArgs& args, Path path) {
+#ifdef COUNT
+    for (unsigned own = 0; own < NOTHING; ++own) {
+        const unsigned lanes = __ballot_sync(0xffffffffu, path == own);
+        if (threadIdx.x % 32 == 0 && lanes != 0) {
+            atomicAdd(&((Tally*)args.tally)->counts[own], __popc(lanes));
+        }
+    }
+#endif
+}
+
+extern "C" __global__ void __launch_bounds__(BLOCK) raster(const __grid_constant__ RasterArgs args) {
+    const unsigned at = blockIdx.x * BLOCK + threadIdx.x, triangle = args.first + at;
+    Aim aim;
+    aim.path = NOTHING;
+    if (at < args.count) {
+        aim_at(args, triangle, aim);
+    }
+    __syncwarp();
+    push_medium(args, aim.path == MEDIUM, triangle);
+    count(args, aim.path);
+    if (aim.path == LARGE) {
+        push_large(args, aim.box, triangle);
+    }
+    if (aim.path == SMALL) {
+        draw_small(args, aim, triangle);
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(BLOCK, 2) raster_warps(const __grid_constant__ RasterArgs args) {
+    const unsigned queued = ((const Tally*)args.tally)->medium, lane = threadIdx.x % 32;
+    const unsigned warps = gridDim.x * (BLOCK / 32);
+    for (unsigned at = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; at < queued; at += warps) {
+        const unsigned triangle = ((const unsigned*)args.medium)[at];
+        float4 corners[3];
+        load_triangle(args, triangle, corners);
+        Aim aim;
+        aim_whole(args, corners, aim);
+        const Piece<int> piece(aim.a, aim.b, aim.c, aim.turned, (int)aim.area);
+        for (int row = aim.box.y0 + (int)lane / 8; row <= aim.box.y1; row += 4) {
+            for (int column = aim.box.x0 + (int)lane % 8; column <= aim.box.x1; column += 8) {
+                float depth;
+                if (piece.covers(column, row, depth)) {
+                    put(args, column, row, depth, triangle);
+                }
+            }
+        }
+    }
+}
+
+// The last entry whose first tile is not behind this one.
+__device__ inline Large find(const RasterArgs& args, unsigned entries, unsigned long long tile) {
+    const Large* list = (const Large*)args.large;
+    unsigned low = 0, high = entries;
+    while (high - low > 1) {
+        const unsigned middle = low + (high - low) / 2;
+        (list[middle].first <= tile ? low : high) = middle;
+    }
+    return list[low];
+}
+
+__device__ inline void corners_of(const RasterArgs& args, unsigned triangle, Polygon& polygon) {
+    float4 corners[3];
+    load_triangle(args, triangle, corners);
+    if (is_whole(args, corners[0]) && is_whole(args, corners[1]) && is_whole(args, corners[2])) {
+        polygon.count = 3;
+        for (unsigned i = 0; i < 3; ++i) {
+            polygon.corners[i] = snap(args, corners[i]);
+        }
+    } else {
+        clip_triangle(args, corners[0], corners[1], corners[2], polygon);
+    }
+}
+
+// Whether all samples between two corners of a tile lie outside one edge: its largest value there is at one of the four.
+__device__ inline bool is_beyond(const Corner& from, const Corner& to, int least, const Box& box) {
+    const int x = CELL * (to.y > from.y ? box.x0 : box.x1) + CELL / 2;
+    const int y = CELL * (to.x > from.x ? box.y1 : box.y0) + CELL / 2;
+    return Piece<long long>::edge(from, to, x, y) < least;
+}
+
+__device__ inline void draw_tile(const RasterArgs& args, const Piece<long long>& piece, const Box& box, unsigned triangle) {
+    if (is_beyond(piece.b, piece.c, piece.least_a, box) || is_beyond(piece.c, piece.a, piece.least_b, box) ||
+        is_beyond(piece.a, piece.b, piece.least_c, box)) {
+        return;
+    }
+    for (int row = box.y0 + (int)threadIdx.x / 32; row <= box.y1; row += BLOCK / 32) {
+        for (int column = box.x0 + (int)threadIdx.x % 32; column <= box.x1; column += 32) {
+            float depth;
+            if (piece.covers(column, row, depth)) {
+                put(args, column, row, depth, triangle);
+            }
+        }
+    }
+}
+
+// All pieces of a polygon turn the way that the whole does; what rounding turned the other way has no samples of its own.
+__device__ inline void draw_pieces(const RasterArgs& args, const Polygon& polygon, const Box& box, unsigned triangle) {
+    long long whole = 0;
+    for (unsigned i = 1; i + 1 < polygon.count; ++i) {
+        whole += area_of(polygon.corners[0], polygon.corners[i], polygon.corners[i + 1]);
+    }
+    const bool turned = whole < 0;
+    for (unsigned i = 1; i + 1 < polygon.count; ++i) {
+        const Corner &a = polygon.corners[0], &b = polygon.corners[i], &c = polygon.corners[i + 1];
+        const long long area = area_of(a, b, c), own = turned ? -area : area;
+        if (own > 0) {
+            draw_tile(args, Piece<long long>(a, b, c, turned, own), box, triangle);
+        }
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(BLOCK) raster_tiles(const __grid_constant__ RasterArgs args) {
+    __shared__ Polygon polygon;
+    __shared__ Large entry;
+    const unsigned long long large = ((const Tally*)args.tally)->large;
+    const unsigned entries = (unsigned)(large >> TILES_BITS);
+    const unsigned long long tiles = large & ((1ull << TILES_BITS) - 1);
+    for (unsigned long long tile = blockIdx.x; tile < tiles; tile += gridDim.x) {
+        if (threadIdx.x == 0) {
+            entry = find(args, entries, tile);
+            corners_of(args, entry.triangle, polygon);
+        }
+        __syncthreads();
+        const unsigned own = (unsigned)(tile - entry.first), across = (entry.box >> 16 & 255) + 1;
+        const int x = TILE * (int)((entry.box & 255) + own % across), y = TILE * (int)((entry.box >> 8 & 255) + own / across);
+        const Box box = {x, y, min(x + TILE, (int)args.width) - 1, min(y + TILE, (int)args.height) - 1};
+        draw_pieces(args, polygon, box, entry.triangle);
+        __syncthreads();
+    }
+}

@@ -1,0 +1,235 @@
+// One triangle on its way to samples: corners in clip space, clipped, in 1/256 pixel, its three edges and its depth. Every
+// sum and product of floats is rounded by itself, so that the same bits come out wherever it is computed.
+// Windows have y down, the first sample of the first row at (1/2, 1/2). Twin: src/reference/raster.rs.
+#pragma once
+
+constexpr int CELL = 256;                 // steps of a pixel
+constexpr unsigned MOST_CORNERS = 8;      // three, and one more for each of five planes
+constexpr float LEAST_W = 0x1p-100f;      // below, 1 / w is no number to go on with
+
+struct RasterArgs {
+    unsigned long long positions;         // [vertices][3] f32
+    unsigned long long triangles;         // [triangles][3] u32: vertices
+    unsigned long long target;            // [height][width] u64: depth, id; or f32: depth                 (in, out)
+    unsigned long long medium;            // [triangles] u32: triangles that warps draw                    (out, in)
+    unsigned long long large;             // [triangles] Large: those that blocks draw                     (out, in)
+    unsigned long long tally;             // Tally                                                         (in, out)
+    float clip[16];                       // clip from positions, row-major
+    float half_width, half_height;        // pixels
+    float guard_x, guard_y;               // |x| and |y| up to which nothing is clipped, in units of w
+    unsigned width, height;
+    unsigned first, count;                // the triangles of this launch
+    unsigned faces;                       // 0: both, 1: fronts (anticlockwise with y up)
+    unsigned pad;
+};
+
+struct Large {
+    unsigned long long first;             // tiles of those before it
+    unsigned triangle;
+    unsigned box;                         // first tile: x, y; tiles across - 1: 8 bits each
+};
+
+struct Tally {
+    unsigned medium, pad;
+    unsigned long long large;             // entries << TILES_BITS | tiles
+    unsigned counts[8];                   // by Path
+};
+
+enum Path { SMALL, MEDIUM, LARGE, NOT_FINITE, OUTSIDE, FLAT, BACK, MISSED, NOTHING };
+
+struct Corner {
+    int x, y;                             // 1/256 pixel
+    float z;                              // depth in the window
+};
+
+struct Polygon {
+    unsigned count;
+    Corner corners[MOST_CORNERS];
+};
+
+// Samples, both ends included.
+struct Box {
+    int x0, y0, x1, y1;
+};
+
+__device__ inline float times(float a, float b) {
+    return __fmul_rn(a, b);
+}
+
+__device__ inline float plus(float a, float b) {
+    return __fadd_rn(a, b);
+}
+
+__device__ inline float4 to_clip(const RasterArgs& args, unsigned vertex) {
+    const float* p = (const float*)args.positions + 3 * (size_t)vertex;
+    const float x = __ldg(p), y = __ldg(p + 1), z = __ldg(p + 2);
+    const float* m = args.clip;
+    float4 out;
+    out.x = plus(plus(plus(times(m[0], x), times(m[1], y)), times(m[2], z)), m[3]);
+    out.y = plus(plus(plus(times(m[4], x), times(m[5], y)), times(m[6], z)), m[7]);
+    out.z = plus(plus(plus(times(m[8], x), times(m[9], y)), times(m[10], z)), m[11]);
+    out.w = plus(plus(plus(times(m[12], x), times(m[13], y)), times(m[14], z)), m[15]);
+    return out;
+}
+
+__device__ inline void load_triangle(const RasterArgs& args, unsigned triangle, float4 (&corners)[3]) {
+    const unsigned* vertices = (const unsigned*)args.triangles + 3 * (size_t)triangle;
+#pragma unroll
+    for (unsigned i = 0; i < 3; ++i) {
+        corners[i] = to_clip(args, __ldg(vertices + i));
+    }
+}
+
+__device__ inline bool is_finite(float4 v) {
+    constexpr float LARGEST = 0x1.fffffep127f;
+    return fabsf(v.x) <= LARGEST && fabsf(v.y) <= LARGEST && fabsf(v.z) <= LARGEST && fabsf(v.w) <= LARGEST;
+}
+
+// Whether all three lie beyond one plane of the view.
+__device__ inline bool is_outside(const float4 (&v)[3]) {
+    return (v[0].x > v[0].w && v[1].x > v[1].w && v[2].x > v[2].w) ||
+           (v[0].x < -v[0].w && v[1].x < -v[1].w && v[2].x < -v[2].w) ||
+           (v[0].y > v[0].w && v[1].y > v[1].w && v[2].y > v[2].w) ||
+           (v[0].y < -v[0].w && v[1].y < -v[1].w && v[2].y < -v[2].w) ||
+           (v[0].z > v[0].w && v[1].z > v[1].w && v[2].z > v[2].w) ||
+           (v[0].z < -v[0].w && v[1].z < -v[1].w && v[2].z < -v[2].w);
+}
+
+// Not negative on the inner side of a plane: the near one, then the sides of the guard.
+__device__ inline float inside(const RasterArgs& args, float4 v, unsigned plane) {
+    const float x = times(args.guard_x, v.w), y = times(args.guard_y, v.w);
+    return plane == 0 ? plus(v.z, v.w) : plane == 1 ? plus(x, -v.x) : plane == 2 ? plus(x, v.x)
+         : plane == 3 ? plus(y, -v.y) : plus(y, v.y);
+}
+
+__device__ inline bool is_whole(const RasterArgs& args, float4 v) {
+    const float x = times(args.guard_x, v.w), y = times(args.guard_y, v.w);
+    return plus(v.z, v.w) >= 0.0f && plus(x, -v.x) >= 0.0f && plus(x, v.x) >= 0.0f && plus(y, -v.y) >= 0.0f &&
+           plus(y, v.y) >= 0.0f && v.w >= LEAST_W;
+}
+
+__device__ inline Corner snap(const RasterArgs& args, float4 v) {
+    const float inverse = __frcp_rn(v.w);
+    const float x = plus(times(times(v.x, inverse), args.half_width), args.half_width);
+    const float y = plus(times(-times(v.y, inverse), args.half_height), args.half_height);
+    Corner corner;
+    corner.x = __float2int_rn(times(x, (float)CELL));
+    corner.y = __float2int_rn(times(y, (float)CELL));
+    corner.z = plus(times(times(v.z, inverse), 0.5f), 0.5f);
+    return corner;
+}
+
+// From the inner end of an edge towards its outer one, whichever triangle of the edge asks.
+__device__ inline float4 cut(float4 in, float4 out, float d_in, float d_out) {
+    const float t = __fdiv_rn(d_in, plus(d_in, -d_out));
+    float4 v;
+    v.x = plus(in.x, times(t, plus(out.x, -in.x)));
+    v.y = plus(in.y, times(t, plus(out.y, -in.y)));
+    v.z = plus(in.z, times(t, plus(out.z, -in.z)));
+    v.w = plus(in.w, times(t, plus(out.w, -in.w)));
+    return v;
+}
+
+// Sutherland and Hodgman's clipping by the near plane and the guard; no corners if nothing is left. Rarely called.
+__device__ __noinline__ void clip_triangle(const RasterArgs& args, float4 a, float4 b, float4 c, Polygon& polygon) {
+    float4 lists[2][MOST_CORNERS];
+    unsigned count = 3, from = 0;
+    lists[0][0] = a;
+    lists[0][1] = b;
+    lists[0][2] = c;
+    for (unsigned plane = 0; plane < 5; ++plane) {
+        unsigned kept = 0;
+        for (unsigned i = 0; i < count; ++i) {
+            const float4 a = lists[from][i], b = lists[from][i + 1 == count ? 0 : i + 1];
+            const float da = inside(args, a, plane), db = inside(args, b, plane);
+            if (da >= 0.0f && kept < MOST_CORNERS) {
+                lists[1 - from][kept++] = a;
+            }
+            if ((da >= 0.0f) != (db >= 0.0f) && kept < MOST_CORNERS) {
+                lists[1 - from][kept++] = da >= 0.0f ? cut(a, b, da, db) : cut(b, a, db, da);
+            }
+        }
+        from = 1 - from;
+        count = kept;
+    }
+    polygon.count = count < 3 ? 0 : count;
+    for (unsigned i = 0; i < polygon.count; ++i) {
+        if (!(lists[from][i].w >= LEAST_W)) {
+            polygon.count = 0;
+            return;
+        }
+        polygon.corners[i] = snap(args, lists[from][i]);
+    }
+}
+
+// Twice the area between two sides that begin at a, positive where b, c follow clockwise on the screen.
+__device__ inline long long area_of(const Corner& a, const Corner& b, const Corner& c) {
+    return (long long)(b.x - a.x) * (c.y - a.y) - (long long)(b.y - a.y) * (c.x - a.x);
+}
+
+// The samples between two ends, cut by the window.
+__device__ inline Box box_of(const RasterArgs& args, int x0, int y0, int x1, int y1) {
+    constexpr int MIDDLE = CELL / 2;
+    return {max(0, (x0 + MIDDLE - 1) >> 8), max(0, (y0 + MIDDLE - 1) >> 8), min((int)args.width - 1, (x1 - MIDDLE) >> 8),
+            min((int)args.height - 1, (y1 - MIDDLE) >> 8)};
+}
+
+// A triangle with its corners clockwise on the screen. Wide holds its edges at all samples that are asked about.
+template <typename Wide>
+struct Piece {
+    Corner a, b, c;
+    float inverse, rise_b, rise_c;        // 1 / area; depth from a to b and to c
+    int least_a, least_b, least_c;        // an edge opposite to a corner takes samples from here on: top-left rule
+
+    __device__ static int least(const Corner& from, const Corner& to) {
+        return to.y < from.y || (to.y == from.y && to.x > from.x) ? 0 : 1;
+    }
+
+    __device__ Piece(const Corner& first, const Corner& second, const Corner& third, bool turned, Wide area) {
+        a = first;
+        b = turned ? third : second;
+        c = turned ? second : third;
+        inverse = __frcp_rn((float)area);
+        rise_b = plus(b.z, -a.z);
+        rise_c = plus(c.z, -a.z);
+        least_a = least(b, c);
+        least_b = least(c, a);
+        least_c = least(a, b);
+    }
+
+    __device__ static Wide edge(const Corner& from, const Corner& to, int x, int y) {
+        return (Wide)(to.x - from.x) * (y - from.y) - (Wide)(to.y - from.y) * (x - from.x);
+    }
+
+    // Whether the sample of a pixel lies inside and before the far plane; its depth if so, not below 0.
+    __device__ bool covers(int column, int row, float& depth) const {
+        const int x = CELL * column + CELL / 2, y = CELL * row + CELL / 2;
+        const Wide at_b = edge(c, a, x, y), at_c = edge(a, b, x, y);
+        if (edge(b, c, x, y) < least_a || at_b < least_b || at_c < least_c) {
+            return false;
+        }
+        const float share_b = times((float)at_b, inverse), share_c = times((float)at_c, inverse);
+        const float z = plus(a.z, plus(times(share_b, rise_b), times(share_c, rise_c)));
+        depth = z > 0.0f ? z : 0.0f;
+        return z <= 1.0f;
+    }
+};
+
+// Depths are not negative, so that their bits are ordered as they are. What was read before is never below what is there
+// now: an atomic that it makes needless would have changed nothing.
+__device__ inline void put(const RasterArgs& args, int column, int row, float depth, unsigned triangle) {
+    const size_t at = (size_t)row * args.width + column;
+    const unsigned bits = __float_as_uint(depth);
+#ifdef DEPTH
+    unsigned* target = (unsigned*)args.target + at;
+    if (bits < __ldcg(target)) {
+        atomicMin(target, bits);
+    }
+#else
+    const unsigned long long key = (unsigned long long)bits << 32 | triangle;
+    unsigned long long* target = (unsigned long long*)args.target + at;
+    if (key < __ldcg(target)) {
+        atomicMin(target, key);
+    }
+#endif
+}

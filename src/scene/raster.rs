@@ -1,0 +1,89 @@
+//! What a rasteriser is told besides a mesh: the window, and groups of triangles.
+
+use nalgebra::Matrix4;
+
+use crate::error::{Result, invalid};
+
+/// The most pixels along a side of a window.
+pub const MAX_SIDE: u32 = 16384;
+
+/// A rectangle of pixels, and how positions come into it. Rows are counted from the top.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Window {
+    clip: [f32; 16],
+    width: u32,
+    height: u32,
+}
+
+impl Window {
+    /// A window of `width` x `height` pixels that shows what `clip_from_positions` takes into OpenGL's clip volume.
+    /// Rounded to f32 here. What is not finite drops every triangle that it reaches.
+    ///
+    /// # Errors
+    /// `Invalid` when a side is not 1 to [`MAX_SIDE`] pixels.
+    pub fn new(clip_from_positions: &Matrix4<f64>, width: u32, height: u32) -> Result<Self> {
+        for (name, side) in [("width", width), ("height", height)] {
+            if !(1..=MAX_SIDE).contains(&side) {
+                return Err(invalid(name, format!("1 to {MAX_SIDE} pixels"), side));
+            }
+        }
+        let clip = std::array::from_fn(|at| clip_from_positions[(at / 4, at % 4)] as f32);
+        Ok(Self { clip, width, height })
+    }
+
+    /// Clip from positions, row-major.
+    pub const fn clip(&self) -> &[f32; 16] {
+        &self.clip
+    }
+
+    /// Width and height in pixels.
+    pub const fn size(&self) -> [u32; 2] {
+        [self.width, self.height]
+    }
+
+    /// Pixels.
+    pub const fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Half the width and height in pixels.
+    pub fn half(&self) -> [f32; 2] {
+        self.size().map(|side| 0.5 * side as f32)
+    }
+
+    /// The |x| and |y| in normalised device coordinates beyond which triangles are clipped: 16384 pixels from the middle,
+    /// where an f32 still tells more than 1/256 pixel.
+    pub fn guard(&self) -> [f32; 2] {
+        self.half().map(|half| MAX_SIDE as f32 / half)
+    }
+}
+
+/// Which sides of triangles are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Faces {
+    #[default]
+    Both,
+    /// Those whose corners are seen anticlockwise.
+    Fronts,
+}
+
+/// Triangles that are drawn alike, next to each other in the list.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Group {
+    pub first: u32,
+    pub triangles: u32,
+    pub faces: Faces,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_have_pixels_and_not_too_many() {
+        let of = |width, height| Window::new(&Matrix4::identity(), width, height);
+        assert!(of(0, 1).is_err() && of(1, 0).is_err() && of(MAX_SIDE + 1, 1).is_err());
+        let largest = of(MAX_SIDE, 1).expect("a window");
+        assert_eq!((largest.guard()[0], largest.half()), (2.0, [8192.0, 0.5]));
+    }
+}
