@@ -8,6 +8,7 @@ mod judge;
 pub(crate) mod neighbours;
 pub(crate) mod readers;
 pub(crate) mod refusal;
+pub(crate) mod soups;
 pub(crate) mod surfaces;
 pub(crate) mod truncation;
 

@@ -10,6 +10,7 @@ mod interop;
 mod judge;
 mod normals;
 mod overlap;
+mod raster;
 mod real;
 mod report;
 mod scenes;

@@ -11,6 +11,7 @@ mod layering;
 mod normals;
 mod picks;
 mod pixels;
+mod raster;
 mod readers;
 mod real;
 mod restart;

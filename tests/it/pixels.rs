@@ -8,6 +8,7 @@ mod layers;
 mod limits;
 mod picking;
 mod post;
+mod raster;
 mod shading;
 mod shadow;
 mod shadow_extremes;

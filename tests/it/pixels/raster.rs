@@ -1,0 +1,155 @@
+//! The rasteriser's definition beside OpenGL: ids differ only where depths tie, or where the sample lies on an edge.
+
+use std::sync::Arc;
+
+use modalcast::deform::Deformer as _;
+use modalcast::domain::{Material, Mesh};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::reference::raster::Raster;
+use modalcast::render::{Seen, Shot};
+use modalcast::scene::{Camera, Culling, Faces, Group, Lens, Scene, State, View, Window};
+use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
+
+use super::build::{Stage, open};
+use crate::scenes::Random;
+
+const SIZE: [u32; 2] = [320, 240];
+/// A step of the snapped corners, pixels.
+const EDGE: f64 = 1.0 / 256.0;
+/// Depth precision: 24 bits of the window's range from each side.
+const TIE: f64 = 2.0 / (1 << 24) as f64;
+
+/// Triangles of many sizes in one domain, all around and behind the eye.
+fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
+    let mut random = Random(seed);
+    let mut rest = Vec::new();
+    for at in 0..1500 {
+        let size = [0.02, 0.1, 0.5, 3.0][at % 4] * if at % 4 == 3 { f32::from(u8::from(at % 60 == 3)) } else { 1.0 };
+        let middle = random.triple().map(|number| 3.0 * number);
+        for _ in 0..3 {
+            let aside = random.triple();
+            rest.push(std::array::from_fn(|axis| middle[axis] + size * aside[axis]));
+        }
+    }
+    let triangles: Vec<[u32; 3]> = (0..rest.len() as u32 / 3).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect();
+    let count = rest.len();
+    let normals = vec![[0.0, 0.0, 1.0]; count];
+    let mesh = Mesh::indexed(rest, normals, vec![[0.0; 2]; count], triangles.clone()).expect("a mesh");
+    let mut stage = Stage::new();
+    (stage.0.look.samples, stage.0.look.culling) = (1, Culling::None);
+    (stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene(), triangles)
+}
+
+/// A triangle in homogeneous window coordinates, exact but for f64.
+struct Exact {
+    edges: [Vector3<f64>; 3],
+    depths: Vector3<f64>,
+    weights: Vector3<f64>,
+    turn: f64,
+}
+
+impl Exact {
+    fn new(clip: &Matrix4<f64>, corners: [[f32; 3]; 3]) -> Self {
+        let clips =
+            corners.map(|corner| clip * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
+        let [half_width, half_height] = SIZE.map(|side| 0.5 * f64::from(side));
+        let [a, b, c] = clips.map(|v| Vector3::new(half_width * (v.x + v.w), half_height * (v.w - v.y), v.w));
+        let of = |pick: fn(&Vector4<f64>) -> f64| Vector3::from(clips.each_ref().map(pick));
+        let turn = Matrix3::from_columns(&[a, b, c]).determinant();
+        Self { edges: [b.cross(&c), c.cross(&a), a.cross(&b)], depths: of(|v| v.z), weights: of(|v| v.w), turn }
+    }
+
+    /// Distances to the edges in pixels, positive inside.
+    fn distances(&self, sample: Vector3<f64>) -> [f64; 3] {
+        self.edges.map(|edge| self.turn.signum() * edge.dot(&sample) / edge.xy().norm())
+    }
+
+    /// Whether a sample lies on an edge but for a step of the snapped corners.
+    fn is_on_edge(&self, sample: Vector3<f64>) -> bool {
+        let distances = self.distances(sample);
+        distances.iter().all(|own| *own >= -EDGE) && distances.iter().any(|own| own.abs() <= EDGE)
+    }
+
+    /// Depth in the window at a sample.
+    fn depth(&self, sample: Vector3<f64>) -> f64 {
+        let shares = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
+        0.5 * shares.dot(&self.depths) / shares.dot(&self.weights) + 0.5
+    }
+
+    /// What a step of the snapped corners makes of the depth at a sample.
+    fn slope(&self, sample: Vector3<f64>) -> f64 {
+        let aside = [Vector3::x(), Vector3::y()].map(|step| self.depth(sample + EDGE * step) - self.depth(sample));
+        aside[0].abs() + aside[1].abs()
+    }
+}
+
+/// Samples that differ, and those of them that no rule excuses.
+#[derive(Debug, Default, PartialEq)]
+struct Differences {
+    edges: usize,
+    ties: usize,
+    wrong: usize,
+}
+
+fn compare(got: &[Option<u32>], want: &[Option<u32>], exact: &[Exact]) -> Differences {
+    let mut found = Differences::default();
+    for (at, (got, want)) in got.iter().zip(want).enumerate().filter(|(_, (got, want))| got != want) {
+        let (x, y) = (at % SIZE[0] as usize, at / SIZE[0] as usize);
+        let sample = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
+        let both: Vec<&Exact> = [got, want].into_iter().flatten().map(|id| &exact[*id as usize]).collect();
+        let tie =
+            |a: &Exact, b: &Exact| (a.depth(sample) - b.depth(sample)).abs() <= TIE + a.slope(sample) + b.slope(sample);
+        if both.iter().any(|own| own.is_on_edge(sample)) {
+            found.edges += 1;
+        } else if both.len() == 2 && tie(both[0], both[1]) {
+            found.ties += 1;
+        } else {
+            found.wrong += 1;
+        }
+    }
+    found
+}
+
+#[test]
+fn ids_are_those_of_opengl_but_on_edges_and_where_depths_tie() {
+    let mut renderer = open();
+    for (seed, eye) in [(1, [0.0, 0.5, 9.0]), (2, [0.3, 0.2, 0.5]), (3, [-6.0, 4.0, 2.0])] {
+        let (scene, triangles) = scene(seed);
+        let view = View::LookAt { eye, target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+        let camera = Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 40.0 };
+        let mut deformer = ReferenceDeformer::new(&scene);
+        let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+        let surface = deformer.surface().expect("there").clone();
+        let buffers = renderer.load(&scene).expect("loads");
+        renderer.upload(&buffers, &surface).expect("uploads");
+        let [width, height] = SIZE;
+        renderer.draw(&buffers, &Shot { camera, width, height, bounds }).expect("draws");
+        assert_eq!(renderer.ran().samples, 1);
+        let id = |seen: &Seen| match seen {
+            Seen::Triangle(place) => buffers.triangle(*place).map(|(_, triangle)| triangle as u32),
+            _ => None,
+        };
+        let want: Vec<Option<u32>> = renderer.seen().expect("reads").iter().map(id).collect();
+        renderer.unload(buffers);
+
+        let clip = camera.clip_from_camera(width, height, &bounds) * camera.camera_from_world();
+        let corner = |vertex: u32| std::array::from_fn(|axis| surface.positions[3 * vertex as usize + axis]);
+        let exact: Vec<Exact> = triangles.iter().map(|own| Exact::new(&clip, own.map(corner))).collect();
+        let ids = |clip: &Matrix4<f64>| {
+            let mut raster = Raster::new(Window::new(clip, width, height).expect("a window"));
+            let group = Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both };
+            raster.draw(&surface.positions, &triangles, group);
+            raster.ids()
+        };
+        let found = compare(&ids(&clip), &want, &exact);
+        let covered = want.iter().flatten().count();
+        eprintln!("eye {eye:?}: {covered} samples see a triangle; {found:?}");
+        assert!(covered > 5000 && found.wrong == 0, "{covered} covered, {found:?}");
+        assert!(found.edges + found.ties < covered / 100, "{found:?}");
+
+        let mut shifted = Matrix4::identity();
+        shifted[(0, 3)] = 0.1 / f64::from(width);
+        let control = compare(&ids(&(shifted * clip)), &want, &exact);
+        assert!(control.wrong > 5, "control: a twentieth of a pixel aside is told: {control:?}");
+    }
+}

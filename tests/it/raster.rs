@@ -1,0 +1,262 @@
+//! The rasteriser's definition against geometry, and the kernel's own way through a mesh against the definition.
+
+use modalcast::reference::raster::{Corner, Dropped, NOTHING, Outline, Raster, depth_at, edge, outline, pieces};
+use modalcast::scene::{Faces, Group, Window};
+
+use crate::both::soups::{Soup, fan, flat, perspective, soups};
+
+/// Numbers of `kernels/raster.cu`, checked against its text below.
+const FEW: i32 = 32;
+const NARROW: i32 = 16384;
+const TILE: i32 = 64;
+const BITS: u32 = 40;
+
+/// What the kernels do to one window: queues in any order, 32-bit edges where a thread or a warp draws.
+struct Walk<'a> {
+    soup: &'a Soup,
+    keys: Vec<u64>,
+    medium: Vec<u32>,
+    /// First tile, triangle, box.
+    large: Vec<(u64, u32, u32)>,
+    tally: u64,
+    paths: [usize; 3],
+}
+
+impl Walk<'_> {
+    fn put(&mut self, column: i32, row: i32, depth: f32, triangle: u32) {
+        let at = row as usize * self.soup.window.size()[0] as usize + column as usize;
+        self.keys[at] = self.keys[at].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
+    }
+
+    fn outline(&self, triangle: u32, faces: Faces) -> Result<Outline, Dropped> {
+        outline(&self.soup.window, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
+    }
+
+    /// `raster`: the narrow tests of `aim_whole`, and what each path pushes.
+    fn aim(&mut self, triangle: u32, faces: Faces) {
+        let Ok(outline) = self.outline(triangle, faces) else { return };
+        let extent = |of: fn(&Corner) -> i32| {
+            let all = || outline.corners.iter().map(of);
+            all().max().expect("corners") - all().min().expect("corners")
+        };
+        let [x0, y0, x1, y1] = outline.samples;
+        let narrow = !outline.clipped && extent(|corner| corner.x) <= NARROW && extent(|corner| corner.y) <= NARROW;
+        if narrow && (x1 - x0 + 1) * (y1 - y0 + 1) <= FEW {
+            self.paths[0] += 1;
+            self.draw_narrow(&outline, triangle);
+        } else if narrow {
+            self.paths[1] += 1;
+            self.medium.push(triangle);
+        } else {
+            self.paths[2] += 1;
+            let (x, y) = (x0 / TILE, y0 / TILE);
+            let (across, down) = (x1 / TILE - x + 1, y1 / TILE - y + 1);
+            assert!(x < 256 && y < 256 && across <= 256, "boxes are three bytes");
+            let before = self.tally;
+            self.tally += 1 << BITS | (across * down) as u64;
+            let box_of = (x | y << 8 | (across - 1) << 16) as u32;
+            assert_eq!((before >> BITS) as usize, self.large.len());
+            self.large.push((before & ((1 << BITS) - 1), triangle, box_of));
+        }
+    }
+
+    /// Debug builds of this test stop at an overflow of 32 bits.
+    fn draw_narrow(&mut self, outline: &Outline, triangle: u32) {
+        let edge = |from: &Corner, to: &Corner, x: i32, y: i32| -> i32 {
+            let [one, other] = [(to.x - from.x, y - from.y), (to.y - from.y, x - from.x)];
+            let product = |(a, b): (i32, i32)| a.checked_mul(b).expect("32 bits hold it");
+            product(one).checked_sub(product(other)).expect("32 bits hold it")
+        };
+        let [a, b, c] = pieces(outline)[0];
+        let area = edge(&a, &b, c.x, c.y);
+        let [x0, y0, x1, y1] = outline.samples;
+        for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
+            let (x, y) = (256 * column + 128, 256 * row + 128);
+            let inside = [(&b, &c), (&c, &a), (&a, &b)].iter().all(|(from, to)| {
+                let takes = to.y < from.y || (to.y == from.y && to.x > from.x);
+                edge(from, to, x, y) >= i32::from(!takes)
+            });
+            let [share_b, share_c] = [edge(&c, &a, x, y), edge(&a, &b, x, y)].map(|at| at as f32 * (1.0 / area as f32));
+            let z = a.z + (share_b * (b.z - a.z) + share_c * (c.z - a.z));
+            if inside && z <= 1.0 {
+                self.put(column, row, if z > 0.0 { z } else { 0.0 }, triangle);
+            }
+        }
+    }
+
+    /// `raster_tiles`: one tile of the list, found by halving, with the rejection of tiles beyond an edge.
+    fn tile(&mut self, tile: u64) {
+        let (mut low, mut high) = (0, self.large.len());
+        while high - low > 1 {
+            let middle = low + (high - low) / 2;
+            *(if self.large[middle].0 <= tile { &mut low } else { &mut high }) = middle;
+        }
+        let (first, triangle, box_of) = self.large[low];
+        let (own, across) = ((tile - first) as u32, (box_of >> 16 & 255) + 1);
+        let (x, y) =
+            (TILE * ((box_of & 255) + own % across) as i32, TILE * ((box_of >> 8 & 255) + own / across) as i32);
+        let [width, height] = self.soup.window.size().map(|side| side as i32);
+        let (right, bottom) = ((x + TILE).min(width) - 1, (y + TILE).min(height) - 1);
+        let outline = self.outline(triangle, Faces::Both).expect("queued");
+        for piece in pieces(&outline) {
+            let beyond = |from: &Corner, to: &Corner| {
+                let column = if to.y > from.y { x } else { right };
+                let row = if to.x > from.x { bottom } else { y };
+                let takes = to.y < from.y || (to.y == from.y && to.x > from.x);
+                edge(from, to, 256 * column + 128, 256 * row + 128) < i64::from(!takes)
+            };
+            let [a, b, c] = &piece;
+            if beyond(b, c) || beyond(c, a) || beyond(a, b) {
+                continue;
+            }
+            for (row, column) in (y..=bottom).flat_map(|row| (x..=right).map(move |column| (row, column))) {
+                if let Some(depth) = depth_at(&piece, column, row) {
+                    self.put(column, row, depth, triangle);
+                }
+            }
+        }
+    }
+}
+
+/// `raster`, `raster_warps` and `raster_tiles` one after the other, queues backwards.
+fn twin_of_raster(soup: &Soup) -> (Vec<u64>, [usize; 3]) {
+    let keys = vec![NOTHING; soup.window.pixels()];
+    let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
+    for group in &soup.groups {
+        (group.first..group.first + group.triangles).rev().for_each(|triangle| walk.aim(triangle, group.faces));
+    }
+    for triangle in std::mem::take(&mut walk.medium) {
+        let outline = walk.outline(triangle, Faces::Both).expect("queued");
+        walk.draw_narrow(&outline, triangle);
+    }
+    (0..walk.tally & ((1 << BITS) - 1)).rev().for_each(|tile| walk.tile(tile));
+    (walk.keys, walk.paths)
+}
+
+#[test]
+fn threads_warps_and_blocks_draw_what_the_definition_draws_and_32_bits_hold_narrow_edges() {
+    let text = include_str!("../../kernels/raster.cu");
+    for line in [
+        format!("#define FEW {FEW}"),
+        format!("#define NARROW {NARROW}"),
+        format!("constexpr int TILE = {TILE};"),
+        format!("constexpr unsigned TILES_BITS = {BITS};"),
+    ] {
+        assert!(text.contains(&line), "the kernel has another {line}");
+    }
+    let mut all = [0; 3];
+    for soup in soups() {
+        let (keys, paths) = twin_of_raster(&soup);
+        assert!(keys == soup.drawn().keys, "{}", soup.name);
+        (0..3).for_each(|path| all[path] += paths[path]);
+    }
+    assert!(all.iter().all(|path| *path > 10), "every path is taken: {all:?}");
+}
+
+/// How many pieces of a fan take each sample, with the top-left rule or with every edge closed.
+fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
+    let [width, height] = soup.window.size().map(|side| side as i32);
+    let all: Vec<[Corner; 3]> = (soup.triangles.iter())
+        .filter_map(|triangle| outline(&soup.window, &soup.positions, *triangle, Faces::Both).ok())
+        .flat_map(|outline| pieces(&outline))
+        .collect();
+    let takes = |piece: &[Corner; 3], column: i32, row: i32| {
+        let [a, b, c] = piece;
+        let inside = |from, to| edge(from, to, 256 * column + 128, 256 * row + 128) >= 0;
+        if closed { inside(a, b) && inside(b, c) && inside(c, a) } else { depth_at(piece, column, row).is_some() }
+    };
+    let count = |column, row| all.iter().filter(|piece| takes(piece, column, row)).count();
+    (0..height).flat_map(|row| (0..width).map(move |column| (column, row))).map(|(x, y)| count(x, y)).collect()
+}
+
+#[test]
+fn a_fan_covers_every_sample_once() {
+    let mut soup = fan(flat(128, 128));
+    // The middle on a sample, and spokes along rows and columns: many samples lie on edges.
+    soup.positions[..2].copy_from_slice(&[1.0 / 128.0, 1.0 / 128.0]);
+    for spoke in [0, 10, 20, 30] {
+        let own = &mut soup.positions[3 * (1 + spoke)..][..2];
+        let axis = usize::from(spoke % 20 == 0);
+        own[axis] = 1.0 / 128.0;
+    }
+    soup.positions.chunks_exact_mut(3).for_each(|position| position[2] = 0.0);
+    assert!(takers(&soup, false).iter().all(|count| *count == 1));
+    let twice = takers(&soup, true).iter().filter(|count| **count > 1).count();
+    assert!(twice > 100, "control: without the rule {twice} samples are taken twice or more");
+}
+
+#[test]
+fn a_fan_through_the_near_plane_covers_no_sample_twice_nor_leaves_any_out() {
+    let mut soup = fan(perspective(96, 64, 0.5, 100.0));
+    // A floor one below the eye, that goes on behind it.
+    for position in soup.positions.chunks_exact_mut(3) {
+        let [x, y] = [position[0], position[1]];
+        position.copy_from_slice(&[30.0 * x, -1.0, 30.0 * y]);
+    }
+    let counts = takers(&soup, false);
+    assert!(counts.iter().all(|count| *count <= 1));
+    // The floor ends 57 away: 1 / 57 below the horizon, half a row; near is 0.5, so all rows below are floor.
+    let rows = counts.chunks_exact(96).map(|row| row.iter().sum::<usize>()).collect::<Vec<_>>();
+    assert!(rows[..32].iter().all(|count| *count == 0) && rows[34..].iter().all(|count| *count == 96), "{rows:?}");
+}
+
+#[test]
+fn equal_depths_go_to_the_lower_id_and_a_nearer_one_wins_whatever_its_id() {
+    let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
+    let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
+    let drawn = |triangles: &[[u32; 3]]| {
+        let mut raster = Raster::new(flat(4, 4));
+        let group = Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both };
+        raster.draw(&positions, triangles, group);
+        (raster.ids(), raster.depths())
+    };
+    let [a, b, c, d] = [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]];
+    assert_eq!(drawn(&[a, b]), (vec![Some(0); 16], vec![0.75; 16]));
+    assert_eq!(drawn(&[a, c, b, d]), (vec![Some(1); 16], vec![0.625; 16]));
+    assert_eq!(drawn(&[]), (vec![None; 16], vec![1.0; 16]));
+}
+
+#[test]
+fn triangles_are_dropped_for_the_reason_that_they_give() {
+    let window = flat(10, 10);
+    let why = |corners: [[f32; 3]; 3], faces: Faces| outline(&window, &corners.concat(), [0, 1, 2], faces).err();
+    let front = [[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]];
+    let back = [front[1], front[0], front[2]];
+    assert_eq!(why(front, Faces::Fronts), None);
+    assert_eq!(why(back, Faces::Both), None);
+    assert_eq!(why(back, Faces::Fronts), Some(Dropped::Back));
+    assert_eq!(why([[f32::NAN, 0.0, 0.0], front[1], front[2]], Faces::Both), Some(Dropped::NotFinite));
+    assert_eq!(why(front.map(|[x, y, z]| [x + 2.0, y, z]), Faces::Both), Some(Dropped::Outside));
+    assert_eq!(why(front.map(|[x, y, z]| [x, y, z + 1.5]), Faces::Both), Some(Dropped::Outside));
+    assert_eq!(why([front[0], front[0], front[1]], Faces::Both), Some(Dropped::Flat));
+    assert_eq!(why(front.map(|[x, y, z]| [0.05 * x, 0.05 * y, z]), Faces::Both), Some(Dropped::Missed));
+}
+
+#[test]
+fn a_plane_has_the_depth_of_its_equation_and_a_rectangle_the_samples_of_its_area() {
+    let (near, far) = (0.5, 50.0);
+    let window: Window = perspective(200, 200, near, far);
+    let corners = [[-2.0, -2.0, -4.0], [2.0, -2.0, -9.0], [-1.0, 3.0, -20.0]];
+    let mut raster = Raster::new(window);
+    let positions = corners.map(|corner| corner.map(|number: f64| number as f32)).concat();
+    raster.draw(&positions, &[[0, 1, 2]], Group { first: 0, triangles: 1, faces: Faces::Both });
+    let [a, b, c] = corners.map(nalgebra::Vector3::from);
+    let normal = (b - a).cross(&(c - a));
+    let focal = 1.0 / 30.0_f64.to_radians().tan();
+    let (mut seen, mut worst) = (0, 0.0_f64);
+    for (at, depth) in raster.depths().into_iter().enumerate().filter(|(at, _)| raster.ids()[*at].is_some()) {
+        let pixel = |place: usize| (place as f64 + 0.5) / 100.0 - 1.0;
+        let ray = nalgebra::Vector3::new(pixel(at % 200) / focal, -pixel(at / 200) / focal, -1.0);
+        let distance = normal.dot(&a) / normal.dot(&ray);
+        let z = (far + near) / (far - near) - 2.0 * far * near / ((far - near) * distance);
+        worst = worst.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
+        seen += 1;
+    }
+    // Corners move by up to 1/512 pixel, and the depth of this plane changes by less than 1e-3 a pixel.
+    assert!(seen > 1000 && worst < 4e-6, "{seen} samples, off by up to {worst:e}");
+
+    let mut raster = Raster::new(flat(100, 100));
+    let square = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
+    raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], Group { first: 0, triangles: 2, faces: Faces::Fronts });
+    assert_eq!(raster.ids().iter().flatten().count(), 40 * 60);
+}
