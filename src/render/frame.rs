@@ -115,6 +115,14 @@ pub fn shadow_texel(scene: &Scene, shot: &Shot) -> Option<[Vector3<f64>; 2]> {
     Some([texel(0), texel(1)])
 }
 
+/// The matrix from the world to the clip space of the shadow map: the sun looks along z, -1 is nearest to it. None when
+/// the look has no shadow. For positions that are relative to the scene's origin.
+pub fn shadow_clip(scene: &Scene, shot: &Shot) -> Option<Matrix4<f64>> {
+    scene.look.shadow?;
+    let map = LightBox::fit(&sun_fit(scene, shot, [0.0; 3])).map_from_world;
+    Some(Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map)
+}
+
 /// Whether the camera stands above the ground; from below it is not drawn.
 pub(super) fn above_ground(scene: &Scene, shot: &Shot) -> bool {
     let up = scene.up.index();

@@ -55,7 +55,7 @@ use std::time::Duration;
 
 pub use self::cull::{Culled, Sifted};
 pub use self::device::{EglDevice, devices};
-pub use self::frame::shadow_texel;
+pub use self::frame::{shadow_clip, shadow_texel};
 use self::gl::{Gl, Program};
 pub use self::lists::Lists;
 pub use self::pick::{Hit, Pick};

@@ -4,11 +4,12 @@ use super::Report;
 use super::bare::{BEYOND_US, Bare};
 use super::blurs::{Blurs, MOST_US, TIMES_AS_FAST};
 use super::plants::Plant;
+use super::raster::{Counts, MOST_DIFFERING, Pair, Rastered};
 use crate::report::peers::{dash, line, rule};
 
 /// All of them that the report has.
 pub(super) fn markdown(report: &Report) -> String {
-    [bare(&report.bare), blurs(&report.blurs), plants(&report.plants)].concat()
+    [bare(&report.bare), raster(&report.raster), blurs(&report.blurs), plants(&report.plants)].concat()
 }
 
 fn bare(list: &[Bare]) -> String {
@@ -50,6 +51,37 @@ fn bare(list: &[Bare]) -> String {
             us(own.usual.frame_us),
             us(own.usual.beyond_us),
         ]));
+    }
+    text
+}
+
+fn raster(list: &[Rastered]) -> String {
+    if list.is_empty() {
+        return String::new();
+    }
+    let head = ["load", "triangles", "ids that differ", "depth us: OpenGL", "CUDA", "times as fast"];
+    let head = head.into_iter().chain(["of", "ids us: OpenGL", "CUDA", "times as fast", "in the map", "in the frame"]);
+    let head: Vec<String> = head.map(String::from).collect();
+    let mut text = format!(
+        "\n## Raster\n\nThe bare passes at one sample a pixel, by OpenGL and by CUDA's own kernels, in the same run. Where \
+         more than {} % of the ids differ nothing is timed. Triangles: drawn by a thread + a warp + tile by tile; between \
+         the samples; dropped for another reason.\n\n",
+        100.0 * MOST_DIFFERING
+    );
+    let columns = head.len();
+    text.push_str(&line(head));
+    text.push_str(&rule(columns));
+    for own in list {
+        let count =
+            |own: Counts| format!("{} + {} + {}; {}; {}", own.small, own.medium, own.large, own.missed, own.dropped);
+        let pair = |pair: Option<Pair>| match pair {
+            Some(pair) => [pair.opengl.median_us, pair.cuda.median_us, pair.ratio()].map(|own| format!("{own:.1}")),
+            None => [(); 3].map(|()| dash()),
+        };
+        let first = [own.load.clone(), own.triangles.to_string(), format!("{} of {}", own.differing, own.samples)];
+        let cells = first.into_iter().chain(pair(own.passes.map(|passes| passes.depth))).chain([own.map.to_string()]);
+        let cells = cells.chain(pair(own.passes.map(|passes| passes.visibility)));
+        text.push_str(&line(cells.chain([count(own.in_map), count(own.in_frame)])));
     }
     text
 }

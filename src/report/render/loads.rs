@@ -200,6 +200,37 @@ pub(super) fn lying(half: f32, height: f32) -> Result<Mesh> {
     quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
 }
 
+/// A room of about 10,000 triangles, seen from inside: no load of its own, a mesh that fills the frame.
+pub(super) fn room() -> Result<(Mesh, Camera)> {
+    const CELLS: u32 = 29;
+    let (mut rest, mut normals, mut triangles) = (Vec::new(), Vec::new(), Vec::new());
+    for (axis, side) in (0..3).flat_map(|axis| [(axis, -1.0_f32), (axis, 1.0)]) {
+        let first = rest.len() as u32;
+        for (row, column) in (0..=CELLS).flat_map(|row| (0..=CELLS).map(move |column| (row, column))) {
+            let at = |cell: u32| 2.0 * cell as f32 / CELLS as f32 - 1.0;
+            let mut point = [0.0; 3];
+            (point[axis], point[(axis + 1) % 3], point[(axis + 2) % 3]) = (side, at(column), at(row));
+            rest.push([3.0 * point[0], 1.5 * point[1], 3.0 * point[2]]);
+            normals.push(std::array::from_fn(|own| if own == axis { -side } else { 0.0 }));
+        }
+        for (row, column) in (0..CELLS).flat_map(|row| (0..CELLS).map(move |column| (row, column))) {
+            let a = first + row * (CELLS + 1) + column;
+            let (b, c, d) = (a + 1, a + CELLS + 2, a + CELLS + 1);
+            triangles.extend(if side < 0.0 { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] });
+        }
+    }
+    let view = View::LookAt { eye: [2.1, 0.4, 2.3], target: [-1.0, -0.3, -1.2], up: [0.0, 1.0, 0.0] };
+    let camera = Camera { view, lens: Lens::FieldOfView(60.0), near: 0.05, far: 20.0 };
+    Ok((Mesh::indexed(rest, normals, Vec::new(), triangles)?, camera))
+}
+
+/// Two triangles that fill the frame.
+pub(super) fn screen() -> Result<(Mesh, Camera)> {
+    let mesh = quad([[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [3.0, 3.0, 0.0], [-3.0, 3.0, 0.0]], [0.0, 0.0, 1.0])?;
+    let view = View::LookAt { eye: [0.1, 0.0, 1.2], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+    Ok((mesh, Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 10.0 }))
+}
+
 fn paint(diffuse: [f32; 3]) -> Material {
     Material {
         ambient: diffuse,

@@ -11,6 +11,7 @@
 //! - `readback`: frames a second when each is read.
 //! - [`metrics`]: errors, light bleeding, flicker.
 //! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur in compute and in fragments.
+//! - `raster`: the same passes by CUDA beside OpenGL.
 //! - [`packing`]: images in one array as equation 3.13 packs them, against arrays by size.
 //! - [`plants`]: the plants of table 4.5 with rendering.
 //! - [`timed`]: frame times of a scene of the user, for programs that draw the same.
@@ -35,6 +36,7 @@ mod picture;
 mod pictures;
 pub mod plants;
 mod plot;
+mod raster;
 mod readback;
 mod shade;
 mod soup;
@@ -54,6 +56,7 @@ use self::loads::Kind;
 pub use self::measure::Row;
 pub use self::pictures::File;
 use self::plants::Plant;
+pub use self::raster::Rastered;
 pub use self::readback::Readback;
 use self::studio::Studio;
 pub use self::studio::{Pass, Size};
@@ -123,6 +126,8 @@ pub struct Report {
     pub readback: Vec<Readback>,
     /// What the bare passes take on each load.
     pub bare: Vec<Bare>,
+    /// The passes by CUDA beside them, where there is a device.
+    pub raster: Vec<Rastered>,
     /// What the passes that make the same map of moments take, in compute and in fragments.
     pub blurs: Vec<Blurs>,
     /// Plants of table 4.5, deformed and drawn.
@@ -152,17 +157,22 @@ pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Repor
         progress(&format!("{}: reading back", kind.name()));
         readback.push(readback::measure(&mut studio, request, *kind)?);
     }
-    let device = if request.plants.is_empty() { None } else { plants::device() };
+    let device = plants::device();
+    let raster = match &device {
+        Some(device) => raster::measure(&mut studio, device, request, &mut progress)?,
+        None => Vec::new(),
+    };
     let mut plants = Vec::new();
     for index in &request.plants {
         progress(&format!("plant-{}", index + 1));
         plants.push(plants::measure(&mut studio, device.as_ref(), request, *index)?);
     }
-    let failed = rows.iter().filter(|row: &&Row| !row.as_stated()).map(why).collect();
+    let failed = rows.iter().filter(|row: &&Row| !row.as_stated()).map(why);
+    let failed = failed.chain(raster.iter().filter_map(Rastered::fault)).collect();
     let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::BOUNDS);
     let blurs = Blurs::of(&rows);
     let size = request.size;
-    Ok(Report { made, renderer, size, bounds, loads, rows, readback, bare, blurs, plants, failed, pictures })
+    Ok(Report { made, renderer, size, bounds, loads, rows, readback, bare, raster, blurs, plants, failed, pictures })
 }
 
 fn why(row: &Row) -> String {

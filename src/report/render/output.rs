@@ -70,7 +70,7 @@ const COLUMNS: [(&str, &str); 55] = [
 ];
 
 impl Report {
-    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes, and blurs both ways), `plants.csv`, `report.md`,
+    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes, and raster and blurs both ways), `plants.csv`, `report.md`,
     /// `report.svg`, `report.png` and `pictures/` into a folder, which is made.
     ///
     /// # Errors
@@ -129,6 +129,18 @@ fn passes_csv(report: &Report) -> Result<Vec<u8>> {
             let [own, beyond, size] = [frame.frame_us.to_string(), frame.beyond_us.to_string(), bare.map.to_string()];
             let what = "both bare passes";
             lines.push([&bare.load, what, &size, "", &both, &frame.name, &own, &beyond, ""].map(String::from));
+        }
+    }
+    for (own, passes) in report.raster.iter().filter_map(|own| own.passes.map(|passes| (own, passes))) {
+        let frame = format!("{}x{}", report.size.width, report.size.height);
+        let both = [
+            ("raster depth in CUDA", own.map.to_string(), passes.depth),
+            ("raster ids in CUDA", frame, passes.visibility),
+        ];
+        for (what, size, pair) in both {
+            let [cuda, opengl, ratio] =
+                [pair.cuda.median_us, pair.opengl.median_us, pair.ratio()].map(|us| us.to_string());
+            lines.push([&own.load, what, &size, "1", &cuda, "in OpenGL", &opengl, "", &ratio].map(String::from));
         }
     }
     for blurs in &report.blurs {

@@ -75,12 +75,6 @@ impl Exact {
         let shares = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
         0.5 * shares.dot(&self.depths) / shares.dot(&self.weights) + 0.5
     }
-
-    /// What a step of the snapped corners makes of the depth at a sample.
-    fn slope(&self, sample: Vector3<f64>) -> f64 {
-        let aside = [Vector3::x(), Vector3::y()].map(|step| self.depth(sample + EDGE * step) - self.depth(sample));
-        aside[0].abs() + aside[1].abs()
-    }
 }
 
 /// Samples that differ, and those of them that no rule excuses.
@@ -97,8 +91,7 @@ fn compare(got: &[Option<u32>], want: &[Option<u32>], exact: &[Exact]) -> Differ
         let (x, y) = (at % SIZE[0] as usize, at / SIZE[0] as usize);
         let sample = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
         let both: Vec<&Exact> = [got, want].into_iter().flatten().map(|id| &exact[*id as usize]).collect();
-        let tie =
-            |a: &Exact, b: &Exact| (a.depth(sample) - b.depth(sample)).abs() <= TIE + a.slope(sample) + b.slope(sample);
+        let tie = |a: &Exact, b: &Exact| (a.depth(sample) - b.depth(sample)).abs() <= TIE;
         if both.iter().any(|own| own.is_on_edge(sample)) {
             found.edges += 1;
         } else if both.len() == 2 && tie(both[0], both[1]) {
