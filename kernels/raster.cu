@@ -263,7 +263,7 @@ __device__ inline void draw_pieces(const RasterArgs& args, const Polygon& polygo
     }
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK) raster_tiles(const __grid_constant__ RasterArgs args) {
+extern "C" __global__ void __launch_bounds__(BLOCK, 3) raster_tiles(const __grid_constant__ RasterArgs args) {
     __shared__ Polygon polygon;
     __shared__ Large entry;
     const unsigned long long large = ((const Tally*)args.tally)->large;

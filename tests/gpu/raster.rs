@@ -2,6 +2,8 @@
 
 use modalcast::gpu::{Device, Raster, RasterCounts, RasterForm, RasterMesh, Spread, Trial as _};
 use modalcast::reference::raster::{Dropped, outline};
+use modalcast::report::render::loads::Kind;
+use modalcast::report::render::{Request, Size, rasters};
 
 use crate::both::soups::{Soup, soups};
 
@@ -75,4 +77,28 @@ fn gpu_every_triangle_is_counted_once_and_each_path_is_taken() {
     assert!(all.iter().all(|path| *path > 10), "{all:?}");
     let quiet = launched(&device, &soups()[1], RasterForm::default()).counts(&device).expect("counts");
     assert_eq!(quiet, RasterCounts::default(), "nothing is counted unasked");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_ids_of_whole_scenes_are_opengls_and_both_ways_are_timed() {
+    let request = Request {
+        loads: vec![Kind::Square, Kind::Triangles(50_000)],
+        plants: vec![],
+        variants: vec![],
+        size: Size { width: 640, height: 360 },
+        quick: true,
+        replays: 20,
+    };
+    let report = rasters(&request, |_| {}).expect("a report");
+    report.rows.iter().for_each(|row| eprintln!("{}", row.line()));
+    assert_eq!(report.rows.len(), 4);
+    for row in &report.rows {
+        let passes = row.passes.unwrap_or_else(|| panic!("not timed: {row:?}"));
+        assert!(passes.depth.ratio() > 0.0 && passes.visibility.ratio() > 0.0);
+        assert!(row.in_frame.small + row.in_frame.medium + row.in_frame.large > 0, "{row:?}");
+    }
+    let named = |name: &str| report.rows.iter().find(|row| row.load == name).expect("there").in_frame;
+    assert!(named("room").dropped > 1000, "much of the room lies behind the eye: {:?}", named("room"));
+    assert_eq!(named("screen").large, 2);
 }

@@ -24,6 +24,7 @@ Examples:
   modalcast report render --out report --quick
   modalcast report render --out report --load tree --load triangles-3000000 --size 1920x1080
   modalcast report render --out report --load square --variant 'variance 512*'
+  modalcast report render --out report --raster --load triangles-3000000 --size 1920x1080
   modalcast report render --out figures --figures
   modalcast report render --out figures --figures --scene path/to/plant --size 1280x960";
 
@@ -56,6 +57,10 @@ pub(super) struct Args {
     /// Draws the figures of the thesis's chapter 4.2 instead, from our own scenes: nothing is measured.
     #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
     figures: bool,
+    /// Only the rasteriser in CUDA beside OpenGL's bare passes, on the loads, a room and two triangles that fill the frame:
+    /// raster.json and raster.md. Needs an NVIDIA GPU.
+    #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
+    raster: bool,
     /// A scene of your own, a path to a model or a scene folder; may be repeated. With --figures a picture of it too;
     /// alone its frame times and nothing else: times.json and a picture.
     #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["loads", "variants", "quick"])]
@@ -76,11 +81,22 @@ pub(super) fn run(args: &Args) -> Outcome {
         return timed(args);
     }
     let request = request(args)?;
+    if args.raster {
+        return rasters(args, &request);
+    }
     let report = working("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
     report.write(&args.out)?;
     lines(&report).into_iter().for_each(say);
     say(format!("written to {}", args.out.display()));
     Ok(report.passed())
+}
+
+fn rasters(args: &Args, request: &Request) -> Outcome {
+    let rasters = working("measuring", || render::rasters(request, |what| tracing::info!(what, "measuring")))?;
+    rasters.write(&args.out)?;
+    rasters.rows.iter().for_each(|row| say(row.line()));
+    say(format!("written to {}", args.out.display()));
+    Ok(rasters.passed())
 }
 
 fn figures(args: &Args) -> Outcome {
@@ -201,6 +217,7 @@ fn lines(report: &Report) -> Vec<String> {
             format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.beyond_us)
         }));
     }
+    lines.extend(report.raster.iter().map(render::Rastered::line));
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
     lines
 }
@@ -219,6 +236,7 @@ mod tests {
             replays: None,
             quick: true,
             figures: false,
+            raster: false,
             scenes: vec![],
         }
     }

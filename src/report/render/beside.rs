@@ -55,7 +55,8 @@ fn bare(list: &[Bare]) -> String {
     text
 }
 
-fn raster(list: &[Rastered]) -> String {
+/// CUDA beside OpenGL.
+pub(super) fn raster(list: &[Rastered]) -> String {
     if list.is_empty() {
         return String::new();
     }

@@ -56,7 +56,7 @@ use self::loads::Kind;
 pub use self::measure::Row;
 pub use self::pictures::File;
 use self::plants::Plant;
-pub use self::raster::Rastered;
+pub use self::raster::{Rastered, Rasters, rasters};
 pub use self::readback::Readback;
 use self::studio::Studio;
 pub use self::studio::{Pass, Size};

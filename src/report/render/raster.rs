@@ -1,6 +1,7 @@
 //! Ids with depth, and depth alone, by CUDA beside the same by OpenGL: the scene stripped to its mesh, one sample a pixel,
 //! both in one run. Ids are compared before anything is timed.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use nalgebra::Matrix4;
@@ -9,10 +10,11 @@ use serde::Serialize;
 use super::loads::{Kind, add, room, screen};
 use super::measure::STILL;
 use super::studio::{Set, Size, Studio};
-use super::{Request, bare};
+use super::{Request, bare, beside};
 use crate::error::{Result, during};
 use crate::gpu::{self, Device, Raster, RasterCounts, RasterForm, RasterMesh, Trial as _};
-use crate::render::{Seen, Shot, shadow_clip};
+use crate::render::{Info, Seen, Shot, shadow_clip};
+use crate::report::machine::Provenance;
 use crate::report::timing::{FEWEST, Timing};
 use crate::scene::{Camera, Faces, Group, Look, Parts, Scene, State, Window};
 
@@ -85,6 +87,74 @@ impl Rastered {
         let Self { load, differing, samples, passes, .. } = self;
         passes.is_none().then(|| format!("{load}: raster: {differing} of {samples} samples see another triangle"))
     }
+}
+
+impl Rastered {
+    /// The figures as a line for people.
+    pub fn line(&self) -> String {
+        let pair = |pair: Pair| {
+            format!(
+                "{:.1} us by OpenGL, {:.1} by CUDA, {:.1} times as fast",
+                pair.opengl.median_us,
+                pair.cuda.median_us,
+                pair.ratio()
+            )
+        };
+        let times = self.passes.map_or("not timed".into(), |passes| {
+            format!("depth {} {}; ids {}", self.map, pair(passes.depth), pair(passes.visibility))
+        });
+        format!("{:<18}{times}; {} of {} ids differ", self.load, self.differing, self.samples)
+    }
+}
+
+/// These passes alone, of several loads.
+#[derive(Debug, Clone, Serialize)]
+pub struct Rasters {
+    pub made: Provenance,
+    pub renderer: Info,
+    pub size: Size,
+    pub rows: Vec<Rastered>,
+}
+
+impl Rasters {
+    /// Writes `raster.json` and `raster.md` into a folder, which is made.
+    ///
+    /// # Errors
+    /// `Fault` when a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        std::fs::create_dir_all(folder).map_err(during("report"))?;
+        let json = serde_json::to_vec_pretty(self).map_err(during("report"))?;
+        let page = format!(
+            "{}\n\n{}; {} x {} pixels.\n{}",
+            self.made.line(),
+            self.renderer.renderer,
+            self.size.width,
+            self.size.height,
+            beside::raster(&self.rows)
+        );
+        for (name, bytes) in [("raster.json", json), ("raster.md", page.into_bytes())] {
+            std::fs::write(folder.join(name), bytes).map_err(during("report"))?;
+        }
+        Ok(())
+    }
+
+    /// Whether everything was timed.
+    pub fn passed(&self) -> bool {
+        self.rows.iter().all(|row| row.passes.is_some())
+    }
+}
+
+/// Measures these passes and nothing else; `progress` hears what is being done.
+///
+/// # Errors
+/// `Unavailable` without OpenGL, a CUDA device or NVRTC; those of loading and drawing a scene.
+pub fn rasters(request: &Request, mut progress: impl FnMut(&str)) -> Result<Rasters> {
+    let device = Device::open(0)?;
+    device.check_compiler()?;
+    let mut studio = Studio::open()?;
+    let rows = measure(&mut studio, &device, request, &mut progress)?;
+    let renderer = studio.renderer.info().clone();
+    Ok(Rasters { made: Provenance::here(), renderer, size: request.size, rows })
 }
 
 /// A stripped scene, how it stands and what sees it.
@@ -237,8 +307,7 @@ mod tests {
     use super::*;
     use crate::render::Renderer;
 
-    /// What the windows show is what OpenGL draws: the share of samples on which a point in the middle of the triangle
-    /// that OpenGL saw falls into the pixel's neighbourhood.
+    /// The box of the triangle that OpenGL saw at a sample holds the sample.
     #[test]
     fn windows_and_triangles_are_those_of_the_frame_that_opengl_draws() {
         let mut studio = Studio::open().expect("OpenGL");
