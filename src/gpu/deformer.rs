@@ -27,7 +27,6 @@ use super::rotation::{Rotation, Turn};
 use crate::deform::{Backend, Deformed, Deformer, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::scene::{Changed, Scene, State};
-use crate::telemetry::ms_since;
 
 /// Steps that may be under way at once.
 pub const MOST_UNDER_WAY: usize = 2;
@@ -145,7 +144,7 @@ impl CudaDeformer {
         let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
         let (flight, begin) = self.under_way.pop_front().ok_or_else(none)?;
         let bounds = self.flights[flight].wait().inspect_err(|_| self.forget())?;
-        let whole = ms_since(begin);
+        let whole = begin.elapsed().as_secs_f64() * 1e3;
         let own = self.flights[flight].own_ms().inspect_err(|_| self.forget())?;
         Ok(Deformed { bounds, ms: own.unwrap_or(whole) })
     }
@@ -182,7 +181,7 @@ impl CudaDeformer {
         let displacements = self.displacements.as_ref().map_or(0, |buffer| address(&self.device, buffer));
         let header = Header { displacements, ..header };
         let access = if keep { Access::WriteSome } else { Access::WriteAll };
-        flight.before_ms = ms_since(begin);
+        flight.before_ms = begin.elapsed().as_secs_f64() * 1e3;
         self.output.with(&self.device, Use { set: turn.output, access }, |to| {
             flight.mark_mapped(&self.device)?;
             let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
