@@ -93,6 +93,24 @@ pub struct Scene {
 }
 
 impl Scene {
+    /// The parts that the scene would be built of again, to change some of them.
+    pub fn parts(&self) -> Parts {
+        Parts {
+            name: self.name.clone(),
+            shapes: self.shapes.clone(),
+            materials: self.materials.clone(),
+            textures: self.textures.clone(),
+            domains: self.domains.clone(),
+            up: self.up,
+            unit: self.unit,
+            origin: self.origin,
+            look: self.look,
+            deformation: self.deformation,
+            rigid_transforms: self.rigid_transforms,
+            remarks: self.remarks.clone(),
+        }
+    }
+
     /// Checks all that is between the parts and computes packing, needs, tangents and rest bounds, once.
     ///
     /// # Errors

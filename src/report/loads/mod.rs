@@ -148,25 +148,7 @@ impl Kind {
 /// # Errors
 /// `Invalid` when the choices make no sense.
 pub fn restated(scene: &Scene, deformation: Deformation) -> Result<Arc<Scene>> {
-    Scene::new(parts_of(scene, deformation))
-}
-
-/// The parts that a scene would be built of again.
-fn parts_of(scene: &Scene, deformation: Deformation) -> Parts {
-    Parts {
-        name: scene.name.clone(),
-        shapes: scene.shapes.clone(),
-        materials: scene.materials.clone(),
-        textures: scene.textures.clone(),
-        domains: scene.domains.clone(),
-        up: scene.up,
-        unit: scene.unit,
-        origin: scene.origin,
-        look: scene.look,
-        deformation,
-        rigid_transforms: scene.rigid_transforms,
-        remarks: scene.remarks.clone(),
-    }
+    Scene::new(Parts { deformation, ..scene.parts() })
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use fastrand::Rng;
 use rayon::prelude::*;
 
 use super::build::{Patch, QUICK, Triangles, scene, seed_of, shape};
-use super::{Kind, Load, Size, parts_of};
+use super::{Kind, Load, Size};
 use crate::domain::Follow;
 use crate::error::Result;
 use crate::report::thesis::{PLANTS, Species};
@@ -35,7 +35,7 @@ pub(super) fn grow_on_branches(index: usize, size: Size) -> Result<Load> {
     let branches =
         grown.scene.domains.iter().filter(|domain| grown.scene.shapes[domain.shape].modes.rank() > 0).count();
     let name = Kind::Follows(index).name();
-    let mut parts = parts_of(&grown.scene, grown.scene.deformation);
+    let mut parts = grown.scene.parts();
     parts.name.clone_from(&name);
     for leaf in branches..parts.domains.len() {
         let parent = leaf % branches;

@@ -6,7 +6,6 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::meter;
 use crate::domain::Material;
 use crate::error::Result;
 use crate::render::Ran;
@@ -61,7 +60,7 @@ pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
     let shadow = Shadow { method: ShadowMethod::Standard, size: map, ..Shadow::default() };
     let look = Look { shadow: Some(shadow), ground: None, bloom: None, culling: Culling::None, ..scene.look };
     let materials = vec![Material { double_sided: true, ..Material::default() }];
-    let mut parts = Parts { look, materials, textures: Vec::new(), ..meter::parts(scene) };
+    let mut parts = Parts { look, materials, textures: Vec::new(), ..scene.parts() };
     for domain in &mut parts.domains {
         domain.material = 0;
         domain.runs.clear();

@@ -14,7 +14,7 @@ use crate::scene::{Ground, Look, Parts, Scene};
 /// # Errors
 /// `Invalid` when the look makes no sense.
 pub(super) fn relit(scene: &Scene, look: Look) -> Result<Arc<Scene>> {
-    Scene::new(Parts { look, ..parts(scene) })
+    Scene::new(Parts { look, ..scene.parts() })
 }
 
 /// The light meter of a scene. A blended surface keeps its alpha, a cut-out its holes; the sun is as bright as the display.
@@ -30,7 +30,7 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
         ground: scene.look.ground.map(|_| Ground { colour: [1.0; 3] }),
         ..scene.look
     };
-    let mut parts = Parts { look, ..parts(scene) };
+    let mut parts = Parts { look, ..scene.parts() };
     for material in &mut parts.materials {
         *material = Material { ambient: [0.0; 3], diffuse: [1.0; 3], specular: [0.0; 3], ..material.clone() };
     }
@@ -48,23 +48,6 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
         }
     }
     Scene::new(parts)
-}
-
-pub(super) fn parts(scene: &Scene) -> Parts {
-    Parts {
-        name: scene.name.clone(),
-        shapes: scene.shapes.clone(),
-        materials: scene.materials.clone(),
-        textures: scene.textures.clone(),
-        domains: scene.domains.clone(),
-        up: scene.up,
-        unit: scene.unit,
-        origin: scene.origin,
-        look: scene.look,
-        deformation: scene.deformation,
-        rigid_transforms: scene.rigid_transforms,
-        remarks: scene.remarks.clone(),
-    }
 }
 
 /// The share of the light that arrives, per pixel, from frames of the light meter with and without shadows. Bytes tell it

@@ -21,8 +21,6 @@ use crate::domain::{Corners, Mesh, Modes, Shape, Texture};
 use crate::error::{Result, invalid};
 use crate::scene::{Parts, Scene};
 
-use super::meter;
-
 /// How images lie in arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -40,7 +38,7 @@ pub enum Packing {
 /// # Errors
 /// `Invalid` when a triangle crosses the rim of its image.
 pub(super) fn packed(scene: &Scene, packing: Packing) -> Result<Arc<Scene>> {
-    let mut parts = meter::parts(scene);
+    let mut parts = scene.parts();
     if packing != Packing::Classes {
         repeat(&mut parts, packing)?;
     }

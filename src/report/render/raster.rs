@@ -203,7 +203,7 @@ fn measure_load(studio: &mut Studio, device: &Device, request: &Request, kind: K
 impl Job {
     fn new(name: &str, scene: &Scene, (state, camera): (State, Camera), request: &Request) -> Result<Self> {
         let map = if request.quick { MAPS.1 } else { MAPS.0 };
-        let one = Scene::new(Parts { look: Look { samples: 1, ..scene.look }, ..super::meter::parts(scene) })?;
+        let one = Scene::new(Parts { look: Look { samples: 1, ..scene.look }, ..scene.parts() })?;
         let (size, replays) = (request.size, request.replays.max(FEWEST));
         Ok(Self { name: name.into(), scene: bare::stripped(&one, map)?, state, camera, size, map, replays })
     }

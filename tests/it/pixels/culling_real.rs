@@ -15,21 +15,7 @@ const FRAMES: usize = 9;
 
 /// The same scene under another look.
 fn under(scene: &Scene, look: Look) -> Arc<Scene> {
-    let parts = Parts {
-        name: scene.name.clone(),
-        shapes: scene.shapes.clone(),
-        materials: scene.materials.clone(),
-        textures: scene.textures.clone(),
-        domains: scene.domains.clone(),
-        up: scene.up,
-        unit: scene.unit,
-        origin: scene.origin,
-        look,
-        deformation: scene.deformation,
-        rigid_transforms: scene.rigid_transforms,
-        remarks: vec![],
-    };
-    Scene::new(parts).expect("a good scene")
+    Scene::new(Parts { look, ..scene.parts() }).expect("a good scene")
 }
 
 /// The picture, the median milliseconds of some passes, and what was culled.

@@ -4,7 +4,7 @@ use nalgebra::{Matrix4, Rotation3, Vector3};
 
 use crate::domain::{Texture, Transform};
 use crate::error::Result;
-use crate::scene::{Look, Parts, Scene};
+use crate::scene::{Look, Parts};
 
 /// Where one plant stands: to the right, towards the viewer, turned about its trunk, and how large.
 #[derive(Debug, Clone, Copy)]
@@ -58,18 +58,6 @@ fn bring(forest: &mut Parts, species: &Parts) -> [usize; 2] {
     [shape, material]
 }
 
-/// The parts of a scene, to be built again with a change.
-pub(super) fn parts_of(scene: &Scene) -> Parts {
-    Parts {
-        shapes: scene.shapes.clone(),
-        materials: scene.materials.clone(),
-        textures: scene.textures.clone(),
-        domains: scene.domains.clone(),
-        look: scene.look,
-        ..Parts::named(scene.name.clone())
-    }
-}
-
 /// The same tree in blossom: leaves of the second kind are petals now, and those of the first a young green.
 ///
 /// # Errors
@@ -100,10 +88,11 @@ fn tinted(image: &Texture, tint: [f32; 3]) -> Result<Texture> {
 mod tests {
     use super::*;
     use crate::load;
+    use crate::scene::Scene;
 
     #[test]
     fn plants_share_what_their_species_has_and_keep_their_parents_among_themselves() {
-        let tree = parts_of(&load::open("tree").expect("built"));
+        let tree = load::open("tree").expect("built").parts();
         let blossom = in_blossom(&tree).expect("tinted");
         assert_ne!(blossom.textures, tree.textures);
         let stand = |species: usize, right: f64| Stand { species, right, near: 0.0, turn: 1.0, scale: 0.5 };

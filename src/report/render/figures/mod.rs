@@ -103,7 +103,7 @@ struct Species {
 
 impl Species {
     fn grow() -> Result<Self> {
-        let tree = forest::parts_of(load::open("tree")?.as_ref());
+        let tree = load::open("tree")?.parts();
         let bark = bark(&tree)?;
         let conifer = |habit: &fir::Habit| fir::grow(habit, bark);
         let (fir, hemlock, spruce) = (conifer(&fir::FIR)?, conifer(&fir::HEMLOCK)?, conifer(&fir::SPRUCE)?);
