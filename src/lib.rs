@@ -14,16 +14,17 @@
 //! |---|---|---|
 //! | `cli` | the command line: one file per command | `config`, `service`, `report`, `engine`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `tree`, `deform`, `scene`, `domain`, `telemetry`, `error` |
 //! | `service` | gRPC: wire to values and back; the only module that names proto | `config`, `engine`, `deform`, `scene`, `domain`, `telemetry`, `error` |
-//! | `report` | error against run time: synthetic scenes, errors by source, timing, tables and plots | `gpu`, `cpu`, `reference`, `render`, `load`, `deform`, `storage`, `scene`, `domain`, `error` |
-//! | `engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `deform`, `scene`, `domain`, `telemetry`, `error` |
-//! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage`, `deform`, `scene`, `domain`, `error` |
+//! | `report` | error against run time: synthetic scenes, errors by source, timing, tables and plots | `gpu`, `cpu`, `reference`, `render`, `load`, `deform`, `raster`, `storage`, `scene`, `domain`, `error` |
+//! | `engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `deform`, `raster`, `scene`, `domain`, `telemetry`, `error` |
+//! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage`, `deform`, `raster`, `scene`, `domain`, `error` |
 //! | `cpu` | the f32 deformer of machines without a GPU | `storage`, `deform`, `scene`, `domain`, `error` |
 //! | `reference` | the same in f64, plain: the definition that the others are tested against | `deform`, `scene`, `domain`, `error` |
-//! | `render` | EGL and OpenGL: buffers, passes, readback | `deform`, `scene`, `domain`, `error` |
+//! | `render` | EGL and OpenGL: buffers, passes, readback | `deform`, `raster`, `scene`, `domain`, `error` |
 //! | `frame` | pixels and numbers to bytes, colour maps with their legends; pure functions | `error` |
 //! | `load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
 //! | `tree` | the built-in scene: beams to modes, modes to skin | `scene`, `domain`, `error` |
 //! | `deform` | what every deformer does, as a trait | `scene`, `error` |
+//! | `raster` | what draws into samples beside OpenGL, as a trait | `scene`, `error` |
 //! | `storage` | U in tiles as cpu and gpu read it: storage types, a-priori bounds, mode truncation; pure | `scene`, `domain`, `error` |
 //! | `scene` | the set of domains, its packing and needs; one step as values; cameras | `domain`, `error` |
 //! | `domain` | mesh, modes U, material, texture; parsed once, immutable | `error` |
@@ -53,6 +54,7 @@ pub mod error;
 pub mod frame;
 pub mod gpu;
 pub mod load;
+pub mod raster;
 pub mod reference;
 pub mod render;
 pub mod report;
