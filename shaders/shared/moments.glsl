@@ -1,5 +1,9 @@
 // Depth to what is blurred: m = depth - 1/2 and m m.
 layout(binding = 0) uniform sampler2DArray from;
+#ifdef OF_BUFFER
+// Depth by another rasteriser, top row first.
+layout(std430, binding = 0) readonly buffer Depths { float depths_held[]; };
+#endif
 #ifdef SPLITS
 layout(location = 1) uniform int layer;
 #else
@@ -17,7 +21,12 @@ float ground(ivec2 at, int side) {
 
 // m at a texel. Beyond the edge as on it: the rim of the map is empty, and the ground goes on.
 float centred(ivec2 at, int side) {
-    float depth = texelFetch(from, ivec3(clamp(at, ivec2(0), ivec2(side - 1)), layer), 0).x;
+    ivec2 held = clamp(at, ivec2(0), ivec2(side - 1));
+#ifdef OF_BUFFER
+    float depth = depths_held[(side - 1 - held.y) * side + held.x];
+#else
+    float depth = texelFetch(from, ivec3(held, layer), 0).x;
+#endif
     // Where nothing is, there is but the ground behind it. The ground casts no shadow, but with its own depth in place of
     // the far plane's the bound is exact on it: the share of the blur's weight that lies off the caster.
     return depth >= 1.0 ? ground(at, side) : depth - 0.5;

@@ -9,6 +9,7 @@ use super::viewer::{Body, Shown, StepName};
 use crate::deform::{Surface, Wanted};
 use crate::error::{Result, during, invalid};
 use crate::frame;
+use crate::render::Paths;
 use crate::scene::{Bounds, Cells, Layout, Scene, Slot};
 use crate::telemetry::{Stage, StageTimes, ms_since};
 
@@ -38,6 +39,8 @@ pub struct Encoded {
     pub step: StepName,
     pub skipped: u64,
     pub stages: StageTimes,
+    /// Of colours: who drew the frame.
+    pub paths: Paths,
     pub bytes: Bytes,
 }
 
@@ -154,8 +157,12 @@ pub fn checked_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<
 pub async fn encode_frame(shown: Shown, format: Format) -> Result<Encoded> {
     let mut stages = shown.stages;
     let begin = Instant::now();
+    let mut paths = Paths::default();
     let (size, pixels) = match shown.body {
-        Body::Frame(image) => ([image.width, image.height], image.rgba),
+        Body::Frame(image) => {
+            paths = image.paths;
+            ([image.width, image.height], image.rgba)
+        }
         Body::Survey(survey, Some(legend)) => {
             let size = [survey.width, survey.height];
             (size, aside("encode", move || frame::colour_map(&survey.bytes, survey.samples, size, &legend)).await?)
@@ -171,7 +178,7 @@ pub async fn encode_frame(shown: Shown, format: Format) -> Result<Encoded> {
             bytes
         }
     };
-    Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, bytes: bytes.into() })
+    Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, paths, bytes: bytes.into() })
 }
 
 /// Packs what is wanted of the chosen domains: all positions in row order of U, then all normals, displacements and
@@ -192,7 +199,8 @@ pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<P
     };
     let (origin, origin_bytes, bytes) = aside("copy", work).await?;
     stages.push((Stage::Encode, ms_since(begin)));
-    let encoded = Encoded { step: shown.step, skipped: shown.skipped, stages, bytes: bytes.into() };
+    let (step, skipped, paths) = (shown.step, shown.skipped, Paths::default());
+    let encoded = Encoded { step, skipped, stages, paths, bytes: bytes.into() };
     Ok(Packed { encoded, origin, origin_bytes })
 }
 

@@ -38,6 +38,8 @@ pub use values::checked_mode;
 pub use viewer::{Body, Delivery, Feed, Showing, Shown, StepName, View};
 pub use workbench::{Info, Workbench};
 
+pub use crate::render::{Path, Paths};
+
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;

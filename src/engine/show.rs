@@ -181,7 +181,7 @@ mod tests {
     use super::super::{testing, worker::Reply};
     use super::*;
     use crate::config::Config;
-    use crate::render::Image;
+    use crate::render::{Image, Paths};
     use crate::scene::{Camera, State};
 
     /// A scene at its first step, and what it asks of the device.
@@ -210,7 +210,9 @@ mod tests {
     }
 
     fn answer((width, reply): (u32, Reply<Image>)) {
-        reply.send(Ok(Image { width, height: 8, rgba: vec![], passes: vec![] })).expect("somebody waits");
+        reply
+            .send(Ok(Image { width, height: 8, rgba: vec![], passes: vec![], paths: Paths::default() }))
+            .expect("somebody waits");
     }
 
     /// Shows the second step to a viewer whose frame of the first is late, and then to one that has room: how soon the device

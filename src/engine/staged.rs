@@ -7,11 +7,15 @@ use super::viewer::Showing;
 use crate::deform::{Deformed, Deformer, Fetch, Surface, Wanted};
 use crate::error::{Error, Result, during, invalid};
 use crate::frame::Legend;
-use crate::render::{Renderer, SceneBuffers};
+use crate::raster::{Mesh, Rasteriser};
+use crate::render::{Renderer, SceneBuffers, Shot};
 use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
 
 /// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
 const FARTHEST: f64 = 1e18;
+
+/// Pixels of the frames that are measured to choose what draws.
+const MEASURED: [u32; 2] = [1920, 1080];
 
 /// A scene that can be deformed and drawn.
 pub struct Staged {
@@ -175,6 +179,25 @@ impl Staged {
         renderer.upload(buffers, self.deformer.read(Wanted::VERTICES)?)?;
         self.filled = true;
         Ok(true)
+    }
+
+    /// Gives the scene's buffers a rasteriser beside OpenGL.
+    pub(super) fn draw_beside(
+        &mut self,
+        renderer: &mut Renderer,
+        make: impl FnOnce(Mesh) -> Result<Box<dyn Rasteriser>>,
+    ) -> Result<()> {
+        self.fill_shared(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        renderer.draw_beside(buffers, make)
+    }
+
+    /// Lets the faster of both draw each pass, as frames of this size are drawn of the scene where it is.
+    pub(super) fn choose_paths(&mut self, renderer: &mut Renderer) -> Result<()> {
+        let [width, height] = MEASURED;
+        let camera = Camera::framing(&self.scene, width, height);
+        let (bounds, _) = self.fill_buffers(renderer, &camera)?;
+        renderer.choose_paths(self.buffers()?, &Shot { camera, width, height, bounds }).map(drop)
     }
 
     pub(super) fn buffers(&self) -> Result<&SceneBuffers> {

@@ -49,8 +49,7 @@ impl Frame {
         let light = LightBox::fit(&sun_fit(scene, shot, origin));
         let viewer = shot.camera.relative_to(origin);
         let camera = viewer.camera_from_world();
-        // The depth range is for the deformed and the rest state: planes must not jump when a branch bends.
-        let clip = viewer.clip_from_camera(shot.width, shot.height, &bounds.union(home));
+        let clip = clip_from_camera(scene, shot, origin);
         let (centre, fade) = ground_disc(scene.up.index(), home, viewer.eye());
         let colour = |[r, g, b]: [f32; 3], fourth: f64| [r, g, b, fourth as f32];
         let frame = Self {
@@ -80,6 +79,25 @@ impl Frame {
             false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", shot.camera))),
         }
     }
+}
+
+/// The camera's projection of positions that are relative to `origin`. The depth range is for the deformed and the rest
+/// state: planes must not jump when a branch bends.
+fn clip_from_camera(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Matrix4<f64> {
+    let bounds = sound(scene, shot);
+    let viewer = shot.camera.relative_to(origin);
+    viewer.clip_from_camera(shot.width, shot.height, &bounds.union(home(scene, bounds, origin)))
+}
+
+/// Clip space of a shot from positions that are relative to `origin`.
+pub(super) fn camera_clip(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Matrix4<f64> {
+    clip_from_camera(scene, shot, origin) * shot.camera.relative_to(origin).camera_from_world()
+}
+
+/// Clip space of the shadow map from positions that are relative to `origin`: the sun looks along z, -1 is nearest to it.
+pub(super) fn map_clip(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Matrix4<f64> {
+    let map = LightBox::fit(&sun_fit(scene, shot, origin)).map_from_world;
+    Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map
 }
 
 /// The bounds of a shot. Those that overflowed fit no shadow and no depth range; those at rest are always good.
@@ -118,9 +136,7 @@ pub fn shadow_texel(scene: &Scene, shot: &Shot) -> Option<[Vector3<f64>; 2]> {
 /// The matrix from the world to the clip space of the shadow map: the sun looks along z, -1 is nearest to it. None when
 /// the look has no shadow. For positions that are relative to the scene's origin.
 pub fn shadow_clip(scene: &Scene, shot: &Shot) -> Option<Matrix4<f64>> {
-    scene.look.shadow?;
-    let map = LightBox::fit(&sun_fit(scene, shot, [0.0; 3])).map_from_world;
-    Some(Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map)
+    scene.look.shadow.map(|_| map_clip(scene, shot, [0.0; 3]))
 }
 
 /// Whether the camera stands above the ground; from below it is not drawn.

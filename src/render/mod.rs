@@ -8,6 +8,7 @@
 //! | occluders | depth of what the last frame saw, and its pyramid (compute) | hidden triangles are culled |
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
+//! | unpack | the same and the ground, as a rasteriser beside OpenGL saw it, to ids (compute) | that draws ([`Path`]) |
 //! | ground | the same of the ground | the look has a ground, and the camera is above it |
 //! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
 //! | count, scan, fill | lists of the blended fragments of each pixel | exact, and some triangle is blended |
@@ -33,6 +34,7 @@ mod gl;
 mod light;
 mod lists;
 mod passes;
+mod paths;
 mod pick;
 mod plan;
 mod post;
@@ -58,6 +60,7 @@ pub use self::device::{EglDevice, devices};
 pub use self::frame::{shadow_clip, shadow_texel};
 use self::gl::{Gl, Program};
 pub use self::lists::Lists;
+pub use self::paths::{Path, Paths};
 pub use self::pick::{Hit, Pick};
 pub use self::plan::{Allocation, Plan, Saving, plan};
 pub use self::ring::FRAMES_UNDER_WAY;
@@ -118,6 +121,7 @@ pub struct Image {
     /// "cull" (of a culled scene, with the occluders), "visibility" (with the ground), "blended" (lists and all), "shade" (with the backdrop), "bloom" and "encode" of
     /// drawing.
     pub passes: Vec<(&'static str, f64)>,
+    pub paths: Paths,
 }
 
 /// Names of the OpenGL buffers that a deformer may write in place of an upload.
@@ -137,6 +141,8 @@ pub struct Ran {
     /// Passes, in order. Of several frames of one step the first alone has "shadow" and "blur", where they can be shared:
     /// see [`SceneBuffers::hold_step`].
     pub passes: Vec<&'static str>,
+    /// Who drew the passes that turn triangles into samples.
+    pub paths: Paths,
     /// Draw calls of the visibility and blended passes.
     pub draws: usize,
     /// Samples a pixel.

@@ -4,6 +4,7 @@ use super::cull::{SHADOW_CULL, command};
 use super::frame::{Frame, above_ground};
 use super::geometry::{Group, Kind};
 use super::gl::{Buffer, Clear, Fixed, Framebuffer, Gl, Program, Texture};
+use super::paths::Path;
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
@@ -51,8 +52,12 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
 }
 
 /// Depth from the sun.
-pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
+pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
     let Some(map) = &buffers.shadow else { return Ok(()) };
+    if let Some(beside) = buffers.shadow_beside() {
+        return beside.depth(buffers, shot, ran);
+    }
+    ran.paths.shadow = Some(Path::OpenGl);
     super::shadow::depth(gl, buffers, map)?;
     ran.passes.extend(buffers.culler.as_ref().map(|_| SHADOW_CULL));
     ran.passes.push("shadow");
@@ -104,6 +109,7 @@ pub(super) fn identify(
     }
     if any {
         ran.passes.push("visibility");
+        ran.paths.visibility = Some(Path::OpenGl);
     }
     gl.check("visibility")
 }

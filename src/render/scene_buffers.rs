@@ -11,6 +11,7 @@ use super::SharedBuffers;
 use super::cull::{Culler, LISTED};
 use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials, whose};
 use super::gl::{self, Attribute, Buffer, Gl, Program, Texture, TextureKind, VertexArray};
+use super::paths::Beside;
 use super::plan::{Allocation, Plan, planned};
 use super::post::Post;
 use super::programs::{Compile, Programs, Sampled};
@@ -39,6 +40,8 @@ const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders
 pub struct SceneBuffers {
     /// Names of the buffers that a deformer may write in place of an upload.
     pub shared: SharedBuffers,
+    /// Draws passes in place of OpenGL, where the look asks for it and somebody gave one. Before the buffers that it knows.
+    pub(super) beside: Option<Beside>,
     pub(super) scene: Arc<Scene>,
     pub(super) buffers: BTreeMap<String, Buffer>,
     pub(super) views: Views,
@@ -138,6 +141,7 @@ impl SceneBuffers {
         let [colours, normals] = images;
         Ok(Self {
             shared,
+            beside: None,
             scene: Arc::clone(scene),
             views,
             solids: solids(gl, &buffers, "triangle vertices")?,
@@ -160,6 +164,10 @@ impl SceneBuffers {
             values: None,
             plan,
         })
+    }
+
+    pub(super) const fn options(&self) -> &Options {
+        &self.options
     }
 
     /// The programs of frames of so many samples a pixel; compiled now unless the look asked for that many.
@@ -233,7 +241,9 @@ impl SceneBuffers {
         let buffers = self.buffers.iter().map(|(name, buffer)| Allocation { name: name.clone(), bytes: buffer.bytes });
         let apart = self.apart.iter().map(|apart| Allocation { name: "apart".into(), bytes: apart.buffer.bytes });
         let values = self.values.iter().map(|own| Allocation { name: "values".into(), bytes: own.buffer.bytes });
-        buffers.chain(apart).chain(values).collect()
+        let beside = self.beside.iter().flat_map(Beside::allocated);
+        let beside = beside.map(|(name, bytes)| Allocation { name: name.into(), bytes });
+        buffers.chain(apart).chain(values).chain(beside).collect()
     }
 
     /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.

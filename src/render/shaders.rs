@@ -200,6 +200,14 @@ impl Options {
         [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground, &self.resolve].concat()
     }
 
+    /// Keys of a rasteriser beside OpenGL to ids.
+    pub(super) fn unpack(&self) -> Source {
+        let mut head = self.head(&[]);
+        writeln!(head, "#define TILE {TILE}").ok();
+        let text = [&head, FRAME, IDS, include_str!("../../shaders/unpack.comp")].concat();
+        Source { label: "unpack".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+
     pub(super) fn ground(&self) -> Source {
         let head = self.head(&[]);
         let vertex = [&head, FRAME, include_str!("../../shaders/ground.vert")].concat();

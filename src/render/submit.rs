@@ -17,7 +17,7 @@ use super::ring::Slot;
 use super::scene_buffers::SceneBuffers;
 use super::splits::Splits;
 use super::target::{Form, Target};
-use super::{Image, Ran, Renderer, Shot, cull, frame, passes};
+use super::{Image, Paths, Ran, Renderer, Shot, cull, frame, passes};
 use crate::error::{Error, Result, during, invalid};
 
 /// Bytes that one thread copies at a time: enough that starting it costs little of that.
@@ -46,6 +46,7 @@ pub struct Pixels {
     height: u32,
     lent: Option<Lent>,
     passes: Vec<(&'static str, f64)>,
+    paths: Paths,
 }
 
 impl Renderer {
@@ -106,8 +107,9 @@ impl Renderer {
         if let Some(culled) = &ran.culled {
             tracing::trace!(?culled, "triangles before they were drawn");
         }
+        let paths = ran.paths;
         self.ran = ran;
-        Ok(Pixels { width: form.width, height: form.height, lent, passes: times(&passes) })
+        Ok(Pixels { width: form.width, height: form.height, lent, passes: times(&passes), paths })
     }
 
     fn start(&mut self, buffers: &SceneBuffers, shot: &Shot, is_read: bool) -> Result<Ticket> {
@@ -165,17 +167,21 @@ impl Renderer {
         };
         let mut times = Vec::new();
         buffers.shared_shadow.draw_unless_there(buffers.shadow_of(shot), || {
-            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
+            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, shot, ran))?);
             times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
             Ok(())
         })?;
-        if buffers.culler.is_some() {
+        let beside = buffers.visibility_beside();
+        if buffers.culler.is_some() && beside.is_none() {
             times.push(timed("cull", &mut || cull::camera(gl, buffers, target, sampled, ran))?);
         }
         times.extend([
-            timed("visibility", &mut || {
-                passes::visibility(gl, buffers, target, sampled, ran)?;
-                passes::ground(gl, buffers, shot, ran)
+            timed("visibility", &mut || match beside {
+                Some(beside) => beside.ids(gl, buffers, (target, shot), ran),
+                None => {
+                    passes::visibility(gl, buffers, target, sampled, ran)?;
+                    passes::ground(gl, buffers, shot, ran)
+                }
             })?,
             timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
             timed("shade", &mut || passes::shade(gl, buffers, target, sampled, ran))?,
@@ -252,7 +258,7 @@ impl Pixels {
     /// Copies the pixels, on several threads when they are many.
     pub fn into_image(self) -> Image {
         let begin = Instant::now();
-        let Self { width, height, lent, mut passes } = self;
+        let Self { width, height, lent, mut passes, paths } = self;
         let bytes = lent.as_ref().map_or(&[][..], Lent::bytes);
         let mut rgba = vec![0; bytes.len()];
         let stretches = rgba.par_chunks_mut(STRETCH).zip(bytes.par_chunks(STRETCH));
@@ -261,7 +267,7 @@ impl Pixels {
         if let Some((_, ms)) = passes.iter_mut().find(|(name, _)| *name == "read") {
             *ms += begin.elapsed().as_secs_f64() * 1e3;
         }
-        Image { width, height, rgba, passes }
+        Image { width, height, rgba, passes, paths }
     }
 }
 

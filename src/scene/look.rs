@@ -80,6 +80,22 @@ pub enum Culling {
     Depth,
 }
 
+/// What turns triangles into samples, pass by pass: the depth of the shadow map, and what the camera sees.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rastering {
+    /// OpenGL's rasteriser: the reference.
+    #[default]
+    OpenGl,
+    /// A rasteriser in CUDA, where it can: on the CUDA device that also draws, for variance maps that are not split, and for
+    /// frames with one sample a pixel in which nothing is blended. Elsewhere OpenGL draws; a frame says who drew it. Samples
+    /// may see another triangle only where depths tie, within 1/256 pixel of an edge, and at the rim of what an image cuts
+    /// out.
+    Cuda,
+    /// For each pass the faster of both, measured when the scene is loaded.
+    Fastest,
+}
+
 /// Light, shadow, ground and sky. Colours are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -116,6 +132,8 @@ pub struct Look {
     pub fragments: Option<u32>,
     /// What is left out before it is drawn.
     pub culling: Culling,
+    /// What draws.
+    pub raster: Rastering,
 }
 
 impl Default for Look {
@@ -139,6 +157,7 @@ impl Default for Look {
             opaque_alpha: 0.95,
             fragments: None,
             culling: Culling::default(),
+            raster: Rastering::default(),
         }
     }
 }

@@ -22,7 +22,7 @@ pub use camera::{Bounds, Camera, Lens, View};
 pub use cells::{Cells, GRID, REACH, nearest_cell};
 pub use deformation::{Batches, Deformation, Normals, Storage};
 pub use layout::{Layout, Slot};
-pub use look::{Culling, Ground, Look, MAX_FRAGMENTS, Transparency, UpAxis};
+pub use look::{Culling, Ground, Look, MAX_FRAGMENTS, Rastering, Transparency, UpAxis};
 pub use movers::Movers;
 pub use needs::Needs;
 pub use post::{Antialias, Bloom, Tone};

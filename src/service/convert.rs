@@ -3,7 +3,7 @@
 
 use modalcast_proto::v1;
 
-use crate::engine::{self, Delivery, Engine, Format, Host, Policy, StepName, View, Which};
+use crate::engine::{self, Delivery, Engine, Format, Host, Path, Policy, StepName, View, Which};
 use crate::error::{Result, invalid};
 use crate::scene::{Camera, RawUpdate, Rectangle, Scene, TransformFormat};
 use crate::telemetry::StageTimes;
@@ -60,6 +60,14 @@ pub(super) fn stages(times: &StageTimes) -> Vec<v1::StageTime> {
         milliseconds: *ms as f32,
     };
     times.iter().map(wire).collect()
+}
+
+pub(super) const fn drawn_by(path: Option<Path>) -> v1::DrawnBy {
+    match path {
+        None => v1::DrawnBy::Unspecified,
+        Some(Path::OpenGl) => v1::DrawnBy::Opengl,
+        Some(Path::Cuda) => v1::DrawnBy::Cuda,
+    }
 }
 
 pub(super) fn raw_update(step: v1::Step) -> Result<RawUpdate> {

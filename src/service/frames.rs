@@ -4,7 +4,7 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{delivery, picture, said, stages, step_id, which_of_frame, wire_format};
+use super::convert::{delivery, drawn_by, picture, said, stages, step_id, which_of_frame, wire_format};
 use super::picks;
 use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
@@ -110,6 +110,8 @@ fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iter
         total: frame.bytes.len() as u64,
         skipped: frame.skipped,
         stages: stages(&frame.stages),
+        shadow_drawn_by: drawn_by(frame.paths.shadow).into(),
+        visibility_drawn_by: drawn_by(frame.paths.visibility).into(),
     };
     let mut head = Some(head);
     let cut = move |(offset, data): (u64, Bytes)| v1::FrameChunk { head: head.take(), offset, data };

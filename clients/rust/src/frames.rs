@@ -169,6 +169,16 @@ pub struct Frame {
     /// Steps passed over since the last frame of the stream.
     pub skipped: u64,
     pub stages: Stages,
+    /// Of colour: what drew the shadow map, unless another frame of the step shares it, and what the camera sees.
+    pub shadow_drawn_by: Option<DrawnBy>,
+    pub visibility_drawn_by: Option<DrawnBy>,
+}
+
+/// What turned triangles into samples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DrawnBy {
+    OpenGl,
+    Cuda,
 }
 
 impl Client {
@@ -275,8 +285,25 @@ fn frame(head: v1::FrameHead, bytes: Bytes) -> Result<Frame> {
         return Err(malformed("frame.total", format!("{total} bytes"), bytes.len()));
     }
     let step = head.step.ok_or_else(|| malformed("frame.step", "a step", "none"))?;
-    let stages = stages(head.stages);
-    Ok(Frame { step, width: head.width, height: head.height, format, bytes, skipped: head.skipped, stages })
+    Ok(Frame {
+        step,
+        width: head.width,
+        height: head.height,
+        format,
+        bytes,
+        skipped: head.skipped,
+        shadow_drawn_by: drawn_by(head.shadow_drawn_by()),
+        visibility_drawn_by: drawn_by(head.visibility_drawn_by()),
+        stages: stages(head.stages),
+    })
+}
+
+const fn drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
+    match wire {
+        v1::DrawnBy::Unspecified => None,
+        v1::DrawnBy::Opengl => Some(DrawnBy::OpenGl),
+        v1::DrawnBy::Cuda => Some(DrawnBy::Cuda),
+    }
 }
 
 pub(crate) fn stages(wire: Vec<v1::StageTime>) -> Stages {

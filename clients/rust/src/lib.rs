@@ -17,7 +17,7 @@ pub use client::{Client, REPLY_LIMIT};
 pub use drive::{Ack, Drive, Finished, Policy};
 pub use error::{Error, Refusal, Result};
 pub use frames::{
-    Camera, Delivery, Format, Frame, FrameRequest, Frames, FramesRequest, Lens, Output, Picture, Stages, View,
+    Camera, Delivery, DrawnBy, Format, Frame, FrameRequest, Frames, FramesRequest, Lens, Output, Picture, Stages, View,
 };
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};

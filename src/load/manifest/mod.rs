@@ -13,6 +13,7 @@
 //! look.antialias = "samples" # or "fxaa", "none": one sample a pixel
 //! look.transparency = "exact" # or "two-pass", with opaque_alpha; exact keeps as many fragments as look.fragments says
 //! look.culling = "depth"     # or "none", "triangles": what is left out before it is drawn; the picture stays the same
+//! look.raster = "opengl"      # or "cuda", "fastest": what turns triangles into samples
 //! look.bloom = { threshold = 1.0, strength = 0.5, levels = 5 }   # light above the threshold glows
 //! look.tone = "aces"         # or "reinhard", "none"; look.exposure = 1.2 multiplies all light before it
 //! look.dither = true         # slow gradients show no bands

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::*;
 use crate::domain::{AlphaMode, Transform};
 use crate::scene::{
-    Antialias, Batches, Bloom, Culling, Deformation, Moments, Normals, Shadow, ShadowMethod, Storage, Tone,
+    Antialias, Batches, Bloom, Culling, Deformation, Moments, Normals, Rastering, Shadow, ShadowMethod, Storage, Tone,
 };
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
@@ -32,7 +32,7 @@ fn one_model_with_everything_said_about_the_scene() {
         "name = 'n'\nup = 'z'\nunit = 0.01\norigin = [1.5, 0, 0]\ntransforms = 'rigid'\nshadows = false\n\
          model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n\
          look.antialias = 'fxaa'\nlook.bloom.strength = 0.25\nlook.tone = 'aces'\nlook.exposure = 1.5\n\
-         look.dither = true\nlook.culling = 'depth'\n\
+         look.dither = true\nlook.culling = 'depth'\nlook.raster = 'fastest'\n\
          deform = { storage = 'int8', normals = 'exact', truncation = 1e-4, displacements = true, batches = 'never' }\n",
     )
     .expect("good");
@@ -43,6 +43,7 @@ fn one_model_with_everything_said_about_the_scene() {
     assert_eq!(parts.look.bloom, Some(Bloom { strength: 0.25, ..Bloom::default() }));
     assert_eq!((parts.look.antialias, parts.look.tone), (Antialias::Fxaa, Tone::Aces));
     assert_eq!((parts.look.exposure, parts.look.dither, parts.look.culling), (1.5, true, Culling::Depth));
+    assert_eq!(parts.look.raster, Rastering::Fastest);
     let deformation = Deformation {
         storage: Storage::Int8,
         normals: Normals::Exact,

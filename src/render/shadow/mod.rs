@@ -12,6 +12,7 @@ pub(super) use self::sources::{Tile, defines};
 use super::geometry::Kind;
 use super::gl::{self, Clear, Fixed, Framebuffer, Gl, Program, Texture, TextureKind};
 use super::passes::{draw_kind, listed};
+use super::paths::Beside;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::LANES;
 use crate::error::{Result, during};
@@ -137,8 +138,15 @@ pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<
 /// Blurred moments of the depth, layer by layer. Whether the map has any.
 pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<bool> {
     let Some(blurred) = &map.blurred else { return Ok(false) };
+    let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
+    if let (Some((depths, program)), Some(first)) =
+        (buffers.shadow_beside().and_then(Beside::blur), programs.first_mut())
+    {
+        *first = program;
+        depths.bind_storage(0);
+    }
     for layer in 0..map.shadow.splits {
-        match (buffers.programs.blur.as_slice(), &blurred.half) {
+        match (programs.as_slice(), &blurred.half) {
             ([tiles], None) => {
                 let tile = Tile::of(&map.shadow);
                 let groups = [tile.wide, tile.tall].map(|side| map.shadow.size.div_ceil(side));

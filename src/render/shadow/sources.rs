@@ -109,6 +109,14 @@ impl Options {
         }
     }
 
+    /// The first of them, for depth that lies in a buffer; none where there are none.
+    pub(in crate::render) fn blur_of_buffer(&self) -> Option<Source> {
+        let Source { label, stages } = self.blur().into_iter().next().filter(|_| self.has("VARIANCE"))?;
+        let version = |text: String| text.replacen('\n', "\n#define OF_BUFFER\n", 1);
+        let stages = stages.into_iter().map(|(stage, text)| (stage, version(text))).collect();
+        Some(Source { label: label + ", of a buffer", stages })
+    }
+
     fn blur_head(&self, more: &[&str], lanes: u32, run: u32) -> String {
         let mut head = self.head(more);
         let format = if self.shadow.moments == Moments::F16 { "rg16f" } else { "rg32f" };

@@ -349,6 +349,8 @@ fn frame(shown: &Shown, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
         total: bytes.len() as u64,
         skipped: 0,
         stages: vec![v1::StageTime { stage: "draw".into(), milliseconds: 2.0 }],
+        shadow_drawn_by: v1::DrawnBy::Unspecified.into(),
+        visibility_drawn_by: v1::DrawnBy::Cuda.into(),
     });
     chunks(bytes).into_iter().map(|(offset, (data, _))| v1::FrameChunk { head: head.take(), offset, data }).collect()
 }

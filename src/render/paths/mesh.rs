@@ -1,0 +1,102 @@
+//! What a rasteriser beside OpenGL is given of a scene: the triangles of the draw groups, and what cuts holes into them.
+
+use super::super::geometry::{Geometry, Kind, kind, used_materials};
+use super::super::scene_buffers::SceneBuffers;
+use super::super::textures::{Array, Use, arrays, cutoff, levels, place};
+use crate::domain::{AlphaMode, Material};
+use crate::error::Result;
+use crate::raster::{AlphaImage, CutOuts, GlBuffer, Mesh, Surface};
+use crate::scene::{Faces, Group, Scene};
+
+/// The mesh of a scene, whose positions are those that its buffers share.
+pub(super) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<Mesh> {
+    let (scene, positions) = (&buffers.scene, buffers.buffer("positions")?);
+    let geometry = Geometry::new(scene);
+    let groups = geometry.groups.iter().map(|group| Group {
+        first: group.first_triangle as u32,
+        triangles: group.triangles as u32,
+        faces: if group.double_sided { Faces::Both } else { Faces::Fronts },
+    });
+    Ok(Mesh {
+        positions: GlBuffer { name: positions.name(), bytes: positions.bytes },
+        groups: groups.collect(),
+        cut_outs: cut_outs(scene, &geometry, anisotropy),
+        triangles: geometry.triangle_vertices,
+    })
+}
+
+/// Cut-out triangles, and blended ones, which come after them and cast shadows from a threshold of alpha on.
+fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOuts> {
+    let first = geometry.groups.iter().find(|group| group.kind != Kind::Opaque)?.first_triangle;
+    let uv = |corner: u32| geometry.uvs.get(corner as usize).copied().unwrap_or_default();
+    let arrays = arrays(scene, Use::Colour);
+    let mut images: Vec<usize> = Vec::new();
+    let table = used_materials(scene).into_iter().map(|index| surface(scene, &scene.materials[index], &mut images));
+    Some(CutOuts {
+        first: first as u32,
+        uvs: geometry.triangles[first..].iter().map(|corners| corners.map(uv)).collect(),
+        surfaces: match geometry.materials.get(first..) {
+            Some(materials) => materials.to_vec(),
+            None => vec![0; geometry.triangles.len() - first],
+        },
+        table: table.collect(),
+        images: images.iter().filter_map(|texture| alpha(scene, &arrays, *texture)).collect(),
+        anisotropy,
+    })
+}
+
+/// What is left of a material; its image is put behind the others unless it is there.
+fn surface(scene: &Scene, material: &Material, images: &mut Vec<usize>) -> Surface {
+    let least = match material.alpha_mode {
+        AlphaMode::Opaque => 0.0,
+        AlphaMode::Mask { cutoff } => cutoff,
+        AlphaMode::Blend => scene.look.shadow.unwrap_or_default().alpha_threshold,
+    };
+    let wanted = material.colour_texture.filter(|_| kind(material) != Kind::Opaque);
+    let image = wanted.map(|texture| {
+        let there = images.iter().position(|image| *image == texture);
+        there.unwrap_or_else(|| {
+            images.push(texture);
+            images.len() - 1
+        })
+    });
+    Surface { alpha: material.alpha, least, image: image.map(|image| image as u32) }
+}
+
+/// The alpha of all levels of an image, as OpenGL has them.
+fn alpha(scene: &Scene, arrays: &[Array], texture: usize) -> Option<AlphaImage> {
+    let array = &arrays[place(arrays, texture)?.0];
+    let levels = levels(&scene.textures[texture], array, Use::Colour, cutoff(scene, texture));
+    let of = |rgba: &Vec<u8>| rgba.iter().skip(3).step_by(4).copied().collect();
+    Some(AlphaImage { width: array.width, height: array.height, levels: levels.iter().map(of).collect() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::geometry::tests::squares;
+    use super::*;
+    use crate::domain::Texture;
+
+    #[test]
+    fn cut_outs_are_what_is_not_opaque_with_the_alpha_of_their_own_images() {
+        let with = |alpha_mode, colour_texture| Material { alpha_mode, colour_texture, ..Material::default() };
+        let mut parts = squares(vec![
+            with(AlphaMode::Blend, Some(1)),
+            with(AlphaMode::Opaque, Some(0)),
+            with(AlphaMode::Mask { cutoff: 0.25 }, Some(1)),
+        ]);
+        let texture = |alpha| Texture::new("one", 2, 1, vec![9, 9, 9, alpha, 9, 9, 9, 255]).expect("fits");
+        parts.textures = vec![texture(7), texture(100)];
+        let scene = Scene::new(parts).expect("good");
+        let geometry = Geometry::new(&scene);
+        let cut = cut_outs(&scene, &geometry, 8.0).expect("there are some");
+        assert_eq!((cut.first, cut.uvs.len()), (2, 4), "the opaque square comes first");
+        assert_eq!(cut.uvs[0], [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]);
+        let of = |triangle: usize| cut.table[cut.surfaces[triangle] as usize];
+        assert_eq!((of(0).least, of(2).least), (0.25, scene.look.shadow.expect("has one").alpha_threshold));
+        assert_eq!((of(0).image, of(2).image, cut.images.len()), (Some(0), Some(0), 1), "the opaque one's is not read");
+        assert_eq!((cut.images[0].levels.len(), &cut.images[0].levels[0]), (2, &vec![100, 255]));
+        let opaque = Scene::new(squares(vec![Material::default()])).expect("good");
+        assert_eq!(cut_outs(&opaque, &Geometry::new(&opaque), 8.0), None);
+    }
+}

@@ -1,0 +1,221 @@
+//! Frames that a rasteriser beside OpenGL draws, through the definition of such a one: their pictures are OpenGL's, and the
+//! frames say who drew them.
+
+use std::sync::Arc;
+
+use glow::HasContext as _;
+use modalcast::deform::Deformer as _;
+use modalcast::domain::{AlphaMode, Material};
+use modalcast::error::{Result, invalid};
+use modalcast::raster::{GlBuffer, Mesh, Rasteriser};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::reference::raster::Raster;
+use modalcast::render::{Image, Path, Paths, Ran, Renderer, SceneBuffers, Seen, Shot};
+use modalcast::scene::{Blurring, Camera, Faces, Group, Lens, Scene, Shadow, State, View, Window};
+use nalgebra::{Matrix4, Vector3};
+
+use super::build::{Stage, facing, lying, open};
+
+/// The reference rasteriser, on buffers of the OpenGL context that is current.
+struct Plain {
+    mesh: Mesh,
+    gl: glow::Context,
+    /// How far everything is drawn aside, in normalised device coordinates: for controls.
+    aside: f64,
+}
+
+impl std::fmt::Debug for Plain {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.write_str("Plain")
+    }
+}
+
+impl Plain {
+    fn new(mesh: Mesh, aside: f64) -> Self {
+        // SAFETY: the library is loaded already.
+        let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("libEGL");
+        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |place| place as *const _);
+        // SAFETY: a context is current on this thread while its scene is loaded.
+        let gl = unsafe { glow::Context::from_loader_function(address) };
+        Self { mesh, gl, aside }
+    }
+
+    fn positions(&self) -> Vec<f32> {
+        let GlBuffer { name, bytes } = self.mesh.positions;
+        let mut positions = vec![0_f32; bytes as usize / 4];
+        // SAFETY: a buffer of the current context and a list of its size.
+        unsafe {
+            self.gl.bind_buffer(glow::COPY_READ_BUFFER, Some(named(name)));
+            self.gl.get_buffer_sub_data(glow::COPY_READ_BUFFER, 0, bytemuck::cast_slice_mut(&mut positions));
+        }
+        positions
+    }
+
+    fn draw(&self, window: &Window, groups: &[Group]) -> Raster {
+        let [width, height] = window.size();
+        let clip = Matrix4::from_row_slice(&window.clip().map(f64::from));
+        let clip = Matrix4::new_translation(&Vector3::new(self.aside, 0.0, 0.0)) * clip;
+        let mut raster = Raster::new(Window::new(&clip, width, height).expect("a window"));
+        groups.iter().for_each(|group| raster.draw(&self.positions(), &self.mesh.triangles, *group));
+        raster
+    }
+
+    fn write(&self, into: GlBuffer, bytes: &[u8]) -> Result<()> {
+        if (bytes.len() as u64) > into.bytes {
+            return Err(invalid("raster.buffer", format!("{} bytes", bytes.len()), into.bytes));
+        }
+        // SAFETY: a buffer of the current context, large enough.
+        unsafe {
+            self.gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(named(into.name)));
+            self.gl.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, bytes);
+        }
+        Ok(())
+    }
+}
+
+impl Rasteriser for Plain {
+    fn depth(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
+        let all = Group { first: 0, triangles: self.mesh.triangles.len() as u32, faces: Faces::Both };
+        self.write(into, bytemuck::cast_slice(&self.draw(window, &[all]).depths()))
+    }
+
+    fn ids(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
+        self.write(into, bytemuck::cast_slice(&self.draw(window, &self.mesh.groups).keys))
+    }
+}
+
+fn named(name: u32) -> glow::Buffer {
+    glow::NativeBuffer(std::num::NonZeroU32::new(name).expect("a name"))
+}
+
+/// Who draws a scene.
+#[derive(Clone, Copy, PartialEq)]
+enum By {
+    OpenGl,
+    /// Everything this far aside.
+    Beside(f64),
+}
+
+struct Shown {
+    image: Image,
+    seen: Vec<Seen>,
+    ran: Ran,
+    allocated: Vec<String>,
+}
+
+const SIZE: [u32; 2] = [192, 128];
+
+fn show(scene: &Arc<Scene>, camera: Camera, by: By) -> Shown {
+    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(scene));
+    let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let mut buffers = renderer.load(scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    give(&mut renderer, &mut buffers, by);
+    let [width, height] = SIZE;
+    let image = renderer.draw(&buffers, &Shot { camera, width, height, bounds }).expect("draws");
+    let (seen, ran) = (renderer.seen().expect("reads"), renderer.ran().clone());
+    let allocated = buffers.allocated().into_iter().map(|part| part.name).collect();
+    Shown { image, seen, ran, allocated }
+}
+
+fn give(renderer: &mut Renderer, buffers: &mut SceneBuffers, by: By) {
+    if let By::Beside(aside) = by {
+        let make = |mesh: Mesh| Ok(Box::new(Plain::new(mesh, aside)) as Box<dyn Rasteriser>);
+        renderer.draw_beside(buffers, make).expect("given");
+    }
+}
+
+/// A wall, half of a box below the ground, and a lid, under a slanting sun.
+fn yard(shadow: Option<Shadow>, samples: u32) -> Stage {
+    let mut stage = Stage::new();
+    let defaults = modalcast::scene::Look::default();
+    (stage.0.look.ground, stage.0.look.horizon) = (defaults.ground, defaults.horizon);
+    (stage.0.look.sun, stage.0.look.shadow, stage.0.look.samples) = ([1.0, 3.0, 2.0], shadow, samples);
+    let plain = || Material { double_sided: true, ..Material::default() };
+    let wall = facing(-1.0, 0.0, 0.2, 1.1, -0.4);
+    stage.add(wall, plain()).add(lying(0.45, 0.7), Material::default()).add(lying(0.3, 0.0), plain())
+}
+
+fn from_above() -> Camera {
+    let view = View::LookAt { eye: [1.4, 1.9, 4.0], target: [0.0, 0.2, 0.0], up: [0.0, 1.0, 0.0] };
+    Camera { view, lens: Lens::FieldOfView(38.0), near: 0.1, far: 60.0 }
+}
+
+fn differing<T: PartialEq>(one: &[T], other: &[T]) -> usize {
+    one.iter().zip(other).filter(|(one, other)| one != other).count()
+}
+
+/// Bytes of pixels that differ by more than a few levels.
+fn far_off(one: &Image, other: &Image) -> usize {
+    one.rgba.iter().zip(&other.rgba).filter(|(one, other)| one.abs_diff(**other) > 4).count()
+}
+
+#[test]
+fn a_frame_drawn_beside_opengl_is_opengls_ground_and_shadow_included() {
+    for blurring in [Blurring::Tiles, Blurring::Rows, Blurring::Fragments] {
+        let shadow = Shadow { size: 256, blurring, ..Shadow::default() };
+        let scene = yard(Some(shadow), 1).scene();
+        let want = show(&scene, from_above(), By::OpenGl);
+        let got = show(&scene, from_above(), By::Beside(0.0));
+        let cuda = Some(Path::Cuda);
+        assert_eq!(got.ran.paths, Paths { shadow: cuda, visibility: cuda });
+        assert_eq!(want.ran.paths, Paths { shadow: Some(Path::OpenGl), visibility: Some(Path::OpenGl) });
+        assert_eq!(got.ran.passes[..4], ["shadow", "blur", "visibility", "unpack"]);
+        assert!(!got.ran.passes.contains(&"ground") && got.allocated.iter().any(|name| name == "shadow depths"));
+        assert!(!want.allocated.iter().any(|name| name == "keys" || name == "shadow depths"), "costs OpenGL nothing");
+        let kinds = |kind: fn(&Seen) -> bool| want.seen.iter().filter(|seen| kind(seen)).count();
+        assert!(kinds(|seen| *seen == Seen::Ground) > 5000 && kinds(|seen| matches!(seen, Seen::Triangle(_))) > 2000);
+        let (ids, pixels) = (differing(&got.seen, &want.seen), far_off(&got.image, &want.image));
+        assert!(ids <= 12 && pixels <= 60, "{blurring:?}: {ids} ids, {pixels} bytes differ");
+        let aside = show(&scene, from_above(), By::Beside(0.02));
+        let (ids, pixels) = (differing(&aside.seen, &want.seen), far_off(&aside.image, &want.image));
+        assert!(ids > 100 && pixels > 300, "control: two pixels aside: {ids} ids, {pixels} bytes");
+    }
+}
+
+#[test]
+fn the_ground_hides_what_lies_below_it_and_not_what_lies_in_it() {
+    let scene = yard(None, 1).scene();
+    let seen = |by: By, down: f32| {
+        let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
+        let mut state = State::rest(&scene);
+        for domain in 0..2 {
+            state.transforms[domain].0[7] -= down;
+        }
+        let bounds = deformer.deform(&state).expect("deforms").bounds;
+        let mut buffers = renderer.load(&scene).expect("loads");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        give(&mut renderer, &mut buffers, by);
+        let [width, height] = SIZE;
+        renderer.draw(&buffers, &Shot { camera: from_above(), width, height, bounds }).expect("draws");
+        let domain = |seen: &Seen| match seen {
+            Seen::Triangle(place) => buffers.triangle(*place).map(|(domain, _)| domain),
+            _ => None,
+        };
+        let seen: Vec<Option<usize>> = renderer.seen().expect("reads").iter().map(domain).collect();
+        seen
+    };
+    let count = |seen: &[Option<usize>], domain: usize| seen.iter().filter(|own| **own == Some(domain)).count();
+    let (up, want, got) = (seen(By::OpenGl, 0.0), seen(By::OpenGl, 0.8), seen(By::Beside(0.0), 0.8));
+    assert!(differing(&got, &want) <= 8, "{} samples differ", differing(&got, &want));
+    assert!(count(&want, 0) > 100 && 2 * count(&got, 0) < count(&up, 0), "most of the wall is below the ground");
+    assert!(count(&up, 1) > 100 && count(&got, 1) == 0, "the lid is");
+    assert!(count(&got, 2) > 300, "what lies in the plane of the ground is seen");
+}
+
+#[test]
+fn what_it_may_not_draw_is_drawn_by_opengl() {
+    let paths = |stage: Stage| show(&stage.scene(), from_above(), By::Beside(0.0)).ran.paths;
+    let (opengl, cuda) = (Some(Path::OpenGl), Some(Path::Cuda));
+    let base = Shadow { size: 128, ..Shadow::default() };
+    assert_eq!(paths(yard(Some(base), 4)), Paths { shadow: cuda, visibility: opengl }, "four samples a pixel");
+    let split = Shadow { splits: 2, ..base };
+    assert_eq!(paths(yard(Some(split), 1)), Paths { shadow: opengl, visibility: cuda });
+    let standard = Shadow { method: modalcast::scene::ShadowMethod::Standard, ..base };
+    assert_eq!(paths(yard(Some(standard), 1)), Paths { shadow: opengl, visibility: cuda });
+    assert_eq!(paths(yard(None, 1)), Paths { shadow: None, visibility: cuda });
+    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..Material::default() };
+    let blended = yard(None, 1).add(facing(0.0, 0.0, 0.5, 0.5, 0.5), glass);
+    assert_eq!(paths(blended), Paths { shadow: None, visibility: opengl });
+    assert_eq!(paths(yard(None, 4)), Paths { shadow: None, visibility: opengl }, "and nothing is made for it");
+}
