@@ -59,7 +59,9 @@ pub struct AlphaImage {
     pub levels: Vec<Vec<u8>>,
 }
 
-/// Draws one mesh. Buffers are ordered with OpenGL's commands before and after a call without a wait of the host.
+/// Draws one mesh. Buffers are ordered with OpenGL's commands before and after a call without a wait of the host. It may
+/// keep hold of the positions and of what it drew into: OpenGL deletes the first after it, the others after
+/// [`forget`](Rasteriser::forget).
 pub trait Rasteriser: std::fmt::Debug {
     /// Depth of every sample: f32 from 0 to 1, 1 where nothing is. All triangles are drawn from both sides.
     ///
@@ -73,4 +75,7 @@ pub trait Rasteriser: std::fmt::Debug {
     /// # Errors
     /// As [`Self::depth`].
     fn ids(&mut self, window: &Window, into: GlBuffer) -> Result<()>;
+
+    /// Lets go of a buffer that was drawn into, before OpenGL deletes it: its name may be given to another.
+    fn forget(&mut self, _name: u32) {}
 }

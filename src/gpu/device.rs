@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use cudarc::driver::{CudaContext, CudaFunction, CudaStream, DriverError, result, sys};
+use cudarc::driver::{CudaContext, CudaFunction, CudaModule, CudaStream, DriverError, result, sys};
 use cudarc::nvrtc::Ptx;
 
 use super::compile::{cubin, nvrtc};
@@ -95,10 +95,23 @@ impl Device {
     /// # Errors
     /// `Unavailable` when NVRTC is missing or does not fit the driver; `Fault` when compiling or loading fails.
     pub(super) fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
+        let module = self.module(name, source, defines)?;
+        module.load_function(name).map_err(during("load kernel"))
+    }
+
+    /// Several functions of a source that is compiled once; the first names it.
+    ///
+    /// # Errors
+    /// As [`Self::function`].
+    pub(super) fn functions(&self, names: &[&str], source: &str, defines: &[&str]) -> Result<Vec<CudaFunction>> {
+        let module = self.module(names.first().unwrap_or(&""), source, defines)?;
+        names.iter().map(|name| module.load_function(name).map_err(during("load kernel"))).collect()
+    }
+
+    fn module(&self, name: &str, source: &str, defines: &[&str]) -> Result<Arc<CudaModule>> {
         self.check_compiler()?;
         let cubin = cubin(name, source, defines, self.capability)?;
-        let module = self.context.load_module(Ptx::from_binary(cubin)).map_err(during("load kernel"))?;
-        module.load_function(name).map_err(during("load kernel"))
+        self.context.load_module(Ptx::from_binary(cubin)).map_err(during("load kernel"))
     }
 }
 

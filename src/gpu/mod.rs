@@ -23,6 +23,7 @@
 //! | `boxes` | a box of each domain, where the scene keeps them |
 //! | `rotation` | which of two outputs a step writes while the other is read, and what it lacks; pure |
 //! | `fetch` | vertices on their way to the host, beside the next step |
+//! | `raster` | triangles to samples in OpenGL's buffers, beside OpenGL's own rasteriser |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
 //! | `probe`, `report` | what is there, and whether the device agrees on layouts |
 //! | `trials` | what only measures |
@@ -47,6 +48,7 @@ mod output;
 mod pack;
 mod plan;
 mod probe;
+mod raster;
 mod report;
 mod rings;
 mod rotation;
@@ -59,11 +61,12 @@ pub use device::Device;
 pub use layout::{Agreement, agreements};
 pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
+pub use raster::{GlRaster, RasterForm, Spread};
 pub use report::device_values;
 pub use trials::{
     BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Raster, RasterCounts,
-    RasterForm, RasterMesh, Roofs, Split, Spread, Thesis, Timing, Trial, cublas_version, empty_replay,
-    gigabytes_per_second, host_writes, idle_in_warp, ingest, lanes, overlap, roofs, time,
+    RasterMesh, Roofs, Split, Thesis, Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes,
+    idle_in_warp, ingest, lanes, overlap, roofs, time,
 };
 
 /// OpenGL buffers to write into, by name.

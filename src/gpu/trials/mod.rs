@@ -12,7 +12,7 @@
 //! | [`mod@ingest`] | the way of a step's values to the device |
 //! | [`mod@overlap`] | steps that the host reads, one after the other and side by side |
 //! | [`cublas`], [`plain_update`] | a library's products, and the vertex update behind them |
-//! | [`mod@raster`] | triangles to samples by atomic minima: ids with depth, or depth alone |
+//! | [`mod@raster`] | the rasteriser on positions and samples of its own |
 //! | [`thesis`] | the kernels of the thesis |
 
 mod batch_mma;
@@ -34,7 +34,7 @@ pub use ingest::ingest;
 pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
 pub use ours::{Extent, Ours};
 pub use overlap::{HostWrite, Overlap, host_writes, overlap};
-pub use raster::{Raster, RasterCounts, RasterForm, RasterMesh, Spread};
+pub use raster::{Raster, RasterCounts, RasterMesh};
 pub use roof::{Roofs, roofs};
 pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
 pub use trial::{KernelFacts, Trial};

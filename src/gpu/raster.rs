@@ -1,0 +1,204 @@
+//! Launches `kernels/raster.cu`: which triangle each sample of a window sees and how deep, or depth alone, by atomic minima.
+//!
+//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels, and blocks draw larger and clipped ones
+//! tile by tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
+//! stay on the device.
+//!
+//! | file | what |
+//! |---|---|
+//! | [`form`] | the variants of the kernels |
+//! | [`check`] | which meshes are refused |
+//! | [`opengl`] | positions and samples in OpenGL's buffers |
+
+mod check;
+mod form;
+mod opengl;
+
+use bytemuck::{Pod, Zeroable};
+use cudarc::driver::sys::{self, CUdevice_attribute};
+use cudarc::driver::{CudaFunction, CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+
+pub(super) use self::check::check;
+pub(super) use self::form::{FUNCTIONS, SOURCE};
+pub use self::form::{RasterForm, Spread};
+pub use self::opengl::GlRaster;
+use super::device::Device;
+use super::memory::{address, download, room, upload};
+use crate::error::{Result, during};
+use crate::scene::{Faces, Group, Window};
+
+/// Threads of a block, and blocks of a multiprocessor where blocks take turns.
+const BLOCK: u32 = 256;
+const RESIDENT: u32 = 8;
+
+/// What a sample holds before anything is drawn.
+const NOTHING: u32 = u32::MAX;
+
+/// Arguments of all kernels; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct RasterArgs {
+    positions: u64,
+    triangles: u64,
+    target: u64,
+    medium: u64,
+    large: u64,
+    tally: u64,
+    clip: [f32; 16],
+    half: [f32; 2],
+    guard: [f32; 2],
+    size: [u32; 2],
+    first: u32,
+    count: u32,
+    faces: u32,
+    pad: u32,
+}
+
+const _: () = assert!(size_of::<RasterArgs>() == 152, "RasterArgs differs from kernels/raster.cuh");
+
+// SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
+unsafe impl DeviceRepr for RasterArgs {}
+
+/// What was queued and counted.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct Tally {
+    medium: u32,
+    pad: u32,
+    large: u64,
+    counts: [u32; 8],
+}
+
+const _: () = assert!(size_of::<Tally>() == 48, "Tally differs from kernels/raster.cuh");
+
+/// Bytes of an entry of the large queue.
+const LARGE: u64 = 16;
+
+/// The compiled kernels of one form.
+#[derive(Debug)]
+pub(super) struct Functions {
+    form: RasterForm,
+    list: Vec<CudaFunction>,
+}
+
+impl Functions {
+    /// Compiles a form, or takes it from the cache.
+    ///
+    /// # Errors
+    /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
+    pub(super) fn new(device: &Device, form: RasterForm) -> Result<Self> {
+        Ok(Self { form, list: device.functions(&FUNCTIONS, SOURCE, &form.defines())? })
+    }
+
+    /// Each with its name.
+    pub(super) fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
+        FUNCTIONS.into_iter().zip(&self.list)
+    }
+}
+
+/// What is drawn where, once: addresses on the device, of as many vertices as [`check`] was told and of a sample for each
+/// pixel.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pass<'a> {
+    pub functions: &'a Functions,
+    pub groups: &'a [Group],
+    pub window: &'a Window,
+    pub positions: u64,
+    pub target: u64,
+}
+
+/// A mesh's triangles on the device, and the queues for them.
+#[derive(Debug)]
+pub(super) struct Core {
+    triangles: CudaSlice<u8>,
+    medium: CudaSlice<u8>,
+    large: CudaSlice<u8>,
+    tally: CudaSlice<u8>,
+    /// Blocks of the kernels that take turns.
+    blocks: u32,
+}
+
+impl Core {
+    /// Puts triangles that [`check`] let pass onto the device.
+    ///
+    /// # Errors
+    /// `Fault` when the device refuses.
+    pub(super) fn new(device: &Device, triangles: &[[u32; 3]]) -> Result<Self> {
+        let units = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT);
+        let units = u32::try_from(units.map_err(during("device"))?).unwrap_or(1);
+        let count = triangles.len() as u64;
+        Ok(Self {
+            triangles: upload(device, triangles.as_flattened())?,
+            medium: room(device, 4 * count)?,
+            large: room(device, LARGE * count)?,
+            tally: room(device, size_of::<Tally>() as u64)?,
+            blocks: RESIDENT * units,
+        })
+    }
+
+    /// Clears the target and draws into it, on the device's stream.
+    ///
+    /// # Errors
+    /// `Fault` when the device refuses.
+    pub(super) fn draw(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
+        self.clear(device, pass)?;
+        let args = self.args(device, pass);
+        for group in pass.groups.iter().filter(|group| group.triangles > 0) {
+            let faces = u32::from(group.faces == Faces::Fronts);
+            let own = RasterArgs { first: group.first, count: group.triangles, faces, ..args };
+            start(device, &pass.functions.list[0], group.triangles.div_ceil(BLOCK), own)?;
+        }
+        pass.functions.list[1..].iter().try_for_each(|function| start(device, function, self.blocks, args))
+    }
+
+    /// Triangles of the last pass by what became of them, as the kernels' paths are numbered; zeros unless its form counts.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub(super) fn counts(&self, device: &Device) -> Result<[u32; 8]> {
+        let mut tally = [Tally::zeroed()];
+        // SAFETY: the buffer is one tally.
+        unsafe { download(device, address(device, &self.tally), &mut tally) }?;
+        Ok(tally[0].counts)
+    }
+
+    fn args(&self, device: &Device, pass: &Pass<'_>) -> RasterArgs {
+        RasterArgs {
+            positions: pass.positions,
+            triangles: address(device, &self.triangles),
+            target: pass.target,
+            medium: address(device, &self.medium),
+            large: address(device, &self.large),
+            tally: address(device, &self.tally),
+            clip: *pass.window.clip(),
+            half: pass.window.half(),
+            guard: pass.window.guard(),
+            size: pass.window.size(),
+            ..RasterArgs::zeroed()
+        }
+    }
+
+    /// Empty queues and samples without anything.
+    fn clear(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
+        let form = pass.functions.form;
+        let nothing = if form.depth_only { 1.0_f32.to_bits() } else { NOTHING };
+        let words = form.bytes(pass.window) / 4;
+        let tally = (address(device, &self.tally), 0, size_of::<Tally>() as u64 / 4);
+        for (buffer, word, words) in [(pass.target, nothing, words), tally] {
+            let stream = device.stream().cu_stream();
+            // SAFETY: the buffer has these words, all of which are written on the stream that orders its readers.
+            let set = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
+            set.result().map_err(during("raster"))?;
+        }
+        Ok(())
+    }
+}
+
+fn start(device: &Device, function: &CudaFunction, blocks: u32, args: RasterArgs) -> Result<()> {
+    let mut launch = device.stream().launch_builder(function);
+    let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
+    // SAFETY: `RasterArgs` is the kernels' only argument. `check` saw that triangles name vertices that are there and
+    // groups triangles; queues have room for each of them, and the target a sample for each pixel.
+    unsafe { launch.arg(&args).launch(config) }.map_err(during("raster"))?;
+    Ok(())
+}

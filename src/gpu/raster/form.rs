@@ -1,0 +1,53 @@
+//! The variants of the kernels.
+
+use crate::scene::Window;
+
+pub(in super::super) const SOURCE: &str = include_str!("../../../kernels/raster.cu");
+
+/// The functions in it, in the order of their launches.
+pub(in super::super) const FUNCTIONS: [&str; 3] = ["raster", "raster_warps", "raster_tiles"];
+
+/// Who draws the triangles that could be drawn by a thread; for comparisons, the result is the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spread {
+    /// Threads, warps and blocks by size.
+    #[default]
+    BySize,
+    /// No threads: warps and blocks.
+    Warps,
+    /// Blocks alone.
+    Tiles,
+}
+
+/// Which variant of the kernels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RasterForm {
+    /// Depth without ids, as shadow maps want it.
+    pub depth_only: bool,
+    /// Whether triangles are counted by their path.
+    pub counted: bool,
+    /// By size where depth is alone.
+    pub spread: Spread,
+}
+
+impl RasterForm {
+    /// The macros that it is compiled with.
+    pub(in super::super) fn defines(self) -> Vec<&'static str> {
+        let counted = self.counted.then_some("COUNT");
+        if self.depth_only {
+            return std::iter::once("DEPTH").chain(counted).collect();
+        }
+        let spread: &[&str] = match self.spread {
+            Spread::BySize => &[],
+            Spread::Warps => &["FEW=0"],
+            Spread::Tiles => &["FEW=0", "NARROW=-1"],
+        };
+        counted.into_iter().chain(spread.iter().copied()).collect()
+    }
+
+    /// Bytes of all samples of a window.
+    pub(in super::super) const fn bytes(self, window: &Window) -> u64 {
+        let sample = if self.depth_only { size_of::<f32>() } else { size_of::<u64>() };
+        sample as u64 * window.pixels() as u64
+    }
+}

@@ -1,0 +1,128 @@
+//! The rasteriser that OpenGL's passes may give way to: positions and samples in OpenGL's buffers.
+
+use std::sync::Arc;
+
+use super::super::device::Device;
+use super::super::interop::{Access, Registered, Sharing, mapped};
+use super::{Core, Functions, Pass, RasterForm, check};
+use crate::error::{Error, Result, during, invalid};
+use crate::raster::{GlBuffer, Mesh, Rasteriser};
+use crate::scene::{Faces, Group, Window};
+
+/// Bytes of a vertex's position.
+const VERTEX: u64 = 12;
+
+/// Draws one mesh by CUDA. Lives and dies on the thread that owns the OpenGL context, and before its buffers.
+#[derive(Debug)]
+pub struct GlRaster {
+    // Buffers are given back to OpenGL before anything else goes.
+    positions: Registered,
+    depth: Kind,
+    ids: Kind,
+    sharing: Sharing,
+    core: Core,
+    device: Arc<Device>,
+}
+
+/// One kind of pass: its kernels and the buffer that it drew into, both from its first pass on.
+#[derive(Debug)]
+struct Kind {
+    into: Option<Registered>,
+    functions: Option<Functions>,
+    form: RasterForm,
+    groups: Vec<Group>,
+}
+
+/// What a pass of a kind takes.
+type Ready<'a> = (&'a Functions, &'a [Group], &'a mut Registered);
+
+impl Kind {
+    const fn new(depth_only: bool, groups: Vec<Group>) -> Self {
+        let form = RasterForm { depth_only, counted: false, spread: super::Spread::BySize };
+        Self { into: None, functions: None, form, groups }
+    }
+
+    /// Compiles and registers what is missing for a pass.
+    fn prepare(&mut self, device: &Device, sharing: &Sharing, into: GlBuffer) -> Result<Ready<'_>> {
+        let functions = match self.functions.take() {
+            Some(functions) => functions,
+            None => Functions::new(device, self.form)?,
+        };
+        let kept = self.into.take().filter(|own| own.buffer() == into);
+        let registered = match kept {
+            Some(own) => own,
+            None => sharing.register(device, into)?,
+        };
+        Ok((self.functions.insert(functions), &self.groups, self.into.insert(registered)))
+    }
+}
+
+impl GlRaster {
+    /// Puts a mesh's triangles onto the device and registers its positions, which are those of the OpenGL context that is
+    /// current on this thread. Kernels are compiled at the first pass that wants them.
+    ///
+    /// # Errors
+    /// `Invalid` when there are 2^24 triangles or more, one names no vertex, or a group no triangle; `Fault` when the
+    /// device refuses, or CUDA cannot share OpenGL's buffer.
+    pub fn new(device: &Arc<Device>, mesh: Mesh) -> Result<Self> {
+        check(mesh.positions.bytes / VERTEX, &mesh.triangles, &mesh.groups)?;
+        if mesh.cut_outs.is_some() {
+            return Err(invalid("cut-outs", "none", "some"));
+        }
+        device.context().bind_to_thread().map_err(during("device"))?;
+        let sharing = Sharing::open(device)?;
+        let all = Group { first: 0, triangles: mesh.triangles.len() as u32, faces: Faces::Both };
+        let raster = Self {
+            positions: sharing.register(device, mesh.positions)?,
+            depth: Kind::new(true, vec![all]),
+            ids: Kind::new(false, mesh.groups),
+            sharing,
+            core: Core::new(device, &mesh.triangles)?,
+            device: Arc::clone(device),
+        };
+        // The triangles were copied from memory that goes now; a fault of that copy shows here.
+        device.stream().synchronize().map_err(during("upload"))?;
+        Ok(raster)
+    }
+
+    fn pass(&mut self, depth_only: bool, window: &Window, into: GlBuffer) -> Result<()> {
+        let Self { positions, depth, ids, sharing, core, device } = self;
+        let kind = if depth_only { depth } else { ids };
+        let needed = kind.form.bytes(window);
+        if into.bytes < needed {
+            let reason = format!("buffer {} has {} bytes, {needed} are needed", into.name, into.bytes);
+            return Err(Error::Fault { stage: "raster", reason });
+        }
+        device.context().bind_to_thread().map_err(during("device"))?;
+        let (functions, groups, target) = kind.prepare(device, sharing, into)?;
+        // Not `WriteAll`: the kernels read the samples that they wrote.
+        let uses = &mut [(positions, Access::Read), (target, Access::WriteSome)];
+        mapped(device, uses, |addresses| {
+            let pass = Pass { functions, groups, window, positions: addresses[0], target: addresses[1] };
+            core.draw(device, &pass)
+        })
+    }
+}
+
+impl Rasteriser for GlRaster {
+    fn depth(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
+        self.pass(true, window, into)
+    }
+
+    fn ids(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
+        self.pass(false, window, into)
+    }
+
+    fn forget(&mut self, name: u32) {
+        for kind in [&mut self.depth, &mut self.ids] {
+            kind.into.take_if(|own| own.buffer().name == name);
+        }
+    }
+}
+
+impl Drop for GlRaster {
+    fn drop(&mut self) {
+        // A failure adds nothing: the device says so at its next call.
+        self.device.stream().synchronize().ok();
+    }
+}
