@@ -10,10 +10,11 @@ use crate::cpu::CpuDeformer;
 use crate::deform::{Backend, Deformer};
 use crate::error::{Error, Result};
 use crate::frame::Legend;
-use crate::gpu::{self, CudaDeformer, GlBuffers};
+use crate::gpu::{self, CudaDeformer, GlBuffers, GlRaster};
+use crate::raster::{Mesh, Rasteriser};
 use crate::reference::ReferenceDeformer;
 use crate::render::{self, Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Shot, Survey, Ticket};
-use crate::scene::{Camera, Rectangle, Scene};
+use crate::scene::{Camera, Rastering, Rectangle, Scene};
 use crate::telemetry::{Stage, ms_since};
 
 /// What deforms and what draws, for people to read.
@@ -104,13 +105,35 @@ impl Workbench {
             _ => Box::new(CpuDeformer::new(scene)),
         };
         let mut staged = Staged::new(scene, deformer, buffers);
-        match staged.rest() {
+        let ready = staged.rest().and_then(|()| self.draw_beside(&mut staged));
+        match ready {
             Ok(()) => Ok(staged),
             Err(error) => {
                 self.unstage(staged);
                 Err(error)
             }
         }
+    }
+
+    /// Gives a scene whose look asks for it a rasteriser in CUDA, and lets the faster of both draw each pass where it asks for
+    /// that. Where there can be none, OpenGL draws and the log says why.
+    ///
+    /// # Errors
+    /// Those of drawing the frames that are measured.
+    fn draw_beside(&mut self, staged: &mut Staged) -> Result<()> {
+        let scene = Arc::clone(staged.scene());
+        let (wanted, Some(device), Ok(renderer)) = (scene.look.raster, &self.device, &mut self.renderer) else {
+            return Ok(());
+        };
+        if wanted == Rastering::OpenGl || renderer.info().cuda_device.is_none() {
+            return Ok(());
+        }
+        let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(device, mesh)?) as Box<dyn Rasteriser>);
+        if let Err(error) = staged.draw_beside(renderer, make) {
+            tracing::warn!(%error, "OpenGL draws: its buffers have no rasteriser in CUDA");
+            return Ok(());
+        }
+        if wanted == Rastering::Fastest { staged.choose_paths(renderer) } else { Ok(()) }
     }
 
     /// Frees what a staged scene holds.

@@ -95,6 +95,7 @@ fn rasters(args: &Args, request: &Request) -> Outcome {
     let rasters = working("measuring", || render::rasters(request, |what| tracing::info!(what, "measuring")))?;
     rasters.write(&args.out)?;
     rasters.rows.iter().for_each(|row| say(row.line()));
+    rasters.frames.iter().for_each(|row| say(row.line()));
     say(format!("written to {}", args.out.display()));
     Ok(rasters.passed())
 }

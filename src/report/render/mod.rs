@@ -30,6 +30,7 @@ mod output;
 pub mod packing;
 mod page;
 mod paint;
+mod paths;
 mod patience;
 mod pattern;
 mod picture;

@@ -9,6 +9,7 @@ use serde::Serialize;
 
 use super::loads::{Kind, add, room, screen};
 use super::measure::STILL;
+use super::paths::{self, Frames};
 use super::studio::{Set, Size, Studio};
 use super::{Request, bare, beside};
 use crate::error::{Result, during};
@@ -19,7 +20,7 @@ use crate::report::timing::{FEWEST, Timing};
 use crate::scene::{Camera, Faces, Group, Look, Parts, Scene, State, Window};
 
 /// Side of the depth map: in full, and in a quick run.
-const MAPS: (u32, u32) = (4096, 1024);
+pub(super) const MAPS: (u32, u32) = (4096, 1024);
 
 /// The largest share of samples whose ids may differ from OpenGL's: those on edges and where depths tie. What is beyond
 /// is not timed.
@@ -114,6 +115,8 @@ pub struct Rasters {
     pub renderer: Info,
     pub size: Size,
     pub rows: Vec<Rastered>,
+    /// Whole frames.
+    pub frames: Vec<Frames>,
 }
 
 impl Rasters {
@@ -125,12 +128,13 @@ impl Rasters {
         std::fs::create_dir_all(folder).map_err(during("report"))?;
         let json = serde_json::to_vec_pretty(self).map_err(during("report"))?;
         let page = format!(
-            "{}\n\n{}; {} x {} pixels.\n{}",
+            "{}\n\n{}; {} x {} pixels.\n{}{}",
             self.made.line(),
             self.renderer.renderer,
             self.size.width,
             self.size.height,
-            beside::raster(&self.rows)
+            beside::raster(&self.rows),
+            paths::markdown(&self.frames)
         );
         for (name, bytes) in [("raster.json", json), ("raster.md", page.into_bytes())] {
             std::fs::write(folder.join(name), bytes).map_err(during("report"))?;
@@ -140,7 +144,7 @@ impl Rasters {
 
     /// Whether everything was timed.
     pub fn passed(&self) -> bool {
-        self.rows.iter().all(|row| row.passes.is_some())
+        self.rows.iter().all(|row| row.passes.is_some()) && paths::faults(&self.frames).is_empty()
     }
 }
 
@@ -153,8 +157,9 @@ pub fn rasters(request: &Request, mut progress: impl FnMut(&str)) -> Result<Rast
     device.check_compiler()?;
     let mut studio = Studio::open()?;
     let rows = measure(&mut studio, &device, request, &mut progress)?;
+    let frames = paths::measure(&mut studio, &device, request, &mut progress)?;
     let renderer = studio.renderer.info().clone();
-    Ok(Rasters { made: Provenance::here(), renderer, size: request.size, rows })
+    Ok(Rasters { made: Provenance::here(), renderer, size: request.size, rows, frames })
 }
 
 /// A stripped scene, how it stands and what sees it.
