@@ -10,6 +10,7 @@ mod interop;
 mod judge;
 mod normals;
 mod overlap;
+mod paths;
 mod raster;
 mod real;
 mod report;
