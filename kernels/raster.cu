@@ -1,16 +1,18 @@
 // Triangles to samples, one a pixel: the least depth of each and whose it is, by one atomic minimum of both. The result
 // does not depend on the order of anything.
 //   raster        a thread a triangle of a group: drops it, draws it if few samples are near, or hands it on
+//   raster_cut    the same of triangles that are cut out
 //   raster_warps  a warp a triangle of the medium queue
 //   raster_tiles  a block a tile of a triangle of the large queue; clipped ones come here too
 // Macros: DEPTH   depth alone, f32, no ids: a shadow map
+//         CUT     there are triangles of which alpha leaves a part: all from args.cut on. Asked before the atomic
 //         COUNT   how many triangles took each path, and why others were dropped
 //         FEW     samples near a triangle that a thread draws, at most
 //         NARROW  1/256 pixels of a triangle that a warp draws, at most 16384: its edges fit 32 bits
-// Launch: BLOCK threads a block; of raster as many as triangles need, of the others any number: they take turns.
-// No holes: triangles of materials with alpha masks are drawn whole.
+// Launch: BLOCK threads a block; of raster and raster_cut as many as triangles need, of the others any number: they take
+// turns.
 // CPU twin: Raster::draw.
-#include "raster.cuh"
+#include "cut_out.cuh"
 
 #ifndef FEW
 #define FEW 32
@@ -110,13 +112,15 @@ __device__ inline void aim_at(const RasterArgs& args, unsigned triangle, Aim& ai
     }
 }
 
+template <typename Kind>
 __device__ inline void draw_small(const RasterArgs& args, const Aim& aim, unsigned triangle) {
     const Piece<int> piece(aim.a, aim.b, aim.c, aim.turned, (int)aim.area);
+    const Kind surface(args, triangle);
     for (int row = aim.box.y0; row <= aim.box.y1; ++row) {
         for (int column = aim.box.x0; column <= aim.box.x1; ++column) {
             float depth;
             if (piece.covers(column, row, depth)) {
-                put(args, column, row, depth, triangle);
+                put(args, surface, column, row, depth, triangle);
             }
         }
     }
@@ -162,7 +166,8 @@ __device__ inline void count(const RasterArgs& args, Path path) {
 #endif
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK) raster(const __grid_constant__ RasterArgs args) {
+template <typename Kind>
+__device__ inline void draw_group(const RasterArgs& args) {
     const unsigned at = blockIdx.x * BLOCK + threadIdx.x, triangle = args.first + at;
     Aim aim;
     aim.path = NOTHING;
@@ -176,27 +181,55 @@ extern "C" __global__ void __launch_bounds__(BLOCK) raster(const __grid_constant
         push_large(args, aim.box, triangle);
     }
     if (aim.path == SMALL) {
-        draw_small(args, aim, triangle);
+        draw_small<Kind>(args, aim, triangle);
     }
 }
 
+extern "C" __global__ void __launch_bounds__(BLOCK) raster(const __grid_constant__ RasterArgs args) {
+    draw_group<Whole>(args);
+}
+
+#ifdef CUT
+extern "C" __global__ void __launch_bounds__(BLOCK) raster_cut(const __grid_constant__ RasterArgs args) {
+    draw_group<CutOut>(args);
+}
+#endif
+
+template <typename Kind>
+__device__ inline void draw_medium(const RasterArgs& args, unsigned triangle) {
+    float4 corners[3];
+    load_triangle(args, triangle, corners);
+    Aim aim;
+    aim_whole(args, corners, aim);
+    const Piece<int> piece(aim.a, aim.b, aim.c, aim.turned, (int)aim.area);
+    const Kind surface(args, triangle);
+    const int lane = (int)threadIdx.x % 32;
+    for (int row = aim.box.y0 + lane / 8; row <= aim.box.y1; row += 4) {
+        for (int column = aim.box.x0 + lane % 8; column <= aim.box.x1; column += 8) {
+            float depth;
+            if (piece.covers(column, row, depth)) {
+                put(args, surface, column, row, depth, triangle);
+            }
+        }
+    }
+}
+
+__device__ inline bool is_cut(const RasterArgs& args, unsigned triangle) {
+#ifdef CUT
+    return triangle >= args.cut;
+#else
+    return false;
+#endif
+}
+
 extern "C" __global__ void __launch_bounds__(BLOCK, 2) raster_warps(const __grid_constant__ RasterArgs args) {
-    const unsigned queued = ((const Tally*)args.tally)->medium, lane = threadIdx.x % 32;
-    const unsigned warps = gridDim.x * (BLOCK / 32);
+    const unsigned queued = ((const Tally*)args.tally)->medium, warps = gridDim.x * (BLOCK / 32);
     for (unsigned at = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; at < queued; at += warps) {
         const unsigned triangle = ((const unsigned*)args.medium)[at];
-        float4 corners[3];
-        load_triangle(args, triangle, corners);
-        Aim aim;
-        aim_whole(args, corners, aim);
-        const Piece<int> piece(aim.a, aim.b, aim.c, aim.turned, (int)aim.area);
-        for (int row = aim.box.y0 + (int)lane / 8; row <= aim.box.y1; row += 4) {
-            for (int column = aim.box.x0 + (int)lane % 8; column <= aim.box.x1; column += 8) {
-                float depth;
-                if (piece.covers(column, row, depth)) {
-                    put(args, column, row, depth, triangle);
-                }
-            }
+        if (is_cut(args, triangle)) {
+            draw_medium<CutOut>(args, triangle);
+        } else {
+            draw_medium<Whole>(args, triangle);
         }
     }
 }
@@ -232,7 +265,9 @@ __device__ inline bool is_beyond(const Corner& from, const Corner& to, int least
     return Piece<long long>::edge(from, to, x, y) < least;
 }
 
-__device__ inline void draw_tile(const RasterArgs& args, const Piece<long long>& piece, const Box& box, unsigned triangle) {
+template <typename Kind>
+__device__ inline void draw_tile(const RasterArgs& args, const Kind& surface, const Piece<long long>& piece, const Box& box,
+                                 unsigned triangle) {
     if (is_beyond(piece.b, piece.c, piece.least_a, box) || is_beyond(piece.c, piece.a, piece.least_b, box) ||
         is_beyond(piece.a, piece.b, piece.least_c, box)) {
         return;
@@ -241,24 +276,26 @@ __device__ inline void draw_tile(const RasterArgs& args, const Piece<long long>&
         for (int column = box.x0 + (int)threadIdx.x % 32; column <= box.x1; column += 32) {
             float depth;
             if (piece.covers(column, row, depth)) {
-                put(args, column, row, depth, triangle);
+                put(args, surface, column, row, depth, triangle);
             }
         }
     }
 }
 
 // All pieces of a polygon turn the way that the whole does; what rounding turned the other way has no samples of its own.
+template <typename Kind>
 __device__ inline void draw_pieces(const RasterArgs& args, const Polygon& polygon, const Box& box, unsigned triangle) {
     long long whole = 0;
     for (unsigned i = 1; i + 1 < polygon.count; ++i) {
         whole += area_of(polygon.corners[0], polygon.corners[i], polygon.corners[i + 1]);
     }
     const bool turned = whole < 0;
+    const Kind surface(args, triangle);
     for (unsigned i = 1; i + 1 < polygon.count; ++i) {
         const Corner &a = polygon.corners[0], &b = polygon.corners[i], &c = polygon.corners[i + 1];
         const long long area = area_of(a, b, c), own = turned ? -area : area;
         if (own > 0) {
-            draw_tile(args, Piece<long long>(a, b, c, turned, own), box, triangle);
+            draw_tile(args, surface, Piece<long long>(a, b, c, turned, own), box, triangle);
         }
     }
 }
@@ -278,7 +315,11 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 3) raster_tiles(const __grid
         const unsigned own = (unsigned)(tile - entry.first), across = (entry.box >> 16 & 255) + 1;
         const int x = TILE * (int)((entry.box & 255) + own % across), y = TILE * (int)((entry.box >> 8 & 255) + own / across);
         const Box box = {x, y, min(x + TILE, (int)args.width) - 1, min(y + TILE, (int)args.height) - 1};
-        draw_pieces(args, polygon, box, entry.triangle);
+        if (is_cut(args, entry.triangle)) {
+            draw_pieces<CutOut>(args, polygon, box, entry.triangle);
+        } else {
+            draw_pieces<Whole>(args, polygon, box, entry.triangle);
+        }
         __syncthreads();
     }
 }

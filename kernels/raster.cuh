@@ -14,13 +14,16 @@ struct RasterArgs {
     unsigned long long medium;            // [triangles] u32: triangles that warps draw                    (out, in)
     unsigned long long large;             // [triangles] Large: those that blocks draw                     (out, in)
     unsigned long long tally;             // Tally                                                         (in, out)
+    unsigned long long uvs;               // [triangles - cut][3][2] f32
+    unsigned long long surfaces;          // [triangles - cut] u32: places in the table
+    unsigned long long table;             // [surfaces] Surface
     float clip[16];                       // clip from positions, row-major
     float half_width, half_height;        // pixels
     float guard_x, guard_y;               // |x| and |y| up to which nothing is clipped, in units of w
     unsigned width, height;
     unsigned first, count;                // the triangles of this launch
     unsigned faces;                       // 0: both, 1: fronts (anticlockwise with y up)
-    unsigned pad;
+    unsigned cut;                         // the first triangle that is cut out; with the three above, of CUT
 };
 
 struct Large {
@@ -216,19 +219,20 @@ struct Piece {
 };
 
 // Depths are not negative, so that their bits are ordered as they are. What was read before is never below what is there
-// now: an atomic that it makes needless would have changed nothing.
-__device__ inline void put(const RasterArgs& args, int column, int row, float depth, unsigned triangle) {
+// now: an atomic that it makes needless would have changed nothing, and what would not be seen need not be looked at.
+template <typename Kind>
+__device__ inline void put(const RasterArgs& args, const Kind& surface, int column, int row, float depth, unsigned triangle) {
     const size_t at = (size_t)row * args.width + column;
     const unsigned bits = __float_as_uint(depth);
 #ifdef DEPTH
     unsigned* target = (unsigned*)args.target + at;
-    if (bits < __ldcg(target)) {
+    if (bits < __ldcg(target) && surface.keeps(args, column, row)) {
         atomicMin(target, bits);
     }
 #else
     const unsigned long long key = (unsigned long long)bits << 32 | triangle;
     unsigned long long* target = (unsigned long long*)args.target + at;
-    if (key < __ldcg(target)) {
+    if (key < __ldcg(target) && surface.keeps(args, column, row)) {
         atomicMin(target, key);
     }
 #endif

@@ -18,7 +18,7 @@
 //! | `engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `deform`, `raster`, `scene`, `domain`, `telemetry`, `error` |
 //! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage`, `deform`, `raster`, `scene`, `domain`, `error` |
 //! | `cpu` | the f32 deformer of machines without a GPU | `storage`, `deform`, `scene`, `domain`, `error` |
-//! | `reference` | the same in f64, plain: the definition that the others are tested against | `deform`, `scene`, `domain`, `error` |
+//! | `reference` | the same in f64, plain: the definition that the others are tested against | `deform`, `raster`, `scene`, `domain`, `error` |
 //! | `render` | EGL and OpenGL: buffers, passes, readback | `deform`, `raster`, `scene`, `domain`, `error` |
 //! | `frame` | pixels and numbers to bytes, colour maps with their legends; pure functions | `error` |
 //! | `load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |

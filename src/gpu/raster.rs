@@ -2,15 +2,18 @@
 //!
 //! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels, and blocks draw larger and clipped ones
 //! tile by tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
-//! stay on the device.
+//! stay on the device. Of a cut-out a sample is kept where alpha is large enough, asked before the minimum; meshes without
+//! any compile nothing of that.
 //!
 //! | file | what |
 //! |---|---|
 //! | [`form`] | the variants of the kernels |
 //! | [`check`] | which meshes are refused |
+//! | [`mod@cut_out`] | texture coordinates, surfaces and images of cut-outs |
 //! | [`opengl`] | positions and samples in OpenGL's buffers |
 
 mod check;
+mod cut_out;
 mod form;
 mod opengl;
 
@@ -18,13 +21,15 @@ use bytemuck::{Pod, Zeroable};
 use cudarc::driver::sys::{self, CUdevice_attribute};
 use cudarc::driver::{CudaFunction, CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-pub(super) use self::check::check;
-pub(super) use self::form::{FUNCTIONS, SOURCE};
+pub(super) use self::check::{check, check_cut_outs};
+use self::cut_out::Cut;
+pub(super) use self::form::{FUNCTIONS, SOURCE, WHOLE};
 pub use self::form::{RasterForm, Spread};
 pub use self::opengl::GlRaster;
 use super::device::Device;
 use super::memory::{address, download, room, upload};
 use crate::error::{Result, during};
+use crate::raster::CutOuts;
 use crate::scene::{Faces, Group, Window};
 
 /// Threads of a block, and blocks of a multiprocessor where blocks take turns.
@@ -44,6 +49,9 @@ struct RasterArgs {
     medium: u64,
     large: u64,
     tally: u64,
+    uvs: u64,
+    surfaces: u64,
+    table: u64,
     clip: [f32; 16],
     half: [f32; 2],
     guard: [f32; 2],
@@ -51,10 +59,10 @@ struct RasterArgs {
     first: u32,
     count: u32,
     faces: u32,
-    pad: u32,
+    cut: u32,
 }
 
-const _: () = assert!(size_of::<RasterArgs>() == 152, "RasterArgs differs from kernels/raster.cuh");
+const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from kernels/raster.cuh");
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for RasterArgs {}
@@ -78,7 +86,11 @@ const LARGE: u64 = 16;
 #[derive(Debug)]
 pub(super) struct Functions {
     form: RasterForm,
-    list: Vec<CudaFunction>,
+    raster: CudaFunction,
+    /// Where there are cut-outs.
+    raster_cut: Option<CudaFunction>,
+    raster_warps: CudaFunction,
+    raster_tiles: CudaFunction,
 }
 
 impl Functions {
@@ -86,13 +98,23 @@ impl Functions {
     ///
     /// # Errors
     /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
-    pub(super) fn new(device: &Device, form: RasterForm) -> Result<Self> {
-        Ok(Self { form, list: device.functions(&FUNCTIONS, SOURCE, &form.defines())? })
+    pub(super) fn new(device: &Device, form: RasterForm, cut: bool) -> Result<Self> {
+        let names: &[&str] = if cut { &FUNCTIONS } else { &WHOLE };
+        let mut list = device.functions(names, SOURCE, &form.defines(cut))?.into_iter();
+        let mut next = || list.next().ok_or_else(|| during("load kernel")("a function is missing"));
+        Ok(Self {
+            form,
+            raster: next()?,
+            raster_cut: if cut { Some(next()?) } else { None },
+            raster_warps: next()?,
+            raster_tiles: next()?,
+        })
     }
 
     /// Each with its name.
     pub(super) fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
-        FUNCTIONS.into_iter().zip(&self.list)
+        let list = [Some(&self.raster), self.raster_cut.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
+        FUNCTIONS.into_iter().zip(list).filter_map(|(name, function)| function.map(|function| (name, function)))
     }
 }
 
@@ -114,16 +136,17 @@ pub(super) struct Core {
     medium: CudaSlice<u8>,
     large: CudaSlice<u8>,
     tally: CudaSlice<u8>,
+    cut: Option<Cut>,
     /// Blocks of the kernels that take turns.
     blocks: u32,
 }
 
 impl Core {
-    /// Puts triangles that [`check`] let pass onto the device.
+    /// Puts triangles and cut-outs that [`check`] and [`check_cut_outs`] let pass onto the device.
     ///
     /// # Errors
     /// `Fault` when the device refuses.
-    pub(super) fn new(device: &Device, triangles: &[[u32; 3]]) -> Result<Self> {
+    pub(super) fn new(device: &Device, triangles: &[[u32; 3]], cut_outs: Option<&CutOuts>) -> Result<Self> {
         let units = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT);
         let units = u32::try_from(units.map_err(during("device"))?).unwrap_or(1);
         let count = triangles.len() as u64;
@@ -132,8 +155,14 @@ impl Core {
             medium: room(device, 4 * count)?,
             large: room(device, LARGE * count)?,
             tally: room(device, size_of::<Tally>() as u64)?,
+            cut: cut_outs.map(|cut_outs| Cut::new(device, cut_outs)).transpose()?,
             blocks: RESIDENT * units,
         })
+    }
+
+    /// Whether its passes need functions with cut-outs.
+    pub(super) const fn is_cut(&self) -> bool {
+        self.cut.is_some()
     }
 
     /// Clears the target and draws into it, on the device's stream.
@@ -142,13 +171,36 @@ impl Core {
     /// `Fault` when the device refuses.
     pub(super) fn draw(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
         self.clear(device, pass)?;
-        let args = self.args(device, pass);
-        for group in pass.groups.iter().filter(|group| group.triangles > 0) {
-            let faces = u32::from(group.faces == Faces::Fronts);
-            let own = RasterArgs { first: group.first, count: group.triangles, faces, ..args };
-            start(device, &pass.functions.list[0], group.triangles.div_ceil(BLOCK), own)?;
+        let (args, functions) = (self.args(device, pass), pass.functions);
+        for group in pass.groups {
+            let (whole, cut) = self.split(*group);
+            for (function, own) in [(Some(&functions.raster), whole), (functions.raster_cut.as_ref(), cut)] {
+                if let Some(function) = function.filter(|_| own.triangles > 0) {
+                    let faces = u32::from(own.faces == Faces::Fronts);
+                    let args = RasterArgs { first: own.first, count: own.triangles, faces, ..args };
+                    start(device, function, own.triangles.div_ceil(BLOCK), args)?;
+                }
+            }
         }
-        pass.functions.list[1..].iter().try_for_each(|function| start(device, function, self.blocks, args))
+        start(device, &functions.raster_warps, self.blocks, args)?;
+        start(device, &functions.raster_tiles, self.blocks, args)
+    }
+
+    /// Launches of a pass over these groups.
+    pub(super) fn launches(&self, groups: &[Group]) -> usize {
+        let of_group = |group: &Group| {
+            let (whole, cut) = self.split(*group);
+            usize::from(whole.triangles > 0) + usize::from(cut.triangles > 0)
+        };
+        2 + groups.iter().map(of_group).sum::<usize>()
+    }
+
+    /// The part of a group before the first cut-out, and the rest.
+    fn split(&self, group: Group) -> (Group, Group) {
+        let first = self.cut.as_ref().map_or(u32::MAX, |cut| cut.first);
+        let whole = first.saturating_sub(group.first).min(group.triangles);
+        let cut = Group { first: group.first + whole, triangles: group.triangles - whole, ..group };
+        (Group { triangles: whole, ..group }, cut)
     }
 
     /// Triangles of the last pass by what became of them, as the kernels' paths are numbered; zeros unless its form counts.
@@ -163,6 +215,8 @@ impl Core {
     }
 
     fn args(&self, device: &Device, pass: &Pass<'_>) -> RasterArgs {
+        let cut = self.cut.as_ref();
+        let addresses = cut.map(|cut| cut.addresses(device)).unwrap_or_default();
         RasterArgs {
             positions: pass.positions,
             triangles: address(device, &self.triangles),
@@ -174,6 +228,10 @@ impl Core {
             half: pass.window.half(),
             guard: pass.window.guard(),
             size: pass.window.size(),
+            uvs: addresses.uvs,
+            surfaces: addresses.surfaces,
+            table: addresses.table,
+            cut: cut.map_or(u32::MAX, |cut| cut.first),
             ..RasterArgs::zeroed()
         }
     }

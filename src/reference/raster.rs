@@ -4,8 +4,12 @@
 //! around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and snapped to 1/256 pixel. From there
 //! on coverage is exact, in integers: a sample belongs to the triangle on whose inner side of all edges it lies; one on an
 //! edge belongs to the triangle that has it as its top or left edge. So triangles that share an edge cover every sample
-//! between them once. Depth is z/w, linear in the window, in f32 from the exact edge values.
+//! between them once. Depth is z/w, linear in the window, in f32 from the exact edge values. Of a cut-out that is left where
+//! alpha is large enough ([`cut_out`]).
 
+pub mod cut_out;
+
+use crate::raster::CutOuts;
 use crate::scene::{Faces, Group, Window};
 
 /// Parts of a pixel, and the least w that is divided by.
@@ -68,9 +72,28 @@ impl Raster {
 
     /// Draws the triangles of a group; positions are three numbers a vertex.
     pub fn draw(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: Group) {
+        self.draw_where(positions, triangles, group, |_, _| true);
+    }
+
+    /// The same of a mesh of which some triangles are cut out.
+    pub fn draw_cut_out(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: Group, cut_outs: &CutOuts) {
+        let window = self.window;
+        self.draw_where(positions, triangles, group, |triangle, pixel| {
+            let corners = corners(&window, positions, triangles[triangle as usize]);
+            cut_out::keeps(cut_outs, &window, (triangle, &corners), pixel)
+        });
+    }
+
+    fn draw_where(
+        &mut self,
+        positions: &[f32],
+        triangles: &[[u32; 3]],
+        group: Group,
+        keeps: impl Fn(u32, [i32; 2]) -> bool,
+    ) {
         for triangle in group.first..group.first + group.triangles {
             if let Ok(outline) = outline(&self.window, positions, triangles[triangle as usize], group.faces) {
-                self.fill(&outline, triangle);
+                self.fill(&outline, triangle, |pixel| keeps(triangle, pixel));
             }
         }
     }
@@ -86,12 +109,12 @@ impl Raster {
         self.keys.iter().map(|key| (*key != NOTHING).then_some(*key as u32)).collect()
     }
 
-    fn fill(&mut self, outline: &Outline, triangle: u32) {
+    fn fill(&mut self, outline: &Outline, triangle: u32, keeps: impl Fn([i32; 2]) -> bool) {
         let [x0, y0, x1, y1] = outline.samples;
         let width = self.window.size()[0] as usize;
         for piece in pieces(outline) {
             for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
-                if let Some(depth) = depth_at(&piece, column, row) {
+                if let Some(depth) = depth_at(&piece, column, row).filter(|_| keeps([column, row])) {
                     let key = &mut self.keys[row as usize * width + column as usize];
                     *key = (*key).min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
                 }
@@ -105,7 +128,7 @@ impl Raster {
 /// # Errors
 /// Why it is dropped.
 pub fn outline(window: &Window, positions: &[f32], triangle: [u32; 3], faces: Faces) -> Result<Outline, Dropped> {
-    let corners = triangle.map(|vertex| to_clip(window, &positions[3 * vertex as usize..][..3]));
+    let corners = corners(window, positions, triangle);
     if !corners.as_flattened().iter().all(|number| number.is_finite()) {
         return Err(Dropped::NotFinite);
     }
@@ -131,6 +154,11 @@ pub fn outline(window: &Window, positions: &[f32], triangle: [u32; 3], faces: Fa
         return Err(Dropped::Missed);
     }
     Ok(Outline { corners, area, samples, clipped })
+}
+
+/// A triangle's corners in clip space.
+pub fn corners(window: &Window, positions: &[f32], triangle: [u32; 3]) -> [[f32; 4]; 3] {
+    triangle.map(|vertex| to_clip(window, &positions[3 * vertex as usize..][..3]))
 }
 
 /// The triangles of a fan over the outline, each turned so that its corners follow clockwise on the screen.

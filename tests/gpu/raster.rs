@@ -8,7 +8,8 @@ use modalcast::report::render::{Request, Size, rasters};
 use crate::both::soups::{Soup, soups};
 
 fn launched(device: &Device, soup: &Soup, form: RasterForm) -> Raster {
-    let mesh = RasterMesh { positions: &soup.positions, triangles: &soup.triangles, groups: &soup.groups };
+    let mesh =
+        RasterMesh { positions: &soup.positions, triangles: &soup.triangles, groups: &soup.groups, cut_outs: None };
     let raster = Raster::new(device, mesh, soup.window, form).expect("a raster");
     // Twice: queues and samples of the first launch are gone.
     (0..2).for_each(|_| raster.launch(device, 0).expect("launches"));

@@ -13,11 +13,12 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
 /// Headers that kernels may include, by name.
-const HEADERS: [(&str, &str); 10] = [
+const HEADERS: [(&str, &str); 11] = [
     ("layout.cuh", include_str!("../../../kernels/layout.cuh")),
     ("batch_load.cuh", include_str!("../../../kernels/batch_load.cuh")),
     ("chain.cuh", include_str!("../../../kernels/chain.cuh")),
     ("chunk.cuh", include_str!("../../../kernels/chunk.cuh")),
+    ("cut_out.cuh", include_str!("../../../kernels/cut_out.cuh")),
     ("follow.cuh", include_str!("../../../kernels/follow.cuh")),
     ("ordered.cuh", include_str!("../../../kernels/ordered.cuh")),
     ("raster.cuh", include_str!("../../../kernels/raster.cuh")),

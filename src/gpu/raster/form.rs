@@ -4,8 +4,13 @@ use crate::scene::Window;
 
 pub(in super::super) const SOURCE: &str = include_str!("../../../kernels/raster.cu");
 
-/// The functions in it, in the order of their launches.
-pub(in super::super) const FUNCTIONS: [&str; 3] = ["raster", "raster_warps", "raster_tiles"];
+/// The functions in it: those that a group is launched with, its whole triangles and then its cut-outs, and those behind.
+/// Without [`CUT`] there is no second.
+pub(in super::super) const FUNCTIONS: [&str; 4] = ["raster", "raster_cut", "raster_warps", "raster_tiles"];
+pub(in super::super) const WHOLE: [&str; 3] = [FUNCTIONS[0], FUNCTIONS[2], FUNCTIONS[3]];
+
+/// The macro of meshes with cut-outs.
+const CUT: &str = "CUT";
 
 /// Who draws the triangles that could be drawn by a thread; for comparisons, the result is the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -31,18 +36,19 @@ pub struct RasterForm {
 }
 
 impl RasterForm {
-    /// The macros that it is compiled with.
-    pub(in super::super) fn defines(self) -> Vec<&'static str> {
-        let counted = self.counted.then_some("COUNT");
+    /// The macros that it is compiled with, for meshes with cut-outs or without.
+    pub(in super::super) fn defines(self, cut: bool) -> Vec<&'static str> {
+        let more =
+            [(cut, CUT), (self.counted, "COUNT")].into_iter().filter_map(|(wanted, name)| wanted.then_some(name));
         if self.depth_only {
-            return std::iter::once("DEPTH").chain(counted).collect();
+            return std::iter::once("DEPTH").chain(more).collect();
         }
         let spread: &[&str] = match self.spread {
             Spread::BySize => &[],
             Spread::Warps => &["FEW=0"],
             Spread::Tiles => &["FEW=0", "NARROW=-1"],
         };
-        counted.into_iter().chain(spread.iter().copied()).collect()
+        more.chain(spread.iter().copied()).collect()
     }
 
     /// Bytes of all samples of a window.

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use super::super::device::Device;
 use super::super::interop::{Access, Registered, Sharing, mapped};
-use super::{Core, Functions, Pass, RasterForm, check};
-use crate::error::{Error, Result, during, invalid};
+use super::{Core, Functions, Pass, RasterForm, Spread, check, check_cut_outs};
+use crate::error::{Error, Result, during};
 use crate::raster::{GlBuffer, Mesh, Rasteriser};
 use crate::scene::{Faces, Group, Window};
 
@@ -38,15 +38,15 @@ type Ready<'a> = (&'a Functions, &'a [Group], &'a mut Registered);
 
 impl Kind {
     const fn new(depth_only: bool, groups: Vec<Group>) -> Self {
-        let form = RasterForm { depth_only, counted: false, spread: super::Spread::BySize };
+        let form = RasterForm { depth_only, counted: false, spread: Spread::BySize };
         Self { into: None, functions: None, form, groups }
     }
 
     /// Compiles and registers what is missing for a pass.
-    fn prepare(&mut self, device: &Device, sharing: &Sharing, into: GlBuffer) -> Result<Ready<'_>> {
+    fn prepare(&mut self, device: &Device, (sharing, core): (&Sharing, &Core), into: GlBuffer) -> Result<Ready<'_>> {
         let functions = match self.functions.take() {
             Some(functions) => functions,
-            None => Functions::new(device, self.form)?,
+            None => Functions::new(device, self.form, core.is_cut())?,
         };
         let kept = self.into.take().filter(|own| own.buffer() == into);
         let registered = match kept {
@@ -62,12 +62,13 @@ impl GlRaster {
     /// current on this thread. Kernels are compiled at the first pass that wants them.
     ///
     /// # Errors
-    /// `Invalid` when there are 2^24 triangles or more, one names no vertex, or a group no triangle; `Fault` when the
-    /// device refuses, or CUDA cannot share OpenGL's buffer.
+    /// `Invalid` when there are 2^24 triangles or more, one names no vertex, a group no triangle, or cut-outs do not fit;
+    /// `Fault` when the device refuses, or CUDA cannot share OpenGL's buffer.
     pub fn new(device: &Arc<Device>, mesh: Mesh) -> Result<Self> {
         check(mesh.positions.bytes / VERTEX, &mesh.triangles, &mesh.groups)?;
-        if mesh.cut_outs.is_some() {
-            return Err(invalid("cut-outs", "none", "some"));
+        let cut_outs = mesh.cut_outs.filter(|cut_outs| (cut_outs.first as usize) < mesh.triangles.len());
+        if let Some(cut_outs) = &cut_outs {
+            check_cut_outs(mesh.triangles.len(), cut_outs)?;
         }
         device.context().bind_to_thread().map_err(during("device"))?;
         let sharing = Sharing::open(device)?;
@@ -77,7 +78,7 @@ impl GlRaster {
             depth: Kind::new(true, vec![all]),
             ids: Kind::new(false, mesh.groups),
             sharing,
-            core: Core::new(device, &mesh.triangles)?,
+            core: Core::new(device, &mesh.triangles, cut_outs.as_ref())?,
             device: Arc::clone(device),
         };
         // The triangles were copied from memory that goes now; a fault of that copy shows here.
@@ -94,7 +95,7 @@ impl GlRaster {
             return Err(Error::Fault { stage: "raster", reason });
         }
         device.context().bind_to_thread().map_err(during("device"))?;
-        let (functions, groups, target) = kind.prepare(device, sharing, into)?;
+        let (functions, groups, target) = kind.prepare(device, (sharing, core), into)?;
         // Not `WriteAll`: the kernels read the samples that they wrote.
         let uses = &mut [(positions, Access::Read), (target, Access::WriteSome)];
         mapped(device, uses, |addresses| {

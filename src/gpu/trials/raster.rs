@@ -4,9 +4,10 @@ use cudarc::driver::CudaSlice;
 
 use super::super::device::Device;
 use super::super::memory::{address, download, room, upload};
-use super::super::raster::{Core, Functions, Pass, RasterForm, check};
+use super::super::raster::{Core, Functions, Pass, RasterForm, check, check_cut_outs};
 use super::trial::{KernelFacts, Trial};
 use crate::error::Result;
+use crate::raster::CutOuts;
 use crate::scene::{Group, Window};
 
 /// What is drawn.
@@ -17,6 +18,7 @@ pub struct RasterMesh<'a> {
     /// Vertices; a triangle's id is its place here.
     pub triangles: &'a [[u32; 3]],
     pub groups: &'a [Group],
+    pub cut_outs: Option<&'a CutOuts>,
 }
 
 /// Triangles by what became of them.
@@ -59,7 +61,11 @@ impl Raster {
     /// NVRTC is missing; `Fault` when the device refuses.
     pub fn new(device: &Device, mesh: RasterMesh<'_>, window: Window, form: RasterForm) -> Result<Self> {
         check(mesh.positions.len() as u64 / 3, mesh.triangles, mesh.groups)?;
-        let functions = Functions::new(device, form)?;
+        if let Some(cut_outs) = mesh.cut_outs {
+            check_cut_outs(mesh.triangles.len(), cut_outs)?;
+        }
+        let core = Core::new(device, mesh.triangles, mesh.cut_outs)?;
+        let functions = Functions::new(device, form, core.is_cut())?;
         let facts = functions.named().map(|(name, function)| KernelFacts::of(name, function)).collect::<Result<_>>()?;
         let (target, triangles) = (form.bytes(&window), size_of_val(mesh.triangles) as u64);
         Ok(Self {
@@ -69,7 +75,7 @@ impl Raster {
             groups: mesh.groups.to_vec(),
             positions: upload(device, mesh.positions)?,
             target: room(device, target)?,
-            core: Core::new(device, mesh.triangles)?,
+            core,
             window,
             bytes: vec![("samples", target), ("x", size_of_val(mesh.positions) as u64), ("triangles", triangles)],
         })
@@ -134,7 +140,7 @@ impl Trial for Raster {
     }
 
     fn launches(&self) -> usize {
-        2 + self.groups.iter().filter(|group| group.triangles > 0).count()
+        self.core.launches(&self.groups)
     }
 
     fn kernels(&self) -> Vec<KernelFacts> {
@@ -144,7 +150,7 @@ impl Trial for Raster {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::raster::{FUNCTIONS, SOURCE, Spread};
+    use super::super::super::raster::{FUNCTIONS, SOURCE, Spread, WHOLE};
     use super::super::trial::Code;
     use super::super::trial::tests::compile_all;
     use super::*;
@@ -152,7 +158,7 @@ mod tests {
     /// What a server or a trial ever compiles.
     const CODE: Code = Code {
         source: SOURCE,
-        functions: &FUNCTIONS,
+        functions: &WHOLE,
         variants: &[
             &[],
             &["DEPTH"],
@@ -165,13 +171,30 @@ mod tests {
         ],
     };
 
+    const CUT: Code = Code {
+        source: SOURCE,
+        functions: &FUNCTIONS,
+        variants: &[
+            &["CUT"],
+            &["DEPTH", "CUT"],
+            &["CUT", "COUNT"],
+            &["DEPTH", "CUT", "COUNT"],
+            &["CUT", "FEW=0"],
+            &["CUT", "FEW=0", "NARROW=-1"],
+            &["CUT", "COUNT", "FEW=0"],
+            &["CUT", "COUNT", "FEW=0", "NARROW=-1"],
+        ],
+    };
+
     #[test]
     fn every_form_is_a_variant_that_is_compiled_in_the_check() {
         for depth_only in [false, true] {
             for counted in [false, true] {
                 for spread in [Spread::BySize, Spread::Warps, Spread::Tiles] {
                     let form = RasterForm { depth_only, counted, spread };
-                    assert!(CODE.variants.contains(&form.defines().as_slice()), "{form:?}");
+                    for (cut, code) in [(false, CODE), (true, CUT)] {
+                        assert!(code.variants.contains(&form.defines(cut).as_slice()), "{form:?}");
+                    }
                 }
             }
         }
@@ -181,5 +204,6 @@ mod tests {
     #[ignore = "needs NVRTC: deploy/check installs it"]
     fn nvrtc_compiles_every_raster() {
         compile_all(&CODE);
+        compile_all(&CUT);
     }
 }

@@ -228,7 +228,7 @@ impl Job {
         let triangles = triangles(&self.scene);
         let positions = set.surface()?.positions.clone();
         let group = [Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both }];
-        let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &group };
+        let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &group, cut_outs: None };
         let (frame, map) = (self.frame(&shot)?, self.map(&shot)?);
         let [of_frame, of_map] = [(frame, false), (map, true)].map(|(window, depth_only)| {
             Raster::new(device, mesh, window, RasterForm { depth_only, ..RasterForm::default() })
