@@ -1,6 +1,7 @@
 // What every sample sees to the colour of its pixel, in linear light. A triangle is shaded once in a pixel, in the middle of
 // the samples that see it, however many those are; the mean of the samples, as they are shown, is the pixel.
-//   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1       (in)
+//   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1; NOTHING for ground
+//                                      that was not drawn                                               (in)
 //   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, share that they let by   (in)
 //   picture  [height][width]           RGBA16F, bottom row first                                        (out)
 //   glare    [height][width]           RGBA16F: light that glows                                        (out)
@@ -44,6 +45,18 @@ vec3 ground_seen(vec3 direction) {
     return ground(frame.eye.xyz + way * direction);
 }
 #endif
+
+// What a sample sees. Ground that was not drawn lies behind all else.
+uint seen_by(ivec2 at, int index, ivec2 size) {
+    uint id = texelFetch(ids, at, index).x;
+#ifdef GROUND_SEEN
+    if (id == NOTHING && frame.eye.w > 0.0) {
+        vec2 image = 2.0 * (vec2(at) + SAMPLE_PLACES[index]) / vec2(size) - 1.0;
+        if (meets_ground(through(image))) id = GROUND;
+    }
+#endif
+    return id;
+}
 
 vec3 shaded(uint id, vec2 image, vec2 texel) {
     vec3 direction = through(image);
@@ -110,7 +123,7 @@ void main() {
     bool inside = all(lessThan(at, size));
     bool sees = false;
     for (int index = 0; index < SAMPLES; index++) {
-        seen[index] = texelFetch(ids, min(at, size - 1), index).x;
+        seen[index] = seen_by(min(at, size - 1), index, size);
         sees = sees || (seen[index] != NOTHING && seen[index] != GROUND);
     }
     if (gl_LocalInvocationIndex == 0u) sees_triangle = 0u;
@@ -133,7 +146,7 @@ void main() {
     uint tile = tiles[min(place, count - 1u)];
     ivec2 at = TILE * ivec2(tile & 0xFFFFu, tile >> 16) + ivec2(gl_LocalInvocationID.xy);
     if (place >= count || any(greaterThanEqual(at, size))) return;
-    for (int index = 0; index < SAMPLES; index++) seen[index] = texelFetch(ids, at, index).x;
+    for (int index = 0; index < SAMPLES; index++) seen[index] = seen_by(at, index, size);
     imageStore(picture, at, vec4(pixel(at, size, seen), 1.0));
 #endif
 }

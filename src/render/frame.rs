@@ -33,6 +33,10 @@ const _: () = assert!(size_of::<Frame>() == 368, "Frame differs from shaders/sha
 /// The ground fades by exp(-(d / D)^2) and is drawn to this many D: there it is the horizon to the last bit.
 const EDGE: f64 = 6.0;
 
+/// Vertices may lie below the ground by so many roundings of a coordinate and still count as on it: positions are sums in
+/// f32. The ground that is drawn lies behind what it touches, by as many roundings of depth and the depth of a pixel on it.
+const ROUNDINGS: f64 = 4.0;
+
 impl Frame {
     /// The numbers of one shot of positions that are relative to `origin`, a point in scene units from the scene's
     /// origin. It is taken off the camera in f64.
@@ -56,7 +60,7 @@ impl Frame {
             clip_from_world: (clip * camera).cast().into(),
             map_from_world: light.map_from_world.cast().into(),
             world_from_image: world_from_image(&clip, &camera).cast().into(),
-            eye: wide(viewer.eye(), 0.0),
+            eye: wide(viewer.eye(), if ground_is_last(scene, shot, origin) { 1.0 } else { 0.0 }),
             to_sun: wide(to_sun, 0.0),
             sunlight: colour(look.sunlight, 0.0),
             skylight: colour(look.skylight, 0.0),
@@ -78,6 +82,19 @@ impl Frame {
             true => Ok(frame),
             false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", shot.camera))),
         }
+    }
+
+    /// Whether who sees nothing at (x, y) of normalised device coordinates sees ground that was not drawn. Twin of
+    /// `meets_ground` in `shaders/shared/ground.glsl`.
+    pub(super) fn meets_ground(&self, image: [f64; 2]) -> bool {
+        let vector = |four: [f32; 4]| Vector3::new(four[0], four[1], four[2]).cast::<f64>();
+        let [x, y, one] = [0, 1, 2].map(|column| vector(self.world_from_image[column]));
+        let (direction, eye, up) = (x * image[0] + y * image[1] + one, vector(self.eye), vector(self.up));
+        let (fall, above) = (-direction.dot(&up), eye.dot(&up) - f64::from(self.up[3]));
+        let aside = eye - vector(self.ground_centre) + direction * (above / fall);
+        let aside = aside - up * aside.dot(&up);
+        let in_square = aside.iter().all(|side| side.abs() <= f64::from(self.ground_centre[3]));
+        self.eye[3] > 0.0 && fall > 0.0 && above > 0.0 && in_square
     }
 }
 
@@ -143,6 +160,16 @@ pub fn shadow_clip(scene: &Scene, shot: &Shot) -> Option<Matrix4<f64>> {
 pub(super) fn above_ground(scene: &Scene, shot: &Shot) -> bool {
     let up = scene.up.index();
     shot.camera.eye()[up] > scene.rest_bounds.min[up]
+}
+
+/// Whether the ground lies behind all else: the camera stands above it, and nothing of the scene lies below. Who sees nothing
+/// and looks down then sees the ground, and it need not be drawn.
+pub(super) fn ground_is_last(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> bool {
+    let (up, bounds) = (scene.up.index(), shot.bounds);
+    let height = home(scene, bounds, origin).min[up];
+    let largest = [height, bounds.min[up], bounds.max[up]].map(f64::abs).into_iter().fold(0.0, f64::max);
+    let lowest = bounds.min[up] + ROUNDINGS * f64::from(f32::EPSILON) * largest;
+    scene.look.ground.is_some() && above_ground(scene, shot) && bounds.is_finite() && lowest >= height
 }
 
 /// The rest bounds in the frame of the positions. A scene that has left the scene's origin for good, so that positions
@@ -217,13 +244,38 @@ mod tests {
     }
 
     #[test]
+    fn the_ground_is_last_where_nothing_lies_below_it_by_more_than_rounding_and_the_camera_is_above() {
+        let scene = Scene::new(squares(vec![Material::default()])).expect("good");
+        let (rest, up) = (scene.rest_bounds, scene.up.index());
+        let largest = rest.min[up].abs().max(rest.max[up].abs());
+        let is_last = |lowered: f64, raised: f64, origin: f64| {
+            let mut shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: rest };
+            shot.bounds.min[up] -= lowered + origin;
+            shot.bounds.max[up] -= origin;
+            let mut eye = [0.3, 0.4, 0.5];
+            eye[up] = rest.min[up] + raised;
+            shot.camera.view = View::LookAt { eye, target: [0.1; 3], up: [0.6, 0.8, 0.0] };
+            let mut from = [0.0; 3];
+            from[up] = origin;
+            ground_is_last(&scene, &shot, from)
+        };
+        assert!(is_last(0.0, 1.0, 0.0) && is_last(-0.1, 1.0, 0.0) && is_last(0.0, 1.0, 4096.0));
+        assert!(is_last(2e-7 * largest, 1.0, 0.0), "rounding");
+        assert!(!is_last(1e-6 * largest, 1.0, 0.0) && !is_last(1e-2, 1.0, 4096.0), "below");
+        assert!(!is_last(0.0, 0.0, 0.0) && !is_last(0.0, -1.0, 0.0), "the camera is not above");
+    }
+
+    #[test]
     fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
         let mut shot =
             Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: scene.rest_bounds };
         let good = Frame::new(&scene, &shot, [0.0; 3]).expect("good");
+        let [x, y, z, is_last] = good.eye;
+        assert!(is_last > 0.0, "nothing is below the ground");
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
-            assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced"), good);
+            let replaced = Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced");
+            assert_eq!(replaced, Frame { eye: [x, y, z, 0.0], ..good }, "what overflowed may be below it");
         }
         shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let refusal = Frame::new(&scene, &shot, [0.0; 3]).expect_err("overflows").to_string();

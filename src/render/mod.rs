@@ -9,11 +9,11 @@
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
 //! | unpack | the same and the ground, as a rasteriser beside OpenGL saw it, to ids (compute) | that draws ([`Path`]) |
-//! | ground | the same of the ground | the look has a ground, and the camera is above it |
+//! | ground | the same of the ground | the look has a ground, the camera is above it, and something is below it |
 //! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
 //! | count, scan, fill | lists of the blended fragments of each pixel | exact, and some triangle is blended |
 //! | resolve | lists sorted by depth, shaded and blended (compute) | the same |
-//! | backdrop | sky, ground and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
+//! | backdrop | sky, ground (found here where it was not drawn) and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
 //! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
 //! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
 //! | encode | light to sRGB bytes, top row first; smooths edges and mixes levels (compute) | always |
@@ -174,6 +174,8 @@ pub struct Renderer {
     /// The most recently used last.
     targets: Vec<Target>,
     ran: Ran,
+    /// Of the last frame.
+    last: Option<frame::Frame>,
     watchdog: Duration,
     /// What picks are drawn into, once there was one.
     picker: Option<pick::Picker>,
@@ -203,6 +205,7 @@ impl Renderer {
             sample_places,
             targets: Vec::new(),
             ran: Ran::default(),
+            last: None,
             watchdog: WATCHDOG,
             picker: None,
             surveyor: None,
@@ -299,7 +302,14 @@ impl Renderer {
         self.gl.wait("seen", self.watchdog)?;
         let words = staging.read(bytes as usize)?;
         let id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
-        Ok(words.chunks_exact(4).map(|word| Seen::from_id(id(word))).collect())
+        let place = if samples > 1 { self.sample_places[0] } else { [0.5; 2] };
+        let size = [target.form.width, target.form.height];
+        let behind = |pixel: u32| self.last.is_some_and(|last| last.meets_ground(image_place(pixel, size, place)));
+        let seen = words.chunks_exact(4).zip(0..).map(|(word, pixel)| match Seen::from_id(id(word)) {
+            Seen::Nothing if behind(pixel) => Seen::Ground,
+            seen => seen,
+        });
+        Ok(seen.collect())
     }
 
     /// Puts the images for frames of this form last in the list, made if need be.
@@ -324,6 +334,14 @@ impl Renderer {
         self.programs.insert(source, Rc::clone(&program));
         Ok(program)
     }
+}
+
+/// Normalised device coordinates of a place in a pixel, by the pixel's number from the top left on; the place is measured
+/// from the pixel's lower left, 0 to 1.
+fn image_place(pixel: u32, [width, height]: [u32; 2], place: [f32; 2]) -> [f64; 2] {
+    let (column, row) = (pixel % width, height - 1 - pixel / width);
+    let across = |at: u32, place: f32, side: u32| 2.0 * (f64::from(at) + f64::from(place)) / f64::from(side) - 1.0;
+    [across(column, place[0], width), across(row, place[1], height)]
 }
 
 impl Drop for Renderer {

@@ -114,7 +114,8 @@ pub(super) fn identify(
     gl.check("visibility")
 }
 
-/// The ground as one more thing that samples see.
+/// The ground as one more thing that samples see. A picture's is drawn where something lies below it alone; else the
+/// shading finds it.
 pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
     let Some(program) = buffers.programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) else {
         return Ok(());

@@ -37,7 +37,7 @@ pub struct Plan {
     pub buffers: Vec<Allocation>,
     /// Textures of the scene, by name.
     pub textures: Vec<Allocation>,
-    /// Passes of a frame, in order.
+    /// Passes of a frame, in order; that of the ground runs where the camera is above it and something lies below.
     pub passes: Vec<&'static str>,
     /// Draw calls of the visibility and blended passes together, fourteen at most: domains and materials do not matter.
     pub draws: usize,

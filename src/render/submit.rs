@@ -115,6 +115,7 @@ impl Renderer {
     fn start(&mut self, buffers: &SceneBuffers, shot: &Shot, is_read: bool) -> Result<Ticket> {
         self.check_size(shot)?;
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
+        self.last = Some(numbers);
         let look = &buffers.scene.look;
         let size = [shot.width, shot.height];
         let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
@@ -180,7 +181,8 @@ impl Renderer {
                 Some(beside) => beside.ids(gl, buffers, (target, shot), ran),
                 None => {
                     passes::visibility(gl, buffers, target, sampled, ran)?;
-                    passes::ground(gl, buffers, shot, ran)
+                    let is_last = frame::ground_is_last(&buffers.scene, shot, buffers.origin);
+                    if is_last { Ok(()) } else { passes::ground(gl, buffers, shot, ran) }
                 }
             })?,
             timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,

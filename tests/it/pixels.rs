@@ -5,6 +5,7 @@ mod build;
 mod culling;
 mod culling_real;
 mod far;
+mod ground;
 mod layers;
 mod limits;
 mod picking;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast::deform::Deformer as _;
 use modalcast::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
 use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Allocation, Image, Prefer, Ran, Renderer, Shot};
+use modalcast::render::{Allocation, Image, Prefer, Ran, Renderer, Shot, plan};
 use modalcast::scene::{Camera, Lens, Parts, Scene, State, View};
 
 /// A scene under construction: no shadow, no ground, a black sky, the sun behind the camera.
@@ -136,6 +136,11 @@ impl Picture {
             .filter(|(x, y)| claim(self.at(*x, *y)))
             .count()
     }
+}
+
+/// The planned passes of a scene with nothing below its ground, which is not drawn then.
+pub(super) fn planned_above(scene: &Scene) -> Vec<&'static str> {
+    plan(scene).passes.into_iter().filter(|pass| *pass != "ground").collect()
 }
 
 /// sRGB byte of a linear value.

@@ -3,10 +3,10 @@
 use modalcast::deform::{Deformer as _, Surface};
 use modalcast::domain::{AlphaMode, Material, Mesh};
 use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Shot, plan};
+use modalcast::render::Shot;
 use modalcast::scene::{Antialias, Bloom, Camera, Lens, Look, State, Tone};
 
-use super::build::{Picture, Stage, camera, close, draw, draw_sized, facing, open, picture, srgb};
+use super::build::{Picture, Stage, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb};
 
 /// A stage whose white surfaces give this light, with one sample a pixel.
 fn glowing(light: [f32; 3], change: impl FnOnce(Look) -> Look) -> Stage {
@@ -240,7 +240,7 @@ fn the_same_input_gives_the_same_bytes_whatever_is_named_and_only_the_named_pass
     let rich = scene(everything(Look::default()));
     let mut renderer = open();
     let first = draw(&mut renderer, &rich, camera(96), 96);
-    assert_eq!(first.ran.passes, plan(&rich).passes);
+    assert_eq!(first.ran.passes, planned_above(&rich));
     assert!(first.ran.passes.contains(&"bloom"));
     let plain = draw(&mut renderer, &scene(Look::default()), camera(96), 96);
     assert!(!plain.ran.passes.contains(&"bloom"));

@@ -1,0 +1,140 @@
+//! The ground that is found where nothing else is seen, against the ground that is drawn.
+
+use std::sync::Arc;
+
+use modalcast::deform::Surface;
+use modalcast::domain::{AlphaMode, Material};
+use modalcast::render::{Renderer, Seen, Shot};
+use modalcast::scene::{Bloom, Bounds, Camera, Culling, Ground, Lens, Look, Scene, Shadow, Transparency, View};
+
+use super::build::{Stage, facing, lying, open};
+
+const SIZE: u32 = 96;
+
+/// A wall and a pane that stand on the ground, a mat that lies on it, and a leaf with holes above.
+fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
+    let mut stage = Stage::new();
+    let base = &mut stage.0.look;
+    (base.zenith, base.horizon) = ([0.1, 0.3, 0.8], [0.7, 0.8, 0.9]);
+    base.sun = [2.0, 3.0, 1.0];
+    base.ground = Some(Ground { colour: [0.5, 0.4, 0.3], ..Ground::default() });
+    look(base);
+    let holes = stage.texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
+    let painted = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
+    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..painted([0.2, 0.9, 0.3]) };
+    let leaf =
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(holes), ..painted([1.0; 3]) };
+    let stage =
+        stage.add(lying(1.5, 0.0), painted([0.9, 0.2, 0.2])).add(facing(-2.0, 0.0, -0.5, 1.5, -0.3), painted([0.4; 3]));
+    stage.add(facing(-1.0, 0.0, 2.5, 1.0, 0.8), glass).add(facing(0.5, 1.1, 1.5, 2.1, 0.0), leaf).scene()
+}
+
+fn from(eye: [f64; 3]) -> Camera {
+    let view = View::LookAt { eye, target: [0.0, 0.8, 0.0], up: [0.0, 1.0, 0.0] };
+    Camera { view, lens: Lens::FieldOfView(50.0), near: 0.0, far: 0.0 }
+}
+
+struct Frame {
+    rgba: Vec<u8>,
+    seen: Vec<Seen>,
+    passes: Vec<&'static str>,
+}
+
+impl Frame {
+    /// The scene at rest, all `sunk` lower, when it is told that its lowest point is at `lowest`.
+    fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, (sunk, lowest): (f32, f64)) -> Self {
+        let buffers = renderer.load(scene).expect("loads");
+        let of_all = |part: fn(&modalcast::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
+            scene
+                .domains
+                .iter()
+                .flat_map(|domain| part(&scene.shapes[domain.shape].mesh).as_flattened())
+                .copied()
+                .collect()
+        };
+        let (mut positions, normals) = (of_all(|mesh| mesh.rest()), of_all(|mesh| &mesh.corners().normals));
+        positions.chunks_exact_mut(3).for_each(|vertex| vertex[1] -= sunk);
+        renderer.upload(&buffers, &Surface { positions, normals, ..Surface::default() }).expect("uploads");
+        let mut bounds = scene.rest_bounds;
+        bounds.min[1] = lowest;
+        let shot = Shot { camera, width: SIZE, height: SIZE, bounds };
+        let rgba = renderer.draw(&buffers, &shot).expect("draws").rgba;
+        let passes = renderer.ran().passes.clone();
+        let seen = renderer.seen().expect("reads");
+        renderer.unload(buffers);
+        Self { rgba, seen, passes }
+    }
+
+    fn draws_ground(&self) -> bool {
+        self.passes.contains(&"ground")
+    }
+
+    /// Pixels of another colour, by more than two levels; and that see something else.
+    fn against(&self, other: &Self) -> [usize; 2] {
+        let pixels = self.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
+        let far = |(own, other): &(&[u8], &[u8])| own.iter().zip(*other).any(|(a, b)| a.abs_diff(*b) > 2);
+        [pixels.filter(far).count(), self.seen.iter().zip(&other.seen).filter(|(own, other)| own != other).count()]
+    }
+}
+
+/// Below the ground by more than rounding, and by less than is seen in a shadow map or in the range of depth.
+const BELOW: f64 = -1e-5;
+
+#[test]
+fn ground_that_is_not_drawn_makes_the_picture_that_it_makes_when_drawn() {
+    let looks: [fn(&mut Look); 6] = [
+        |_| {},
+        |look| look.samples = 1,
+        |look| look.shadow = Some(Shadow { size: 256, ..Shadow::default() }),
+        |look| look.transparency = Transparency::TwoPass,
+        |look| look.culling = Culling::Depth,
+        |look| look.bloom = Some(Bloom::default()),
+    ];
+    let mut renderer = open();
+    for (index, look) in looks.into_iter().enumerate() {
+        let scene = stage(look);
+        for eye in [[0.5, 1.0, 7.0], [3.0, 4.0, 5.0], [-4.0, 0.05, 1.0], [0.0, 0.8, 60.0]] {
+            let mut frame = |lowest: f64| Frame::new(&mut renderer, &scene, from(eye), (0.0, lowest));
+            let (found, drawn) = (frame(0.0), frame(BELOW));
+            assert_eq!([found.draws_ground(), drawn.draws_ground()], [false, true]);
+            // Samples at the horizon, where the far edge of the ground is the sky to the last bit, may round otherwise.
+            let [colours, ids] = found.against(&drawn);
+            assert!(
+                colours == 0 && ids <= 2,
+                "look {index} from {eye:?}: {colours} colours and {ids} ids of {}",
+                SIZE * SIZE
+            );
+            let ground = found.seen.iter().filter(|seen| **seen == Seen::Ground).count();
+            assert!(ground > 500, "look {index} from {eye:?}: {ground} pixels of ground");
+        }
+    }
+}
+
+#[test]
+fn ground_hides_what_lies_below_it_and_is_not_there_from_below() {
+    let (scene, mut renderer) = (stage(|_| {}), open());
+    let camera = from([0.5, 1.0, 7.0]);
+    let mut frame = |eye: Camera, sunk: f32, lowest: f64| Frame::new(&mut renderer, &scene, eye, (sunk, lowest));
+    let (right, wrong) = (frame(camera, 0.7, -0.7), frame(camera, 0.7, 0.0));
+    assert_eq!([right.draws_ground(), wrong.draws_ground()], [true, false]);
+    let [colours, ids] = wrong.against(&right);
+    assert!(colours > 300 && ids > 300, "control: {colours} colours and {ids} ids tell who lies below");
+    let from_below = frame(from([0.5, -1.0, 7.0]), 0.0, 0.0);
+    assert!(!from_below.draws_ground() && from_below.seen.iter().all(|seen| *seen != Seen::Ground));
+    let nowhere = frame(camera, 0.0, f64::NAN);
+    assert!(nowhere.draws_ground(), "bounds that overflowed tell nothing");
+}
+
+#[test]
+fn what_lies_on_the_ground_is_seen_and_rounding_does_not_put_it_below() {
+    let (scene, mut renderer) = (stage(|_| {}), open());
+    let camera = from([1.0, 5.0, 4.0]);
+    let rounded = Bounds { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];
+    let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, rounded));
+    assert!(!frame.draws_ground());
+    let drawn = Frame::new(&mut renderer, &scene, camera, (4e-7, BELOW));
+    let [colours, ids] = frame.against(&drawn);
+    assert!(drawn.draws_ground() && colours == 0 && ids <= 2, "{colours} colours and {ids} ids");
+    let red = frame.rgba.chunks_exact(4).filter(|pixel| pixel[0] > pixel[1].saturating_add(30)).count();
+    assert!(red > 300, "{red} pixels of the mat");
+}
