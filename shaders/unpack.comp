@@ -15,8 +15,8 @@ float ground_depth(vec2 image, vec2 texel) {
     float height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
     vec3 falls = -frame.up.xyz * mat3(frame.world_from_image) / height;
     float nearness = dot(falls, vec3(image, 1.0));
-    if (height <= 0.0 || nearness <= 0.0) return 2.0;
     vec3 direction = mat3(frame.world_from_image) * vec3(image, 1.0);
+    if (!meets_ground(direction)) return 2.0;
     vec2 from = (frame.clip_from_world * vec4(frame.eye.xyz, 1.0)).zw;
     vec2 towards = (frame.clip_from_world * vec4(direction, 0.0)).zw;
     vec2 there = nearness * from + towards;

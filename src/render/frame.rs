@@ -85,7 +85,7 @@ impl Frame {
     }
 
     /// Whether who sees nothing at (x, y) of normalised device coordinates sees ground that was not drawn. Twin of
-    /// `meets_ground` in `shaders/shared/ground.glsl`.
+    /// `meets_ground` in `shaders/shared/meets.glsl`.
     pub(super) fn meets_ground(&self, image: [f64; 2]) -> bool {
         let vector = |four: [f32; 4]| Vector3::new(four[0], four[1], four[2]).cast::<f64>();
         let [x, y, one] = [0, 1, 2].map(|column| vector(self.world_from_image[column]));

@@ -23,6 +23,7 @@ pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl")
 const LISTS: &str = include_str!("../../shaders/shared/lists.glsl");
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../shaders/shared/ground.glsl");
+const MEETS: &str = include_str!("../../shaders/shared/meets.glsl");
 const PHONG: &str = include_str!("../../shaders/shared/phong.glsl");
 const SHARES: &str = include_str!("../../shaders/shared/shares.glsl");
 const TRIANGLE: &str = include_str!("../../shaders/shared/triangle.glsl");
@@ -196,15 +197,17 @@ impl Options {
     fn shading(&self, samples: u32, more: &[&str]) -> String {
         let mut head = self.head(more);
         writeln!(head, "#define TILE {TILE}\n#define ROW {TILE_ROW}u").ok();
-        let ground = if self.defines.contains(&"GROUND_SEEN") { GROUND } else { "" };
-        [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground, &self.resolve].concat()
+        let ground = if self.defines.contains(&"GROUND_SEEN") { [MEETS, GROUND] } else { [""; 2] };
+        [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground[0], ground[1], &self.resolve]
+            .concat()
     }
 
     /// Keys of a rasteriser beside OpenGL to ids.
     pub(super) fn unpack(&self) -> Source {
         let mut head = self.head(&[]);
         writeln!(head, "#define TILE {TILE}").ok();
-        let text = [&head, FRAME, IDS, include_str!("../../shaders/unpack.comp")].concat();
+        let ground = if self.defines.contains(&"GROUND_SEEN") { MEETS } else { "" };
+        let text = [&head, FRAME, IDS, ground, include_str!("../../shaders/unpack.comp")].concat();
         Source { label: "unpack".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 

@@ -17,7 +17,7 @@ fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
     let base = &mut stage.0.look;
     (base.zenith, base.horizon) = ([0.1, 0.3, 0.8], [0.7, 0.8, 0.9]);
     base.sun = [2.0, 3.0, 1.0];
-    base.ground = Some(Ground { colour: [0.5, 0.4, 0.3], ..Ground::default() });
+    base.ground = Some(Ground { colour: [0.5, 0.4, 0.3] });
     look(base);
     let holes = stage.texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
     let painted = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
