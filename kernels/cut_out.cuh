@@ -84,12 +84,12 @@ struct CutOut {
         const float whole = __frcp_rn(sum_of(a, b, c));
         float2 uv = {times(sum_of(times(a, u[0]), times(b, u[1]), times(c, u[2])), whole),
                      times(sum_of(times(a, v[0]), times(b, v[1]), times(c, v[2])), whole)};
-        // By how much the shares change from pixel to pixel, times what the corners differ by from here.
+        // By how much the shares change to the next pixel across and down, times what the corners differ by from here.
         float2 across = {0.0f, 0.0f}, down = {0.0f, 0.0f};
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {
             const unsigned j = (i + 1) % 3, k = (i + 2) % 3;
-            const float by_x = cross_of(py[j], py[k], w[j], w[k]), by_y = cross_of(w[j], w[k], px[j], px[k]);
+            const float by_x = cross_of(py[j], py[k], w[j], w[k]), by_y = cross_of(px[j], px[k], w[j], w[k]);
             const float du = plus(u[i], -uv.x), dv = plus(v[i], -uv.y);
             across.x = plus(across.x, times(by_x, du));
             across.y = plus(across.y, times(by_x, dv));

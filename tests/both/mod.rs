@@ -2,6 +2,7 @@
 //! of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
 
 pub(crate) mod changes;
+pub(crate) mod cut_outs;
 pub(crate) mod extremes;
 pub(crate) mod following;
 mod judge;

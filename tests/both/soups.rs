@@ -80,6 +80,17 @@ pub(crate) fn fan(window: Window) -> Soup {
     soup
 }
 
+/// Triangles without area: corners that are one vertex, and corners on a line; between them one that has some.
+fn degenerate() -> Soup {
+    let mut positions = scattered(&mut Random(9), 8, 0.8, [0.6; 3]);
+    positions.extend([[-0.9, -0.9, 0.0], [0.0, 0.0, 0.1], [0.9, 0.9, 0.2]].concat());
+    let triangles = (0..24).flat_map(|at: u32| {
+        let (a, b) = (at, (at + 7) % 24);
+        [[a, a, a], [a, a, b], [a, b, a], [b, a, a], [24, 25, 26], [26, 25, 24], [a, b, 25]]
+    });
+    Soup::new("degenerate", positions, triangles.collect(), flat(160, 90))
+}
+
 /// All of them.
 pub(crate) fn soups() -> Vec<Soup> {
     let mut random = Random(5);
@@ -118,6 +129,7 @@ pub(crate) fn soups() -> Vec<Soup> {
             Window::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("a window")
         }),
         Soup::apart("nothing", Vec::new(), flat(8, 8)),
+        degenerate(),
         fan(flat(128, 128)),
     ]
 }

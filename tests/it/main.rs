@@ -2,6 +2,7 @@
 
 #[path = "../both/mod.rs"]
 mod both;
+mod cut_outs;
 mod deformers;
 mod far;
 mod following;

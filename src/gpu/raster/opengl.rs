@@ -48,12 +48,21 @@ impl Kind {
             Some(functions) => functions,
             None => Functions::new(device, self.form, core.is_cut())?,
         };
-        let kept = self.into.take().filter(|own| own.buffer() == into);
-        let registered = match kept {
+        if self.into.as_ref().is_some_and(|own| own.buffer() != into) {
+            self.let_go(device);
+        }
+        let registered = match self.into.take() {
             Some(own) => own,
             None => sharing.register(device, into)?,
         };
         Ok((self.functions.insert(functions), &self.groups, self.into.insert(registered)))
+    }
+
+    /// Gives the buffer back to OpenGL once nothing draws into it any more.
+    fn let_go(&mut self, device: &Device) {
+        // A failure adds nothing: the device says so at its next call.
+        device.stream().synchronize().ok();
+        self.into = None;
     }
 }
 
@@ -86,7 +95,17 @@ impl GlRaster {
         Ok(raster)
     }
 
+    /// Draws; a target that failed is let go of.
     fn pass(&mut self, depth_only: bool, window: &Window, into: GlBuffer) -> Result<()> {
+        let drawn = self.draw(depth_only, window, into);
+        if drawn.is_err() {
+            let kind = if depth_only { &mut self.depth } else { &mut self.ids };
+            kind.let_go(&self.device);
+        }
+        drawn
+    }
+
+    fn draw(&mut self, depth_only: bool, window: &Window, into: GlBuffer) -> Result<()> {
         let Self { positions, depth, ids, sharing, core, device } = self;
         let kind = if depth_only { depth } else { ids };
         let needed = kind.form.bytes(window);
@@ -116,7 +135,9 @@ impl Rasteriser for GlRaster {
 
     fn forget(&mut self, name: u32) {
         for kind in [&mut self.depth, &mut self.ids] {
-            kind.into.take_if(|own| own.buffer().name == name);
+            if kind.into.as_ref().is_some_and(|own| own.buffer().name == name) {
+                kind.let_go(&self.device);
+            }
         }
     }
 }

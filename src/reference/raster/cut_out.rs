@@ -38,11 +38,11 @@ pub fn footprint(window: &Window, corners: &[[f32; 4]; 3], uvs: &[[f32; 2]; 3], 
     let whole = 1.0 / (shares[0] + shares[1] + shares[2]);
     let sum = |of: [f32; 3]| of[0] + of[1] + of[2];
     let uv = [0, 1].map(|axis| sum([0, 1, 2].map(|at| shares[at] * uvs[at][axis])) * whole);
-    // By how much the shares change from pixel to pixel, times what the corners differ by from here.
+    // By how much the shares change to the next pixel across and down, times what the corners differ by from here.
     let change = |rates: [f32; 3], step: f32| {
         [0, 1].map(|axis| sum([0, 1, 2].map(|at| rates[at] * (uvs[at][axis] - uv[axis]))) * (step * inverse))
     };
-    let (across, down) = (change(cross(&y, &w), step[0]), change(cross(&w, &x), step[1]));
+    let (across, down) = (change(cross(&y, &w), step[0]), change(cross(&x, &w), step[1]));
     let is_finite = [uv, across, down].as_flattened().iter().all(|number| number.is_finite());
     if is_finite { Footprint { uv, across, down } } else { Footprint::default() }
 }

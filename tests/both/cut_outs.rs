@@ -1,0 +1,150 @@
+//! Soups of which a part is cut out, and what of them no two filters need agree on.
+
+use modalcast::raster::{AlphaImage, CutOuts, Surface};
+use modalcast::reference::raster::cut_out::{alpha, footprint};
+use modalcast::reference::raster::{Raster, corners, depth_at, outline, pieces};
+use modalcast::scene::{Faces, Group, Window};
+
+use super::soups::{Soup, flat, perspective, soups};
+use crate::scenes::Random;
+
+/// Triangles from `first` on are cut out of a soup.
+pub(crate) struct Holes {
+    pub(crate) soup: Soup,
+    pub(crate) cut_outs: CutOuts,
+}
+
+impl Holes {
+    /// What the definition draws.
+    pub(crate) fn drawn(&self) -> Raster {
+        let Soup { window, positions, triangles, groups, .. } = &self.soup;
+        let mut raster = Raster::new(*window);
+        groups.iter().for_each(|group| raster.draw_cut_out(positions, triangles, *group, &self.cut_outs));
+        raster
+    }
+
+    /// Samples at which some alpha is within `tolerance` of what it must reach.
+    pub(crate) fn doubtful(&self, tolerance: f32) -> Vec<bool> {
+        let (soup, cut_outs) = (&self.soup, &self.cut_outs);
+        let mut list = vec![false; soup.window.pixels()];
+        for (triangle, faces) in soup
+            .groups
+            .iter()
+            .flat_map(|group| (group.first..group.first + group.triangles).map(move |triangle| (triangle, group.faces)))
+        {
+            let Some(own) = triangle.checked_sub(cut_outs.first) else { continue };
+            let vertices = soup.triangles[triangle as usize];
+            let Ok(outline) = outline(&soup.window, &soup.positions, vertices, faces) else { continue };
+            let (corners, uvs) = (corners(&soup.window, &soup.positions, vertices), &cut_outs.uvs[own as usize]);
+            let least = cut_outs.table[cut_outs.surfaces[own as usize] as usize].least;
+            let [x0, y0, x1, y1] = outline.samples;
+            for piece in pieces(&outline) {
+                for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
+                    if depth_at(&piece, column, row).is_some() {
+                        let at = footprint(&soup.window, &corners, uvs, [column, row]);
+                        let near = (alpha(cut_outs, triangle, &at) - least).abs() <= tolerance;
+                        list[row as usize * soup.window.size()[0] as usize + column as usize] |= near;
+                    }
+                }
+            }
+        }
+        list
+    }
+}
+
+/// An image whose level `l` has the texel `of(l, column, row)`.
+pub(crate) fn image(width: u32, height: u32, mut of: impl FnMut(u32, u32, u32) -> u8) -> AlphaImage {
+    let levels = (0..=width.max(height).ilog2()).map(|level| {
+        let [width, height] = [width, height].map(|side| (side >> level).max(1));
+        (0..width * height).map(|at| of(level, at % width, at / width)).collect()
+    });
+    AlphaImage { width, height, levels: levels.collect() }
+}
+
+/// Soups whose images say the same everywhere, and surfaces without any: nothing is left to the filter. All but the first
+/// third of the triangles are cut out.
+pub(crate) fn plain_holes() -> Vec<Holes> {
+    let mut random = Random(21);
+    let surface = |alpha, least, image| Surface { alpha, least, image };
+    let table = vec![
+        surface(1.0, 0.5, Some(0)),
+        surface(1.0, 0.5, Some(1)),
+        surface(0.25, 0.5, Some(1)),
+        surface(1.0, 0.0, Some(0)),
+        surface(0.75, 0.75, None),
+        surface(0.5, 0.75, None),
+        surface(1.0, f32::NAN, None),
+    ];
+    let images = vec![image(5, 3, |_, _, _| 0), image(8, 1, |_, _, _| 255)];
+    let holes = |soup: Soup| {
+        let first = soup.triangles.len() as u32 / 3;
+        let count = soup.triangles.len() - first as usize;
+        let mut uv = || [random.number(), random.number()].map(|number| 3.0 * number);
+        let uvs = (0..count).map(|_| [uv(), uv(), uv()]).collect();
+        let surfaces = (0..count).map(|at| (at % table.len()) as u32).collect();
+        let (table, images) = (table.clone(), images.clone());
+        Holes { soup, cut_outs: CutOuts { first, uvs, surfaces, table, images, anisotropy: 8.0 } }
+    };
+    soups().into_iter().map(holes).collect()
+}
+
+/// Two triangles that are the whole window, `side` pixels, with an image from corner to corner: u grows to the right, v
+/// downwards. In a window of the image's own size each sample is the middle of a texel.
+pub(crate) fn sheet(side: u32, image: AlphaImage) -> Holes {
+    let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| [x, y, 0.0]).concat();
+    let triangles = vec![[0, 1, 2], [0, 2, 3]];
+    let uv = |corner: u32| [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]][corner as usize];
+    let cut_outs = CutOuts {
+        first: 0,
+        uvs: triangles.iter().map(|corners: &[u32; 3]| corners.map(uv)).collect(),
+        surfaces: vec![0; 2],
+        table: vec![Surface { alpha: 1.0, least: 0.5, image: Some(0) }],
+        images: vec![image],
+        anisotropy: 1.0,
+    };
+    let groups = vec![Group { first: 0, triangles: 2, faces: Faces::Fronts }];
+    Holes { soup: Soup { name: "a sheet", positions, triangles, groups, window: flat(side, side) }, cut_outs }
+}
+
+/// A floor one below the eye that goes on behind it, in `cuts` x `cuts` rectangles, and a wall at its end that is whole. The
+/// floor's image is smooth, so that filters of few digits differ little.
+pub(crate) fn floor(cuts: u32) -> Holes {
+    let mut positions = [[-20.0, -9.0, -20.5], [20.0, -9.0, -20.5], [20.0, 9.0, -20.5], [-20.0, 9.0, -20.5]].concat();
+    let mut triangles = vec![[0, 1, 2], [0, 2, 3]];
+    let part = |at: u32| at as f32 / cuts as f32;
+    let places = (0..=cuts).flat_map(|row| (0..=cuts).map(move |column| (column, row)));
+    positions.extend(places.flat_map(|(x, z)| [18.0 * part(x) - 9.0, -1.0, 9.0 - 29.0 * part(z)]));
+    let mut uvs = Vec::new();
+    for (column, row) in (0..cuts).flat_map(|row| (0..cuts).map(move |column| (column, row))) {
+        let corners = [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(right, far)| (column + right, row + far));
+        for list in [[0, 1, 2], [0, 2, 3]] {
+            let corners = list.map(|corner: usize| corners[corner]);
+            triangles.push(corners.map(|(x, z)| 4 + z * (cuts + 1) + x));
+            uvs.push(corners.map(|(x, z)| [3.0 * part(x), 5.0 * part(z)]));
+        }
+    }
+    let cut_outs = CutOuts {
+        first: 2,
+        surfaces: vec![0; uvs.len()],
+        uvs,
+        table: vec![Surface { alpha: 1.0, least: 0.4, image: Some(0) }],
+        images: vec![waves()],
+        anisotropy: 1.0,
+    };
+    let window: Window = perspective(192, 128, 0.1, 100.0);
+    let groups = vec![
+        Group { first: 0, triangles: 2, faces: Faces::Fronts },
+        Group { first: 2, triangles: triangles.len() as u32 - 2, faces: Faces::Both },
+    ];
+    Holes { soup: Soup { name: "a floor", positions, triangles, groups, window }, cut_outs }
+}
+
+/// One wave across and one down, in levels that differ, so that a wrong one shows.
+fn waves() -> AlphaImage {
+    let wave = |at: u32, of: u32| (std::f32::consts::TAU * (at as f32 + 0.5) / of as f32).sin();
+    image(64, 32, |level, column, row| {
+        let sides = [64, 32].map(|side: u32| (side >> level).max(1));
+        let height = 60.0 - 4.0 * level as f32;
+        (127.5 + height * (wave(column, sides[0]) + wave(row, sides[1]))).round() as u8
+    })
+}

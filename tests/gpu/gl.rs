@@ -1,0 +1,73 @@
+//! OpenGL buffers of a hidden context on the CUDA device.
+
+use std::num::NonZeroU32;
+
+use glow::HasContext as _;
+use modalcast::raster::GlBuffer;
+use modalcast::render::{Prefer, Renderer};
+
+/// The context of a renderer, which stays current on this thread.
+pub(crate) struct Gl {
+    pub(crate) renderer: Renderer,
+    api: glow::Context,
+}
+
+impl Gl {
+    pub(crate) fn open() -> Self {
+        let renderer = Renderer::open(Prefer::Cuda(0)).expect("OpenGL on the CUDA device");
+        // SAFETY: the library is loaded already, by the renderer.
+        let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("EGL");
+        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |found| found as *const _);
+        // SAFETY: the renderer's context is current, and outlives this one.
+        let api = unsafe { glow::Context::from_loader_function(address) };
+        Self { renderer, api }
+    }
+
+    /// A buffer of these numbers.
+    pub(crate) fn filled<T: bytemuck::Pod>(&self, list: &[T]) -> GlBuffer {
+        let buffer = self.room(size_of_val(list) as u64);
+        self.write(buffer, list);
+        buffer
+    }
+
+    /// A buffer of ones.
+    pub(crate) fn room(&self, bytes: u64) -> GlBuffer {
+        let ones = vec![u8::MAX; bytes.max(16) as usize];
+        // SAFETY: the context is current on this thread, as in all calls below.
+        let name = unsafe {
+            let buffer = self.api.create_buffer().expect("a buffer");
+            self.api.bind_buffer(glow::COPY_WRITE_BUFFER, Some(buffer));
+            self.api.buffer_data_u8_slice(glow::COPY_WRITE_BUFFER, &ones, glow::DYNAMIC_DRAW);
+            buffer.0.get()
+        };
+        GlBuffer { name, bytes: ones.len() as u64 }
+    }
+
+    pub(crate) fn write<T: bytemuck::Pod>(&self, to: GlBuffer, list: &[T]) {
+        // SAFETY: as above; OpenGL refuses what does not fit.
+        unsafe {
+            self.api.bind_buffer(glow::COPY_WRITE_BUFFER, Some(native(to)));
+            self.api.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, bytemuck::cast_slice(list));
+        }
+    }
+
+    /// The first `count` numbers of a buffer, in the order of OpenGL's commands: nobody waits for CUDA here.
+    pub(crate) fn read<T: bytemuck::Pod>(&self, from: GlBuffer, count: usize) -> Vec<T> {
+        let mut list = vec![T::zeroed(); count];
+        // SAFETY: as above.
+        unsafe {
+            self.api.bind_buffer(glow::COPY_READ_BUFFER, Some(native(from)));
+            self.api.get_buffer_sub_data(glow::COPY_READ_BUFFER, 0, bytemuck::cast_slice_mut(&mut list));
+        }
+        list
+    }
+
+    pub(crate) fn delete(&self, buffer: GlBuffer) {
+        // SAFETY: as above.
+        unsafe { self.api.delete_buffer(native(buffer)) };
+    }
+}
+
+fn native(buffer: GlBuffer) -> glow::NativeBuffer {
+    glow::NativeBuffer(NonZeroU32::new(buffer.name).expect("a name"))
+}

@@ -1,0 +1,207 @@
+//! The rasteriser in OpenGL's buffers, against its definition.
+
+use std::sync::Arc;
+
+use modalcast::deform::Deformer as _;
+use modalcast::gpu::{CudaDeformer, Device, GlBuffers, GlRaster};
+use modalcast::raster::{CutOuts, GlBuffer, Mesh, Rasteriser};
+use modalcast::reference::raster::Raster;
+use modalcast::scene::{Faces, Group, Scene, Window};
+
+use crate::both::cut_outs::plain_holes;
+use crate::both::soups::{Soup, flat, soups};
+use crate::gl::Gl;
+use crate::scenes;
+
+/// Positions in a buffer of OpenGL's, and what draws them.
+struct Stage {
+    device: Arc<Device>,
+    gl: Gl,
+}
+
+impl Stage {
+    fn open() -> Self {
+        let gl = Gl::open();
+        Self { device: Device::open(0).expect("a CUDA device"), gl }
+    }
+
+    fn raster(&self, soup: &Soup, cut_outs: Option<CutOuts>) -> (GlRaster, GlBuffer) {
+        let positions = self.gl.filled(&soup.positions);
+        let mesh = mesh(positions, soup, cut_outs);
+        (GlRaster::new(&self.device, mesh).expect("a rasteriser"), positions)
+    }
+
+    fn ids(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u64> {
+        raster.ids(window, into).expect("draws");
+        self.gl.read(into, window.pixels())
+    }
+
+    /// Bits of depths.
+    fn depth(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u32> {
+        raster.depth(window, into).expect("draws");
+        self.gl.read(into, window.pixels())
+    }
+}
+
+fn mesh(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) -> Mesh {
+    Mesh { positions, triangles: soup.triangles.clone(), groups: soup.groups.clone(), cut_outs }
+}
+
+/// All triangles from both sides, as depth alone is drawn.
+fn from_both_sides(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
+    let mut raster = Raster::new(soup.window);
+    let all = Group { first: 0, triangles: soup.triangles.len() as u32, faces: Faces::Both };
+    match cut_outs {
+        Some(cut_outs) => raster.draw_cut_out(&soup.positions, &soup.triangles, all, cut_outs),
+        None => raster.draw(&soup.positions, &soup.triangles, all),
+    }
+    raster.depths().into_iter().map(f32::to_bits).collect()
+}
+
+fn differing<T: PartialEq>(got: &[T], want: &[T]) -> usize {
+    assert_eq!(got.len(), want.len());
+    got.iter().zip(want).filter(|(got, want)| got != want).count()
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_samples_in_opengls_buffers_have_the_bits_of_the_definition_run_after_run() {
+    let stage = Stage::open();
+    let mut backs = 0;
+    for soup in soups() {
+        let (mut raster, positions) = stage.raster(&soup, None);
+        let pixels = soup.window.pixels() as u64;
+        let (keys, depths) = (stage.gl.room(8 * pixels), stage.gl.room(4 * pixels));
+        let (want, want_depths) = (soup.drawn(), from_both_sides(&soup, None));
+        backs += differing(&want_depths, &want.depths().into_iter().map(f32::to_bits).collect::<Vec<_>>());
+        for run in 0..3 {
+            let got = stage.ids(&mut raster, &soup.window, keys);
+            assert_eq!(differing(&got, &want.keys), 0, "{}, run {run}", soup.name);
+            let got = stage.depth(&mut raster, &soup.window, depths);
+            assert_eq!(differing(&got, &want_depths), 0, "{}, depth, run {run}", soup.name);
+        }
+        drop(raster);
+        [positions, keys, depths].into_iter().for_each(|buffer| stage.gl.delete(buffer));
+    }
+    assert!(backs > 1000, "control: {backs} samples see a back in depth alone");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_cut_outs_that_say_the_same_everywhere_have_the_bits_of_the_definition_in_both_passes() {
+    let stage = Stage::open();
+    for holes in plain_holes() {
+        let soup = &holes.soup;
+        let (mut raster, _) = stage.raster(soup, Some(holes.cut_outs.clone()));
+        let pixels = soup.window.pixels() as u64;
+        let got = stage.ids(&mut raster, &soup.window, stage.gl.room(8 * pixels));
+        assert_eq!(differing(&got, &holes.drawn().keys), 0, "{}", soup.name);
+        let got = stage.depth(&mut raster, &soup.window, stage.gl.room(4 * pixels));
+        assert_eq!(differing(&got, &from_both_sides(soup, Some(&holes.cut_outs))), 0, "{}, depth", soup.name);
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_positions_that_opengl_writes_are_drawn_without_a_wait() {
+    let stage = Stage::open();
+    let mut soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
+    let (mut raster, positions) = stage.raster(&soup, None);
+    let keys = stage.gl.room(8 * soup.window.pixels() as u64);
+    let mut before = Vec::new();
+    for step in 0..20 {
+        soup.positions
+            .iter_mut()
+            .enumerate()
+            .for_each(|(at, number)| *number += 0.01 * ((at + step) % 7) as f32 - 0.03);
+        stage.gl.write(positions, &soup.positions);
+        let got = stage.ids(&mut raster, &soup.window, keys);
+        assert_eq!(differing(&got, &soup.drawn().keys), 0, "step {step}");
+        assert!(got != before, "the judge can fail");
+        before = got;
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_targets_change_with_the_size_of_frames_also_under_the_name_of_one_that_was_deleted() {
+    let stage = Stage::open();
+    let mut soup = soups().into_iter().find(|soup| soup.name == "large").expect("there");
+    let (mut raster, _) = stage.raster(&soup, None);
+    for (width, height) in [(64, 64), (640, 480), (640, 480), (33, 7), (1, 1), (640, 480)] {
+        soup.window = flat(width, height);
+        let keys = stage.gl.room(8 * soup.window.pixels() as u64);
+        let want = soup.drawn();
+        for _ in 0..2 {
+            assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &want.keys), 0, "{width} x {height}");
+        }
+        raster.forget(keys.name);
+        stage.gl.delete(keys);
+    }
+    // Larger than needed, and two that take turns without being forgotten.
+    let list = [0, 100].map(|more| stage.gl.room(8 * soup.window.pixels() as u64 + more));
+    for keys in [list[0], list[1], list[0], list[1]] {
+        stage.gl.write(keys, &vec![0_u64; soup.window.pixels()]);
+        assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &soup.drawn().keys), 0);
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_are_faults_and_harm_nothing() {
+    let stage = Stage::open();
+    let soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
+    let pixels = soup.window.pixels() as u64;
+    let unknown = |bytes| GlBuffer { name: 999_999, bytes };
+    let refused = GlRaster::new(&stage.device, mesh(unknown(4 * soup.positions.len() as u64), &soup, None));
+    assert!(refused.expect_err("unknown").to_string().contains("999999"));
+    let (mut raster, positions) = stage.raster(&soup, None);
+    raster.ids(&soup.window, unknown(8 * pixels)).expect_err("unknown");
+    let small = stage.gl.room(4 * pixels);
+    raster.ids(&soup.window, small).expect_err("too small, and it says so");
+    raster.ids(&soup.window, GlBuffer { bytes: 8 * pixels, ..small }).expect_err("smaller than it says");
+    let fewer = GlBuffer { bytes: 3 * 4 * 2, ..positions };
+    GlRaster::new(&stage.device, mesh(fewer, &soup, None)).expect_err("vertices that are not there");
+    let keys = stage.gl.room(8 * pixels);
+    assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &soup.drawn().keys), 0, "after refusals");
+    assert_eq!(differing(&stage.depth(&mut raster, &soup.window, small), &from_both_sides(&soup, None)), 0);
+}
+
+/// Packed vertices of each triangle.
+fn triangles(scene: &Scene) -> Vec<[u32; 3]> {
+    let of_domain = |domain: usize| {
+        let (mesh, first) = (&scene.shape_of(domain).mesh, scene.layout.slots[domain].first_vertex as u32);
+        let vertices = &mesh.corners().vertices;
+        mesh.triangles().iter().map(move |corners| corners.map(|corner| first + vertices[corner as usize]))
+    };
+    (0..scene.domains.len()).flat_map(of_domain).collect()
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_positions_that_a_deformer_shares_are_drawn_step_by_step() {
+    let mut stage = Stage::open();
+    let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
+    let buffers = stage.gl.renderer.load(&scene).expect("loads");
+    let modalcast::render::SharedBuffers { positions, normals, tangents } = buffers.shared;
+    let shared = GlBuffers { positions, normals, tangents };
+    let mut deformer = CudaDeformer::new(&stage.device, &scene, Some(shared)).expect("a deformer");
+    assert!(deformer.shares_buffers(), "interop was refused");
+    let list = triangles(&scene);
+    let all = Group { first: 0, triangles: list.len() as u32, faces: Faces::Both };
+    let positions = GlBuffer { name: positions, bytes: 12 * scene.layout.vertices as u64 };
+    let mesh = Mesh { positions, triangles: list.clone(), groups: vec![all], cut_outs: None };
+    let mut raster = GlRaster::new(&stage.device, mesh).expect("a buffer that is registered twice");
+    let window = flat(300, 200);
+    let keys = stage.gl.room(8 * window.pixels() as u64);
+    for seed in 0..10 {
+        deformer.deform(&scenes::state(&scene, seed)).expect("deforms");
+        let got = stage.ids(&mut raster, &window, keys);
+        let mut want = Raster::new(window);
+        want.draw(&deformer.surface().expect("copies").positions, &list, all);
+        assert_eq!(differing(&got, &want.keys), 0, "step {seed}");
+        assert!(got.iter().any(|key| *key != u64::MAX), "something is seen");
+    }
+    drop((raster, deformer));
+    stage.gl.renderer.unload(buffers);
+}

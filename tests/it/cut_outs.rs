@@ -1,0 +1,187 @@
+//! What is left of a cut-out, against geometry.
+
+use modalcast::raster::{AlphaImage, CutOuts, Surface};
+use modalcast::reference::raster::cut_out::{Footprint, alpha, footprint};
+use modalcast::reference::raster::{Raster, corners};
+use modalcast::scene::Window;
+use nalgebra::{Matrix3, Vector3};
+
+use crate::both::cut_outs::{floor, image, plain_holes, sheet};
+use crate::both::soups::{flat, perspective};
+
+/// Texture coordinates where the ray through a sample meets the plane of a triangle, in f64. The eye is that of
+/// [`perspective`], 60 degrees high.
+fn by_ray(window: &Window, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
+    let [width, height] = window.size().map(f64::from);
+    let focal = 1.0 / 30.0_f64.to_radians().tan();
+    let ray = Vector3::new((2.0 * x / width - 1.0) * width / height / focal, (1.0 - 2.0 * y / height) / focal, -1.0);
+    let [a, b, c] = triangle.map(Vector3::from);
+    // a + s (b - a) + t (c - a) = r ray
+    let solved = Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("a plane");
+    [0, 1].map(|axis| {
+        uvs[0][axis] + solved[0] * (uvs[1][axis] - uvs[0][axis]) + solved[1] * (uvs[2][axis] - uvs[0][axis])
+    })
+}
+
+struct Case {
+    triangle: [[f64; 3]; 3],
+    uvs: [[f64; 2]; 3],
+    pixel: [i32; 2],
+    window: Window,
+}
+
+impl Case {
+    /// The footprint, and the largest error of its coordinates and of its changes; the latter against differences.
+    fn errors(&self) -> (f64, f64) {
+        let positions: Vec<f32> = self.triangle.as_flattened().iter().map(|number| *number as f32).collect();
+        let corners = corners(&self.window, &positions, [0, 1, 2]);
+        let got = footprint(&self.window, &corners, &self.uvs.map(|uv| uv.map(|number| number as f32)), self.pixel);
+        let middle = self.pixel.map(|at| f64::from(at) + 0.5);
+        let at = |x: f64, y: f64| by_ray(&self.window, self.triangle, self.uvs, [middle[0] + x, middle[1] + y]);
+        let worst = |got: [f32; 2], want: [f64; 2]| {
+            (0..2).map(|axis| (f64::from(got[axis]) - want[axis]).abs()).fold(0.0, f64::max)
+        };
+        let slope = |high: [f64; 2], low: [f64; 2]| [0, 1].map(|axis| (high[axis] - low[axis]) / 2e-3);
+        let across = worst(got.across, slope(at(1e-3, 0.0), at(-1e-3, 0.0)));
+        let down = worst(got.down, slope(at(0.0, 1e-3), at(0.0, -1e-3)));
+        (worst(got.uv, at(0.0, 0.0)), across.max(down))
+    }
+}
+
+#[test]
+fn texture_coordinates_are_those_of_the_ray_also_where_corners_are_behind_the_eye() {
+    let window = perspective(192, 128, 0.1, 100.0);
+    let uvs = [[0.0, 0.0], [3.0, 0.0], [3.0, 5.0]];
+    let tilted = [[-2.0, -2.0, -3.0], [2.5, -1.0, -5.0], [0.3, 3.0, -9.0]];
+    let through = [[-9.0, -1.0, 9.0], [9.0, -1.0, 9.0], [2.0, -1.0, -20.0]];
+    let mut worst = (0.0_f64, 0.0_f64);
+    for (triangle, pixels) in [(tilted, [[90, 60], [101, 70], [80, 66]]), (through, [[96, 80], [96, 120], [99, 100]])] {
+        for pixel in pixels {
+            let (of_uv, of_change) = Case { triangle, uvs, pixel, window }.errors();
+            worst = (worst.0.max(of_uv), worst.1.max(of_change));
+        }
+    }
+    assert!(worst.0 < 1e-5 && worst.1 < 1e-4, "{worst:?}");
+    let affine = by_ray(&window, tilted.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
+    let right = by_ray(&window, tilted, uvs, [90.5, 60.5]);
+    assert!((affine[0] - right[0]).abs() > 0.05, "control: without perspective {affine:?} for {right:?}");
+}
+
+#[test]
+fn small_triangles_far_from_the_middle_keep_their_digits() {
+    // 16384 pixels wide, in the last column; 1/50 pixel in size.
+    let window = flat(16384, 64);
+    let pixel = [16383, 1];
+    let middle = [1.0 - 0.5 / 8192.0, 1.0 - 1.5 / 32.0];
+    let size = [0.01 / 8192.0, 0.01 / 32.0];
+    let at = |x: f64, y: f64| [middle[0] + size[0] * x, middle[1] + size[1] * y, 0.0];
+    let positions: Vec<f32> =
+        [at(-1.0, -1.0), at(1.0, -1.0), at(0.0, 1.0)].as_flattened().iter().map(|number| *number as f32).collect();
+    let got =
+        footprint(&window, &corners(&window, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
+    // f32 tells 1/16384^2 of the window: a twentieth of this triangle.
+    assert!((got.uv[0] - 0.5).abs() < 0.06 && (got.uv[1] - 0.5).abs() < 0.06, "{got:?}");
+    assert!((got.across[0] / 50.0 - 1.0).abs() < 0.1, "{got:?}");
+    // Beside the triangle by a snap: the nearest of it, not what lies beyond.
+    let beside =
+        [at(0.2, -1.0), at(2.0, -1.0), at(1.2, 1.0)].as_flattened().iter().map(|n| *n as f32).collect::<Vec<_>>();
+    let got = footprint(&window, &corners(&window, &beside, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
+    assert!((0.0..=1.0).contains(&got.uv[0]) && (0.0..=1.0).contains(&got.uv[1]), "{got:?}");
+}
+
+#[test]
+fn what_has_no_numbers_has_zeros() {
+    let window = flat(8, 8);
+    let uvs = [[0.5, 0.25], [1.0, 0.0], [0.0, 1.0]];
+    let of = |corners: [[f32; 4]; 3], uvs: [[f32; 2]; 3]| footprint(&window, &corners, &uvs, [3, 3]);
+    let good = [[-1.0, -1.0, 0.0, 1.0], [1.0, -1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]];
+    assert!(of(good, uvs) != Footprint::default());
+    assert_eq!(of([good[0]; 3], uvs), Footprint::default());
+    assert_eq!(of(good.map(|corner| corner.map(|number| number * 1e30)), uvs), Footprint::default());
+    assert_eq!(of(good.map(|corner| corner.map(|number| number * 1e-30)), uvs), Footprint::default());
+    assert_eq!(of(good, [[f32::NAN; 2], uvs[1], uvs[2]]), Footprint::default());
+    assert_eq!(of(good, [[3e38, 0.0], [-3e38, 0.0], uvs[2]]), Footprint::default());
+}
+
+fn of_image(image: AlphaImage) -> CutOuts {
+    let table = vec![Surface { alpha: 1.0, least: 0.5, image: Some(0) }];
+    CutOuts { first: 4, uvs: vec![[[0.0; 2]; 3]], surfaces: vec![0], table, images: vec![image], anisotropy: 1.0 }
+}
+
+#[test]
+fn images_repeat_and_are_mixed_between_texels_and_levels() {
+    // 0, 51, 102 ... in a row of 4; level 1 is 2 texels of 255, level 2 one of 0.
+    let cut_outs = of_image(image(4, 1, |level, column, _| [51 * column as u8, 255, 0][level as usize]));
+    let at = |u: f32, change: f32| {
+        let footprint = Footprint { uv: [u, 0.3], across: [change, 0.0], down: [0.0; 2] };
+        alpha(&cut_outs, 4, &footprint)
+    };
+    let is = |got: f32, want: f32| assert!((got - want).abs() < 1e-6, "{got} for {want}");
+    is(at(0.125, 0.0), 0.0);
+    is(at(0.375, 0.25), 0.2);
+    is(at(0.5, 0.1), 0.3);
+    // Between the last texel and the first.
+    is(at(0.0, 0.0), 0.3);
+    for repeat in [-2.0, 1.0, 5.0] {
+        is(at(0.375 + repeat, 0.0), 0.2);
+    }
+    is(at(0.375, 0.5), 1.0);
+    is(at(0.375, 0.25 * 2.0_f32.sqrt()), 0.6);
+    is(at(0.375, 1.0), 0.0);
+    is(at(0.375, 1e30), 0.0);
+    is(at(0.375, f32::MIN_POSITIVE), 0.2);
+}
+
+#[test]
+fn a_sheet_is_its_image_row_by_row_and_its_next_level_at_half_the_size() {
+    let mut random = crate::scenes::Random(3);
+    let own = image(64, 64, |_, _, _| if random.number() < 0.0 { 0 } else { 255 });
+    for level in [0, 1] {
+        let keys = sheet(64 >> level, own.clone()).drawn();
+        let seen: Vec<bool> = keys.ids().iter().map(Option::is_some).collect();
+        let want: Vec<bool> = own.levels[level].iter().map(|texel| *texel == 255).collect();
+        assert!(seen == want, "level {level}");
+    }
+    let turned = own.levels[0].iter().rev().map(|texel| *texel == 255).collect::<Vec<_>>();
+    assert!(sheet(64, own).drawn().ids().iter().map(Option::is_some).ne(turned), "the judge can fail");
+}
+
+#[test]
+fn images_that_say_the_same_everywhere_leave_all_of_a_triangle_or_nothing() {
+    let mut differing = 0;
+    for holes in plain_holes() {
+        let (soup, cut_outs) = (&holes.soup, &holes.cut_outs);
+        // Which surfaces leave anything, as their table says.
+        let keeps = [false, true, false, true, true, false, false];
+        let mut kept = Raster::new(soup.window);
+        for group in &soup.groups {
+            for triangle in group.first..group.first + group.triangles {
+                let own = triangle.checked_sub(cut_outs.first);
+                if own.is_none_or(|own| keeps[cut_outs.surfaces[own as usize] as usize]) {
+                    let one = modalcast::scene::Group { first: triangle, triangles: 1, faces: group.faces };
+                    kept.draw(&soup.positions, &soup.triangles, one);
+                }
+            }
+        }
+        let drawn = holes.drawn();
+        assert!(drawn.keys == kept.keys, "{}", soup.name);
+        differing += drawn.keys.iter().zip(&soup.drawn().keys).filter(|(cut, whole)| cut != whole).count();
+    }
+    assert!(differing > 10_000, "control: {differing} samples see something else than without holes");
+}
+
+#[test]
+fn a_floor_has_holes_through_which_the_wall_is_seen_and_little_of_it_is_doubtful() {
+    let holes = floor(1);
+    let ids = holes.drawn().ids();
+    let of = |wanted: fn(u32) -> bool| ids.iter().flatten().filter(|id| wanted(**id)).count();
+    let (wall, seen) = (of(|id| id < 2), of(|id| id >= 2));
+    let whole = holes.soup.drawn().ids().iter().flatten().filter(|id| **id >= 2).count();
+    assert!(seen > whole / 5 && seen < whole * 4 / 5 && wall > 1000, "{seen} of {whole}, {wall}");
+    let doubtful = holes.doubtful(1.0 / 16.0).iter().filter(|doubt| **doubt).count();
+    assert!((100..whole / 4).contains(&doubtful), "{doubtful} of {whole}");
+    let pieces = floor(40).drawn().ids();
+    let same = |(a, b): (&Option<u32>, &Option<u32>)| a.is_some_and(|id| id >= 2) == b.is_some_and(|id| id >= 2);
+    let unlike = ids.iter().zip(&pieces).filter(|pair| !same(*pair)).count();
+    assert!(unlike < whole / 50, "in pieces {unlike} of {whole} samples differ");
+}
