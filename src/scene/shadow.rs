@@ -37,7 +37,8 @@ pub enum Blurring {
     /// Tiles on hardware, rows in software.
     #[default]
     Fitting,
-    /// One compute pass over tiles in shared memory.
+    /// One compute pass: over strips, with sums in registers; over tiles in shared memory where a blur above 8 reaches too
+    /// far for that.
     Tiles,
     /// Two compute passes without shared memory.
     Rows,

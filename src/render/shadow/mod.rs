@@ -3,12 +3,13 @@
 
 mod shared;
 mod sources;
+mod strip;
 
 use std::rc::Rc;
 
 pub(super) use self::shared::Shared;
-use self::sources::RUN;
-pub(super) use self::sources::{Tile, defines};
+pub(super) use self::sources::defines;
+use self::sources::{RUN, made_at_once};
 use super::geometry::Kind;
 use super::gl::{self, Clear, Fixed, Framebuffer, Gl, Program, Texture, TextureKind};
 use super::passes::{draw_kind, listed};
@@ -147,10 +148,9 @@ pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<b
     }
     for layer in 0..map.shadow.splits {
         match (programs.as_slice(), &blurred.half) {
-            ([tiles], None) => {
-                let tile = Tile::of(&map.shadow);
-                let groups = [tile.wide, tile.tall].map(|side| map.shadow.size.div_ceil(side));
-                begin(tiles, &map.depth, map, layer);
+            ([both], None) => {
+                let groups = made_at_once(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
+                begin(both, &map.depth, map, layer);
                 blurred.moments.bind_image_layer(0, layer);
                 gl.dispatch(groups[0], groups[1]);
             }

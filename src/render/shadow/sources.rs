@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use super::super::geometry::Kind;
 use super::super::gl;
 use super::super::shaders::{CASTER, DRAWN, FRAME, LANES, Options, Slopes, Source, drawn};
+use super::strip::Strip;
 use crate::scene::{Blurring, Moments, Shadow, ShadowMethod};
 
 const SUN: &str = include_str!("../../../shaders/shared/sun.glsl");
@@ -16,7 +17,7 @@ pub(in crate::render) const RUN: u32 = 8;
 /// Lanes of a workgroup that blurs a tile.
 const TILE_LANES: u32 = 256;
 /// The shared memory that every device gives a workgroup.
-const SHARED_BYTES: u32 = 32 << 10;
+pub(super) const SHARED_BYTES: u32 = 32 << 10;
 
 /// The branches of a kind of map.
 pub(in crate::render) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'static str> {
@@ -29,18 +30,24 @@ pub(in crate::render) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'stat
     ["SHADOWS", method].into_iter().chain(splits)
 }
 
+/// Texels of the map that a workgroup of the blur in one pass makes: columns and rows.
+pub(in crate::render) fn made_at_once(shadow: &Shadow) -> [u32; 2] {
+    let tile = Tile::of(shadow);
+    Strip::of(shadow).map_or([tile.wide, tile.tall], |strip| [Strip::WIDE, strip.tall])
+}
+
 /// A workgroup's tile of the map: its sides, and how many rows of depth it holds at once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::render) struct Tile {
-    pub(in crate::render) wide: u32,
-    pub(in crate::render) tall: u32,
+struct Tile {
+    wide: u32,
+    tall: u32,
     band: u32,
     reach: u32,
 }
 
 impl Tile {
     /// The first of these that fits into shared memory: a wider reach leaves room for fewer texels at once.
-    pub(in crate::render) fn of(shadow: &Shadow) -> Self {
+    fn of(shadow: &Shadow) -> Self {
         let reach = shadow.reach();
         let sizes = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
         // All rows at once where they fit: a second band would leave most lanes idle.
@@ -104,7 +111,7 @@ impl Options {
     /// The programs that make blurred moments of depth, in order.
     pub(in crate::render) fn blur(&self) -> Vec<Source> {
         match self.shadow.blurring {
-            Blurring::Fitting | Blurring::Tiles => vec![self.blur_tiles()],
+            Blurring::Fitting | Blurring::Tiles => vec![self.blur_at_once()],
             Blurring::Rows | Blurring::Fragments => vec![self.blur_along(true), self.blur_along(false)],
         }
     }
@@ -144,9 +151,17 @@ impl Options {
         Source { label, stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
     }
 
-    /// Both directions of the blur, tile by tile.
-    fn blur_tiles(&self) -> Source {
-        let (tile, weights) = (Tile::of(&self.shadow), weights(self.shadow.blur));
+    /// Both directions of the blur, strip by strip where the reach allows it.
+    fn blur_at_once(&self) -> Source {
+        let weights = weights(self.shadow.blur);
+        let Some(strip) = Strip::of(&self.shadow) else { return self.blur_tiles(&weights) };
+        let text = self.blur_head(&["FIRST"], Strip::WIDE, 1) + &strip.text(&weights);
+        Source { label: "blur, strips".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    }
+
+    /// The same tile by tile.
+    fn blur_tiles(&self, weights: &[f32]) -> Source {
+        let tile = Tile::of(&self.shadow);
         let Tile { wide, tall, band, reach } = tile;
         let mut text = self.blur_head(&["FIRST"], TILE_LANES, RUN);
         writeln!(text, "#define WIDE {wide}\n#define TALL {tall}\n#define BAND {band}\n#define REACH {reach}").ok();
@@ -154,8 +169,8 @@ impl Options {
         writeln!(text, "shared float depths[BAND * DEPTH_PITCH];").ok();
         writeln!(text, "shared vec2 rows[(TALL + 2 * REACH) * PITCH];").ok();
         writeln!(text, "vec2 pair(float m) {{ return vec2(m, m * m); }}").ok();
-        text += &taps("across", "int at", &weights, RUN, |tap| format!("pair(depths[at + {tap}])"));
-        text += &taps("down", "int at", &weights, RUN, |tap| format!("rows[at + {tap} * PITCH]"));
+        text += &taps("across", "int at", weights, RUN, |tap| format!("pair(depths[at + {tap}])"));
+        text += &taps("down", "int at", weights, RUN, |tap| format!("rows[at + {tap} * PITCH]"));
         text += include_str!("../../../shaders/blur_tile.comp");
         Source { label: "blur, tiles".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }

@@ -1,0 +1,145 @@
+//! The blur of a variance map by strips: the text of its shader, with every sum in a variable of its own. Arrays would do
+//! where compilers keep them in registers, and not all do.
+
+use std::fmt::Write as _;
+
+use crate::scene::Shadow;
+
+/// Rows that a turn of the walk takes.
+const TURN: u32 = 4;
+const LANES: u32 = 64;
+/// The widest reach of which the sums stay in the registers of a lane.
+const WIDEST: u32 = 24;
+
+/// A workgroup's strip of the map: a column for each lane, and the rows that it makes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::render) struct Strip {
+    pub(in crate::render) tall: u32,
+    pub(in crate::render) reach: u32,
+}
+
+impl Strip {
+    pub(in crate::render) const WIDE: u32 = LANES;
+
+    /// None where the blur reaches too far. A tall strip begins seldom, which costs 2 `reach` rows; a small map needs many
+    /// strips, so that all of a device has work.
+    pub(in crate::render) fn of(shadow: &Shadow) -> Option<Self> {
+        let reach = shadow.reach();
+        let rows = (shadow.size / 32).clamp(16, 128) + 2 * reach;
+        let tall = rows.next_multiple_of(TURN) - 2 * reach;
+        (reach <= WIDEST).then_some(Self { tall, reach })
+    }
+
+    /// Bytes of shared memory.
+    #[cfg(test)]
+    pub(in crate::render) const fn bytes(self) -> u32 {
+        4 * 2 * TURN * (LANES + 2 * self.reach)
+    }
+
+    /// The shader behind its head, which tells LANES, for half a bell of these weights.
+    pub(in crate::render) fn text(self, weights: &[f32]) -> String {
+        let Self { tall, reach } = self;
+        let text = format!("#define TALL {tall}\n#define TURN {TURN}\n#define REACH {reach}\n");
+        let body = include_str!("../../../shaders/blur_strip.comp");
+        let parts = [("// @SUMS", self.sums()), ("// @LOAD", self.load()), ("// @ADD", self.add(weights))];
+        text + &parts.into_iter().fold(String::from(body), |body, (place, part)| body.replace(place, &part))
+    }
+
+    /// What a turn hands to the next: the sums that are begun.
+    fn sums(self) -> String {
+        (0..2 * self.reach).map(|sum| format!("vec2 sum{sum} = vec2(0.0);\n")).collect()
+    }
+
+    /// Depths of a turn's rows to shared memory: first a lane's own column, then what lies to both sides. All are on their
+    /// way before one is waited for.
+    fn load(self) -> String {
+        let (reach, wide) = (self.reach, LANES + 2 * self.reach);
+        let (mut read, mut write) = (String::new(), String::new());
+        for row in 0..TURN {
+            let at = format!("corner + ivec2(lane, first + {row} - {reach})");
+            writeln!(read, "float own{row} = centred({at}, side);").ok();
+            writeln!(write, "depths[half_at + {} + lane] = own{row};", row * wide + reach).ok();
+        }
+        let cells = TURN * 2 * reach;
+        for (index, begin) in (0..cells).step_by(LANES as usize).enumerate() {
+            writeln!(read, "int cell{index} = {begin} + lane, row{index} = cell{index} / {};", 2 * reach).ok();
+            writeln!(read, "int column{index} = cell{index} % {};", 2 * reach).ok();
+            writeln!(read, "if (column{index} >= {reach}) column{index} += {LANES};").ok();
+            writeln!(read, "float beside{index} = 0.0;").ok();
+            let inside = if begin + LANES > cells { format!("if (cell{index} < {cells}) ") } else { String::new() };
+            let at = format!("corner + ivec2(column{index}, first + row{index}) - {reach}");
+            writeln!(read, "{inside}beside{index} = centred({at}, side);").ok();
+            writeln!(write, "{inside}depths[half_at + row{index} * {wide} + column{index}] = beside{index};").ok();
+        }
+        read + &write
+    }
+
+    /// A turn's rows, blurred, to the sums that they are part of; sums that are whole are stored.
+    fn add(self, weights: &[f32]) -> String {
+        let reach = self.reach;
+        let weight = |from: u32, to: u32| format!("{:?}", weights[from.abs_diff(to) as usize]);
+        let mut text = String::new();
+        for row in 0..TURN {
+            writeln!(text, "vec2 blurred{row} = vec2(0.0);").ok();
+            for tap in 0..=2 * reach {
+                let from = row * (LANES + 2 * reach) + tap;
+                writeln!(text, "float m{row}_{tap} = depths[half_at + {from} + lane];").ok();
+                let pair = format!("vec2(m{row}_{tap}, m{row}_{tap} * m{row}_{tap})");
+                writeln!(text, "blurred{row} += {} * {pair};", weight(tap, reach)).ok();
+            }
+            for sum in row..row + 2 * reach {
+                writeln!(text, "sum{sum} += {} * blurred{row};", weight(sum, row + reach)).ok();
+            }
+            let last = row + 2 * reach;
+            writeln!(text, "vec2 sum{last} = {} * blurred{row};", weight(last, row + reach)).ok();
+            let at = format!("corner + ivec2(lane, first + {row} - {})", 2 * reach);
+            let within = (2 * reach).saturating_sub(row);
+            writeln!(text, "if (first >= {within}) imageStore(to, {at}, vec4(sum{row}, 0.0, 0.0));").ok();
+        }
+        for sum in 0..2 * reach {
+            writeln!(text, "sum{sum} = sum{};", sum + TURN).ok();
+        }
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sources::{SHARED_BYTES, weights};
+    use super::*;
+
+    fn strip(blur: f32, size: u32) -> Option<Strip> {
+        Strip::of(&Shadow { blur, size, ..Shadow::default() })
+    }
+
+    #[test]
+    fn strips_fit_into_shared_memory_and_are_walked_in_whole_turns_up_to_the_widest_reach() {
+        for step in 0..=160 {
+            let blur = step as f32 / 10.0;
+            for size in [16, 512, 1000, 4096, 16384] {
+                let Some(strip) = strip(blur, size) else {
+                    assert!(blur > 8.0, "{blur}");
+                    continue;
+                };
+                assert!(strip.bytes() <= SHARED_BYTES && strip.reach <= WIDEST && strip.tall >= 16, "{strip:?}");
+                assert_eq!((strip.tall + 2 * strip.reach) % TURN, 0, "{strip:?}");
+            }
+        }
+        assert!(strip(8.1, 1024).is_none(), "control");
+    }
+
+    #[test]
+    fn a_turn_adds_every_row_to_all_its_sums_and_stores_each_that_is_whole() {
+        for blur in [0.0, 0.3, 1.5, 2.3, 8.0] {
+            let (strip, weights) = (strip(blur, 4096).expect("narrow enough"), weights(blur));
+            let text = strip.text(&weights);
+            let (taps, count) = (2 * strip.reach + 1, |part: &str| text.matches(part).count() as u32);
+            assert_eq!((count("@"), count("imageStore(to")), (0, TURN), "{blur}");
+            assert_eq!(count("depths[half_at + ") - count("] = "), TURN * taps, "{blur}: depths read");
+            assert_eq!(count(" * blurred"), TURN * taps, "{blur}: sums");
+            let centre = format!("{:?} * blurred0", weights[0]);
+            let own_row = format!("sum{} += {centre}", strip.reach);
+            assert!(text.contains(&own_row) || strip.reach == 0, "{blur}: the middle row has the middle weight");
+        }
+    }
+}
