@@ -146,7 +146,7 @@ impl CudaDeformer {
         let bounds = self.flights[flight].wait().inspect_err(|_| self.forget())?;
         let whole = begin.elapsed().as_secs_f64() * 1e3;
         let own = self.flights[flight].own_ms().inspect_err(|_| self.forget())?;
-        Ok(Deformed { bounds, ms: own.unwrap_or(whole) })
+        Ok(Deformed { bounds, light: None, ms: own.unwrap_or(whole) })
     }
 
     /// Starts the whole graph of the last step once more, for measuring it alone: outputs of our own stay where they are.

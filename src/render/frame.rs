@@ -6,7 +6,7 @@ use nalgebra::{Matrix4, Vector3};
 use super::Shot;
 use super::light::{Fit, LightBox};
 use crate::error::{Result, invalid};
-use crate::scene::{Bounds, Scene};
+use crate::scene::{Bounds, LightBounds, Scene};
 
 /// Twin of `FrameBlock` in `shaders/shared/frame.glsl`; columns of matrices follow each other.
 #[repr(C)]
@@ -88,6 +88,11 @@ fn sound(scene: &Scene, shot: &Shot) -> Bounds {
     if sound { shot.bounds } else { scene.rest_bounds }
 }
 
+/// What the vertices of a shot take up in light space, unless that or their bounds overflowed.
+fn lit(shot: &Shot) -> Option<LightBounds> {
+    shot.light.filter(|light| light.is_sound() && shot.bounds.is_finite())
+}
+
 /// What the sun's box is fitted to, relative to `origin` as the positions are.
 pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
     let bounds = sound(scene, shot);
@@ -97,6 +102,7 @@ pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
         to_sun: scene.look.to_sun(scene.up),
         up: scene.up,
         bounds,
+        light: lit(shot),
         ground: scene.look.ground.map(|_| height),
         size: f64::from(shadow.size),
         rim: f64::from(shadow.reach()) + 1.0,
@@ -203,8 +209,13 @@ mod tests {
     #[test]
     fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
-        let mut shot =
-            Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: scene.rest_bounds };
+        let mut shot = Shot {
+            camera: Camera::framing(&scene, 64, 64),
+            width: 64,
+            height: 64,
+            bounds: scene.rest_bounds,
+            light: None,
+        };
         let good = Frame::new(&scene, &shot, [0.0; 3]).expect("good");
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced"), good);

@@ -108,7 +108,7 @@ pub(super) fn draw_sized(
     let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = Shot { camera, width, height, bounds };
+    let shot = Shot { camera, width, height, bounds, light: None };
     let image = renderer.draw(&buffers, &shot).expect("draws");
     let (ran, allocated) = (renderer.ran().clone(), buffers.allocated());
     renderer.unload(buffers);

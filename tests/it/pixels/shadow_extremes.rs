@@ -40,7 +40,7 @@ fn picture(meshes: &[Mesh], sun: [f32; 3], shadow: Shadow, camera: Option<(f64, 
     let mut renderer = open();
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    renderer.draw(&buffers, &Shot { camera: shown, width: 32, height: 32, bounds }).expect("draws")
+    renderer.draw(&buffers, &Shot { camera: shown, width: 32, height: 32, bounds, light: None }).expect("draws")
 }
 
 fn black(image: &Image) -> usize {
@@ -110,7 +110,7 @@ fn frames(scene: &std::sync::Arc<Scene>) -> Vec<Image> {
         Bounds { min: rest.min, max: [rest.max[0] * (1.0 + 2.0 * by), rest.max[1], rest.max[2] * (1.0 + by)] }
     };
     let mut frame = |step: u32| {
-        let shot = Shot { camera, width: 96, height: 96, bounds: grown(step) };
+        let shot = Shot { camera, width: 96, height: 96, bounds: grown(step), light: None };
         renderer.draw(&buffers, &shot).expect("draws")
     };
     (0..60).map(&mut frame).collect()

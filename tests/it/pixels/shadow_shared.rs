@@ -37,7 +37,7 @@ fn cameras(scene: &Scene) -> [Camera; 2] {
 }
 
 fn shot(camera: Camera, bounds: Bounds) -> Shot {
-    Shot { camera, width: 64, height: 64, bounds }
+    Shot { camera, width: 64, height: 64, bounds, light: None }
 }
 
 fn shadows(renderer: &Renderer) -> usize {
