@@ -252,6 +252,8 @@ mod tests {
         good.q[0] = 0.25;
         staged.deform(&good).expect("a good step");
         let before = staged.surface().expect("vertices").clone();
+        let light = staged.light;
+        assert!(light.is_some_and(|light| light.is_sound()));
         let last = scene.layout.slots[1].first_q;
         for amount in [f32::MAX, 1e30] {
             let mut bad = good.clone();
@@ -259,7 +261,7 @@ mod tests {
             let refusal = staged.deform(&bad).expect_err("overflows").to_string();
             assert!(refusal.starts_with("step.q of domain 'right'"), "{refusal}");
             assert_eq!(staged.surface().expect("vertices"), &before);
-            assert!(staged.bounds().is_finite());
+            assert!(staged.bounds().is_finite() && staged.light == light);
         }
         assert_ne!(before, Surface::default());
     }

@@ -220,6 +220,12 @@ mod tests {
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             assert_eq!(Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced"), good);
         }
+        let measured = LightBounds(Bounds { min: [-0.25; 3], max: [0.25; 3] });
+        let with = |light| Frame::new(&scene, &Shot { light: Some(light), ..shot }, [0.0; 3]).expect("good");
+        assert_ne!(with(measured), good, "control: what was measured decides");
+        for lost in [LightBounds::EMPTY, measured.widened(f64::NAN), measured.widened(f64::INFINITY)] {
+            assert_eq!(with(lost), good, "{lost:?}");
+        }
         shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let refusal = Frame::new(&scene, &shot, [0.0; 3]).expect_err("overflows").to_string();
         assert!(refusal.starts_with("camera:"), "{refusal}");

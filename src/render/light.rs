@@ -154,6 +154,43 @@ mod tests {
         }
     }
 
+    /// A ball inside the bounds of [`fit`], each axis scaled.
+    fn ball(scale: [f64; 3]) -> Vec<Point3<f64>> {
+        let point = |at: u32| {
+            let (turn, height) = (2.4 * f64::from(at), f64::from(at) / 250.0 - 1.0);
+            let round = (1.0 - height * height).max(0.0).sqrt();
+            Point3::new(scale[0] * round * turn.cos(), 1.5 + scale[1] * height, scale[2] * round * turn.sin())
+        };
+        (0..=500).map(point).collect()
+    }
+
+    fn held(fit: &Fit, points: &[Point3<f64>]) -> Option<LightBounds> {
+        let axes = light_axes(fit.to_sun, fit.up);
+        let one =
+            |point: &Point3<f64>| LightBounds::of_box(&axes, &Bounds { min: (*point).into(), max: (*point).into() });
+        Some(points.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union))
+    }
+
+    #[test]
+    fn a_box_around_what_was_measured_holds_it_and_its_shadow_and_is_smaller_than_one_around_the_corners() {
+        for sun in [Vector3::new(0.4, 0.8, 0.5), Vector3::new(1.0, 0.3, 0.0), Vector3::new(-0.5, 0.6, 0.7)] {
+            let (corners, points) = (fit(sun, Some(-0.5)), ball([0.9, 1.4, 1.9]));
+            let fit = Fit { light: held(&corners, &points), ..corners };
+            let (light, by_corners) = (LightBox::fit(&fit), LightBox::fit(&corners));
+            for point in points {
+                let shadow = point - fit.to_sun * ((point.y + 0.5) / fit.to_sun.y);
+                for point in [point, shadow] {
+                    let at = light.map_from_world.transform_point(&point);
+                    let rim = fit.rim / fit.size;
+                    assert!(at.xy().iter().all(|number| (rim..=1.0 - rim).contains(number)), "{sun} {at}");
+                    assert!((0.0..=1.0).contains(&at.z), "{sun} {at}");
+                }
+            }
+            let area = |light: &LightBox| light.sides[0].half * light.sides[1].half;
+            assert!(area(&light) < 0.9 * area(&by_corners), "{sun}");
+        }
+    }
+
     #[test]
     fn a_ground_far_below_and_a_sun_on_the_horizon_stay_finite() {
         for (sun, ground) in [
@@ -173,12 +210,15 @@ mod tests {
 
     /// Where a fixed point falls between the texels of the map, over bounds that sway and grow slowly: the most that it
     /// moves from step to step, in texels, but for the steps at which the map takes another rung; and their number.
-    fn crawl(place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
+    fn crawl(is_lit: bool, place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
         let mut fit = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut last, mut most, mut jumps): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
         for step in 0..400 {
             let sway = f64::from(step) * 0.3;
             fit.bounds.max = [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
+            let [x, y, z] = fit.bounds.max;
+            // A size that does not sway about a rung.
+            fit.light = held(&fit, &ball([x, 0.5 * y, z].map(|scale| 0.95 * scale))).filter(|_| is_lit);
             let at = place(&fit).map(|number| number * fit.size);
             let width = LightBox::fit(&fit).sides[0].half + LightBox::fit(&fit).sides[1].half;
             if let Some((before, was)) = last {
@@ -191,14 +231,16 @@ mod tests {
     }
 
     #[test]
-    fn texels_stay_where_they_are_in_the_world_while_the_bounds_sway_and_grow() {
+    fn texels_stay_where_they_are_in_the_world_while_the_scene_sways_and_grows() {
         let point = Point3::new(0.3, 1.1, -0.7);
-        let (most, jumps) = crawl(|fit| {
-            let at = LightBox::fit(fit).map_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
-            [at.x, at.y]
-        });
-        assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs");
-        let (most, _) = crawl(|fit| {
+        for is_lit in [false, true] {
+            let (most, jumps) = crawl(is_lit, |fit| {
+                let at = LightBox::fit(fit).map_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
+                [at.x, at.y]
+            });
+            assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs, measured {is_lit}");
+        }
+        let (most, _) = crawl(false, |fit| {
             let axes = light_axes(fit.to_sun, fit.up);
             [0, 1].map(|axis| {
                 let ends = fit.bounds.corners().map(|corner| axes[axis].dot(&corner.coords));

@@ -8,6 +8,7 @@ mod device;
 mod extremes;
 mod interop;
 mod judge;
+mod light;
 mod normals;
 mod overlap;
 mod raster;
