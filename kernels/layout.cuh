@@ -26,10 +26,10 @@ struct Header {
     unsigned step;       // this step; counts from 1
     unsigned changed;    // domains in the list of `apply`
     unsigned stale;      // tiles in its other list
-    unsigned reserved;
-    unsigned bounds[6];  // `ordered` maxima of -x, -y, -z, x, y, z; sent as zeros
+    unsigned reserved[3];
+    unsigned bounds[12]; // `ordered` maxima of -x, -y, -z, x, y, z; with LIGHT of the same in light space; sent as zeros
 };
-static_assert(sizeof(Header) == 80, "Header differs from src/gpu/layout.rs");
+static_assert(sizeof(Header) == 112, "Header differs from src/gpu/layout.rs");
 
 // `kind` of a tile: how many items its last quad has, 0 in a mixed tile; whether positions are computed of its items,
 // and whether normals and tangents are. A tile of both computes corner i of a shape with vertex i.
@@ -173,8 +173,10 @@ struct BoundsArgs {
     unsigned* piece_boxes;
     unsigned count;
     unsigned piece_count;
+    float light[9]; // with LIGHT: the axes of light space, one after the other
+    unsigned reserved;
 };
-static_assert(sizeof(BoundsArgs) == 48, "BoundsArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/gpu/layout.rs");
 
 struct ApplyArgs {
     const Header* header;

@@ -12,6 +12,11 @@ __device__ inline unsigned ordered(float x) {
     return x != x ? 0xffffffffu : ordered_number(x);
 }
 
+// The number that a key stands for; of 0, which no number has, and of the NaN's key a NaN.
+__device__ inline float number_of(unsigned key) {
+    return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
+}
+
 __device__ inline unsigned warp_max(unsigned key) {
 #if __CUDA_ARCH__ >= 800
     return __reduce_max_sync(0xffffffffu, key);

@@ -8,7 +8,7 @@
 use std::sync::Arc;
 
 use crate::error::Result;
-use crate::scene::{Bounds, State};
+use crate::scene::{Bounds, LightBounds, State};
 
 /// Deformed vertices of a whole scene, packed as the scene's layout says.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -132,6 +132,11 @@ pub struct Deformed {
     /// Bounds of all deformed positions as they are in [`Surface`]. Not finite when f32 overflowed somewhere, in a
     /// displacement that is kept too.
     pub bounds: Bounds,
+    /// What the same positions take up along the axes of light space ([`Scene::light_axes`](crate::scene::Scene)), relative
+    /// to the same origin; none where the look has no shadow. It holds every vertex. `reference` is as tight as the
+    /// vertices are; the others put boxes around up to 128 vertices each and reach beyond by less than the diagonal of
+    /// such a box, and never beyond the corners of `bounds` by more than rounding.
+    pub light: Option<LightBounds>,
     /// Milliseconds from the call until the vertices were there; with vertices in the renderer's own buffers, without the
     /// wait for frames that are still drawn from them.
     pub ms: f64,

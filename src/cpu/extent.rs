@@ -1,8 +1,9 @@
 //! The bounds of one tile, kept so that what did not change still counts.
 
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use crate::scene::Bounds;
+use crate::scene::{Bounds, LightBounds};
 
 /// Bounds of f32 positions: all NaN as soon as one of them is not finite, `min > max` for none.
 #[derive(Debug, Clone, Copy)]
@@ -64,6 +65,12 @@ impl Extent {
     /// Bounds of all tiles.
     pub(super) fn all(extents: &[Self]) -> Bounds {
         extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
+    }
+
+    /// What all tiles take up along these axes of light space, from the corners of their boxes.
+    pub(super) fn along(extents: &[Self], axes: &[Vector3<f64>; 3]) -> LightBounds {
+        let one = |extent: &Self| LightBounds::of_box(axes, &extent.to_bounds());
+        extents.par_iter().with_min_len(4096).map(one).reduce(|| LightBounds::EMPTY, LightBounds::union)
     }
 
     /// Bounds of the tiles of one domain.

@@ -140,7 +140,8 @@ impl Deformer for CpuDeformer {
         } else {
             orient::orient(&self.scene, state, corners, &mut self.surface);
         }
-        Ok(Deformed { bounds: Extent::all(&self.extents), ms: begin.elapsed().as_secs_f64() * 1e3 })
+        let light = self.scene.light_axes().map(|axes| Extent::along(&self.extents, &axes));
+        Ok(Deformed { bounds: Extent::all(&self.extents), light, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
     fn surface(&mut self) -> Result<&Surface> {

@@ -9,13 +9,30 @@ use crate::error::{Error, Result, during, invalid};
 use crate::frame::Legend;
 use crate::raster::{Mesh, Rasteriser};
 use crate::render::{Renderer, SceneBuffers, Shot};
-use crate::scene::{Bounds, Camera, Scene, State, nearest_cell};
+use crate::scene::{Bounds, Camera, LightBounds, Scene, State, nearest_cell};
 
 /// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
 const FARTHEST: f64 = 1e18;
 
 /// Pixels of the frames that are measured to choose what draws.
 const MEASURED: [u32; 2] = [1920, 1080];
+
+/// What the buffers hold, in the frame that suits a camera.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Filled {
+    bounds: Bounds,
+    /// None in a frame of the camera's own: the deformer measured in others.
+    light: Option<LightBounds>,
+    /// Whether an upload was needed.
+    pub(super) uploaded: bool,
+}
+
+impl Filled {
+    /// A frame of it.
+    pub(super) const fn shot(&self, camera: Camera, [width, height]: [u32; 2]) -> Shot {
+        Shot { camera, width, height, bounds: self.bounds, light: self.light }
+    }
+}
 
 /// A scene that can be deformed and drawn.
 pub struct Staged {
@@ -25,6 +42,8 @@ pub struct Staged {
     /// Whether the buffers hold the vertices of the last deformation.
     filled: bool,
     bounds: Bounds,
+    /// Of the same vertices; with a shadow.
+    light: Option<LightBounds>,
     /// What the deformer's output shows.
     shown: Arc<State>,
     /// Counts what was deformed, refused states and their repair too: each is another content of the buffers.
@@ -43,6 +62,7 @@ impl Staged {
             buffers,
             filled: false,
             bounds: scene.rest_bounds,
+            light: None,
             shown,
             turn: 0,
             mapped: None,
@@ -55,7 +75,7 @@ impl Staged {
         if !is_near(&deformed.bounds) {
             return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
         }
-        self.bounds = deformed.bounds;
+        (self.bounds, self.light) = (deformed.bounds, deformed.light);
         Ok(())
     }
 
@@ -90,7 +110,7 @@ impl Staged {
             }
         };
         if is_near(&deformed.bounds) {
-            self.bounds = deformed.bounds;
+            (self.bounds, self.light) = (deformed.bounds, deformed.light);
             self.shown = Arc::clone(state);
             return Ok(deformed);
         }
@@ -112,9 +132,8 @@ impl Staged {
         self.deformer.surface()
     }
 
-    /// Makes the buffers if need be and brings the last deformation into them, in a frame that suits the camera. Returns
-    /// the bounds in that frame, and whether an upload was needed.
-    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<(Bounds, bool)> {
+    /// Makes the buffers if need be and brings the last deformation into them, in a frame that suits the camera.
+    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<Filled> {
         let uploaded = self.fill_shared(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
         let apart = match &self.shown.cells {
@@ -123,14 +142,14 @@ impl Staged {
             cells => {
                 buffers.relative_to(cells.as_ref().map_or([0.0; 3], |cells| cells.shared()));
                 buffers.hold_step(self.turn);
-                return Ok((self.bounds, uploaded));
+                return Ok(Filled { bounds: self.bounds, light: self.light, uploaded });
             }
         };
         let view = nearest_cell(camera.eye().into());
         let positions = &self.deformer.read(Wanted::VERTICES)?.positions;
         let (positions, bounds) = apart.seen_from(view, &self.scene, positions);
         renderer.upload_apart(buffers, &positions, view)?;
-        Ok((bounds, true))
+        Ok(Filled { bounds, light: None, uploaded: true })
     }
 
     /// Begins to bring what is wanted of the last deformation to host memory, beside what is deformed next.
@@ -194,10 +213,9 @@ impl Staged {
 
     /// Lets the faster of both draw each pass, as frames of this size are drawn of the scene where it is.
     pub(super) fn choose_paths(&mut self, renderer: &mut Renderer) -> Result<()> {
-        let [width, height] = MEASURED;
-        let camera = Camera::framing(&self.scene, width, height);
-        let (bounds, _) = self.fill_buffers(renderer, &camera)?;
-        renderer.choose_paths(self.buffers()?, &Shot { camera, width, height, bounds }).map(drop)
+        let camera = Camera::framing(&self.scene, MEASURED[0], MEASURED[1]);
+        let filled = self.fill_buffers(renderer, &camera)?;
+        renderer.choose_paths(self.buffers()?, &filled.shot(camera, MEASURED)).map(drop)
     }
 
     pub(super) fn buffers(&self) -> Result<&SceneBuffers> {
@@ -256,6 +274,8 @@ mod tests {
         good.q[0] = 0.25;
         staged.deform(&good).expect("a good step");
         let before = staged.surface().expect("vertices").clone();
+        let light = staged.light;
+        assert!(light.is_some_and(|light| light.is_sound()));
         let last = scene.layout.slots[1].first_q;
         for amount in [f32::MAX, 1e30] {
             let mut bad = good.clone();
@@ -263,7 +283,7 @@ mod tests {
             let refusal = staged.deform(&bad).expect_err("overflows").to_string();
             assert!(refusal.starts_with("step.q of domain 'right'"), "{refusal}");
             assert_eq!(staged.surface().expect("vertices"), &before);
-            assert!(staged.bounds().is_finite());
+            assert!(staged.bounds().is_finite() && staged.light == light);
         }
         assert_ne!(before, Surface::default());
     }

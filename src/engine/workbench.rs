@@ -13,7 +13,7 @@ use crate::frame::Legend;
 use crate::gpu::{self, CudaDeformer, GlBuffers, GlRaster};
 use crate::raster::{Mesh, Rasteriser};
 use crate::reference::ReferenceDeformer;
-use crate::render::{self, Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Shot, Survey, Ticket};
+use crate::render::{self, Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Survey, Ticket};
 use crate::scene::{Camera, Rastering, Rectangle, Scene};
 use crate::telemetry::{Stage, ms_since};
 
@@ -159,9 +159,9 @@ impl Workbench {
         let camera = camera.checked()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let begin = Instant::now();
-        let (bounds, uploaded) = staged.fill_buffers(renderer, &camera)?;
-        let upload_ms = uploaded.then(|| ms_since(begin));
-        let shot = Shot { camera, width, height, bounds };
+        let filled = staged.fill_buffers(renderer, &camera)?;
+        let upload_ms = filled.uploaded.then(|| ms_since(begin));
+        let shot = filled.shot(camera, [width, height]);
         Ok(Drawing { ticket: renderer.submit(staged.buffers()?, &shot)?, upload_ms })
     }
 
@@ -187,12 +187,12 @@ impl Workbench {
         &mut self,
         staged: &mut Staged,
         camera: &Camera,
-        [width, height]: [u32; 2],
+        size: [u32; 2],
         showing: Showing,
     ) -> Result<(Survey, Option<Legend>)> {
         let camera = camera.checked()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let (bounds, _) = staged.fill_buffers(renderer, &camera)?;
+        let shot = staged.fill_buffers(renderer, &camera)?.shot(camera, size);
         let legend = staged.map_values(renderer, showing)?;
         let field = match (showing, &legend) {
             (_, Some(legend)) => Field::Values { largest: legend.largest as f32 },
@@ -200,7 +200,7 @@ impl Workbench {
             (Showing::Normals, _) => Field::Normals,
             _ => Field::Domains,
         };
-        let survey = renderer.survey(staged.buffers()?, &Shot { camera, width, height, bounds }, field)?;
+        let survey = renderer.survey(staged.buffers()?, &shot, field)?;
         Ok((survey, legend))
     }
 
@@ -212,13 +212,13 @@ impl Workbench {
         &mut self,
         staged: &mut Staged,
         camera: &Camera,
-        [width, height]: [u32; 2],
+        size: [u32; 2],
         rectangle: Rectangle,
     ) -> Result<Pick> {
         let camera = camera.checked()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let (bounds, _) = staged.fill_buffers(renderer, &camera)?;
-        renderer.begin_pick(staged.buffers()?, &Shot { camera, width, height, bounds }, rectangle)
+        let shot = staged.fill_buffers(renderer, &camera)?.shot(camera, size);
+        renderer.begin_pick(staged.buffers()?, &shot, rectangle)
     }
 
     /// Waits for a pick; the hits, row by row.

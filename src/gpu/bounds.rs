@@ -1,7 +1,8 @@
-//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`, and of each domain where the
-//! scene keeps boxes.
+//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`, those in light space where the
+//! look has a shadow, and those of each domain where the scene keeps boxes.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
+use nalgebra::Vector3;
 
 use super::boxes::Boxes;
 use super::chain;
@@ -11,36 +12,72 @@ use super::inputs::Values;
 use super::layout::{BoundsArgs, Piece};
 use super::plan::Kernel;
 use crate::error::Result;
+use crate::scene::{LightBounds, Scene};
 
 /// The kernel.
 #[derive(Debug)]
 pub(super) struct Bounds {
     pub(super) function: CudaFunction,
     config: LaunchConfig,
+    /// The axes of light space, of a scene with a shadow.
+    light: Option<[Vector3<f64>; 3]>,
     /// Of a scene that keeps them.
     pub(super) boxes: Option<Boxes>,
 }
 
 impl Bounds {
     /// With `pieces`, a box of each domain is made too.
-    pub(super) fn new(device: &Device, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
+    pub(super) fn new(device: &Device, scene: &Scene, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
         Ok(Self {
             function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
             config: config(kernel),
+            light: scene.light_axes(),
             boxes: pieces.map(|pieces| Boxes::new(device, pieces)).transpose()?,
         })
+    }
+
+    /// Words of its result.
+    pub(super) const fn words(&self) -> usize {
+        if self.light.is_some() { 12 } else { 6 }
     }
 
     /// Starts the kernel on `count` boxes; the result goes into the header among the values.
     pub(super) fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
         let (pieces, piece_boxes, piece_count) = self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
         let Values { header, stamps, .. } = values;
-        let args = BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count };
+        let args = BoundsArgs {
+            header,
+            boxes,
+            pieces,
+            stamps,
+            piece_boxes,
+            count,
+            piece_count,
+            light: narrow(self.light),
+            reserved: 0,
+        };
         // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
         // allocated them, and `piece_boxes` for each piece. Pieces name boxes, vertices and domains of the same scene.
         // The kernel waits first.
         unsafe { chain::launch(device, &self.function, self.config, &args) }
     }
+}
+
+/// Axes as the kernel takes them.
+fn narrow(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
+    let axes = axes.unwrap_or_default();
+    std::array::from_fn(|at| axes[at / 3][at % 3] as f32)
+}
+
+/// The bounds in light space that the last six of twelve keys stand for; none where there are but six.
+///
+/// The kernel's sums round up, but its axes are f32: a component of a unit vector is off by 2^-25 at most, so an end by as
+/// much of the sum of the largest coordinates. Twice that is added.
+pub(super) fn light_of(keys: &[u32]) -> Option<LightBounds> {
+    let (world, light) = keys.split_at_checked(6).filter(|(_, light)| light.len() == 6)?;
+    let world = bounds_of(world);
+    let farthest: f64 = world.min.iter().zip(&world.max).map(|(min, max)| min.abs().max(max.abs())).sum();
+    Some(LightBounds(bounds_of(light)).widened(farthest * f64::from(f32::EPSILON) / 2.0))
 }
 
 /// The bounds that the six keys stand for.
@@ -69,6 +106,39 @@ mod tests {
             x if x.is_sign_negative() => !x.to_bits(),
             x => x.to_bits() | 0x8000_0000,
         }
+    }
+
+    #[test]
+    fn light_bounds_are_the_last_six_keys_and_hold_what_the_axes_lost_in_f32() {
+        let world = [1000.0_f32, 10.0, 1.0, 2000.0, 10.0, -0.5].map(ordered);
+        let light = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(ordered);
+        assert_eq!(light_of(&world), None, "without a shadow there are six");
+        let LightBounds(got) = light_of(&[world, light].concat()).expect("twelve");
+        let margin = (2000.0 + 10.0 + 1.0) * 2.0_f64.powi(-24);
+        for (end, want) in [(got.min, [-1.0, 2.0, 0.0]), (got.max, [4.0, 5.0, 6.0])] {
+            let out = |axis: usize| if want[axis] == end[axis] { 0.0 } else { (want[axis] - end[axis]).abs() };
+            assert!((0..3).all(|axis| (out(axis) - margin).abs() < 1e-12), "{end:?}");
+        }
+        assert!(got.min[0] < -1.0 && got.max[2] > 6.0, "outwards");
+        let mut lost = light;
+        lost[4] = ordered(f32::NAN);
+        assert!(!light_of(&[world, lost].concat()).is_some_and(|light| light.is_sound()));
+        assert!(!light_of(&[0; 12]).is_some_and(|light| light.is_sound()), "nothing was measured");
+    }
+
+    #[test]
+    fn the_margin_covers_axes_in_f32_whatever_the_sun() {
+        let mut worst = 0.0_f64;
+        for step in 0..1000 {
+            let angle = 0.1 * f64::from(step);
+            let sun = Vector3::new(angle.sin(), (1.7 * angle).cos(), (0.3 * angle).sin()).normalize();
+            let axes = crate::scene::light_axes(sun, crate::scene::UpAxis::Y);
+            for (axis, narrow) in axes.iter().zip(narrow(Some(axes)).chunks_exact(3)) {
+                (0..3).for_each(|at| worst = worst.max((axis[at] - f64::from(narrow[at])).abs()));
+            }
+        }
+        assert!(worst <= 2.0_f64.powi(-25) && worst > 2.0_f64.powi(-28), "{worst}");
+        assert_eq!(narrow(None), [0.0; 9]);
     }
 
     #[test]

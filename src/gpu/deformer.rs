@@ -71,7 +71,7 @@ impl CudaDeformer {
         let deform = Deform::new(device, scene, (plan.needed(Launch::Deform)?, plan.kernel(Launch::Batch)), tables)?;
         let apply = plan.kernel(Launch::Apply);
         let kernels = Kernels {
-            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?, deform.pieces())?,
+            bounds: Bounds::new(device, scene, plan.needed(Launch::Bounds)?, deform.pieces())?,
             normals: plan.kernel(Launch::Normals).map(|normals| Normals::new(device, scene, normals)).transpose()?,
             apply: apply.map(|apply| Apply::new(device, deform.packing(), apply)).transpose()?,
             deform,
@@ -143,10 +143,10 @@ impl CudaDeformer {
     pub fn finish(&mut self) -> Result<Deformed> {
         let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
         let (flight, begin) = self.under_way.pop_front().ok_or_else(none)?;
-        let bounds = self.flights[flight].wait().inspect_err(|_| self.forget())?;
+        let (bounds, light) = self.flights[flight].wait().inspect_err(|_| self.forget())?;
         let whole = begin.elapsed().as_secs_f64() * 1e3;
         let own = self.flights[flight].own_ms().inspect_err(|_| self.forget())?;
-        Ok(Deformed { bounds, ms: own.unwrap_or(whole) })
+        Ok(Deformed { bounds, light, ms: own.unwrap_or(whole) })
     }
 
     /// Starts the whole graph of the last step once more, for measuring it alone: outputs of our own stay where they are.

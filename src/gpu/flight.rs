@@ -7,13 +7,14 @@ use cudarc::driver::sys::{CUevent_flags, CUgraphInstantiate_flags, CUstreamCaptu
 use cudarc::driver::{CudaEvent, CudaGraph, PinnedHostSlice, result};
 
 use super::apply::{Apply, List};
-use super::bounds::{Bounds, bounds_of};
+use super::bounds::{Bounds, bounds_of, light_of};
 use super::deform::Deform;
 use super::device::Device;
 use super::inputs::{Inputs, Pinned};
 use super::layout::Header;
 use super::normals::Normals;
 use crate::error::{Error, Result, during};
+use crate::scene::LightBounds;
 
 /// The kernels of a scene.
 #[derive(Debug)]
@@ -49,7 +50,7 @@ impl Flight {
         let mut values = inputs.pinned(device)?;
         let mut list = kernels.apply.as_ref().map(|apply| apply.list(device)).transpose()?;
         // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
-        let answer = unsafe { device.context().alloc_pinned_with_flags(6, 0) };
+        let answer = unsafe { device.context().alloc_pinned_with_flags(kernels.bounds.words(), 0) };
         let mut answer = answer.map_err(during("allocate"))?;
         let parts = (kernels, inputs);
         let whole = capture(device, || start(device, parts, (&mut values, None), &mut answer))?;
@@ -86,10 +87,11 @@ impl Flight {
         graph.ok_or_else(missing)?.launch().map_err(during("deform"))
     }
 
-    /// Waits for the end of the step, and returns its bounds.
-    pub(super) fn wait(&self) -> Result<crate::scene::Bounds> {
+    /// Waits for the end of the step, and returns its bounds, in light space too where the scene has a shadow.
+    pub(super) fn wait(&self) -> Result<(crate::scene::Bounds, Option<LightBounds>)> {
         self.done.synchronize().map_err(during("deform"))?;
-        Ok(bounds_of(self.answer.as_slice().map_err(during("deform"))?))
+        let keys = self.answer.as_slice().map_err(during("deform"))?;
+        Ok((bounds_of(keys), light_of(keys)))
     }
 }
 
@@ -127,6 +129,6 @@ fn start(
     kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, places))?;
     let bounds = places.header + std::mem::offset_of!(Header, bounds) as u64;
     let answer = answer.as_mut_slice().map_err(during("capture"))?;
-    // SAFETY: the header has six words of bounds, so has `answer`, and the step is waited for before they are read.
+    // SAFETY: the header has twelve words of bounds, `answer` no more, and the step is waited for before they are read.
     unsafe { result::memcpy_dtoh_async(answer, bounds, device.stream().cu_stream()) }.map_err(during("capture"))
 }

@@ -37,8 +37,8 @@ pub(super) struct Header {
     pub step: u32,
     pub changed: u32,
     pub stale: u32,
-    pub reserved: u32,
-    pub bounds: [u32; 6],
+    pub reserved: [u32; 3],
+    pub bounds: [u32; 12],
 }
 
 /// The work of one warp of `deform`.
@@ -182,6 +182,8 @@ pub(super) struct BoundsArgs {
     pub piece_boxes: u64,
     pub count: u32,
     pub piece_count: u32,
+    pub light: [f32; 9],
+    pub reserved: u32,
 }
 
 /// Arguments of `apply`.
@@ -234,7 +236,7 @@ pub(super) struct NormalsArgs {
     pub reserved: u32,
 }
 
-const _: () = assert!(size_of::<Header>() == 80, "Header differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Header>() == 112, "Header differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
@@ -245,7 +247,7 @@ const _: () = assert!(size_of::<Member>() == 16, "Member differs from kernels/la
 const _: () = assert!(size_of::<Block>() == 16, "Block differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BatchArgs>() == 96, "BatchArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Piece>() == 16, "Piece differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<BoundsArgs>() == 48, "BoundsArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoundsArgs>() == 88, "BoundsArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from kernels/layout.cuh");
@@ -303,7 +305,7 @@ pub fn agreements() -> Vec<Agreement> {
             header, blocks, groups, members, words, rest, scales, transforms, following, frames, q, boxes
         }
         Piece { first, count, domain, of_vertices }
-        BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count }
+        BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count, light, reserved }
         ApplyArgs { header, changes, new_transforms, new_q, stale, following, transforms, q, stamps, list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {

@@ -153,6 +153,13 @@ pub(super) mod tests {
         Scene::new(parts).expect("a scene")
     }
 
+    /// The same without normal maps and shadow.
+    pub(in super::super) fn unlit(shapes: &[(usize, usize)]) -> Arc<Scene> {
+        let mut parts = parts(shapes, false, false);
+        parts.look.shadow = None;
+        Scene::new(parts).expect("a scene")
+    }
+
     /// Every shape used by two domains, corner i being vertex i.
     pub(in super::super) fn alike(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);

@@ -44,7 +44,7 @@ pub(super) const KERNELS: [KernelSource; 5] = [
         source: include_str!("../../kernels/batch.cu"),
         features: &["FOLLOWERS", "BATCH_8", "BATCH_4"],
     },
-    KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &["BOXES"] },
+    KernelSource { name: "bounds", source: include_str!("../../kernels/bounds.cu"), features: &["LIGHT", "BOXES"] },
     KernelSource { name: "apply", source: include_str!("../../kernels/apply.cu"), features: &["FOLLOWERS"] },
     KernelSource {
         name: "normals",
@@ -259,7 +259,7 @@ pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tabl
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
         bytes_in: inputs,
-        bytes_out: 24,
+        bytes_out: if needs.shadows { 48 } else { 24 },
         bytes_of_changes: changes as u64,
         left_out: left_out(
             scene,
@@ -303,6 +303,7 @@ fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
             ("NORMAL_MAPS", needs.normal_maps),
             ("SHEAR", needs.shear),
             ("FOLLOWERS", needs.followers),
+            ("LIGHT", needs.shadows),
             ("BOXES", needs.boxes),
         ];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
@@ -371,6 +372,7 @@ fn left_out(scene: &Scene, batched: bool, [tangents, displacements, boxes]: [u64
             needs.displacements,
             LeftOut { feature: "displacements", what: "u as an output of `deform`", bytes: displacements },
         ),
+        (needs.shadows, LeftOut { feature: "shadows", what: "bounds in light space", bytes: 0 }),
         (needs.boxes, LeftOut { feature: "boxes", what: "a box of each domain in `bounds`", bytes: boxes }),
     ];
     let batches = LeftOut { feature: "batches", what: "`batch`, and groups of domains", bytes: 0 };

@@ -14,7 +14,7 @@ pub use orient::{orient_normals, orient_tangents};
 
 use crate::deform::{Backend, Deformed, Deformer, Surface};
 use crate::error::Result;
-use crate::scene::{Bounds, Scene, Slot, State};
+use crate::scene::{Bounds, LightBounds, Scene, Slot, State};
 
 /// The deformer `reference`: computes in f64 and rounds once.
 #[derive(Debug)]
@@ -55,6 +55,10 @@ impl Deformer for ReferenceDeformer {
         let positions = deform(&self.scene, state);
         let mut bounds = Bounds::EMPTY;
         positions.iter().for_each(|position| bounds.include(*position));
+        let light = self.scene.light_axes().map(|axes| {
+            let one = |position: &[f64; 3]| LightBounds::of_box(&axes, &Bounds { min: *position, max: *position });
+            positions.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union)
+        });
         let (normals, tangents) = if self.scene.needs.exact_normals {
             (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
         } else {
@@ -64,7 +68,7 @@ impl Deformer for ReferenceDeformer {
         self.surface.normals = round(normals);
         self.surface.tangents = round(tangents);
         self.keep(state, &mut bounds);
-        Ok(Deformed { bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        Ok(Deformed { bounds, light, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
     fn surface(&mut self) -> Result<&Surface> {

@@ -6,7 +6,7 @@ use nalgebra::{Matrix4, Vector3};
 use super::Shot;
 use super::light::{Fit, LightBox};
 use crate::error::{Result, invalid};
-use crate::scene::{Bounds, Scene};
+use crate::scene::{Bounds, LightBounds, Scene};
 
 /// Twin of `FrameBlock` in `shaders/shared/frame.glsl`; columns of matrices follow each other.
 #[repr(C)]
@@ -123,6 +123,11 @@ fn sound(scene: &Scene, shot: &Shot) -> Bounds {
     if sound { shot.bounds } else { scene.rest_bounds }
 }
 
+/// What the vertices of a shot take up in light space, unless that or their bounds overflowed.
+fn lit(shot: &Shot) -> Option<LightBounds> {
+    shot.light.filter(|light| light.is_sound() && shot.bounds.is_finite())
+}
+
 /// What the sun's box is fitted to, relative to `origin` as the positions are.
 pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
     let bounds = sound(scene, shot);
@@ -132,6 +137,7 @@ pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
         to_sun: scene.look.to_sun(scene.up),
         up: scene.up,
         bounds,
+        light: lit(shot),
         ground: scene.look.ground.map(|_| height),
         size: f64::from(shadow.size),
         rim: f64::from(shadow.reach()) + 1.0,
@@ -249,7 +255,8 @@ mod tests {
         let (rest, up) = (scene.rest_bounds, scene.up.index());
         let largest = rest.min[up].abs().max(rest.max[up].abs());
         let is_last = |lowered: f64, raised: f64, origin: f64| {
-            let mut shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: rest };
+            let camera = Camera::framing(&scene, 64, 64);
+            let mut shot = Shot { camera, width: 64, height: 64, bounds: rest, light: None };
             shot.bounds.min[up] -= lowered + origin;
             shot.bounds.max[up] -= origin;
             let mut eye = [0.3, 0.4, 0.5];
@@ -268,14 +275,25 @@ mod tests {
     #[test]
     fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
-        let mut shot =
-            Shot { camera: Camera::framing(&scene, 64, 64), width: 64, height: 64, bounds: scene.rest_bounds };
+        let mut shot = Shot {
+            camera: Camera::framing(&scene, 64, 64),
+            width: 64,
+            height: 64,
+            bounds: scene.rest_bounds,
+            light: None,
+        };
         let good = Frame::new(&scene, &shot, [0.0; 3]).expect("good");
         let [x, y, z, is_last] = good.eye;
         assert!(is_last > 0.0, "nothing is below the ground");
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             let replaced = Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced");
             assert_eq!(replaced, Frame { eye: [x, y, z, 0.0], ..good }, "what overflowed may be below it");
+        }
+        let measured = LightBounds(Bounds { min: [-0.25; 3], max: [0.25; 3] });
+        let with = |light| Frame::new(&scene, &Shot { light: Some(light), ..shot }, [0.0; 3]).expect("good");
+        assert_ne!(with(measured), good, "control: what was measured decides");
+        for lost in [LightBounds::EMPTY, measured.widened(f64::NAN), measured.widened(f64::INFINITY)] {
+            assert_eq!(with(lost), good, "{lost:?}");
         }
         shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let refusal = Frame::new(&scene, &shot, [0.0; 3]).expect_err("overflows").to_string();

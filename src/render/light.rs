@@ -1,13 +1,14 @@
 //! The sun's view of the deformed scene: a box in light space, and the matrix from the world into it (section 3.3.1).
 //!
 //! The z axis of light space is v_l, the direction to the sun, and its y axis points up in the world. The box is the
-//! axis-aligned box there of the world-space bounds, symmetric about their centre in x and y. Its four side facets run
+//! axis-aligned box there of the vertices, as the deformer measured them, symmetric about its centre in x and y; or, as in
+//! the thesis, that of the corners of their world-space bounds, where a shot has no more. Its four side facets run
 //! along the light, so they are lengthened until they meet the ground: then the whole shadow on it lies inside. All sides
 //! keep to steps that are fixed in the world, so that shadows do not crawl while the scene sways.
 
 use nalgebra::{Matrix4, Vector3};
 
-use crate::scene::{Bounds, UpAxis};
+use crate::scene::{Bounds, LightBounds, UpAxis, light_axes};
 
 /// How far below the box the ground may pull the far plane, in diagonals: a grazing sun would pull it to infinity, and a
 /// receiver beyond the far plane is still shaded rightly.
@@ -32,6 +33,8 @@ pub(super) struct Fit {
     pub(super) to_sun: Vector3<f64>,
     pub(super) up: UpAxis,
     pub(super) bounds: Bounds,
+    /// Of the same vertices; without it, the corners of `bounds` take its place.
+    pub(super) light: Option<LightBounds>,
     /// Height of the ground along up.
     pub(super) ground: Option<f64>,
     /// Side of the map and the empty rim that the blur needs, both in texels.
@@ -64,16 +67,15 @@ fn rung(length: f64) -> f64 {
 
 impl LightBox {
     pub(super) fn fit(fit: &Fit) -> Self {
-        let axes = axes(fit.to_sun, fit.up);
-        let centre = fit.bounds.centre().coords;
-        let corners = fit.bounds.corners().map(|corner| corner.coords);
+        let axes = light_axes(fit.to_sun, fit.up);
+        let LightBounds(held) = fit.light.unwrap_or_else(|| LightBounds::of_box(&axes, &fit.bounds));
         let diagonal = diagonal(fit);
         let sides = [0, 1].map(|axis: usize| {
-            let reach = corners.iter().map(|corner| axes[axis].dot(&(corner - centre)).abs()).fold(0.0, f64::max);
-            Side::snapped(axes[axis].dot(&centre), reach.max(diagonal / 64.0), fit)
+            let (centre, reach) = (0.5 * (held.min[axis] + held.max[axis]), 0.5 * (held.max[axis] - held.min[axis]));
+            Side::snapped(centre, reach.max(diagonal / 64.0), fit)
         });
         let plane = fit.ground.and_then(|height| ground_plane(&axes, fit.up, height));
-        let (near, far) = depths(fit, &corners.map(|corner| axes[2].dot(&corner)), &sides, plane);
+        let (near, far) = depths(fit, [held.min[2], held.max[2]], &sides, plane);
         let range = near - far;
         let mut map_from_world = Matrix4::identity();
         for (axis, side) in sides.iter().enumerate() {
@@ -104,10 +106,9 @@ fn diagonal(fit: &Fit) -> f64 {
 }
 
 /// z of light space at the planes nearest to the sun and farthest from it, in whole steps as the sides are.
-fn depths(fit: &Fit, corners: &[f64; 8], sides: &[Side; 2], plane: Option<[f64; 3]>) -> (f64, f64) {
+fn depths(fit: &Fit, [mut far, nearest]: [f64; 2], sides: &[Side; 2], plane: Option<[f64; 3]>) -> (f64, f64) {
     let diagonal = diagonal(fit);
-    let near = corners.iter().copied().fold(f64::NEG_INFINITY, f64::max) + 0.01 * diagonal;
-    let mut far = corners.iter().copied().fold(f64::INFINITY, f64::min);
+    let near = nearest + 0.01 * diagonal;
     for corner in 0..4 {
         let at = |axis: usize| sides[axis].low + if corner >> axis & 1 == 0 { 0.0 } else { 2.0 * sides[axis].half };
         let meets = plane.map_or(far, |[a, b, c]| a * at(0) + b * at(1) + c);
@@ -115,16 +116,6 @@ fn depths(fit: &Fit, corners: &[f64; 8], sides: &[Side; 2], plane: Option<[f64; 
     }
     let step = diagonal.log2().floor().exp2() / 64.0;
     ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
-}
-
-/// x, y and z of light space. With the sun straight up, "up in the world" says nothing, and any y will do.
-fn axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
-    let across = up.vector().cross(&to_sun);
-    let x = across.try_normalize(1e-6).unwrap_or_else(|| {
-        let other = if to_sun.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
-        other.cross(&to_sun).normalize()
-    });
-    [x, to_sun.cross(&x), to_sun]
 }
 
 /// The z of the ground in light space at (x, y): a x + b y + c; none when the sun is as good as on the horizon.
@@ -141,7 +132,7 @@ mod tests {
 
     fn fit(to_sun: Vector3<f64>, ground: Option<f64>) -> Fit {
         let bounds = Bounds { min: [-1.0, 0.0, -2.0], max: [1.0, 3.0, 2.0] };
-        Fit { to_sun: to_sun.normalize(), up: UpAxis::Y, bounds, ground, size: 1024.0, rim: 6.0 }
+        Fit { to_sun: to_sun.normalize(), up: UpAxis::Y, bounds, light: None, ground, size: 1024.0, rim: 6.0 }
     }
 
     #[test]
@@ -160,6 +151,43 @@ mod tests {
                 let [a, b, c] = light.ground;
                 assert!((a * shadow.x + b * shadow.y + c - shadow.z).abs() < 1e-9, "the ground's own depth");
             }
+        }
+    }
+
+    /// A ball inside the bounds of [`fit`], each axis scaled.
+    fn ball(scale: [f64; 3]) -> Vec<Point3<f64>> {
+        let point = |at: u32| {
+            let (turn, height) = (2.4 * f64::from(at), f64::from(at) / 250.0 - 1.0);
+            let round = (1.0 - height * height).max(0.0).sqrt();
+            Point3::new(scale[0] * round * turn.cos(), 1.5 + scale[1] * height, scale[2] * round * turn.sin())
+        };
+        (0..=500).map(point).collect()
+    }
+
+    fn held(fit: &Fit, points: &[Point3<f64>]) -> Option<LightBounds> {
+        let axes = light_axes(fit.to_sun, fit.up);
+        let one =
+            |point: &Point3<f64>| LightBounds::of_box(&axes, &Bounds { min: (*point).into(), max: (*point).into() });
+        Some(points.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union))
+    }
+
+    #[test]
+    fn a_box_around_what_was_measured_holds_it_and_its_shadow_and_is_smaller_than_one_around_the_corners() {
+        for sun in [Vector3::new(0.4, 0.8, 0.5), Vector3::new(1.0, 0.3, 0.0), Vector3::new(-0.5, 0.6, 0.7)] {
+            let (corners, points) = (fit(sun, Some(-0.5)), ball([0.9, 1.4, 1.9]));
+            let fit = Fit { light: held(&corners, &points), ..corners };
+            let (light, by_corners) = (LightBox::fit(&fit), LightBox::fit(&corners));
+            for point in points {
+                let shadow = point - fit.to_sun * ((point.y + 0.5) / fit.to_sun.y);
+                for point in [point, shadow] {
+                    let at = light.map_from_world.transform_point(&point);
+                    let rim = fit.rim / fit.size;
+                    assert!(at.xy().iter().all(|number| (rim..=1.0 - rim).contains(number)), "{sun} {at}");
+                    assert!((0.0..=1.0).contains(&at.z), "{sun} {at}");
+                }
+            }
+            let area = |light: &LightBox| light.sides[0].half * light.sides[1].half;
+            assert!(area(&light) < 0.9 * area(&by_corners), "{sun}");
         }
     }
 
@@ -182,12 +210,15 @@ mod tests {
 
     /// Where a fixed point falls between the texels of the map, over bounds that sway and grow slowly: the most that it
     /// moves from step to step, in texels, but for the steps at which the map takes another rung; and their number.
-    fn crawl(place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
+    fn crawl(is_lit: bool, place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
         let mut fit = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut last, mut most, mut jumps): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
         for step in 0..400 {
             let sway = f64::from(step) * 0.3;
             fit.bounds.max = [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
+            let [x, y, z] = fit.bounds.max;
+            // A size that does not sway about a rung.
+            fit.light = held(&fit, &ball([x, 0.5 * y, z].map(|scale| 0.95 * scale))).filter(|_| is_lit);
             let at = place(&fit).map(|number| number * fit.size);
             let width = LightBox::fit(&fit).sides[0].half + LightBox::fit(&fit).sides[1].half;
             if let Some((before, was)) = last {
@@ -200,15 +231,17 @@ mod tests {
     }
 
     #[test]
-    fn texels_stay_where_they_are_in_the_world_while_the_bounds_sway_and_grow() {
+    fn texels_stay_where_they_are_in_the_world_while_the_scene_sways_and_grows() {
         let point = Point3::new(0.3, 1.1, -0.7);
-        let (most, jumps) = crawl(|fit| {
-            let at = LightBox::fit(fit).map_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
-            [at.x, at.y]
-        });
-        assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs");
-        let (most, _) = crawl(|fit| {
-            let axes = axes(fit.to_sun, fit.up);
+        for is_lit in [false, true] {
+            let (most, jumps) = crawl(is_lit, |fit| {
+                let at = LightBox::fit(fit).map_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
+                [at.x, at.y]
+            });
+            assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs, measured {is_lit}");
+        }
+        let (most, _) = crawl(false, |fit| {
+            let axes = light_axes(fit.to_sun, fit.up);
             [0, 1].map(|axis| {
                 let ends = fit.bounds.corners().map(|corner| axes[axis].dot(&corner.coords));
                 let low = ends.into_iter().fold(f64::INFINITY, f64::min);

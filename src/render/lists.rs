@@ -310,7 +310,8 @@ mod tests {
         let buffers = renderer.load(&scene).expect("loads");
         renderer.upload(&buffers, &surface).expect("uploads");
         let camera = Camera::framing(&scene, 64, 64);
-        let image = renderer.draw(&buffers, &Shot { camera, width: 64, height: 64, bounds }).expect("draws");
+        let image =
+            renderer.draw(&buffers, &Shot { camera, width: 64, height: 64, bounds, light: None }).expect("draws");
         (image.rgba, renderer)
     }
 

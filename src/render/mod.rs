@@ -73,7 +73,7 @@ pub use self::survey::{Field, Survey};
 use self::target::{Form, Target};
 use crate::deform::Surface;
 use crate::error::{Result, during};
-use crate::scene::{Bounds, Camera, Scene};
+use crate::scene::{Bounds, Camera, LightBounds, Scene};
 
 /// Which EGL device to draw on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -107,8 +107,11 @@ pub struct Shot {
     pub camera: Camera,
     pub width: u32,
     pub height: u32,
-    /// Bounds of the deformed vertices; the shadow map is fitted to them.
+    /// Bounds of the deformed vertices.
     pub bounds: Bounds,
+    /// What the same vertices take up in light space, to which the shadow map is fitted; without it, to the corners of
+    /// `bounds`.
+    pub light: Option<LightBounds>,
 }
 
 /// RGBA8 sRGB pixels, top row first.

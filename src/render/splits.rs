@@ -102,14 +102,14 @@ mod tests {
     fn fit() -> Fit {
         let bounds = Bounds { min: [-50.0, 0.0, -50.0], max: [50.0, 5.0, 50.0] };
         let to_sun = Vector3::new(0.4, 0.8, 0.5).normalize();
-        Fit { to_sun, up: UpAxis::Y, bounds, ground: Some(0.0), size: 512.0, rim: 6.0 }
+        Fit { to_sun, up: UpAxis::Y, bounds, light: None, ground: Some(0.0), size: 512.0, rim: 6.0 }
     }
 
     fn shot(turn: f64) -> Shot {
         let eye = [0.0, 2.0, 20.0];
         let view = View::LookAt { eye, target: [turn.sin(), 2.0, 20.0 - turn.cos()], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.1, far: 80.0 };
-        Shot { camera, width: 160, height: 90, bounds: fit().bounds }
+        Shot { camera, width: 160, height: 90, bounds: fit().bounds, light: None }
     }
 
     #[test]

@@ -129,6 +129,7 @@ impl<D: Deformer> Both<D> {
                 assert_eq!(wrong_box(&self.scene, &listed), None, "{name}, show {}", self.shows);
             }
             assert_eq!(listed.difference(&whole), None, "{name}, show {}", self.shows);
+            assert!(listed.light.is_some() && listed.light == whole.light, "{name}, show {}", self.shows);
         }
         assert_eq!(listed.bounds.is_finite(), whole.bounds.is_finite(), "{name}");
         self.shows += 1;

@@ -6,6 +6,7 @@ pub(crate) mod cut_outs;
 pub(crate) mod extremes;
 pub(crate) mod following;
 mod judge;
+pub(crate) mod light;
 pub(crate) mod neighbours;
 pub(crate) mod readers;
 pub(crate) mod refusal;
@@ -15,9 +16,9 @@ pub(crate) mod truncation;
 
 use std::sync::Arc;
 
-use modalcast::deform::{Deformer, Surface};
+use modalcast::deform::{Deformed, Deformer, Surface};
 use modalcast::domain::{Domain, Mesh, Shape};
-use modalcast::scene::{Bounds, Deformation, Scene, State};
+use modalcast::scene::{Bounds, Deformation, LightBounds, Scene, State};
 
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 pub(crate) use judge::{beyond, displacements_beyond, displacements_within, within};
@@ -26,12 +27,13 @@ pub(crate) use judge::{beyond, displacements_beyond, displacements_within, withi
 #[derive(Debug, Clone)]
 pub(crate) struct Shown {
     pub(crate) bounds: Bounds,
+    pub(crate) light: Option<LightBounds>,
     pub(crate) surface: Surface,
 }
 
 pub(crate) fn run(deformer: &mut dyn Deformer, state: &State) -> Shown {
-    let bounds = deformer.deform(state).expect("deforms").bounds;
-    Shown { bounds, surface: deformer.surface().expect("a surface").clone() }
+    let Deformed { bounds, light, .. } = deformer.deform(state).expect("deforms");
+    Shown { bounds, light, surface: deformer.surface().expect("a surface").clone() }
 }
 
 impl Shown {
@@ -86,7 +88,7 @@ pub(crate) fn scene_of(
 #[test]
 fn a_bit_a_length_and_a_bound_are_differences() {
     let surface = Surface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..Surface::default() };
-    let shown = Shown { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, surface };
+    let shown = Shown { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
     assert_eq!(shown.difference(&shown), None);
     let spoilt = |spoil: &dyn Fn(&mut Shown)| {
         let mut other = shown.clone();

@@ -121,7 +121,8 @@ pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
         let same = got.displacements == new.displacements;
         assert!(is(wanted.displacements, same, new.displacements != old.displacements), "step {number}");
         assert!(is(wanted.positions, got.positions == new.positions, new.positions != old.positions), "step {number}");
-        let whole = Shown { bounds: want.bounds, surface: deformer.surface().expect("copies").clone() };
+        let whole =
+            Shown { bounds: want.bounds, light: want.light, surface: deformer.surface().expect("copies").clone() };
         assert_eq!(whole.difference(&want), None, "step {number}: the rest comes after");
         last = want;
     }

@@ -80,7 +80,7 @@ fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
     let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
     let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&to_share))).expect("a deformer");
     let bounds = direct.deform(&state).expect("deforms").bounds;
-    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 320, height: 240, bounds };
+    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
     let shown = renderer.draw(&to_share, &shot).expect("draws");
     renderer.upload(&to_fill, direct.surface().expect("copies")).expect("uploads");
     let uploaded = renderer.draw(&to_fill, &shot).expect("draws");
@@ -104,7 +104,8 @@ fn gpu_frames_under_way_keep_the_vertices_of_their_step_while_the_next_ones_over
     let mut copied = CudaDeformer::new(&device, &scene, None).expect("a deformer");
     assert!(direct.shares_buffers(), "interop was refused");
     // Large, so that a frame takes longer than a step.
-    let shot = |bounds| Shot { camera: Camera::framing(&scene, 64, 64), width: 1920, height: 1080, bounds };
+    let shot =
+        |bounds| Shot { camera: Camera::framing(&scene, 64, 64), width: 1920, height: 1080, bounds, light: None };
     let (mut frames, mut wanted) = (std::collections::VecDeque::new(), Vec::new());
     let mut images = Vec::new();
     for seed in 0..30 {

@@ -9,6 +9,7 @@ mod extremes;
 mod gl;
 mod interop;
 mod judge;
+mod light;
 mod normals;
 mod overlap;
 mod paths;

@@ -221,7 +221,7 @@ fn gpu_two_hundred_thousand_leaves_follow_a_thousand_branches_within_their_bound
     let mut deformer = deformer(&scene);
     let plan = deformer.plan();
     eprintln!("201,000 domains: {} bytes a step, {} bytes of frames", plan.bytes_in, plan.bytes(Role::Frames));
-    assert_eq!((plan.launches(), plan.bytes_in), (3, 80 + 48 * 1000 + 4 * 6000));
+    assert_eq!((plan.launches(), plan.bytes_in), (3, 112 + 48 * 1000 + 4 * 6000));
     let mut state = scenes::state(&scene, 95);
     let before = both::run(&mut deformer, &state);
     both::within("200,000 leaves", (&scene, &state), &before.surface.positions, 0.0);

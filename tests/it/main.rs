@@ -9,6 +9,7 @@ mod following;
 mod frames;
 mod hostile;
 mod layering;
+mod light;
 mod normals;
 mod picks;
 mod pixels;

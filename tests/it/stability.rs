@@ -7,7 +7,7 @@ use modalcast::cpu::CpuDeformer;
 use modalcast::scene::Scene;
 use modalcast::storage::Truncation;
 
-use crate::both::{changes, extremes, following, neighbours, readers, refusal, surfaces, truncation};
+use crate::both::{changes, extremes, following, light, neighbours, readers, refusal, surfaces, truncation};
 
 fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene)
@@ -134,4 +134,19 @@ fn followers_ten_thousand_kilometres_away_keep_the_millimetre() {
 #[test]
 fn products_of_frames_that_overflow_do_no_harm_where_the_vertices_do_not() {
     following::products_that_overflow(deformer);
+}
+
+#[test]
+fn what_vertices_take_up_in_light_space_holds_every_one_of_them() {
+    light::every_vertex_is_held(deformer);
+}
+
+#[test]
+fn a_thin_scene_is_fitted_closely_in_light_space() {
+    light::a_thin_scene_is_fitted_closely(deformer);
+}
+
+#[test]
+fn light_space_is_not_measured_without_a_shadow_and_overflow_there_is_told() {
+    light::nothing_is_measured_without_a_shadow_and_overflow_is_told(deformer);
 }

@@ -144,10 +144,11 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
 }
 
 /// Macros that add code, each with the macro that it builds on; the others choose among code of about the same length.
-const ADD: [(&str, &str, &[&str]); 13] = [
+const ADD: [(&str, &str, &[&str]); 14] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED", &["MODES"]),
     ("deform", "DISPLACEMENTS", &["MODES"]),
+    ("bounds", "LIGHT", &[]),
     ("bounds", "BOXES", &[]),
     ("deform", "ORIENT", &[]),
     ("deform", "SHIFTED", &["ORIENT"]),

@@ -1,6 +1,6 @@
 //! What scenes cost.
 
-use super::super::pack::tests::{deformed, exact, kept, on_the_first, scene, stored};
+use super::super::pack::tests::{deformed, exact, kept, on_the_first, scene, stored, unlit};
 use super::super::rings::Rings;
 use super::*;
 use crate::scene::Deformation;
@@ -14,11 +14,11 @@ fn a_scene_without_modes_normal_maps_and_shear_compiles_none_of_their_branches()
     let bare = plan(&scene(&[(7, 0), (300, 0)], false, true));
     assert_eq!(
         defines(&bare),
-        [("deform", vec!["NARROW", "ORIENT", "SHIFTED"]), ("bounds", vec![]), ("apply", vec![])]
+        [("deform", vec!["NARROW", "ORIENT", "SHIFTED"]), ("bounds", vec!["LIGHT"]), ("apply", vec![])]
     );
     assert_eq!(bare.bytes(Role::Tangents) + bare.bytes(Role::RestTangents), 0);
     assert_eq!((bare.bytes(Role::Words), bare.bytes(Role::Scales)), (0, 0));
-    assert_eq!(bare.bytes_in, 80 + 48 * 4, "a header and four transforms, no q");
+    assert_eq!(bare.bytes_in, 112 + 48 * 4, "a header and four transforms, no q");
     let left_out: Vec<_> = bare.left_out.iter().map(|part| part.feature).collect();
     let last = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
     assert_eq!(left_out, [&["modes", "normal_maps", "shear"][..], &last].concat());
@@ -31,7 +31,7 @@ fn a_scene_that_needs_more_leaves_less_out() {
     assert_eq!(full.kernels[0].defines, ["MODES", "NARROW", "ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]);
     assert_eq!(full.bytes(Role::Tangents), 16 * 2 * (9 + 302));
     assert_eq!(full.bytes(Role::RestTangents), 64 * (3 + 76), "a quad of four corners each");
-    assert_eq!(full.bytes_in, 80 + 48 * 4 + 4 * 4);
+    assert_eq!(full.bytes_in, 112 + 48 * 4 + 4 * 4);
     assert_eq!(full.left_out.len(), 7);
 }
 
@@ -39,7 +39,7 @@ fn a_scene_that_needs_more_leaves_less_out() {
 fn followers_need_no_room_in_a_step_and_cost_frames_and_a_macro_once() {
     let (own, on_others) = (scene(&[(7, 2), (300, 0)], false, true), on_the_first(&[(7, 2), (300, 0)]));
     let (alone, follows) = (plan(&own), plan(&on_others));
-    assert_eq!((alone.bytes_in, follows.bytes_in), (80 + 48 * 4 + 4 * 4, 80 + 48 + 4 * 4), "three of four follow");
+    assert_eq!((alone.bytes_in, follows.bytes_in), (112 + 48 * 4 + 4 * 4, 112 + 48 + 4 * 4), "three of four follow");
     assert_eq!(follows.bytes(Role::Frames), 8 * 4 + 48 * 3);
     assert_eq!(alone.bytes(Role::Frames), 0);
     let with = |plan: &Plan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
@@ -100,6 +100,18 @@ fn displacements_and_boxes_are_outputs_and_macros_of_kernels_that_are_there_and_
 
 /// The macros of what is kept for readers.
 const KEPT: [&str; 2] = ["DISPLACEMENTS", "BOXES"];
+
+#[test]
+fn light_space_is_measured_by_a_macro_of_a_kernel_that_is_there_and_only_for_a_shadow() {
+    let sizes = [(7, 2), (300, 0)];
+    let (lit, dark) = (plan(&stored(&sizes, Storage::F32)), plan(&unlit(&sizes)));
+    let defines = |plan: &Plan| plan.kernel(Launch::Bounds).expect("always").defines.clone();
+    assert_eq!((defines(&lit), defines(&dark)), (vec!["LIGHT"], vec![]));
+    assert_eq!((lit.bytes_out, dark.bytes_out), (48, 24));
+    assert_eq!((lit.launches(), lit.total_bytes()), (dark.launches(), dark.total_bytes()));
+    let left_out = |plan: &Plan| plan.left_out.iter().any(|part| part.feature == "shadows");
+    assert!(left_out(&dark) && !left_out(&lit));
+}
 
 #[test]
 fn launches_do_not_grow_with_the_number_of_domains() {

@@ -105,7 +105,7 @@ impl Ours {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
             extent,
             scene: Arc::clone(scene),
-            bounds: Bounds::new(device, plan.needed(Launch::Bounds)?, deform.pieces())?,
+            bounds: Bounds::new(device, scene, plan.needed(Launch::Bounds)?, deform.pieces())?,
             normals,
             listed: changed.is_some(),
             inputs: Vec::new(),

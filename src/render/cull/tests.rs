@@ -55,7 +55,7 @@ fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
     let view = View::LookAt { eye: [0.3, 0.2, 4.0], target: [0.1, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
     let camera = Camera { view, lens, near: 0.0, far: 0.0 };
-    let shot = Shot { camera, width: 64, height: 64, bounds: scene.rest_bounds };
+    let shot = Shot { camera, width: 64, height: 64, bounds: scene.rest_bounds, light: None };
     renderer.draw(&buffers, &shot).expect("draws");
     let second = renderer.draw(&buffers, &shot).expect("draws").rgba;
     assert!(renderer.ran().culled.is_some_and(|culled| culled.camera.left_out() > 0));

@@ -6,7 +6,7 @@ use std::cell::Cell;
 use super::super::Shot;
 use super::super::scene_buffers::SceneBuffers;
 use crate::error::Result;
-use crate::scene::Bounds;
+use crate::scene::{Bounds, LightBounds};
 
 /// What the vertices are, and what the map was last drawn of.
 #[derive(Debug, Default)]
@@ -21,6 +21,7 @@ pub(in crate::render) struct Shared {
 pub(in crate::render) struct Content {
     step: u64,
     bounds: Bounds,
+    light: Option<LightBounds>,
     origin: [f64; 3],
 }
 
@@ -59,6 +60,6 @@ impl SceneBuffers {
     pub(in crate::render) fn shadow_of(&self, shot: &Shot) -> Option<Content> {
         let splits = self.scene.look.shadow.map_or(1, |shadow| shadow.splits);
         let step = self.shared_shadow.step.get().filter(|_| splits == 1)?;
-        Some(Content { step, bounds: shot.bounds, origin: self.origin })
+        Some(Content { step, bounds: shot.bounds, light: shot.light, origin: self.origin })
     }
 }

@@ -40,7 +40,7 @@ fn surface(by: f32) -> Surface {
 
 fn shot(scene: &Scene, side: u32) -> Shot {
     let camera = Camera::framing(scene, side, side);
-    Shot { camera, width: side, height: side, bounds: scene.rest_bounds }
+    Shot { camera, width: side, height: side, bounds: scene.rest_bounds, light: None }
 }
 
 /// A picture of one surface by itself, and how many blended fragments it has.

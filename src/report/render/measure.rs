@@ -17,7 +17,7 @@ use super::soup::Soup;
 use super::studio::{Pass, Set, Size, Studio};
 use super::variants::{Aim, Bounds, Method, Variant};
 use super::view::View;
-use super::{Entry, Request, meter};
+use super::{Entry, Request, Texels, meter};
 use crate::error::Result;
 use crate::render::{Culled, Image, shadow_texel};
 use crate::scene::{Camera, Culling, Look, Scene, Shadow};
@@ -88,6 +88,7 @@ struct References {
     hard: Picture,
     /// One per variant.
     aims: Vec<Picture>,
+    texels: Option<Texels>,
 }
 
 /// What all variants of a load are measured with.
@@ -172,7 +173,7 @@ fn references(
     let mut pictures = trace(&soup, &view, &terms, detail(request));
     studio.strike(set);
     let aims = pictures.split_off(1);
-    Ok(References { hard: pictures.pop().unwrap_or_default(), aims })
+    Ok(References { hard: pictures.pop().unwrap_or_default(), aims, texels: Texels::of(&stage.scene, &shot) })
 }
 
 fn term(variant: &Variant, texel: Option<[Vector3<f64>; 2]>) -> Term {
@@ -236,6 +237,7 @@ impl Job<'_> {
             samples: detail.side * detail.side,
             taps: detail.taps,
             reference_ms,
+            texels: self.references.texels,
             steps: self.moving.as_ref().map_or(0, Vec::len),
             no_flicker: self.moving.as_ref().err().cloned(),
             steps_size: small(self.request.size),

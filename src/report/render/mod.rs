@@ -65,7 +65,8 @@ use self::variants::Variant;
 use super::machine::Provenance;
 use super::wants;
 use crate::error::Result;
-use crate::render::Info;
+use crate::render::{Info, Shot, shadow_texel};
+use crate::scene::Scene;
 
 /// What to report on.
 #[derive(Debug, Clone)]
@@ -106,11 +107,30 @@ pub struct Entry {
     pub taps: usize,
     /// What tracing all references of its still picture took.
     pub reference_ms: f64,
+    /// Of the shadow map of its own look; none without one.
+    pub texels: Option<Texels>,
     /// Steps over which flicker was looked at, and the size of their pictures.
     pub steps: usize,
     pub steps_size: Size,
     /// Why flicker was not looked at.
     pub no_flicker: Option<String>,
+}
+
+/// The longer sides of a texel of a shadow map of `size` texels a side, in scene units: of the map that is drawn, which is
+/// fitted to what the vertices take up in light space, and of one that is fitted to the corners of their bounds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Texels {
+    pub size: u32,
+    pub side: f64,
+    pub by_corners: f64,
+}
+
+impl Texels {
+    fn of(scene: &Scene, shot: &Shot) -> Option<Self> {
+        let longer = |shot: &Shot| shadow_texel(scene, shot).map(|sides| sides[0].norm().max(sides[1].norm()));
+        let (side, by_corners) = (longer(shot)?, longer(&Shot { light: None, ..*shot })?);
+        scene.look.shadow.map(|shadow| Self { size: shadow.size, side, by_corners })
+    }
 }
 
 /// A whole report.

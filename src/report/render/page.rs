@@ -1,6 +1,6 @@
 //! `report.md`: the report as tables for people.
 
-use super::{Entry, Report, Row, beside};
+use super::{Entry, Report, Row, Texels, beside};
 use crate::render::Sifted;
 use crate::report::peers::{dash, line, rule};
 
@@ -67,14 +67,17 @@ const HEAD: [&str; 25] = [
 ];
 
 fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
-    let Entry { name, vertices, triangles, domains, samples, taps, reference_ms, steps, .. } = load;
+    let Entry { name, vertices, triangles, domains, samples, taps, reference_ms, steps, texels, .. } = load;
     let mut text = format!(
         "\n## {name}\n\n{vertices} vertices, {triangles} triangles, {domains} domains. References: {samples} samples a \
-         pixel, {taps} rays each over a footprint, {:.1} s; {}.\n\n",
+         pixel, {taps} rays each over a footprint, {:.1} s; {}.{}\n\n",
         reference_ms / 1e3,
         load.no_flicker
             .as_ref()
-            .map_or_else(|| format!("flicker over {steps} steps"), |why| format!("no flicker: {why}"))
+            .map_or_else(|| format!("flicker over {steps} steps"), |why| format!("no flicker: {why}")),
+        texels.map_or_else(String::new, |Texels { size, side, by_corners }| format!(
+            " A texel of a map of {size} is {side:.5} long, {by_corners:.5} if it were fitted to the corners of the bounds."
+        ))
     );
     text.push_str(&line(HEAD.map(String::from)));
     text.push_str(&rule(HEAD.len()));

@@ -14,7 +14,7 @@ use serde::Serialize;
 use super::studio::{Size, Studio};
 use super::{Request, meter};
 use crate::cpu::CpuDeformer;
-use crate::deform::{Backend, Deformer, Wanted};
+use crate::deform::{Backend, Deformed, Deformer, Wanted};
 use crate::error::{Result, during};
 use crate::gpu::{self, CudaDeformer, Device, GlBuffers, Role};
 use crate::render::{SceneBuffers, Shot};
@@ -168,7 +168,7 @@ fn times(
 fn frame(studio: &mut Studio, rig: &mut Rig, (camera, size): (Camera, Size), state: &State) -> Result<[f64; 5]> {
     let us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
     let whole = Instant::now();
-    let bounds = rig.deformer.deform(state)?.bounds;
+    let Deformed { bounds, light, .. } = rig.deformer.deform(state)?;
     let deform = us(whole);
     let begin = Instant::now();
     let mut upload = 0.0;
@@ -176,7 +176,7 @@ fn frame(studio: &mut Studio, rig: &mut Rig, (camera, size): (Camera, Size), sta
         studio.renderer.upload(&rig.buffers, rig.deformer.read(Wanted::VERTICES)?)?;
         upload = us(begin);
     }
-    let shot = Shot { camera, width: size.width, height: size.height, bounds };
+    let shot = Shot { camera, width: size.width, height: size.height, bounds, light };
     let image = studio.renderer.draw(&rig.buffers, &shot)?;
     let frame = us(whole);
     let passes = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));

@@ -111,11 +111,12 @@ impl Feed {
     fn stepped(studio: &mut Studio, set: &mut Set, stage: &Stage, size: Size) -> Result<Self> {
         let mut pose = |step: usize| -> Result<_> {
             studio.pose(set, &stage.state(step))?;
-            Ok((set.surface()?.clone(), set.bounds()))
+            Ok((set.surface()?.clone(), set.extents()))
         };
         let ((later, far), (first, near)) = (pose(STILL + APART)?, pose(STILL)?);
         let camera = stage.camera(size);
-        let shot = |camera: Camera| Shot { bounds: near.union(far), ..set.shot(camera, size) };
+        let light = near.1.zip(far.1).map(|(near, far)| near.union(far));
+        let shot = |camera: Camera| Shot { bounds: near.0.union(far.0), light, ..set.shot(camera, size) };
         Ok(Self { shots: [camera, farther(camera)].map(shot), steps: Some([first, later]) })
     }
 

@@ -10,7 +10,7 @@ use crate::deform::{Deformer, Surface};
 use crate::error::{Result, during};
 use crate::render::{Image, Prefer, Renderer, SceneBuffers, Shot};
 use crate::report::timing::{FEWEST, Timing};
-use crate::scene::{Bounds, Camera, Scene, State};
+use crate::scene::{Bounds, Camera, LightBounds, Scene, State};
 
 /// Size of a picture in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -40,6 +40,7 @@ pub(super) struct Set {
     pub(super) buffers: SceneBuffers,
     deformer: CpuDeformer,
     bounds: Bounds,
+    light: Option<LightBounds>,
 }
 
 impl Studio {
@@ -50,12 +51,13 @@ impl Studio {
     /// Loads a scene.
     pub(super) fn set(&mut self, scene: &Arc<Scene>) -> Result<Set> {
         let (buffers, deformer) = (self.renderer.load(scene)?, CpuDeformer::new(scene));
-        Ok(Set { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY })
+        Ok(Set { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, light: None })
     }
 
     /// Deforms it and uploads what came of that.
     pub(super) fn pose(&mut self, set: &mut Set, state: &State) -> Result<()> {
-        set.bounds = set.deformer.deform(state)?.bounds;
+        let deformed = set.deformer.deform(state)?;
+        (set.bounds, set.light) = (deformed.bounds, deformed.light);
         self.renderer.upload(&set.buffers, set.deformer.surface()?)
     }
 
@@ -104,12 +106,12 @@ impl Studio {
 
 impl Set {
     pub(super) fn shot(&self, camera: Camera, size: Size) -> Shot {
-        Shot { camera, width: size.width, height: size.height, bounds: self.bounds }
+        Shot { camera, width: size.width, height: size.height, bounds: self.bounds, light: self.light }
     }
 
-    /// Bounds of the vertices that were drawn last.
-    pub(super) const fn bounds(&self) -> Bounds {
-        self.bounds
+    /// Bounds of the vertices that were drawn last, and what they take up in light space.
+    pub(super) const fn extents(&self) -> (Bounds, Option<LightBounds>) {
+        (self.bounds, self.light)
     }
 
     pub(super) fn scene(&self) -> &Arc<Scene> {

@@ -49,7 +49,7 @@ fn shot(bounds: Bounds, side: u32, above: bool) -> Shot {
         near: 0.0,
         far: 0.0,
     };
-    Shot { camera, width: side, height: side, bounds }
+    Shot { camera, width: side, height: side, bounds, light: None }
 }
 
 fn pictures(parts: Parts, above: bool, terms: &[Term], side: u32) -> Vec<Picture> {
@@ -328,7 +328,8 @@ fn a_tree_of_boxes_that_moves_along_meets_what_one_built_anew_does() {
     };
     let ((first, _), (later, bounds)) = (at(0), at(30));
     let size = Size { width: 48, height: 32 };
-    let view = View::new(&stage.scene, &Shot { camera: stage.camera(size), width: 48, height: 32, bounds });
+    let view =
+        View::new(&stage.scene, &Shot { camera: stage.camera(size), width: 48, height: 32, bounds, light: None });
     let traced = |soup: &Soup| trace(soup, &view, &[Term::Hard], Detail::QUICK);
     let anew = traced(&Soup::new(&stage.scene, &later));
     assert_eq!(traced(&Soup::new(&stage.scene, &first).moved(&stage.scene, &later)), anew);

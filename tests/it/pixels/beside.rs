@@ -112,7 +112,7 @@ fn show(scene: &Arc<Scene>, camera: Camera, by: By) -> Shown {
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
     give(&mut renderer, &mut buffers, by);
     let [width, height] = SIZE;
-    let image = renderer.draw(&buffers, &Shot { camera, width, height, bounds }).expect("draws");
+    let image = renderer.draw(&buffers, &Shot { camera, width, height, bounds, light: None }).expect("draws");
     let (seen, ran) = (renderer.seen().expect("reads"), renderer.ran().clone());
     let allocated = buffers.allocated().into_iter().map(|part| part.name).collect();
     Shown { image, seen, ran, allocated }
@@ -187,7 +187,7 @@ fn the_ground_hides_what_lies_below_it_and_not_what_lies_in_it() {
         renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
         give(&mut renderer, &mut buffers, by);
         let [width, height] = SIZE;
-        renderer.draw(&buffers, &Shot { camera: from_above(), width, height, bounds }).expect("draws");
+        renderer.draw(&buffers, &Shot { camera: from_above(), width, height, bounds, light: None }).expect("draws");
         let domain = |seen: &Seen| match seen {
             Seen::Triangle(place) => buffers.triangle(*place).map(|(domain, _)| domain),
             _ => None,

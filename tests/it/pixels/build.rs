@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer as _;
+use modalcast::deform::{Deformed, Deformer as _};
 use modalcast::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
 use modalcast::reference::ReferenceDeformer;
 use modalcast::render::{Allocation, Image, Prefer, Ran, Renderer, Shot, plan};
@@ -105,10 +105,10 @@ pub(super) fn draw_sized(
     [width, height]: [u32; 2],
 ) -> Picture {
     let mut deformer = ReferenceDeformer::new(scene);
-    let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let Deformed { bounds, light, .. } = deformer.deform(&State::rest(scene)).expect("deforms");
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = Shot { camera, width, height, bounds };
+    let shot = Shot { camera, width, height, bounds, light };
     let image = renderer.draw(&buffers, &shot).expect("draws");
     let (ran, allocated) = (renderer.ran().clone(), buffers.allocated());
     renderer.unload(buffers);

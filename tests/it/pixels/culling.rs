@@ -54,7 +54,7 @@ impl Show {
     }
 
     fn frame(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
-        let shot = Shot { camera, width, height, bounds: self.scene.rest_bounds };
+        let shot = Shot { camera, width, height, bounds: self.scene.rest_bounds, light: None };
         let rgba = self.renderer.draw(&self.buffers, &shot).expect("draws").rgba;
         let ran = self.renderer.ran().clone();
         Frame { rgba, seen: self.renderer.seen().expect("ids"), ran }
@@ -334,7 +334,7 @@ fn picks_and_pictures_of_numbers_do_not_know_of_culling_and_neither_do_places_of
     let shown = ALL.map(|culling| {
         let mut show = Show::new(mixed(4, Transparency::Exact), culling);
         let camera = at([0.0, 1.0, 9.0], [0.0; 3]);
-        let shot = Shot { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds };
+        let shot = Shot { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds, light: None };
         show.frame(camera, [SIZE, SIZE]);
         let rectangle = Rectangle::within([SIZE; 2], [40; 2], [8; 2]).expect("inside");
         let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("picks");

@@ -25,7 +25,7 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
     let camera = Camera::framing(scene, SIZE[0], SIZE[1]);
-    let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds };
+    let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
     let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("draws")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "frames differ");
     let median = |name: &'static str| {

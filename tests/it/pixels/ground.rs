@@ -57,7 +57,7 @@ impl Frame {
         renderer.upload(&buffers, &Surface { positions, normals, ..Surface::default() }).expect("uploads");
         let mut bounds = scene.rest_bounds;
         bounds.min[1] = lowest;
-        let shot = Shot { camera, width: SIZE, height: SIZE, bounds };
+        let shot = Shot { camera, width: SIZE, height: SIZE, bounds, light: None };
         let rgba = renderer.draw(&buffers, &shot).expect("draws").rgba;
         let passes = renderer.ran().passes.clone();
         let seen = renderer.seen().expect("reads");

@@ -71,12 +71,12 @@ fn frames_of_no_size_and_above_the_limit_are_refused_with_the_numbers() {
     let buffers = renderer.load(&scene).expect("loads");
     let limit = renderer.info().max_side;
     for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
-        let shot = Shot { camera: camera(64), width, height, bounds: scene.rest_bounds };
+        let shot = Shot { camera: camera(64), width, height, bounds: scene.rest_bounds, light: None };
         let refusal = renderer.draw(&buffers, &shot).expect_err("refused").to_string();
         let expected = format!("frame.size: expected 1 to {limit} pixels a side, given {width} x {height}");
         assert_eq!(refusal, expected);
     }
-    let shot = Shot { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds };
+    let shot = Shot { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
     assert_eq!(renderer.draw(&buffers, &shot).expect("one pixel is a frame").rgba.len(), 4);
 }
 
@@ -139,7 +139,7 @@ fn vertices_that_overflowed_spoil_no_other_pixel_and_blacken_none() {
         let surface = Surface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..Surface::default() };
         renderer.upload(&buffers, &surface).expect("uploads");
         let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
-        let shot = Shot { camera: camera(64), width: 64, height: 64, bounds };
+        let shot = Shot { camera: camera(64), width: 64, height: 64, bounds, light: None };
         let image = renderer.draw(&buffers, &shot).expect("draws");
         assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{bad}");
     }
@@ -180,7 +180,7 @@ fn renderers_come_and_go_on_many_threads_and_on_one() {
     let mut deformer = ReferenceDeformer::new(&scene);
     let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
     left.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 32, height: 32, bounds };
+    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
     assert!(left.draw(&buffers, &shot).expect("draws").rgba == first, "two contexts on one thread keep apart");
 }
 

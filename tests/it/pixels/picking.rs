@@ -36,7 +36,7 @@ impl Board {
     }
 
     fn shot(&self, camera: Camera, size: u32) -> Shot {
-        Shot { camera, width: size, height: size, bounds: self.bounds }
+        Shot { camera, width: size, height: size, bounds: self.bounds, light: None }
     }
 
     /// In a square picture: the hits of a rectangle, by its corner and size.

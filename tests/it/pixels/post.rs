@@ -269,7 +269,7 @@ fn light_that_is_no_number_or_infinite_spoils_no_other_pixel() {
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));
                 let buffers = renderer.load(&scene).expect("loads");
                 renderer.upload(&buffers, &surface).expect("uploads");
-                let shot = Shot { camera: camera(64), width: 64, height: 64, bounds };
+                let shot = Shot { camera: camera(64), width: 64, height: 64, bounds, light: None };
                 let image = renderer.draw(&buffers, &shot).expect("draws");
                 Picture { image, ran: renderer.ran().clone(), allocated: vec![] }
             };

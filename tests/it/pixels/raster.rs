@@ -116,7 +116,7 @@ fn ids_are_those_of_opengl_but_on_edges_and_where_depths_tie() {
         let buffers = renderer.load(&scene).expect("loads");
         renderer.upload(&buffers, &surface).expect("uploads");
         let [width, height] = SIZE;
-        renderer.draw(&buffers, &Shot { camera, width, height, bounds }).expect("draws");
+        renderer.draw(&buffers, &Shot { camera, width, height, bounds, light: None }).expect("draws");
         assert_eq!(renderer.ran().samples, 1);
         let id = |seen: &Seen| match seen {
             Seen::Triangle(place) => buffers.triangle(*place).map(|(_, triangle)| triangle as u32),

@@ -8,7 +8,7 @@ use modalcast::domain::{AlphaMode, Material};
 use modalcast::engine::Workbench;
 use modalcast::reference::ReferenceDeformer;
 use modalcast::render::{Renderer, SceneBuffers, Shot};
-use modalcast::scene::{Bounds, Camera, Lens, Scene, Shadow, State};
+use modalcast::scene::{Bounds, Camera, Lens, LightBounds, Scene, Shadow, State};
 
 use super::build::open;
 use super::shadow::{stage, with_square};
@@ -37,7 +37,7 @@ fn cameras(scene: &Scene) -> [Camera; 2] {
 }
 
 fn shot(camera: Camera, bounds: Bounds) -> Shot {
-    Shot { camera, width: 64, height: 64, bounds }
+    Shot { camera, width: 64, height: 64, bounds, light: None }
 }
 
 fn shadows(renderer: &Renderer) -> usize {
@@ -111,6 +111,13 @@ fn an_upload_forgets_the_name_and_other_bounds_or_another_origin_have_another_sh
     assert_eq!(drawn, [2, 0, 2, 0, 2]);
     let nobody = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
     assert_eq!([nobody, nobody].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 2], "no bounds are the same");
+    let lit = [0.0, 0.0, 0.5, 0.5].map(|more| {
+        let axes = scene.light_axes().expect("a shadow");
+        let light = Some(LightBounds::of_box(&axes, &bounds).widened(more));
+        renderer.draw(&buffers, &Shot { light, ..shot(camera, bounds) }).expect("draws");
+        shadows(&renderer)
+    });
+    assert_eq!(lit, [2, 0, 2, 0], "another box in light space");
     buffers.relative_to([1024.0, 0.0, 0.0]);
     assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 0]);
     renderer.upload(&buffers, &surface).expect("uploads");

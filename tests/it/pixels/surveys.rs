@@ -20,7 +20,7 @@ fn survey(stage: Stage, camera: Camera, size: u32, field: Field) -> Survey {
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
     renderer.upload(&buffers, &surface).expect("uploads");
-    let shot = Shot { camera, width: size, height: size, bounds: scene.rest_bounds };
+    let shot = Shot { camera, width: size, height: size, bounds: scene.rest_bounds, light: None };
     if let Field::Values { .. } = field {
         renderer.survey(&buffers, &shot, field).expect_err("no values yet");
         let values: Vec<f32> = surface.positions.chunks_exact(3).map(|point| point[0]).collect();
@@ -139,7 +139,7 @@ fn numbers_cost_nothing_until_they_are_asked_for_and_leave_the_frame_as_it_was()
         ..Default::default()
     };
     renderer.upload(&buffers, &surface).expect("uploads");
-    let shot = Shot { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds };
+    let shot = Shot { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
     let before = renderer.draw(&buffers, &shot).expect("draws").rgba;
     let (ran, planned) = (renderer.ran().clone(), buffers.allocated());
     renderer.upload_values(&mut buffers, &[0.0, 1.0, 2.0, 3.0]).expect("uploads");

@@ -226,7 +226,7 @@ fn spoiled(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], flat: bool
     }
     let surface = Surface { positions, normals: normals.repeat(4), tangents: tangents.repeat(4), ..Surface::default() };
     renderer.upload(&buffers, &surface).expect("uploads");
-    let shot = Shot { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds };
+    let shot = Shot { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
     renderer.draw(&buffers, &shot).expect("draws").rgba
 }
 

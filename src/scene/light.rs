@@ -1,0 +1,123 @@
+//! Light space: the constant axes along which the map of the sun's shadow lies (section 3.3.1 of the thesis), and boxes in
+//! it.
+//!
+//! The thesis takes an axis-aligned box of the vertices in the world and that of its eight corners in light space. The
+//! second is fitted closer here: to the corners of the boxes of small parts of the surface, or to the vertices.
+
+use nalgebra::Vector3;
+
+use super::{Bounds, Scene, UpAxis};
+
+/// x, y and z of light space, unit vectors in the world: z is v_l, the direction to the sun, and y points up in the world.
+/// With the sun straight up, "up in the world" says nothing, and any y will do.
+pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
+    let across = up.vector().cross(&to_sun);
+    let x = across.try_normalize(1e-6).unwrap_or_else(|| {
+        let other = if to_sun.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
+        other.cross(&to_sun).normalize()
+    });
+    [x, to_sun.cross(&x), to_sun]
+}
+
+impl Scene {
+    /// The axes along which deformers measure the vertices for the sun's shadow; none where the look has none.
+    pub fn light_axes(&self) -> Option<[Vector3<f64>; 3]> {
+        self.look.shadow.map(|_| light_axes(self.look.to_sun(self.up), self.up))
+    }
+}
+
+/// A box along the axes of light space, in scene units from the same origin as what it holds; empty when `min > max`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LightBounds(pub Bounds);
+
+impl LightBounds {
+    pub const EMPTY: Self = Self(Bounds::EMPTY);
+
+    /// The smallest that holds a box of the world: a corner of the box is the farthest along each axis. A NaN in the box
+    /// gives one here, so does what is infinite, and an empty box an empty one.
+    pub fn of_box(axes: &[Vector3<f64>; 3], world: &Bounds) -> Self {
+        if world.min[0] > world.max[0] {
+            return Self::EMPTY;
+        }
+        let end = |axis: usize, is_upper: bool| {
+            let farthest = |along: usize| {
+                let part = axes[axis][along];
+                part * if (part >= 0.0) == is_upper { world.max[along] } else { world.min[along] }
+            };
+            farthest(0) + farthest(1) + farthest(2)
+        };
+        Self(Bounds {
+            min: std::array::from_fn(|axis| end(axis, false)),
+            max: std::array::from_fn(|axis| end(axis, true)),
+        })
+    }
+
+    /// The smallest that holds both; NaN in either stays NaN.
+    #[must_use]
+    pub fn union(self, other: Self) -> Self {
+        Self(self.0.union(other.0))
+    }
+
+    /// The same, longer by `margin` at every end.
+    #[must_use]
+    pub fn widened(self, margin: f64) -> Self {
+        Self(Bounds { min: self.0.min.map(|end| end - margin), max: self.0.max.map(|end| end + margin) })
+    }
+
+    /// Whether a map can be fitted to it: it holds something, and all of it is finite.
+    pub fn is_sound(&self) -> bool {
+        self.0.is_finite() && self.0.min[0] <= self.0.max[0]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn suns() -> [Vector3<f64>; 5] {
+        [[0.4, 0.8, 0.5], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 1e-9], [-0.3, 0.1, -0.9]]
+            .map(|sun| Vector3::from(sun).normalize())
+    }
+
+    #[test]
+    fn axes_are_perpendicular_unit_vectors_with_y_up_and_z_to_the_sun() {
+        for (sun, up) in suns().into_iter().flat_map(|sun| [UpAxis::X, UpAxis::Y, UpAxis::Z].map(|up| (sun, up))) {
+            let [x, y, z] = light_axes(sun, up);
+            assert!((x.cross(&y) - z).norm() < 1e-12 && (x.norm() - 1.0).abs() < 1e-12, "{sun}");
+            assert!(z == sun && y.dot(&up.vector()) >= -1e-12, "{sun} {up:?}");
+        }
+    }
+
+    #[test]
+    fn a_box_in_light_space_reaches_to_the_farthest_corners_and_no_farther() {
+        let world = Bounds { min: [-1.0, 0.5, -2.0], max: [1.5, 3.0, 2.0] };
+        for sun in suns() {
+            let axes = light_axes(sun, UpAxis::Y);
+            let mut want = Bounds::EMPTY;
+            for corner in world.corners() {
+                want.include(axes.map(|axis| axis.dot(&corner.coords)));
+            }
+            let LightBounds(got) = LightBounds::of_box(&axes, &world);
+            for axis in 0..3 {
+                assert!(
+                    (got.min[axis] - want.min[axis]).abs() < 1e-12 && (got.max[axis] - want.max[axis]).abs() < 1e-12
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_is_empty_and_what_is_not_finite_is_told() {
+        let axes = light_axes(suns()[0], UpAxis::Y);
+        let of = |min, max| LightBounds::of_box(&axes, &Bounds { min, max });
+        let good = of([0.0; 3], [1.0; 3]);
+        assert!(good.is_sound() && !LightBounds::EMPTY.is_sound());
+        assert_eq!(LightBounds::of_box(&axes, &Bounds::EMPTY), LightBounds::EMPTY);
+        assert_eq!(good.union(LightBounds::EMPTY), good);
+        for bad in [f64::NAN, f64::INFINITY] {
+            assert!(!of([0.0; 3], [1.0, bad, 1.0]).is_sound());
+            assert!(!good.union(of([0.0; 3], [1.0, bad, 1.0])).is_sound());
+        }
+        assert_eq!(good.widened(0.5).0.max[2], good.0.max[2] + 0.5);
+    }
+}

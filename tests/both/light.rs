@@ -1,0 +1,129 @@
+//! What vertices take up in light space: nothing is outside, little is between, and a scene without a shadow is not measured.
+
+use std::sync::Arc;
+
+use modalcast::deform::Deformer;
+use modalcast::domain::{Mesh, Modes, Shape};
+use modalcast::scene::{Batches, Bounds, Deformation, LightBounds, Scene, State};
+
+use super::{Shown, run, scene_of};
+use crate::scenes::{self, Random};
+
+/// Vertices of a tile, of which a box is made.
+pub(crate) const TILE: usize = 128;
+
+/// A thin coil along the diagonal of a cube of side 2, which bends in smooth waves: the box of a tile of it is small, that
+/// of all of it is not.
+pub(crate) fn coil(vertices: usize, rank: usize) -> Shape {
+    let along = |vertex: usize| vertex as f32 / vertices as f32;
+    let point = |vertex: usize| {
+        let (t, turn) = (2.0 * along(vertex) - 1.0, 300.0 * along(vertex));
+        [t + 0.02 * turn.cos(), t + 0.02 * turn.sin(), t]
+    };
+    let rest: Vec<[f32; 3]> = (0..vertices).map(point).collect();
+    let wave = |entry: usize| 0.05 * ((entry / (3 * vertices) + 1) as f32 * 3.0 * along(entry / 3 % vertices)).sin();
+    let modes = Modes::from_columns(3 * vertices, rank, (0..3 * vertices * rank).map(wave).collect()).expect("modes");
+    let last = vertices as u32 - 1;
+    let triangles = (0..=last).map(|at| [at, (at + 1).min(last), (at + 2).min(last)]).collect();
+    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; vertices], vec![], triangles).expect("a mesh");
+    Shape::new(mesh, modes).expect("a shape")
+}
+
+/// Coils of tiles of their own and of shared ones.
+pub(crate) fn coils(deformation: Deformation) -> Arc<Scene> {
+    scene_of(vec![coil(5000, 4), coil(700, 2), coil(9, 1)], 2, deformation, false)
+}
+
+/// The smallest box along the axes of a scene's light that holds all of the packed positions, tile by tile of `size`.
+pub(crate) fn along(scene: &Scene, positions: &[f32], size: usize) -> LightBounds {
+    let axes = scene.light_axes().expect("the look has a shadow");
+    let tile = |positions: &[f32]| LightBounds::of_box(&axes, &Bounds::of(positions));
+    positions.chunks(3 * size).map(tile).fold(LightBounds::EMPTY, LightBounds::union)
+}
+
+/// How far `inner` reaches out of `outer`, or a NaN if there is one.
+pub(crate) fn beyond(outer: &LightBounds, inner: &LightBounds) -> f64 {
+    let ends = (0..3).flat_map(|axis| [outer.0.min[axis] - inner.0.min[axis], inner.0.max[axis] - outer.0.max[axis]]);
+    ends.fold(0.0, |most: f64, end| if end.is_nan() || most.is_nan() { f64::NAN } else { most.max(end) })
+}
+
+/// The sum of the largest coordinates: what f32 rounds in proportion to.
+pub(crate) fn reach(bounds: &Bounds) -> f64 {
+    bounds.min.iter().zip(&bounds.max).map(|(min, max)| min.abs().max(max.abs())).sum()
+}
+
+/// The largest diagonal of the box of a tile.
+fn widest(positions: &[f32]) -> f64 {
+    positions.chunks(3 * TILE).map(|tile| Bounds::of(tile).diagonal()).fold(0.0, f64::max)
+}
+
+/// What a step says of light space, which holds every vertex and not much more than the corners of the bounds.
+fn held(name: &str, scene: &Scene, shown: &Shown) -> LightBounds {
+    let light = shown.light.expect("the look has a shadow");
+    let (exact, corners) = (along(scene, &shown.surface.positions, 1), along_corners(scene, &shown.bounds));
+    let reach = reach(&shown.bounds);
+    assert!(beyond(&light, &exact) <= 1e-12 * reach, "{name}: a vertex is outside: {light:?}, {exact:?}");
+    assert!(beyond(&corners, &light) <= 4e-7 * reach, "{name}: {light:?} reaches beyond {corners:?}");
+    let smaller = exact.widened(-1e-3 * shown.bounds.diagonal());
+    assert!(shown.bounds.diagonal() == 0.0 || beyond(&smaller, &exact) > 0.0, "{name}: control");
+    light
+}
+
+fn along_corners(scene: &Scene, bounds: &Bounds) -> LightBounds {
+    LightBounds::of_box(&scene.light_axes().expect("the look has a shadow"), bounds)
+}
+
+/// Random, smooth, moved far away, of one vertex, and of domains that share a tile.
+pub(crate) fn every_vertex_is_held<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    let together = Deformation { batches: Batches::Always, ..Deformation::default() };
+    let scenes = [
+        ("coils", coils(Deformation::default())),
+        ("coils together", coils(together)),
+        ("one vertex", scenes::scene(&[(1, 1)], 1, false, true)),
+        ("small ones", scenes::scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
+    ];
+    for (name, scene) in scenes {
+        let mut deformer = make(&scene);
+        for seed in 0..3 {
+            let mut state = scenes::state(&scene, seed);
+            held(name, &scene, &run(&mut deformer, &state));
+            state.transforms.iter_mut().for_each(|place| place.0[3] += 1e6);
+            held(&format!("{name}, far"), &scene, &run(&mut deformer, &state));
+            state.transforms.iter_mut().for_each(|place| place.0.iter_mut().for_each(|entry| *entry *= 1e-20));
+            held(&format!("{name}, tiny"), &scene, &run(&mut deformer, &state));
+        }
+    }
+}
+
+/// Half the volume at most of what the corners give, and no more than a tile's diagonal beyond the vertices.
+pub(crate) fn a_thin_scene_is_fitted_closely<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    let scene = scene_of(vec![coil(5000, 4)], 1, Deformation::default(), false);
+    let shown = run(&mut make(&scene), &State::rest(&scene));
+    let light = held("coil", &scene, &shown);
+    let (exact, corners) = (along(&scene, &shown.surface.positions, 1), along_corners(&scene, &shown.bounds));
+    let widest = widest(&shown.surface.positions);
+    assert!(beyond(&exact, &light) < widest, "{light:?} beyond {exact:?}, tiles of {widest}");
+    let volume = |LightBounds(of): &LightBounds| (0..3).map(|axis| of.max[axis] - of.min[axis]).product::<f64>();
+    let [light, exact, corners] = [light, exact, corners].map(|of| volume(&of));
+    eprintln!("coil: {:.3} of the volume by corners, {:.3} by vertices", light / corners, exact / corners);
+    assert!(light < 0.5 * corners && exact <= light);
+}
+
+/// A look without a shadow asks for nothing, and what overflows is told.
+pub(crate) fn nothing_is_measured_without_a_shadow_and_overflow_is_told<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
+    let mut parts = scenes::parts(vec![scenes::shape(&mut Random(3), 300, 2)]);
+    parts.domains = vec![scenes::domain(0, 0); 2];
+    parts.look.shadow = None;
+    let dark = Scene::new(parts).expect("a scene");
+    assert_eq!(run(&mut make(&dark), &State::rest(&dark)).light, None);
+    let scene = scenes::scene(&[(300, 2)], 2, false, false);
+    let (mut deformer, good) = (make(&scene), State::rest(&scene));
+    let before = run(&mut deformer, &good).light;
+    assert!(before.is_some_and(|light| light.is_sound()));
+    for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
+        let mut lost = good.clone();
+        lost.transforms[1].0.fill(bad);
+        assert!(run(&mut deformer, &lost).light.is_some_and(|light| !light.is_sound()), "{bad}");
+        assert_eq!(run(&mut deformer, &good).light, before, "forgotten");
+    }
+}
