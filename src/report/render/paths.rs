@@ -13,8 +13,7 @@ use super::raster::{MAPS, MOST_DIFFERING};
 use super::studio::{Pass, Set, Size, Studio};
 use super::{Request, studio};
 use crate::error::Result;
-use crate::gpu::{Device, GlRaster};
-use crate::raster::{Mesh, Rasteriser};
+use crate::gpu::Device;
 use crate::render::{Culled, Paths, Seen};
 use crate::scene::{Antialias, Camera, Culling, Look, Parts, Scene, Shadow, State};
 
@@ -121,8 +120,7 @@ impl Job {
         let want = self.shown(studio, set, size)?;
         let opengl = studio.time(set, self.camera, size, replays)?;
         let culled = studio.renderer.ran().culled;
-        let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(device, mesh)?) as Box<dyn Rasteriser>);
-        studio.renderer.draw_beside(&mut set.buffers, make)?;
+        studio.draw_beside(set, device)?;
         let got = self.shown(studio, set, size)?;
         let paths = studio.renderer.ran().paths;
         let differing = got.1.iter().zip(&want.1).filter(|(got, want)| got != want).count();

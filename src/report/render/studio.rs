@@ -5,12 +5,15 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::plants;
 use crate::cpu::CpuDeformer;
 use crate::deform::{Deformer, Surface};
 use crate::error::{Result, during};
+use crate::gpu::{Device, GlRaster};
+use crate::raster::{Mesh, Rasteriser};
 use crate::render::{Image, Prefer, Renderer, SceneBuffers, Shot};
 use crate::report::timing::{FEWEST, Timing};
-use crate::scene::{Bounds, Camera, LightBounds, Scene, State};
+use crate::scene::{Bounds, Camera, LightBounds, Rastering, Scene, State};
 
 /// Size of a picture in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -52,6 +55,29 @@ impl Studio {
     pub(super) fn set(&mut self, scene: &Arc<Scene>) -> Result<Set> {
         let (buffers, deformer) = (self.renderer.load(scene)?, CpuDeformer::new(scene));
         Ok(Set { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, light: None })
+    }
+
+    /// Lets CUDA draw what it may of a scene.
+    ///
+    /// # Errors
+    /// Those of the device.
+    pub(super) fn draw_beside(&mut self, set: &mut Set, device: &Arc<Device>) -> Result<()> {
+        let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(device, mesh)?) as Box<dyn Rasteriser>);
+        self.renderer.draw_beside(&mut set.buffers, make)
+    }
+
+    /// Lets those draw a posed scene that its look names, as far as they are there.
+    ///
+    /// # Errors
+    /// Those of the device, and of drawing.
+    pub(super) fn draw_as_named(&mut self, set: &mut Set, camera: Camera, size: Size) -> Result<()> {
+        let wanted = set.scene.look.raster;
+        let Some(device) = plants::device().filter(|_| wanted != Rastering::OpenGl) else { return Ok(()) };
+        self.draw_beside(set, &device)?;
+        if wanted == Rastering::Fastest {
+            self.renderer.choose_paths(&set.buffers, &set.shot(camera, size))?;
+        }
+        Ok(())
     }
 
     /// Deforms it and uploads what came of that.

@@ -9,7 +9,7 @@ use super::pictures::{self, File};
 use super::studio::{Pass, Size, Studio};
 use crate::error::{Result, during};
 use crate::load;
-use crate::render::Info;
+use crate::render::{Info, Paths};
 use crate::report::machine::Provenance;
 use crate::report::timing::{FEWEST, Timing};
 use crate::scene::{Camera, Look, State};
@@ -33,6 +33,8 @@ pub struct Sample {
     pub look: Look,
     /// Samples a pixel.
     pub samples: u32,
+    /// Who drew it.
+    pub paths: Paths,
     /// `clip_from_world`, column by column; the camera frames the scene.
     pub clip_from_world: Vec<f64>,
     pub eye: [f64; 3],
@@ -78,6 +80,7 @@ fn sample(studio: &mut Studio, request: &Request, source: &str) -> Result<(Sampl
     let mut set = studio.set(&scene)?;
     studio.pose(&mut set, &State::rest(&scene))?;
     let camera = Camera::framing(&scene, size.width, size.height);
+    studio.draw_as_named(&mut set, camera, size)?;
     let passes = studio.time(&set, camera, size, request.replays)?;
     let mut times = Vec::new();
     for _ in 0..request.replays.max(FEWEST) {
@@ -94,6 +97,7 @@ fn sample(studio: &mut Studio, request: &Request, source: &str) -> Result<(Sampl
         triangles: scene.layout.triangles,
         look: scene.look,
         samples: studio.renderer.ran().samples,
+        paths: studio.renderer.ran().paths,
         clip_from_world: clip.iter().copied().collect(),
         eye: camera.eye().into(),
         to_sun: scene.look.to_sun(scene.up).into(),
