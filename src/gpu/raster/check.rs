@@ -51,7 +51,7 @@ pub(in super::super) fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> 
     if let Some(image) = asked.into_iter().find(|image| *image as usize >= images.len()) {
         return Err(invalid("surfaces", format!("images below {}", images.len()), image));
     }
-    if !(*anisotropy >= 1.0) {
+    if anisotropy.is_nan() || *anisotropy < 1.0 {
         return Err(invalid("anisotropy", "1 or more", anisotropy));
     }
     images.iter().try_for_each(check_image)
