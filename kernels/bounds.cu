@@ -105,7 +105,7 @@ struct Along {
         float lower = 0.0f, upper = 0.0f;
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {
-            const float below = number_of(box[i]), above = number_of(box[3 + i]);
+            const float below = unordered(box[i]), above = unordered(box[3 + i]);
             const bool is_along = axis[i] >= 0.0f;
             lower = __fmaf_ru(fabsf(axis[i]), is_along ? below : above, lower);
             upper = __fmaf_ru(fabsf(axis[i]), is_along ? above : below, upper);

@@ -13,7 +13,7 @@ __device__ inline unsigned ordered(float x) {
 }
 
 // The number that a key stands for; of 0, which no number has, and of the NaN's key a NaN.
-__device__ inline float number_of(unsigned key) {
+__device__ inline float unordered(unsigned key) {
     return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
 }
 

@@ -90,7 +90,7 @@ pub(super) fn bounds_of(keys: &[u32]) -> crate::scene::Bounds {
     bounds
 }
 
-/// The inverse of `ordered` in `kernels/ordered.cuh`. Zero, which no number has, gives a NaN like the NaN's own key.
+/// `unordered` of `kernels/ordered.cuh`, the inverse of `ordered`. Zero, which no number has, gives a NaN like the NaN's own key.
 fn number_of(key: u32) -> f32 {
     f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
 }
