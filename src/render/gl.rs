@@ -357,23 +357,6 @@ impl Gl {
         }
     }
 
-    /// Runs the current compute program where nothing but the host reads what it writes: commands after it may run beside it,
-    /// until [`Self::order`].
-    pub(super) fn dispatch_for_host(&self, [groups_x, groups_y]: [u32; 2]) {
-        let gl = self.on();
-        // SAFETY: the shaders check their own bounds.
-        unsafe {
-            gl.dispatch_compute(groups_x, groups_y, 1);
-            gl.memory_barrier(glow::CLIENT_MAPPED_BUFFER_BARRIER_BIT | glow::BUFFER_UPDATE_BARRIER_BIT);
-        }
-    }
-
-    /// Lets what comes after see and overwrite whatever shaders before wrote and read.
-    pub(super) fn order(&self) {
-        // SAFETY: orders commands.
-        unsafe { self.on().memory_barrier(glow::ALL_BARRIER_BITS) }
-    }
-
     pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
         self.copy_to(from, (to, 0), bytes);
     }

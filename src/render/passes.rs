@@ -149,8 +149,6 @@ pub(super) fn blended(
 
 /// What is seen to linear light.
 pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
-    // The frame before may still make bytes of this picture.
-    gl.order();
     bind_shadow(buffers);
     target.ids.bind(ID_UNIT);
     if let Some(layer) = &target.layer {

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
-use super::gl::{Buffer, Fence, Lent, Stopwatch};
+use super::gl::{Fence, Lent, Stopwatch};
 use super::lists;
 use super::programs::Sampled;
 use super::ring::Slot;
@@ -132,10 +132,8 @@ impl Renderer {
             splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
-        let staging = slot.as_ref().and_then(Slot::staging);
-        let host = staging.map(|staging| &*staging.buffer);
-        let mut passes = self.run(buffers, shot, (target, &sampled, host), &mut ran)?;
-        passes.extend(self.bring(buffers, target, host)?);
+        let mut passes = self.run(buffers, shot, (target, &sampled), &mut ran)?;
+        passes.extend(self.bring(buffers, target, slot.as_ref())?);
         Ok(Ticket {
             form,
             slot,
@@ -161,7 +159,7 @@ impl Renderer {
         &self,
         buffers: &SceneBuffers,
         shot: &Shot,
-        (target, sampled, host): (&Target, &Sampled, Option<&Buffer>),
+        (target, sampled): (&Target, &Sampled),
         ran: &mut Ran,
     ) -> Result<Vec<(&'static str, Stopwatch)>> {
         let gl = &self.gl;
@@ -190,24 +188,26 @@ impl Renderer {
             timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
             timed("shade", &mut || passes::shade(gl, buffers, target, sampled, ran))?,
             timed("bloom", &mut || buffers.post.bloom(gl, target, ran))?,
-            timed("encode", &mut || buffers.post.encode(gl, target, host, ran))?,
+            timed("encode", &mut || buffers.post.encode(gl, target, ran))?,
         ]);
         Ok(times)
     }
 
-    /// Brings what is told of lists and of what was culled to where the host can read it, behind the pixels.
+    /// Brings the pixels, and behind them what is told of lists and of what was culled, to where the host can read them.
     fn bring(
         &self,
         buffers: &SceneBuffers,
         target: &Target,
-        host: Option<&Buffer>,
+        slot: Option<&Slot>,
     ) -> Result<Option<(&'static str, Stopwatch)>> {
-        let Some(host) = host else { return Ok(None) };
+        let Some(staging) = slot.and_then(Slot::staging) else { return Ok(None) };
+        let bytes = target.form.bytes();
         let copy = || {
+            self.gl.copy(&target.packed, &staging.buffer, bytes);
             let ledger = target.lists.as_ref().map(|lists| &lists.ledger);
             for (from, to) in [ledger, buffers.buffers.get(cull::COUNTED)].into_iter().zip(target.form.told()) {
                 if let Some(from) = from.filter(|_| !to.is_empty()) {
-                    self.gl.copy_to(from, (host, to.start), to.end - to.start);
+                    self.gl.copy_to(from, (&staging.buffer, to.start), to.end - to.start);
                 }
             }
             self.gl.check("read")
