@@ -167,18 +167,27 @@ impl Renderer {
             gl.timed((pass, self.watchdog), commands).map(|stopwatch| (pass, stopwatch))
         };
         let mut times = Vec::new();
-        buffers.shared_shadow.draw_unless_there(buffers.shadow_of(shot), || {
-            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, shot, ran))?);
+        let content = buffers.shadow_of(shot);
+        let by_others = buffers.drawn_beside().map(|(beside, draws)| {
+            let wanted = [draws[0] && buffers.shared_shadow.is_wanted(content), draws[1]];
+            (beside, wanted)
+        });
+        if let Some((beside, wanted)) = by_others.filter(|(_, wanted)| wanted.contains(&true)) {
+            let name = if wanted[0] { "raster" } else { "ids" };
+            times.push(timed(name, &mut || beside.draw(gl, (buffers, shot), wanted, ran))?);
+        }
+        buffers.shared_shadow.draw_unless_there(content, || {
+            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
             times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
             Ok(())
         })?;
-        let beside = buffers.visibility_beside();
+        let beside = by_others.filter(|(_, wanted)| wanted[1]).map(|(beside, _)| beside);
         if buffers.culler.is_some() && beside.is_none() {
             times.push(timed("cull", &mut || cull::camera(gl, buffers, target, sampled, ran))?);
         }
         times.extend([
             timed("visibility", &mut || match beside {
-                Some(beside) => beside.ids(gl, buffers, (target, shot), ran),
+                Some(beside) => beside.unpack(gl, target, ran),
                 None => {
                     passes::visibility(gl, buffers, target, sampled, ran)?;
                     let is_last = frame::ground_is_last(&buffers.scene, shot, buffers.origin);
@@ -276,11 +285,11 @@ impl Pixels {
 /// Milliseconds of the stages and of the passes that they are made of.
 fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
     let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, stopwatch)| (*name, stopwatch.ms())).collect();
-    let of_shadow = |name: &str| ["shadow", "blur"].contains(&name);
+    let of_shadow = |name: &str| ["raster", "shadow", "blur"].contains(&name);
     let sum =
         |wanted: &dyn Fn(&str) -> bool| all.iter().filter(|(name, _)| wanted(name)).fold(0.0, |sum, (_, ms)| sum + ms);
     let mut times = vec![("shadow", sum(&of_shadow))];
-    times.extend(all.iter().filter(|(name, _)| *name == "blur"));
+    times.extend(all.iter().filter(|(name, _)| of_shadow(name) && *name != "shadow"));
     times.push(("draw", sum(&|name| !of_shadow(name) && name != "read")));
     times.extend(all.iter().filter(|(name, _)| !of_shadow(name)));
     times

@@ -53,7 +53,8 @@ fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> (Image, Vec<Seen>)
         let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(&device, mesh)?) as Box<dyn Rasteriser>);
         renderer.draw_beside(&mut buffers, make).expect("given");
     }
-    let camera = Camera::framing(scene, SIZE[0], SIZE[1]);
+    // A near plane far enough off that depths tell surfaces apart: those that tie may be drawn in any order.
+    let camera = Camera { near: 1.0, far: 40.0, ..Camera::framing(scene, SIZE[0], SIZE[1]) };
     let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds: deformed.bounds, light: deformed.light };
     let image = renderer.draw(&buffers, &shot).expect("draws");
     (image, renderer.seen().expect("reads"))
