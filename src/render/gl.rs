@@ -3,7 +3,6 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
-mod clear;
 mod culling;
 mod debug;
 mod fence;
@@ -19,7 +18,6 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
-use self::clear::{Attached, ClearTexSubImage};
 pub(super) use self::debug::is_wanted as is_debug_wanted;
 pub(super) use self::fence::Fence;
 pub(super) use self::limits::Limits;
@@ -43,8 +41,6 @@ pub(super) struct Gl {
     glow: glow::Context,
     context: Context,
     pub(super) limits: Limits,
-    /// Fills textures, where that is better than clearing framebuffers.
-    fill: Option<ClearTexSubImage>,
     /// Timer queries that nobody waits for.
     timers: RefCell<Vec<glow::Query>>,
     /// Buffers that are to go once they were read.
@@ -109,10 +105,7 @@ impl Gl {
         if context.is_debug {
             debug::listen(&mut glow);
         }
-        let mut gl =
-            Self { glow, context, limits, fill: None, timers: RefCell::default(), retired: RefCell::default() };
-        gl.fill = gl.filler();
-        Ok(Rc::new(gl))
+        Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default(), retired: RefCell::default() }))
     }
 
     /// The functions, with the context current.
@@ -221,8 +214,7 @@ impl Gl {
         // SAFETY: attaches textures of this context; completeness is asked for at once.
         unsafe {
             let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
-            let of = |texture: &Texture| Attached::new(texture, 0);
-            let framebuffer = Framebuffer { gl: Rc::clone(self), name, colour: colour.map(of), depth: depth.map(of) };
+            let framebuffer = Framebuffer { gl: Rc::clone(self), name };
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(name));
             if let Some(colour) = colour {
                 gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(colour.name), 0);
@@ -289,8 +281,6 @@ impl Gl {
             gl.viewport(0, 0, width as i32, height as i32);
             gl.depth_mask(true);
             match clear {
-                Clear::Depth if self.fill(into, false) => {}
-                Clear::DepthAndIds if self.fill(into, true) => {}
                 Clear::Depth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
                 Clear::DepthAndIds => {
                     gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]);

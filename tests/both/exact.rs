@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 /// A step of the snapped corners, pixels.
 const EDGE: f64 = 1.0 / 256.0;
 /// Depth precision: 24 bits of the window's range from each side.
-const TIE: f64 = 2.0 / (1 << 24) as f64;
+pub(crate) const TIE: f64 = 2.0 / (1 << 24) as f64;
 
 /// A triangle in homogeneous window coordinates, exact but for f64.
 pub(crate) struct Exact {
@@ -52,13 +52,14 @@ pub(crate) struct Differences {
     pub(crate) wrong: usize,
 }
 
+/// Samples that differ; depths tie where they differ by `least` or less.
 pub(crate) fn compare(got: &[Option<u32>], want: &[Option<u32>], exact: &[Exact], size: [u32; 2]) -> Differences {
     let mut found = Differences::default();
     for (at, (got, want)) in got.iter().zip(want).enumerate().filter(|(_, (got, want))| got != want) {
         let (x, y) = (at % size[0] as usize, at / size[0] as usize);
         let sample = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
         let both: Vec<&Exact> = [got, want].into_iter().flatten().map(|id| &exact[*id as usize]).collect();
-        let tie = |a: &Exact, b: &Exact| (a.depth(sample) - b.depth(sample)).abs() <= TIE;
+        let tie = |a: &Exact, b: &Exact| (a.depth(sample) - b.depth(sample)).abs() <= least;
         if both.iter().any(|own| own.is_on_edge(sample)) {
             found.edges += 1;
         } else if both.len() == 2 && tie(both[0], both[1]) {
