@@ -53,7 +53,12 @@ pub(crate) struct Differences {
 }
 
 /// Samples that differ; depths tie where they differ by `least` or less.
-pub(crate) fn compare(got: &[Option<u32>], want: &[Option<u32>], exact: &[Exact], size: [u32; 2]) -> Differences {
+pub(crate) fn compare(
+    got: &[Option<u32>],
+    want: &[Option<u32>],
+    exact: &[Exact],
+    (size, least): ([u32; 2], f64),
+) -> Differences {
     let mut found = Differences::default();
     for (at, (got, want)) in got.iter().zip(want).enumerate().filter(|(_, (got, want))| got != want) {
         let (x, y) = (at % size[0] as usize, at / size[0] as usize);
