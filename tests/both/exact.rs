@@ -4,9 +4,6 @@ use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 /// A step of the snapped corners, pixels.
 const EDGE: f64 = 1.0 / 256.0;
-/// Depth precision: 24 bits of the window's range from each side.
-pub(crate) const TIE: f64 = 2.0 / (1 << 24) as f64;
-
 /// A triangle in homogeneous window coordinates, exact but for f64.
 pub(crate) struct Exact {
     edges: [Vector3<f64>; 3],

@@ -11,10 +11,12 @@ use modalcast::scene::{Camera, Culling, Faces, Group, Lens, Scene, State, View, 
 use nalgebra::Matrix4;
 
 use super::build::{Stage, open};
-use crate::both::exact::{Exact, TIE, compare};
+use crate::both::exact::{Exact, compare};
 use crate::scenes::Random;
 
 const SIZE: [u32; 2] = [320, 240];
+/// Depth precision: 24 bits of the window's range from each side.
+const TIE: f64 = 2.0 / (1 << 24) as f64;
 /// Triangles of many sizes in one domain, all around and behind the eye.
 fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
