@@ -1,8 +1,9 @@
-// The ground: a square so large that its edge has long faded into the horizon, made from the vertex's number.
+// The plane of the ground as one triangle over the picture. As depth over w is linear in the picture, three corners say it
+// all; corners of a square in the world would lie behind the eye, and what a rasteriser makes of those is no plane any more.
+out vec2 image;
+
 void main() {
-    const vec2 corners[6] = vec2[](vec2(-1, -1), vec2(1, -1), vec2(1, 1), vec2(-1, -1), vec2(1, 1), vec2(-1, 1));
-    vec2 corner = corners[gl_VertexID] * frame.ground_centre.w;
-    // The up axis is a unit vector of the frame, so turning its components around gives the two others.
-    vec3 world = frame.ground_centre.xyz + corner.x * frame.up.yzx + corner.y * frame.up.zxy;
-    gl_Position = frame.clip_from_world * vec4(world, 1.0);
+    image = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+    vec2 slope;
+    gl_Position = vec4(image, ground_depth(image, slope), 1.0);
 }

@@ -15,7 +15,7 @@ void main() {
     if (any(greaterThanEqual(at, size_of_ids()))) return;
     uint last = NOTHING;
     for (int index = 0; index < SAMPLES; index++) {
-        uint id = texelFetch(ids, at, index).x;
+        uint id = id_at(at, index);
         if (id != NOTHING && id != GROUND && id != last) remember(id - 1u);
         last = id;
     }

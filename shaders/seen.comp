@@ -8,5 +8,5 @@ void main() {
     ivec2 size = size_of_ids();
     ivec2 at = ivec2(gl_GlobalInvocationID.xy);
     if (at.x >= size.x) return;
-    seen[uint(size.y - 1 - at.y) * uint(size.x) + uint(at.x)] = texelFetch(ids, at, 0).x;
+    seen[uint(size.y - 1 - at.y) * uint(size.x) + uint(at.x)] = id_at(at, 0);
 }

@@ -2,6 +2,7 @@
 // the samples that see it, however many those are; the mean of the samples, as they are shown, is the pixel.
 //   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1; NOTHING for ground
 //                                      that was not drawn                                               (in)
+//   drawn    [height][width][SAMPLES]  depth: 1 where there is no id                                    (in)
 //   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, share that they let by   (in)
 //   picture  [height][width]           RGBA16F, bottom row first                                        (out)
 //   glare    [height][width]           RGBA16F: light that glows                                        (out)
@@ -34,9 +35,6 @@ layout(std430, binding = 1) buffer Tiles {
 shared uint sees_triangle;
 #endif
 
-// A direction in the world, as long as it takes to go one unit of depth.
-vec3 through(vec2 image) { return mat3(frame.world_from_image) * vec3(image, 1.0); }
-
 #ifdef GROUND_SEEN
 vec3 ground_seen(vec3 direction) {
     // Rasterised ground is below the eye, and the direction to it goes down; a rounded one must not turn back.
@@ -48,18 +46,18 @@ vec3 ground_seen(vec3 direction) {
 
 // What a sample sees. Ground that was not drawn lies behind all else.
 uint seen_by(ivec2 at, int index, ivec2 size) {
-    uint id = texelFetch(ids, at, index).x;
+    uint id = id_at(at, index);
 #ifdef GROUND_SEEN
     if (id == NOTHING && frame.eye.w > 0.0) {
         vec2 image = 2.0 * (vec2(at) + SAMPLE_PLACES[index]) / vec2(size) - 1.0;
-        if (meets_ground(through(image))) id = GROUND;
+        if (meets_ground(towards(image))) id = GROUND;
     }
 #endif
     return id;
 }
 
 vec3 shaded(uint id, vec2 image, vec2 texel) {
-    vec3 direction = through(image);
+    vec3 direction = towards(image);
     vec3 light = sky(direction);
 #ifdef GROUND_SEEN
     if (id == GROUND) light = ground_seen(direction);

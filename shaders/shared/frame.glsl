@@ -4,8 +4,8 @@ layout(std140, binding = 0) uniform FrameBlock {
     mat4 clip_from_world;
     mat4 map_from_world;   // to the shadow map: x, y and depth from 0 to 1
     mat4 world_from_image; // columns x, y, 1 of normalised device coordinates to a direction
-    vec4 eye;              // and 1 where the ground was not drawn: who sees nothing may see it
-    vec4 to_sun;
+    vec4 eye;              // and 1 where a ground is below it: who sees nothing may see that
+    vec4 to_sun;           // and 1 where the ground may hide something
     vec4 sunlight;
     vec4 skylight;
     vec4 zenith;

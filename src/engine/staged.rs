@@ -215,7 +215,8 @@ impl Staged {
     pub(super) fn choose_paths(&mut self, renderer: &mut Renderer) -> Result<()> {
         let camera = Camera::framing(&self.scene, MEASURED[0], MEASURED[1]);
         let filled = self.fill_buffers(renderer, &camera)?;
-        renderer.choose_paths(self.buffers()?, &filled.shot(camera, MEASURED)).map(drop)
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        renderer.choose_paths(buffers, &filled.shot(camera, MEASURED)).map(drop)
     }
 
     pub(super) fn buffers(&self) -> Result<&SceneBuffers> {

@@ -259,7 +259,7 @@ pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tabl
         kernels,
         buffers: buffers.into_iter().map(|(role, bytes)| Buffer { role, bytes }).collect(),
         bytes_in: inputs,
-        bytes_out: if needs.shadows { 48 } else { 24 },
+        bytes_out: if scene.light_axes().is_some() { 48 } else { 24 },
         bytes_of_changes: changes as u64,
         left_out: left_out(
             scene,
@@ -303,7 +303,7 @@ fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
             ("NORMAL_MAPS", needs.normal_maps),
             ("SHEAR", needs.shear),
             ("FOLLOWERS", needs.followers),
-            ("LIGHT", needs.shadows),
+            ("LIGHT", scene.light_axes().is_some()),
             ("BOXES", needs.boxes),
         ];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
@@ -372,7 +372,7 @@ fn left_out(scene: &Scene, batched: bool, [tangents, displacements, boxes]: [u64
             needs.displacements,
             LeftOut { feature: "displacements", what: "u as an output of `deform`", bytes: displacements },
         ),
-        (needs.shadows, LeftOut { feature: "shadows", what: "bounds in light space", bytes: 0 }),
+        (scene.light_axes().is_some(), LeftOut { feature: "shadows", what: "bounds in light space", bytes: 0 }),
         (needs.boxes, LeftOut { feature: "boxes", what: "a box of each domain in `bounds`", bytes: boxes }),
     ];
     let batches = LeftOut { feature: "batches", what: "`batch`, and groups of domains", bytes: 0 };

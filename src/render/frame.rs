@@ -60,8 +60,8 @@ impl Frame {
             clip_from_world: (clip * camera).cast().into(),
             map_from_world: light.map_from_world.cast().into(),
             world_from_image: world_from_image(&clip, &camera).cast().into(),
-            eye: wide(viewer.eye(), if ground_is_last(scene, shot, origin) { 1.0 } else { 0.0 }),
-            to_sun: wide(to_sun, 0.0),
+            eye: wide(viewer.eye(), flag(look.ground.is_some() && above_ground(scene, shot))),
+            to_sun: wide(to_sun, flag(!ground_is_last(scene, shot, origin))),
             sunlight: colour(look.sunlight, 0.0),
             skylight: colour(look.skylight, 0.0),
             zenith: colour(look.zenith, 0.0),
@@ -212,6 +212,10 @@ fn world_from_image(clip: &Matrix4<f64>, camera: &Matrix4<f64>) -> Matrix4<f64> 
     (world_from_camera * camera_from_image).to_homogeneous()
 }
 
+const fn flag(on: bool) -> f64 {
+    if on { 1.0 } else { 0.0 }
+}
+
 fn wide(vector: Vector3<f64>, fourth: f64) -> [f32; 4] {
     [vector.x as f32, vector.y as f32, vector.z as f32, fourth as f32]
 }
@@ -283,11 +287,11 @@ mod tests {
             light: None,
         };
         let good = Frame::new(&scene, &shot, [0.0; 3]).expect("good");
-        let [x, y, z, is_last] = good.eye;
-        assert!(is_last > 0.0, "nothing is below the ground");
+        let [x, y, z, may_hide] = good.to_sun;
+        assert!(may_hide == 0.0 && good.eye[3] > 0.0, "nothing is below the ground");
         for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             let replaced = Frame::new(&scene, &Shot { bounds, ..shot }, [0.0; 3]).expect("replaced");
-            assert_eq!(replaced, Frame { eye: [x, y, z, 0.0], ..good }, "what overflowed may be below it");
+            assert_eq!(replaced, Frame { to_sun: [x, y, z, 1.0], ..good }, "what overflowed may be below it");
         }
         let measured = LightBounds(Bounds { min: [-0.25; 3], max: [0.25; 3] });
         let with = |light| Frame::new(&scene, &Shot { light: Some(light), ..shot }, [0.0; 3]).expect("good");

@@ -243,6 +243,8 @@ impl Renderer {
 
     /// Frees a scene's buffers.
     pub fn unload(&mut self, buffers: SceneBuffers) {
+        // Makes this context current: a rasteriser beside it gives its buffers back to the current one.
+        self.gl.check("unload").ok();
         drop(buffers);
     }
 

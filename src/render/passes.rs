@@ -8,7 +8,8 @@ use super::paths::Path;
 use super::programs::Sampled;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
-    COLOUR_UNIT, COUNT_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE, TILE_ROW,
+    COLOUR_UNIT, COUNT_UNIT, DEPTH_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE,
+    TILE_ROW,
 };
 use super::splits::Splits;
 use super::target::Target;
@@ -79,7 +80,9 @@ pub(super) fn visibility(
     ran: &mut Ran,
 ) -> Result<()> {
     let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
-    let into = (&target.visible, [target.form.width, target.form.height], listed(buffers));
+    // Of several samples, depth says where there is an id.
+    let clear = if target.form.samples > 1 { Clear::Depth } else { Clear::DepthAndIds };
+    let into = (&target.visible, clear, [target.form.width, target.form.height], listed(buffers));
     identify(gl, buffers, into, programs, ran)?;
     super::cull::remember(gl, buffers, target, sampled)
 }
@@ -89,11 +92,11 @@ pub(super) fn visibility(
 pub(super) fn identify(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (into, [width, height], drawn): (&Framebuffer, [u32; 2], Drawn),
+    (into, clear, [width, height], drawn): (&Framebuffer, Clear, [u32; 2], Drawn),
     (cut_out, parts): (Option<&Program>, Option<&Program>),
     ran: &mut Ran,
 ) -> Result<()> {
-    gl.begin(into, width, height, Clear::DepthAndIds);
+    gl.begin(into, width, height, clear);
     // What is cut out comes last: where something stands before it, nothing is sampled.
     let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out), (Kind::Blend, parts)];
     let written = Fixed { depth_write: true, ..Fixed::default() };
@@ -119,7 +122,7 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran
     };
     gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
     program.bind(None);
-    gl.draw_made(&buffers.nothing, 6);
+    gl.draw_made(&buffers.nothing, 3);
     ran.passes.push("ground");
     gl.check("ground")
 }
@@ -147,7 +150,7 @@ pub(super) fn blended(
 /// What is seen to linear light.
 pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
     bind_shadow(buffers);
-    target.ids.bind(ID_UNIT);
+    bind_seen(target);
     if let Some(layer) = &target.layer {
         layer.colour.bind(LAYER_UNIT);
     }
@@ -173,6 +176,12 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
     gl.check("shade")
 }
 
+/// Binds what each sample sees. Depth says where that is something.
+pub(super) fn bind_seen(target: &Target) {
+    target.ids.bind(ID_UNIT);
+    target.depth.bind(DEPTH_UNIT);
+}
+
 /// Words made from ids, where the host can read them; `program` has a number at location 0 when one is given.
 pub(super) fn words(
     gl: &Gl,
@@ -190,7 +199,7 @@ pub(super) fn words(
 /// Ids of each pixel's first sample, where the host can read them.
 pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
     program.bind(None);
-    target.ids.bind(ID_UNIT);
+    bind_seen(target);
     target.packed.bind_storage(PIXELS);
     gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
     gl.check("seen")

@@ -109,7 +109,7 @@ impl Renderer {
         passes::identify(
             gl,
             buffers,
-            (&picker.visible, [width, height], passes::Drawn::All),
+            (&picker.visible, gl::Clear::DepthAndIds, [width, height], passes::Drawn::All),
             (cut_out.as_deref(), None),
             ran,
         )?;

@@ -42,11 +42,13 @@ pub(super) const TRIANGLE_VERTEX_UNIT: u32 = 18;
 pub(super) const UV_UNIT: u32 = 19;
 pub(super) const TANGENT_UNIT: u32 = 20;
 pub(super) const ID_UNIT: u32 = 21;
+/// Depth of the samples whose ids are at [`ID_UNIT`].
+pub(super) const DEPTH_UNIT: u32 = 26;
 pub(super) const LAYER_UNIT: u32 = 22;
 pub(super) const COUNT_UNIT: u32 = 23;
 pub(super) const VALUE_UNIT: u32 = 24;
 /// Textures that the shading reads beside the scene's images, at most.
-pub(super) const OTHER_READS: usize = 12;
+pub(super) const OTHER_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Lanes of a compute workgroup, along x.
@@ -197,24 +199,22 @@ impl Options {
     fn shading(&self, samples: u32, more: &[&str]) -> String {
         let mut head = self.head(more);
         writeln!(head, "#define TILE {TILE}\n#define ROW {TILE_ROW}u").ok();
-        let ground = if self.defines.contains(&"GROUND_SEEN") { [MEETS, GROUND] } else { [""; 2] };
-        [&head, &self.sampling(samples), FRAME, CLIP, IDS, &self.sun(), SKY, ground[0], ground[1], &self.resolve]
-            .concat()
+        let ground = if self.defines.contains(&"GROUND_SEEN") { GROUND } else { "" };
+        [&head, &self.sampling(samples), FRAME, CLIP, IDS, MEETS, &self.sun(), SKY, ground, &self.resolve].concat()
     }
 
     /// Keys of a rasteriser beside OpenGL to ids.
     pub(super) fn unpack(&self) -> Source {
         let mut head = self.head(&[]);
         writeln!(head, "#define TILE {TILE}").ok();
-        let ground = if self.defines.contains(&"GROUND_SEEN") { MEETS } else { "" };
-        let text = [&head, FRAME, IDS, ground, include_str!("../../shaders/unpack.comp")].concat();
+        let text = [&head, FRAME, IDS, MEETS, include_str!("../../shaders/unpack.comp")].concat();
         Source { label: "unpack".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
     pub(super) fn ground(&self) -> Source {
         let head = self.head(&[]);
-        let vertex = [&head, FRAME, include_str!("../../shaders/ground.vert")].concat();
-        let fragment = [&head, IDS, include_str!("../../shaders/ground.frag")].concat();
+        let vertex = [&head, FRAME, MEETS, include_str!("../../shaders/ground.vert")].concat();
+        let fragment = [&head, FRAME, IDS, MEETS, include_str!("../../shaders/ground.frag")].concat();
         Source { label: "ground".into(), stages: drawn(vertex, fragment) }
     }
 }

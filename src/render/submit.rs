@@ -17,7 +17,7 @@ use super::ring::Slot;
 use super::scene_buffers::SceneBuffers;
 use super::splits::Splits;
 use super::target::{Form, Target};
-use super::{Image, Paths, Ran, Renderer, Shot, cull, frame, passes};
+use super::{Image, Path, Paths, Ran, Renderer, Shot, cull, frame, passes};
 use crate::error::{Error, Result, during, invalid};
 
 /// Bytes that one thread copies at a time: enough that starting it costs little of that.
@@ -101,6 +101,8 @@ impl Renderer {
             (ran.lists, ran.culled) =
                 (told(listed)?.map(|head| lists::told(&head)), told(culled)?.map(|counts| cull::told(&counts)));
         }
+        // Nothing was sifted where somebody else saw.
+        ran.culled = ran.culled.filter(|_| ran.paths.visibility != Some(Path::Cuda));
         let lent = staging.map(|staging| staging.lend(form.bytes() as usize)).transpose()?;
         self.gl.check("read")?;
         warn_of_lists(&self.ran, &ran);
@@ -115,7 +117,6 @@ impl Renderer {
     fn start(&mut self, buffers: &SceneBuffers, shot: &Shot, is_read: bool) -> Result<Ticket> {
         self.check_size(shot)?;
         let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
-        self.last = Some(numbers);
         let look = &buffers.scene.look;
         let size = [shot.width, shot.height];
         let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
@@ -134,6 +135,7 @@ impl Renderer {
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
         let mut passes = self.run(buffers, shot, (target, &sampled), &mut ran)?;
         passes.extend(self.bring(buffers, target, slot.as_ref())?);
+        self.last = Some(numbers);
         Ok(Ticket {
             form,
             slot,
@@ -174,14 +176,17 @@ impl Renderer {
         });
         if let Some((beside, wanted)) = by_others.filter(|(_, wanted)| wanted.contains(&true)) {
             let name = if wanted[0] { "raster" } else { "ids" };
-            times.push(timed(name, &mut || beside.draw(gl, (buffers, shot), wanted, ran))?);
+            match timed(name, &mut || beside.draw(gl, (buffers, shot), wanted, ran)) {
+                Ok(time) => times.push(time),
+                Err(error) => beside.give_up(&error),
+            }
         }
         buffers.shared_shadow.draw_unless_there(content, || {
             times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
             times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
             Ok(())
         })?;
-        let beside = by_others.filter(|(_, wanted)| wanted[1]).map(|(beside, _)| beside);
+        let beside = buffers.drawn_beside().filter(|(_, draws)| draws[1]).map(|(beside, _)| beside);
         if buffers.culler.is_some() && beside.is_none() {
             times.push(timed("cull", &mut || cull::camera(gl, buffers, target, sampled, ran))?);
         }
@@ -190,7 +195,9 @@ impl Renderer {
                 Some(beside) => beside.unpack(gl, target, ran),
                 None => {
                     passes::visibility(gl, buffers, target, sampled, ran)?;
-                    let is_last = frame::ground_is_last(&buffers.scene, shot, buffers.origin);
+                    // The bounds of a scene apart leave out what is far away.
+                    let is_last =
+                        buffers.apart.is_none() && frame::ground_is_last(&buffers.scene, shot, buffers.origin);
                     if is_last { Ok(()) } else { passes::ground(gl, buffers, shot, ran) }
                 }
             })?,

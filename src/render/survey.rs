@@ -121,7 +121,7 @@ impl Renderer {
             passes::identify(
                 gl,
                 buffers,
-                (&surveyor.visible, [form.width, form.height], passes::Drawn::All),
+                (&surveyor.visible, gl::Clear::DepthAndIds, [form.width, form.height], passes::Drawn::All),
                 (cut_out.as_deref(), None),
                 ran,
             )?;

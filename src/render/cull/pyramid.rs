@@ -4,6 +4,7 @@ use std::rc::Rc;
 
 use super::super::gl::{self, Buffer, Framebuffer, Gl, Texture};
 use super::super::programs::Sampled;
+use super::super::shaders::DEPTH_UNIT;
 use super::super::target::Form;
 use crate::error::Result;
 
@@ -13,7 +14,6 @@ pub(super) const TOP: u32 = 8;
 const TURN: u32 = 4;
 const SIDE: u32 = 1 << TURN;
 const PYRAMID: u32 = 4;
-const DEPTH_UNIT: u32 = 26;
 
 /// What occluders are drawn into, and the pyramid of it. For frames of one form.
 #[derive(Debug)]

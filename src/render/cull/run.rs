@@ -3,10 +3,9 @@
 use super::super::Ran;
 use super::super::geometry::Kind;
 use super::super::gl::{Clear, Gl, Program};
-use super::super::passes::{Drawn, draw_depth};
+use super::super::passes::{Drawn, bind_seen, draw_depth};
 use super::super::programs::Sampled;
 use super::super::scene_buffers::SceneBuffers;
-use super::super::shaders::ID_UNIT;
 use super::super::target::Target;
 use super::layout::Groups;
 use super::pyramid::packed;
@@ -112,7 +111,7 @@ pub(in crate::render) fn remember(gl: &Gl, buffers: &SceneBuffers, target: &Targ
     let Some(program) = sampled.cull.as_ref().and_then(|programs| programs.remember.as_ref()) else { return Ok(()) };
     gl.wait_for_stores();
     bind(buffers);
-    target.ids.bind(ID_UNIT);
+    bind_seen(target);
     program.bind(None);
     gl.dispatch(target.form.width.div_ceil(REMEMBERED), target.form.height.div_ceil(REMEMBERED));
     gl.check("remember")

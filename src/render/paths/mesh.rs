@@ -40,7 +40,7 @@ fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOu
             None => vec![0; geometry.triangles.len() - first],
         },
         table: table.collect(),
-        images: images.iter().filter_map(|texture| alpha(scene, &arrays, *texture)).collect(),
+        images: images.iter().map(|texture| alpha(scene, &arrays, *texture)).collect(),
         anisotropy,
     })
 }
@@ -63,12 +63,15 @@ fn surface(scene: &Scene, material: &Material, images: &mut Vec<usize>) -> Surfa
     Surface { alpha: material.alpha, least, image: image.map(|image| image as u32) }
 }
 
-/// The alpha of all levels of an image, as OpenGL has them.
-fn alpha(scene: &Scene, arrays: &[Array], texture: usize) -> Option<AlphaImage> {
-    let array = &arrays[place(arrays, texture)?.0];
+/// The alpha of all levels of an image, as OpenGL has them; an opaque texel where OpenGL has none.
+fn alpha(scene: &Scene, arrays: &[Array], texture: usize) -> AlphaImage {
+    let Some((array, _)) = place(arrays, texture) else {
+        return AlphaImage { width: 1, height: 1, levels: vec![vec![u8::MAX]] };
+    };
+    let array = &arrays[array];
     let levels = levels(&scene.textures[texture], array, Use::Colour, cutoff(scene, texture));
     let of = |rgba: &Vec<u8>| rgba.iter().skip(3).step_by(4).copied().collect();
-    Some(AlphaImage { width: array.width, height: array.height, levels: levels.iter().map(of).collect() })
+    AlphaImage { width: array.width, height: array.height, levels: levels.iter().map(of).collect() }
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ use super::scene_buffers::SceneBuffers;
 use super::shaders::TILE;
 use super::target::Target;
 use super::{Ran, Renderer, Shot};
-use crate::error::{Result, during};
+use crate::error::{Error, Result, during};
 use crate::raster::{GlBuffer, Mesh, Rasteriser};
 use crate::scene::{Scene, Window};
 
@@ -147,14 +147,22 @@ impl Beside {
         let frame = Window::new(&camera_clip(scene, shot, origin), shot.width, shot.height)?;
         let depth = self.shadow.as_ref().filter(|_| shadow).map(|depths| (&map, of(&depths.buffer)));
         let keys = self.visibility.as_ref().filter(|_| visibility);
-        // What is replaced goes once the rasteriser knows its successor.
-        let _replaced = keys.map(|keys| keys.make_room(gl, KEY * frame.pixels() as u64)).transpose()?;
+        let replaced = keys.map(|keys| keys.make_room(gl, KEY * frame.pixels() as u64)).transpose()?.flatten();
+        if let Some(replaced) = replaced {
+            self.rasteriser.borrow_mut().forget(replaced.name());
+        }
         let into = keys.and_then(|keys| keys.buffer.borrow().as_ref().map(of));
         self.rasteriser.borrow_mut().draw(depth, into.map(|into| (&frame, into)))?;
-        ran.passes.push("raster");
+        ran.passes.push(if depth.is_some() { "raster" } else { "ids" });
         ran.paths.shadow = depth.map(|_| Path::Cuda);
         ran.paths.visibility = into.map(|_| Path::Cuda);
         Ok(())
+    }
+
+    /// Leaves the scene to OpenGL from now on.
+    pub(super) fn give_up(&self, error: &Error) {
+        tracing::warn!(%error, "OpenGL draws from now on: the rasteriser beside it failed");
+        self.draws.set([false; 2]);
     }
 
     /// What the first pass of the blur is to read, and by which program.

@@ -10,11 +10,11 @@ const FRAMES: usize = 6;
 
 impl Renderer {
     /// Draws some frames by each way and keeps the fastest: each of both passes by OpenGL or beside it, because what one costs
-    /// hangs on who draws the other. What was chosen; OpenGL where there is nothing else.
+    /// hangs on who draws the other. What was chosen; OpenGL where there is nothing else. What draws nothing goes.
     ///
     /// # Errors
     /// Those of drawing.
-    pub fn choose_paths(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Paths> {
+    pub fn choose_paths(&mut self, buffers: &mut SceneBuffers, shot: &Shot) -> Result<Paths> {
         let Some(beside) = &buffers.beside else { return Ok(Paths::default()) };
         let able = beside.draws.get();
         let mut measured = Vec::new();
@@ -28,6 +28,9 @@ impl Renderer {
         let fastest = measured.into_iter().min_by(|one, other| one.1.total_cmp(&other.1));
         let ways = fastest.map_or([false; 2], |(ways, _)| ways);
         beside.draws.set(ways);
+        if ways == [false; 2] {
+            buffers.beside = None;
+        }
         let path = |beside: bool| Some(if beside { Path::Cuda } else { Path::OpenGl });
         Ok(Paths { shadow: path(ways[0]), visibility: path(ways[1]) })
     }
@@ -37,7 +40,9 @@ impl Renderer {
         let mut times = Vec::new();
         for _ in 0..FRAMES {
             buffers.shared_shadow.forget();
-            times.push(of_frame(&self.draw(buffers, shot)?));
+            // Nobody reads it, so that those whose frames are under way are not in its way.
+            let ticket = self.submit_unread(buffers, shot)?;
+            times.push(of_frame(&self.collect(ticket)?));
         }
         times.remove(0);
         times.sort_by(f64::total_cmp);

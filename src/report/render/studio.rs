@@ -75,7 +75,8 @@ impl Studio {
         let Some(device) = plants::device().filter(|_| wanted != Rastering::OpenGl) else { return Ok(()) };
         self.draw_beside(set, &device)?;
         if wanted == Rastering::Fastest {
-            self.renderer.choose_paths(&set.buffers, &set.shot(camera, size))?;
+            let shot = set.shot(camera, size);
+            self.renderer.choose_paths(&mut set.buffers, &shot)?;
         }
         Ok(())
     }

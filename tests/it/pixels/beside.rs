@@ -220,3 +220,67 @@ fn what_it_may_not_draw_is_drawn_by_opengl() {
     assert_eq!(paths(blended), Paths { shadow: None, visibility: opengl });
     assert_eq!(paths(yard(None, 4)), Paths { shadow: None, visibility: opengl }, "and nothing is made for it");
 }
+
+#[test]
+fn cameras_of_one_step_share_the_shadow_and_a_scene_apart_is_opengls_until_it_comes_together() {
+    let scene = yard(Some(Shadow { size: 256, ..Shadow::default() }), 1).scene();
+    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
+    let deformed = deformer.deform(&State::rest(&scene)).expect("deforms");
+    let mut buffers = renderer.load(&scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    give(&mut renderer, &mut buffers, By::Beside(0.0));
+    let shot = |eye: [f64; 3]| {
+        let view = View::LookAt { eye, target: [0.0, 0.2, 0.0], up: [0.0, 1.0, 0.0] };
+        let camera = Camera { view, ..from_above() };
+        Shot { camera, width: SIZE[0], height: SIZE[1], bounds: deformed.bounds, light: deformed.light }
+    };
+    let (one, other) = (shot([1.4, 1.9, 4.0]), shot([-2.0, 1.2, 3.0]));
+    let alone = renderer.draw(&buffers, &other).expect("draws");
+    buffers.hold_step(7);
+    let draw = |renderer: &mut Renderer, buffers: &SceneBuffers, shot: &Shot| {
+        let image = renderer.draw(buffers, shot).expect("draws");
+        (image, renderer.ran().passes[..2].to_vec())
+    };
+    assert_eq!(draw(&mut renderer, &buffers, &one).1, ["raster", "blur"]);
+    let (shared, passes) = draw(&mut renderer, &buffers, &other);
+    assert_eq!(passes, ["ids", "unpack"], "the shadow is there");
+    assert_eq!(shared.paths, Paths { shadow: None, visibility: Some(Path::Cuda) });
+    assert!(shared.rgba == alone.rgba, "the same picture");
+    let positions = deformer.surface().expect("there").positions.clone();
+    renderer.upload_apart(&mut buffers, &positions, [0.0; 3]).expect("uploads");
+    let (apart, passes) = draw(&mut renderer, &buffers, &other);
+    assert_eq!((passes[0], apart.paths.visibility), ("shadow", Some(Path::OpenGl)), "it knows the shared ones alone");
+    assert!(far_off(&apart, &alone) <= 60, "{}", far_off(&apart, &alone));
+    buffers.relative_to([0.0; 3]);
+    let (together, _) = draw(&mut renderer, &buffers, &other);
+    assert_eq!(together.paths.visibility, Some(Path::Cuda));
+    assert!(together.rgba == alone.rgba, "the same picture again");
+}
+
+/// A rasteriser that always fails.
+#[derive(Debug)]
+struct Broken;
+
+impl Rasteriser for Broken {
+    fn draw(&mut self, _: Option<Order<'_>>, _: Option<Order<'_>>) -> Result<()> {
+        Err(invalid("raster", "a device", "none"))
+    }
+}
+
+#[test]
+fn a_rasteriser_that_fails_leaves_the_frame_to_opengl_and_those_after_it() {
+    let scene = yard(Some(Shadow { size: 128, ..Shadow::default() }), 1).scene();
+    let want = show(&scene, from_above(), By::OpenGl);
+    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
+    let deformed = deformer.deform(&State::rest(&scene)).expect("deforms");
+    let mut buffers = renderer.load(&scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    renderer.draw_beside(&mut buffers, |_| Ok(Box::new(Broken) as Box<dyn Rasteriser>)).expect("given");
+    let [width, height] = SIZE;
+    let shot = Shot { camera: from_above(), width, height, bounds: deformed.bounds, light: None };
+    for _ in 0..2 {
+        let image = renderer.draw(&buffers, &shot).expect("draws");
+        assert_eq!(image.paths, want.ran.paths);
+        assert!(image.rgba == want.image.rgba);
+    }
+}
