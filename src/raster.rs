@@ -59,22 +59,22 @@ pub struct AlphaImage {
     pub levels: Vec<Vec<u8>>,
 }
 
+/// A window and the buffer that its samples go to.
+pub type Order<'a> = (&'a Window, GlBuffer);
+
 /// Draws one mesh. Buffers are ordered with OpenGL's commands before and after a call without a wait of the host. It may
 /// keep hold of the positions and of what it drew into: OpenGL deletes the first after it, the others after
 /// [`forget`](Rasteriser::forget).
 pub trait Rasteriser: std::fmt::Debug {
-    /// Depth of every sample: f32 from 0 to 1, 1 where nothing is. All triangles are drawn from both sides.
+    /// Draws depth, ids, or both in one turn, because changing over from OpenGL and back takes longer than either.
+    ///
+    /// Depth of every sample: f32 from 0 to 1, 1 where nothing is; all triangles are drawn from both sides. Ids, what every
+    /// sample sees: u64, the bits of its depth, then in the lower half the triangle; all ones where nothing is; triangles
+    /// are drawn from the sides that their groups say.
     ///
     /// # Errors
-    /// `Fault` when the device fails, or the buffer is unknown or smaller than the window.
-    fn depth(&mut self, window: &Window, into: GlBuffer) -> Result<()>;
-
-    /// What every sample sees: u64, the bits of its depth, then in the lower half the triangle; all ones where nothing is.
-    /// Triangles are drawn from the sides that their groups say.
-    ///
-    /// # Errors
-    /// As [`Self::depth`].
-    fn ids(&mut self, window: &Window, into: GlBuffer) -> Result<()>;
+    /// `Fault` when the device fails, or a buffer is unknown or smaller than its window.
+    fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()>;
 
     /// Lets go of a buffer that was drawn into, before OpenGL deletes it: its name may be given to another.
     fn forget(&mut self, _name: u32) {}

@@ -3,6 +3,7 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod clear;
 mod culling;
 mod debug;
 mod fence;
@@ -18,6 +19,7 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
+use self::clear::{Attached, ClearTexSubImage};
 pub(super) use self::debug::is_wanted as is_debug_wanted;
 pub(super) use self::fence::Fence;
 pub(super) use self::limits::Limits;
@@ -41,6 +43,8 @@ pub(super) struct Gl {
     glow: glow::Context,
     context: Context,
     pub(super) limits: Limits,
+    /// Fills textures, where that is better than clearing framebuffers.
+    fill: Option<ClearTexSubImage>,
     /// Timer queries that nobody waits for.
     timers: RefCell<Vec<glow::Query>>,
     /// Buffers that are to go once they were read.
@@ -105,7 +109,10 @@ impl Gl {
         if context.is_debug {
             debug::listen(&mut glow);
         }
-        Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default(), retired: RefCell::default() }))
+        let mut gl =
+            Self { glow, context, limits, fill: None, timers: RefCell::default(), retired: RefCell::default() };
+        gl.fill = gl.filler();
+        Ok(Rc::new(gl))
     }
 
     /// The functions, with the context current.
@@ -214,7 +221,8 @@ impl Gl {
         // SAFETY: attaches textures of this context; completeness is asked for at once.
         unsafe {
             let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
-            let framebuffer = Framebuffer { gl: Rc::clone(self), name };
+            let of = |texture: &Texture| Attached::new(texture, 0);
+            let framebuffer = Framebuffer { gl: Rc::clone(self), name, colour: colour.map(of), depth: depth.map(of) };
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(name));
             if let Some(colour) = colour {
                 gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(colour.name), 0);
@@ -281,6 +289,8 @@ impl Gl {
             gl.viewport(0, 0, width as i32, height as i32);
             gl.depth_mask(true);
             match clear {
+                Clear::Depth if self.fill(into, false) => {}
+                Clear::DepthAndIds if self.fill(into, true) => {}
                 Clear::Depth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
                 Clear::DepthAndIds => {
                     gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]);
@@ -355,23 +365,6 @@ impl Gl {
             gl.dispatch_compute_indirect(0);
             gl.memory_barrier(glow::ALL_BARRIER_BITS);
         }
-    }
-
-    /// Runs the current compute program where nothing but the host reads what it writes: commands after it may run beside it,
-    /// until [`Self::order`].
-    pub(super) fn dispatch_for_host(&self, [groups_x, groups_y]: [u32; 2]) {
-        let gl = self.on();
-        // SAFETY: the shaders check their own bounds.
-        unsafe {
-            gl.dispatch_compute(groups_x, groups_y, 1);
-            gl.memory_barrier(glow::CLIENT_MAPPED_BUFFER_BARRIER_BIT | glow::BUFFER_UPDATE_BARRIER_BIT);
-        }
-    }
-
-    /// Lets what comes after see and overwrite whatever shaders before wrote and read.
-    pub(super) fn order(&self) {
-        // SAFETY: orders commands.
-        unsafe { self.on().memory_barrier(glow::ALL_BARRIER_BITS) }
     }
 
     pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {

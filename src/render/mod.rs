@@ -2,13 +2,14 @@
 //!
 //! | pass | what it does | runs when |
 //! |---|---|---|
+//! | raster | the shadow map's depth, what the camera sees, or both, by a rasteriser beside OpenGL ([`Path`]) | the look asks for it |
 //! | shadow cull | lists of the triangles that the shadow map may show (compute) | triangles are culled |
 //! | shadow | depth from the sun; cut-outs leave holes | the look has a shadow |
 //! | blur | depth to moments, blurred in x and in y (compute) | that shadow is a variance map |
 //! | occluders | depth of what the last frame saw, and its pyramid (compute) | hidden triangles are culled |
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
 //! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
-//! | unpack | the same and the ground, as a rasteriser beside OpenGL saw it, to ids (compute) | that draws ([`Path`]) |
+//! | unpack | in its place: what a rasteriser beside OpenGL saw, and the ground, to ids (compute) | that drew it |
 //! | ground | the same of the ground | the look has a ground, the camera is above it, and something is below it |
 //! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
 //! | count, scan, fill | lists of the blended fragments of each pixel | exact, and some triangle is blended |
@@ -120,7 +121,8 @@ pub struct Image {
     pub width: u32,
     pub height: u32,
     pub rgba: Vec<u8>,
-    /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "blur" of the shadow,
+    /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "raster" (of a rasteriser
+    /// beside OpenGL; what the camera sees too, where it draws both) and "blur" of the shadow, "ids" (by that one alone),
     /// "cull" (of a culled scene, with the occluders), "visibility" (with the ground), "blended" (lists and all), "shade" (with the backdrop), "bloom" and "encode" of
     /// drawing.
     pub passes: Vec<(&'static str, f64)>,

@@ -51,12 +51,9 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     Ok(())
 }
 
-/// Depth from the sun.
-pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
-    let Some(map) = &buffers.shadow else { return Ok(()) };
-    if let Some(beside) = buffers.shadow_beside() {
-        return beside.depth(buffers, shot, ran);
-    }
+/// Depth from the sun, unless a rasteriser beside OpenGL has drawn it.
+pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
+    let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_beside().is_none()) else { return Ok(()) };
     ran.paths.shadow = Some(Path::OpenGl);
     super::shadow::depth(gl, buffers, map)?;
     ran.passes.extend(buffers.culler.as_ref().map(|_| SHADOW_CULL));
@@ -149,8 +146,6 @@ pub(super) fn blended(
 
 /// What is seen to linear light.
 pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
-    // The frame before may still make bytes of this picture.
-    gl.order();
     bind_shadow(buffers);
     target.ids.bind(ID_UNIT);
     if let Some(layer) = &target.layer {

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::rc::Rc;
 
 use super::Ran;
-use super::gl::{self, Buffer, Gl, Program, Texture, TextureKind};
+use super::gl::{self, Gl, Program, Texture, TextureKind};
 use super::programs::Compile;
 use super::shaders::{LANES, Source, TILE};
 use super::target::{Form, Target};
@@ -73,17 +73,11 @@ impl Post {
     }
 
     /// Light to bytes, where the host can read them.
-    /// Bytes to where the host reads them, or into the target where nobody does. What is written to the host takes its way
-    /// beside the passes of the next frame that do not touch this one's picture.
-    pub(super) fn encode(&self, gl: &Gl, target: &Target, host: Option<&Buffer>, ran: &mut Ran) -> Result<()> {
+    pub(super) fn encode(&self, gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
         self.encode.bind(None);
         target.picture.bind(0);
-        host.unwrap_or(&target.packed).bind_storage(super::passes::PIXELS);
-        let groups = [target.form.width.div_ceil(LANES), target.form.height];
-        match host {
-            Some(_) => gl.dispatch_for_host(groups),
-            None => gl.dispatch(groups[0], groups[1]),
-        }
+        target.packed.bind_storage(super::passes::PIXELS);
+        gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
         ran.passes.push("encode");
         gl.check("encode")
     }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
-use super::gl::{Buffer, Fence, Lent, Stopwatch};
+use super::gl::{Fence, Lent, Stopwatch};
 use super::lists;
 use super::programs::Sampled;
 use super::ring::Slot;
@@ -132,10 +132,8 @@ impl Renderer {
             splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
-        let staging = slot.as_ref().and_then(Slot::staging);
-        let host = staging.map(|staging| &*staging.buffer);
-        let mut passes = self.run(buffers, shot, (target, &sampled, host), &mut ran)?;
-        passes.extend(self.bring(buffers, target, host)?);
+        let mut passes = self.run(buffers, shot, (target, &sampled), &mut ran)?;
+        passes.extend(self.bring(buffers, target, slot.as_ref())?);
         Ok(Ticket {
             form,
             slot,
@@ -161,7 +159,7 @@ impl Renderer {
         &self,
         buffers: &SceneBuffers,
         shot: &Shot,
-        (target, sampled, host): (&Target, &Sampled, Option<&Buffer>),
+        (target, sampled): (&Target, &Sampled),
         ran: &mut Ran,
     ) -> Result<Vec<(&'static str, Stopwatch)>> {
         let gl = &self.gl;
@@ -169,18 +167,27 @@ impl Renderer {
             gl.timed((pass, self.watchdog), commands).map(|stopwatch| (pass, stopwatch))
         };
         let mut times = Vec::new();
-        buffers.shared_shadow.draw_unless_there(buffers.shadow_of(shot), || {
-            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, shot, ran))?);
+        let content = buffers.shadow_of(shot);
+        let by_others = buffers.drawn_beside().map(|(beside, draws)| {
+            let wanted = [draws[0] && buffers.shared_shadow.is_wanted(content), draws[1]];
+            (beside, wanted)
+        });
+        if let Some((beside, wanted)) = by_others.filter(|(_, wanted)| wanted.contains(&true)) {
+            let name = if wanted[0] { "raster" } else { "ids" };
+            times.push(timed(name, &mut || beside.draw(gl, (buffers, shot), wanted, ran))?);
+        }
+        buffers.shared_shadow.draw_unless_there(content, || {
+            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
             times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
             Ok(())
         })?;
-        let beside = buffers.visibility_beside();
+        let beside = by_others.filter(|(_, wanted)| wanted[1]).map(|(beside, _)| beside);
         if buffers.culler.is_some() && beside.is_none() {
             times.push(timed("cull", &mut || cull::camera(gl, buffers, target, sampled, ran))?);
         }
         times.extend([
             timed("visibility", &mut || match beside {
-                Some(beside) => beside.ids(gl, buffers, (target, shot), ran),
+                Some(beside) => beside.unpack(gl, target, ran),
                 None => {
                     passes::visibility(gl, buffers, target, sampled, ran)?;
                     let is_last = frame::ground_is_last(&buffers.scene, shot, buffers.origin);
@@ -190,24 +197,26 @@ impl Renderer {
             timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
             timed("shade", &mut || passes::shade(gl, buffers, target, sampled, ran))?,
             timed("bloom", &mut || buffers.post.bloom(gl, target, ran))?,
-            timed("encode", &mut || buffers.post.encode(gl, target, host, ran))?,
+            timed("encode", &mut || buffers.post.encode(gl, target, ran))?,
         ]);
         Ok(times)
     }
 
-    /// Brings what is told of lists and of what was culled to where the host can read it, behind the pixels.
+    /// Brings the pixels, and behind them what is told of lists and of what was culled, to where the host can read them.
     fn bring(
         &self,
         buffers: &SceneBuffers,
         target: &Target,
-        host: Option<&Buffer>,
+        slot: Option<&Slot>,
     ) -> Result<Option<(&'static str, Stopwatch)>> {
-        let Some(host) = host else { return Ok(None) };
+        let Some(staging) = slot.and_then(Slot::staging) else { return Ok(None) };
+        let bytes = target.form.bytes();
         let copy = || {
+            self.gl.copy(&target.packed, &staging.buffer, bytes);
             let ledger = target.lists.as_ref().map(|lists| &lists.ledger);
             for (from, to) in [ledger, buffers.buffers.get(cull::COUNTED)].into_iter().zip(target.form.told()) {
                 if let Some(from) = from.filter(|_| !to.is_empty()) {
-                    self.gl.copy_to(from, (host, to.start), to.end - to.start);
+                    self.gl.copy_to(from, (&staging.buffer, to.start), to.end - to.start);
                 }
             }
             self.gl.check("read")
@@ -276,11 +285,11 @@ impl Pixels {
 /// Milliseconds of the stages and of the passes that they are made of.
 fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
     let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, stopwatch)| (*name, stopwatch.ms())).collect();
-    let of_shadow = |name: &str| ["shadow", "blur"].contains(&name);
+    let of_shadow = |name: &str| ["raster", "shadow", "blur"].contains(&name);
     let sum =
         |wanted: &dyn Fn(&str) -> bool| all.iter().filter(|(name, _)| wanted(name)).fold(0.0, |sum, (_, ms)| sum + ms);
     let mut times = vec![("shadow", sum(&of_shadow))];
-    times.extend(all.iter().filter(|(name, _)| *name == "blur"));
+    times.extend(all.iter().filter(|(name, _)| of_shadow(name) && *name != "shadow"));
     times.push(("draw", sum(&|name| !of_shadow(name) && name != "read")));
     times.extend(all.iter().filter(|(name, _)| !of_shadow(name)));
     times

@@ -6,6 +6,7 @@
 
 use nalgebra::Vector3;
 
+use super::shadow::Fit;
 use super::{Bounds, Scene, UpAxis};
 
 /// x, y and z of light space, unit vectors in the world: z is v_l, the direction to the sun, and y points up in the world.
@@ -20,9 +21,11 @@ pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
 }
 
 impl Scene {
-    /// The axes along which deformers measure the vertices for the sun's shadow; none where the look has none.
+    /// The axes along which deformers measure the vertices for the sun's shadow; none where the look has no map that is fitted to
+    /// them.
     pub fn light_axes(&self) -> Option<[Vector3<f64>; 3]> {
-        self.look.shadow.map(|_| light_axes(self.look.to_sun(self.up), self.up))
+        let fitted = self.look.shadow.filter(|shadow| shadow.fit == Fit::Vertices);
+        fitted.map(|_| light_axes(self.look.to_sun(self.up), self.up))
     }
 }
 

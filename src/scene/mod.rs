@@ -31,7 +31,7 @@ pub use post::{Antialias, Bloom, Tone};
 pub use raster::{Faces, Group, MAX_SIDE, Window};
 pub use rectangle::Rectangle;
 pub use rigid::TransformFormat;
-pub use shadow::{Blurring, Moments, Shadow, ShadowMethod};
+pub use shadow::{Blurring, Fit, Moments, Shadow, ShadowMethod};
 pub use state::{Changed, State};
 pub use update::{RawUpdate, Update};
 

@@ -31,6 +31,18 @@ pub enum Moments {
     F16,
 }
 
+/// What a map is fitted to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Fit {
+    /// What the vertices take up as the sun sees them: the texels of a tree have a third of the area, and its leaves fill three
+    /// times as many of them.
+    #[default]
+    Vertices,
+    /// The corners of the vertices' box in the world, as the thesis has it (section 3.3.1): deformers measure nothing more.
+    Corners,
+}
+
 /// What blurs the moments of a variance map; all three give the same map up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Blurring {
@@ -67,6 +79,7 @@ pub struct Shadow {
     /// Maps of this size, 1 to 4, split by distance from the camera: the nearer finer, the last over the whole scene.
     /// `blur` is in texels of each, so that shadows are sharper nearby.
     pub splits: u32,
+    pub fit: Fit,
     /// For measurements; no file names it.
     #[serde(skip)]
     pub blurring: Blurring,
@@ -83,6 +96,7 @@ impl Default for Shadow {
             alpha_threshold: 0.5,
             moments: Moments::default(),
             splits: 1,
+            fit: Fit::default(),
             blurring: Blurring::default(),
         }
     }

@@ -3,6 +3,7 @@
 
 pub(crate) mod changes;
 pub(crate) mod cut_outs;
+pub(crate) mod exact;
 pub(crate) mod extremes;
 pub(crate) mod following;
 mod judge;

@@ -12,6 +12,7 @@ use modalcast::raster::{Mesh, Rasteriser};
 use modalcast::render::{Image, Path, Paths, Pixels, Prefer, Renderer, Seen, Shot};
 use modalcast::scene::{Antialias, Camera, Look, Parts, Rastering, Scene, Shadow, State};
 
+use crate::both::exact::{Exact, compare};
 use crate::scenes;
 
 const SIZE: [u32; 2] = [960, 540];
@@ -42,8 +43,14 @@ fn frames(scene: &Scene, raster: Rastering, states: &[State]) -> Vec<Image> {
     images
 }
 
-/// A still picture by one way, and what each pixel sees.
-fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> (Image, Vec<Seen>) {
+/// A still picture by one way, the place of the triangle that each pixel sees, and each triangle as f64 has it.
+struct Still {
+    image: Image,
+    seen: Vec<Option<u32>>,
+    exact: Vec<Exact>,
+}
+
+fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> Still {
     let device = Device::open(0).expect("a CUDA device");
     let (mut renderer, mut deformer) = (Renderer::open(Prefer::Cuda(0)).expect("OpenGL"), CpuDeformer::new(scene));
     let deformed = deformer.deform(state).expect("deforms");
@@ -53,48 +60,82 @@ fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> (Image, Vec<Seen>)
         let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(&device, mesh)?) as Box<dyn Rasteriser>);
         renderer.draw_beside(&mut buffers, make).expect("given");
     }
-    let camera = Camera::framing(scene, SIZE[0], SIZE[1]);
+    // A near plane far enough off that depths tell surfaces apart.
+    let camera = Camera { near: 1.0, far: 40.0, ..Camera::framing(scene, SIZE[0], SIZE[1]) };
     let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds: deformed.bounds, light: deformed.light };
     let image = renderer.draw(&buffers, &shot).expect("draws");
-    (image, renderer.seen().expect("reads"))
+    let place = |seen: &Seen| if let Seen::Triangle(place) = seen { Some(*place as u32) } else { None };
+    let seen = renderer.seen().expect("reads").iter().map(place).collect();
+    let clip = camera.clip_from_camera(SIZE[0], SIZE[1], &deformed.bounds) * camera.camera_from_world();
+    let positions = &deformer.surface().expect("there").positions;
+    let exact = |place: usize| {
+        let (domain, triangle) = buffers.triangle(place).expect("there");
+        let (mesh, first) = (&scene.shape_of(domain).mesh, scene.layout.slots[domain].first_vertex);
+        let vertex = |corner: u32| first + mesh.corners().vertices[corner as usize] as usize;
+        let corners =
+            mesh.triangles()[triangle].map(|corner| std::array::from_fn(|k| positions[3 * vertex(corner) + k]));
+        Exact::new(&clip, SIZE, corners)
+    };
+    let exact = (0..scene.layout.triangles).map(exact).collect();
+    Still { image, seen, exact }
 }
 
-/// The share of pixels of which `claim` holds.
-fn share(claims: impl Iterator<Item = bool>) -> f64 {
-    let (mut yes, mut all) = (0_usize, 0_usize);
-    claims.for_each(|claim| (yes, all) = (yes + usize::from(claim), all + 1));
-    yes as f64 / all as f64
+/// A soup of triangles that pierce each other, moved and mirrored; and a tree with cut-out leaves.
+fn scenes_and_states() -> [(&'static str, Arc<Scene>, State); 2] {
+    let soup = scenes::scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
+    let tree = modalcast::load::open("tree").expect("built in");
+    let (moved, rest) = (scenes::state(&soup, 1), State::rest(&tree));
+    [("soup", soup, moved), ("tree", tree, rest)]
 }
 
-/// Shares of pixels: that see something else; and that do not and still look different, by more than a few levels.
-fn differences(scene: &Scene, state: &State, shadow: Option<Shadow>) -> [f64; 2] {
-    let look = Look { shadow, antialias: Antialias::None, ..scene.look };
-    let scene = Scene::new(Parts { look, ..scene.parts() }).expect("a good scene");
-    let [want, got] = [false, true].map(|by_cuda| still(&scene, state, by_cuda));
-    let other = || got.1.iter().zip(&want.1).map(|(got, want)| got != want);
-    let pixels = got.0.rgba.chunks_exact(4).zip(want.0.rgba.chunks_exact(4));
-    let far = pixels.map(|(got, want)| got.iter().zip(want).any(|(got, want)| got.abs_diff(*want) > 6));
-    [share(other()), share(far.zip(other()).map(|(far, other)| far && !other))]
+fn under(scene: &Scene, shadow: Option<Shadow>) -> Arc<Scene> {
+    let look = Look { shadow, ground: None, antialias: Antialias::None, ..scene.look };
+    Scene::new(Parts { look, ..scene.parts() }).expect("a good scene")
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_what_pixels_see_and_their_light_are_opengls() {
-    let made = scenes::scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
-    let tree = modalcast::load::open("tree").expect("built in");
-    let (moved, rest) = (scenes::state(&made, 1), State::rest(&tree));
-    // A soup of triangles that pierce each other, many smaller than a texel of the map; and a tree with cut-out leaves.
-    for (name, scene, state, most) in [("soup", &made, &moved, [0.01, 0.001, 0.05]), ("tree", &tree, &rest, [0.01; 3])]
-    {
-        let [ids, light] = differences(scene, state, None);
-        let [_, shaded] = differences(scene, state, Some(Shadow::default()));
-        eprintln!("{name}: {ids:.6} see another triangle, {light:.6} differ elsewhere, {shaded:.6} with shadows");
-        assert!(ids <= most[0] && light <= most[1] && shaded <= most[2], "{name}");
+fn gpu_pixels_see_the_triangles_that_opengl_shows_but_on_edges_and_where_depths_tie() {
+    for (name, scene, state) in scenes_and_states() {
+        let scene = under(&scene, None);
+        let [want, got] = [false, true].map(|by_cuda| still(&scene, &state, by_cuda));
+        let found = compare(&got.seen, &want.seen, &want.exact, SIZE);
+        eprintln!("{name}: {found:?} of {} pixels", got.seen.len());
+        for at in (0..got.seen.len()).filter(|at| got.seen[*at] != want.seen[*at]).take(8) {
+            let sample = nalgebra::Vector3::new((at % 960) as f64 + 0.5, (at / 960) as f64 + 0.5, 1.0);
+            let tell = |id: Option<u32>| {
+                id.map(|id| (id, want.exact[id as usize].depth(sample), want.exact[id as usize].distances(sample)))
+            };
+            eprintln!("  differ {at}: cuda {:?}, opengl {:?}", tell(got.seen[at]), tell(want.seen[at]));
+        }
+        // The rim of a hole is where filtered alpha meets its threshold: hardware weighs texels in 8 bits.
+        let rims = if name == "tree" { SIZE[0] * SIZE[1] / 500 } else { 0 };
+        assert!(found.wrong <= rims as usize, "{name}: {found:?}");
+        let other = still(&scene, &State { q: state.q.iter().map(|q| q + 0.3).collect(), ..state.clone() }, true);
+        let control = compare(&other.seen, &want.seen, &want.exact, SIZE);
+        assert!(control.wrong > rims as usize + 500, "control: {name}: {control:?}");
     }
-    let [ids, _] = differences(&made, &scenes::state(&made, 2), None);
-    let other = [still(&made, &moved, true).1, still(&made, &scenes::state(&made, 2), true).1];
-    let control = share(other[0].iter().zip(&other[1]).map(|(one, other)| one != other));
-    assert!(ids < 0.01 && control > 0.05, "control: another step is seen otherwise: {control}");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_light_and_shadow_of_what_is_seen_alike_are_opengls() {
+    for (name, scene, state) in scenes_and_states() {
+        for shadow in [None, Some(Shadow::default())] {
+            let scene = under(&scene, shadow);
+            let [want, got] = [false, true].map(|by_cuda| still(&scene, &state, by_cuda));
+            let pixels = got.image.rgba.chunks_exact(4).zip(want.image.rgba.chunks_exact(4));
+            let far = pixels.map(|(got, want)| got.iter().zip(want).any(|(got, want)| got.abs_diff(*want) > 6));
+            let alike = got.seen.iter().zip(&want.seen).map(|(got, want)| got == want);
+            let off = far.zip(alike).filter(|(far, alike)| *far && *alike).count();
+            eprintln!("{name}, {:?}: {off} pixels differ in light alone", shadow.map(|shadow| shadow.size));
+            assert!(off <= got.seen.len() / 500, "{name}: {off}");
+        }
+    }
+    let [(_, soup, state), _] = scenes_and_states();
+    let [dark, lit] = [Some(Shadow::default()), None].map(|shadow| still(&under(&soup, shadow), &state, true).image);
+    let off = dark.rgba.iter().zip(&lit.rgba).filter(|(dark, lit)| dark.abs_diff(**lit) > 6).count();
+    assert!(off > dark.rgba.len() / 50, "control: shadows are seen: {off}");
 }
 
 #[test]

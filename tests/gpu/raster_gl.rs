@@ -32,13 +32,13 @@ impl Stage {
     }
 
     fn ids(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u64> {
-        raster.ids(window, into).expect("draws");
+        raster.draw(None, Some((window, into))).expect("draws");
         self.gl.read(into, window.pixels())
     }
 
     /// Bits of depths.
     fn depth(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u32> {
-        raster.depth(window, into).expect("draws");
+        raster.draw(Some((window, into)), None).expect("draws");
         self.gl.read(into, window.pixels())
     }
 }
@@ -156,10 +156,10 @@ fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_are_faults_and_ha
     let refused = GlRaster::new(&stage.device, mesh(unknown(4 * soup.positions.len() as u64), &soup, None));
     assert!(refused.expect_err("unknown").to_string().contains("999999"));
     let (mut raster, positions) = stage.raster(&soup, None);
-    raster.ids(&soup.window, unknown(8 * pixels)).expect_err("unknown");
+    raster.draw(None, Some((&soup.window, unknown(8 * pixels)))).expect_err("unknown");
     let small = stage.gl.room(4 * pixels);
-    raster.ids(&soup.window, small).expect_err("too small, and it says so");
-    raster.ids(&soup.window, GlBuffer { bytes: 8 * pixels, ..small }).expect_err("smaller than it says");
+    raster.draw(None, Some((&soup.window, small))).expect_err("too small, and it says so");
+    raster.draw(None, Some((&soup.window, GlBuffer { bytes: 8 * pixels, ..small }))).expect_err("smaller than it says");
     let fewer = GlBuffer { bytes: 3 * 4 * 2, ..positions };
     GlRaster::new(&stage.device, mesh(fewer, &soup, None)).expect_err("vertices that are not there");
     let keys = stage.gl.room(8 * pixels);

@@ -6,8 +6,8 @@ use super::super::device::Device;
 use super::super::interop::{Access, Registered, Sharing, mapped};
 use super::{Core, Functions, Pass, RasterForm, Spread, check, check_cut_outs};
 use crate::error::{Error, Result, during};
-use crate::raster::{GlBuffer, Mesh, Rasteriser};
-use crate::scene::{Faces, Group, Window};
+use crate::raster::{GlBuffer, Mesh, Order, Rasteriser};
+use crate::scene::{Faces, Group};
 
 /// Bytes of a vertex's position.
 const VERTEX: u64 = 12;
@@ -95,42 +95,45 @@ impl GlRaster {
         Ok(raster)
     }
 
-    /// Draws; a target that failed is let go of.
-    fn pass(&mut self, depth_only: bool, window: &Window, into: GlBuffer) -> Result<()> {
-        let drawn = self.draw(depth_only, window, into);
-        if drawn.is_err() {
-            let kind = if depth_only { &mut self.depth } else { &mut self.ids };
-            kind.let_go(&self.device);
-        }
-        drawn
-    }
-
-    fn draw(&mut self, depth_only: bool, window: &Window, into: GlBuffer) -> Result<()> {
-        let Self { positions, depth, ids, sharing, core, device } = self;
-        let kind = if depth_only { depth } else { ids };
-        let needed = kind.form.bytes(window);
-        if into.bytes < needed {
-            let reason = format!("buffer {} has {} bytes, {needed} are needed", into.name, into.bytes);
-            return Err(Error::Fault { stage: "raster", reason });
-        }
+    /// Draws one window or two, mapped together.
+    fn pass(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()> {
+        let Self { positions, depth: of_depth, ids: of_ids, sharing, core, device } = self;
         device.context().bind_to_thread().map_err(during("device"))?;
-        let (functions, groups, target) = kind.prepare(device, (sharing, core), into)?;
+        let mut ready = Vec::new();
+        for (kind, order) in [(of_depth, depth), (of_ids, ids)] {
+            let Some((window, into)) = order else { continue };
+            let needed = kind.form.bytes(window);
+            if into.bytes < needed {
+                let reason = format!("buffer {} has {} bytes, {needed} are needed", into.name, into.bytes);
+                return Err(Error::Fault { stage: "raster", reason });
+            }
+            ready.push((window, kind.prepare(device, (sharing, core), into)?));
+        }
         // Not `WriteAll`: the kernels read the samples that they wrote.
-        let uses = &mut [(positions, Access::Read), (target, Access::WriteSome)];
-        mapped(device, uses, |addresses| {
-            let pass = Pass { functions, groups, window, positions: addresses[0], target: addresses[1] };
-            core.draw(device, &pass)
+        let mut uses = vec![(positions, Access::Read)];
+        let mut passes = Vec::new();
+        for (window, (functions, groups, target)) in ready {
+            uses.push((target, Access::WriteSome));
+            passes.push((window, functions, groups));
+        }
+        mapped(device, &mut uses, |[positions, targets @ ..]| {
+            let mut passes = passes.iter().zip(targets);
+            passes.try_for_each(|((window, functions, groups), target)| {
+                core.draw(device, &Pass { functions, groups, window, positions, target })
+            })
         })
     }
 }
 
 impl Rasteriser for GlRaster {
-    fn depth(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
-        self.pass(true, window, into)
-    }
-
-    fn ids(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
-        self.pass(false, window, into)
+    /// Draws; targets of what failed are let go of.
+    fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()> {
+        let drawn = if depth.is_some() || ids.is_some() { self.pass(depth, ids) } else { Ok(()) };
+        if drawn.is_err() {
+            self.depth.let_go(&self.device);
+            self.ids.let_go(&self.device);
+        }
+        drawn
     }
 
     fn forget(&mut self, name: u32) {

@@ -18,7 +18,8 @@
 //! look.tone = "aces"         # or "reinhard", "none"; look.exposure = 1.2 multiplies all light before it
 //! look.dither = true         # slow gradients show no bands
 //! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }   # variance, standard, filtered; maps, 1 to 4
-//!                            # and bleeding, least_variance, alpha_threshold, moments (f32, f16)
+//!                            # and bleeding, least_variance, alpha_threshold, moments (f32, f16), fit (vertices,
+//!                            # corners)
 //! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
 //! deform.batches = "never"   # or "always": whether domains that share a U are deformed together; else where it pays
 //! deform.boxes = true        # keep a box of each domain for readers, and with displacements u = U q of each vertex

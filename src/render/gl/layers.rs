@@ -4,6 +4,7 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
+use super::clear::Attached;
 use super::{Framebuffer, Gl, Program, Texture};
 use crate::error::{Result, during};
 
@@ -20,7 +21,9 @@ impl Gl {
         // SAFETY: attaches a layer of a texture of this context; completeness is asked for at once.
         unsafe {
             let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
-            let framebuffer = Framebuffer { gl: Rc::clone(self), name };
+            let attached = |wanted: bool| wanted.then(|| Attached::new(image, layer));
+            let (colour, depth) = (attached(!is_depth), attached(is_depth));
+            let framebuffer = Framebuffer { gl: Rc::clone(self), name, colour, depth };
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(name));
             gl.framebuffer_texture_layer(glow::FRAMEBUFFER, point, Some(image.name), 0, layer as i32);
             gl.draw_buffers(&[if is_depth { glow::NONE } else { glow::COLOR_ATTACHMENT0 }]);

@@ -5,6 +5,7 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::Gl;
+use super::clear::Attached;
 use crate::error::{Result, during};
 
 /// A buffer object of fixed size.
@@ -45,6 +46,8 @@ pub(in crate::render) struct Program {
 pub(in crate::render) struct Framebuffer {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Framebuffer,
+    pub(super) colour: Option<Attached>,
+    pub(super) depth: Option<Attached>,
 }
 
 #[derive(Debug)]

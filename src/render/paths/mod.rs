@@ -118,32 +118,42 @@ impl Renderer {
 }
 
 impl SceneBuffers {
-    /// The rasteriser, if it draws this pass: it knows the shared positions alone.
-    fn drawn_beside(&self, pass: usize) -> Option<&Beside> {
-        self.beside.as_ref().filter(|beside| self.apart.is_none() && beside.draws.get()[pass])
+    /// The rasteriser, and which of shadow map and visibility it draws: it knows the shared positions alone. None where OpenGL
+    /// draws both.
+    pub(super) fn drawn_beside(&self) -> Option<(&Beside, [bool; 2])> {
+        let beside = self.beside.as_ref().filter(|_| self.apart.is_none())?;
+        let draws = beside.draws.get();
+        draws.contains(&true).then_some((beside, draws))
     }
 
     /// The rasteriser that draws the shadow map's depth; none where OpenGL does.
     pub(super) fn shadow_beside(&self) -> Option<&Beside> {
-        self.drawn_beside(0)
-    }
-
-    /// The rasteriser that draws what the camera sees; none where OpenGL does, as it does where there are several samples a
-    /// pixel after all.
-    pub(super) fn visibility_beside(&self) -> Option<&Beside> {
-        self.drawn_beside(1)
+        self.drawn_beside().filter(|(_, draws)| draws[0]).map(|(beside, _)| beside)
     }
 }
 
 impl Beside {
-    /// Depth from the sun.
-    pub(super) fn depth(&self, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
-        let Some(Depths { buffer, .. }) = &self.shadow else { return Err(during("shadow")("no buffer for depth")) };
-        let size = buffers.scene.look.shadow.map_or(1, |shadow| shadow.size);
-        let window = Window::new(&map_clip(&buffers.scene, shot, buffers.origin), size, size)?;
-        self.rasteriser.borrow_mut().depth(&window, of(buffer))?;
-        ran.passes.push("shadow");
-        ran.paths.shadow = Some(Path::Cuda);
+    /// Draws into the buffers what of both is wanted of this frame.
+    pub(super) fn draw(
+        &self,
+        gl: &Rc<Gl>,
+        (buffers, shot): (&SceneBuffers, &Shot),
+        [shadow, visibility]: [bool; 2],
+        ran: &mut Ran,
+    ) -> Result<()> {
+        let (scene, origin) = (&buffers.scene, buffers.origin);
+        let side = scene.look.shadow.map_or(1, |shadow| shadow.size);
+        let map = Window::new(&map_clip(scene, shot, origin), side, side)?;
+        let frame = Window::new(&camera_clip(scene, shot, origin), shot.width, shot.height)?;
+        let depth = self.shadow.as_ref().filter(|_| shadow).map(|depths| (&map, of(&depths.buffer)));
+        let keys = self.visibility.as_ref().filter(|_| visibility);
+        // What is replaced goes once the rasteriser knows its successor.
+        let _replaced = keys.map(|keys| keys.make_room(gl, KEY * frame.pixels() as u64)).transpose()?;
+        let into = keys.and_then(|keys| keys.buffer.borrow().as_ref().map(of));
+        self.rasteriser.borrow_mut().draw(depth, into.map(|into| (&frame, into)))?;
+        ran.passes.push("raster");
+        ran.paths.shadow = depth.map(|_| Path::Cuda);
+        ran.paths.visibility = into.map(|_| Path::Cuda);
         Ok(())
     }
 
@@ -152,27 +162,15 @@ impl Beside {
         self.shadow.as_ref().map(|depths| (&depths.buffer, depths.blur.as_ref()))
     }
 
-    /// Ids of what the camera sees, the ground too.
-    pub(super) fn ids(
-        &self,
-        gl: &Rc<Gl>,
-        buffers: &SceneBuffers,
-        (target, shot): (&Target, &Shot),
-        ran: &mut Ran,
-    ) -> Result<()> {
-        let Some(keys) = &self.visibility else { return Err(during("visibility")("no buffer for keys")) };
-        let window = Window::new(&camera_clip(&buffers.scene, shot, buffers.origin), shot.width, shot.height)?;
-        // What is replaced goes once the rasteriser knows its successor.
-        let _replaced = keys.make_room(gl, KEY * window.pixels() as u64)?;
-        let buffer = keys.buffer.borrow();
-        let Some(buffer) = buffer.as_ref() else { return Err(during("visibility")("no buffer for keys")) };
-        self.rasteriser.borrow_mut().ids(&window, of(buffer))?;
+    /// Keys to the ids of what the camera sees, the ground too.
+    pub(super) fn unpack(&self, gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
+        let missing = || during("unpack")("no keys were drawn");
+        let keys = self.visibility.as_ref().ok_or_else(missing)?;
         keys.unpack.bind(None);
-        buffer.bind_storage(0);
+        keys.buffer.borrow().as_ref().ok_or_else(missing)?.bind_storage(0);
         target.ids.bind_image(0);
-        gl.dispatch(shot.width.div_ceil(TILE), shot.height.div_ceil(TILE));
-        ran.passes.extend(["visibility", "unpack"]);
-        ran.paths.visibility = Some(Path::Cuda);
+        gl.dispatch(target.form.width.div_ceil(TILE), target.form.height.div_ceil(TILE));
+        ran.passes.push("unpack");
         gl.check("unpack")
     }
 

@@ -9,44 +9,43 @@ use crate::error::Result;
 const FRAMES: usize = 6;
 
 impl Renderer {
-    /// Draws some frames by both ways and keeps the faster for each pass; what was chosen. OpenGL where there is no other.
+    /// Draws some frames by each way and keeps the fastest: each of both passes by OpenGL or beside it, because what one costs
+    /// hangs on who draws the other. What was chosen; OpenGL where there is nothing else.
     ///
     /// # Errors
     /// Those of drawing.
     pub fn choose_paths(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Paths> {
         let Some(beside) = &buffers.beside else { return Ok(Paths::default()) };
         let able = beside.draws.get();
-        beside.draws.set([false; 2]);
-        let opengl = self.median_ms(buffers, shot)?;
-        beside.draws.set(able);
-        let cuda = self.median_ms(buffers, shot)?;
-        let faster: [bool; 2] = std::array::from_fn(|pass| able[pass] && cuda[pass] < opengl[pass]);
-        beside.draws.set(faster);
-        tracing::info!(?opengl, ?cuda, ?faster, "milliseconds of shadow map and visibility by both ways");
-        let path = |pass: usize| Some(if faster[pass] { Path::Cuda } else { Path::OpenGl });
-        Ok(Paths { shadow: path(0), visibility: path(1) })
+        let mut measured = Vec::new();
+        for ways in [[false, false], [true, false], [false, true], [true, true]] {
+            if ways.iter().zip(able).all(|(wanted, able)| able || !wanted) {
+                beside.draws.set(ways);
+                measured.push((ways, self.median_ms(buffers, shot)?));
+            }
+        }
+        tracing::info!(?measured, "milliseconds a frame by who draws: shadow map, visibility beside OpenGL");
+        let fastest = measured.into_iter().min_by(|one, other| one.1.total_cmp(&other.1));
+        let ways = fastest.map_or([false; 2], |(ways, _)| ways);
+        beside.draws.set(ways);
+        let path = |beside: bool| Some(if beside { Path::Cuda } else { Path::OpenGl });
+        Ok(Paths { shadow: path(ways[0]), visibility: path(ways[1]) })
     }
 
-    /// Milliseconds of the shadow map with its blur, and of what the camera sees with its culling.
-    fn median_ms(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<[f64; 2]> {
+    /// Milliseconds of a frame that draws its shadow, its pixels left where they are.
+    fn median_ms(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<f64> {
         let mut times = Vec::new();
         for _ in 0..FRAMES {
-            // Every frame draws its shadow.
             buffers.shared_shadow.forget();
-            times.push(of_passes(&self.draw(buffers, shot)?));
+            times.push(of_frame(&self.draw(buffers, shot)?));
         }
-        let median = |pass: usize| {
-            let mut own: Vec<f64> = times[1..].iter().map(|time| time[pass]).collect();
-            own.sort_by(f64::total_cmp);
-            own[own.len() / 2]
-        };
-        Ok([median(0), median(1)])
+        times.remove(0);
+        times.sort_by(f64::total_cmp);
+        Ok(times[times.len() / 2])
     }
 }
 
-fn of_passes(image: &Image) -> [f64; 2] {
-    let sum = |names: &[&str]| {
-        image.passes.iter().filter(|(name, _)| names.contains(name)).fold(0.0, |sum, (_, ms)| sum + ms)
-    };
-    [sum(&["shadow"]), sum(&["cull", "visibility"])]
+fn of_frame(image: &Image) -> f64 {
+    let stages = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));
+    stages.fold(0.0, |sum, (_, ms)| sum + ms)
 }

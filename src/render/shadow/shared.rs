@@ -31,6 +31,11 @@ impl Shared {
         self.step.set(None);
     }
 
+    /// Whether the map does not show this content yet.
+    pub(in crate::render) fn is_wanted(&self, content: Option<Content>) -> bool {
+        content.is_none() || content != self.drawn.get()
+    }
+
     /// Draws the map by `draw` unless it shows this content already; whether that was needed. A map whose drawing failed shows
     /// nothing.
     pub(in crate::render) fn draw_unless_there(
@@ -38,8 +43,8 @@ impl Shared {
         content: Option<Content>,
         draw: impl FnOnce() -> Result<()>,
     ) -> Result<bool> {
-        let drawn = self.drawn.take();
-        let wanted = content.is_none() || content != drawn;
+        let wanted = self.is_wanted(content);
+        self.drawn.take();
         if wanted {
             draw()?;
         }

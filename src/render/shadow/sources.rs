@@ -33,7 +33,7 @@ pub(in crate::render) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'stat
 /// Texels of the map that a workgroup of the blur in one pass makes: columns and rows.
 pub(in crate::render) fn made_at_once(shadow: &Shadow) -> [u32; 2] {
     let tile = Tile::of(shadow);
-    Strip::of(shadow).map_or([tile.wide, tile.tall], |strip| [Strip::WIDE, strip.tall])
+    Strip::of(shadow).map_or([tile.wide, tile.tall], |strip| [strip.wide, strip.tall])
 }
 
 /// A workgroup's tile of the map: its sides, and how many rows of depth it holds at once.
@@ -155,7 +155,7 @@ impl Options {
     fn blur_at_once(&self) -> Source {
         let weights = weights(self.shadow.blur);
         let Some(strip) = Strip::of(&self.shadow) else { return self.blur_tiles(&weights) };
-        let text = self.blur_head(&["FIRST"], Strip::WIDE, 1) + &strip.text(&weights);
+        let text = self.blur_head(&["FIRST"], strip.wide, 1) + &strip.text(&weights);
         Source { label: "blur, strips".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 

@@ -5,41 +5,46 @@ use std::fmt::Write as _;
 
 use crate::scene::Shadow;
 
-/// Rows that a turn of the walk takes.
-const TURN: u32 = 4;
-const LANES: u32 = 64;
+/// Lanes of a workgroup and rows of a turn: for a reach up to so far, and beyond. More sums leave registers for fewer lanes,
+/// which wait less often when a turn is long. Of 4096^2 on an H200: 15 taps took 135 us with the first and 154 with the
+/// other, 25 taps 200 and 166.
+const NEAR: u32 = 9;
+const WALKS: [(u32, u32); 2] = [(64, 4), (128, 8)];
 /// The widest reach of which the sums stay in the registers of a lane.
 const WIDEST: u32 = 24;
 
 /// A workgroup's strip of the map: a column for each lane, and the rows that it makes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::render) struct Strip {
+    /// Lanes: columns.
+    pub(in crate::render) wide: u32,
     pub(in crate::render) tall: u32,
-    pub(in crate::render) reach: u32,
+    /// Rows that are read at once.
+    turn: u32,
+    reach: u32,
 }
 
 impl Strip {
-    pub(in crate::render) const WIDE: u32 = LANES;
-
     /// None where the blur reaches too far. A tall strip begins seldom, which costs 2 `reach` rows; a small map needs many
     /// strips, so that all of a device has work.
     pub(in crate::render) fn of(shadow: &Shadow) -> Option<Self> {
         let reach = shadow.reach();
+        let (wide, turn) = WALKS[usize::from(reach > NEAR)];
         let rows = (shadow.size / 32).clamp(16, 128) + 2 * reach;
-        let tall = rows.next_multiple_of(TURN) - 2 * reach;
-        (reach <= WIDEST).then_some(Self { tall, reach })
+        let tall = rows.next_multiple_of(turn) - 2 * reach;
+        (reach <= WIDEST).then_some(Self { wide, tall, turn, reach })
     }
 
     /// Bytes of shared memory.
     #[cfg(test)]
-    pub(in crate::render) const fn bytes(self) -> u32 {
-        4 * 2 * TURN * (LANES + 2 * self.reach)
+    const fn bytes(self) -> u32 {
+        4 * 2 * self.turn * (self.wide + 2 * self.reach)
     }
 
     /// The shader behind its head, which tells LANES, for half a bell of these weights.
     pub(in crate::render) fn text(self, weights: &[f32]) -> String {
-        let Self { tall, reach } = self;
-        let text = format!("#define TALL {tall}\n#define TURN {TURN}\n#define REACH {reach}\n");
+        let Self { tall, turn, reach, .. } = self;
+        let text = format!("#define TALL {tall}\n#define TURN {turn}\n#define REACH {reach}\n");
         let body = include_str!("../../../shaders/blur_strip.comp");
         let parts = [("// @SUMS", self.sums()), ("// @LOAD", self.load()), ("// @ADD", self.add(weights))];
         text + &parts.into_iter().fold(String::from(body), |body, (place, part)| body.replace(place, &part))
@@ -53,36 +58,37 @@ impl Strip {
     /// Depths of a turn's rows to shared memory: first a lane's own column, then what lies to both sides. All are on their
     /// way before one is waited for.
     fn load(self) -> String {
-        let (reach, wide) = (self.reach, LANES + 2 * self.reach);
+        let Self { wide, turn, reach, .. } = self;
+        let pitch = wide + 2 * reach;
         let (mut read, mut write) = (String::new(), String::new());
-        for row in 0..TURN {
+        for row in 0..turn {
             let at = format!("corner + ivec2(lane, first + {row} - {reach})");
             writeln!(read, "float own{row} = centred({at}, side);").ok();
-            writeln!(write, "depths[half_at + {} + lane] = own{row};", row * wide + reach).ok();
+            writeln!(write, "depths[half_at + {} + lane] = own{row};", row * pitch + reach).ok();
         }
-        let cells = TURN * 2 * reach;
-        for (index, begin) in (0..cells).step_by(LANES as usize).enumerate() {
+        let cells = turn * 2 * reach;
+        for (index, begin) in (0..cells).step_by(wide as usize).enumerate() {
             writeln!(read, "int cell{index} = {begin} + lane, row{index} = cell{index} / {};", 2 * reach).ok();
             writeln!(read, "int column{index} = cell{index} % {};", 2 * reach).ok();
-            writeln!(read, "if (column{index} >= {reach}) column{index} += {LANES};").ok();
+            writeln!(read, "if (column{index} >= {reach}) column{index} += {wide};").ok();
             writeln!(read, "float beside{index} = 0.0;").ok();
-            let inside = if begin + LANES > cells { format!("if (cell{index} < {cells}) ") } else { String::new() };
+            let inside = if begin + wide > cells { format!("if (cell{index} < {cells}) ") } else { String::new() };
             let at = format!("corner + ivec2(column{index}, first + row{index}) - {reach}");
             writeln!(read, "{inside}beside{index} = centred({at}, side);").ok();
-            writeln!(write, "{inside}depths[half_at + row{index} * {wide} + column{index}] = beside{index};").ok();
+            writeln!(write, "{inside}depths[half_at + row{index} * {pitch} + column{index}] = beside{index};").ok();
         }
         read + &write
     }
 
     /// A turn's rows, blurred, to the sums that they are part of; sums that are whole are stored.
     fn add(self, weights: &[f32]) -> String {
-        let reach = self.reach;
+        let Self { wide, turn, reach, .. } = self;
         let weight = |from: u32, to: u32| format!("{:?}", weights[from.abs_diff(to) as usize]);
         let mut text = String::new();
-        for row in 0..TURN {
+        for row in 0..turn {
             writeln!(text, "vec2 blurred{row} = vec2(0.0);").ok();
             for tap in 0..=2 * reach {
-                let from = row * (LANES + 2 * reach) + tap;
+                let from = row * (wide + 2 * reach) + tap;
                 writeln!(text, "float m{row}_{tap} = depths[half_at + {from} + lane];").ok();
                 let pair = format!("vec2(m{row}_{tap}, m{row}_{tap} * m{row}_{tap})");
                 writeln!(text, "blurred{row} += {} * {pair};", weight(tap, reach)).ok();
@@ -97,7 +103,7 @@ impl Strip {
             writeln!(text, "if (first >= {within}) imageStore(to, {at}, vec4(sum{row}, 0.0, 0.0));").ok();
         }
         for sum in 0..2 * reach {
-            writeln!(text, "sum{sum} = sum{};", sum + TURN).ok();
+            writeln!(text, "sum{sum} = sum{};", sum + turn).ok();
         }
         text
     }
@@ -122,7 +128,7 @@ mod tests {
                     continue;
                 };
                 assert!(strip.bytes() <= SHARED_BYTES && strip.reach <= WIDEST && strip.tall >= 16, "{strip:?}");
-                assert_eq!((strip.tall + 2 * strip.reach) % TURN, 0, "{strip:?}");
+                assert_eq!((strip.tall + 2 * strip.reach) % strip.turn, 0, "{strip:?}");
             }
         }
         assert!(strip(8.1, 1024).is_none(), "control");
@@ -130,13 +136,13 @@ mod tests {
 
     #[test]
     fn a_turn_adds_every_row_to_all_its_sums_and_stores_each_that_is_whole() {
-        for blur in [0.0, 0.3, 1.5, 2.3, 8.0] {
+        for blur in [0.0, 0.3, 1.5, 2.3, 4.0, 8.0] {
             let (strip, weights) = (strip(blur, 4096).expect("narrow enough"), weights(blur));
             let text = strip.text(&weights);
             let (taps, count) = (2 * strip.reach + 1, |part: &str| text.matches(part).count() as u32);
-            assert_eq!((count("@"), count("imageStore(to")), (0, TURN), "{blur}");
-            assert_eq!(count("depths[half_at + ") - count("] = "), TURN * taps, "{blur}: depths read");
-            assert_eq!(count(" * blurred"), TURN * taps, "{blur}: sums");
+            assert_eq!((count("@"), count("imageStore(to")), (0, strip.turn), "{blur}");
+            assert_eq!(count("depths[half_at + ") - count("] = "), strip.turn * taps, "{blur}: depths read");
+            assert_eq!(count(" * blurred"), strip.turn * taps, "{blur}: sums");
             let centre = format!("{:?} * blurred0", weights[0]);
             let own_row = format!("sum{} += {centre}", strip.reach);
             assert!(text.contains(&own_row) || strip.reach == 0, "{blur}: the middle row has the middle weight");

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::loads::Kind;
 use super::packing::Packing;
-use crate::scene::{Blurring, Culling, Look, Moments, Shadow, ShadowMethod, Transparency};
+use crate::scene::{Blurring, Culling, Fit, Look, Moments, Shadow, ShadowMethod, Transparency};
 
 /// How shadows are made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -155,6 +155,12 @@ impl Variant {
         Self::soft(format!("variance {size}, blur {blur}, bleeding uncut"), Method::Variance, shadow)
     }
 
+    /// A map that is fitted to the corners of a box, as the thesis has it.
+    fn cornered(size: u32) -> Self {
+        let shadow = Shadow { size, fit: Fit::Corners, ..Shadow::default() };
+        Self::soft(format!("variance {size}, fitted to corners"), Method::Variance, shadow)
+    }
+
     /// The same picture, blurred by other passes: a baseline of time.
     fn blurred((size, blur): (u32, f32), (name, blurring): (&str, Blurring)) -> Self {
         let shadow = Shadow { size, blur, blurring, ..Shadow::default() };
@@ -211,6 +217,7 @@ pub fn all(quick: bool) -> Vec<Variant> {
     all.extend([2048, 4096].map(Variant::f16));
     all.extend(BLURS[1..].iter().map(|blur| Variant::uncut(1024, *blur)));
     all.extend((2..=4).map(|splits| Variant::split(1024, splits)));
+    all.push(Variant::cornered(2048));
     let passes = [("tiles", Blurring::Tiles), ("rows", Blurring::Rows), ("fragments", Blurring::Fragments)];
     // 25 depths in each direction, and 15.
     for map in [(1024, 4.0), (4096, 4.0), (4096, 2.3)] {
@@ -245,6 +252,7 @@ fn few() -> Vec<Variant> {
         Variant::filtered(1024, BLURS[1]),
         Variant::f16(2048),
         Variant::split(1024, 3),
+        Variant::cornered(2048),
         Variant::blended("exact transparency", Transparency::Exact),
         Variant::blended("two-pass transparency", Transparency::TwoPass),
     ];
@@ -262,7 +270,7 @@ mod tests {
         for quick in [false, true] {
             let all = all(quick);
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
-            assert_eq!((names.len(), all.len()), if quick { (16, 16) } else { (49, 49) });
+            assert_eq!((names.len(), all.len()), if quick { (17, 17) } else { (50, 50) });
             for variant in &all {
                 let look = variant.look(Look::default());
                 let transparency = variant.transparency.unwrap_or_default();

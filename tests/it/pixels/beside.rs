@@ -7,7 +7,7 @@ use glow::HasContext as _;
 use modalcast::deform::Deformer as _;
 use modalcast::domain::{AlphaMode, Material};
 use modalcast::error::{Result, invalid};
-use modalcast::raster::{GlBuffer, Mesh, Rasteriser};
+use modalcast::raster::{GlBuffer, Mesh, Order, Rasteriser};
 use modalcast::reference::ReferenceDeformer;
 use modalcast::reference::raster::Raster;
 use modalcast::render::{Image, Path, Paths, Ran, Renderer, SceneBuffers, Seen, Shot};
@@ -51,7 +51,7 @@ impl Plain {
         positions
     }
 
-    fn draw(&self, window: &Window, groups: &[Group]) -> Raster {
+    fn drawn(&self, window: &Window, groups: &[Group]) -> Raster {
         let [width, height] = window.size();
         let clip = Matrix4::from_row_slice(&window.clip().map(f64::from));
         let clip = Matrix4::new_translation(&Vector3::new(self.aside, 0.0, 0.0)) * clip;
@@ -74,13 +74,13 @@ impl Plain {
 }
 
 impl Rasteriser for Plain {
-    fn depth(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
-        let all = Group { first: 0, triangles: self.mesh.triangles.len() as u32, faces: Faces::Both };
-        self.write(into, bytemuck::cast_slice(&self.draw(window, &[all]).depths()))
-    }
-
-    fn ids(&mut self, window: &Window, into: GlBuffer) -> Result<()> {
-        self.write(into, bytemuck::cast_slice(&self.draw(window, &self.mesh.groups).keys))
+    fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()> {
+        if let Some((window, into)) = depth {
+            let all = Group { first: 0, triangles: self.mesh.triangles.len() as u32, faces: Faces::Both };
+            self.write(into, bytemuck::cast_slice(&self.drawn(window, &[all]).depths()))?;
+        }
+        let Some((window, into)) = ids else { return Ok(()) };
+        self.write(into, bytemuck::cast_slice(&self.drawn(window, &self.mesh.groups).keys))
     }
 }
 
@@ -160,7 +160,7 @@ fn a_frame_drawn_beside_opengl_is_opengls_ground_and_shadow_included() {
         let cuda = Some(Path::Cuda);
         assert_eq!(got.ran.paths, Paths { shadow: cuda, visibility: cuda });
         assert_eq!(want.ran.paths, Paths { shadow: Some(Path::OpenGl), visibility: Some(Path::OpenGl) });
-        assert_eq!(got.ran.passes[..4], ["shadow", "blur", "visibility", "unpack"]);
+        assert_eq!(got.ran.passes[..3], ["raster", "blur", "unpack"]);
         assert!(!got.ran.passes.contains(&"ground") && got.allocated.iter().any(|name| name == "shadow depths"));
         assert!(!want.allocated.iter().any(|name| name == "keys" || name == "shadow depths"), "costs OpenGL nothing");
         let kinds = |kind: fn(&Seen) -> bool| want.seen.iter().filter(|seen| kind(seen)).count();

@@ -8,17 +8,13 @@ use modalcast::reference::ReferenceDeformer;
 use modalcast::reference::raster::Raster;
 use modalcast::render::{Seen, Shot};
 use modalcast::scene::{Camera, Culling, Faces, Group, Lens, Scene, State, View, Window};
-use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
+use nalgebra::Matrix4;
 
 use super::build::{Stage, open};
+use crate::both::exact::{Exact, compare};
 use crate::scenes::Random;
 
 const SIZE: [u32; 2] = [320, 240];
-/// A step of the snapped corners, pixels.
-const EDGE: f64 = 1.0 / 256.0;
-/// Depth precision: 24 bits of the window's range from each side.
-const TIE: f64 = 2.0 / (1 << 24) as f64;
-
 /// Triangles of many sizes in one domain, all around and behind the eye.
 fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
@@ -38,69 +34,6 @@ fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut stage = Stage::new();
     (stage.0.look.samples, stage.0.look.culling) = (1, Culling::None);
     (stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene(), triangles)
-}
-
-/// A triangle in homogeneous window coordinates, exact but for f64.
-struct Exact {
-    edges: [Vector3<f64>; 3],
-    depths: Vector3<f64>,
-    weights: Vector3<f64>,
-    turn: f64,
-}
-
-impl Exact {
-    fn new(clip: &Matrix4<f64>, corners: [[f32; 3]; 3]) -> Self {
-        let clips =
-            corners.map(|corner| clip * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
-        let [half_width, half_height] = SIZE.map(|side| 0.5 * f64::from(side));
-        let [a, b, c] = clips.map(|v| Vector3::new(half_width * (v.x + v.w), half_height * (v.w - v.y), v.w));
-        let of = |pick: fn(&Vector4<f64>) -> f64| Vector3::from(clips.each_ref().map(pick));
-        let turn = Matrix3::from_columns(&[a, b, c]).determinant();
-        Self { edges: [b.cross(&c), c.cross(&a), a.cross(&b)], depths: of(|v| v.z), weights: of(|v| v.w), turn }
-    }
-
-    /// Distances to the edges in pixels, positive inside.
-    fn distances(&self, sample: Vector3<f64>) -> [f64; 3] {
-        self.edges.map(|edge| self.turn.signum() * edge.dot(&sample) / edge.xy().norm())
-    }
-
-    /// Whether a sample lies on an edge but for a step of the snapped corners.
-    fn is_on_edge(&self, sample: Vector3<f64>) -> bool {
-        let distances = self.distances(sample);
-        distances.iter().all(|own| *own >= -EDGE) && distances.iter().any(|own| own.abs() <= EDGE)
-    }
-
-    /// Depth in the window at a sample.
-    fn depth(&self, sample: Vector3<f64>) -> f64 {
-        let shares = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
-        0.5 * shares.dot(&self.depths) / shares.dot(&self.weights) + 0.5
-    }
-}
-
-/// Samples that differ, and those of them that no rule excuses.
-#[derive(Debug, Default, PartialEq)]
-struct Differences {
-    edges: usize,
-    ties: usize,
-    wrong: usize,
-}
-
-fn compare(got: &[Option<u32>], want: &[Option<u32>], exact: &[Exact]) -> Differences {
-    let mut found = Differences::default();
-    for (at, (got, want)) in got.iter().zip(want).enumerate().filter(|(_, (got, want))| got != want) {
-        let (x, y) = (at % SIZE[0] as usize, at / SIZE[0] as usize);
-        let sample = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
-        let both: Vec<&Exact> = [got, want].into_iter().flatten().map(|id| &exact[*id as usize]).collect();
-        let tie = |a: &Exact, b: &Exact| (a.depth(sample) - b.depth(sample)).abs() <= TIE;
-        if both.iter().any(|own| own.is_on_edge(sample)) {
-            found.edges += 1;
-        } else if both.len() == 2 && tie(both[0], both[1]) {
-            found.ties += 1;
-        } else {
-            found.wrong += 1;
-        }
-    }
-    found
 }
 
 #[test]
@@ -127,14 +60,14 @@ fn ids_are_those_of_opengl_but_on_edges_and_where_depths_tie() {
 
         let clip = camera.clip_from_camera(width, height, &bounds) * camera.camera_from_world();
         let corner = |vertex: u32| std::array::from_fn(|axis| surface.positions[3 * vertex as usize + axis]);
-        let exact: Vec<Exact> = triangles.iter().map(|own| Exact::new(&clip, own.map(corner))).collect();
+        let exact: Vec<Exact> = triangles.iter().map(|own| Exact::new(&clip, SIZE, own.map(corner))).collect();
         let ids = |clip: &Matrix4<f64>| {
             let mut raster = Raster::new(Window::new(clip, width, height).expect("a window"));
             let group = Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both };
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()
         };
-        let found = compare(&ids(&clip), &want, &exact);
+        let found = compare(&ids(&clip), &want, &exact, SIZE);
         let covered = want.iter().flatten().count();
         eprintln!("eye {eye:?}: {covered} samples see a triangle; {found:?}");
         assert!(covered > 5000 && found.wrong == 0, "{covered} covered, {found:?}");
@@ -142,7 +75,7 @@ fn ids_are_those_of_opengl_but_on_edges_and_where_depths_tie() {
 
         let mut shifted = Matrix4::identity();
         shifted[(0, 3)] = 0.1 / f64::from(width);
-        let control = compare(&ids(&(shifted * clip)), &want, &exact);
+        let control = compare(&ids(&(shifted * clip)), &want, &exact, SIZE);
         assert!(control.wrong > 5, "control: a twentieth of a pixel aside is told: {control:?}");
     }
 }
