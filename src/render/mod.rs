@@ -24,7 +24,8 @@
 //! Two things are drawn only when asked for, with programs and buffers made then: what a few pixels see ([`Pick`]), and
 //! numbers in place of colours ([`Survey`]).
 //!
-//! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone.
+//! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone. Of
+//! several samples a pixel these are never cleared: depth says where there is one.
 
 mod cull;
 mod device;

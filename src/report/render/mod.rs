@@ -11,7 +11,7 @@
 //! - `readback`: frames a second when each is read.
 //! - [`metrics`]: errors, light bleeding, flicker.
 //! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur in compute and in fragments.
-//! - `raster`: the same passes by CUDA beside OpenGL.
+//! - `raster`: the same passes by CUDA beside OpenGL; `paths`: whole frames with either.
 //! - [`packing`]: images in one array as equation 3.13 packs them, against arrays by size.
 //! - [`plants`]: the plants of table 4.5 with rendering.
 //! - [`timed`]: frame times of a scene of the user, for programs that draw the same.
