@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use fake::{FakeDomain, World, serve};
-use modalcast_client::{Array, Client, Error, Format, FrameRequest, FramesRequest, Picture, Policy, Step};
+use modalcast_client::{Array, Client, DrawnBy, Error, Format, FrameRequest, FramesRequest, Picture, Policy, Step};
 use modalcast_client::{VertexRequest, VertexStreamRequest};
 use tokio::sync::Semaphore;
 
@@ -51,6 +51,7 @@ async fn a_frame_above_four_mebibytes_comes_whole_and_names_its_step() {
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
     assert_eq!(frame.stages, [("draw".to_owned(), 2.0)]);
+    assert_eq!((frame.shadow_drawn_by, frame.visibility_drawn_by), (None, Some(DrawnBy::Cuda)));
 }
 
 #[tokio::test]
