@@ -164,6 +164,16 @@ impl Scene {
         Ok(Arc::new(scene))
     }
 
+    /// The packed vertices of each triangle, in the order of the packing.
+    pub fn triangle_vertices(&self) -> Vec<[u32; 3]> {
+        let of_domain = |domain: usize| {
+            let (mesh, first) = (&self.shape_of(domain).mesh, self.layout.slots[domain].first_vertex as u32);
+            let vertices = &mesh.corners().vertices;
+            mesh.triangles().iter().map(move |corners| corners.map(|corner| first + vertices[corner as usize]))
+        };
+        (0..self.domains.len()).flat_map(of_domain).collect()
+    }
+
     /// The shape of a domain.
     pub fn shape_of(&self, domain: usize) -> &Shape {
         &self.shapes[self.domains[domain].shape]

@@ -70,12 +70,11 @@ fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> Still {
     let seen = renderer.seen().expect("reads").iter().map(place).collect();
     let clip = camera.clip_from_camera(SIZE[0], SIZE[1], &deformed.bounds) * camera.camera_from_world();
     let positions = &deformer.surface().expect("there").positions;
+    let list = scene.triangle_vertices();
     let exact = |place: usize| {
         let (domain, triangle) = buffers.triangle(place).expect("there");
-        let (mesh, first) = (&scene.shape_of(domain).mesh, scene.layout.slots[domain].first_vertex);
-        let vertex = |corner: u32| first + mesh.corners().vertices[corner as usize] as usize;
-        let corners =
-            mesh.triangles()[triangle].map(|corner| std::array::from_fn(|k| positions[3 * vertex(corner) + k]));
+        let corners = list[scene.layout.slots[domain].first_triangle + triangle]
+            .map(|vertex| std::array::from_fn(|axis| positions[3 * vertex as usize + axis]));
         Exact::new(&clip, SIZE, corners)
     };
     let exact = (0..scene.layout.triangles).map(exact).collect();

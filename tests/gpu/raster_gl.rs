@@ -6,7 +6,7 @@ use modalcast::deform::Deformer as _;
 use modalcast::gpu::{CudaDeformer, Device, GlBuffers, GlRaster};
 use modalcast::raster::{CutOuts, GlBuffer, Mesh, Rasteriser};
 use modalcast::reference::raster::Raster;
-use modalcast::scene::{Faces, Group, Scene, Window};
+use modalcast::scene::{Faces, Group, Window};
 
 use crate::both::cut_outs::plain_holes;
 use crate::both::soups::{Soup, flat, soups};
@@ -167,16 +167,6 @@ fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_are_faults_and_ha
     assert_eq!(differing(&stage.depth(&mut raster, &soup.window, small), &from_both_sides(&soup, None)), 0);
 }
 
-/// Packed vertices of each triangle.
-fn triangles(scene: &Scene) -> Vec<[u32; 3]> {
-    let of_domain = |domain: usize| {
-        let (mesh, first) = (&scene.shape_of(domain).mesh, scene.layout.slots[domain].first_vertex as u32);
-        let vertices = &mesh.corners().vertices;
-        mesh.triangles().iter().map(move |corners| corners.map(|corner| first + vertices[corner as usize]))
-    };
-    (0..scene.domains.len()).flat_map(of_domain).collect()
-}
-
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_positions_that_a_deformer_shares_are_drawn_step_by_step() {
@@ -187,7 +177,7 @@ fn gpu_positions_that_a_deformer_shares_are_drawn_step_by_step() {
     let shared = GlBuffers { positions, normals, tangents };
     let mut deformer = CudaDeformer::new(&stage.device, &scene, Some(shared)).expect("a deformer");
     assert!(deformer.shares_buffers(), "interop was refused");
-    let list = triangles(&scene);
+    let list = scene.triangle_vertices();
     let all = Group { first: 0, triangles: list.len() as u32, faces: Faces::Both };
     let positions = GlBuffer { name: positions, bytes: 12 * scene.layout.vertices as u64 };
     let mesh = Mesh { positions, triangles: list.clone(), groups: vec![all], cut_outs: None };

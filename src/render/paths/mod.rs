@@ -143,9 +143,10 @@ impl Beside {
     ) -> Result<()> {
         let (scene, origin) = (&buffers.scene, buffers.origin);
         let side = scene.look.shadow.map_or(1, |shadow| shadow.size);
-        let map = Window::new(&map_clip(scene, shot, origin), side, side)?;
+        let map = || Window::new(&map_clip(scene, shot, origin), side, side);
+        let map = if shadow { Some(map()?) } else { None };
         let frame = Window::new(&camera_clip(scene, shot, origin), shot.width, shot.height)?;
-        let depth = self.shadow.as_ref().filter(|_| shadow).map(|depths| (&map, of(&depths.buffer)));
+        let depth = self.shadow.as_ref().zip(map.as_ref()).map(|(depths, map)| (map, of(&depths.buffer)));
         let keys = self.visibility.as_ref().filter(|_| visibility);
         let replaced = keys.map(|keys| keys.make_room(gl, KEY * frame.pixels() as u64)).transpose()?.flatten();
         if let Some(replaced) = replaced {

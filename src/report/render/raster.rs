@@ -225,7 +225,7 @@ impl Job {
         studio.draw(set, self.camera, self.size)?;
         let ids = self.ids(&studio.renderer.seen()?, set);
         let shot = set.shot(self.camera, self.size);
-        let triangles = triangles(&self.scene);
+        let triangles = self.scene.triangle_vertices();
         let positions = set.surface()?.positions.clone();
         let group = [Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both }];
         let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &group, cut_outs: None };
@@ -297,16 +297,6 @@ fn counts(device: &Device, mesh: RasterMesh<'_>, window: Window, depth_only: boo
     Ok(raster.counts(device)?.into())
 }
 
-/// The packed vertices of each triangle, in the scene's order.
-fn triangles(scene: &Scene) -> Vec<[u32; 3]> {
-    let of_domain = |domain: usize| {
-        let (mesh, first) = (&scene.shape_of(domain).mesh, scene.layout.slots[domain].first_vertex as u32);
-        let vertices = &mesh.corners().vertices;
-        mesh.triangles().iter().map(move |corners| corners.map(|corner| first + vertices[corner as usize]))
-    };
-    (0..scene.domains.len()).flat_map(of_domain).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -339,7 +329,7 @@ mod tests {
         let shot = set.shot(camera, job.size);
         let (window, positions) =
             (job.frame(&shot).expect("a window"), set.surface().expect("there").positions.clone());
-        let list = triangles(&job.scene);
+        let list = job.scene.triangle_vertices();
         let clip = window.clip();
         let row =
             |row: usize, p: [f32; 3]| (0..3).map(|at| clip[4 * row + at] * p[at]).sum::<f32>() + clip[4 * row + 3];
