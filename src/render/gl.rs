@@ -3,6 +3,7 @@
 //! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
 //! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
 
+mod clear;
 mod culling;
 mod debug;
 mod fence;
@@ -18,6 +19,7 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
+pub(super) use self::clear::Clear;
 pub(super) use self::debug::is_wanted as is_debug_wanted;
 pub(super) use self::fence::Fence;
 pub(super) use self::limits::Limits;
@@ -79,20 +81,6 @@ pub(super) struct Fixed {
     pub(super) cull: bool,
     /// Colours are blended over those that are there; alpha becomes the share of what was there before that is left.
     pub(super) blend: bool,
-}
-
-/// What a pass begins with.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Clear {
-    /// Depth of 1.
-    Depth,
-    /// Depth of 1 and ids of 0.
-    DepthAndIds,
-    Colour([f32; 4]),
-    /// Words of 0, without depth.
-    Words,
-    /// All stays.
-    Nothing,
 }
 
 impl Gl {
@@ -269,27 +257,6 @@ impl Gl {
                 ask(glow::SAMPLE_POSITION, index, place.as_mut_ptr());
             }
             self.check("samples").map(|()| places)
-        }
-    }
-
-    /// Binds a framebuffer, sets the viewport and clears.
-    pub(super) fn begin(&self, into: &Framebuffer, width: u32, height: u32, clear: Clear) {
-        let gl = self.on();
-        // SAFETY: state and a clear of a complete framebuffer.
-        unsafe {
-            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(into.name));
-            gl.viewport(0, 0, width as i32, height as i32);
-            gl.depth_mask(true);
-            match clear {
-                Clear::Depth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
-                Clear::DepthAndIds => {
-                    gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]);
-                    gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]);
-                }
-                Clear::Words => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
-                Clear::Nothing => {}
-                Clear::Colour(colour) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &colour),
-            }
         }
     }
 

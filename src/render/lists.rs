@@ -14,6 +14,7 @@ use super::cull::command;
 use super::geometry::Kind;
 use super::gl::{self, Buffer, Clear, Fixed, Framebuffer, Gl, Limits, Program, Texture, TextureKind};
 use super::passes::{NO_TILES, TILES, begins, bind_shadow, draw_group, listed};
+use super::region::{Region, Touched};
 use super::scene_buffers::SceneBuffers;
 use super::shaders::lists::{BINS, TALLY};
 use super::shaders::{self, Options, TILE};
@@ -93,6 +94,7 @@ pub(super) struct ListTarget {
     pub(super) layers: Texture,
     /// Clears the counts.
     counted: Framebuffer,
+    touched: Touched,
     /// Depth alone, to test against.
     behind: Framebuffer,
     records: Buffer,
@@ -136,6 +138,7 @@ impl ListTarget {
         let tiles = u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE));
         Ok(Self {
             counted: gl.colour_framebuffer(&counts)?,
+            touched: Touched::default(),
             behind: gl.framebuffer(None, depth)?,
             counts,
             ends: image(gl::TEXTURE_2D, gl::R32UI, 1)?,
@@ -192,22 +195,23 @@ pub(super) fn told(head: &[u8]) -> Lists {
 pub(super) fn draw(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (target, form): (&ListTarget, Form),
+    (target, part): (&ListTarget, Region),
     programs: &ListPrograms,
     ran: &mut Ran,
 ) -> Result<()> {
     target.empty(gl, buffers);
-    gl.begin(&target.counted, form.width, form.height, Clear::Words);
+    let [width, height] = part.frame();
+    gl.begin(&target.counted, part, Clear::Words(&target.touched));
     target.bind();
-    gather(gl, buffers, (target, form), (programs, COUNT), ran);
+    gather(gl, buffers, (target, part), (programs, COUNT), ran);
     gl.check("count")?;
     programs.tally.bind(None);
-    gl.dispatch(form.width.div_ceil(TALLY), form.height.div_ceil(TALLY));
+    gl.dispatch(width.div_ceil(TALLY), height.div_ceil(TALLY));
     programs.place.bind(None);
-    gl.dispatch(form.width.div_ceil(TILE), form.height.div_ceil(TILE));
+    gl.dispatch(width.div_ceil(TILE), height.div_ceil(TILE));
     gl.check("scan")?;
-    gather(gl, buffers, (target, form), (programs, FILL), ran);
-    gather(gl, buffers, (target, form), (programs, JOIN), ran);
+    gather(gl, buffers, (target, part), (programs, FILL), ran);
+    gather(gl, buffers, (target, part), (programs, JOIN), ran);
     gl.check("fill")?;
     bind_shadow(buffers);
     target.layers.bind_image(LAYERS);
@@ -224,14 +228,14 @@ pub(super) const PASSES: [&str; 4] = ["count", "scan", "fill", "resolve"];
 fn gather(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (target, form): (&ListTarget, Form),
+    (target, part): (&ListTarget, Region),
     (programs, turn): (&ListPrograms, i32),
     ran: &mut Ran,
 ) {
     let (all, drawn) = (buffers.array(Kind::Blend), listed(buffers));
     let array = buffers.listed(Kind::Blend).map(|(array, _)| array).or(all);
     let Some(array) = array else { return };
-    gl.begin(&target.behind, form.width, form.height, Clear::Nothing);
+    gl.begin(&target.behind, part, Clear::Nothing);
     let groups = buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == Kind::Blend);
     for (index, (place, group)) in groups.enumerate() {
         gl.set(Fixed { cull: !group.double_sided, ..Fixed::default() });

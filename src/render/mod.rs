@@ -41,6 +41,7 @@ mod pick;
 mod plan;
 mod post;
 mod programs;
+mod region;
 mod ring;
 mod scene_buffers;
 mod seen;

@@ -6,6 +6,7 @@ use super::geometry::{Group, Kind};
 use super::gl::{Buffer, Clear, Fixed, Framebuffer, Gl, Program, Texture};
 use super::paths::Path;
 use super::programs::Sampled;
+use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
     COLOUR_UNIT, COUNT_UNIT, DEPTH_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE,
@@ -81,22 +82,25 @@ pub(super) fn visibility(
 ) -> Result<()> {
     let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
     // Of several samples, depth says where there is an id.
-    let clear = if target.form.samples > 1 { Clear::Depth } else { Clear::DepthAndIds };
-    let into = (&target.visible, clear, [target.form.width, target.form.height], listed(buffers));
+    let clear = match target.form.samples {
+        1 => Clear::DepthAndIds(Some([&target.touched.depth, &target.touched.ids])),
+        _ => Clear::Depth(Some(&target.touched.depth)),
+    };
+    let into = (&target.visible, clear, target.reach.get(), listed(buffers));
     identify(gl, buffers, into, programs, ran)?;
     super::cull::remember(gl, buffers, target, sampled)
 }
 
-/// Ids and depth into a framebuffer of this width and height or larger: of what is opaque; of what is cut out, by the first
+/// Ids and depth into a part of a framebuffer as large as its frame or larger: of what is opaque; of what is cut out, by the first
 /// program; and of the opaque parts of what is blended, by the second.
 pub(super) fn identify(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (into, clear, [width, height], drawn): (&Framebuffer, Clear, [u32; 2], Drawn),
+    (into, clear, part, drawn): (&Framebuffer, Clear<'_>, Region, Drawn),
     (cut_out, parts): (Option<&Program>, Option<&Program>),
     ran: &mut Ran,
 ) -> Result<()> {
-    gl.begin(into, width, height, clear);
+    gl.begin(into, part, clear);
     // What is cut out comes last: where something stands before it, nothing is sampled.
     let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out), (Kind::Blend, parts)];
     let written = Fixed { depth_write: true, ..Fixed::default() };
@@ -136,10 +140,10 @@ pub(super) fn blended(
     ran: &mut Ran,
 ) -> Result<()> {
     if let (Some(programs), Some(lists)) = (&sampled.lists, &target.lists) {
-        return super::lists::draw(gl, buffers, (lists, target.form), programs, ran);
+        return super::lists::draw(gl, buffers, (lists, target.reach.get()), programs, ran);
     }
     let (Some(program), Some(layer)) = (&sampled.blended, &target.layer) else { return Ok(()) };
-    gl.begin(&layer.framebuffer, target.form.width, target.form.height, Clear::Colour(CLEAR_LAYER));
+    gl.begin(&layer.framebuffer, target.reach.get(), Clear::Colour(CLEAR_LAYER, &layer.touched));
     bind_shadow(buffers);
     let program = (Kind::Blend, program.as_ref(), listed(buffers));
     draw(gl, buffers, program, Fixed { blend: true, ..Fixed::default() }, ran);

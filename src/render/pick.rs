@@ -12,6 +12,7 @@ use nalgebra::{Matrix3, Matrix4, Vector3};
 
 use super::geometry::{Stretch, whose};
 use super::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
+use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::seen::Seen;
 use super::shaders;
@@ -109,7 +110,7 @@ impl Renderer {
         passes::identify(
             gl,
             buffers,
-            (&picker.visible, gl::Clear::DepthAndIds, [width, height], passes::Drawn::All),
+            (&picker.visible, gl::Clear::DepthAndIds(None), Region::whole([width, height]), passes::Drawn::All),
             (cut_out.as_deref(), None),
             ran,
         )?;

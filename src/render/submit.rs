@@ -13,6 +13,7 @@ use rayon::prelude::*;
 use super::gl::{Fence, Lent, Stopwatch};
 use super::lists;
 use super::programs::Sampled;
+use super::region::Region;
 use super::ring::Slot;
 use super::scene_buffers::SceneBuffers;
 use super::splits::Splits;
@@ -125,6 +126,7 @@ impl Renderer {
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let slot = if is_read { Some(target.ring.take(self.watchdog)?) } else { None };
+        target.reach.set(reach(buffers, shot));
         buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
         cull::begin(buffers);
@@ -195,10 +197,7 @@ impl Renderer {
                 Some(beside) => beside.unpack(gl, target, ran),
                 None => {
                     passes::visibility(gl, buffers, target, sampled, ran)?;
-                    // The bounds of a scene apart leave out what is far away.
-                    let is_last =
-                        buffers.apart.is_none() && frame::ground_is_last(&buffers.scene, shot, buffers.origin);
-                    if is_last { Ok(()) } else { passes::ground(gl, buffers, shot, ran) }
+                    if draws_ground(buffers, shot) { passes::ground(gl, buffers, shot, ran) } else { Ok(()) }
                 }
             })?,
             timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
@@ -230,6 +229,23 @@ impl Renderer {
         };
         self.gl.timed(("read", self.watchdog), copy).map(|stopwatch| Some(("read", stopwatch)))
     }
+}
+
+/// Whether the ground is one more thing that samples see.
+fn draws_ground(buffers: &SceneBuffers, shot: &Shot) -> bool {
+    let scene = &buffers.scene;
+    // The bounds of a scene apart leave out what is far away.
+    let is_last = buffers.apart.is_none() && frame::ground_is_last(scene, shot, buffers.origin);
+    scene.look.ground.is_some() && frame::above_ground(scene, shot) && !is_last
+}
+
+/// Where a frame may have triangles, or ground that is drawn.
+fn reach(buffers: &SceneBuffers, shot: &Shot) -> Region {
+    let size = [shot.width, shot.height];
+    if buffers.apart.is_some() || draws_ground(buffers, shot) {
+        return Region::whole(size);
+    }
+    Region::of(&frame::camera_clip(&buffers.scene, shot, buffers.origin), &shot.bounds, size)
 }
 
 impl Ticket {

@@ -6,6 +6,7 @@ use std::time::Instant;
 use rayon::prelude::*;
 
 use super::gl::{self, Buffer, Framebuffer, Texture};
+use super::region::Region;
 use super::scene_buffers::{SceneBuffers, Values};
 use super::seen::Seen;
 use super::shaders::{self, VALUE_UNIT};
@@ -121,7 +122,12 @@ impl Renderer {
             passes::identify(
                 gl,
                 buffers,
-                (&surveyor.visible, gl::Clear::DepthAndIds, [form.width, form.height], passes::Drawn::All),
+                (
+                    &surveyor.visible,
+                    gl::Clear::DepthAndIds(None),
+                    Region::whole([form.width, form.height]),
+                    passes::Drawn::All,
+                ),
                 (cut_out.as_deref(), None),
                 ran,
             )?;

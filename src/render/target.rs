@@ -1,12 +1,14 @@
 //! Where a frame is drawn: ids, depth and blended layer of every sample, the picture, and the buffers through which its
 //! pixels come back.
 
+use std::cell::Cell;
 use std::ops::Range;
 use std::rc::Rc;
 
 use super::cull::{COUNT_BYTES, Pyramid};
 use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
 use super::lists::{HEAD, ListTarget};
+use super::region::{Region, Touched};
 use super::ring::Ring;
 use super::shaders::TILE;
 use crate::error::Result;
@@ -46,6 +48,9 @@ pub(super) struct Target {
     /// Per sample what it sees; kept until the next frame, like depth.
     pub(super) ids: Texture,
     pub(super) visible: Framebuffer,
+    pub(super) touched: Seen,
+    /// Where the frame that is drawn now may have triangles, or ground that is drawn.
+    pub(super) reach: Cell<Region>,
     pub(super) layer: Option<Layer>,
     pub(super) lists: Option<ListTarget>,
     /// The tiles that see triangles, after the numbers of the dispatch over them.
@@ -69,6 +74,14 @@ pub(super) struct Target {
 pub(super) struct Layer {
     pub(super) framebuffer: Framebuffer,
     pub(super) colour: Texture,
+    pub(super) touched: Touched,
+}
+
+/// What is known of what samples see.
+#[derive(Debug, Default)]
+pub(super) struct Seen {
+    pub(super) ids: Touched,
+    pub(super) depth: Touched,
 }
 
 impl Form {
@@ -106,7 +119,9 @@ impl Target {
     pub(super) fn new(gl: &Rc<Gl>, form: Form) -> Result<Self> {
         let Form { width, height, samples, blended, .. } = form;
         let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
-        let layer = |colour: Texture| Ok(Layer { framebuffer: gl.framebuffer(Some(&colour), &depth)?, colour });
+        let layer = |colour: Texture| {
+            Ok(Layer { framebuffer: gl.framebuffer(Some(&colour), &depth)?, colour, touched: Touched::default() })
+        };
         let layer = if blended == Blended::Drawn { Some(layer(image(gl, form, gl::RGBA16F)?)?) } else { None };
         let lists = match blended {
             Blended::Listed(budget) => Some(ListTarget::new(gl, form, budget, &depth)?),
@@ -116,6 +131,8 @@ impl Target {
         Ok(Self {
             form: Form { samples, ..form },
             visible: gl.framebuffer(Some(&ids), &depth)?,
+            touched: Seen::default(),
+            reach: Cell::new(Region::whole([width, height])),
             ids,
             layer,
             lists,

@@ -11,6 +11,7 @@ mod limits;
 mod picking;
 mod post;
 mod raster;
+mod reach;
 mod shading;
 mod shadow;
 mod shadow_extremes;

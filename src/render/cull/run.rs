@@ -85,7 +85,7 @@ pub(in crate::render) fn camera(
         empty(gl, buffers, culler);
         remembered.bind(None);
         lists(gl, culler, &programs.list);
-        gl.begin(&pyramid.occluders, target.form.width, target.form.height, Clear::Depth);
+        gl.begin(&pyramid.occluders, target.reach.get(), Clear::Depth(Some(&target.touched.depth)));
         let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, sampled.mask.as_deref())];
         for (kind, program) in kinds {
             if let Some(program) = program {

@@ -38,6 +38,7 @@ impl Gl {
         unsafe {
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(into.name));
             gl.viewport(0, 0, side as i32, side as i32);
+            gl.disable(glow::SCISSOR_TEST);
         }
         self.draw_made(nothing, 3);
     }

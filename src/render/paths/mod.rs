@@ -178,6 +178,7 @@ impl Beside {
         keys.unpack.bind(None);
         keys.buffer.borrow().as_ref().ok_or_else(missing)?.bind_storage(0);
         target.ids.bind_image(0);
+        target.touched.ids.everywhere();
         gl.dispatch(target.form.width.div_ceil(TILE), target.form.height.div_ceil(TILE));
         ran.passes.push("unpack");
         gl.check("unpack")

@@ -14,6 +14,7 @@ use super::geometry::Kind;
 use super::gl::{self, Clear, Fixed, Framebuffer, Gl, Program, Texture, TextureKind};
 use super::passes::{draw_kind, listed};
 use super::paths::Beside;
+use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::LANES;
 use crate::error::{Result, during};
@@ -124,7 +125,7 @@ pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<
     let drawn = listed(buffers);
     for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
         super::cull::sun(gl, buffers, size, |program| choose(program, map, layer))?;
-        gl.begin(framebuffer, size, size, Clear::Depth);
+        gl.begin(framebuffer, Region::whole([size; 2]), Clear::Depth(None));
         gl.set(Fixed { depth_write: true, ..Fixed::default() });
         for (kind, program) in [Kind::Opaque, Kind::Mask, Kind::Blend].into_iter().zip(&buffers.programs.shadow) {
             let Some(program) = program else { continue };

@@ -1,0 +1,201 @@
+//! The part of a frame that a scene can take up. What lies outside is neither drawn nor, next time, cleared: a sample of 32
+//! bits that is cleared takes a device as long as one that is drawn (an H200 14 a nanosecond, measured).
+
+use std::cell::Cell;
+
+use nalgebra::{Matrix4, Vector4};
+
+use crate::scene::Bounds;
+
+/// A rectangle of a frame's pixels; (0, 0) is the bottom left one. It may be empty.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Region {
+    frame: [u32; 2],
+    corner: [u32; 2],
+    size: [u32; 2],
+}
+
+/// The pixels of an image that may hold something else than what it is cleared to: at first all of them.
+#[derive(Debug, Default)]
+pub(super) struct Touched(Cell<Option<Region>>);
+
+/// What f32 makes of a clip coordinate, relative to the sum of its products' magnitudes: each number of the matrix is
+/// rounded, each product, and three sums.
+const ROUNDINGS: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
+
+/// Pixels around what the numbers say: a rasteriser moves corners by up to 1/256 pixel, and a sample may lie anywhere in one.
+const MARGIN: f64 = 1.0;
+
+impl Region {
+    pub(super) const fn whole(frame: [u32; 2]) -> Self {
+        Self { frame, corner: [0; 2], size: frame }
+    }
+
+    /// Where a frame of so many pixels can show what lies in `bounds`, when `clip` takes positions to clip space in f32. All
+    /// of it when some of that lies behind the eye, or overflowed.
+    pub(super) fn of(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
+        let corner = |index: usize| -> [f64; 3] {
+            std::array::from_fn(|axis| if index >> axis & 1 == 0 { bounds.min[axis] } else { bounds.max[axis] })
+        };
+        let corners: [Vector4<f64>; 8] = std::array::from_fn(|index| {
+            let [x, y, z] = corner(index);
+            Vector4::new(x, y, z, 1.0)
+        });
+        let magnitudes = corners.iter().map(|corner| clip.abs() * corner.abs());
+        let rounded = magnitudes.fold(Vector4::zeros(), |most: Vector4<f64>, one| most.sup(&one)) * ROUNDINGS;
+        let shown = corners.map(|corner| clip * corner);
+        let nearest = shown.iter().fold(f64::INFINITY, |least, at| least.min(at.w)) - rounded.w;
+        let numbers = shown.iter().chain([&rounded]).flat_map(|four| four.iter());
+        if !(nearest > 0.0 && numbers.clone().all(|number| number.is_finite())) {
+            return Self::whole(frame);
+        }
+        let spans = [0, 1].map(|axis| {
+            let at = shown.map(|at| at[axis] / at.w);
+            let (least, most) = at.iter().fold((f64::MAX, f64::MIN), |(a, b), &one| (a.min(one), b.max(one)));
+            let off = (rounded[axis] + least.abs().max(most.abs()) * rounded.w) / nearest;
+            let side = f64::from(frame[axis]);
+            let pixel = |image: f64, margin: f64| ((0.5 * image + 0.5) * side + margin).clamp(0.0, side);
+            // As a cast, a NaN is 0: it cannot be one here, and would be cut off the wrong side if it were.
+            [pixel(least - off, -MARGIN).floor() as u32, pixel(most + off, MARGIN).ceil() as u32]
+        });
+        Self { frame, corner: spans.map(|[low, _]| low), size: spans.map(|[low, high]| high - low) }
+    }
+
+    /// Width and height of the frame.
+    pub(super) const fn frame(&self) -> [u32; 2] {
+        self.frame
+    }
+
+    /// Column and row of the bottom left pixel, width and height.
+    pub(super) const fn part(&self) -> [u32; 4] {
+        let ([x, y], [width, height]) = (self.corner, self.size);
+        [x, y, width, height]
+    }
+}
+
+impl Touched {
+    /// What was touched, none for all; from now on this is.
+    pub(super) fn replace(&self, by: Region) -> Option<Region> {
+        self.0.replace(Some(by))
+    }
+
+    /// Somebody writes to all of it.
+    pub(super) fn everywhere(&self) {
+        self.0.set(None);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, Lens, View};
+
+    const FRAME: [u32; 2] = [640, 400];
+
+    fn clip(eye: [f64; 3], target: [f64; 3], bounds: &Bounds) -> Matrix4<f64> {
+        let view = View::LookAt { eye, target, up: [0.0, 1.0, 0.0] };
+        let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.0, far: 0.0 };
+        camera.clip_from_camera(FRAME[0], FRAME[1], bounds) * camera.camera_from_world()
+    }
+
+    /// Where f32 puts a point, in pixels, as a vertex shader does.
+    fn pixel(clip: &Matrix4<f64>, point: [f32; 3]) -> [f32; 2] {
+        let clip: Matrix4<f32> = clip.cast();
+        let at = clip * Vector4::new(point[0], point[1], point[2], 1.0);
+        [0, 1].map(|axis| (0.5 * at[axis] / at.w + 0.5) * FRAME[axis] as f32)
+    }
+
+    /// A box of this half side, its middle, and every fifth of it on the way to its corners.
+    fn filled(centre: [f64; 3], half: f64) -> (Bounds, Vec<[f32; 3]>) {
+        let (mut bounds, mut points) = (Bounds::EMPTY, Vec::new());
+        for index in 0..216 {
+            let step = [index % 6, index / 6 % 6, index / 36].map(|step| f64::from(step) / 2.5 - 1.0);
+            let point: [f32; 3] = std::array::from_fn(|axis| (centre[axis] + half * step[axis]) as f32);
+            bounds.include(point.map(f64::from));
+            points.push(point);
+        }
+        (bounds, points)
+    }
+
+    #[test]
+    fn what_lies_in_the_bounds_is_drawn_inside_the_region_however_far_from_the_origin() {
+        // Near the origin, and where f32 moves points by pixels.
+        for (centre, away) in [([0.3, -0.2, 0.1], 5.0), ([2e5, -3e4, 1e5], 5.0), ([-9e6, 0.0, 9e6], 900.0)] {
+            let (bounds, points) = filled(centre, 0.1 * away);
+            for turn in 0..16 {
+                let angle = 0.4 * f64::from(turn);
+                let aside = 0.02 * away * f64::from(turn);
+                let eye = [centre[0] + away * angle.cos(), centre[1] + aside, centre[2] + away * angle.sin()];
+                let target = [centre[0] + aside, centre[1], centre[2] - aside];
+                let clip = clip(eye, target, &bounds);
+                let region = Region::of(&clip, &bounds, FRAME);
+                let [x, y, width, height] = region.part().map(|number| number as f32);
+                for point in &points {
+                    let at = pixel(&clip, *point);
+                    let outside = |at: f32, low: f32, size: f32, side: f32| {
+                        at.clamp(0.0, side) < low || at.clamp(0.0, side) > low + size
+                    };
+                    let out = outside(at[0], x, width, 640.0) || outside(at[1], y, height, 400.0);
+                    assert!(!out, "{at:?} lies outside of {region:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_region_reaches_little_farther_than_the_bounds_and_is_empty_where_they_are_not_seen() {
+        let (bounds, points) = filled([0.0; 3], 0.5);
+        let clip_from = |target: [f64; 3]| clip([0.3, 0.4, 6.0], target, &bounds);
+        let seen = clip_from([0.0; 3]);
+        let [x, y, width, height] = Region::of(&seen, &bounds, FRAME).part().map(|number| number as f32);
+        let far = |pick: fn(f32, f32) -> f32, axis: usize| {
+            points.iter().map(|point| pixel(&seen, *point)[axis]).reduce(pick).expect("points")
+        };
+        for (own, tight) in [
+            (x, far(f32::min, 0)),
+            (y, far(f32::min, 1)),
+            (x + width, far(f32::max, 0)),
+            (y + height, far(f32::max, 1)),
+        ] {
+            assert!((own - tight).abs() <= 2.01, "{own} for {tight}");
+        }
+        for aside in [[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, -9.0, 0.0]] {
+            let [_, _, width, height] = Region::of(&clip_from(aside), &bounds, FRAME).part();
+            assert_eq!(width * height, 0, "{aside:?}");
+        }
+    }
+
+    #[test]
+    fn bounds_around_the_eye_behind_it_or_overflowed_may_be_anywhere() {
+        let (bounds, _) = filled([0.0; 3], 0.5);
+        let whole = Region::whole(FRAME);
+        let inside = clip([0.1, 0.2, 0.3], [0.0; 3], &bounds);
+        assert_eq!(Region::of(&inside, &bounds, FRAME), whole);
+        let away = clip([0.0, 0.0, 6.0], [0.0, 0.0, 12.0], &bounds);
+        assert_eq!(Region::of(&away, &bounds, FRAME), whole);
+        let seen = clip([0.0, 0.0, 6.0], [0.0; 3], &bounds);
+        assert_ne!(Region::of(&seen, &bounds, FRAME), whole, "control");
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            for axis in 0..3 {
+                let mut lost = bounds;
+                lost.max[axis] = bad;
+                assert_eq!(Region::of(&seen, &lost, FRAME), whole);
+            }
+            assert_eq!(Region::of(&(seen * bad), &bounds, FRAME), whole);
+        }
+        assert_eq!(Region::of(&seen, &Bounds::EMPTY, FRAME), whole);
+        // So far along x that f32 may put it anywhere there.
+        let (bounds, _) = filled([1e9, 0.0, 0.0], 0.5);
+        let [_, y, width, height] = Region::of(&clip([1e9, 0.0, 6.0], [1e9, 0.0, 0.0], &bounds), &bounds, FRAME).part();
+        assert!(width == FRAME[0] && y > 100 && height < 200, "{y}, {width} x {height}");
+    }
+
+    #[test]
+    fn an_image_is_touched_everywhere_at_first_and_again_when_somebody_says_so() {
+        let (touched, part) = (Touched::default(), Region { frame: FRAME, corner: [3, 4], size: [5, 6] });
+        assert_eq!(touched.replace(part), None);
+        assert_eq!(touched.replace(Region::whole(FRAME)), Some(part));
+        touched.everywhere();
+        assert_eq!(touched.replace(part), None);
+    }
+}

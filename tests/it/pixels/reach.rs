@@ -1,0 +1,110 @@
+//! Frames draw and clear no more than their scene can take up: what an earlier frame left elsewhere is never seen.
+
+use std::sync::Arc;
+
+use modalcast::domain::{AlphaMode, Material};
+use modalcast::render::{Renderer, SceneBuffers, Seen, Shot};
+use modalcast::scene::{Bounds, Camera, Culling, Look, Scene, Transparency};
+
+use super::build::{Stage, camera, facing, open};
+
+const SIZE: u32 = 96;
+
+/// An opaque square, a leaf with holes before it and a pane before that.
+fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
+    let mut stage = Stage::new();
+    look(&mut stage.0.look);
+    let holes = stage.texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
+    let painted = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
+    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..painted([0.2, 0.9, 0.3]) };
+    let leaf =
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(holes), ..painted([1.0; 3]) };
+    let stage = stage.add(facing(-1.0, -1.0, 0.3, 0.3, -0.5), painted([0.9, 0.2, 0.2]));
+    stage.add(facing(-0.4, -0.6, 0.9, 0.7, 0.0), leaf).add(facing(0.0, 0.0, 1.0, 1.0, 0.5), glass).scene()
+}
+
+/// The scene at rest, where every vertex is where its mesh says.
+fn loaded(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
+    let buffers = renderer.load(scene).expect("loads");
+    let mut surface = modalcast::deform::Surface::default();
+    for domain in &scene.domains {
+        let mesh = &scene.shapes[domain.shape].mesh;
+        surface.positions.extend(mesh.rest().as_flattened());
+        surface.normals.extend(mesh.corners().normals.as_flattened());
+    }
+    renderer.upload(&buffers, &surface).expect("uploads");
+    buffers
+}
+
+/// The camera so many pixels aside.
+fn aside([x, y]: [f64; 2]) -> Camera {
+    let mut moved = camera(SIZE);
+    if let modalcast::scene::Lens::Intrinsics { cx, cy, .. } = &mut moved.lens {
+        (*cx, *cy) = (*cx + x, *cy + y);
+    }
+    moved
+}
+
+type Frame = (Vec<u8>, Vec<Seen>);
+
+fn frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, bounds: Bounds) -> Frame {
+    let shot = Shot { camera, width: SIZE, height: SIZE, bounds, light: None };
+    let rgba = renderer.draw(buffers, &shot).expect("draws").rgba;
+    (rgba, renderer.seen().expect("reads"))
+}
+
+#[test]
+fn a_frame_after_others_elsewhere_is_that_of_a_fresh_renderer() {
+    let looks: [fn(&mut Look); 6] = [
+        |look| look.samples = 1,
+        |_| {},
+        |look| look.transparency = Transparency::TwoPass,
+        |look| look.transparency = Transparency::Exact,
+        |look| look.culling = Culling::Depth,
+        |look| (look.culling, look.samples) = (Culling::Depth, 1),
+    ];
+    let places = [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [500.0, 0.0], [20.0, -20.0], [0.0; 2]];
+    for (index, look) in looks.into_iter().enumerate() {
+        let scene = stage(look);
+        let (mut used, mut last) = (open(), None::<Frame>);
+        let buffers = loaded(&mut used, &scene);
+        for place in places {
+            let (mut fresh, camera) = (open(), aside(place));
+            let alone = loaded(&mut fresh, &scene);
+            let want = frame(&mut fresh, &alone, camera, scene.rest_bounds);
+            let got = frame(&mut used, &buffers, camera, scene.rest_bounds);
+            assert!(got == want, "look {index} at {place:?}");
+            let triangles = got.1.iter().filter(|seen| matches!(seen, Seen::Triangle(_))).count();
+            assert_eq!(triangles > 100, place[0] < 100.0, "look {index} at {place:?}: {triangles} pixels");
+            assert!(last.as_ref() != Some(&got), "control: look {index} at {place:?} is another picture");
+            last = Some(got);
+        }
+    }
+}
+
+#[test]
+fn scenes_that_share_a_target_do_not_see_each_other() {
+    let (both, mut shared) = ([stage(|_| {}), stage(|look| look.transparency = Transparency::Exact)], open());
+    let buffers = [0, 1].map(|index| loaded(&mut shared, &both[index]));
+    for (turn, place) in [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [12.0, 3.0]].into_iter().enumerate() {
+        let (at, mut fresh) = (turn % 2, open());
+        let alone = loaded(&mut fresh, &both[at]);
+        let bounds = both[at].rest_bounds;
+        let want = frame(&mut fresh, &alone, aside(place), bounds);
+        assert!(frame(&mut shared, &buffers[at], aside(place), bounds) == want, "turn {turn}");
+    }
+}
+
+#[test]
+fn nothing_is_drawn_outside_of_the_bounds_of_a_shot() {
+    let (scene, mut renderer) = (stage(|_| {}), open());
+    let buffers = loaded(&mut renderer, &scene);
+    let mut ids = |bounds: Bounds| {
+        let (_, seen) = frame(&mut renderer, &buffers, camera(SIZE), bounds);
+        seen.iter().filter(|seen| matches!(seen, Seen::Triangle(_))).count()
+    };
+    let whole = ids(scene.rest_bounds);
+    let half = ids(Bounds { max: [0.0, 1.0, 0.5], ..scene.rest_bounds });
+    let unknown = ids(Bounds { max: [f64::NAN; 3], ..scene.rest_bounds });
+    assert!(half < whole * 3 / 4 && whole == unknown, "{half} and {unknown} of {whole} pixels");
+}
