@@ -3,7 +3,8 @@
 //   raster        a thread a triangle of a group: drops it, draws it if few samples are near, or hands it on
 //   raster_cut    the same of triangles that are cut out
 //   raster_warps  a warp a triangle of the medium queue
-//   raster_tiles  a block a tile of a triangle of the large queue; clipped ones come here too
+//   raster_tiles  a warp a tile of a triangle of the large queue, or a strip of it where tiles are few; clipped ones come
+//                 here too
 // Macros: DEPTH   depth alone, f32, no ids: a shadow map
 //         CUT     there are triangles of which alpha leaves a part: all from args.cut on. Asked before the atomic
 //         COUNT   how many triangles took each path, and why others were dropped
@@ -21,8 +22,9 @@
 #define NARROW 16384
 #endif
 
-constexpr unsigned BLOCK = 256;
+constexpr unsigned BLOCK = 128, WARPS = BLOCK / 32;
 constexpr int TILE = 64;
+constexpr unsigned HALVINGS = 3;          // of a tile into strips, at most
 constexpr unsigned TILES_BITS = 40;
 
 // Where a triangle goes, and what drawing it there needs.
@@ -222,9 +224,9 @@ __device__ inline bool is_cut(const RasterArgs& args, unsigned triangle) {
 #endif
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK, 2) raster_warps(const __grid_constant__ RasterArgs args) {
-    const unsigned queued = ((const Tally*)args.tally)->medium, warps = gridDim.x * (BLOCK / 32);
-    for (unsigned at = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; at < queued; at += warps) {
+extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid_constant__ RasterArgs args) {
+    const unsigned queued = ((const Tally*)args.tally)->medium, warps = gridDim.x * WARPS;
+    for (unsigned at = blockIdx.x * WARPS + threadIdx.x / 32; at < queued; at += warps) {
         const unsigned triangle = ((const unsigned*)args.medium)[at];
         if (is_cut(args, triangle)) {
             draw_medium<CutOut>(args, triangle);
@@ -234,13 +236,15 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 2) raster_warps(const __grid
     }
 }
 
-// The last entry whose first tile is not behind this one.
+// The last entry whose first tile is not behind this one. A warp asks 32 entries at a time.
 __device__ inline Large find(const RasterArgs& args, unsigned entries, unsigned long long tile) {
     const Large* list = (const Large*)args.large;
     unsigned low = 0, high = entries;
     while (high - low > 1) {
-        const unsigned middle = low + (high - low) / 2;
-        (list[middle].first <= tile ? low : high) = middle;
+        const unsigned step = (high - low + 31) / 32, own = low + step * (threadIdx.x % 32);
+        const unsigned before = __popc(__ballot_sync(0xffffffffu, own < high && list[own].first <= tile));
+        low += step * (before - 1);
+        high = min(low + step, high);
     }
     return list[low];
 }
@@ -258,6 +262,21 @@ __device__ inline void corners_of(const RasterArgs& args, unsigned triangle, Pol
     }
 }
 
+// What a polygon's corners leave of a tile.
+__device__ inline Box within(const RasterArgs& args, const Polygon& polygon, const Box& tile) {
+    const Corner& first = polygon.corners[0];
+    int x0 = first.x, x1 = first.x, y0 = first.y, y1 = first.y;
+    for (unsigned i = 1; i < polygon.count; ++i) {
+        const Corner& corner = polygon.corners[i];
+        x0 = min(x0, corner.x);
+        x1 = max(x1, corner.x);
+        y0 = min(y0, corner.y);
+        y1 = max(y1, corner.y);
+    }
+    const Box own = box_of(args, x0, y0, x1, y1);
+    return {max(own.x0, tile.x0), max(own.y0, tile.y0), min(own.x1, tile.x1), min(own.y1, tile.y1)};
+}
+
 // Whether all samples between two corners of a tile lie outside one edge: its largest value there is at one of the four.
 __device__ inline bool is_beyond(const Corner& from, const Corner& to, int least, const Box& box) {
     const int x = CELL * (to.y > from.y ? box.x0 : box.x1) + CELL / 2;
@@ -272,8 +291,9 @@ __device__ inline void draw_tile(const RasterArgs& args, const Kind& surface, co
         is_beyond(piece.a, piece.b, piece.least_c, box)) {
         return;
     }
-    for (int row = box.y0 + (int)threadIdx.x / 32; row <= box.y1; row += BLOCK / 32) {
-        for (int column = box.x0 + (int)threadIdx.x % 32; column <= box.x1; column += 32) {
+    const int lane = (int)threadIdx.x % 32;
+    for (int row = box.y0 + lane / 8; row <= box.y1; row += 4) {
+        for (int column = box.x0 + lane % 8; column <= box.x1; column += 8) {
             float depth;
             if (piece.covers(column, row, depth)) {
                 put(args, surface, column, row, depth, triangle);
@@ -282,44 +302,77 @@ __device__ inline void draw_tile(const RasterArgs& args, const Kind& surface, co
     }
 }
 
+// What a block has to do, and what a warp of it draws in one turn. Kept where it takes no registers.
+struct Turns {
+    unsigned long long count;
+    unsigned entries, halvings;           // of tiles into strips
+};
+
+struct Turn {
+    Polygon polygon;
+    Box box;
+    unsigned triangle;
+};
+
+// A tile is 128 rounds of a warp: where there are fewer tiles than warps, that is what all would wait for.
+__device__ inline void plan_turns(const RasterArgs& args, Turns& turns) {
+    const unsigned long long large = ((const Tally*)args.tally)->large, tiles = large & ((1ull << TILES_BITS) - 1);
+    turns.entries = (unsigned)(large >> TILES_BITS);
+    turns.halvings = 0;
+    while (turns.halvings < HALVINGS && tiles << (turns.halvings + 1) <= WARPS * gridDim.x) {
+        ++turns.halvings;
+    }
+    turns.count = tiles << turns.halvings;
+}
+
+__device__ inline void take_turn(const RasterArgs& args, const Turns& turns, const Large& entry, unsigned long long at, Turn& turn) {
+    const unsigned own = (unsigned)((at >> turns.halvings) - entry.first), across = (entry.box >> 16 & 255) + 1;
+    const int tall = TILE >> turns.halvings, strip = (int)at & ((1 << turns.halvings) - 1);
+    const int x = TILE * (int)((entry.box & 255) + own % across);
+    const int y = TILE * (int)((entry.box >> 8 & 255) + own / across) + tall * strip;
+    corners_of(args, entry.triangle, turn.polygon);
+    turn.box = within(args, turn.polygon, {x, y, x + TILE - 1, y + tall - 1});
+    turn.triangle = entry.triangle;
+}
+
 // All pieces of a polygon turn the way that the whole does; what rounding turned the other way has no samples of its own.
 template <typename Kind>
-__device__ inline void draw_pieces(const RasterArgs& args, const Polygon& polygon, const Box& box, unsigned triangle) {
+__device__ inline void draw_pieces(const RasterArgs& args, const Turn& turn) {
+    const Polygon& polygon = turn.polygon;
     long long whole = 0;
     for (unsigned i = 1; i + 1 < polygon.count; ++i) {
         whole += area_of(polygon.corners[0], polygon.corners[i], polygon.corners[i + 1]);
     }
     const bool turned = whole < 0;
-    const Kind surface(args, triangle);
+    const Kind surface(args, turn.triangle);
     for (unsigned i = 1; i + 1 < polygon.count; ++i) {
         const Corner &a = polygon.corners[0], &b = polygon.corners[i], &c = polygon.corners[i + 1];
         const long long area = area_of(a, b, c), own = turned ? -area : area;
         if (own > 0) {
-            draw_tile(args, surface, Piece<long long>(a, b, c, turned, own), box, triangle);
+            draw_tile(args, surface, Piece<long long>(a, b, c, turned, own), turn.box, turn.triangle);
         }
     }
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK, 3) raster_tiles(const __grid_constant__ RasterArgs args) {
-    __shared__ Polygon polygon;
-    __shared__ Large entry;
-    const unsigned long long large = ((const Tally*)args.tally)->large;
-    const unsigned entries = (unsigned)(large >> TILES_BITS);
-    const unsigned long long tiles = large & ((1ull << TILES_BITS) - 1);
-    for (unsigned long long tile = blockIdx.x; tile < tiles; tile += gridDim.x) {
-        if (threadIdx.x == 0) {
-            entry = find(args, entries, tile);
-            corners_of(args, entry.triangle, polygon);
+extern "C" __global__ void __launch_bounds__(BLOCK, 5) raster_tiles(const __grid_constant__ RasterArgs args) {
+    __shared__ Turns turns;
+    __shared__ Turn own[WARPS];
+    if (threadIdx.x == 0) {
+        plan_turns(args, turns);
+    }
+    __syncthreads();
+    Turn& turn = own[threadIdx.x / 32];
+    for (unsigned long long at = blockIdx.x * WARPS + threadIdx.x / 32; at < turns.count; at += WARPS * gridDim.x) {
+        const Large entry = find(args, turns.entries, at >> turns.halvings);
+        if (threadIdx.x % 32 == 0) {
+            take_turn(args, turns, entry, at, turn);
         }
-        __syncthreads();
-        const unsigned own = (unsigned)(tile - entry.first), across = (entry.box >> 16 & 255) + 1;
-        const int x = TILE * (int)((entry.box & 255) + own % across), y = TILE * (int)((entry.box >> 8 & 255) + own / across);
-        const Box box = {x, y, min(x + TILE, (int)args.width) - 1, min(y + TILE, (int)args.height) - 1};
-        if (is_cut(args, entry.triangle)) {
-            draw_pieces<CutOut>(args, polygon, box, entry.triangle);
+        __syncwarp();
+        if (is_cut(args, turn.triangle)) {
+            draw_pieces<CutOut>(args, turn);
         } else {
-            draw_pieces<Whole>(args, polygon, box, entry.triangle);
+            draw_pieces<Whole>(args, turn);
         }
-        __syncthreads();
+        __syncwarp();
     }
 }

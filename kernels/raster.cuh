@@ -12,7 +12,7 @@ struct RasterArgs {
     unsigned long long triangles;         // [triangles][3] u32: vertices
     unsigned long long target;            // [height][width] u64: depth, id; or f32: depth                 (in, out)
     unsigned long long medium;            // [triangles] u32: triangles that warps draw                    (out, in)
-    unsigned long long large;             // [triangles] Large: those that blocks draw                     (out, in)
+    unsigned long long large;             // [triangles] Large: those that are drawn by tiles               (out, in)
     unsigned long long tally;             // Tally                                                         (in, out)
     unsigned long long uvs;               // [triangles - cut][3][2] f32
     unsigned long long surfaces;          // [triangles - cut] u32: places in the table

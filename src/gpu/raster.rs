@@ -1,6 +1,6 @@
 //! Launches `kernels/raster.cu`: which triangle each sample of a window sees and how deep, or depth alone, by atomic minima.
 //!
-//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels, and blocks draw larger and clipped ones
+//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels, and warps draw larger and clipped ones
 //! tile by tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
 //! stay on the device. Of a cut-out a sample is kept where alpha is large enough, asked before the minimum; meshes without
 //! any compile nothing of that.
@@ -33,8 +33,8 @@ use crate::raster::CutOuts;
 use crate::scene::{Faces, Group, Window};
 
 /// Threads of a block, and blocks of a multiprocessor where blocks take turns.
-const BLOCK: u32 = 256;
-const RESIDENT: u32 = 8;
+const BLOCK: u32 = 128;
+const RESIDENT: u32 = 16;
 
 /// What a sample holds before anything is drawn.
 const NOTHING: u32 = u32::MAX;

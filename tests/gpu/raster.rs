@@ -36,7 +36,7 @@ fn dropped(soup: &Soup) -> ([u32; 5], u32) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_sample_has_the_bits_of_the_definition_whether_threads_warps_or_blocks_draw() {
+fn gpu_every_sample_has_the_bits_of_the_definition_whether_threads_warps_or_tiles_draw() {
     let device = Device::open(0).expect("a CUDA device");
     for soup in soups() {
         let want = soup.drawn();

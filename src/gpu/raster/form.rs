@@ -15,12 +15,12 @@ const CUT: &str = "CUT";
 /// Who draws the triangles that could be drawn by a thread; for comparisons, the result is the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Spread {
-    /// Threads, warps and blocks by size.
+    /// Threads and warps by size.
     #[default]
     BySize,
-    /// No threads: warps and blocks.
+    /// No threads: warps, by tiles where triangles are large.
     Warps,
-    /// Blocks alone.
+    /// Tiles alone.
     Tiles,
 }
 
