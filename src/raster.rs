@@ -76,6 +76,12 @@ pub trait Rasteriser: std::fmt::Debug {
     /// `Fault` when the device fails, or a buffer is unknown or smaller than its window.
     fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()>;
 
+    /// Compiles what passes of depth, of ids, or of both need, so that no frame waits for that.
+    ///
+    /// # Errors
+    /// `Unavailable` when there is no compiler; `Fault` when compiling fails.
+    fn make_ready(&mut self, depth: bool, ids: bool) -> Result<()>;
+
     /// Lets go of a buffer that was drawn into, before OpenGL deletes it: its name may be given to another.
     fn forget(&mut self, _name: u32) {}
 }

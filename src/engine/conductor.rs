@@ -8,11 +8,12 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
+use super::command::SceneId;
 use super::keep::Keeper;
 use super::lane::{Lane, Place, Policy, Waiting};
 use super::late::Late;
 use super::viewer::{Delivery, Shown, StepName, View, Viewer};
-use super::worker::{SceneId, Worker};
+use super::worker::Worker;
 use crate::config::Config;
 use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result};

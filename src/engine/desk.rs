@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use tokio::sync::mpsc;
 
+use super::command::{Command, Copied, Reply, SceneId};
 use super::staged::Staged;
 use super::workbench::{Drawing, Info, Workbench};
-use super::worker::{Command, Copied, Reply, SceneId};
 use crate::deform::{Fetch, Wanted};
 use crate::error::{Result, during};
 use crate::render::{FRAMES_UNDER_WAY, Hit, Image, Pick};

@@ -7,11 +7,11 @@ use std::time::Instant;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
+use super::command::SceneId;
 use super::conductor::{Ask, Beginning, Conductor, Means, Message, Which};
 use super::lane::{Place, Policy, Report, Waiting};
 use super::ledger::Origin;
 use super::viewer::{Delivery, Feed, Shown, StepName, View};
-use super::worker::SceneId;
 use crate::error::{Error, Result, invalid};
 use crate::scene::{RawUpdate, Scene, State, Update};
 use crate::telemetry::ms_since;

@@ -21,10 +21,11 @@
 
 use std::sync::Arc;
 
+use super::command::Copied;
 use super::conductor::{Conductor, Done, acknowledge};
 use super::show::known;
 use super::viewer::{Body, Claim, Shown, StepName, View, Viewer};
-use super::worker::{Asked, Copied};
+use super::worker::Asked;
 use crate::error::Result;
 use crate::render::{FRAMES_UNDER_WAY, Image};
 use crate::scene::Cells;

@@ -4,6 +4,7 @@
 //! A scene's task orders everything that happens to it (`conductor`); a writer reaches it through a bounded lane
 //! (`lane`), a subscriber through a bounded feed (`viewer`), and both are told when they are too fast or too slow.
 
+mod command;
 mod conductor;
 mod desk;
 mod encode;

@@ -174,11 +174,11 @@ mod tests {
     use tokio::sync::{Notify, mpsc};
     use tokio::time::timeout;
 
+    use super::super::command::{Command, Reply};
     use super::super::conductor::{Beginning, Means};
     use super::super::keep::Keeper;
     use super::super::viewer::Feed;
-    use super::super::worker::{Command, Worker};
-    use super::super::{testing, worker::Reply};
+    use super::super::{testing, worker::Worker};
     use super::*;
     use crate::config::Config;
     use crate::render::{Image, Paths};

@@ -1,5 +1,5 @@
-//! The device thread: takes commands from a bounded queue, owns the workbench and every staged scene (`desk`), answers each
-//! command once. Vertices, picks and frames are answered late: they leave the device while commands after theirs are
+//! The device thread: takes commands (`command`) from a bounded queue, owns the workbench and every staged scene (`desk`),
+//! answers each command once. Vertices, picks and frames are answered late: they leave the device while commands after theirs are
 //! obeyed.
 
 use std::sync::Arc;
@@ -7,68 +7,16 @@ use std::sync::Arc;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
+use super::command::{Command, Copied, Reply, SceneId};
 use super::desk::{Desk, work};
 use super::viewer::Showing;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
-use crate::deform::{Deformed, Surface, Wanted};
+use crate::deform::{Deformed, Wanted};
 use crate::error::{Error, Result, during};
 use crate::frame::Legend;
 use crate::render::{FRAMES_UNDER_WAY, Hit, Image, Survey};
 use crate::scene::{Camera, Rectangle, Scene, State};
-
-/// Names a staged scene on the device thread.
-pub(super) type SceneId = u64;
-
-pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
-
-/// What the device thread can be asked for.
-pub(super) enum Command {
-    Stage {
-        id: SceneId,
-        scene: Arc<Scene>,
-        reply: Reply<()>,
-    },
-    Deform {
-        id: SceneId,
-        state: Arc<State>,
-        reply: Reply<Deformed>,
-    },
-    Draw {
-        id: SceneId,
-        camera: Camera,
-        size: (u32, u32),
-        reply: Reply<Image>,
-    },
-    /// A frame of numbers, with the legend of a colour map.
-    Survey {
-        id: SceneId,
-        camera: Camera,
-        size: [u32; 2],
-        showing: Showing,
-        reply: Reply<(Survey, Option<Legend>)>,
-    },
-    Pick {
-        id: SceneId,
-        camera: Camera,
-        picture: [u32; 2],
-        rectangle: Rectangle,
-        reply: Reply<Vec<Hit>>,
-    },
-    /// Brings what is wanted to the host, beside the command after it; the second value is the milliseconds until it was
-    /// there.
-    Copy {
-        id: SceneId,
-        wanted: Wanted,
-        reply: Reply<Copied>,
-    },
-    Unstage {
-        id: SceneId,
-        reply: Reply<()>,
-    },
-    /// Ends the thread.
-    Quit,
-}
 
 /// The way to the device thread. The thread ends when the last one of these is gone.
 #[derive(Debug, Clone)]
@@ -177,9 +125,6 @@ impl Worker {
         })
     }
 }
-
-/// Vertices and the milliseconds until they were there.
-pub(super) type Copied = (Arc<Surface>, f64);
 
 /// What the device thread was asked for, in the order in which it was asked.
 #[derive(Debug)]

@@ -24,7 +24,7 @@ pub struct GlRaster {
     device: Arc<Device>,
 }
 
-/// One kind of pass: its kernels and the buffer that it drew into, both from its first pass on.
+/// One kind of pass: its kernels, and the buffer that it drew into from its first pass on.
 #[derive(Debug)]
 struct Kind {
     into: Option<Registered>,
@@ -42,12 +42,17 @@ impl Kind {
         Self { into: None, functions: None, form, groups }
     }
 
+    /// Compiles its kernels, or takes those that it has.
+    fn compiled(&mut self, device: &Device, core: &Core) -> Result<Functions> {
+        match self.functions.take() {
+            Some(functions) => Ok(functions),
+            None => Functions::new(device, self.form, core.is_cut()),
+        }
+    }
+
     /// Compiles and registers what is missing for a pass.
     fn prepare(&mut self, device: &Device, (sharing, core): (&Sharing, &Core), into: GlBuffer) -> Result<Ready<'_>> {
-        let functions = match self.functions.take() {
-            Some(functions) => functions,
-            None => Functions::new(device, self.form, core.is_cut())?,
-        };
+        let functions = self.compiled(device, core)?;
         if self.into.as_ref().is_some_and(|own| own.buffer() != into) {
             self.let_go(device);
         }
@@ -68,7 +73,7 @@ impl Kind {
 
 impl GlRaster {
     /// Puts a mesh's triangles onto the device and registers its positions, which are those of the OpenGL context that is
-    /// current on this thread. Kernels are compiled at the first pass that wants them.
+    /// current on this thread. Kernels are compiled by [`Rasteriser::make_ready`], or at the first pass that wants them.
     ///
     /// # Errors
     /// `Invalid` when there are 2^24 triangles or more, one names no vertex, a group no triangle, or cut-outs do not fit;
@@ -134,6 +139,17 @@ impl Rasteriser for GlRaster {
             self.ids.let_go(&self.device);
         }
         drawn
+    }
+
+    fn make_ready(&mut self, depth: bool, ids: bool) -> Result<()> {
+        let Self { depth: of_depth, ids: of_ids, core, device, .. } = self;
+        for (kind, wanted) in [(of_depth, depth), (of_ids, ids)] {
+            if wanted {
+                let functions = kind.compiled(device, core)?;
+                kind.functions = Some(functions);
+            }
+        }
+        Ok(())
     }
 
     fn forget(&mut self, name: u32) {

@@ -88,7 +88,7 @@ impl Renderer {
     /// where it may draw nothing.
     ///
     /// # Errors
-    /// Those of `make`, and `Fault` of OpenGL; the scene is then drawn by OpenGL as before.
+    /// Those of `make` and of [`Rasteriser::make_ready`], and `Fault` of OpenGL; the scene is then drawn by OpenGL as before.
     pub fn draw_beside(
         &mut self,
         buffers: &mut SceneBuffers,
@@ -111,8 +111,9 @@ impl Renderer {
             false => None,
         };
         let draws = Cell::new([shadow.is_some(), visibility.is_some()]);
-        let mesh = mesh::of(buffers, self.gl.limits.anisotropy)?;
-        buffers.beside = Some(Beside { rasteriser: RefCell::new(make(mesh)?), shadow, visibility, draws });
+        let mut rasteriser = make(mesh::of(buffers, self.gl.limits.anisotropy)?)?;
+        rasteriser.make_ready(shadow.is_some(), visibility.is_some())?;
+        buffers.beside = Some(Beside { rasteriser: RefCell::new(rasteriser), shadow, visibility, draws });
         Ok(())
     }
 }

@@ -74,6 +74,10 @@ impl Plain {
 }
 
 impl Rasteriser for Plain {
+    fn make_ready(&mut self, _: bool, _: bool) -> Result<()> {
+        Ok(())
+    }
+
     fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()> {
         if let Some((window, into)) = depth {
             let all = Group { first: 0, triangles: self.mesh.triangles.len() as u32, faces: Faces::Both };
@@ -262,6 +266,10 @@ fn cameras_of_one_step_share_the_shadow_and_a_scene_apart_is_opengls_until_it_co
 struct Broken;
 
 impl Rasteriser for Broken {
+    fn make_ready(&mut self, _: bool, _: bool) -> Result<()> {
+        Ok(())
+    }
+
     fn draw(&mut self, _: Option<Order<'_>>, _: Option<Order<'_>>) -> Result<()> {
         Err(invalid("raster", "a device", "none"))
     }
@@ -282,5 +290,40 @@ fn a_rasteriser_that_fails_leaves_the_frame_to_opengl_and_those_after_it() {
         let image = renderer.draw(&buffers, &shot).expect("draws");
         assert_eq!(image.paths, want.ran.paths);
         assert!(image.rgba == want.image.rgba);
+    }
+}
+
+/// A rasteriser without a compiler, which keeps in mind what it was to compile.
+#[derive(Debug)]
+struct Unready(std::rc::Rc<std::cell::Cell<[bool; 2]>>);
+
+impl Rasteriser for Unready {
+    fn make_ready(&mut self, depth: bool, ids: bool) -> Result<()> {
+        self.0.set([depth, ids]);
+        Err(invalid("raster", "a compiler", "none"))
+    }
+
+    fn draw(&mut self, _: Option<Order<'_>>, _: Option<Order<'_>>) -> Result<()> {
+        panic!("nothing was compiled");
+    }
+}
+
+#[test]
+fn what_a_scene_may_have_drawn_is_compiled_when_it_is_loaded_and_opengl_draws_where_that_fails() {
+    let shadow = Some(Shadow { size: 128, ..Shadow::default() });
+    for (shadow, samples, want) in [(shadow, 1, [true; 2]), (shadow, 4, [true, false]), (None, 1, [false, true])] {
+        let scene = yard(shadow, samples).scene();
+        let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
+        let deformed = deformer.deform(&State::rest(&scene)).expect("deforms");
+        let mut buffers = renderer.load(&scene).expect("loads");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        let asked = std::rc::Rc::default();
+        let unready = Unready(std::rc::Rc::clone(&asked));
+        let refused = renderer.draw_beside(&mut buffers, |_| Ok(Box::new(unready) as Box<dyn Rasteriser>));
+        assert!(refused.is_err() && asked.get() == want, "{:?}", asked.get());
+        let [width, height] = SIZE;
+        let shot = Shot { camera: from_above(), width, height, bounds: deformed.bounds, light: None };
+        let paths = renderer.draw(&buffers, &shot).expect("draws").paths;
+        assert_eq!(paths.visibility, Some(Path::OpenGl));
     }
 }

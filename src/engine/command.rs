@@ -1,0 +1,68 @@
+//! What the device thread can be asked for.
+
+use std::sync::Arc;
+
+use tokio::sync::oneshot;
+
+use super::viewer::Showing;
+use crate::deform::{Deformed, Surface, Wanted};
+use crate::error::Result;
+use crate::frame::Legend;
+use crate::render::{Hit, Image, Survey};
+use crate::scene::{Camera, Rectangle, Scene, State};
+
+/// Names a staged scene on the device thread.
+pub(super) type SceneId = u64;
+
+pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
+
+/// Vertices and the milliseconds until they were there.
+pub(super) type Copied = (Arc<Surface>, f64);
+
+/// One thing that it is asked for, with where the answer goes.
+pub(super) enum Command {
+    Stage {
+        id: SceneId,
+        scene: Arc<Scene>,
+        reply: Reply<()>,
+    },
+    Deform {
+        id: SceneId,
+        state: Arc<State>,
+        reply: Reply<Deformed>,
+    },
+    Draw {
+        id: SceneId,
+        camera: Camera,
+        size: (u32, u32),
+        reply: Reply<Image>,
+    },
+    /// A frame of numbers, with the legend of a colour map.
+    Survey {
+        id: SceneId,
+        camera: Camera,
+        size: [u32; 2],
+        showing: Showing,
+        reply: Reply<(Survey, Option<Legend>)>,
+    },
+    Pick {
+        id: SceneId,
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: Rectangle,
+        reply: Reply<Vec<Hit>>,
+    },
+    /// Brings what is wanted to the host, beside the command after it; the second value is the milliseconds until it was
+    /// there.
+    Copy {
+        id: SceneId,
+        wanted: Wanted,
+        reply: Reply<Copied>,
+    },
+    Unstage {
+        id: SceneId,
+        reply: Reply<()>,
+    },
+    /// Ends the thread.
+    Quit,
+}
