@@ -1,5 +1,7 @@
 // The material of a triangle, by its number in the index buffer. Twin: `PackedMaterial` in src/render/scene_buffers.rs.
-//   materials           [materials][STRIDE]  RGBA32F, fetched and never filtered
+//   materials           [materials][STRIDE]  RGBA32F, fetched and never filtered: ambient with the array of the normal map,
+//                                            diffuse with its layer, specular with the exponent; and all that a cut-out asks
+//                                            for: array and layer of the colour texture, alpha, cutoff
 //   triangle_materials  [triangles]          R32UI; not read where all these triangles have one
 // Buffer textures: a software rasteriser fetches eight of their texels at once, but storage words one by one.
 struct Material {
@@ -20,6 +22,8 @@ Material material_of(int number) {
 #else
     const int first = STRIDE * ONLY_MATERIAL;
 #endif
-    ivec4 images = ivec4(texelFetch(materials, first + 3));
-    return Material(texelFetch(materials, first), texelFetch(materials, first + 1), texelFetch(materials, first + 2), images);
+    vec4 ambient = texelFetch(materials, first), diffuse = texelFetch(materials, first + 1);
+    vec4 specular = texelFetch(materials, first + 2), cut = texelFetch(materials, first + 3);
+    ivec4 images = ivec4(cut.xy, ambient.a, diffuse.a);
+    return Material(vec4(ambient.rgb, cut.z), vec4(diffuse.rgb, cut.w), specular, images);
 }

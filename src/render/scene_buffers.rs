@@ -22,14 +22,16 @@ use crate::domain::AlphaMode;
 use crate::error::{Result, during};
 use crate::scene::Scene;
 
-/// Twin of `Material` in `shaders/shared/material.glsl`.
+/// Twin of `material_of` in `shaders/shared/material.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct PackedMaterial {
-    ambient_alpha: [f32; 4],
-    diffuse_cutoff: [f32; 4],
+    /// With the array of the normal map, and its layer.
+    ambient_array: [f32; 4],
+    diffuse_layer: [f32; 4],
     specular_exponent: [f32; 4],
-    images: [f32; 4],
+    /// Array and layer of the colour texture, alpha, cutoff.
+    cut: [f32; 4],
 }
 
 pub(super) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
@@ -272,12 +274,13 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
             AlphaMode::Blend => scene.look.opaque_alpha,
             AlphaMode::Opaque => 0.0,
         };
-        let ([a, b], [c, d]) = (at(&images[0], material.colour_texture), at(&images[1], material.normal_texture));
+        let [colour_array, colour_layer] = at(&images[0], material.colour_texture);
+        let [normal_array, normal_layer] = at(&images[1], material.normal_texture);
         PackedMaterial {
-            ambient_alpha: wide(material.ambient, material.alpha),
-            diffuse_cutoff: wide(material.diffuse, cutoff),
+            ambient_array: wide(material.ambient, normal_array),
+            diffuse_layer: wide(material.diffuse, normal_layer),
             specular_exponent: wide(material.specular, material.shininess),
-            images: [a, b, c, d],
+            cut: [colour_array, colour_layer, material.alpha, cutoff],
         }
     };
     used_materials(scene).into_iter().map(|material| one(&scene.materials[material])).collect()
