@@ -26,6 +26,9 @@ const ROUNDINGS: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
 /// Pixels around what the numbers say: a rasteriser moves corners by up to 1/256 pixel, and a sample may lie anywhere in one.
 const MARGIN: f64 = 1.0;
 
+/// Pixels beside a part of a frame that a draw into it may still reach: llvmpipe lets one through with several samples.
+const SLACK: u32 = 2;
+
 impl Region {
     pub(super) const fn whole(frame: [u32; 2]) -> Self {
         Self { frame, corner: [0; 2], size: frame }
@@ -61,6 +64,13 @@ impl Region {
         Self { frame, corner: spans.map(|[low, _]| low), size: spans.map(|[low, high]| high - low) }
     }
 
+    /// With so many more pixels on each side, as far as the frame reaches.
+    fn grown(self, by: u32) -> Self {
+        let low = self.corner.map(|at| at.saturating_sub(by));
+        let high = [0, 1].map(|axis| (self.corner[axis] + self.size[axis] + by).min(self.frame[axis]));
+        Self { corner: low, size: [high[0] - low[0], high[1] - low[1]], ..self }
+    }
+
     /// Width and height of the frame.
     pub(super) const fn frame(&self) -> [u32; 2] {
         self.frame
@@ -76,7 +86,7 @@ impl Region {
 impl Touched {
     /// What was touched, none for all; from now on this is.
     pub(super) fn replace(&self, by: Region) -> Option<Region> {
-        self.0.replace(Some(by))
+        self.0.replace(Some(by.grown(SLACK)))
     }
 
     /// Somebody writes to all of it.
@@ -192,9 +202,11 @@ mod tests {
 
     #[test]
     fn an_image_is_touched_everywhere_at_first_and_again_when_somebody_says_so() {
-        let (touched, part) = (Touched::default(), Region { frame: FRAME, corner: [3, 4], size: [5, 6] });
+        let (touched, part) = (Touched::default(), Region { frame: FRAME, corner: [3, 1], size: [5, 6] });
         assert_eq!(touched.replace(part), None);
-        assert_eq!(touched.replace(Region::whole(FRAME)), Some(part));
+        let around = Region { frame: FRAME, corner: [1, 0], size: [9, 9] };
+        assert_eq!(touched.replace(Region::whole(FRAME)), Some(around));
+        assert_eq!(touched.replace(part), Some(Region::whole(FRAME)));
         touched.everywhere();
         assert_eq!(touched.replace(part), None);
     }

@@ -96,6 +96,23 @@ fn scenes_that_share_a_target_do_not_see_each_other() {
 }
 
 #[test]
+fn what_reaches_beyond_the_bounds_of_its_shot_leaves_nothing_behind() {
+    for transparency in [Transparency::TwoPass, Transparency::Exact] {
+        let scene = stage(|look| look.transparency = transparency);
+        let mut renderer = open();
+        let buffers = loaded(&mut renderer, &scene);
+        // Cut on all sides, between two pixels that are shaded together or beside them.
+        let told = Bounds { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
+        let mut draw = |place: [f64; 2]| frame(&mut renderer, &buffers, aside(place), told);
+        for place in [[0.0; 2], [1.0; 2]] {
+            let first = draw(place);
+            assert!(draw([30.0, 20.0]) != first, "control");
+            assert!(draw(place) == first && draw(place) == first, "the same again at {place:?}");
+        }
+    }
+}
+
+#[test]
 fn nothing_is_drawn_outside_of_the_bounds_of_a_shot() {
     let (scene, mut renderer) = (stage(|_| {}), open());
     let buffers = loaded(&mut renderer, &scene);
