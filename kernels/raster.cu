@@ -62,21 +62,8 @@ __device__ __noinline__ void aim_clipped(const RasterArgs& args, float4 a, float
         clipped.path = OUTSIDE;
         return;
     }
-    const Corner first = polygon.corners[0];
-    int x0 = first.x, x1 = first.x, y0 = first.y, y1 = first.y;
-    long long area = 0;
-    for (unsigned i = 1; i < polygon.count; ++i) {
-        const Corner corner = polygon.corners[i];
-        x0 = min(x0, corner.x);
-        x1 = max(x1, corner.x);
-        y0 = min(y0, corner.y);
-        y1 = max(y1, corner.y);
-        if (i + 1 < polygon.count) {
-            area += area_of(first, corner, polygon.corners[i + 1]);
-        }
-    }
-    clipped.box = box_of(args, x0, y0, x1, y1);
-    clipped.path = judge(args, area, clipped.box);
+    clipped.box = box_of(args, polygon);
+    clipped.path = judge(args, area_of(polygon), clipped.box);
 }
 
 __device__ inline void aim_whole(const RasterArgs& args, const float4 (&corners)[3], Aim& aim) {
@@ -262,19 +249,8 @@ __device__ inline void corners_of(const RasterArgs& args, unsigned triangle, Pol
     }
 }
 
-// What a polygon's corners leave of a tile.
-__device__ inline Box within(const RasterArgs& args, const Polygon& polygon, const Box& tile) {
-    const Corner& first = polygon.corners[0];
-    int x0 = first.x, x1 = first.x, y0 = first.y, y1 = first.y;
-    for (unsigned i = 1; i < polygon.count; ++i) {
-        const Corner& corner = polygon.corners[i];
-        x0 = min(x0, corner.x);
-        x1 = max(x1, corner.x);
-        y0 = min(y0, corner.y);
-        y1 = max(y1, corner.y);
-    }
-    const Box own = box_of(args, x0, y0, x1, y1);
-    return {max(own.x0, tile.x0), max(own.y0, tile.y0), min(own.x1, tile.x1), min(own.y1, tile.y1)};
+__device__ inline Box common(const Box& one, const Box& other) {
+    return {max(one.x0, other.x0), max(one.y0, other.y0), min(one.x1, other.x1), min(one.y1, other.y1)};
 }
 
 // Whether all samples between two corners of a tile lie outside one edge: its largest value there is at one of the four.
@@ -302,12 +278,14 @@ __device__ inline void draw_tile(const RasterArgs& args, const Kind& surface, co
     }
 }
 
-// What a block has to do, and what a warp of it draws in one turn. Kept where it takes no registers.
+// What a block has to do. Kept where it takes no registers, like what follows.
 struct Turns {
     unsigned long long count;
-    unsigned entries, halvings;           // of tiles into strips
+    unsigned entries;
+    unsigned halvings;                    // of every tile into strips
 };
 
+// What a warp draws in one turn.
 struct Turn {
     Polygon polygon;
     Box box;
@@ -325,13 +303,14 @@ __device__ inline void plan_turns(const RasterArgs& args, Turns& turns) {
     turns.count = tiles << turns.halvings;
 }
 
-__device__ inline void take_turn(const RasterArgs& args, const Turns& turns, const Large& entry, unsigned long long at, Turn& turn) {
+__device__ inline void take_turn(const RasterArgs& args, const Turns& turns, const Large& entry, unsigned long long at,
+                                 Turn& turn) {
     const unsigned own = (unsigned)((at >> turns.halvings) - entry.first), across = (entry.box >> 16 & 255) + 1;
     const int tall = TILE >> turns.halvings, strip = (int)at & ((1 << turns.halvings) - 1);
     const int x = TILE * (int)((entry.box & 255) + own % across);
     const int y = TILE * (int)((entry.box >> 8 & 255) + own / across) + tall * strip;
     corners_of(args, entry.triangle, turn.polygon);
-    turn.box = within(args, turn.polygon, {x, y, x + TILE - 1, y + tall - 1});
+    turn.box = common(box_of(args, turn.polygon), {x, y, x + TILE - 1, y + tall - 1});
     turn.triangle = entry.triangle;
 }
 
@@ -339,11 +318,7 @@ __device__ inline void take_turn(const RasterArgs& args, const Turns& turns, con
 template <typename Kind>
 __device__ inline void draw_pieces(const RasterArgs& args, const Turn& turn) {
     const Polygon& polygon = turn.polygon;
-    long long whole = 0;
-    for (unsigned i = 1; i + 1 < polygon.count; ++i) {
-        whole += area_of(polygon.corners[0], polygon.corners[i], polygon.corners[i + 1]);
-    }
-    const bool turned = whole < 0;
+    const bool turned = area_of(polygon) < 0;
     const Kind surface(args, turn.triangle);
     for (unsigned i = 1; i + 1 < polygon.count; ++i) {
         const Corner &a = polygon.corners[0], &b = polygon.corners[i], &c = polygon.corners[i + 1];

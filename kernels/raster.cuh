@@ -177,6 +177,27 @@ __device__ inline Box box_of(const RasterArgs& args, int x0, int y0, int x1, int
             min((int)args.height - 1, (y1 - MIDDLE) >> 8)};
 }
 
+__device__ inline long long area_of(const Polygon& polygon) {
+    long long area = 0;
+    for (unsigned i = 1; i + 1 < polygon.count; ++i) {
+        area += area_of(polygon.corners[0], polygon.corners[i], polygon.corners[i + 1]);
+    }
+    return area;
+}
+
+__device__ inline Box box_of(const RasterArgs& args, const Polygon& polygon) {
+    const Corner& first = polygon.corners[0];
+    int x0 = first.x, x1 = first.x, y0 = first.y, y1 = first.y;
+    for (unsigned i = 1; i < polygon.count; ++i) {
+        const Corner& corner = polygon.corners[i];
+        x0 = min(x0, corner.x);
+        x1 = max(x1, corner.x);
+        y0 = min(y0, corner.y);
+        y1 = max(y1, corner.y);
+    }
+    return box_of(args, x0, y0, x1, y1);
+}
+
 // A triangle with its corners clockwise on the screen. Wide holds its edges at all samples that are asked about.
 template <typename Wide>
 struct Piece {

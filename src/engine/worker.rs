@@ -1,6 +1,6 @@
 //! The device thread: takes commands (`command`) from a bounded queue, owns the workbench and every staged scene (`desk`),
-//! answers each command once. Vertices, picks and frames are answered late: they leave the device while commands after theirs are
-//! obeyed.
+//! answers each command once. Vertices, picks and frames are answered late: they leave the device while commands after
+//! theirs are obeyed.
 
 use std::sync::Arc;
 

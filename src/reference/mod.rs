@@ -53,8 +53,6 @@ impl Deformer for ReferenceDeformer {
     fn deform(&mut self, state: &State) -> Result<Deformed> {
         let begin = Instant::now();
         let positions = deform(&self.scene, state);
-        let mut bounds = Bounds::EMPTY;
-        positions.iter().for_each(|position| bounds.include(*position));
         let light = self.scene.light_axes().map(|axes| {
             let one = |position: &[f64; 3]| LightBounds::of_box(&axes, &Bounds { min: *position, max: *position });
             positions.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union)
@@ -67,6 +65,7 @@ impl Deformer for ReferenceDeformer {
         self.surface.positions = round(positions);
         self.surface.normals = round(normals);
         self.surface.tangents = round(tangents);
+        let mut bounds = Bounds::of(&self.surface.positions);
         self.keep(state, &mut bounds);
         Ok(Deformed { bounds, light, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }

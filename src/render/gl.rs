@@ -19,7 +19,7 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
-pub(super) use self::clear::Clear;
+pub(super) use self::clear::{Clear, Traces};
 pub(super) use self::debug::is_wanted as is_debug_wanted;
 pub(super) use self::fence::Fence;
 pub(super) use self::limits::Limits;

@@ -25,7 +25,8 @@
 //! numbers in place of colours ([`Survey`]).
 //!
 //! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone. Of
-//! several samples a pixel these are never cleared: depth says where there is one.
+//! several samples a pixel these are never cleared: depth says where there is one. Of a frame no more is drawn into than the
+//! bounds of the vertices can reach, and no more is cleared than earlier frames have.
 
 mod cull;
 mod device;
@@ -110,7 +111,7 @@ pub struct Shot {
     pub camera: Camera,
     pub width: u32,
     pub height: u32,
-    /// Bounds of the deformed vertices.
+    /// Bounds that hold every deformed vertex: a frame shows nothing outside of them, unless they are not finite.
     pub bounds: Bounds,
     /// What the same vertices take up in light space, to which the shadow map is fitted; without it, to the corners of
     /// `bounds`.

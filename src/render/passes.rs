@@ -83,7 +83,7 @@ pub(super) fn visibility(
     let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
     // Of several samples, depth says where there is an id.
     let clear = match target.form.samples {
-        1 => Clear::DepthAndIds(Some([&target.touched.depth, &target.touched.ids])),
+        1 => Clear::DepthAndIds(Some(&target.touched)),
         _ => Clear::Depth(Some(&target.touched.depth)),
     };
     let into = (&target.visible, clear, target.reach.get(), listed(buffers));
@@ -91,8 +91,8 @@ pub(super) fn visibility(
     super::cull::remember(gl, buffers, target, sampled)
 }
 
-/// Ids and depth into a part of a framebuffer as large as its frame or larger: of what is opaque; of what is cut out, by the first
-/// program; and of the opaque parts of what is blended, by the second.
+/// Ids and depth into a part of a framebuffer as large as its frame or larger: of what is opaque; of what is cut out, by
+/// the first program; and of the opaque parts of what is blended, by the second.
 pub(super) fn identify(
     gl: &Gl,
     buffers: &SceneBuffers,

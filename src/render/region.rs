@@ -37,13 +37,7 @@ impl Region {
     /// Where a frame of so many pixels can show what lies in `bounds`, when `clip` takes positions to clip space in f32. All
     /// of it when some of that lies behind the eye, or overflowed.
     pub(super) fn of(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
-        let corner = |index: usize| -> [f64; 3] {
-            std::array::from_fn(|axis| if index >> axis & 1 == 0 { bounds.min[axis] } else { bounds.max[axis] })
-        };
-        let corners: [Vector4<f64>; 8] = std::array::from_fn(|index| {
-            let [x, y, z] = corner(index);
-            Vector4::new(x, y, z, 1.0)
-        });
+        let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip.abs() * corner.abs());
         let rounded = magnitudes.fold(Vector4::zeros(), |most: Vector4<f64>, one| most.sup(&one)) * ROUNDINGS;
         let shown = corners.map(|corner| clip * corner);

@@ -135,8 +135,15 @@ impl Renderer {
             splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
-        let mut passes = self.run(buffers, shot, (target, &sampled), &mut ran)?;
-        passes.extend(self.bring(buffers, target, slot.as_ref())?);
+        let passes = self.run(buffers, shot, (target, &sampled), &mut ran).and_then(|mut passes| {
+            passes.extend(self.bring(buffers, target, slot.as_ref())?);
+            Ok(passes)
+        });
+        if passes.is_err() {
+            // Nobody knows what its images hold.
+            self.targets.pop();
+        }
+        let passes = passes?;
         self.last = Some(numbers);
         Ok(Ticket {
             form,

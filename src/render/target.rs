@@ -6,7 +6,7 @@ use std::ops::Range;
 use std::rc::Rc;
 
 use super::cull::{COUNT_BYTES, Pyramid};
-use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind};
+use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureKind, Traces};
 use super::lists::{HEAD, ListTarget};
 use super::region::{Region, Touched};
 use super::ring::Ring;
@@ -48,7 +48,7 @@ pub(super) struct Target {
     /// Per sample what it sees; kept until the next frame, like depth.
     pub(super) ids: Texture,
     pub(super) visible: Framebuffer,
-    pub(super) touched: Seen,
+    pub(super) touched: Traces,
     /// Where the frame that is drawn now may have triangles, or ground that is drawn.
     pub(super) reach: Cell<Region>,
     pub(super) layer: Option<Layer>,
@@ -75,13 +75,6 @@ pub(super) struct Layer {
     pub(super) framebuffer: Framebuffer,
     pub(super) colour: Texture,
     pub(super) touched: Touched,
-}
-
-/// What is known of what samples see.
-#[derive(Debug, Default)]
-pub(super) struct Seen {
-    pub(super) ids: Touched,
-    pub(super) depth: Touched,
 }
 
 impl Form {
@@ -131,7 +124,7 @@ impl Target {
         Ok(Self {
             form: Form { samples, ..form },
             visible: gl.framebuffer(Some(&ids), &depth)?,
-            touched: Seen::default(),
+            touched: Traces::default(),
             reach: Cell::new(Region::whole([width, height])),
             ids,
             layer,

@@ -9,6 +9,7 @@ use crate::both::soups::{Soup, fan, flat, perspective, soups};
 const FEW: i32 = 32;
 const NARROW: i32 = 16384;
 const TILE: i32 = 64;
+const HALVINGS: u32 = 3;
 const BITS: u32 = 40;
 
 /// What the kernels do to one window: queues in any order, 32-bit edges where a thread or a warp draws.
@@ -84,20 +85,30 @@ impl Walk<'_> {
         }
     }
 
-    /// `raster_tiles`: one tile of the list, found by halving, with the rejection of tiles beyond an edge.
-    fn tile(&mut self, tile: u64) {
+    /// The entry of a tile, as 32 lanes find it.
+    fn find(&self, tile: u64) -> usize {
         let (mut low, mut high) = (0, self.large.len());
         while high - low > 1 {
-            let middle = low + (high - low) / 2;
-            *(if self.large[middle].0 <= tile { &mut low } else { &mut high }) = middle;
+            let step = (high - low).div_ceil(32);
+            let is_before = |own: &usize| *own < high && self.large[*own].0 <= tile;
+            low += step * ((0..32).map(|lane| low + step * lane).filter(is_before).count() - 1);
+            high = high.min(low + step);
         }
-        let (first, triangle, box_of) = self.large[low];
+        low
+    }
+
+    /// `raster_tiles`: one strip of a tile of the list, cut by the triangle's samples, with the rejection of what lies beyond
+    /// an edge.
+    fn strip(&mut self, at: u64, halvings: u32) {
+        let tile = at >> halvings;
+        let (first, triangle, box_of) = self.large[self.find(tile)];
         let (own, across) = ((tile - first) as u32, (box_of >> 16 & 255) + 1);
-        let (x, y) =
-            (TILE * ((box_of & 255) + own % across) as i32, TILE * ((box_of >> 8 & 255) + own / across) as i32);
-        let [width, height] = self.soup.window.size().map(|side| side as i32);
-        let (right, bottom) = ((x + TILE).min(width) - 1, (y + TILE).min(height) - 1);
+        let tall = TILE >> halvings;
+        let x = TILE * ((box_of & 255) + own % across) as i32;
+        let y = TILE * ((box_of >> 8 & 255) + own / across) as i32 + tall * (at as i32 & ((1 << halvings) - 1));
         let outline = self.outline(triangle, Faces::Both).expect("queued");
+        let [x0, y0, x1, y1] = outline.samples;
+        let (x, right, y, bottom) = (x.max(x0), (x + TILE - 1).min(x1), y.max(y0), (y + tall - 1).min(y1));
         for piece in pieces(&outline) {
             let beyond = |from: &Corner, to: &Corner| {
                 let column = if to.y > from.y { x } else { right };
@@ -118,8 +129,8 @@ impl Walk<'_> {
     }
 }
 
-/// `raster`, `raster_warps` and `raster_tiles` one after the other, queues backwards.
-fn twin_of_raster(soup: &Soup) -> (Vec<u64>, [usize; 3]) {
+/// `raster`, `raster_warps` and `raster_tiles` one after the other, queues backwards, tiles halved so many times.
+fn twin_of_raster(soup: &Soup, halvings: u32) -> (Vec<u64>, [usize; 3]) {
     let keys = vec![NOTHING; soup.window.pixels()];
     let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
     for group in &soup.groups {
@@ -129,26 +140,30 @@ fn twin_of_raster(soup: &Soup) -> (Vec<u64>, [usize; 3]) {
         let outline = walk.outline(triangle, Faces::Both).expect("queued");
         walk.draw_narrow(&outline, triangle);
     }
-    (0..walk.tally & ((1 << BITS) - 1)).rev().for_each(|tile| walk.tile(tile));
+    (0..(walk.tally & ((1 << BITS) - 1)) << halvings).rev().for_each(|at| walk.strip(at, halvings));
     (walk.keys, walk.paths)
 }
 
 #[test]
-fn threads_warps_and_blocks_draw_what_the_definition_draws_and_32_bits_hold_narrow_edges() {
+fn threads_warps_and_strips_of_tiles_draw_what_the_definition_draws_and_32_bits_hold_narrow_edges() {
     let text = include_str!("../../kernels/raster.cu");
     for line in [
         format!("#define FEW {FEW}"),
         format!("#define NARROW {NARROW}"),
         format!("constexpr int TILE = {TILE};"),
+        format!("constexpr unsigned HALVINGS = {HALVINGS};"),
         format!("constexpr unsigned TILES_BITS = {BITS};"),
     ] {
         assert!(text.contains(&line), "the kernel has another {line}");
     }
     let mut all = [0; 3];
     for soup in soups() {
-        let (keys, paths) = twin_of_raster(&soup);
-        assert!(keys == soup.drawn().keys, "{}", soup.name);
-        (0..3).for_each(|path| all[path] += paths[path]);
+        let want = soup.drawn().keys;
+        for halvings in 0..=HALVINGS {
+            let (keys, paths) = twin_of_raster(&soup, halvings);
+            assert!(keys == want, "{}, {halvings} halvings", soup.name);
+            (0..3).for_each(|path| all[path] += paths[path]);
+        }
     }
     assert!(all.iter().all(|path| *path > 10), "every path is taken: {all:?}");
 }

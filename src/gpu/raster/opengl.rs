@@ -42,17 +42,18 @@ impl Kind {
         Self { into: None, functions: None, form, groups }
     }
 
-    /// Compiles its kernels, or takes those that it has.
-    fn compiled(&mut self, device: &Device, core: &Core) -> Result<Functions> {
-        match self.functions.take() {
-            Some(functions) => Ok(functions),
-            None => Functions::new(device, self.form, core.is_cut()),
-        }
+    /// Its kernels, compiled unless they are.
+    fn compiled(&mut self, device: &Device, core: &Core) -> Result<&Functions> {
+        let functions = match self.functions.take() {
+            Some(functions) => functions,
+            None => Functions::new(device, self.form, core.is_cut())?,
+        };
+        Ok(self.functions.insert(functions))
     }
 
     /// Compiles and registers what is missing for a pass.
     fn prepare(&mut self, device: &Device, (sharing, core): (&Sharing, &Core), into: GlBuffer) -> Result<Ready<'_>> {
-        let functions = self.compiled(device, core)?;
+        self.compiled(device, core)?;
         if self.into.as_ref().is_some_and(|own| own.buffer() != into) {
             self.let_go(device);
         }
@@ -60,7 +61,8 @@ impl Kind {
             Some(own) => own,
             None => sharing.register(device, into)?,
         };
-        Ok((self.functions.insert(functions), &self.groups, self.into.insert(registered)))
+        let missing = || during("raster")("no kernels were compiled");
+        Ok((self.functions.as_ref().ok_or_else(missing)?, &self.groups, self.into.insert(registered)))
     }
 
     /// Gives the buffer back to OpenGL once nothing draws into it any more.
@@ -145,8 +147,7 @@ impl Rasteriser for GlRaster {
         let Self { depth: of_depth, ids: of_ids, core, device, .. } = self;
         for (kind, wanted) in [(of_depth, depth), (of_ids, ids)] {
             if wanted {
-                let functions = kind.compiled(device, core)?;
-                kind.functions = Some(functions);
+                kind.compiled(device, core)?;
             }
         }
         Ok(())

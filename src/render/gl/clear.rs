@@ -5,13 +5,20 @@ use glow::HasContext as _;
 use super::super::region::{Region, Touched};
 use super::{Framebuffer, Gl};
 
+/// What is known of ids and their depth.
+#[derive(Debug, Default)]
+pub(in crate::render) struct Traces {
+    pub(in crate::render) ids: Touched,
+    pub(in crate::render) depth: Touched,
+}
+
 /// What a pass begins with. What is known of an image tells which pixels need it; without, all do.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::render) enum Clear<'a> {
     /// Depth of 1.
     Depth(Option<&'a Touched>),
     /// Depth of 1 and ids of 0.
-    DepthAndIds(Option<[&'a Touched; 2]>),
+    DepthAndIds(Option<&'a Traces>),
     Colour([f32; 4], &'a Touched),
     /// Words of 0, without depth.
     Words(&'a Touched),
@@ -44,8 +51,8 @@ impl Gl {
         match clear {
             Clear::Depth(touched) => self.fill(part, touched, Fill::Far),
             Clear::DepthAndIds(touched) => {
-                self.fill(part, touched.map(|[depth, _]| depth), Fill::Far);
-                self.fill(part, touched.map(|[_, ids]| ids), Fill::Zero);
+                self.fill(part, touched.map(|both| &both.depth), Fill::Far);
+                self.fill(part, touched.map(|both| &both.ids), Fill::Zero);
             }
             Clear::Words(touched) => self.fill(part, Some(touched), Fill::Zero),
             Clear::Colour(colour, touched) => self.fill(part, Some(touched), Fill::Colour(colour)),

@@ -35,8 +35,6 @@ impl Renderer {
         if ways == [false; 2] {
             buffers.beside = None;
         }
-        // What those frames were drawn into: the scene's own may be smaller by far.
-        self.targets.pop();
         let path = |beside: bool| Some(if beside { Path::Cuda } else { Path::OpenGl });
         Ok(Paths { shadow: path(ways[0]), visibility: path(ways[1]) })
     }

@@ -178,6 +178,36 @@ fn a_frame_drawn_beside_opengl_is_opengls_ground_and_shadow_included() {
 }
 
 #[test]
+fn frames_by_opengl_and_beside_it_that_share_a_target_do_not_see_each_other() {
+    let mut stage = yard(None, 1);
+    stage.0.look.ground = None;
+    let scene = stage.scene();
+    let aside = |x: f64| {
+        let view = View::LookAt { eye: [x, 6.0, 12.0], target: [x, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
+        Camera { view, ..from_above() }
+    };
+    let mut deformer = ReferenceDeformer::new(&scene);
+    let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+    let mut renderer = open();
+    let both = [By::OpenGl, By::Beside(0.0)].map(|by| {
+        let mut buffers = renderer.load(&scene).expect("loads");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        give(&mut renderer, &mut buffers, by);
+        buffers
+    });
+    let [width, height] = SIZE;
+    for (turn, x) in [-2.5, 2.5, 0.0, 1.0, -1.0].into_iter().enumerate() {
+        let shot = Shot { camera: aside(x), width, height, bounds, light: None };
+        let image = renderer.draw(&both[turn % 2], &shot).expect("draws");
+        let alone = show(&scene, aside(x), if turn % 2 == 0 { By::OpenGl } else { By::Beside(0.0) });
+        assert_eq!(image.paths, alone.ran.paths);
+        assert!(image.rgba == alone.image.rgba, "turn {turn}");
+        let triangles = alone.seen.iter().filter(|seen| matches!(seen, Seen::Triangle(_))).count();
+        assert!((200..12_000).contains(&triangles), "{triangles} pixels");
+    }
+}
+
+#[test]
 fn the_ground_hides_what_lies_below_it_and_not_what_lies_in_it() {
     let scene = yard(None, 1).scene();
     let seen = |by: By, down: f32| {

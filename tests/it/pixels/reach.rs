@@ -84,7 +84,14 @@ fn a_frame_after_others_elsewhere_is_that_of_a_fresh_renderer() {
 
 #[test]
 fn scenes_that_share_a_target_do_not_see_each_other() {
-    let (both, mut shared) = ([stage(|_| {}), stage(|look| look.transparency = Transparency::Exact)], open());
+    let mut other = Stage::new();
+    other.0.look.sunlight = [0.9, 0.3, 0.2];
+    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.6, double_sided: true, ..Material::default() };
+    let wall = Material { double_sided: true, ..Material::default() };
+    let other = (0..5).fold(other, |stage, at| {
+        stage.add(facing(0.2 * at as f32 - 0.7, -0.8, 0.2 * at as f32 - 0.6, 0.9, 0.1), wall.clone())
+    });
+    let (both, mut shared) = ([stage(|_| {}), other.add(facing(-0.8, 0.1, 0.8, 0.4, 0.6), glass).scene()], open());
     let buffers = [0, 1].map(|index| loaded(&mut shared, &both[index]));
     for (turn, place) in [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [12.0, 3.0]].into_iter().enumerate() {
         let (at, mut fresh) = (turn % 2, open());
