@@ -126,7 +126,8 @@ impl Renderer {
         let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
         let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
         let slot = if is_read { Some(target.ring.take(self.watchdog)?) } else { None };
-        target.reach.set(reach(buffers, shot));
+        let ground = draws_ground(buffers, shot);
+        target.reach.set(reach(buffers, shot, ground));
         buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
         cull::begin(buffers);
@@ -135,7 +136,7 @@ impl Renderer {
             splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
         let mut ran = Ran { samples: form.samples, ..Ran::default() };
-        let passes = self.run(buffers, shot, (target, &sampled), &mut ran).and_then(|mut passes| {
+        let passes = self.run(buffers, shot, (target, &sampled, ground), &mut ran).and_then(|mut passes| {
             passes.extend(self.bring(buffers, target, slot.as_ref())?);
             Ok(passes)
         });
@@ -170,7 +171,7 @@ impl Renderer {
         &self,
         buffers: &SceneBuffers,
         shot: &Shot,
-        (target, sampled): (&Target, &Sampled),
+        (target, sampled, ground): (&Target, &Sampled, bool),
         ran: &mut Ran,
     ) -> Result<Vec<(&'static str, Stopwatch)>> {
         let gl = &self.gl;
@@ -204,7 +205,7 @@ impl Renderer {
                 Some(beside) => beside.unpack(gl, target, ran),
                 None => {
                     passes::visibility(gl, buffers, target, sampled, ran)?;
-                    if draws_ground(buffers, shot) { passes::ground(gl, buffers, shot, ran) } else { Ok(()) }
+                    if ground { passes::ground(gl, buffers, shot, ran) } else { Ok(()) }
                 }
             })?,
             timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
@@ -247,9 +248,9 @@ fn draws_ground(buffers: &SceneBuffers, shot: &Shot) -> bool {
 }
 
 /// Where a frame may have triangles, or ground that is drawn.
-fn reach(buffers: &SceneBuffers, shot: &Shot) -> Region {
+fn reach(buffers: &SceneBuffers, shot: &Shot, ground: bool) -> Region {
     let size = [shot.width, shot.height];
-    if buffers.apart.is_some() || draws_ground(buffers, shot) {
+    if buffers.apart.is_some() || ground {
         return Region::whole(size);
     }
     Region::of(&frame::camera_clip(&buffers.scene, shot, buffers.origin), &shot.bounds, size)
