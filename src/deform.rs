@@ -133,9 +133,9 @@ pub struct Deformed {
     /// displacement that is kept too.
     pub bounds: Bounds,
     /// What the same positions take up along the axes of light space ([`Scene::light_axes`](crate::scene::Scene)), relative
-    /// to the same origin; none where the look has no shadow that is fitted to them. It holds every vertex. `reference` is as tight as the
-    /// vertices are; the others put boxes around up to 128 vertices each and reach beyond by less than the diagonal of
-    /// such a box, and never beyond the corners of `bounds` by more than rounding.
+    /// to the same origin; none where the look has no shadow that is fitted to them. It holds every vertex. `reference` is
+    /// as tight as the vertices are; the others put boxes around up to 128 vertices each and reach beyond by less than the
+    /// diagonal of such a box, and never beyond the corners of `bounds` by more than rounding.
     pub light: Option<LightBounds>,
     /// Milliseconds from the call until the vertices were there; with vertices in the renderer's own buffers, without the
     /// wait for frames that are still drawn from them.

@@ -19,7 +19,7 @@ pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
 /// Vertices and the milliseconds until they were there.
 pub(super) type Copied = (Arc<Surface>, f64);
 
-/// One thing that it is asked for, with where the answer goes.
+/// A question to the device thread, and where its answer goes.
 pub(super) enum Command {
     Stage {
         id: SceneId,
@@ -52,8 +52,7 @@ pub(super) enum Command {
         rectangle: Rectangle,
         reply: Reply<Vec<Hit>>,
     },
-    /// Brings what is wanted to the host, beside the command after it; the second value is the milliseconds until it was
-    /// there.
+    /// Brings what is wanted to the host, beside the command after it.
     Copy {
         id: SceneId,
         wanted: Wanted,

@@ -1,7 +1,7 @@
 //! Launches `kernels/raster.cu`: which triangle each sample of a window sees and how deep, or depth alone, by atomic minima.
 //!
-//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels, and warps draw larger and clipped ones
-//! tile by tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
+//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels; of larger and clipped ones a warp draws
+//! a tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
 //! stay on the device. Of a cut-out a sample is kept where alpha is large enough, asked before the minimum; meshes without
 //! any compile nothing of that.
 //!

@@ -126,8 +126,8 @@ pub struct Image {
     pub rgba: Vec<u8>,
     /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "raster" (of a rasteriser
     /// beside OpenGL; what the camera sees too, where it draws both) and "blur" of the shadow, "ids" (by that one alone),
-    /// "cull" (of a culled scene, with the occluders), "visibility" (with the ground), "blended" (lists and all), "shade" (with the backdrop), "bloom" and "encode" of
-    /// drawing.
+    /// "cull" (of a culled scene, with the occluders), "visibility" (with the ground), "blended" (lists and all), "shade"
+    /// (with the backdrop), "bloom" and "encode" of drawing.
     pub passes: Vec<(&'static str, f64)>,
     pub paths: Paths,
 }

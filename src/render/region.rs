@@ -52,7 +52,7 @@ impl Region {
             let off = (rounded[axis] + least.abs().max(most.abs()) * rounded.w) / nearest;
             let side = f64::from(frame[axis]);
             let pixel = |image: f64, margin: f64| ((0.5 * image + 0.5) * side + margin).clamp(0.0, side);
-            // As a cast, a NaN is 0: it cannot be one here, and would be cut off the wrong side if it were.
+            // No NaN: all numbers are finite, and w is positive.
             [pixel(least - off, -MARGIN).floor() as u32, pixel(most + off, MARGIN).ceil() as u32]
         });
         Self { frame, corner: spans.map(|[low, _]| low), size: spans.map(|[low, high]| high - low) }

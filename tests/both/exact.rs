@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 /// A step of the snapped corners, pixels.
 const EDGE: f64 = 1.0 / 256.0;
+
 /// A triangle in homogeneous window coordinates, exact but for f64.
 pub(crate) struct Exact {
     edges: [Vector3<f64>; 3],

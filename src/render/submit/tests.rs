@@ -141,6 +141,18 @@ fn a_frame_that_does_not_end_is_an_error_with_the_name_of_the_pass_and_the_next_
 }
 
 #[test]
+fn a_frame_that_fails_halfway_leaves_no_images_of_which_nobody_knows_what_they_hold() {
+    let (mut renderer, scene, mut buffers) = loaded();
+    let shot = shot(&scene, 64);
+    let want = renderer.draw(&buffers, &shot).expect("draws").rgba;
+    let blur = std::mem::take(&mut buffers.programs.blur);
+    let Err(Error::Fault { stage, .. }) = renderer.draw(&buffers, &shot) else { panic!("no fault") };
+    assert_eq!((stage, renderer.targets.len()), ("blur", 0));
+    buffers.programs.blur = blur;
+    assert!(renderer.draw(&buffers, &shot).expect("draws again").rgba == want);
+}
+
+#[test]
 fn a_frame_that_is_late_by_more_than_the_limit_is_ready_to_be_given_up() {
     let (mut renderer, scene, buffers) = loaded();
     renderer.watchdog = Duration::from_millis(5);
