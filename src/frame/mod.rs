@@ -19,20 +19,43 @@ pub fn colour_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -
     Ok(rgba)
 }
 
-/// PNG of RGBA8 sRGB pixels, top row first.
+/// PNG of RGBA8 sRGB pixels, top row first; RGB when every pixel is opaque. Filter Sub with fast compression: on rendered
+/// frames it takes a quarter of the time of adaptive filters, and its files are smaller.
 ///
 /// # Errors
 /// `Fault` when the encoder refuses.
 pub fn png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
+    match opaque_rgb(rgba) {
+        Some(rgb) => encode_png(width, height, png::ColorType::Rgb, &rgb),
+        None => encode_png(width, height, png::ColorType::Rgba, rgba),
+    }
+}
+
+/// The pixels without alpha, when every alpha is 255.
+fn opaque_rgb(rgba: &[u8]) -> Option<Vec<u8>> {
+    let (pixels, _) = rgba.as_chunks::<4>();
+    if pixels.iter().fold(u8::MAX, |all, pixel| all & pixel[3]) != u8::MAX {
+        return None;
+    }
+    let mut rgb = vec![0; 3 * pixels.len()];
+    for (to, [r, g, b, _]) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(pixels) {
+        *to = [*r, *g, *b];
+    }
+    Some(rgb)
+}
+
+fn encode_png(width: u32, height: u32, color: png::ColorType, pixels: &[u8]) -> Result<Vec<u8>> {
     let fail = crate::error::during::<png::EncodingError>("encode");
-    let mut bytes = Vec::with_capacity(rgba.len() / 3);
+    let mut bytes = Vec::with_capacity(pixels.len() / 4);
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
-    encoder.set_color(png::ColorType::Rgba);
+    encoder.set_color(color);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+    // Sets a filter of its own, so the filter comes second.
     encoder.set_compression(png::Compression::Fast);
+    encoder.set_filter(png::Filter::Sub);
     let mut writer = encoder.write_header().map_err(&fail)?;
-    writer.write_image_data(rgba).map_err(&fail)?;
+    writer.write_image_data(pixels).map_err(&fail)?;
     writer.finish().map_err(&fail)?;
     Ok(bytes)
 }
@@ -42,9 +65,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_png_decodes_to_the_same_pixels() {
-        let pixels: Vec<u8> = (0..4 * 5 * 3).map(|byte| byte as u8 * 4).collect();
-        let decoded = image::load_from_memory(&png(5, 3, &pixels).expect("encodes")).expect("decodes").into_rgba8();
-        assert_eq!((decoded.dimensions(), decoded.into_raw()), ((5, 3), pixels));
+    fn png_decodes_to_the_same_pixels_and_drops_opaque_alpha() {
+        let translucent: Vec<u8> = (0..4 * 5 * 3).map(|byte| byte as u8 * 4).collect();
+        let mut opaque = translucent.clone();
+        opaque.chunks_exact_mut(4).for_each(|pixel| pixel[3] = 255);
+        let mut last_is_translucent = opaque.clone();
+        last_is_translucent[4 * 5 * 3 - 1] = 254;
+        for (pixels, has_alpha) in [(translucent, true), (opaque, false), (last_is_translucent, true)] {
+            let decoded = image::load_from_memory(&png(5, 3, &pixels).expect("encodes")).expect("decodes");
+            assert_eq!(decoded.color().has_alpha(), has_alpha);
+            let decoded = decoded.into_rgba8();
+            assert_eq!((decoded.dimensions(), decoded.into_raw()), ((5, 3), pixels));
+        }
     }
 }
