@@ -11,6 +11,14 @@ use crate::scene::ServerInfo;
 /// The largest reply that is put together from chunks, in bytes, unless the caller says otherwise.
 pub const REPLY_LIMIT: u64 = 1 << 30;
 
+/// Flow-control windows in bytes. A stream that nobody reads fills its own window; sixteen of them fill the connection's,
+/// and every other call then waits.
+const STREAM_WINDOW: u32 = 4 << 20;
+const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
+/// The largest HTTP/2 frame that the server may send, in bytes: a whole chunk of a reply. The default of 16 KiB halves the
+/// rate of large replies.
+const FRAME_SIZE: u32 = 1 << 20;
+
 /// A connection to a modalcast server.
 #[derive(Debug, Clone)]
 pub struct Client {
@@ -25,13 +33,13 @@ impl Client {
     /// `Connect` when the URL is none or nobody answers.
     pub async fn connect(url: &str) -> Result<Self> {
         let refused = |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: chain(&fault) };
-        // An unread stream may fill its own window but never the connection's, or every other call would wait too.
         let whole = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
         let endpoint = Endpoint::from_shared(whole)
             .map_err(refused)?
             .connect_timeout(Duration::from_secs(5))
-            .initial_stream_window_size(1 << 20)
-            .initial_connection_window_size(16 << 20)
+            .initial_stream_window_size(STREAM_WINDOW)
+            .initial_connection_window_size(CONNECTION_WINDOW)
+            .max_frame_size(FRAME_SIZE)
             .http2_keep_alive_interval(Duration::from_secs(20))
             .keep_alive_timeout(Duration::from_secs(20));
         let channel = endpoint.connect().await.map_err(refused)?;
