@@ -12,7 +12,7 @@ void main() {
     uint id = texelFetch(ids, at, 0).x;
     uint first = 22u * uint((size.y - 1 - at.y) * size.x + at.x);
     picked[first] = id;
-    if (id == NOTHING || id == GROUND) return;
+    if (id == NOTHING) return;
     ivec3 corners = ivec3(texelFetch(triangle_corners, int(id - 1u)).xyz);
     ivec3 vertices = ivec3(texelFetch(triangle_vertices, int(id - 1u)).xyz);
     for (int index = 0; index < 3; index++) {

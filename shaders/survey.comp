@@ -4,7 +4,7 @@
 //   words    DEPTH    [height][width]           f32 along the view axis times `scale`; infinite: nothing       (out)
 //            NORMALS  [height][width][3]        f32, unit, on the side that is seen; zeros: nothing
 //            VALUES   [height][width][SAMPLES]  value times `scale` and the cosine to the eye, 16 bits each;
-//                                               0: nothing or ground, else the cosine is at least 1 / 65535
+//                                               0: nothing, else the cosine is at least 1 / 65535
 layout(local_size_x = LANES) in;
 layout(location = 0) uniform int scale_bits;
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
@@ -64,14 +64,13 @@ float depth(uint id, vec2 image) {
 #ifdef NORMALS
 vec3 normal_of(uint id, vec2 image) {
     if (id == NOTHING) return vec3(0.0);
-    if (id == GROUND) return frame.up.xyz;
     return unit_or_zero(meet(int(id - 1u), image).normal);
 }
 #endif
 
 #ifdef VALUES
 uint value_of(uint id, vec2 image, float scale) {
-    if (id == NOTHING || id == GROUND) return 0u;
+    if (id == NOTHING) return 0u;
     Met met = meet(int(id - 1u), image);
     vec3 own = vec3(0.0);
     for (int index = 0; index < 3; index++) own[index] = texelFetch(values, met.vertices[index]).x;

@@ -2,8 +2,8 @@
 //! its own with one sample in the middle of each pixel, and only its triangles are read back. The host meets them in f64.
 //!
 //! A pick is begun and finished apart, so that other work can be given to the device in between. Holes of cut-out materials
-//! are holes. Blended triangles cannot be picked: what stands behind them is. The ground stands before what lies below it,
-//! and is no hit itself.
+//! are holes. Blended triangles cannot be picked: what stands behind them is. The ground is not drawn: it is no hit and hides
+//! none.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -114,7 +114,6 @@ impl Renderer {
             (cut_out.as_deref(), None),
             ran,
         )?;
-        passes::ground(gl, buffers, &shot, ran)?;
         let size = Some(width | height << 16);
         passes::words(gl, (&picker.ids, &picker.packed), (&program, size), [width, height])?;
         gl.copy(&picker.packed, &staging, 4 * (WORDS * width as usize * height as usize) as u64);

@@ -14,14 +14,15 @@ use super::target::{Form, image};
 use super::{Ran, Renderer, Shot, frame, passes};
 use crate::error::{Result, during};
 
-/// What is read off a frame. Blended triangles are not there: what stands behind them is.
+/// What is read off a frame. Blended triangles are not there: what stands behind them is. Only depth knows the ground:
+/// elsewhere it hides nothing that hangs below it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Field {
     /// f32, metres along the view axis, not along the ray; infinite where nothing is. The ground counts.
     Depth,
-    /// u32, the domain's index; `u32::MAX` where none is.
+    /// u32, the domain's index; `u32::MAX` where no triangle is.
     Domains,
-    /// Three f32: the unit normal, on the side that is seen; the ground's is up, zeros where nothing is.
+    /// Three f32: the unit normal, on the side that is seen; zeros where no triangle is.
     Normals,
     /// A word per sample: a number of every vertex ([`Renderer::upload_values`]) over `largest`, clamped to 0 to 1, in the
     /// lower 16 bits; and in the upper ones the cosine between normal and eye. 0 where no triangle is.
@@ -131,7 +132,9 @@ impl Renderer {
                 (cut_out.as_deref(), None),
                 ran,
             )?;
-            passes::ground(gl, buffers, shot, ran)?;
+            if field == Field::Depth {
+                passes::ground(gl, buffers, shot, ran)?;
+            }
             passes::words(
                 gl,
                 (&surveyor.ids, &surveyor.packed),

@@ -1,5 +1,6 @@
 //! Pictures against arithmetic, each with a negative control. Runs on whatever EGL gives, Mesa's llvmpipe included.
 
+mod below_ground;
 mod beside;
 mod build;
 mod culling;

@@ -7,8 +7,9 @@ impl Options {
     /// Reads a field off the ids: `DEPTH` and `NORMALS` of one sample a pixel, `VALUES` of all samples.
     pub(in crate::render) fn survey(&self, field: &'static str, samples: u32) -> Source {
         let mut text = format!("#version 430 core\n#define LANES {LANES}\n#define {field}\n");
-        // Without a ground in the look no id is the ground's.
-        text += if self.defines.contains(&"GROUND_SEEN") { "#define GROUND_SEEN\n" } else { "" };
+        // Only depth draws the ground, and only of a look that has one.
+        let has_ground = field == "DEPTH" && self.defines.contains(&"GROUND_SEEN");
+        text += if has_ground { "#define GROUND_SEEN\n" } else { "" };
         text += &self.sampling(samples);
         text += &[FRAME, CLIP, IDS, SHARES, include_str!("../../../shaders/survey.comp")].concat();
         Source { label: format!("survey of {field}, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }

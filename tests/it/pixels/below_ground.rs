@@ -1,0 +1,72 @@
+//! What hangs below the ground: measurement outputs and picks contain all of it.
+
+use std::sync::Arc;
+
+use modalcast::deform::Deformer as _;
+use modalcast::domain::{Material, Transform};
+use modalcast::reference::ReferenceDeformer;
+use modalcast::render::{Field, Hit, Shot};
+use modalcast::scene::{Camera, Ground, Rectangle, Scene, State, View};
+use nalgebra::{Matrix4, Vector3};
+
+use super::build::{Stage, camera, facing, open};
+
+/// Pixels a side.
+const SIZE: u32 = 64;
+
+/// A wall of 40 x 30 pixels on the ground.
+fn wall(samples: u32, ground: Option<Ground>) -> Arc<Scene> {
+    let mut stage = Stage::new();
+    (stage.0.look.ground, stage.0.look.samples) = (ground, samples);
+    stage.add(facing(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).scene()
+}
+
+/// From a little above the ground, so that it may hide what is below.
+fn from_above() -> Camera {
+    Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..camera(SIZE) }
+}
+
+/// Words of a field, and the hits of all pixels, when the wall has sunk by half of its height.
+fn measure(scene: &Arc<Scene>, field: Field) -> (Vec<u32>, Vec<Hit>) {
+    let mut state = State::rest(scene);
+    state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
+    let mut deformer = ReferenceDeformer::new(scene);
+    let bounds = deformer.deform(&state).expect("deforms").bounds;
+    let mut renderer = open();
+    let mut buffers = renderer.load(scene).expect("loads");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    renderer.upload_values(&mut buffers, &[0.25, 0.5, 0.75, 1.0]).expect("uploads");
+    let shot = Shot { camera: from_above(), width: SIZE, height: SIZE, bounds, light: None };
+    let words = bytemuck::pod_collect_to_vec(&renderer.survey(&buffers, &shot, field).expect("surveys").bytes);
+    let whole = Rectangle::within([SIZE; 2], [0; 2], [SIZE; 2]).expect("inside");
+    let pick = renderer.begin_pick(&buffers, &shot, whole).expect("begins");
+    (words, renderer.finish_pick(pick).expect("ends"))
+}
+
+#[test]
+fn measurements_below_the_ground_equal_those_without_ground() {
+    for (samples, field) in [
+        (1, Field::Domains),
+        (1, Field::Normals),
+        (1, Field::Values { largest: 1.0 }),
+        (4, Field::Values { largest: 1.0 }),
+    ] {
+        let [with, without] = [Some(Ground::default()), None].map(|ground| measure(&wall(samples, ground), field));
+        assert_eq!(with, without, "{field:?}, {samples} samples");
+        assert!(with.1.len() > 900, "{field:?}: {} pixels picked", with.1.len());
+        let below = with.1.iter().filter(|hit| hit.position[1] < 0.0).count();
+        assert!(below > 400, "{field:?}: {below} pixels below the ground");
+    }
+}
+
+#[test]
+fn depth_contains_the_ground() {
+    let [with, without] = [Some(Ground::default()), None].map(|ground| measure(&wall(1, ground), Field::Depth).0);
+    let infinite = |words: &[u32]| words.iter().filter(|word| f32::from_bits(**word) == f32::INFINITY).count();
+    assert!(infinite(&without) > infinite(&with) + 1000, "the ground is seen beside the wall");
+    let nearer = with.iter().zip(&without).filter(|(with, without)| {
+        let [with, without] = [with, without].map(|word| f32::from_bits(**word));
+        without.is_finite() && with < without
+    });
+    assert!(nearer.count() > 400, "and before what is below it");
+}
