@@ -47,10 +47,14 @@ pub(super) struct Late {
 
 pub(super) enum Leaving {
     Vertices(Asked<Copied>),
-    Frame(Asked<Image>),
+    Frame(View, Asked<Image>),
 }
 
 impl Leaving {
+    fn is_frame_of(&self, wanted: &View) -> bool {
+        matches!(self, Self::Frame(view, _) if view == wanted)
+    }
+
     /// Waits until it is there, with the stages that this took. Safe to drop while it waits.
     async fn there(&mut self) -> Result<(Body, StageTimes)> {
         match self {
@@ -58,10 +62,10 @@ impl Leaving {
                 let (surface, ms) = copying.there().await?;
                 Ok((Body::Vertices(surface), vec![(Stage::Copy, ms)]))
             }
-            Self::Frame(drawing) => {
+            Self::Frame(_, drawing) => {
                 let image = drawing.there().await?;
                 let stages = known(&image.passes);
-                Ok((Body::Frame(image), stages))
+                Ok((Body::Frame(Arc::new(image.into())), stages))
             }
         }
     }
@@ -81,15 +85,28 @@ impl Conductor {
         }
     }
 
-    /// Begins a viewer's frame of the current step, if it can be late: it waits for its frame and not so many others do.
-    pub(super) fn begin_frame(&self, viewer: &mut Viewer, begun: usize) -> Option<Late> {
-        let (camera, size) = viewer.view.frame().filter(|_| begun < FRAMES_UNDER_WAY)?;
+    /// Gives a viewer with room its frame of the current step late: one of its view that was begun for another viewer, else one
+    /// that begins now, unless too many others have. `begun` are the frames of this step that are not in the queue yet. Returns
+    /// whether the viewer gets one.
+    pub(super) fn begin_frame(&mut self, viewer: &mut Viewer, begun: &mut Vec<Late>) -> bool {
+        let Some((camera, size)) = viewer.view.frame() else { return false };
         if viewer.seen == self.count || !viewer.has_room() {
-            return None;
+            return false;
         }
-        let skipped = self.see(viewer);
+        let count = self.count;
+        let of_view = |late: &&mut Late| late.count == count && late.leaving.is_frame_of(&viewer.view);
+        if let Some(shared) = self.late.iter_mut().chain(begun.iter_mut()).find(of_view) {
+            let skipped = viewer.see(count);
+            shared.claims.push((viewer.claim(), skipped));
+            return true;
+        }
+        if begun.len() >= FRAMES_UNDER_WAY {
+            return false;
+        }
+        let skipped = viewer.see(count);
         let drawing = self.means.worker.begin_draw(self.id, camera, size);
-        Some(self.late(Leaving::Frame(drawing), vec![(viewer.claim(), skipped)]))
+        begun.push(self.late(Leaving::Frame(viewer.view, drawing), vec![(viewer.claim(), skipped)]));
+        true
     }
 
     /// Waits for what is late for the longest, and hands it over. Safe to drop while it waits.

@@ -4,15 +4,18 @@
 //! A scene's task orders everything that happens to it (`conductor`); a writer reaches it through a bounded lane
 //! (`lane`), a subscriber through a bounded feed (`viewer`), and both are told when they are too fast or too slow.
 
+mod blocking;
 mod command;
 mod conductor;
 mod desk;
-mod encode;
+mod encoded_feed;
+mod frame_encoder;
 mod host;
 mod keep;
 mod lane;
 mod late;
 mod ledger;
+mod pack;
 mod picked;
 mod registry;
 mod show;
@@ -27,10 +30,12 @@ mod workbench;
 mod worker;
 
 pub use conductor::Which;
-pub use encode::{Encoded, Format, Packed, Selection, checked_domains, encode_frame, pack_vertices};
+pub use encoded_feed::EncodedFeed;
+pub use frame_encoder::{ColorFrame, Encoded, Format, FrameEncoder};
 pub use host::{Drive, Host};
 pub use lane::{Policy, Report};
 pub use ledger::{Origin, checked_name};
+pub use pack::{Packed, Selection, checked_domains, pack_vertices};
 pub use picked::{Picked, Picks, resolve_picks};
 pub use source::SceneSource;
 pub use staged::Staged;
@@ -47,8 +52,8 @@ use std::thread::JoinHandle;
 
 use tokio::sync::Semaphore;
 
+use self::blocking::run_blocking;
 use self::conductor::Means;
-use self::encode::aside;
 use self::host::Opening;
 use self::keep::Keeper;
 use self::ledger::Ledger;
@@ -74,6 +79,7 @@ struct Shared {
     config: Arc<Config>,
     source: Arc<dyn SceneSource>,
     info: Info,
+    encoder: FrameEncoder,
     means: Means,
     registry: Registry,
     loads: Semaphore,
@@ -93,7 +99,7 @@ impl Engine {
     pub async fn start(config: Config, source: Arc<dyn SceneSource>) -> Result<Self> {
         let config = Arc::new(config);
         let state = config.state.clone();
-        let (ledger, keeper) = aside("state folder", move || {
+        let (ledger, keeper) = run_blocking("state folder", move || {
             let ledger = Ledger::open(&state)?;
             let keeper = Keeper::start(ledger.steps())?;
             Ok((ledger, Arc::new(keeper)))
@@ -106,6 +112,7 @@ impl Engine {
             config,
             source,
             info,
+            encoder: FrameEncoder::per_core(),
             loads: Semaphore::new(LOADS),
             uploads: Arc::new(Semaphore::new(UPLOADS)),
             next_id: AtomicU64::new(1),
@@ -126,6 +133,11 @@ impl Engine {
     /// The settings.
     pub fn config(&self) -> &Config {
         &self.shared.config
+    }
+
+    /// What encodes frames. All its clones share one limit on threads.
+    pub fn encoder(&self) -> &FrameEncoder {
+        &self.shared.encoder
     }
 
     /// The largest image side that the settings and the renderer allow.
@@ -166,7 +178,7 @@ impl Engine {
     /// `Fault` when the repository could not be read.
     pub async fn sources(&self) -> Result<Vec<String>> {
         let source = Arc::clone(&self.shared.source);
-        aside("repository", move || Ok(source.list())).await
+        run_blocking("repository", move || Ok(source.list())).await
     }
 
     /// Begins an upload.
@@ -188,7 +200,7 @@ impl Engine {
         let full = |_| Error::Busy { queue: "uploads under way", limit: UPLOADS };
         let place = Arc::clone(&self.shared.uploads).try_acquire_owned().map_err(full)?;
         let uploads = config.state.join("uploads");
-        aside("upload", move || Upload::begin(&uploads, announced, place)).await
+        run_blocking("upload", move || Upload::begin(&uploads, announced, place)).await
     }
 
     /// Opens a finished upload. A failure leaves nothing of it behind.
@@ -230,7 +242,7 @@ impl Engine {
             engine.shared.ledger.release();
             Ok(())
         };
-        if let Err(error) = aside("shutdown", finish).await {
+        if let Err(error) = run_blocking("shutdown", finish).await {
             tracing::error!(%error, "the engine did not stop cleanly");
         }
     }
@@ -274,7 +286,7 @@ impl Engine {
         let hosted = self.load_and_stage(&name, &origin, upload).await;
         if hosted.is_err() && is_new_upload {
             let place = self.shared.ledger.upload(&name);
-            aside("upload", move || Ok(std::fs::remove_dir_all(place).ok())).await?;
+            run_blocking("upload", move || Ok(std::fs::remove_dir_all(place).ok())).await?;
         }
         hosted.map(Arc::new)
     }
@@ -282,7 +294,7 @@ impl Engine {
     async fn load_and_stage(&self, name: &str, origin: &Origin, upload: Option<Upload>) -> Result<Host> {
         let scene = self.load(name, origin, upload).await?;
         let (engine, key, kept) = (self.clone(), name.to_owned(), Arc::clone(&scene));
-        let state = aside("kept step", move || Ok(engine.shared.means.keeper.load(&key, &kept))).await?;
+        let state = run_blocking("kept step", move || Ok(engine.shared.means.keeper.load(&key, &kept))).await?;
         let state = state.unwrap_or_else(|error| {
             tracing::warn!(scene = name, %error, "the scene begins at rest");
             None
@@ -297,7 +309,7 @@ impl Engine {
         };
         let host = Host::open(opening, self.shared.means.clone()).await?;
         let (engine, key, origin) = (self.clone(), name.to_owned(), origin.clone());
-        if let Err(error) = aside("scenes.json", move || engine.shared.ledger.add(&key, &origin)).await {
+        if let Err(error) = run_blocking("scenes.json", move || engine.shared.ledger.add(&key, &origin)).await {
             host.stop(error.clone()).await;
             return Err(error);
         }
@@ -324,7 +336,7 @@ impl Engine {
                 source.open_within(&place, &entry)
             }
         };
-        aside("load", read).await
+        run_blocking("load", read).await
     }
 
     async fn close_whole(&self, name: &str) -> Result<()> {
@@ -336,7 +348,7 @@ impl Engine {
             None => {}
         }
         let (engine, key) = (self.clone(), name.to_owned());
-        let removed = aside("close", move || {
+        let removed = run_blocking("close", move || {
             engine.shared.means.keeper.forget(&key);
             std::fs::remove_dir_all(engine.shared.ledger.upload(&key)).ok(); // Only uploads have a folder.
             engine.shared.ledger.remove(&key)

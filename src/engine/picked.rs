@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::encode::aside;
+use super::blocking::run_blocking;
 use super::viewer::{Body, Shown, StepName};
 use crate::error::{Result, during};
 use crate::render::Hit;
@@ -52,5 +52,5 @@ pub async fn resolve_picks(shown: Shown, scene: &Arc<Scene>, with_modes: bool) -
         }
         Ok(hits)
     };
-    Ok(Picks { step: shown.step, stages: shown.stages, hits: aside("pick", work).await? })
+    Ok(Picks { step: shown.step, stages: shown.stages, hits: run_blocking("pick", work).await? })
 }

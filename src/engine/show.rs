@@ -39,23 +39,19 @@ impl Conductor {
         let wanted = self.wanted(&viewers);
         let beside = self.has_next();
         let copied = beside && !self.there().covers(wanted);
-        let (mut readers, mut frames) = (Vec::new(), Vec::new());
+        let (mut readers, mut frames, mut drawn) = (Vec::new(), Vec::new(), Vec::new());
         for mut viewer in viewers {
             if viewer.is_gone() {
                 continue;
             }
             // Room may have come only now.
             if copied && self.wants(&viewer).is_some_and(|own| wanted.covers(own)) {
-                let skipped = self.see(&mut viewer);
+                let skipped = viewer.see(self.count);
                 readers.push((viewer.claim(), skipped));
-            } else if let Some(frame) =
-                Some(frames.len()).filter(|_| beside).and_then(|begun| self.begin_frame(&mut viewer, begun))
+            } else if !(beside && self.begin_frame(&mut viewer, &mut frames))
+                && !self.serve(&mut viewer, holds_back, (wanted, &mut drawn)).await
             {
-                frames.push(frame);
-            } else {
-                if !self.serve(&mut viewer, holds_back, wanted).await {
-                    continue;
-                }
+                continue;
             }
             self.viewers.push(viewer);
         }
@@ -80,24 +76,29 @@ impl Conductor {
         there.filter_map(|viewer| self.wants(viewer)).fold(Wanted::default(), Wanted::or)
     }
 
-    /// Notes that a viewer gets the current step; how many it has missed.
-    pub(super) fn see(&self, viewer: &mut Viewer) -> u64 {
-        let skipped = self.count - viewer.seen - 1;
-        viewer.seen = self.count;
-        viewer.stalled = None;
-        skipped
-    }
-
-    /// False when the viewer is to be dropped. `others`: what all viewers want of the vertices.
-    async fn serve(&mut self, viewer: &mut Viewer, holds_back: bool, others: Wanted) -> bool {
+    /// False when the viewer is to be dropped. `others`: what all viewers want of the vertices; `drawn`: the frames that this
+    /// step was drawn into for viewers before, which are shared.
+    async fn serve(
+        &mut self,
+        viewer: &mut Viewer,
+        holds_back: bool,
+        (others, drawn): (Wanted, &mut Vec<(View, Shown)>),
+    ) -> bool {
         if viewer.seen == self.count {
             return true;
         }
         // Nobody waits for what is late for a viewer that could not take more.
         if viewer.has_room() {
             self.settle_for(viewer).await;
-            let skipped = self.see(viewer);
-            let shown = self.show(&viewer.view, skipped, others).await;
+            let skipped = viewer.see(self.count);
+            let shared = drawn.iter().find(|(view, _)| *view == viewer.view);
+            let shown = match shared {
+                Some((_, shown)) => Ok(Shown { skipped, ..shown.clone() }),
+                None => self.show(&viewer.view, skipped, others).await,
+            };
+            if let (None, Ok(shown @ Shown { body: Body::Frame(_), .. })) = (shared, &shown) {
+                drawn.push((viewer.view, shown.clone()));
+            }
             return viewer.claim().deliver(shown);
         }
         if !(holds_back && viewer.delivery == Delivery::Lossless) {
@@ -121,7 +122,7 @@ impl Conductor {
             View::Frame { camera, width, height, showing: Showing::Colour } => {
                 let image = self.means.worker.begin_draw(self.id, camera, (width, height)).wait().await?;
                 stages.extend(known(&image.passes));
-                Body::Frame(image)
+                Body::Frame(Arc::new(image.into()))
             }
             View::Frame { camera, width, height, showing } => {
                 let (survey, legend) = self.means.worker.survey(self.id, camera, [width, height], showing).await?;
@@ -223,8 +224,9 @@ mod tests {
         let ((mut slow, mut slow_feed), (fast, mut fast_feed)) = (viewer(late, 16), viewer(Delivery::Lossless, 24));
         // It asks, and has what a lossless one has beforehand.
         timeout(Duration::ZERO, slow_feed.next()).await.expect_err("nothing yet");
-        let first = conductor.begin_frame(&mut slow, 0);
-        conductor.late.extend(first);
+        let mut begun = Vec::new();
+        assert!(conductor.begin_frame(&mut slow, &mut begun));
+        conductor.late.extend(begun);
         let first = asked(&mut device, 10_000).await.expect("the first frame");
         (conductor.count, conductor.viewers) = (2, vec![slow, fast]);
         let state = State { step: 2, ..State::clone(&conductor.state) };
@@ -257,6 +259,50 @@ mod tests {
     #[tokio::test]
     async fn a_viewer_whose_frame_is_late_and_who_has_no_room_keeps_nobody_waiting() {
         assert_eq!(served(Delivery::Latest).await, (Some(24), vec![(16, 1), (24, 2)]));
+    }
+
+    /// Shows a step to three viewers, two of one view: how often the device draws, and who has got a frame.
+    async fn drawn_for_three(has_next: bool) -> (usize, Vec<u32>) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mut conductor, mut device) = scene(folder.path());
+        let (viewers, feeds): (Vec<_>, Vec<_>) =
+            [16, 24, 16].map(|width| viewer(Delivery::Lossless, width)).into_iter().unzip();
+        (conductor.count, conductor.viewers) = (1, viewers);
+        let serving = async {
+            if has_next {
+                let mut begun = Vec::new();
+                let mut viewers = mem::take(&mut conductor.viewers);
+                assert!(viewers.iter_mut().all(|viewer| conductor.begin_frame(viewer, &mut begun)));
+                conductor.late.extend(begun);
+                conductor.viewers = viewers;
+            } else {
+                conductor.serve_viewers(false).await;
+            }
+            conductor.settle().await;
+        };
+        let drawing = async {
+            let mut drawn = 0;
+            while let Some(frame) = asked(&mut device, 500).await {
+                answer(frame);
+                drawn += 1;
+            }
+            drawn
+        };
+        let ((), drawn) = tokio::join!(serving, drawing);
+        let mut got = Vec::new();
+        for mut feed in feeds {
+            let next = timeout(Duration::from_secs(10), feed.next()).await.expect("a frame");
+            let Ok(Shown { body: Body::Frame(frame), .. }) = next else { panic!("a frame") };
+            got.push(frame.width);
+        }
+        (drawn, got)
+    }
+
+    #[tokio::test]
+    async fn viewers_of_one_view_share_one_drawing_of_a_step() {
+        for has_next in [false, true] {
+            assert_eq!(drawn_for_three(has_next).await, (2, vec![16, 24, 16]), "a step waits: {has_next}");
+        }
     }
 
     #[tokio::test]

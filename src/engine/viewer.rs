@@ -7,11 +7,12 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, watch};
 
+use super::frame_encoder::ColorFrame;
 use super::picked::Picked;
 use crate::deform::{Surface, Wanted};
 use crate::error::{Error, Result, during};
 use crate::frame::Legend;
-use crate::render::{Image, Survey};
+use crate::render::Survey;
 use crate::scene::{Camera, Cells, Rectangle, State};
 use crate::telemetry::StageTimes;
 
@@ -84,7 +85,7 @@ impl StepName {
 /// What a step looks like.
 #[derive(Debug, Clone)]
 pub enum Body {
-    Frame(Image),
+    Frame(Arc<ColorFrame>),
     Vertices(Arc<Surface>),
     /// Numbers in place of colours; a colour map of them when there is a legend.
     Survey(Survey, Option<Legend>),
@@ -161,6 +162,14 @@ impl Viewer {
         self.items.is_closed() || self.over.load(Ordering::Acquire)
     }
 
+    /// Notes that it gets the newest of `count` steps; how many it has missed.
+    pub(super) fn see(&mut self, count: u64) -> u64 {
+        let skipped = count - self.seen - 1;
+        self.seen = count;
+        self.stalled = None;
+        skipped
+    }
+
     /// Takes the room for one picture, which comes now or later.
     pub(super) fn claim(&self) -> Claim {
         self.credits.fetch_sub(1, Ordering::AcqRel);
@@ -199,6 +208,11 @@ impl Feed {
         let (credit, over) = (Arc::clone(&credits), Arc::default());
         let viewer = Viewer { view, delivery, seen: 0, stalled: None, credits: credit, items, over, end };
         (viewer, Self { delivery, asked: false, credits, items: inbox, end: ended, scene })
+    }
+
+    /// Which steps it gets.
+    pub(super) const fn delivery(&self) -> Delivery {
+        self.delivery
     }
 
     /// The next picture. Safe to drop while it waits.

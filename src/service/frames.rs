@@ -8,7 +8,7 @@ use super::convert::{delivery, drawn_by, picture, said, stages, step_id, which_o
 use super::picks;
 use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
-use crate::engine::{Encoded, Engine, Feed, Format, View, encode_frame};
+use crate::engine::{Encoded, EncodedFeed, Engine, Format, View};
 
 /// `FrameService`.
 pub(super) struct Frames(pub(super) Engine);
@@ -27,11 +27,11 @@ impl v1::frame_service_server::FrameService for Frames {
         let host = self.0.find(&request.scene).map_err(status)?;
         let (view, format) = picture(&self.0, &host.scene, request.picture).map_err(status)?;
         let which = which_of_frame(request.step.as_ref());
-        let most = config.chunk_bytes;
+        let (most, encoder) = (config.chunk_bytes, self.0.encoder().clone());
         Ok(respond(move |outlet| async move {
             let work = async {
                 let shown = host.show(which, view).await.map_err(status)?;
-                let frame = encode_frame(shown, format).await.map_err(status)?;
+                let frame = encoder.encode(shown, format).await.map_err(status)?;
                 for chunk in chunks(&frame, view, format, most) {
                     outlet.send(v1::RenderFrameResponse { chunk: Some(chunk) }).await?;
                 }
@@ -62,42 +62,35 @@ impl v1::frame_service_server::FrameService for Frames {
         let delivery = delivery(request.delivery).map_err(status)?;
         // The subscription holds before the reply's head is sent, so that a client may count on the next step.
         let feed = host.watch(view, delivery).await.map_err(status)?;
-        let show = Show { view, format, most: self.0.config().chunk_bytes, frames: request.frames };
-        Ok(respond(move |outlet| deadline.hold("the end of the frame stream", show.run(feed, outlet))))
+        let frames = EncodedFeed::new(feed, self.0.encoder().clone(), format, request.frames);
+        let most = self.0.config().chunk_bytes;
+        let cut = move |frame: &Encoded| chunks(frame, view, format, most);
+        Ok(respond(move |outlet| deadline.hold("the end of the frame stream", send_frames(frames, cut, outlet))))
     }
 }
 
-/// How a stream of frames is sent.
-struct Show {
-    view: View,
-    format: Format,
-    most: usize,
-    /// 0: without end.
-    frames: u64,
-}
-
-impl Show {
-    async fn run(self, mut feed: Feed, outlet: Outlet<v1::StreamFramesResponse>) -> Result<(), Status> {
-        let mut sent = 0;
-        while self.frames == 0 || sent < self.frames {
-            let shown = tokio::select! {
-                shown = feed.next() => shown.map_err(status)?,
-                () = outlet.closed() => return Ok(()),
-            };
-            let frame = encode_frame(shown, self.format).await.map_err(status)?;
-            for chunk in chunks(&frame, self.view, self.format, self.most) {
-                tokio::select! {
-                    sent = outlet.send(v1::StreamFramesResponse { chunk: Some(chunk) }) => sent?,
-                    error = feed.cut_off() => return Err(status(error)),
-                }
+/// Sends every frame in chunks until the stream ends, the client leaves or the feed is cut off.
+async fn send_frames<C: Iterator<Item = v1::FrameChunk>>(
+    mut frames: EncodedFeed,
+    cut: impl Fn(&Encoded) -> C,
+    outlet: Outlet<v1::StreamFramesResponse>,
+) -> Result<(), Status> {
+    loop {
+        let frame = tokio::select! {
+            frame = frames.next() => frame.map_err(status)?,
+            () = outlet.closed() => return Ok(()),
+        };
+        let Some(frame) = frame else { return Ok(()) };
+        for chunk in cut(&frame) {
+            tokio::select! {
+                sent = outlet.send(v1::StreamFramesResponse { chunk: Some(chunk) }) => sent?,
+                error = frames.cut_off() => return Err(status(error)),
             }
-            sent += 1;
         }
-        Ok(())
     }
 }
 
-fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iterator<Item = v1::FrameChunk> {
+fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iterator<Item = v1::FrameChunk> + use<> {
     let (width, height) = match view {
         View::Frame { width, height, .. } => (width, height),
         View::Vertices(_) | View::Pick { .. } => (0, 0),

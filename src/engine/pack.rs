@@ -1,48 +1,22 @@
-//! What a subscriber is shown, as bytes for the wire: PNG or raw pixels, packed vertices. Runs off the device thread.
+//! Vertices as bytes for the wire, packed off the device thread.
 
 use std::sync::Arc;
 use std::time::Instant;
 
-use bytes::Bytes;
-
-use super::viewer::{Body, Shown, StepName};
+use super::blocking::run_blocking;
+use super::frame_encoder::Encoded;
+use super::viewer::{Body, Shown};
 use crate::deform::{Surface, Wanted};
 use crate::error::{Result, during, invalid};
-use crate::frame;
 use crate::render::Paths;
 use crate::scene::{Bounds, Cells, Layout, Scene, Slot};
-use crate::telemetry::{Stage, StageTimes, ms_since};
+use crate::telemetry::{Stage, ms_since};
 
 // Vertices are copied as they lie in memory, and the wire is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"), "vertices would need their bytes swapped");
 
 /// How the most domains of one reply with vertices are bounded: their counts travel in its first message.
 const MOST_DOMAINS: usize = 65_536;
-
-/// How pixels travel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
-    Png,
-    /// RGBA8, top row first.
-    Rgba,
-    /// f32 a pixel: depth.
-    F32,
-    /// u32 a pixel: domains.
-    U32,
-    /// Three f32 a pixel: normals.
-    F32x3,
-}
-
-/// A step as bytes.
-#[derive(Debug, Clone)]
-pub struct Encoded {
-    pub step: StepName,
-    pub skipped: u64,
-    pub stages: StageTimes,
-    /// Of colours: who drew the frame.
-    pub paths: Paths,
-    pub bytes: Bytes,
-}
 
 /// Vertices as bytes, and what they are relative to.
 #[derive(Debug, Clone)]
@@ -150,37 +124,6 @@ pub fn checked_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<
     }
 }
 
-/// Encodes the pixels of a frame.
-///
-/// # Errors
-/// `Fault` when the encoder refuses, or when it was vertices that were shown.
-pub async fn encode_frame(shown: Shown, format: Format) -> Result<Encoded> {
-    let mut stages = shown.stages;
-    let begin = Instant::now();
-    let mut paths = Paths::default();
-    let (size, pixels) = match shown.body {
-        Body::Frame(image) => {
-            paths = image.paths;
-            ([image.width, image.height], image.rgba)
-        }
-        Body::Survey(survey, Some(legend)) => {
-            let size = [survey.width, survey.height];
-            (size, aside("encode", move || frame::colour_map(&survey.bytes, survey.samples, size, &legend)).await?)
-        }
-        Body::Survey(survey, None) => ([survey.width, survey.height], survey.bytes),
-        Body::Vertices(_) | Body::Picked(_) => return Err(during("encode")("it is no picture")),
-    };
-    let bytes = match format {
-        Format::Rgba | Format::F32 | Format::U32 | Format::F32x3 => pixels,
-        Format::Png => {
-            let bytes = aside("encode", move || frame::png(size[0], size[1], &pixels)).await?;
-            stages.push((Stage::Encode, ms_since(begin)));
-            bytes
-        }
-    };
-    Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, paths, bytes: bytes.into() })
-}
-
 /// Packs what is wanted of the chosen domains: all positions in row order of U, then all normals, displacements and
 /// boxes, then the origins of the domains when they are not all the same.
 ///
@@ -197,7 +140,7 @@ pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<P
         let origin = push_origins(&selection, cells.as_deref(), &mut bytes);
         Ok((origin, (bytes.len() - before) as u64, bytes))
     };
-    let (origin, origin_bytes, bytes) = aside("copy", work).await?;
+    let (origin, origin_bytes, bytes) = run_blocking("copy", work).await?;
     stages.push((Stage::Encode, ms_since(begin)));
     let (step, skipped, paths) = (shown.step, shown.skipped, Paths::default());
     let encoded = Encoded { step, skipped, stages, paths, bytes: bytes.into() };
@@ -239,14 +182,6 @@ fn pack(surface: &Surface, selection: &Selection) -> Vec<u8> {
         bytes.extend_from_slice(bytemuck::cast_slice(&sides));
     }
     bytes
-}
-
-/// Runs work that takes a while on a thread where that hurts nobody. A panic there is a fault of that work alone.
-pub(super) async fn aside<T: Send + 'static>(
-    stage: &'static str,
-    work: impl FnOnce() -> Result<T> + Send + 'static,
-) -> Result<T> {
-    tokio::task::spawn_blocking(work).await.map_err(during(stage))?
 }
 
 #[cfg(test)]

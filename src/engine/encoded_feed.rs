@@ -1,0 +1,210 @@
+//! A subscription whose frames are encoded ahead: several at once, delivered in order.
+
+use std::collections::VecDeque;
+
+use tokio::task::JoinHandle;
+
+use super::frame_encoder::{Encoded, Format, FrameEncoder};
+use super::viewer::{Body, Delivery, Feed, Shown};
+use crate::error::{Error, Result, during};
+
+/// Bytes of pixels that one stream may hold before it takes no further frame. A single larger frame is taken alone.
+const IN_FLIGHT_BYTES: usize = 128 << 20;
+/// Frames that a stream of the newest steps holds: one that is sent and one that is encoded meanwhile. More would be older
+/// when they arrive.
+const LATEST_IN_FLIGHT: usize = 2;
+
+/// Encoded frames of a [`Feed`], in its order. A lossless feed has as many frames in flight as there are cores; when these are
+/// not collected, the feed is not read and holds back its writer.
+#[derive(Debug)]
+pub struct EncodedFeed {
+    feed: Feed,
+    encoder: FrameEncoder,
+    format: Format,
+    /// How many frames are still to be taken from the feed.
+    remaining: u64,
+    /// Oldest first.
+    in_flight: VecDeque<Encoding>,
+    /// Why the feed has ended; reported after the frames in flight.
+    ended: Option<Error>,
+}
+
+/// A frame that is being encoded. Dropping it cancels the work unless a thread has begun it.
+#[derive(Debug)]
+struct Encoding {
+    task: JoinHandle<Result<Encoded>>,
+    bytes: usize,
+}
+
+impl Drop for Encoding {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl EncodedFeed {
+    /// Encodes the first `frames` of a feed; all of them when it is 0.
+    pub fn new(feed: Feed, encoder: FrameEncoder, format: Format, frames: u64) -> Self {
+        let remaining = if frames == 0 { u64::MAX } else { frames };
+        Self { feed, encoder, format, remaining, in_flight: VecDeque::new(), ended: None }
+    }
+
+    /// The next frame; none after the last that was asked for. Safe to drop while it waits.
+    ///
+    /// # Errors
+    /// Why the feed has ended, after the frames that it has handed out; `Fault` when a frame cannot be encoded.
+    pub async fn next(&mut self) -> Result<Option<Encoded>> {
+        loop {
+            let has_capacity = self.has_capacity();
+            let Self { feed, in_flight, .. } = self;
+            tokio::select! {
+                biased;
+                encoded = finish_oldest(in_flight), if !in_flight.is_empty() => return encoded.map(Some),
+                shown = feed.next(), if has_capacity => match shown {
+                    Ok(shown) => self.begin(shown),
+                    Err(error) => self.ended = Some(error),
+                },
+                else => return self.ended.clone().map_or(Ok(None), Err),
+            }
+        }
+    }
+
+    /// Waits until the feed is cut off; see [`Feed::cut_off`].
+    pub async fn cut_off(&self) -> Error {
+        self.feed.cut_off().await
+    }
+
+    fn has_capacity(&self) -> bool {
+        let most = match self.feed.delivery() {
+            Delivery::Lossless => self.encoder.cores(),
+            Delivery::Latest => LATEST_IN_FLIGHT,
+        };
+        let bytes: usize = self.in_flight.iter().map(|encoding| encoding.bytes).sum();
+        let has_room = self.in_flight.is_empty() || (self.in_flight.len() < most && bytes < IN_FLIGHT_BYTES);
+        has_room && self.remaining > 0 && self.ended.is_none()
+    }
+
+    fn begin(&mut self, shown: Shown) {
+        let bytes = match &shown.body {
+            Body::Frame(frame) => frame.rgba.len(),
+            Body::Survey(survey, _) => survey.bytes.len(),
+            Body::Vertices(_) | Body::Picked(_) => 0,
+        };
+        let (encoder, format) = (self.encoder.clone(), self.format);
+        let task = tokio::spawn(async move { encoder.encode(shown, format).await });
+        self.in_flight.push_back(Encoding { task, bytes });
+        self.remaining -= 1;
+    }
+}
+
+/// Waits for the frame that was begun first, and removes it. Safe to drop while it waits.
+async fn finish_oldest(in_flight: &mut VecDeque<Encoding>) -> Result<Encoded> {
+    let Some(oldest) = in_flight.front_mut() else { return std::future::pending().await };
+    let encoded = (&mut oldest.task).await;
+    in_flight.pop_front();
+    encoded.map_err(during("encode"))?
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use tokio::time::timeout;
+
+    use super::super::frame_encoder::tests::{noise, paused};
+    use super::super::viewer::{View, Viewer};
+    use super::*;
+    use crate::deform::Wanted;
+
+    fn feed(delivery: Delivery) -> (Viewer, Feed) {
+        Feed::new(View::Vertices(Wanted::VERTICES), delivery, Arc::default())
+    }
+
+    /// Delivers frames of growing size for as long as the feed takes any; how many it took.
+    async fn fill(viewer: &Viewer, frames: &mut EncodedFeed, numbers: std::ops::Range<u64>) -> usize {
+        let mut taken = 0;
+        for number in numbers {
+            timeout(Duration::from_millis(20), frames.next()).await.expect_err("nothing is encoded yet");
+            if !viewer.has_room() {
+                break;
+            }
+            assert!(viewer.claim().deliver(Ok(noise(number, 64 - number as u32))));
+            taken += 1;
+        }
+        taken
+    }
+
+    #[tokio::test]
+    async fn frames_in_flight_are_bounded_and_arrive_in_order() {
+        for (delivery, cores, most) in [(Delivery::Lossless, 3, 3), (Delivery::Latest, 3, LATEST_IN_FLIGHT)] {
+            let (encoder, threads) = paused(cores);
+            let (viewer, feed) = feed(delivery);
+            let mut frames = EncodedFeed::new(feed, encoder, Format::Png, 0);
+            let taken = fill(&viewer, &mut frames, 0..20).await;
+            // A lossless feed holds two more, which the encoder has not taken.
+            let held = if delivery == Delivery::Lossless { 2 } else { 0 };
+            assert_eq!((frames.in_flight.len(), taken), (most, most + held), "{delivery:?}");
+            threads.add_permits(cores);
+            for number in 0..taken as u64 {
+                let frame = frames.next().await.expect("encodes").expect("a frame");
+                assert_eq!(frame.step.number, number);
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_frame_above_the_byte_budget_is_encoded_alone() {
+        let (encoder, threads) = paused(4);
+        let (viewer, feed) = feed(Delivery::Lossless);
+        let mut frames = EncodedFeed::new(feed, encoder, Format::Rgba, 0);
+        let large = |number| {
+            let mut shown = noise(number, 1);
+            let image = crate::render::Image {
+                width: 1,
+                height: 1,
+                rgba: vec![0; IN_FLIGHT_BYTES],
+                passes: vec![],
+                paths: crate::render::Paths::default(),
+            };
+            shown.body = Body::Frame(Arc::new(image.into()));
+            shown
+        };
+        frames.format = Format::Png;
+        assert!(viewer.claim().deliver(Ok(large(0))) && viewer.claim().deliver(Ok(noise(1, 4))));
+        timeout(Duration::from_millis(20), frames.next()).await.expect_err("nothing is encoded yet");
+        assert_eq!(frames.in_flight.len(), 1);
+        drop(frames);
+        assert!(viewer.is_gone());
+        drop(threads);
+    }
+
+    #[tokio::test]
+    async fn the_end_is_reported_after_the_frames_in_flight() {
+        let (encoder, threads) = paused(4);
+        let (viewer, feed) = feed(Delivery::Lossless);
+        let mut frames = EncodedFeed::new(feed, encoder, Format::Png, 0);
+        assert!(viewer.claim().deliver(Ok(noise(0, 32))) && viewer.claim().deliver(Ok(noise(1, 4))));
+        let end = Error::NotFound { what: "scene", given: "gone".into() };
+        viewer.end(end.clone());
+        drop(viewer);
+        timeout(Duration::from_millis(20), frames.next()).await.expect_err("nothing is encoded yet");
+        threads.add_permits(1);
+        for number in 0..2 {
+            assert_eq!(frames.next().await.expect("encodes").expect("a frame").step.number, number);
+        }
+        assert_eq!(frames.next().await.expect_err("the end"), end);
+    }
+
+    #[tokio::test]
+    async fn no_more_frames_are_taken_than_were_asked_for() {
+        let (encoder, threads) = paused(4);
+        threads.add_permits(4);
+        let (viewer, feed) = feed(Delivery::Lossless);
+        let mut frames = EncodedFeed::new(feed, encoder, Format::Rgba, 1);
+        assert!(viewer.claim().deliver(Ok(noise(0, 4))) && viewer.claim().deliver(Ok(noise(1, 4))));
+        assert!(frames.next().await.expect("encodes").is_some());
+        assert!(frames.next().await.expect("the end").is_none());
+        assert!(!viewer.has_room() || viewer.claim().deliver(Ok(noise(2, 4))), "the second frame stays in the feed");
+    }
+}

@@ -1,0 +1,187 @@
+//! Frames as bytes for the wire: PNG or raw pixels. All streams share one encoder, which uses at most one thread per core.
+
+use std::num::NonZero;
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+use tokio::sync::{OnceCell, Semaphore};
+
+use super::blocking::run_blocking;
+use super::viewer::{Body, Shown, StepName};
+use crate::error::{Result, during};
+use crate::frame::{self, Legend};
+use crate::render::{Image, Paths, Survey};
+use crate::telemetry::{Stage, StageTimes, ms_since};
+
+/// How pixels travel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    Png,
+    /// RGBA8, top row first.
+    Rgba,
+    /// f32 a pixel: depth.
+    F32,
+    /// u32 a pixel: domains.
+    U32,
+    /// Three f32 a pixel: normals.
+    F32x3,
+}
+
+/// A step as bytes.
+#[derive(Debug, Clone)]
+pub struct Encoded {
+    pub step: StepName,
+    pub skipped: u64,
+    pub stages: StageTimes,
+    /// Of colours: who drew the frame.
+    pub paths: Paths,
+    pub bytes: Bytes,
+}
+
+/// Color pixels of one step, shared by all subscribers of the same view. Their PNG is made once, when the first asks for it.
+#[derive(Debug)]
+pub struct ColorFrame {
+    pub width: u32,
+    pub height: u32,
+    /// RGBA8 sRGB, top row first.
+    pub rgba: Bytes,
+    paths: Paths,
+    /// With the milliseconds that encoding took.
+    png: OnceCell<(Bytes, f64)>,
+}
+
+impl From<Image> for ColorFrame {
+    fn from(image: Image) -> Self {
+        let Image { width, height, rgba, paths, .. } = image;
+        Self { width, height, rgba: rgba.into(), paths, png: OnceCell::new() }
+    }
+}
+
+/// Encodes frames off the device thread. Clones share the limit on threads.
+#[derive(Debug, Clone)]
+pub struct FrameEncoder {
+    threads: Arc<Semaphore>,
+    cores: usize,
+}
+
+impl FrameEncoder {
+    /// An encoder for this machine: one thread per core.
+    pub(super) fn per_core() -> Self {
+        Self::new(std::thread::available_parallelism().map_or(1, NonZero::get))
+    }
+
+    fn new(cores: usize) -> Self {
+        Self { threads: Arc::new(Semaphore::new(cores)), cores }
+    }
+
+    /// How many frames are encoded at once.
+    pub(super) const fn cores(&self) -> usize {
+        self.cores
+    }
+
+    /// Encodes what a frame or a survey shows.
+    ///
+    /// # Errors
+    /// `Fault` when the PNG encoder refuses, or when `shown` is not a picture.
+    pub async fn encode(&self, shown: Shown, format: Format) -> Result<Encoded> {
+        let mut stages = shown.stages;
+        let mut paths = Paths::default();
+        let (bytes, ms) = match shown.body {
+            Body::Frame(frame) => {
+                paths = frame.paths;
+                match format {
+                    Format::Png => self.png(&frame).await.map(|(bytes, ms)| (bytes, Some(ms)))?,
+                    _ => (frame.rgba.clone(), None),
+                }
+            }
+            Body::Survey(survey, Some(legend)) => {
+                let map = move || color_map(&survey, &legend, format);
+                self.run(map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
+            }
+            Body::Survey(survey, None) => (survey.bytes.into(), None),
+            Body::Vertices(_) | Body::Picked(_) => return Err(during("encode")("it is not a picture")),
+        };
+        stages.extend(ms.map(|ms| (Stage::Encode, ms)));
+        Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, paths, bytes })
+    }
+
+    /// PNG of a frame and the milliseconds that encoding took; made by the first caller, and by the next one if that is
+    /// cancelled.
+    async fn png(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
+        let encode = || {
+            let frame = Arc::clone(frame);
+            self.run(move || frame::png(frame.width, frame.height, &frame.rgba))
+        };
+        frame.png.get_or_try_init(encode).await.cloned()
+    }
+
+    /// Runs work on a blocking thread once one of the cores is free; its bytes and milliseconds, waiting excluded.
+    async fn run(&self, work: impl FnOnce() -> Result<Vec<u8>> + Send + 'static) -> Result<(Bytes, f64)> {
+        let permit = Arc::clone(&self.threads).acquire_owned().await.map_err(during("encode"))?;
+        run_blocking("encode", move || {
+            let _permit = permit;
+            let begin = Instant::now();
+            work().map(|bytes| (bytes.into(), ms_since(begin)))
+        })
+        .await
+    }
+}
+
+fn color_map(survey: &Survey, legend: &Legend, format: Format) -> Result<Vec<u8>> {
+    let size = [survey.width, survey.height];
+    let rgba = frame::colour_map(&survey.bytes, survey.samples, size, legend)?;
+    if format == Format::Png { frame::png(size[0], size[1], &rgba) } else { Ok(rgba) }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// A frame of noise, so that its PNG takes time.
+    pub(in crate::engine) fn noise(number: u64, side: u32) -> Shown {
+        let mut random = fastrand::Rng::with_seed(number);
+        let rgba = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
+        let image = Image { width: side, height: side, rgba, passes: vec![], paths: Paths::default() };
+        let step = StepName { run: 1, number, time: 0.0 };
+        Shown { step, skipped: 0, stages: vec![], cells: None, body: Body::Frame(Arc::new(image.into())) }
+    }
+
+    /// An encoder of which the test decides when it may work.
+    pub(in crate::engine) fn paused(cores: usize) -> (FrameEncoder, Arc<Semaphore>) {
+        let encoder = FrameEncoder { threads: Arc::new(Semaphore::new(0)), cores };
+        let threads = Arc::clone(&encoder.threads);
+        (encoder, threads)
+    }
+
+    #[tokio::test]
+    async fn subscribers_share_one_png_and_raw_pixels() {
+        let encoder = FrameEncoder::new(2);
+        let shown = noise(1, 16);
+        let both = async |format| {
+            let (one, other) = (encoder.encode(shown.clone(), format), encoder.encode(shown.clone(), format));
+            let (one, other) = tokio::join!(one, other);
+            (one.expect("encodes"), other.expect("encodes"))
+        };
+        for format in [Format::Png, Format::Rgba] {
+            let (one, other) = both(format).await;
+            assert_eq!((one.bytes.as_ptr(), one.bytes.len()), (other.bytes.as_ptr(), other.bytes.len()), "{format:?}");
+            assert_eq!(one.stages, other.stages, "{format:?}");
+        }
+        let apart = encoder.encode(noise(1, 16), Format::Png).await.expect("encodes");
+        let (shared, _) = both(Format::Png).await;
+        assert_eq!(apart.bytes, shared.bytes);
+        assert_ne!(apart.bytes.as_ptr(), shared.bytes.as_ptr(), "control: another drawing has its own PNG");
+    }
+
+    #[tokio::test]
+    async fn cancelled_encoding_is_taken_over_by_the_next_subscriber() {
+        let (encoder, threads) = paused(1);
+        let shown = noise(2, 8);
+        let first = encoder.encode(shown.clone(), Format::Png);
+        tokio::time::timeout(std::time::Duration::from_millis(20), first).await.expect_err("no thread is free");
+        threads.add_permits(1);
+        let second = encoder.encode(shown, Format::Png).await.expect("encodes");
+        assert!(image::load_from_memory(&second.bytes).is_ok());
+    }
+}
