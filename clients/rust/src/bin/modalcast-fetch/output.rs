@@ -12,6 +12,8 @@ use crate::cli::SceneOptions;
 /// What a run of frames or vertices came to.
 pub(crate) struct Summary {
     start: Instant,
+    /// When the first and the newest reply were complete.
+    replies: Option<(Instant, Instant)>,
     steps: Vec<u64>,
     runs: Vec<u64>,
     bytes: u64,
@@ -21,11 +23,21 @@ pub(crate) struct Summary {
 
 impl Summary {
     pub(crate) fn new() -> Self {
-        Self { start: Instant::now(), steps: vec![], runs: vec![], bytes: 0, skipped: 0, stages: BTreeMap::new() }
+        Self {
+            start: Instant::now(),
+            replies: None,
+            steps: vec![],
+            runs: vec![],
+            bytes: 0,
+            skipped: 0,
+            stages: BTreeMap::new(),
+        }
     }
 
     /// Counts one reply.
     pub(crate) fn add(&mut self, step: (u64, u64), bytes: u64, skipped: u64, stages: &Stages) {
+        let now = Instant::now();
+        self.replies = Some((self.replies.map_or(now, |(first, _)| first), now));
         self.runs.push(step.0);
         self.steps.push(step.1);
         self.bytes += bytes;
@@ -35,8 +47,15 @@ impl Summary {
         }
     }
 
+    /// Replies per second from the first to the last, so that waiting for the first does not count; 0 of fewer than two.
+    fn rate(&self) -> f64 {
+        let seconds = self.replies.map_or(0.0, |(first, last)| (last - first).as_secs_f64());
+        if seconds > 0.0 { (self.steps.len() - 1) as f64 / seconds } else { 0.0 }
+    }
+
     /// Prints `what` (frames, steps), where they went, and the origin of vertices in metres.
     pub(crate) fn print(mut self, what: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
+        let rate = self.rate();
         let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
         let elapsed = self.start.elapsed().as_secs_f64();
         let count = self.steps.len();
@@ -44,7 +63,7 @@ impl Summary {
             let mut summary = json!({
                 what: count, "out": out.display().to_string(), "steps": self.steps, "runs": self.runs,
                 "bytes": self.bytes, "skipped": self.skipped, "elapsed_s": elapsed,
-                "per_second": count as f64 / elapsed.max(1e-9), "stages_ms": medians,
+                "per_second": rate, "stages_ms": medians,
             });
             if let Some(origin) = origin {
                 summary["origin"] = json!(origin);
@@ -52,7 +71,8 @@ impl Summary {
             println!("{summary}");
             return;
         }
-        println!("{count} {what}, {} bytes, {elapsed:.2} s, {} skipped: {}", self.bytes, self.skipped, out.display());
+        let (bytes, skipped) = (self.bytes, self.skipped);
+        println!("{count} {what}, {bytes} bytes, {elapsed:.2} s ({rate:.1}/s), {skipped} skipped: {}", out.display());
         for (stage, milliseconds) in medians {
             println!("  {stage:8} {milliseconds:8.3} ms (median)");
         }
@@ -141,6 +161,19 @@ fn scene_json(scene: &SceneInfo) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_rate_counts_from_the_first_reply_to_the_last() {
+        let mut summary = Summary::new();
+        assert_eq!(summary.rate(), 0.0);
+        for step in 0..3 {
+            summary.add((1, step), 8, 0, &vec![]);
+        }
+        let start = summary.start;
+        let after = |seconds| start + std::time::Duration::from_secs(seconds);
+        summary.replies = Some((after(60), after(64)));
+        assert_eq!(summary.rate(), 0.5);
+    }
 
     #[test]
     fn the_median_is_the_middle_and_none_is_zero() {
