@@ -48,10 +48,11 @@ impl Conductor {
             if copied && self.wants(&viewer).is_some_and(|own| wanted.covers(own)) {
                 let skipped = viewer.see(self.count);
                 readers.push((viewer.claim(), skipped));
-            } else if !(beside && self.begin_frame(&mut viewer, &mut frames))
-                && !self.serve(&mut viewer, holds_back, (wanted, &mut drawn)).await
-            {
-                continue;
+            } else {
+                let is_begun = beside && self.begin_frame(&mut viewer, &mut frames);
+                if !is_begun && !self.serve(&mut viewer, holds_back, (wanted, &mut drawn)).await {
+                    continue;
+                }
             }
             self.viewers.push(viewer);
         }
