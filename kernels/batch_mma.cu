@@ -7,7 +7,7 @@
 //              vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first what q
 //              is rounded to, then what that leaves, rounded likewise                                   (in)
 //   positions  [vertices][3] f32; domain b begins at vertex `first[b]`                                  (out)
-// Launch: a block of WARPS warps for each tile (src/gpu/trials/batch_mma.rs). CPU twin: the tests of that file.
+// Launch: a block of WARPS warps for each tile (src/compute/gpu/trials/batch_mma.rs). CPU twin: the tests of that file.
 //
 // Not the bits of `deform`: q keeps 22 bits (f16) or 16 (bf16), and a tensor core sums the 16 products of a step in an
 // order and with a rounding of its own. The launcher's bound has both. Nothing that overflows is computed again.
@@ -47,7 +47,7 @@ constexpr unsigned STEP_CHUNKS = 8;
 constexpr unsigned FOURS = 3 * QUADS;
 constexpr unsigned STRIDE = FOURS + 2;
 
-// Twin: src/gpu/trials/batch_mma.rs.
+// Twin: src/compute/gpu/trials/batch_mma.rs.
 struct BatchMmaArgs {
     const uint4* words;
     const float4* rest;
@@ -61,7 +61,7 @@ struct BatchMmaArgs {
     unsigned chunks;
     unsigned aligned; // whether every domain begins at 16 bytes
 };
-static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from src/gpu/trials/batch_mma.rs");
+static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from src/compute/gpu/trials/batch_mma.rs");
 
 #if __CUDA_ARCH__ >= 800
 __device__ __forceinline__ unsigned lane_of() {

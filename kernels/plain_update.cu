@@ -6,7 +6,7 @@
 //   u           f32, three per vertex of a domain with modes                                                     (in)
 //   positions   [vertices][3] f32                                                                                (out)
 // Launch: 256 threads a block, a thread a vertex.
-// CPU twin: the tests of src/gpu/trials/plain_update.rs.
+// CPU twin: the tests of src/compute/gpu/trials/plain_update.rs.
 constexpr unsigned BLOCK = 256;
 constexpr unsigned long long RIGID = 0xffffffffffffffffull;
 
@@ -15,7 +15,7 @@ struct PlainSlot {
     unsigned first;             // packed vertex
     unsigned reserved;
 };
-static_assert(sizeof(PlainSlot) == 16, "PlainSlot differs from src/gpu/trials/plain_update.rs");
+static_assert(sizeof(PlainSlot) == 16, "PlainSlot differs from src/compute/gpu/trials/plain_update.rs");
 
 struct PlainArgs {
     const PlainSlot* slots;
@@ -27,7 +27,7 @@ struct PlainArgs {
     unsigned vertices;
     unsigned reserved;
 };
-static_assert(sizeof(PlainArgs) == 56, "PlainArgs differs from src/gpu/trials/plain_update.rs");
+static_assert(sizeof(PlainArgs) == 56, "PlainArgs differs from src/compute/gpu/trials/plain_update.rs");
 
 extern "C" __global__ void __launch_bounds__(BLOCK) plain_update(const PlainArgs args) {
     const unsigned vertex = blockIdx.x * BLOCK + threadIdx.x;

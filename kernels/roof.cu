@@ -7,7 +7,7 @@
 //   nothing  at all
 // Launch of copy and read: BLOCK threads a block, LOADS words of 16 bytes a thread, as many blocks as the buffer has
 // tiles of BLOCK * LOADS words; buffers are whole tiles.
-// CPU twins: the tests of src/gpu/trials/roof.rs.
+// CPU twins: the tests of src/compute/gpu/trials/roof.rs.
 #ifndef LOADS
 #define LOADS 1
 #endif

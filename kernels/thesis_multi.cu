@@ -5,7 +5,7 @@
 //   q        float4 of coordinates of each domain                                                                (in)
 //   u        [vertices with modes] float4, the fourth number never written                                       (out)
 // Launch: 256 threads a block, a thread a lane; the lanes fill whole blocks. WIDTH is w_g.
-// CPU twin: the tests of src/gpu/trials/thesis/thesis_multi.rs.
+// CPU twin: the tests of src/compute/gpu/trials/thesis/thesis_multi.rs.
 #ifndef WIDTH
 #define WIDTH 8
 #endif

@@ -4,7 +4,7 @@
 //   u       [vertices] float4, the fourth number never written                                                   (out)
 // Launch: 256 threads a block, a warp a line, ceil(lines / 8) blocks. Rows of more than 32 fours (rank above 128, which
 // the text leaves open) take several passes, and so does equation 3.3.
-// CPU twin: the tests of src/gpu/trials/thesis/thesis_single.rs.
+// CPU twin: the tests of src/compute/gpu/trials/thesis/thesis_single.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
 constexpr unsigned LARGEST_RANK = 512;

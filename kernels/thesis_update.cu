@@ -8,7 +8,7 @@
 //   u           float4                                                                                           (in)
 //   positions, normals, tangents  [vertices] float4                                                              (out)
 // Launch: 256 threads a block, four threads a vertex, one number each; ceil(vertices / 64) blocks.
-// CPU twin: the tests of src/gpu/trials/thesis/thesis_update.rs.
+// CPU twin: the tests of src/compute/gpu/trials/thesis/thesis_update.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
 constexpr unsigned VERTICES = WARPS * LANES / 4; // of a block: n_vb
@@ -28,7 +28,7 @@ struct UpdateArgs {
     unsigned vertices;
     unsigned reserved;
 };
-static_assert(sizeof(UpdateArgs) == 88, "UpdateArgs differs from src/gpu/trials/thesis/thesis_update.rs");
+static_assert(sizeof(UpdateArgs) == 88, "UpdateArgs differs from src/compute/gpu/trials/thesis/thesis_update.rs");
 
 __device__ float product(const float* row, const float* rest) {
     return row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] * rest[3];

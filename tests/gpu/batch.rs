@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::domain::Transform;
-use modalcast::gpu::{BatchMma, Cache, Device, Extent, Launch, Ours, Trial, gigabytes_per_second, time};
-use modalcast::scene::{Batches, Deformation, Normals, Parts, Scene, State, Storage};
-use modalcast::storage::bound::{Reaches, Step};
-use modalcast::storage::{Products, QUAD, TILE_QUADS, Tiles};
+use modalcast_compute::gpu::{BatchMma, Cache, Device, Extent, Launch, Ours, Trial, gigabytes_per_second, time};
+use modalcast_compute::storage::bound::{Reaches, Step};
+use modalcast_compute::storage::{Products, QUAD, TILE_QUADS, Tiles};
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{Batches, Deformation, Normals, Parts, Scene, State, Storage};
 
 use crate::both::following::grove;
 use crate::both::readers::wrong_box;
@@ -95,7 +95,7 @@ fn gpu_blocks_with_several_tiles_have_the_bits_of_domains_apart() {
     for (storage, vertices) in [(Storage::F32, 1_100_007), (Storage::Int8, 1_100_007), (Storage::F16, 1_600_001)] {
         let name = format!("{} n {vertices}", storage.name());
         let scenes = both(|| ensemble((vertices, 5, 3), Deformation { boxes: true, ..stored(storage) }));
-        let blocks = modalcast::gpu::plan(&scenes[0]).kernel(Launch::Batch).expect("a batch").blocks as usize;
+        let blocks = modalcast_compute::gpu::plan(&scenes[0]).kernel(Launch::Batch).expect("a batch").blocks as usize;
         assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
         assert_eq!(differences(&name, &scenes), 0, "{name}");
     }
@@ -141,7 +141,7 @@ fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
     let tiles = Tiles::new(shape, storage);
     let (reaches, products) = (Reaches::new(shape, &tiles), Products::of(storage, tiles.rank()));
     let vertices = shape.mesh.rest().len();
-    let want = modalcast::reference::deform(scene, state);
+    let want = modalcast_compute::reference::deform(scene, state);
     let share = |(packed, got): (usize, &[f32; 3])| {
         let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));
         let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated: false };
@@ -269,7 +269,7 @@ fn gpu_scenes_that_choose_have_batches_where_they_pay() {
                 time(&device, &ours, Cache::Warm, 100).expect("times").median_us
             };
             let [batch, alone] = [&together, &apart].map(measured);
-            let chooses = modalcast::gpu::plan(&chosen).kernel(Launch::Batch).is_some();
+            let chooses = modalcast_compute::gpu::plan(&chosen).kernel(Launch::Batch).is_some();
             eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
             let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
             if own > 1.5 * other + 2.0 {

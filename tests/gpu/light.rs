@@ -1,8 +1,8 @@
 //! What vertices take up in light space, by `bounds`: against its twin tile by tile, and what it costs.
 
-use modalcast::deform::Deformer;
-use modalcast::gpu::{Cache, Device, Extent, Ours, Trial, time};
-use modalcast::scene::{Deformation, Scene, State};
+use modalcast_compute::gpu::{Cache, Device, Extent, Ours, Trial, time};
+use modalcast_model::deform::Deformer;
+use modalcast_model::scene::{Deformation, Scene, State};
 
 use crate::both::light::{self, TILE, along, beyond, coil, reach};
 use crate::both::scene_of;

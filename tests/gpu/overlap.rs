@@ -3,11 +3,11 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use modalcast::deform::{Deformer, Fetch, Surface, Wanted};
-use modalcast::domain::{Domain, Follow};
-use modalcast::error::Error;
-use modalcast::gpu::{CudaDeformer, Device, MOST_UNDER_WAY, host_writes, overlap};
-use modalcast::scene::{Deformation, Normals, Scene, State, Storage};
+use modalcast_compute::gpu::{CudaDeformer, Device, MOST_UNDER_WAY, host_writes, overlap};
+use modalcast_model::deform::{Deformer, Fetch, Surface, Wanted};
+use modalcast_model::domain::{Domain, Follow};
+use modalcast_model::error::Error;
+use modalcast_model::scene::{Deformation, Normals, Scene, State, Storage};
 
 use crate::both::readers::kept;
 use crate::both::{self, changes};
@@ -278,7 +278,7 @@ fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_ste
     for (step, state) in states.iter().enumerate() {
         deformer.deform(state).expect("deforms");
         let fetch = deformer.fetch(wanted).expect("begins");
-        assert!(fetch.is_there());
+        assert!(fetch.is_ready());
         if let Some((step, fetch)) = before.replace((step, fetch)) {
             let got = deformer.fetched(&fetch).expect("is there");
             let alone = Surface {

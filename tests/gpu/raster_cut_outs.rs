@@ -1,7 +1,7 @@
 //! Cut-outs on the device, whoever draws them, against the definition: the same bits where the filter has nothing to say,
 //! and away from the threshold where it has.
 
-use modalcast::gpu::{Device, Raster, RasterForm, RasterMesh, Spread, Trial as _};
+use modalcast_compute::gpu::{Device, Raster, RasterForm, RasterMesh, Spread, Trial as _};
 
 use crate::both::cut_outs::{Holes, floor, image, plain_holes, sheet};
 use crate::scenes::Random;
