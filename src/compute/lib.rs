@@ -6,3 +6,5 @@ pub mod cpu;
 pub mod gpu;
 pub mod reference;
 pub mod storage;
+#[cfg(any(test, feature = "testing"))]
+pub mod testing;

@@ -2,6 +2,7 @@
 //! of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
 
 pub(crate) mod changes;
+#[allow(dead_code, reason = "each test binary uses a part")]
 pub(crate) mod cut_outs;
 pub(crate) mod exact;
 pub(crate) mod extremes;

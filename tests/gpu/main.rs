@@ -5,6 +5,8 @@ mod batch;
 #[path = "../both/mod.rs"]
 mod both;
 mod device;
+#[expect(dead_code, reason = "shared with the benchmarks")]
+mod ensembles;
 mod extremes;
 mod gl;
 mod interop;
@@ -13,7 +15,6 @@ mod light;
 mod normals;
 mod overlap;
 mod paths;
-mod raster_cut_outs;
 mod raster_gl;
 mod real;
 mod scenes;

@@ -46,7 +46,9 @@ fn module_of(path: &Path) -> Option<(String, String)> {
     let tier = names.next_if(|name| TIERS.contains(&name.as_str()));
     let package = tier.map_or("modalcast".to_owned(), |tier| format!("modalcast-{tier}"));
     let module = names.next().expect("a name").trim_end_matches(".rs").to_owned();
-    (module != "lib" && module != "main").then_some((package, module))
+    let is_root = module == "lib" || module == "main";
+    // Test support is compiled for tests only and may use everything.
+    (!is_root && module != "testing").then_some((package, module))
 }
 
 /// Every module that a text names as `crate::name` or in `crate::{...}`, outside its comments.
@@ -202,13 +204,18 @@ fn a_twin_elsewhere_is_missed_when_its_method_is_or_when_the_kernel_does_not_nam
 
 #[test]
 fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
-    let kernels = files(&root().join("kernels"), &["cu"]);
-    assert!(!kernels.is_empty());
-    let launchers = files(&root().join("src/compute/gpu"), &["rs"]);
-    for kernel in kernels {
+    // The server's kernels, then those of the benchmarks.
+    let mut pairs = Vec::new();
+    for (kernels, launchers) in [("kernels", "src/compute/gpu"), ("tests/bench/kernels", "tests/bench/src/kernels")] {
+        let found = files(&root().join(kernels), &["cu"]);
+        assert!(!found.is_empty(), "{kernels}");
+        pairs.extend(found.into_iter().map(|kernel| (kernel, launchers)));
+    }
+    for (kernel, folder) in pairs {
         let name = kernel.file_stem().expect("a name").to_string_lossy().into_owned();
+        let launchers = files(&root().join(folder), &["rs"]);
         let launcher = launchers.iter().find(|path| path.file_stem().is_some_and(|stem| *stem == *name));
-        let launcher = launcher.unwrap_or_else(|| panic!("{name} has no launcher below src/compute/gpu"));
+        let launcher = launcher.unwrap_or_else(|| panic!("{name} has no launcher below {folder}"));
         if is_walked_in_tests(&name) {
             let text = fs::read_to_string(launcher).expect("a file");
             assert!(text.contains("    fn twin_of_"), "{} has no twin of {name}", launcher.display());

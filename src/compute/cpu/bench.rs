@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use super::*;
-use crate::storage::testing::{Noise, scene};
+use crate::testing::{Noise, scene};
 use modalcast_model::scene::{Deformation, Storage};
 
 /// The median time of a step, of at least 15 with other coordinates each, in seconds.

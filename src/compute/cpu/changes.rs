@@ -73,7 +73,7 @@ impl Changes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::storage::testing::{Noise, scene};
+    use crate::testing::{Noise, scene};
 
     #[test]
     fn only_domains_whose_numbers_changed_are_named() {

@@ -243,7 +243,7 @@ fn split<const N: usize>(columns: &Columns, length: usize) -> [&[f32]; N] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::storage::testing::{Noise, with_columns};
+    use crate::testing::{Noise, with_columns};
     use modalcast_model::domain::Shape;
 
     /// The chains of one tile of f32.

@@ -15,7 +15,7 @@ const MOST: usize = 4;
 
 /// The kernel, and what writes the lists that it reads over the bus.
 #[derive(Debug)]
-pub(super) struct Apply {
+pub struct Apply {
     function: CudaFunction,
     config: LaunchConfig,
     /// Entries.
@@ -31,7 +31,7 @@ pub(super) type List = PinnedHostSlice<u32>;
 
 /// How long the lists of a step are.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Lengths {
+pub struct Lengths {
     pub changed: u32,
     pub stale: u32,
 }
@@ -63,7 +63,7 @@ fn is_silent(scene: &Scene, domain: usize) -> bool {
 }
 
 impl Apply {
-    pub(super) fn new(device: &Device, packing: &Packing, kernel: &Kernel) -> Result<Self> {
+    pub fn new(device: &Device, packing: &Packing, kernel: &Kernel) -> Result<Self> {
         let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
         Ok(Self {
             function,
@@ -76,7 +76,7 @@ impl Apply {
     }
 
     /// Room for the lists of a step.
-    pub(super) fn list(&self, device: &Device) -> Result<List> {
+    pub fn list(&self, device: &Device) -> Result<List> {
         let words = (CHANGE + TRANSFORM) * self.most + self.coordinates + self.named.len();
         let flags = sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP;
         // SAFETY: the kernel reads only what `write` wrote.
@@ -85,7 +85,7 @@ impl Apply {
 
     /// Writes the lists of a step that changes some domains, into an output that lacks others besides; the caller has
     /// waited for the last launch with `list`. None when there are too many changes for it, or a whole step is less work.
-    pub(super) fn write(
+    pub fn write(
         &mut self,
         list: &mut List,
         packing: &Packing,
@@ -140,7 +140,7 @@ impl Apply {
     }
 
     /// Starts the kernel; the header among the values says how long the lists are. That of tiles goes to `tiles`.
-    pub(super) fn launch(&self, device: &Device, list: &mut List, values: Values, tiles: u64) -> Result<()> {
+    pub fn launch(&self, device: &Device, list: &mut List, values: Values, tiles: u64) -> Result<()> {
         let fail = during("apply");
         let list = list.as_mut_ptr().map_err(&fail)? as u64;
         let new_transforms = list + 4 * (CHANGE * self.most) as u64;

@@ -25,7 +25,7 @@ const VECTOR: usize = 64;
 /// The kernel and its work.
 #[derive(Debug)]
 pub(super) struct Batch {
-    pub(super) function: CudaFunction,
+    pub function: CudaFunction,
     config: LaunchConfig,
     blocks: CudaSlice<u8>,
     groups: CudaSlice<u8>,
@@ -130,8 +130,6 @@ fn shared_bytes(batched: &Batched, defines: &[&str]) -> usize {
 
 #[cfg(test)]
 mod warp;
-#[cfg(test)]
-pub(super) use warp::placed;
 
 #[cfg(test)]
 mod tests {
@@ -139,23 +137,23 @@ mod tests {
 
     use super::super::pack::tests::alike;
     use super::super::plan::{Role, plan};
-    use super::super::trials::tests::{Random, scene as trial_scene};
     use super::super::work::{Coordinates, Work};
     use super::warp::{Tables, Warp};
     use super::*;
+    use crate::testing::{Noise, scene_and_state, transformed_axis};
     use modalcast_model::scene::{Batches, Deformation, Parts, State, Storage};
 
     /// Shapes of so many vertices and modes, each used by `instances` domains, and a state of them.
     fn ensemble(storage: Storage, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, State) {
-        let one = trial_scene(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
+        let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
         let mut parts = Parts::named("ensemble");
         (parts.shapes, parts.materials) = (one.shapes.clone(), one.materials.clone());
         parts.deformation = Deformation { storage, batches: Batches::Always, ..Deformation::default() };
         parts.domains = (0..instances * shapes.len()).map(|at| one.domains[at % shapes.len()].clone()).collect();
         let scene = Scene::new(parts).expect("a scene");
-        let (mut random, mut state) = (Random(instances as u64), State::rest(&scene));
-        state.q.iter_mut().for_each(|coordinate| *coordinate = random.number());
-        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.number()));
+        let (mut random, mut state) = (Noise(instances as u64), State::rest(&scene));
+        state.q.iter_mut().for_each(|coordinate| *coordinate = random.next());
+        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.next()));
         (scene, state)
     }
 
@@ -184,7 +182,7 @@ mod tests {
             let entry = |(mode, q): (usize, &f32)| (shape.modes.at(vertex, axis, mode), *q);
             rest[axis] + q.iter().enumerate().map(entry).fold(0.0_f32, |sum, (entry, q)| entry.mul_add(q, sum))
         });
-        [0, 1, 2].map(|row| placed(&state.transforms[domain].0[4 * row..], bent))
+        [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], bent))
     }
 
     /// Shapes, and how many domains each has.

@@ -16,8 +16,8 @@ use modalcast_model::scene::{LightBounds, Scene};
 
 /// The kernel.
 #[derive(Debug)]
-pub(super) struct Bounds {
-    pub(super) function: CudaFunction,
+pub struct Bounds {
+    pub function: CudaFunction,
     config: LaunchConfig,
     /// The axes of light space, of a scene with a shadow.
     light: Option<[Vector3<f64>; 3]>,
@@ -27,7 +27,7 @@ pub(super) struct Bounds {
 
 impl Bounds {
     /// With `pieces`, a box of each domain is made too.
-    pub(super) fn new(device: &Device, scene: &Scene, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
+    pub fn new(device: &Device, scene: &Scene, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
         Ok(Self {
             function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
             config: config(kernel),
@@ -42,7 +42,7 @@ impl Bounds {
     }
 
     /// Starts the kernel on `count` boxes; the result goes into the header among the values.
-    pub(super) fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
+    pub fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
         let (pieces, piece_boxes, piece_count) = self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
         let Values { header, stamps, .. } = values;
         let args = BoundsArgs {

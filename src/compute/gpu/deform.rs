@@ -25,7 +25,7 @@ const PIECE: usize = 1 << 22;
 
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
-pub(super) struct Deform {
+pub struct Deform {
     function: CudaFunction,
     config: LaunchConfig,
     /// For the domains whose U is read once for several of them.
@@ -56,7 +56,7 @@ pub(super) struct Deform {
 
 impl Deform {
     /// Packs what the tables name onto the device. `batch` is the kernel of scenes with batches.
-    pub(super) fn new(
+    pub fn new(
         device: &Device,
         scene: &Arc<Scene>,
         (kernel, batch): (&Kernel, Option<&Kernel>),
@@ -106,33 +106,33 @@ impl Deform {
     }
 
     /// How coordinates are to be laid out for it.
-    pub(super) const fn packing(&self) -> &Arc<Packing> {
+    pub const fn packing(&self) -> &Arc<Packing> {
         &self.packing
     }
 
     /// What boxes of domains are made of, where the scene keeps them.
-    pub(super) fn pieces(&self) -> Option<&[Piece]> {
+    pub fn pieces(&self) -> Option<&[Piece]> {
         self.pieces.as_deref()
     }
 
     /// The address of its boxes, and how many there are.
-    pub(super) fn boxes(&self, device: &Device) -> (u64, u32) {
+    pub fn boxes(&self, device: &Device) -> (u64, u32) {
         (address(device, &self.boxes), 4 * self.count)
     }
 
     /// Where `apply` puts the list of tiles.
-    pub(super) fn list(&self, device: &Device) -> u64 {
+    pub fn list(&self, device: &Device) -> u64 {
         address(device, &self.list)
     }
 
     /// What a whole step launches.
-    pub(super) fn kernels(&self) -> Vec<(&'static str, &CudaFunction)> {
+    pub fn kernels(&self) -> Vec<(&'static str, &CudaFunction)> {
         let batch = self.batch.as_ref().map(|batch| ("batch", &batch.function));
         batch.into_iter().chain((self.launched > 0).then_some(("deform", &self.function))).collect()
     }
 
     /// Starts the kernels of a whole step; the header among the values says where everything goes.
-    pub(super) fn launch(&self, device: &Device, values: Values) -> Result<()> {
+    pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
         if let Some(batch) = &self.batch {
             let [words, rest, scales, boxes] =
                 [&self.words, &self.rest, &self.scales, &self.boxes].map(|buffer| address(device, buffer));
@@ -146,7 +146,7 @@ impl Deform {
     }
 
     /// Starts it on the tiles of the list, as many as the header says.
-    pub(super) fn launch_listed(&self, device: &Device, values: Values) -> Result<()> {
+    pub fn launch_listed(&self, device: &Device, values: Values) -> Result<()> {
         let grid_dim = ((4 * self.count).min(LISTED_BLOCKS), 1, 1);
         let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
         let missing = || Error::Fault { stage: "deform", reason: "the scene has no lists".into() };

@@ -82,11 +82,11 @@ impl Device {
         fits_driver(nvrtc()?.version, driver_version()?)
     }
 
-    pub(super) const fn context(&self) -> &Arc<CudaContext> {
+    pub const fn context(&self) -> &Arc<CudaContext> {
         &self.context
     }
 
-    pub(super) const fn stream(&self) -> &Arc<CudaStream> {
+    pub const fn stream(&self) -> &Arc<CudaStream> {
         &self.stream
     }
 
@@ -94,7 +94,7 @@ impl Device {
     ///
     /// # Errors
     /// `Unavailable` when NVRTC is missing or does not fit the driver; `Fault` when compiling or loading fails.
-    pub(super) fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
+    pub fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
         let module = self.module(name, source, defines)?;
         module.load_function(name).map_err(during("load kernel"))
     }

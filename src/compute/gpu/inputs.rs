@@ -22,7 +22,7 @@ use modalcast_model::scene::{Scene, State};
 
 /// What decides how a scene's coordinates lie on the device.
 #[derive(Debug)]
-pub(super) struct Packing {
+pub struct Packing {
     pub scene: Arc<Scene>,
     pub coordinates: Coordinates,
     /// Per shape the factors of its modes; empty lists unless the storage has factors.
@@ -32,7 +32,7 @@ pub(super) struct Packing {
 
 /// What lists of changed domains name.
 #[derive(Debug, Default)]
-pub(super) struct Listing {
+pub struct Listing {
     /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
     pub spans: Vec<[(u32, u32); 2]>,
     /// Tiles of all.
@@ -43,7 +43,7 @@ pub(super) struct Listing {
 
 /// Device addresses of a step's values.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Values {
+pub struct Values {
     pub header: u64,
     pub transforms: u64,
     /// Constant: who follows whom, and by which frame. Of a scene with followers.
@@ -85,7 +85,7 @@ impl Sizes {
 
 /// Where the values of a step lie on the device, and what writes them.
 #[derive(Debug)]
-pub(super) struct Inputs {
+pub struct Inputs {
     writer: Writer,
     buffer: CudaSlice<u8>,
     stamps: CudaSlice<u8>,
@@ -95,10 +95,10 @@ pub(super) struct Inputs {
 }
 
 /// Pinned memory for the values of one step on their way.
-pub(super) type Pinned = PinnedHostSlice<f32>;
+pub type Pinned = PinnedHostSlice<f32>;
 
 impl Inputs {
-    pub(super) fn new(device: &Device, packing: &Arc<Packing>) -> Result<Self> {
+    pub fn new(device: &Device, packing: &Arc<Packing>) -> Result<Self> {
         let sizes = Sizes::of(&packing.scene, &packing.coordinates);
         Ok(Self {
             writer: Writer::new(packing),
@@ -111,12 +111,12 @@ impl Inputs {
     }
 
     /// Room for the values of a step.
-    pub(super) fn pinned(&self, device: &Device) -> Result<Pinned> {
+    pub fn pinned(&self, device: &Device) -> Result<Pinned> {
         // SAFETY: the memory is written whole before it is first read, in `write`.
         unsafe { device.context().alloc_pinned(self.sizes.total() as usize / 4) }.map_err(during("allocate"))
     }
 
-    pub(super) fn values(&self, device: &Device) -> Values {
+    pub fn values(&self, device: &Device) -> Values {
         let header = address(device, &self.buffer);
         let transforms = header + size_of::<Header>() as u64;
         let q = transforms + self.sizes.transforms;
@@ -128,7 +128,7 @@ impl Inputs {
     }
 
     /// Writes a whole step. Nothing may be reading the pinned memory: the caller has waited for its last copy.
-    pub(super) fn write(&mut self, to: &mut Pinned, header: &Header, state: &State) -> Result<()> {
+    pub fn write(&mut self, to: &mut Pinned, header: &Header, state: &State) -> Result<()> {
         self.writer.write(to.as_mut_slice().map_err(during("upload"))?, header, state);
         Ok(())
     }
@@ -140,7 +140,7 @@ impl Inputs {
     }
 
     /// Starts the copy of the first `bytes`; the whole when `None`.
-    pub(super) fn send(&self, device: &Device, from: &mut Pinned, bytes: Option<usize>) -> Result<()> {
+    pub fn send(&self, device: &Device, from: &mut Pinned, bytes: Option<usize>) -> Result<()> {
         let fail = during("upload");
         let (to, host) = (address(device, &self.buffer), from.as_mut_slice().map_err(&fail)?);
         let bytes = bytes.unwrap_or(size_of_val(host));
@@ -154,12 +154,12 @@ impl Inputs {
     }
 
     /// Bytes that a whole step copies.
-    pub(super) const fn bytes(&self) -> u64 {
+    pub const fn bytes(&self) -> u64 {
         self.sizes.total()
     }
 
     /// Chunks of modes that each domain sums at the last step; `None` when it sums all.
-    pub(super) fn kept_chunks(&self) -> Option<&[u32]> {
+    pub fn kept_chunks(&self) -> Option<&[u32]> {
         self.writer.truncation.as_ref().map(|choice| choice.counts.as_slice())
     }
 
@@ -171,19 +171,19 @@ impl Inputs {
 
 /// Writes the values of steps, in the order of their parts. Pure.
 #[derive(Debug)]
-pub(super) struct Writer {
+pub struct Writer {
     packing: Arc<Packing>,
     truncation: Option<Choice>,
 }
 
 impl Writer {
-    pub(super) fn new(packing: &Arc<Packing>) -> Self {
+    pub fn new(packing: &Arc<Packing>) -> Self {
         let truncation = packing.scene.needs.truncation.then(|| Choice::new(&packing.scene));
         Self { packing: Arc::clone(packing), truncation }
     }
 
     /// Writes a whole step; `to` has the words of [`Sizes::total`].
-    pub(super) fn write(&mut self, to: &mut [f32], header: &Header, state: &State) {
+    pub fn write(&mut self, to: &mut [f32], header: &Header, state: &State) {
         let mut to = Front::new(to);
         to.put(std::slice::from_ref(header));
         to.put(&state.transforms);

@@ -27,7 +27,7 @@ pub(super) const TILE_CORNERS: u8 = 16;
 /// The start of a step's inputs; pointers are device addresses.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Header {
+pub struct Header {
     pub positions: u64,
     pub normals: u64,
     pub tangents: u64,
@@ -164,7 +164,7 @@ pub(super) struct BatchArgs {
 /// A part of a domain of which `bounds` makes a box.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Piece {
+pub struct Piece {
     pub first: u32,
     pub count: u32,
     pub domain: u32,

@@ -10,21 +10,21 @@ use super::device::Device;
 use modalcast_model::error::{Result, during};
 
 /// Bytes on the device, zeroed.
-pub(super) fn room(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
+pub fn room(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
     // The driver refuses to allocate nothing, and a kernel that reads nothing still wants an address.
     let bytes = usize::try_from(bytes.max(16)).map_err(during("allocate"))?;
     device.stream().alloc_zeros(bytes).map_err(during("allocate"))
 }
 
 /// A new device buffer that holds a list.
-pub(super) fn upload<T: Pod>(device: &Device, list: &[T]) -> Result<CudaSlice<u8>> {
+pub fn upload<T: Pod>(device: &Device, list: &[T]) -> Result<CudaSlice<u8>> {
     let mut buffer = room(device, size_of_val(list) as u64)?;
     device.stream().memcpy_htod(bytemuck::cast_slice::<T, u8>(list), &mut buffer).map_err(during("upload"))?;
     Ok(buffer)
 }
 
 /// The address of a buffer on the device. All use of it is on the device's one stream.
-pub(super) fn address(device: &Device, buffer: &CudaSlice<u8>) -> u64 {
+pub fn address(device: &Device, buffer: &CudaSlice<u8>) -> u64 {
     buffer.device_ptr(device.stream()).0
 }
 
@@ -32,7 +32,7 @@ pub(super) fn address(device: &Device, buffer: &CudaSlice<u8>) -> u64 {
 ///
 /// # Safety
 /// `from` is the address of at least as many bytes of device memory as `to` has.
-pub(super) unsafe fn download<T: Pod>(device: &Device, from: u64, to: &mut [T]) -> Result<()> {
+pub unsafe fn download<T: Pod>(device: &Device, from: u64, to: &mut [T]) -> Result<()> {
     if to.is_empty() {
         return Ok(());
     }

@@ -26,36 +26,36 @@
 //! | `raster` | triangles to samples in OpenGL's buffers, beside OpenGL's own rasteriser |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
 //! | `probe`, `report` | what is there, and whether the device agrees on layouts |
-//! | `trials` | what only measures |
 
-mod apply;
+pub mod apply;
 mod batch;
-mod bounds;
+pub mod bounds;
 mod boxes;
 mod chain;
 mod compile;
-mod deform;
+pub mod deform;
 mod deformer;
 mod device;
 mod fetch;
 mod flight;
-mod inputs;
+pub mod inputs;
 mod interop;
-mod layout;
-mod memory;
-mod normals;
+pub mod layout;
+pub mod memory;
+pub mod normals;
 mod output;
 mod pack;
-mod plan;
+pub mod plan;
 mod probe;
-mod raster;
+pub mod raster;
 mod report;
 mod rings;
 mod rotation;
-mod staging;
-mod trials;
-mod work;
+pub mod staging;
+pub mod work;
 
+#[cfg(any(test, feature = "testing"))]
+pub use compile::{Assembled, assert_compiles};
 pub use deformer::{CudaDeformer, MOST_UNDER_WAY};
 pub use device::Device;
 pub use layout::{Agreement, agreements};
@@ -63,12 +63,6 @@ pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use raster::{GlRaster, RasterForm, Spread};
 pub use report::device_values;
-pub use trials::{
-    BatchMma, Cache, Cublas, Extent, HostWrite, KernelFacts, Lanes, Ours, Overlap, Part, Peer, Raster, RasterCounts,
-    RasterMesh, Roofs, Split, Thesis, Timing, Trial, cublas_version, empty_replay, gigabytes_per_second, host_writes,
-    idle_in_warp, ingest, lanes, overlap, roofs, time,
-};
-
 /// OpenGL buffers to write into, by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GlBuffers {

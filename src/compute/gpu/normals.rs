@@ -16,8 +16,8 @@ use modalcast_model::scene::Scene;
 
 /// The kernel and what it reads of a scene.
 #[derive(Debug)]
-pub(super) struct Normals {
-    pub(super) function: CudaFunction,
+pub struct Normals {
+    pub function: CudaFunction,
     config: LaunchConfig,
     slots: CudaSlice<u8>,
     first_domains: CudaSlice<u8>,
@@ -33,7 +33,7 @@ pub(super) struct Normals {
 }
 
 impl Normals {
-    pub(super) fn new(device: &Device, scene: &Scene, kernel: &Kernel) -> Result<Self> {
+    pub fn new(device: &Device, scene: &Scene, kernel: &Kernel) -> Result<Self> {
         let slots = rings::slots(scene);
         let firsts = pack::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners);
         let tangents = || upload(device, &pack::rest_tangents(scene));
@@ -57,7 +57,7 @@ impl Normals {
 
     /// Starts the kernel, behind the one that writes the positions; the header among the values says where they lie and
     /// where normals and tangents go.
-    pub(super) fn launch(&self, device: &Device, values: Values) -> Result<()> {
+    pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
         let args = NormalsArgs {
             header: values.header,
             slots: address(device, &self.slots),

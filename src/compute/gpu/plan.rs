@@ -178,15 +178,15 @@ pub struct Plan {
 
 /// Where everything lies: made once, planned from and then uploaded.
 #[derive(Debug)]
-pub(super) struct Tables {
-    pub coordinates: Coordinates,
-    pub work: Work,
+pub struct Tables {
+    pub(super) coordinates: Coordinates,
+    pub(super) work: Work,
     /// The parts of domains that boxes are made of.
-    pub pieces: Vec<Piece>,
+    pub(super) pieces: Vec<Piece>,
 }
 
 impl Tables {
-    pub(super) fn new(scene: &Scene) -> Self {
+    pub fn new(scene: &Scene) -> Self {
         let coordinates = Coordinates::new(scene);
         let work = Work::new(scene, &coordinates);
         Self { pieces: boxes::pieces(scene, &work), work, coordinates }
@@ -199,7 +199,7 @@ pub fn plan(scene: &Scene) -> Plan {
 }
 
 /// The same from tables that are there.
-pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tables) -> Plan {
+pub fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tables) -> Plan {
     let needs = scene.needs;
     let layout = &scene.layout;
     let kernels = kernels(scene, work, pieces);
@@ -270,7 +270,7 @@ pub(super) fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tabl
 }
 
 /// The macro of a storage type.
-pub(super) const fn storage_define(storage: Storage) -> Option<&'static str> {
+pub const fn storage_define(storage: Storage) -> Option<&'static str> {
     match storage {
         Storage::F32 => None,
         Storage::F16 => Some(STORAGES[0]),
@@ -402,7 +402,7 @@ impl Plan {
     }
 
     /// The kernel of a launch that every scene has.
-    pub(super) fn needed(&self, launch: Launch) -> Result<&Kernel> {
+    pub fn needed(&self, launch: Launch) -> Result<&Kernel> {
         let missing = || Error::Fault { stage: "plan", reason: format!("no kernel for {launch:?}") };
         self.kernel(launch).ok_or_else(missing)
     }

@@ -21,7 +21,7 @@ use bytemuck::{Pod, Zeroable};
 use cudarc::driver::sys::{self, CUdevice_attribute};
 use cudarc::driver::{CudaFunction, CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-pub(super) use self::check::{check, check_cut_outs};
+pub use self::check::{check, check_cut_outs};
 use self::cut_out::Cut;
 pub(super) use self::form::{FUNCTIONS, SOURCE, WHOLE};
 pub use self::form::{RasterForm, Spread};
@@ -84,7 +84,7 @@ const LARGE: u64 = 16;
 
 /// The compiled kernels of one form.
 #[derive(Debug)]
-pub(super) struct Functions {
+pub struct Functions {
     form: RasterForm,
     raster: CudaFunction,
     /// Where there are cut-outs.
@@ -98,7 +98,7 @@ impl Functions {
     ///
     /// # Errors
     /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
-    pub(super) fn new(device: &Device, form: RasterForm, cut: bool) -> Result<Self> {
+    pub fn new(device: &Device, form: RasterForm, cut: bool) -> Result<Self> {
         let names: &[&str] = if cut { &FUNCTIONS } else { &WHOLE };
         let mut list = device.functions(names, SOURCE, &form.defines(cut))?.into_iter();
         let mut next = || list.next().ok_or_else(|| during("load kernel")("a function is missing"));
@@ -112,7 +112,7 @@ impl Functions {
     }
 
     /// Each with its name.
-    pub(super) fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
+    pub fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
         let list = [Some(&self.raster), self.raster_cut.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
         FUNCTIONS.into_iter().zip(list).filter_map(|(name, function)| function.map(|function| (name, function)))
     }
@@ -121,7 +121,7 @@ impl Functions {
 /// What is drawn where, once: addresses on the device, of as many vertices as [`check`] was told and of a sample for each
 /// pixel.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Pass<'a> {
+pub struct Pass<'a> {
     pub functions: &'a Functions,
     pub groups: &'a [Group],
     pub window: &'a Window,
@@ -131,7 +131,7 @@ pub(super) struct Pass<'a> {
 
 /// A mesh's triangles on the device, and the queues for them.
 #[derive(Debug)]
-pub(super) struct Core {
+pub struct Core {
     triangles: CudaSlice<u8>,
     medium: CudaSlice<u8>,
     large: CudaSlice<u8>,
@@ -146,7 +146,7 @@ impl Core {
     ///
     /// # Errors
     /// `Fault` when the device refuses.
-    pub(super) fn new(device: &Device, triangles: &[[u32; 3]], cut_outs: Option<&CutOuts>) -> Result<Self> {
+    pub fn new(device: &Device, triangles: &[[u32; 3]], cut_outs: Option<&CutOuts>) -> Result<Self> {
         let units = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT);
         let units = u32::try_from(units.map_err(during("device"))?).unwrap_or(1);
         let count = triangles.len() as u64;
@@ -161,7 +161,7 @@ impl Core {
     }
 
     /// Whether its passes need functions with cut-outs.
-    pub(super) const fn is_cut(&self) -> bool {
+    pub const fn is_cut(&self) -> bool {
         self.cut.is_some()
     }
 
@@ -169,7 +169,7 @@ impl Core {
     ///
     /// # Errors
     /// `Fault` when the device refuses.
-    pub(super) fn draw(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
+    pub fn draw(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
         self.clear(device, pass)?;
         let (args, functions) = (self.args(device, pass), pass.functions);
         for group in pass.groups {
@@ -187,7 +187,7 @@ impl Core {
     }
 
     /// Launches of a pass over these groups.
-    pub(super) fn launches(&self, groups: &[Group]) -> usize {
+    pub fn launches(&self, groups: &[Group]) -> usize {
         let of_group = |group: &Group| {
             let (whole, cut) = self.split(*group);
             usize::from(whole.triangles > 0) + usize::from(cut.triangles > 0)
@@ -207,7 +207,7 @@ impl Core {
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    pub(super) fn counts(&self, device: &Device) -> Result<[u32; 8]> {
+    pub fn counts(&self, device: &Device) -> Result<[u32; 8]> {
         let mut tally = [Tally::zeroed()];
         // SAFETY: the buffer is one tally.
         unsafe { download(device, address(device, &self.tally), &mut tally) }?;

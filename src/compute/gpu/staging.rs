@@ -6,7 +6,7 @@ use bytemuck::Pod;
 use rayon::prelude::*;
 
 /// Bytes from which several cores write. `report deform` measures both ways on either side of it (`host_writes`).
-pub(super) const PARALLEL: usize = 1 << 20;
+pub const PARALLEL: usize = 1 << 20;
 /// Words of one core's part: long runs, of which there are enough for many cores.
 const PART: usize = 1 << 15;
 
@@ -37,7 +37,7 @@ fn copy(to: &mut [f32], from: &[f32]) {
 }
 
 /// Copies part by part; both lists have one length.
-pub(super) fn copy_on_all_cores(to: &mut [f32], from: &[f32]) {
+pub fn copy_on_all_cores(to: &mut [f32], from: &[f32]) {
     to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| to.copy_from_slice(from));
 }
 

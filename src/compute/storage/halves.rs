@@ -110,7 +110,7 @@ fn value(bits: u16, storage: Storage) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::storage::testing::Noise;
+    use crate::testing::Noise;
 
     #[test]
     fn two_halves_keep_what_they_promise_at_every_size_and_one_half_does_not() {

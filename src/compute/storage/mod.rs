@@ -13,8 +13,6 @@
 pub mod bound;
 mod halves;
 mod pack;
-#[cfg(test)]
-pub(crate) mod testing;
 mod tiles;
 mod truncation;
 

@@ -170,7 +170,7 @@ impl Tiles {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::storage::testing::{Noise, shape};
+    use crate::testing::{Noise, shape};
 
     const SIZES: [(usize, usize); 12] = [
         (1, 1),

@@ -109,7 +109,7 @@ impl Truncation {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::storage::testing::{Noise, shape};
+    use crate::testing::{Noise, shape};
     use modalcast_model::domain::Shape;
 
     fn decide(truncation: &mut Truncation, q: &[f32], reaches: &[f64], budget: f64) {

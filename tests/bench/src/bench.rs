@@ -7,10 +7,11 @@ use serde::Serialize;
 use super::Ingest;
 use super::ingredients::Stock;
 use super::loads::Load;
-use super::trials;
+use super::offers;
 use super::variant::{Driven, Label, Variant};
+use crate::kernels;
 use modalcast_compute::cpu::{CpuDeformer, read_rate};
-use modalcast_compute::gpu::{self, CudaDeformer, Device};
+use modalcast_compute::gpu::{CudaDeformer, Device};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
@@ -52,12 +53,12 @@ pub trait Bench {
     }
 
     /// Steps whose vertices the host reads, one after the other and side by side; an error says why there is no answer.
-    fn overlap(&self, _load: &Load, _states: &[State], _steps: usize) -> Option<Result<gpu::Overlap>> {
+    fn overlap(&self, _load: &Load, _states: &[State], _steps: usize) -> Option<Result<kernels::Overlap>> {
         None
     }
 
     /// How fast this machine's cores write what goes to the CUDA device.
-    fn host_writes(&self, _replays: usize) -> Vec<gpu::HostWrite> {
+    fn host_writes(&self, _replays: usize) -> Vec<kernels::HostWrite> {
         Vec::new()
     }
 
@@ -90,7 +91,8 @@ impl Machine {
     pub fn open() -> Self {
         let usable = |device: Arc<Device>| {
             device.check_compiler()?;
-            let gpu::Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs } = gpu::roofs(&device)?;
+            let kernels::Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs } =
+                kernels::roofs(&device)?;
             let [copy_gbs, read_gbs, empty_us] = [copy_gbs, read_gbs, empty_us].map(Some);
             let [pinned_h2d_gbs, pinned_d2h_gbs] = [pinned_h2d_gbs, pinned_d2h_gbs].map(Some);
             Ok((device, Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs }))
@@ -131,11 +133,11 @@ impl Bench for Machine {
             if let Some(exact) = exact_normals(scene) {
                 offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            for (name, short) in shortcuts(scene).into_iter().filter(|(_, short)| trials::is_summed_otherwise(short)) {
+            for (name, short) in shortcuts(scene).into_iter().filter(|(_, short)| offers::is_summed_otherwise(short)) {
                 offers.push(driven(&format!("cuda {name} step"), Backend::Cuda, short, &cuda));
-                offers.push(trials::positions(device, &stock, wanted, (format!("cuda {name} positions"), short)));
+                offers.push(offers::positions(device, &stock, wanted, (format!("cuda {name} positions"), short)));
             }
-            offers.extend(trials::trials(device, &stock, scene, wanted));
+            offers.extend(offers::trials(device, &stock, scene, wanted));
         }
         offers
     }
@@ -146,17 +148,17 @@ impl Bench for Machine {
 
     fn ingest(&self, load: &Load, replays: usize) -> Option<Ingest> {
         let device = self.device.as_ref().ok()?;
-        let (bytes, timing) = gpu::ingest(device, &load.scene, &State::rest(&load.scene), replays).ok()?;
+        let (bytes, timing) = kernels::ingest(device, &load.scene, &State::rest(&load.scene), replays).ok()?;
         let expected = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
         Some(Ingest { bytes, median_us: timing.median_us, of_pinned: timing.median_us / expected })
     }
 
-    fn overlap(&self, load: &Load, states: &[State], steps: usize) -> Option<Result<gpu::Overlap>> {
-        Some(gpu::overlap(self.device.as_ref().ok()?, &load.scene, states, steps))
+    fn overlap(&self, load: &Load, states: &[State], steps: usize) -> Option<Result<kernels::Overlap>> {
+        Some(kernels::overlap(self.device.as_ref().ok()?, &load.scene, states, steps))
     }
 
-    fn host_writes(&self, replays: usize) -> Vec<gpu::HostWrite> {
-        let writes = |device: &Arc<Device>| gpu::host_writes(device, replays).ok();
+    fn host_writes(&self, replays: usize) -> Vec<kernels::HostWrite> {
+        let writes = |device: &Arc<Device>| kernels::host_writes(device, replays).ok();
         self.device.as_ref().ok().and_then(writes).unwrap_or_default()
     }
 
@@ -188,7 +190,7 @@ fn shortcuts(scene: &Scene) -> Vec<(String, Deformation)> {
 
 /// The deformation with normals of the deformed surface, where that bends, has normals and is given rigid ones.
 fn exact_normals(scene: &Scene) -> Option<Deformation> {
-    let rigid = scene.needs.modes && trials::has_normals(scene) && scene.deformation.normals == Normals::Rigid;
+    let rigid = scene.needs.modes && offers::has_normals(scene) && scene.deformation.normals == Normals::Rigid;
     rigid.then_some(Deformation { normals: Normals::Exact, ..scene.deformation })
 }
 

@@ -17,9 +17,11 @@ mod double;
 pub mod errors;
 pub mod exact;
 pub mod ingredients;
+pub mod kernels;
 pub mod loads;
 pub mod machine;
 pub mod motion;
+mod offers;
 mod page;
 pub mod peers;
 pub mod plot;
@@ -32,7 +34,6 @@ mod testing;
 pub mod thesis;
 pub mod timing;
 pub mod traffic;
-mod trials;
 pub mod validate;
 pub mod variant;
 
@@ -40,10 +41,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use crate::kernels::{HostWrite, Overlap};
 use bench::{Bench, Roofs};
 use loads::{Kind, Load, Size};
 use machine::Provenance;
-use modalcast_compute::gpu::{HostWrite, Overlap};
 use modalcast_model::deform::Backend;
 use modalcast_model::error::{Result, during};
 use modalcast_model::load;

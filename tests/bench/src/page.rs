@@ -3,7 +3,7 @@
 use super::peers::{dash, line, rule};
 use super::table::Row;
 use super::{Entry, Report};
-use modalcast_compute::gpu::Overlap;
+use crate::kernels::Overlap;
 
 /// The whole page.
 pub(super) fn markdown(report: &Report) -> String {

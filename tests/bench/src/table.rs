@@ -8,7 +8,7 @@ use super::timing::{Cache, Timing};
 use super::traffic::{self, Part};
 use super::validate::Found;
 use super::variant::Label;
-use modalcast_compute::gpu::KernelFacts;
+use crate::kernels::KernelFacts;
 use modalcast_model::deform::Backend;
 use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::{Normals, Storage};

@@ -10,8 +10,8 @@ use super::errors::{Collect, Errors, IMAGE, Orientation, Spread, Tally, Turned, 
 use super::exact::{Judged, judge, widen};
 use super::loads::{Load, restated};
 use super::motion::Motion;
+use super::offers::has_normals;
 use super::sources::{Origin, Sources, Split};
-use super::trials::has_normals;
 use super::variant::Variant;
 use modalcast_compute::reference;
 use modalcast_model::deform::Surface;

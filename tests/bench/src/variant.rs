@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::ingredients::Ingredients;
 use super::timing::{Cache, Timing};
 use super::traffic::{self, Part};
-use modalcast_compute::gpu::KernelFacts;
+use crate::kernels::KernelFacts;
 use modalcast_model::deform::{Backend, Deformer, Surface};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Deformation, Scene, State};

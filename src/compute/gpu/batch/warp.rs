@@ -1,5 +1,6 @@
 //! A warp of `kernels/batch.cu` in step, with its ring, its stages and its ways out.
 
+use crate::testing::transformed_axis;
 use std::sync::Arc;
 
 use super::super::inputs::{Listing, Packing};
@@ -156,7 +157,7 @@ impl<'a> Warp<'a> {
             let rows = self.tables.state.transforms[self.member(member + one).domain as usize].0;
             for axis in 0..3 {
                 let at = one * 3 * VERTICES + 6 * lane + 3 * vertex + axis;
-                staged[at] = placed(&rows[4 * axis..], bent);
+                staged[at] = transformed_axis(&rows[4 * axis..], bent);
             }
         }
         staged
@@ -188,8 +189,4 @@ impl<'a> Warp<'a> {
             (0..3 * vertices).for_each(|k| put(member + one, k, staged[one * 3 * VERTICES + k]));
         }
     }
-}
-
-pub(in super::super) fn placed(row: &[f32], [x, y, z]: [f32; 3]) -> f32 {
-    row[0].mul_add(x, row[1].mul_add(y, row[2].mul_add(z, row[3])))
 }

@@ -1,12 +1,16 @@
 //! Kernels to machine code: by NVRTC, or from disk where an earlier run left it.
 
+#[cfg(any(test, feature = "testing"))]
+mod assembled;
 mod cache;
 mod nvrtc;
 #[cfg(test)]
-pub(super) mod tests;
+mod tests;
 
 use std::path::PathBuf;
 
+#[cfg(any(test, feature = "testing"))]
+pub use self::assembled::{Assembled, assert_compiles};
 use self::cache::{Cache, key_of};
 use self::nvrtc::Job;
 pub(super) use self::nvrtc::nvrtc;

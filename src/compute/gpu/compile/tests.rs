@@ -2,38 +2,10 @@
 
 use rayon::prelude::*;
 
+use super::assembled::{Assembled, spilled};
 use super::nvrtc::{Job, nvrtc};
 use crate::gpu::{layout, plan};
 use modalcast_model::error::Error;
-
-/// What one variant became.
-pub(in super::super) struct Assembled {
-    pub cubin: Vec<u8>,
-    pub log: String,
-}
-
-impl Assembled {
-    /// Compiles a source with macros and asks for what the assembler says of registers.
-    pub(in super::super) fn new(name: &str, source: &str, defines: &[&str], capability: (i32, i32)) -> Self {
-        let mut job = Job::new(name, source, defines, capability);
-        job.options.push("--ptxas-options=-v".into());
-        let (cubin, log) = nvrtc().expect("NVRTC").compile_with_log(&job).expect("compiles");
-        assert!(cubin.starts_with(b"\x7fELF"), "machine code is an ELF file");
-        Self { cubin, log }
-    }
-
-    /// Bytes that all functions together store for want of registers.
-    pub(in super::super) fn spilled(&self) -> usize {
-        spilled(&self.log)
-    }
-}
-
-fn spilled(log: &str) -> usize {
-    let stores: Vec<&str> = log.split(" bytes spill stores").collect();
-    assert!(stores.len() > 1, "the assembler says what it spills: {log}");
-    let number = |before: &&str| before.rsplit(' ').next().and_then(|word| word.parse::<usize>().ok());
-    stores[..stores.len() - 1].iter().map(|before| number(before).expect("a number")).sum()
-}
 
 #[test]
 fn spills_of_all_functions_are_added_and_a_log_without_them_is_no_proof() {

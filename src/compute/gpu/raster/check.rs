@@ -12,7 +12,7 @@ const MOST: usize = 1 << 24;
 ///
 /// # Errors
 /// `Invalid` naming triangles or groups.
-pub(in super::super) fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[Group]) -> Result<()> {
+pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[Group]) -> Result<()> {
     let count = triangles.len();
     if count >= MOST {
         return Err(invalid("triangles", format!("fewer than {MOST}"), count));
@@ -36,7 +36,7 @@ pub(in super::super) fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[G
 ///
 /// # Errors
 /// `Invalid` naming what does not fit.
-pub(in super::super) fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
+pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
     let CutOuts { first, uvs, surfaces, table, images, anisotropy } = cut_outs;
     let left = triangles.saturating_sub(*first as usize);
     for (field, given) in [("texture coordinates", uvs.len()), ("surfaces", surfaces.len())] {

@@ -52,8 +52,58 @@ impl RasterForm {
     }
 
     /// Bytes of all samples of a window.
-    pub(in super::super) const fn bytes(self, window: &Window) -> u64 {
+    pub const fn bytes(self, window: &Window) -> u64 {
         let sample = if self.depth_only { size_of::<f32>() } else { size_of::<u64>() };
         sample as u64 * window.pixels() as u64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::assert_compiles;
+
+    /// What a server or a trial ever compiles.
+    const WITHOUT_CUT_OUTS: &[&[&str]] = &[
+        &[],
+        &["DEPTH"],
+        &["COUNT"],
+        &["DEPTH", "COUNT"],
+        &["FEW=0"],
+        &["FEW=0", "NARROW=-1"],
+        &["COUNT", "FEW=0"],
+        &["COUNT", "FEW=0", "NARROW=-1"],
+    ];
+
+    const WITH_CUT_OUTS: &[&[&str]] = &[
+        &["CUT"],
+        &["DEPTH", "CUT"],
+        &["CUT", "COUNT"],
+        &["DEPTH", "CUT", "COUNT"],
+        &["CUT", "FEW=0"],
+        &["CUT", "FEW=0", "NARROW=-1"],
+        &["CUT", "COUNT", "FEW=0"],
+        &["CUT", "COUNT", "FEW=0", "NARROW=-1"],
+    ];
+
+    #[test]
+    fn every_form_is_a_variant_that_is_compiled_in_the_check() {
+        for depth_only in [false, true] {
+            for counted in [false, true] {
+                for spread in [Spread::BySize, Spread::Warps, Spread::Tiles] {
+                    let form = RasterForm { depth_only, counted, spread };
+                    for (cut, variants) in [(false, WITHOUT_CUT_OUTS), (true, WITH_CUT_OUTS)] {
+                        assert!(variants.contains(&form.defines(cut).as_slice()), "{form:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[ignore = "needs NVRTC: deploy/check installs it"]
+    fn nvrtc_compiles_every_raster() {
+        assert_compiles(SOURCE, &WHOLE, WITHOUT_CUT_OUTS);
+        assert_compiles(SOURCE, &FUNCTIONS, WITH_CUT_OUTS);
     }
 }

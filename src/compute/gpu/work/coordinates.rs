@@ -5,7 +5,7 @@ use modalcast_model::scene::{Scene, Storage};
 
 /// Where a domain's coordinates lie on the device: whole chunks of them.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(in super::super) struct Coordinates {
+pub struct Coordinates {
     /// Of each domain.
     pub first: Vec<u32>,
     /// Numbers of all, a multiple of four.
@@ -15,7 +15,7 @@ pub(in super::super) struct Coordinates {
 }
 
 impl Coordinates {
-    pub(in super::super) fn new(scene: &Scene) -> Self {
+    pub fn new(scene: &Scene) -> Self {
         let storage = scene.deformation.storage;
         // Factors belong to a shape and lists of modes to a domain, so those who share coordinates cannot share these.
         if storage == Storage::F32 && !scene.needs.truncation {

@@ -14,7 +14,7 @@ mod quads;
 pub(super) mod tests;
 
 use batches::Batched;
-pub(super) use coordinates::Coordinates;
+pub use coordinates::Coordinates;
 pub(super) use quads::{Quads, rest_directions, rest_positions};
 
 use super::layout::{Lane, TILE_CORNERS, TILE_VERTICES, Tile};

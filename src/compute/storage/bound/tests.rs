@@ -1,5 +1,5 @@
 use super::*;
-use crate::storage::testing::{Noise, shape, with_columns};
+use crate::testing::{Noise, shape, with_columns};
 
 /// Random coordinates and a sheared, perhaps mirroring transform.
 fn transform(noise: &mut Noise) -> Composed {

@@ -9,9 +9,9 @@ pub(super) mod panel;
 use std::fmt::Write as _;
 
 use super::Report;
+use super::offers::is_partial;
 use super::table::Row;
 use super::timing::Cache;
-use super::trials::is_partial;
 use modalcast_model::deform::Backend;
 use modalcast_model::error::{Result, during};
 use panel::{Look, Panel, Point};

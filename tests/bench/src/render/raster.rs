@@ -12,9 +12,11 @@ use super::measure::STILL;
 use super::paths::{self, Frames};
 use super::studio::{Set, Size, Studio};
 use super::{Request, bare, beside};
+use crate::kernels;
+use crate::kernels::{Raster, RasterCounts, RasterMesh, Trial as _};
 use crate::machine::Provenance;
 use crate::timing::{FEWEST, Timing};
-use modalcast_compute::gpu::{self, Device, Raster, RasterCounts, RasterForm, RasterMesh, Trial as _};
+use modalcast_compute::gpu::{Device, RasterForm};
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Camera, Faces, Group, Look, Parts, Scene, State, Window};
 use modalcast_render::{Info, Seen, Shot, shadow_clip};
@@ -282,8 +284,8 @@ impl Job {
         let pair = |name: &str, raster: &Raster| {
             let opengl = passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
             let opengl = opengl.ok_or_else(|| during("raster")(format!("no pass {name}")))?;
-            let gpu::Timing { median_us, q1_us, q3_us, replays } =
-                gpu::time(device, raster, gpu::Cache::Warm, self.replays)?;
+            let kernels::Timing { median_us, q1_us, q3_us, replays } =
+                kernels::time(device, raster, kernels::Cache::Warm, self.replays)?;
             Ok(Pair { opengl, cuda: Timing { median_us, q1_us, q3_us, replays } })
         };
         Ok(Passes { depth: pair("shadow", ours[0])?, visibility: pair("visibility", ours[1])? })

@@ -1,8 +1,9 @@
 //! The rasteriser on the device, against its definition: the same bits whoever draws.
 
+use modalcast_bench::kernels::{Raster, RasterCounts, RasterMesh, Trial as _};
 use modalcast_bench::render::loads::Kind;
 use modalcast_bench::render::{Request, Size, rasters};
-use modalcast_compute::gpu::{Device, Raster, RasterCounts, RasterForm, RasterMesh, Spread, Trial as _};
+use modalcast_compute::gpu::{Device, RasterForm, Spread};
 use modalcast_compute::reference::raster::{Dropped, outline};
 
 use crate::soups::{Soup, soups};

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{Cache, Cublas, Device, Part, Peer, Split, Thesis, Trial, empty_replay, roofs, time};
+use modalcast_bench::kernels::{Cache, Cublas, Part, Peer, Split, Thesis, Trial, empty_replay, roofs, time};
+use modalcast_compute::gpu::Device;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Bounds, Scene, State};
 
