@@ -7,7 +7,7 @@ use crate::domain::AlphaMode;
 use crate::scene::{Scene, UpAxis};
 
 fn data(path: &str) -> String {
-    let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
+    let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../../../shared/data"), PathBuf::from);
     root.join(path).to_str().expect("UTF-8").to_owned()
 }
 

@@ -7,7 +7,7 @@ use crate::load::files::Files;
 use crate::scene::{Parts, Scene};
 
 fn read(path: &str) -> Parts {
-    let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let data = std::env::var_os("MODALCAST_DATA").map_or(here, PathBuf::from);
     super::super::read(&Files::anywhere(&data), path).expect("the real input")
 }
