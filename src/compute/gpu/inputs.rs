@@ -182,7 +182,7 @@ impl Writer {
         Self { packing: Arc::clone(packing), truncation }
     }
 
-    /// Writes a whole step; `to` has the words of [`Sizes::total`].
+    /// Writes a whole step; `to` has the words of `Sizes::total`.
     pub fn write(&mut self, to: &mut [f32], header: &Header, state: &State) {
         let mut to = Front::new(to);
         to.put(std::slice::from_ref(header));

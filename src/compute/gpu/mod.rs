@@ -1,7 +1,7 @@
 //! CUDA: one launcher per kernel, with the kernel's name.
 //!
 //! Kernels live in `kernels/*.cu`; NVRTC compiles them for the device that is there, with the parts that the scene
-//! needs ([`plan`]), and a cache on disk keeps the machine code. A step is one graph: a copy to the device, at most four
+//! needs ([`plan()`]), and a cache on disk keeps the machine code. A step is one graph: a copy to the device, at most four
 //! launches whatever the number of domains, straight into OpenGL's buffers when the driver shares them, and the bounds
 //! on their way back.
 //!

@@ -7,10 +7,10 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | [`form`] | the variants of the kernels |
+//! | `form` | the variants of the kernels |
 //! | [`check`] | which meshes are refused |
-//! | [`mod@cut_out`] | texture coordinates, surfaces and images of cut-outs |
-//! | [`opengl`] | positions and samples in OpenGL's buffers |
+//! | `cut_out` | texture coordinates, surfaces and images of cut-outs |
+//! | `opengl` | positions and samples in OpenGL's buffers |
 
 mod check;
 mod cut_out;

@@ -1,10 +1,10 @@
 //! A scene to the work list of `deform`: one tile per warp, whatever domains it holds. Pure.
 //!
 //! A tile computes vertices, or corners, or both where corner i of a shape is its vertex i.
-//! A shape of more than [`SMALL`] quads, or one with modes that several domains share, is cut into tiles of its own, and
+//! A shape of more than `SMALL` quads, or one with modes that several domains share, is cut into tiles of its own, and
 //! its U lies on the device once. The quads of smaller domains with the same number of chunks fill tiles together, so
 //! that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first: a long tile that began last would be
-//! waited for. Vertices of domains that [`batches`] puts into groups have tiles too, behind all others: a whole step leaves
+//! waited for. Vertices of domains that `batches` puts into groups have tiles too, behind all others: a whole step leaves
 //! them to `batch`, and a list of changed domains names them.
 
 pub(super) mod batches;
