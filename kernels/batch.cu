@@ -10,7 +10,7 @@
 //   boxes      [tiles of deform][4][6] u32, as `deform` writes them; those of a half of a tile that has no
 //              vertices stay zeros, as they were made                                                   (out)
 // Launch: a block of WARPS warps for each run of tiles of a group, with shared memory for WARPS Own, Common and q.
-// CPU twin: the tests of src/gpu/batch.rs.
+// CPU twin: the tests of src/compute/gpu/batch.rs.
 //
 // The modes are summed in their order, from +0, by fused multiply-adds, as `deform` does: the same bits. What is not
 // finite in f32 is computed again in f64.

@@ -1,4 +1,4 @@
-// What a block of `batch` has in shared memory, and how U, x0, T and q get there. Twin: the tests of src/gpu/batch.rs.
+// What a block of `batch` has in shared memory, and how U, x0, T and q get there. Twin: the tests of src/compute/gpu/batch.rs.
 #pragma once
 #include "chunk.cuh"
 #include "follow.cuh"
@@ -24,7 +24,7 @@ struct Own {
     uint4 ring[STAGES * STAGE_WORDS];
     float4 rest[3 * QUADS];
 };
-static_assert(sizeof(Own) == 9984, "Own differs from src/gpu/batch.rs");
+static_assert(sizeof(Own) == 9984, "Own differs from src/compute/gpu/batch.rs");
 
 __device__ __forceinline__ unsigned lane_of() {
     return threadIdx.x % 32;
@@ -87,7 +87,7 @@ struct Common {
     Member members[VECTORS];
     Part parts[WARPS];
 };
-static_assert(sizeof(Part) == 72 && sizeof(Common) == 64 * VECTORS + 72 * WARPS, "Common differs from src/gpu/batch.rs");
+static_assert(sizeof(Part) == 72 && sizeof(Common) == 64 * VECTORS + 72 * WARPS, "Common differs from src/compute/gpu/batch.rs");
 
 __device__ __forceinline__ Own& own_of(uint4* shared) {
     return ((Own*)shared)[threadIdx.x / 32];

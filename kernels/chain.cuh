@@ -1,5 +1,5 @@
 // A kernel behind another on its stream may be put onto the device while the last blocks of the other still run
-// (programmatic dependent launch, compute capability 9.0 and later; src/gpu/chain.rs). It touches nothing before it has
+// (programmatic dependent launch, compute capability 9.0 and later; src/compute/gpu/chain.rs). It touches nothing before it has
 // waited, and the next one is let in only after that: whoever comes third finds the first complete.
 #pragma once
 

@@ -1,5 +1,5 @@
 // U as it is stored: 48 bytes hold the entries of one quad (4 vertices) for as many modes as fit, as three words of 16
-// bytes. Entry e = (mode * 3 + axis) * 4 + vertex. Twin: src/storage.
+// bytes. Entry e = (mode * 3 + axis) * 4 + vertex. Twin: src/compute/storage.
 #pragma once
 
 #if defined(STORE_F16) || defined(STORE_BF16)

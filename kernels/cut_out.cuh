@@ -4,7 +4,7 @@
 // coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997): right in perspective,
 // and for corners behind the eye, without clipping. Corners are taken relative to the sample first, so that a small
 // triangle far from the middle keeps its digits. Their products hold as long as w is between 2^-50 and 2^50.
-// Twin: src/reference/raster/cut_out.rs; the bits up to the texture's filter are its.
+// Twin: src/compute/reference/raster/cut_out.rs; the bits up to the texture's filter are its.
 #pragma once
 
 #include "raster.cuh"

@@ -20,7 +20,7 @@
 //                 WITHOUT_POSITIONS, for measuring, where u is not mended                                   (out)
 //   boxes         [tiles][4][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                (out)
 // Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles, or any number of blocks with LISTED.
-// CPU twin: src/reference/deform.rs.
+// CPU twin: src/compute/reference/deform.rs.
 //
 // The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
 // agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost; a u

@@ -1,5 +1,5 @@
 // T of a domain: its own or, with FOLLOWERS, that of the domain that it follows times a constant frame. CPU twin:
-// src/domain/composed.rs, bit by bit: the order of operations is stated there.
+// src/model/domain/composed.rs, bit by bit: the order of operations is stated there.
 #pragma once
 #include "layout.cuh"
 

@@ -1,4 +1,4 @@
-// What the host hands to the kernels. Twin: src/gpu/layout.rs; tests compare the size and the offset of every field.
+// What the host hands to the kernels. Twin: src/compute/gpu/layout.rs; tests compare the size and the offset of every field.
 #pragma once
 
 // Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
@@ -29,7 +29,7 @@ struct Header {
     unsigned reserved[3];
     unsigned bounds[12]; // `ordered` maxima of -x, -y, -z, x, y, z; with LIGHT of the same in light space; sent as zeros
 };
-static_assert(sizeof(Header) == 112, "Header differs from src/gpu/layout.rs");
+static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/layout.rs");
 
 // `kind` of a tile: how many items its last quad has, 0 in a mixed tile; whether positions are computed of its items,
 // and whether normals and tangents are. A tile of both computes corner i of a shape with vertex i.
@@ -49,7 +49,7 @@ struct Tile {
     unsigned char width; // quads
     unsigned char kind;
 };
-static_assert(sizeof(Tile) == 32, "Tile differs from src/gpu/layout.rs");
+static_assert(sizeof(Tile) == 32, "Tile differs from src/compute/gpu/layout.rs");
 
 // A quad of a mixed tile.
 struct Lane {
@@ -58,7 +58,7 @@ struct Lane {
     unsigned domain; // four times its index, plus its items less one
     unsigned first_q;
 };
-static_assert(sizeof(Lane) == 16, "Lane differs from src/gpu/layout.rs");
+static_assert(sizeof(Lane) == 16, "Lane differs from src/compute/gpu/layout.rs");
 
 // The same for `normals`. Instances share all but `first` and `first_vertex`.
 struct NormalSlot {
@@ -68,7 +68,7 @@ struct NormalSlot {
     unsigned first_vertex; // packed vertex
     unsigned first_member;
 };
-static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/gpu/layout.rs");
+static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/layout.rs");
 
 // A changed domain in the list of `apply`.
 struct Change {
@@ -77,14 +77,14 @@ struct Change {
     unsigned count;   // of coordinates
     unsigned source;  // of its coordinates in the list's values
 };
-static_assert(sizeof(Change) == 16, "Change differs from src/gpu/layout.rs");
+static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/layout.rs");
 
 // Whose transform a domain has, and which frame it has in it; with FOLLOWERS.
 struct Following {
     unsigned mover; // in the transforms
     unsigned frame;
 };
-static_assert(sizeof(Following) == 8, "Following differs from src/gpu/layout.rs");
+static_assert(sizeof(Following) == 8, "Following differs from src/compute/gpu/layout.rs");
 
 struct DeformArgs {
     const Header* header;
@@ -108,7 +108,7 @@ struct DeformArgs {
     unsigned count; // of tiles
     unsigned reserved;
 };
-static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/layout.rs");
 
 // Domains of one shape whose U `batch` reads once.
 struct Group {
@@ -120,7 +120,7 @@ struct Group {
     unsigned chunks;
     unsigned members;
 };
-static_assert(sizeof(Group) == 32, "Group differs from src/gpu/layout.rs");
+static_assert(sizeof(Group) == 32, "Group differs from src/compute/gpu/layout.rs");
 
 // One of them.
 struct Member {
@@ -129,7 +129,7 @@ struct Member {
     unsigned domain;
     unsigned first_tile; // of `deform`: its boxes
 };
-static_assert(sizeof(Member) == 16, "Member differs from src/gpu/layout.rs");
+static_assert(sizeof(Member) == 16, "Member differs from src/compute/gpu/layout.rs");
 
 // The work of one block of `batch`.
 struct Block {
@@ -138,7 +138,7 @@ struct Block {
     unsigned end;  // the one after the last
     unsigned reserved;
 };
-static_assert(sizeof(Block) == 16, "Block differs from src/gpu/layout.rs");
+static_assert(sizeof(Block) == 16, "Block differs from src/compute/gpu/layout.rs");
 
 struct BatchArgs {
     const Header* header;
@@ -154,7 +154,7 @@ struct BatchArgs {
     const float* q;
     unsigned* boxes;
 };
-static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/layout.rs");
 
 // A part of a domain of which `bounds` makes a box.
 struct Piece {
@@ -163,7 +163,7 @@ struct Piece {
     unsigned domain;
     unsigned of_vertices; // not of boxes
 };
-static_assert(sizeof(Piece) == 16, "Piece differs from src/gpu/layout.rs");
+static_assert(sizeof(Piece) == 16, "Piece differs from src/compute/gpu/layout.rs");
 
 struct BoundsArgs {
     Header* header;
@@ -176,7 +176,7 @@ struct BoundsArgs {
     float light[9]; // with LIGHT: the axes of light space, one after the other
     unsigned reserved;
 };
-static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/layout.rs");
 
 struct ApplyArgs {
     const Header* header;
@@ -190,7 +190,7 @@ struct ApplyArgs {
     unsigned* stamps;
     unsigned* list;
 };
-static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/compute/gpu/layout.rs");
 
 struct NormalsArgs {
     const Header* header;
@@ -211,7 +211,7 @@ struct NormalsArgs {
     unsigned groups;
     unsigned reserved;
 };
-static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/gpu/layout.rs");
+static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/layout.rs");
 
 // Whether a domain changed after this output was last written.
 __device__ inline bool is_stale(const Header* header, const unsigned* stamps, unsigned domain) {

@@ -4,14 +4,14 @@
 //   transforms     [movers][3] float4: the rows of world_from_domain; A is their first three columns   (in)
 //   following, frames  with FOLLOWERS, as `deform` has them                                             (in)
 //   members        [..] u32: the smoothing group of each corner of a shape that has any                 (in)
-//   begins, rings  [groups + 1] u32 and what they point into: src/domain/smoothing.rs                   (in)
+//   begins, rings  [groups + 1] u32 and what they point into: src/model/domain/smoothing.rs                   (in)
 //   group_normals  [3][groups] f32: geometric unit normals at rest, zeros where there is none           (in)
 //   positions      [vertices][3] f32, world, of this step; in the header                                (in)
 //   normals        [corners][3] f32, world; in the header                                               (out)
 //   tangents       [corners] float4, world; zeros where a shape has none; only with NORMAL_MAPS         (out)
 // Launch: BLOCK threads a block, a thread a packed corner, ceil(corners / BLOCK) blocks, whichever domains they meet.
 // A block whose domains have not changed since this output was written is passed over.
-// CPU twin: src/reference/normals.rs, which defines what is computed.
+// CPU twin: src/compute/reference/normals.rs, which defines what is computed.
 //
 // A thread per corner, not per group: corners of one group repeat its sum, from cache. A pass over groups would write and
 // read 12 bytes for each of them and cost a launch, which pays only where groups have two corners and more on average.

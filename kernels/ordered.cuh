@@ -1,4 +1,4 @@
-// Maxima of floats as maxima of integers. Twin: src/gpu/bounds.rs.
+// Maxima of floats as maxima of integers. Twin: src/compute/gpu/bounds.rs.
 #pragma once
 
 // An integer that grows with x and is never 0, of what is a number.

@@ -1,6 +1,6 @@
 // Rigid normals and tangents of a tile: those of the rest state, turned by T alone (equation 3.8 of the thesis; normals
 // by the inverse transpose of A, tangents by A, a mirror flips the sign of the bitangent). CPU twin:
-// src/reference/orient.rs.
+// src/compute/reference/orient.rs.
 //
 // The matrix of a lane is brought to entries of about 1 by a power of two; a direction that it leaves shorter than a
 // tenth has lost digits in f32 and is turned again in f64.

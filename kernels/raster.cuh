@@ -1,6 +1,6 @@
 // One triangle on its way to samples: corners in clip space, clipped, in 1/256 pixel, its three edges and its depth. Every
 // sum and product of floats is rounded by itself, so that the same bits come out wherever it is computed.
-// Windows have y down, the first sample of the first row at (1/2, 1/2). Twin: src/reference/raster.rs.
+// Windows have y down, the first sample of the first row at (1/2, 1/2). Twin: src/compute/reference/raster.rs.
 #pragma once
 
 constexpr int CELL = 256;                 // steps of a pixel

@@ -7,33 +7,45 @@
 //!
 //! renders headless and streams frames or vertices back.
 //!
+//! # Crates
+//! Cargo enforces the tiers: a crate sees only the crates below it. Each lies in its folder of `src`.
+//!
+//! | crate | what it is | built on |
+//! |---|---|---|
+//! | `modalcast` (`src`) | the server: gRPC, the engine, the command line | `modalcast-compute`, `modalcast-render`, `modalcast-model`, `modalcast-proto` |
+//! | `modalcast-compute` (`src/compute`) | deformers in CUDA, on the CPU and in f64; exports the kernels it launches | `modalcast-model` |
+//! | `modalcast-render` (`src/render`) | EGL and OpenGL: buffers, passes, readback | `modalcast-model` |
+//! | `modalcast-model` (`src/model`) | scenes as values, their files, the traits of deformers and rasterizers | |
+//!
+//! Beside them: `proto` (the contract), `clients/rust` and `clients/dynamics` (no crate of the server), `tests/bench` (every
+//! measurement; `modalcast report` starts its program).
+//!
 //! # Modules
-//! A test (`tests/it/layering.rs`) reads this table: a module uses only what its row names, and no arrow points up.
+//! A test (`tests/it/layering.rs`) reads this table: inside of its crate a module uses only what its row names, and the
+//! dependencies have no cycle.
 //!
 //! | module | what lives here | may use |
 //! |---|---|---|
-//! | `cli` | the command line: one file per command | `config`, `service`, `report`, `engine`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `tree`, `deform`, `scene`, `domain`, `telemetry`, `error` |
-//! | `service` | gRPC: wire to values and back; the only module that names proto | `config`, `engine`, `deform`, `scene`, `domain`, `telemetry`, `error` |
-//! | `report` | error against run time: synthetic scenes, errors by source, timing, tables and plots | `gpu`, `cpu`, `reference`, `render`, `load`, `deform`, `raster`, `storage`, `scene`, `domain`, `error` |
-//! | `engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `gpu`, `cpu`, `reference`, `render`, `frame`, `load`, `deform`, `raster`, `scene`, `domain`, `telemetry`, `error` |
-//! | `gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage`, `deform`, `raster`, `scene`, `domain`, `error` |
-//! | `cpu` | the f32 deformer of machines without a GPU | `storage`, `deform`, `scene`, `domain`, `error` |
-//! | `reference` | the same in f64, plain: the definition that the others are tested against | `deform`, `raster`, `scene`, `domain`, `error` |
-//! | `render` | EGL and OpenGL: buffers, passes, readback | `deform`, `raster`, `scene`, `domain`, `error` |
-//! | `frame` | pixels and numbers to bytes, colour maps with their legends; pure functions | `error` |
-//! | `load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
-//! | `tree` | the built-in scene: beams to modes, modes to skin | `scene`, `domain`, `error` |
-//! | `deform` | what every deformer does, as a trait | `scene`, `error` |
-//! | `raster` | what draws into samples beside OpenGL, as a trait | `scene`, `error` |
-//! | `storage` | U in tiles as cpu and gpu read it: storage types, a-priori bounds, mode truncation; pure | `scene`, `domain`, `error` |
-//! | `scene` | the set of domains, its packing and needs; one step as values; cameras | `domain`, `error` |
-//! | `domain` | mesh, modes U, material, texture; parsed once, immutable | `error` |
-//! | `telemetry` | stage names and times, tracing | `error` |
-//! | `config` | every limit and path, validated once | `error` |
-//! | `error` | what can go wrong, sorted by who can act | |
+//! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `frame`, `telemetry` |
+//! | `modalcast::service` | gRPC: wire to values and back; the only module that names proto | `config`, `engine`, `telemetry` |
+//! | `modalcast::engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `frame`, `telemetry` |
+//! | `modalcast::frame` | pixels and numbers to bytes, color maps with their legends; pure functions | |
+//! | `modalcast::telemetry` | stage names and times, tracing | |
+//! | `modalcast::config` | every limit and path, validated once | |
+//! | `modalcast-compute::gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage` |
+//! | `modalcast-compute::cpu` | the f32 deformer of machines without a GPU | `storage` |
+//! | `modalcast-compute::reference` | the same in f64, plain: the definition that the others are tested against | |
+//! | `modalcast-compute::storage` | U in tiles as cpu and gpu read it: storage types, a-priori bounds, mode truncation; pure | |
+//! | `modalcast-model::load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
+//! | `modalcast-model::tree` | the built-in scene: beams to modes, modes to skin | `scene`, `domain`, `error` |
+//! | `modalcast-model::deform` | what every deformer does, as a trait | `scene`, `error` |
+//! | `modalcast-model::raster` | what draws into samples beside OpenGL, as a trait | `scene`, `error` |
+//! | `modalcast-model::scene` | the set of domains, its packing and needs; one step as values; cameras | `domain`, `error` |
+//! | `modalcast-model::domain` | mesh, modes U, material, texture; parsed once, immutable | `error` |
+//! | `modalcast-model::error` | what can go wrong, sorted by who can act | |
 //!
 //! # Invariants
-//! 1. No arrow points up.
+//! 1. No dependency points up.
 //! 2. No proto type below `service`.
 //! 3. No GL or CUDA call off the device thread.
 //! 4. Every channel is bounded and says what it does when full.
@@ -46,20 +58,10 @@
 
 pub mod cli;
 pub mod config;
-pub mod cpu;
-pub mod deform;
-pub mod domain;
 pub mod engine;
-pub mod error;
 pub mod frame;
-pub mod gpu;
-pub mod load;
-pub mod raster;
-pub mod reference;
-pub mod render;
-pub mod report;
-pub mod scene;
 pub mod service;
-pub mod storage;
 pub mod telemetry;
-pub mod tree;
+
+/// A hash of all sources that this program was built from.
+pub const BUILD: &str = env!("MODALCAST_BUILD");

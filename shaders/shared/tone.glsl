@@ -1,4 +1,4 @@
-// The curve from light to what the screen shows, 0 to 1 in each channel: `Tone` in src/scene/post.rs says whose they are.
+// The curve from light to what the screen shows, 0 to 1 in each channel: `Tone` in src/model/scene/post.rs says whose they are.
 // `untoned` is its inverse.
 #if defined(REINHARD)
 // So written, infinite light is white.

@@ -3,9 +3,9 @@
 use serde_json::{Value, json};
 
 use super::{Outcome, say};
-use crate::error::during;
-use crate::render::{Prefer, Renderer};
-use crate::{gpu, render};
+use modalcast_compute::gpu;
+use modalcast_model::error::during;
+use modalcast_render::{Prefer, Renderer};
 
 /// Looks at driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 when no frame can be drawn.
 #[derive(Debug, clap::Args)]
@@ -31,7 +31,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 /// All that the command knows of this machine.
 pub(super) fn examine() -> Value {
     let renderer = Renderer::open(Prefer::Any).map(|renderer| renderer.info().clone());
-    let devices = render::devices();
+    let devices = modalcast_render::devices();
     let cuda = gpu::probe();
     json!({
         "can_draw": renderer.is_ok(),

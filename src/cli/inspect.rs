@@ -4,9 +4,10 @@ use serde_json::{Value, json};
 
 use super::options::working;
 use super::{Outcome, say};
-use crate::error::during;
-use crate::scene::Scene;
-use crate::{gpu, load, render};
+use modalcast_compute::gpu;
+use modalcast_model::error::during;
+use modalcast_model::load;
+use modalcast_model::scene::Scene;
 
 /// Domains that the table for people lists before it sums up the rest; `--json` lists all.
 const LISTED: usize = 24;
@@ -75,7 +76,7 @@ fn json(scene: &Scene) -> Value {
         "deform": scene.deformation,
         "remarks": scene.remarks,
         "deform": gpu::plan(scene),
-        "render": render::plan(scene),
+        "render": modalcast_render::plan(scene),
         "domains": domains,
     })
 }
@@ -127,7 +128,7 @@ fn lines(scene: &Scene) -> Vec<String> {
 
 /// What the deformer and the renderer make for the scene, and what they leave out.
 fn plans(scene: &Scene) -> Vec<String> {
-    let (deform, render) = (gpu::plan(scene), render::plan(scene));
+    let (deform, render) = (gpu::plan(scene), modalcast_render::plan(scene));
     let kernels: Vec<String> =
         deform.kernels.iter().map(|kernel| format!("{} [{}]", kernel.name, kernel.defines.join(" "))).collect();
     let mut lines = vec![

@@ -3,7 +3,7 @@
 mod demo;
 mod doctor;
 mod inspect;
-mod options;
+pub mod options;
 mod render;
 mod report;
 mod serve;
@@ -12,7 +12,7 @@ use std::io::Write as _;
 
 use clap::{Parser, Subcommand};
 
-use crate::error::Error;
+use modalcast_model::error::Error;
 
 /// A GPU server for modal deformable objects: x = T (x0 + U q), rendered headless, streamed over gRPC.
 #[derive(Debug, Parser)]
@@ -32,7 +32,8 @@ enum Command {
     Doctor(doctor::Args),
 }
 
-const EXIT_CODES: &str = "\
+/// The exit codes of all commands, for their help.
+pub const EXIT_CODES: &str = "\
 Exit codes:
   0  done
   1  the check that the command makes did not pass (doctor: no frame can be drawn; demo: a promise was not kept; report: a
@@ -44,7 +45,7 @@ Exit codes:
   6  a fault of the server or the device";
 
 /// What a command ends with: whether its own check passed.
-type Outcome = crate::error::Result<bool>;
+pub type Outcome = modalcast_model::error::Result<bool>;
 
 /// Runs the command line and returns the process's exit code.
 pub fn run() -> u8 {
@@ -58,6 +59,11 @@ pub fn run() -> u8 {
         Command::Inspect(args) => inspect::run(&args),
         Command::Doctor(args) => doctor::run(&args),
     };
+    finish(outcome)
+}
+
+/// The exit code of an outcome; an error is printed.
+pub fn finish(outcome: Outcome) -> u8 {
     match outcome {
         Ok(true) => 0,
         Ok(false) => 1,
@@ -78,7 +84,7 @@ fn exit_code(error: &Error) -> u8 {
 }
 
 /// Prints a line of a command's result. The only way to standard output, so that logs never mix with results.
-fn say(line: impl std::fmt::Display) {
+pub fn say(line: impl std::fmt::Display) {
     if let Err(error) = writeln!(std::io::stdout(), "{line}")
         && error.kind() != std::io::ErrorKind::BrokenPipe
     {

@@ -2,13 +2,13 @@
 
 use std::str::FromStr;
 
-use crate::error::{Error, Result, invalid};
+use modalcast_model::error::{Error, Result, invalid};
 
 /// The size of an image, written 1280x720.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Size {
-    pub(super) width: u32,
-    pub(super) height: u32,
+pub struct Size {
+    pub width: u32,
+    pub height: u32,
 }
 
 impl FromStr for Size {
@@ -30,7 +30,7 @@ impl std::fmt::Display for Size {
 }
 
 /// Does work that may take a while behind a spinner, which shows only on a terminal.
-pub(super) fn working<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
+pub fn working<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
     let spinner = indicatif::ProgressBar::new_spinner().with_message(what);
     spinner.enable_steady_tick(std::time::Duration::from_millis(120));
     let done = work();
@@ -39,7 +39,7 @@ pub(super) fn working<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
 }
 
 /// A point, written X,Y,Z.
-pub(super) fn triple(text: &str) -> Result<[f64; 3]> {
+pub fn triple(text: &str) -> Result<[f64; 3]> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
     let triple = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
     triple.ok_or_else(|| invalid("point", "three numbers X,Y,Z", text))

@@ -8,10 +8,10 @@ use super::options::{Size, triple, working};
 use super::{Outcome, say};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{Showing, Staged, Workbench, checked_mode};
-use crate::error::{Error, Result, during, invalid};
 use crate::frame;
-use crate::load;
-use crate::scene::{Camera, Lens, Scene, State, View};
+use modalcast_model::error::{Error, Result, during, invalid};
+use modalcast_model::load;
+use modalcast_model::scene::{Camera, Lens, Scene, State, View};
 
 /// Renders one frame of a scene to a PNG file.
 #[derive(Debug, clap::Args)]

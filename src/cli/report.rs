@@ -1,198 +1,78 @@
-//! `modalcast report`: what every shortcut costs in error, and what it saves in time.
+//! `modalcast report`: starts `modalcast-report`, a program of its own that lies beside this one, so that a server is built
+//! without its benchmarks.
 
-mod render;
+use std::ffi::OsString;
+use std::path::Path;
+use std::process::Command;
 
-use std::path::PathBuf;
+use modalcast_model::error::{Error, Result, during};
 
-use clap::Subcommand;
+use super::Outcome;
 
-use super::options::working;
-use super::{Outcome, say};
-use crate::error::Result;
-use crate::report::bench::Machine;
-use crate::report::loads::{Kind, Size};
-use crate::report::{Progress, Report, Request, Source, deform};
-
-/// Measures on this machine and writes tables and plots.
-#[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
-pub(super) struct Args {
-    #[command(subcommand)]
-    what: What,
-}
-
-#[derive(Debug, Subcommand)]
-enum What {
-    Deform(DeformArgs),
-    Render(render::Args),
-}
+/// The program with the benchmarks.
+const PROGRAM: &str = "modalcast-report";
 
 const EXAMPLES: &str = "Examples:
-  modalcast report deform --out report
+  modalcast report --help
   modalcast report deform --out report --quick
-  modalcast report deform --out report --load single-22-30 --load plants
-  modalcast report deform --out report --load c --variant 'cuda*' --variant 'cpu f32'
-  modalcast report deform --out report --load c --load plants --variant 'cuda overlap'
-  modalcast report deform --out report --scene path/to/finger
-  modalcast report deform --out report --scene tree --trajectory path/to/record
   modalcast report render --out report --quick";
 
-const LOADS: &str = "Loads:
-  single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P 14 to 22, R 10 to 30)
-  a, a-positions      one domain of 1.5 M vertices, r = 32, with normals and tangents, or without
-  b                   1,000 domains of 1,500 vertices, r mixed 0 to 64
-  c                   200,000 domains of 7 vertices, 95 % of them rigid
-  cancel              one domain whose modes nearly cancel in pairs
-  batch               16 instances of one domain of 2^18 vertices and 32 modes
-  plant-1 .. plant-12 the plants of table 4.5 of the thesis
-  single, plants, all groups of them";
-
-/// Error against run time of the deformation: validates every variant, then times it.
-///
-/// Writes report.json, report.csv, report.md, report.svg and report.png, anew after each load: a run that is stopped
-/// keeps what was done, and names what is missing. Exit code 1 when a variant exceeds its
-/// a-priori error bound.
+/// Measures error against run time on this machine and writes tables and plots.
 #[derive(Debug, clap::Args)]
-#[command(after_help = format!("{LOADS}\n\n{EXAMPLES}"))]
-struct DeformArgs {
-    /// The folder to write to; files of an earlier report there are replaced.
-    #[arg(long)]
-    out: PathBuf,
-    /// A scene: a built-in name, or a path to a model or a scene folder.
-    #[arg(long)]
-    scene: Option<String>,
-    /// Its trajectory: a .csv of time,q0,q1,..., or a folder with q.npy as modalcast-sim --record writes it. Without it,
-    /// the only .q.csv beside the scene is taken.
-    #[arg(long, requires = "scene")]
-    trajectory: Option<PathBuf>,
-    /// A synthetic scene; may be repeated. Without any, and without --scene: all.
-    #[arg(long = "load", value_name = "NAME")]
-    loads: Vec<String>,
-    /// Random states per load; 100 without it, 10 with --quick.
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    seeds: Option<u32>,
-    /// Repetitions per median, at least 20; 100 without it, 20 with --quick.
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    replays: Option<u32>,
-    /// The most steps of a trajectory to look at; all without it.
-    #[arg(long)]
-    steps: Option<usize>,
-    /// Only this variant, or all whose names begin so: "cuda*"; may be repeated.
-    #[arg(long = "variant", value_name = "NAME")]
-    variants: Vec<String>,
-    /// Build every load at a fraction of its size, for machines without a GPU; the report says which.
-    #[arg(long)]
-    quick: bool,
+#[command(after_help = EXAMPLES, disable_help_flag = true)]
+pub(super) struct Args {
+    /// The arguments of modalcast-report.
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENTS")]
+    arguments: Vec<OsString>,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    match &args.what {
-        What::Deform(args) => run_deform(args),
-        What::Render(args) => render::run(args),
-    }
+    let own = std::env::current_exe().map_err(during("report"))?;
+    let program = own.with_file_name(PROGRAM);
+    check_build(&program)?;
+    let status = Command::new(&program).args(&args.arguments).status().map_err(during("report"))?;
+    // Its exit codes are this program's.
+    std::process::exit(status.code().unwrap_or(6));
 }
 
-fn run_deform(args: &DeformArgs) -> Outcome {
-    let request = request(args)?;
-    let hear = |told: Progress<'_>| match told {
-        Progress::Begins(what) => {
-            tracing::info!(load = what, "measuring");
-            Ok(())
-        }
-        // After each load, so that a run that is stopped keeps what was done.
-        Progress::Measured(report) => report.write(&args.out),
+/// Refuses a sibling that is missing or was built from other sources: its measurements would not be of this server.
+fn check_build(program: &Path) -> Result<()> {
+    let refusal = |reason: String| Error::Unavailable {
+        what: PROGRAM,
+        reason,
+        remedy: "Build it with `cargo build --release -p modalcast-bench`".into(),
     };
-    let report = working("measuring", || deform(&request, &Machine::open(), hear))?;
-    lines(&report).into_iter().for_each(say);
-    say(format!("written to {}", args.out.display()));
-    Ok(report.passed())
-}
-
-fn request(args: &DeformArgs) -> Result<Request> {
-    let mut sources = Vec::new();
-    if let Some(source) = &args.scene {
-        sources.push(Source::Scene { source: source.clone(), record: args.trajectory.clone() });
+    let output = Command::new(program).arg("--build").output();
+    let output = output.map_err(|error| refusal(format!("{}: {error}", program.display())))?;
+    let build = String::from_utf8_lossy(&output.stdout);
+    match build.trim() == crate::BUILD {
+        true => Ok(()),
+        false => {
+            Err(refusal(format!("{}: expected build {}, got '{}'", program.display(), crate::BUILD, build.trim())))
+        }
     }
-    for name in &args.loads {
-        sources.extend(Kind::named(name)?.into_iter().map(Source::Synthetic));
-    }
-    if sources.is_empty() {
-        sources.extend(Kind::all().into_iter().map(Source::Synthetic));
-    }
-    let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
-    let number = |given: Option<u32>, usual: usize| given.map_or(usual, |given| given as usize);
-    Ok(Request {
-        sources,
-        seeds: number(args.seeds, seeds),
-        replays: number(args.replays, replays),
-        steps: args.steps.unwrap_or(usize::MAX),
-        variants: args.variants.clone(),
-        size,
-    })
-}
-
-fn lines(report: &Report) -> Vec<String> {
-    let mut lines = report.remarks.clone();
-    lines.push(format!(
-        "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
-        "load", "variant", "cache", "median us", "GB/s", "largest m", "of bound", "passed"
-    ));
-    for row in &report.rows {
-        let show =
-            |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
-        let errors = row.found.as_ref().map(|found| found.errors);
-        lines.push(format!(
-            "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
-            row.load,
-            row.name,
-            row.cache.name(),
-            show(row.timing.map(|timing| timing.median_us), 2),
-            show(row.gbs, 2),
-            errors.map_or("-".into(), |errors| format!("{:.3e}", errors.metres.largest)),
-            show(errors.map(|errors| errors.of_bound), 4),
-            match (row.passed, row.left_out) {
-                (true, _) => "yes",
-                (false, true) => "left out",
-                (false, false) => "NO",
-            }
-        ));
-    }
-    lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
-    lines
 }
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
     use super::*;
 
-    fn args() -> DeformArgs {
-        let out = PathBuf::from("out");
-        DeformArgs {
-            out,
-            scene: None,
-            trajectory: None,
-            loads: vec![],
-            seeds: None,
-            replays: None,
-            steps: None,
-            variants: vec![],
-            quick: false,
-        }
-    }
-
     #[test]
-    fn nothing_named_means_every_load_and_quick_means_fewer_states() {
-        let all = request(&args()).expect("fits");
-        assert_eq!((all.sources.len(), all.seeds, all.replays, all.size), (Kind::all().len(), 100, 100, Size::Full));
-        let quick = request(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("fits");
-        assert_eq!((quick.seeds, quick.replays, quick.size), (3, 20, Size::Quick));
-    }
-
-    #[test]
-    fn a_scene_and_loads_are_taken_together_and_a_wrong_name_is_refused() {
-        let both = DeformArgs { scene: Some("tree".into()), loads: vec!["plants".into(), "c".into()], ..args() };
-        assert_eq!(request(&both).expect("fits").sources.len(), 14);
-        let wrong = request(&DeformArgs { loads: vec!["d".into()], ..args() }).expect_err("no such load");
-        assert!(wrong.to_string().starts_with("load: expected single-P-R"), "{wrong}");
+    fn a_missing_sibling_and_one_of_another_build_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let program = folder.path().join(PROGRAM);
+        let missing = check_build(&program).expect_err("missing").to_string();
+        assert!(missing.contains("cargo build --release -p modalcast-bench"), "{missing}");
+        let write = |build: &str| {
+            std::fs::write(&program, format!("#!/bin/sh\necho {build}\n")).expect("writes");
+            std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("permits");
+        };
+        write("0123");
+        let other = check_build(&program).expect_err("another build").to_string();
+        assert!(other.contains("got '0123'"), "{other}");
+        write(crate::BUILD);
+        check_build(&program).expect("the same build");
     }
 }

@@ -8,9 +8,9 @@ use std::time::Duration;
 use super::{Outcome, say};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{Engine, Info};
-use crate::error::{Result, during};
-use crate::load::Repository;
 use crate::service;
+use modalcast_model::error::{Result, during};
+use modalcast_model::load::Repository;
 
 /// Serves scenes over gRPC until it is told to stop (SIGTERM or Ctrl-C), then drains and ends.
 #[derive(Debug, clap::Args)]

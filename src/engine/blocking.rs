@@ -1,6 +1,6 @@
 //! Work that would block the runtime's own threads.
 
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// Runs long work on a blocking thread. A panic there is a fault of that work alone.
 pub(super) async fn run_blocking<T: Send + 'static>(

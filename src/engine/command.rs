@@ -5,11 +5,11 @@ use std::sync::Arc;
 use tokio::sync::oneshot;
 
 use super::viewer::Showing;
-use crate::deform::{Deformed, Surface, Wanted};
-use crate::error::Result;
 use crate::frame::Legend;
-use crate::render::{Hit, Image, Survey};
-use crate::scene::{Camera, Rectangle, Scene, State};
+use modalcast_model::deform::{Deformed, Surface, Wanted};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Camera, Rectangle, Scene, State};
+use modalcast_render::{Hit, Image, Survey};
 
 /// Names a staged scene on the device thread.
 pub(super) type SceneId = u64;

@@ -15,10 +15,10 @@ use super::late::Late;
 use super::viewer::{Delivery, Shown, StepName, View, Viewer};
 use super::worker::Worker;
 use crate::config::Config;
-use crate::deform::{Surface, Wanted};
-use crate::error::{Error, Result};
-use crate::scene::{Scene, State};
 use crate::telemetry::{Stage, StageTimes};
+use modalcast_model::deform::{Surface, Wanted};
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::{Scene, State};
 
 /// Which step a single request wants. Numbers are those of the current run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -16,11 +16,11 @@ use tokio::sync::mpsc;
 use super::command::{Command, Copied, Reply, SceneId};
 use super::staged::Staged;
 use super::workbench::{Drawing, Info, Workbench};
-use crate::deform::{Fetch, Wanted};
-use crate::error::{Result, during};
-use crate::render::{FRAMES_UNDER_WAY, Hit, Image, Pick};
-use crate::scene::Camera;
 use crate::telemetry::ms_since;
+use modalcast_model::deform::{Fetch, Wanted};
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::Camera;
+use modalcast_render::{FRAMES_UNDER_WAY, Hit, Image, Pick};
 
 /// How long the thread waits for a frame before it looks for a command again.
 const SLICE: Duration = Duration::from_micros(100);
@@ -172,9 +172,9 @@ impl Desk {
         let begin = Instant::now();
         match find(&mut self.scenes, id).and_then(|staged| staged.fetch(wanted)) {
             Ok(fetch) => {
-                let is_there = fetch.is_there();
+                let is_ready = fetch.is_ready();
                 self.arriving.push_back(Arriving { id, fetch, begin, reply });
-                if is_there {
+                if is_ready {
                     self.arriving.rotate_right(1);
                     self.hand_over();
                 }

@@ -6,7 +6,7 @@ use tokio::task::JoinHandle;
 
 use super::frame_encoder::{Encoded, Format, FrameEncoder};
 use super::viewer::{Body, Delivery, Feed, Shown};
-use crate::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, during};
 
 /// Bytes of pixels that one stream may hold before it takes no further frame. A single larger frame is taken alone.
 const IN_FLIGHT_BYTES: usize = 128 << 20;
@@ -115,7 +115,7 @@ mod tests {
     use super::super::frame_encoder::tests::{noise, paused};
     use super::super::viewer::{View, Viewer};
     use super::*;
-    use crate::deform::Wanted;
+    use modalcast_model::deform::Wanted;
 
     fn feed(delivery: Delivery) -> (Viewer, Feed) {
         Feed::new(View::Vertices(Wanted::VERTICES), delivery, Arc::default())
@@ -160,12 +160,12 @@ mod tests {
         let mut frames = EncodedFeed::new(feed, encoder, Format::Rgba, 0);
         let large = |number| {
             let mut shown = noise(number, 1);
-            let image = crate::render::Image {
+            let image = modalcast_render::Image {
                 width: 1,
                 height: 1,
                 rgba: vec![0; IN_FLIGHT_BYTES],
                 passes: vec![],
-                paths: crate::render::Paths::default(),
+                paths: modalcast_render::Paths::default(),
             };
             shown.body = Body::Frame(Arc::new(image.into()));
             shown

@@ -9,10 +9,10 @@ use tokio::sync::{OnceCell, Semaphore};
 
 use super::blocking::run_blocking;
 use super::viewer::{Body, Shown, StepName};
-use crate::error::{Result, during};
 use crate::frame::{self, Legend};
-use crate::render::{Image, Paths, Survey};
 use crate::telemetry::{Stage, StageTimes, ms_since};
+use modalcast_model::error::{Result, during};
+use modalcast_render::{Image, Paths, Survey};
 
 /// How pixels travel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -12,9 +12,9 @@ use super::conductor::{Ask, Beginning, Conductor, Means, Message, Which};
 use super::lane::{Place, Policy, Report, Waiting};
 use super::ledger::Origin;
 use super::viewer::{Delivery, Feed, Shown, StepName, View};
-use crate::error::{Error, Result, invalid};
-use crate::scene::{RawUpdate, Scene, State, Update};
 use crate::telemetry::ms_since;
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::scene::{RawUpdate, Scene, State, Update};
 
 /// How many messages may wait for one scene.
 const MAILBOX: usize = 128;

@@ -12,9 +12,9 @@ use std::time::Duration;
 
 use sha2::{Digest as _, Sha256};
 
-use crate::domain::Transform;
-use crate::error::{Result, during, invalid};
-use crate::scene::{Cells, Scene, State};
+use modalcast_model::domain::Transform;
+use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::scene::{Cells, Scene, State};
 
 /// Time between two writings.
 const REST: Duration = Duration::from_millis(100);
@@ -246,7 +246,7 @@ mod tests {
 
     #[test]
     fn a_step_with_cells_comes_back_with_them_and_one_cut_short_is_refused() {
-        use crate::scene::{RawUpdate, TransformFormat, Update};
+        use modalcast_model::scene::{RawUpdate, TransformFormat, Update};
         let scene = testing::two_strips();
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
         let translation = [1e7 + 0.125, -3.5, 0.0_f64].into_iter().flat_map(f64::to_le_bytes);

@@ -7,9 +7,9 @@ use std::time::Instant;
 
 use tokio::sync::Notify;
 
-use crate::error::{Error, Result, invalid};
-use crate::scene::Update;
 use crate::telemetry::{Stage, StageTimes, ms_since};
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::scene::Update;
 
 /// What happens to steps that come faster than they are done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -221,7 +221,7 @@ impl Lane {
 mod tests {
     use super::super::testing;
     use super::*;
-    use crate::scene::{RawUpdate, State};
+    use modalcast_model::scene::{RawUpdate, State};
 
     fn step(number: u64, domain: u32, q: [f32; 2]) -> Waiting {
         let scene = testing::two_strips();

@@ -26,10 +26,10 @@ use super::conductor::{Conductor, Done, acknowledge};
 use super::show::known;
 use super::viewer::{Body, Claim, Shown, StepName, View, Viewer};
 use super::worker::Asked;
-use crate::error::Result;
-use crate::render::{FRAMES_UNDER_WAY, Image};
-use crate::scene::Cells;
 use crate::telemetry::{Stage, StageTimes};
+use modalcast_model::error::Result;
+use modalcast_model::scene::Cells;
+use modalcast_render::{FRAMES_UNDER_WAY, Image};
 
 /// Something of a step that leaves the device, and who waits for it.
 pub(super) struct Late {
@@ -155,7 +155,7 @@ impl Conductor {
 
 impl View {
     /// Camera and size of a frame of colours.
-    const fn frame(&self) -> Option<(crate::scene::Camera, (u32, u32))> {
+    const fn frame(&self) -> Option<(modalcast_model::scene::Camera, (u32, u32))> {
         match *self {
             Self::Frame { camera, width, height, showing: super::viewer::Showing::Colour } => {
                 Some((camera, (width, height)))

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::keep::replace;
-use crate::error::{Error, Result, during, invalid};
+use modalcast_model::error::{Error, Result, during, invalid};
 
 /// Where a scene came from.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]

@@ -44,7 +44,7 @@ pub use values::checked_mode;
 pub use viewer::{Body, Delivery, Feed, Showing, Shown, StepName, View};
 pub use workbench::{Info, Workbench};
 
-pub use crate::render::{Path, Paths};
+pub use modalcast_render::{Path, Paths};
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -60,8 +60,8 @@ use self::ledger::Ledger;
 use self::registry::Registry;
 use self::worker::Worker;
 use crate::config::Config;
-use crate::error::{Error, Result, invalid};
-use crate::scene::Scene;
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::scene::Scene;
 
 /// How many scenes are read from disk at a time.
 const LOADS: usize = 2;
@@ -222,7 +222,7 @@ impl Engine {
         let name = checked_name(name)?.to_owned();
         // A task of its own: the work must be whole even when the caller goes away.
         let work = async move { engine.close_whole(&name).await };
-        tokio::spawn(work).await.map_err(crate::error::during("close"))?
+        tokio::spawn(work).await.map_err(modalcast_model::error::during("close"))?
     }
 
     /// Ends every stream with `Unavailable`, writes what is to be kept and lets the devices go.
@@ -278,7 +278,7 @@ impl Engine {
             engine.shared.registry.leave(&name, &seat);
             opened
         };
-        tokio::spawn(work).await.map_err(crate::error::during("open"))?
+        tokio::spawn(work).await.map_err(modalcast_model::error::during("open"))?
     }
 
     async fn host(&self, name: String, origin: Origin, upload: Option<Upload>) -> Result<Arc<Host>> {

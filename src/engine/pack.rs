@@ -6,11 +6,11 @@ use std::time::Instant;
 use super::blocking::run_blocking;
 use super::frame_encoder::Encoded;
 use super::viewer::{Body, Shown};
-use crate::deform::{Surface, Wanted};
-use crate::error::{Result, during, invalid};
-use crate::render::Paths;
-use crate::scene::{Bounds, Cells, Layout, Scene, Slot};
 use crate::telemetry::{Stage, ms_since};
+use modalcast_model::deform::{Surface, Wanted};
+use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::scene::{Bounds, Cells, Layout, Scene, Slot};
+use modalcast_render::Paths;
 
 // Vertices are copied as they lie in memory, and the wire is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"), "vertices would need their bytes swapped");

@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use super::blocking::run_blocking;
 use super::viewer::{Body, Shown, StepName};
-use crate::error::{Result, during};
-use crate::render::Hit;
-use crate::scene::{Scene, State};
 use crate::telemetry::StageTimes;
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::{Scene, State};
+use modalcast_render::Hit;
 
 /// One hit.
 #[derive(Debug, Clone, PartialEq)]

@@ -9,7 +9,7 @@ use tokio::sync::OnceCell;
 use super::host::Host;
 use super::ledger::Origin;
 use super::not_open;
-use crate::error::{Error, Result};
+use modalcast_model::error::{Error, Result};
 
 /// A claimed name, and its scene once that is loaded.
 pub(super) struct Seat {

@@ -8,9 +8,9 @@ use super::conductor::{Conductor, Held};
 use super::late::Leaving;
 use super::picked::with_transforms;
 use super::viewer::{Body, Delivery, Showing, Shown, StepName, View, Viewer};
-use crate::deform::{Surface, Wanted};
-use crate::error::{Error, Result};
 use crate::telemetry::{Stage, StageTimes};
+use modalcast_model::deform::{Surface, Wanted};
+use modalcast_model::error::{Error, Result};
 
 impl Conductor {
     /// Answers every request whose step is there or gone; forgets those that nobody waits for.
@@ -183,8 +183,8 @@ mod tests {
     use super::super::{testing, worker::Worker};
     use super::*;
     use crate::config::Config;
-    use crate::render::{Image, Paths};
-    use crate::scene::{Camera, State};
+    use modalcast_model::scene::{Camera, State};
+    use modalcast_render::{Image, Paths};
 
     /// A scene at its first step, and what it asks of the device.
     fn scene(folder: &std::path::Path) -> (Conductor, mpsc::Receiver<Command>) {

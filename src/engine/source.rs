@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::error::Result;
-use crate::load::Repository;
-use crate::scene::Scene;
+use modalcast_model::error::Result;
+use modalcast_model::load::Repository;
+use modalcast_model::scene::Scene;
 
 /// Opens scenes for the engine. Called on threads that may wait for the disk.
 pub trait SceneSource: Send + Sync + 'static {

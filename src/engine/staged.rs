@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use super::values;
 use super::viewer::Showing;
-use crate::deform::{Deformed, Deformer, Fetch, Surface, Wanted};
-use crate::error::{Error, Result, during, invalid};
 use crate::frame::Legend;
-use crate::raster::{Mesh, Rasteriser};
-use crate::render::{Renderer, SceneBuffers, Shot};
-use crate::scene::{Bounds, Camera, LightBounds, Scene, State, nearest_cell};
+use modalcast_model::deform::{Deformed, Deformer, Fetch, Surface, Wanted};
+use modalcast_model::error::{Error, Result, during, invalid};
+use modalcast_model::raster::{Mesh, Rasteriser};
+use modalcast_model::scene::{Bounds, Camera, LightBounds, Scene, State, nearest_cell};
+use modalcast_render::{Renderer, SceneBuffers, Shot};
 
 /// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
 const FARTHEST: f64 = 1e18;
@@ -257,7 +257,7 @@ fn is_near(bounds: &Bounds) -> bool {
 mod tests {
     use super::super::testing;
     use super::*;
-    use crate::reference::ReferenceDeformer;
+    use modalcast_compute::reference::ReferenceDeformer;
 
     fn staged() -> Staged {
         let scene = testing::two_strips();

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use crate::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
-use crate::scene::{Deformation, Parts, Scene};
+use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::scene::{Deformation, Parts, Scene};
 
 /// Two strips of two triangles with two modes each; the second hangs on the first.
 pub(super) fn two_strips() -> Arc<Scene> {

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OwnedSemaphorePermit;
 
-use crate::error::{Result, during, invalid};
+use modalcast_model::error::{Result, during, invalid};
 
 /// The longest path, in bytes, and its most folders.
 const LONGEST_PATH: usize = 240;
@@ -187,7 +187,7 @@ fn hex(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::error::Error;
+    use modalcast_model::error::Error;
 
     fn begin(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let announced = Announcement { scene: "s".into(), entry: String::new(), files, total_bytes };

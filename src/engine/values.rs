@@ -4,10 +4,10 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::viewer::Showing;
-use crate::deform::Surface;
-use crate::error::{Result, invalid};
 use crate::frame::{Legend, round_up};
-use crate::scene::{Scene, State};
+use modalcast_model::deform::Surface;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Scene, State};
 
 /// The least end of a fitted scale of displacements, in diagonals of the scene: below it they may be rounding.
 const LEAST: f64 = 1e-5;
@@ -75,14 +75,15 @@ pub(super) fn legend(scene: &Scene, showing: Showing, values: &[f32]) -> Legend 
 mod tests {
     use super::super::testing;
     use super::*;
-    use crate::reference;
+    use modalcast_compute::reference;
 
     #[test]
     fn displacements_are_those_of_u_whatever_the_placement_and_shapes_are_lengths_of_rows() {
         let scene = testing::two_strips();
         let mut state = State::rest(&scene);
         let turn = nalgebra::Rotation3::from_euler_angles(0.4, 1.0, -0.3).into_inner();
-        state.transforms[1] = crate::domain::Transform::from_parts(&(2.0 * turn), &Vector3::new(5.0, -3.0, 1.0));
+        state.transforms[1] =
+            modalcast_model::domain::Transform::from_parts(&(2.0 * turn), &Vector3::new(5.0, -3.0, 1.0));
         state.q[scene.layout.slots[1].first_q] = 0.75;
         let positions = reference::deform(&scene, &state).into_flattened();
         let surface = Surface { positions: positions.iter().map(|x| *x as f32).collect(), ..Surface::default() };

@@ -9,12 +9,12 @@ use tokio::sync::{Notify, mpsc, watch};
 
 use super::frame_encoder::ColorFrame;
 use super::picked::Picked;
-use crate::deform::{Surface, Wanted};
-use crate::error::{Error, Result, during};
 use crate::frame::Legend;
-use crate::render::Survey;
-use crate::scene::{Camera, Cells, Rectangle, State};
 use crate::telemetry::StageTimes;
+use modalcast_model::deform::{Surface, Wanted};
+use modalcast_model::error::{Error, Result, during};
+use modalcast_model::scene::{Camera, Cells, Rectangle, State};
+use modalcast_render::Survey;
 
 /// How many pictures a lossless subscriber may be behind before it holds back the writer.
 const AHEAD: usize = 2;
@@ -51,7 +51,7 @@ pub enum View {
 pub enum Showing {
     #[default]
     Colour,
-    /// See [`crate::render::Field`].
+    /// See [`modalcast_render::Field`].
     Depth,
     Domains,
     Normals,

@@ -6,16 +6,16 @@ use std::time::{Duration, Instant};
 use super::staged::Staged;
 use super::viewer::Showing;
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::cpu::CpuDeformer;
-use crate::deform::{Backend, Deformer};
-use crate::error::{Error, Result};
 use crate::frame::Legend;
-use crate::gpu::{self, CudaDeformer, GlBuffers, GlRaster};
-use crate::raster::{Mesh, Rasteriser};
-use crate::reference::ReferenceDeformer;
-use crate::render::{self, Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Survey, Ticket};
-use crate::scene::{Camera, Rastering, Rectangle, Scene};
 use crate::telemetry::{Stage, ms_since};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::gpu::{self, CudaDeformer, GlBuffers, GlRaster};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Backend, Deformer};
+use modalcast_model::error::{Error, Result};
+use modalcast_model::raster::{Mesh, Rasteriser};
+use modalcast_model::scene::{Camera, Rastering, Rectangle, Scene};
+use modalcast_render::{Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Survey, Ticket};
 
 /// What deforms and what draws, for people to read.
 #[derive(Debug, Clone)]
@@ -24,7 +24,7 @@ pub struct Info {
     /// The CUDA device's name, or the reason why there is none.
     pub device: String,
     /// What draws, or why nothing does.
-    pub renderer: Result<render::Info>,
+    pub renderer: Result<modalcast_render::Info>,
 }
 
 /// A frame under way.
@@ -79,7 +79,7 @@ impl Workbench {
     }
 
     /// What the last frame really ran; none without a renderer.
-    pub fn ran(&self) -> Option<&render::Ran> {
+    pub fn ran(&self) -> Option<&modalcast_render::Ran> {
         self.renderer.as_ref().ok().map(Renderer::ran)
     }
 

@@ -12,11 +12,11 @@ use super::desk::{Desk, work};
 use super::viewer::Showing;
 use super::workbench::{Info, Workbench};
 use crate::config::Config;
-use crate::deform::{Deformed, Wanted};
-use crate::error::{Error, Result, during};
 use crate::frame::Legend;
-use crate::render::{FRAMES_UNDER_WAY, Hit, Image, Survey};
-use crate::scene::{Camera, Rectangle, Scene, State};
+use modalcast_model::deform::{Deformed, Wanted};
+use modalcast_model::error::{Error, Result, during};
+use modalcast_model::scene::{Camera, Rectangle, Scene, State};
+use modalcast_render::{FRAMES_UNDER_WAY, Hit, Image, Survey};
 
 /// The way to the device thread. The thread ends when the last one of these is gone.
 #[derive(Debug, Clone)]

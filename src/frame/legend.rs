@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::map::viridis;
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// What the colours say.
 #[derive(Debug, Clone, PartialEq)]

@@ -6,7 +6,7 @@ mod map;
 pub use legend::{Legend, draw as draw_legend, round_up};
 pub use map::{paint, viridis};
 
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 /// RGBA8 pixels of a survey of values (little-endian words, `samples` of them a pixel), with their legend.
 ///
@@ -45,7 +45,7 @@ fn opaque_rgb(rgba: &[u8]) -> Option<Vec<u8>> {
 }
 
 fn encode_png(width: u32, height: u32, color: png::ColorType, pixels: &[u8]) -> Result<Vec<u8>> {
-    let fail = crate::error::during::<png::EncodingError>("encode");
+    let fail = modalcast_model::error::during::<png::EncodingError>("encode");
     let mut bytes = Vec::with_capacity(pixels.len() / 4);
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(color);

@@ -3,7 +3,7 @@
 use super::Prefer;
 use super::egl::{Candidate, Context, candidates, none_fits};
 use super::gl::Gl;
-use crate::error::{Error, Result};
+use modalcast_model::error::{Error, Result};
 
 /// One place where OpenGL may be had, as EGL describes it.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]

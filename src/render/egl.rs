@@ -10,7 +10,7 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use khronos_egl as egl;
 
-use crate::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, during};
 
 type Instance = egl::DynamicInstance<egl::EGL1_4>;
 type Raw = *mut c_void;

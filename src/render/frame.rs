@@ -5,8 +5,8 @@ use nalgebra::{Matrix4, Vector3};
 
 use super::Shot;
 use super::light::{Fit, LightBox};
-use crate::error::{Result, invalid};
-use crate::scene::{Bounds, LightBounds, Scene};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Bounds, LightBounds, Scene};
 
 /// Twin of `FrameBlock` in `shaders/shared/frame.glsl`; columns of matrices follow each other.
 #[repr(C)]
@@ -224,8 +224,8 @@ fn wide(vector: Vector3<f64>, fourth: f64) -> [f32; 4] {
 mod tests {
     use super::super::geometry::tests::squares;
     use super::*;
-    use crate::domain::Material;
-    use crate::scene::{Camera, Lens, View};
+    use modalcast_model::domain::Material;
+    use modalcast_model::scene::{Camera, Lens, View};
 
     #[test]
     fn a_direction_through_a_pixel_meets_the_point_that_projects_there() {

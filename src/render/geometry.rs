@@ -6,8 +6,8 @@
 
 use nalgebra::Vector3;
 
-use crate::domain::{AlphaMode, Domain, Material};
-use crate::scene::{Scene, Slot};
+use modalcast_model::domain::{AlphaMode, Domain, Material};
+use modalcast_model::scene::{Scene, Slot};
 
 /// Which pass a triangle belongs to, by its material.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -186,7 +186,7 @@ fn stretches<'a>(domain: &'a Domain, slot: &Slot) -> impl Iterator<Item = (usize
 
 /// Whether a triangle's winding says the opposite of its normals. Which side of a double-sided triangle is seen is asked
 /// of the winding, so that must agree with the normals; files do not always see to it.
-fn winding_disagrees(mesh: &crate::domain::Mesh, triangle: [u32; 3]) -> bool {
+fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -> bool {
     let corners = mesh.corners();
     let at = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let normal = |corner: u32| Vector3::from(corners.normals[corner as usize]).cast::<f64>();
@@ -198,11 +198,11 @@ fn winding_disagrees(mesh: &crate::domain::Mesh, triangle: [u32; 3]) -> bool {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::domain::{Mesh, Metadata, Modes, Run, Shape, Transform};
-    use crate::scene::Parts;
+    use modalcast_model::domain::{Mesh, Metadata, Modes, Run, Shape, Transform};
+    use modalcast_model::scene::Parts;
 
     /// A scene of one unit square (two triangles) per material.
-    pub(in crate::render) fn squares(materials: Vec<Material>) -> Parts {
+    pub(crate) fn squares(materials: Vec<Material>) -> Parts {
         let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
         let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
         let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");

@@ -27,7 +27,7 @@ pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureKind
 pub(super) use self::staging::{Lent, Staging};
 pub(super) use self::timer::Stopwatch;
 use super::egl::Context;
-use crate::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, during};
 
 /// The constants that other files name.
 pub(super) use glow::{
@@ -343,5 +343,5 @@ impl Gl {
 
 /// A refusal by size that a caller can act on.
 pub(super) fn too_large(what: &str, limit: u64, given: u64) -> Error {
-    crate::error::invalid(what, format!("at most {limit} on this device"), given)
+    modalcast_model::error::invalid(what, format!("at most {limit} on this device"), given)
 }

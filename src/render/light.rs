@@ -8,7 +8,7 @@
 
 use nalgebra::{Matrix4, Vector3};
 
-use crate::scene::{Bounds, LightBounds, UpAxis, light_axes};
+use modalcast_model::scene::{Bounds, LightBounds, UpAxis, light_axes};
 
 /// How far below the box the ground may pull the far plane, in diagonals: a grazing sun would pull it to infinity, and a
 /// receiver beyond the far plane is still shaded rightly.

@@ -19,8 +19,8 @@ use super::scene_buffers::SceneBuffers;
 use super::shaders::lists::{BINS, TALLY};
 use super::shaders::{self, Options, TILE};
 use super::target::{Blended, Form};
-use crate::error::Result;
-use crate::scene::{Look, MAX_FRAGMENTS};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Look, MAX_FRAGMENTS};
 
 const RECORDS: u32 = 2;
 const LEDGER: u32 = 3;
@@ -252,11 +252,11 @@ fn gather(
 }
 
 /// What a look wants for the blended triangles of a frame.
-pub(super) fn wanted(gl: &Gl, scene: &crate::scene::Scene, size: [u32; 2]) -> Result<Blended> {
+pub(super) fn wanted(gl: &Gl, scene: &modalcast_model::scene::Scene, size: [u32; 2]) -> Result<Blended> {
     match scene.look.transparency {
         _ if !scene.needs.blend => Ok(Blended::None),
-        crate::scene::Transparency::TwoPass => Ok(Blended::Drawn),
-        crate::scene::Transparency::Exact => budget(&gl.limits, &scene.look, size).map(Blended::Listed),
+        modalcast_model::scene::Transparency::TwoPass => Ok(Blended::Drawn),
+        modalcast_model::scene::Transparency::Exact => budget(&gl.limits, &scene.look, size).map(Blended::Listed),
     }
 }
 
@@ -265,9 +265,9 @@ mod tests {
     use super::super::geometry::tests::squares;
     use super::super::{Prefer, Renderer, Shot};
     use super::*;
-    use crate::deform::Surface;
-    use crate::domain::{AlphaMode, Material};
-    use crate::scene::{Bounds, Camera, Scene, Transparency};
+    use modalcast_model::deform::Surface;
+    use modalcast_model::domain::{AlphaMode, Material};
+    use modalcast_model::scene::{Bounds, Camera, Scene, Transparency};
 
     #[test]
     fn the_budget_is_eight_a_pixel_or_what_the_look_says_as_far_as_one_buffer_reaches() {

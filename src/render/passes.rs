@@ -15,7 +15,7 @@ use super::shaders::{
 use super::splits::Splits;
 use super::target::Target;
 use super::{Ran, Shot};
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 pub(super) const PIXELS: u32 = 0;
 pub(super) const TILES: u32 = 1;

@@ -18,8 +18,8 @@ use super::seen::Seen;
 use super::shaders;
 use super::target::{Form, image};
 use super::{Ran, Renderer, Shot, frame, passes};
-use crate::error::Result;
-use crate::scene::{Camera, Rectangle, Scene};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Camera, Rectangle, Scene};
 
 /// Words per pixel as `shaders/pick.comp` writes them.
 const WORDS: usize = 22;

@@ -1,4 +1,4 @@
-//! What a scene needs of the device, decided once from its [`crate::scene::Needs`]: buffers, textures, passes, shader
+//! What a scene needs of the device, decided once from its [`modalcast_model::scene::Needs`]: buffers, textures, passes, shader
 //! branches; and what was left out, with what that saved against a scene that needs everything.
 //!
 //! The renderer allocates and compiles exactly this. Pure: runs without a device.
@@ -8,7 +8,7 @@ use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
 use super::gl::Limits;
 use super::shadow::fitting;
 use super::textures::{Use, arrays};
-use crate::scene::{Antialias, Culling, Scene, Shadow, Tone, Transparency};
+use modalcast_model::scene::{Antialias, Culling, Scene, Shadow, Tone, Transparency};
 
 /// A buffer or texture and its size.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -243,14 +243,14 @@ fn left_out(scene: &Scene, culling: Culling) -> Vec<Saving> {
 mod tests {
     use super::super::geometry::tests::squares;
     use super::*;
-    use crate::domain::{AlphaMode, Material, Texture};
-    use crate::scene::{Bloom, Look};
+    use modalcast_model::domain::{AlphaMode, Material, Texture};
+    use modalcast_model::scene::{Bloom, Look};
 
     fn names(allocations: &[Allocation]) -> Vec<&str> {
         allocations.iter().map(|allocation| allocation.name.as_str()).collect()
     }
 
-    fn everything() -> crate::scene::Parts {
+    fn everything() -> modalcast_model::scene::Parts {
         let materials = vec![
             Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },

@@ -9,8 +9,8 @@ use super::gl::{self, Gl, Program, Texture, TextureKind};
 use super::programs::Compile;
 use super::shaders::{LANES, Source, TILE};
 use super::target::{Form, Target};
-use crate::error::Result;
-use crate::scene::{Antialias, Bloom, Look, Tone};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Antialias, Bloom, Look, Tone};
 
 const TONE: &str = include_str!("../../shaders/shared/tone.glsl");
 const RESOLVE: &str = include_str!("../../shaders/shared/resolve.glsl");

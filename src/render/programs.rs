@@ -8,7 +8,7 @@ use super::gl::Program;
 use super::lists::ListPrograms;
 use super::plan::Plan;
 use super::shaders::{Options, Source};
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 /// Gives the program of a source, compiled or shared.
 pub(super) type Compile<'a> = dyn FnMut(Source) -> Result<Rc<Program>> + 'a;

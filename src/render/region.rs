@@ -5,7 +5,7 @@ use std::cell::Cell;
 
 use nalgebra::{Matrix4, Vector4};
 
-use crate::scene::Bounds;
+use modalcast_model::scene::Bounds;
 
 /// A rectangle of a frame's pixels; (0, 0) is the bottom left one. It may be empty.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,7 +92,7 @@ impl Touched {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Camera, Lens, View};
+    use modalcast_model::scene::{Camera, Lens, View};
 
     const FRAME: [u32; 2] = [640, 400];
 

@@ -6,7 +6,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use super::gl::{Gl, Staging};
-use crate::error::{Error, Result};
+use modalcast_model::error::{Error, Result};
 
 /// Frames of one form that may be under way at once.
 pub const FRAMES_UNDER_WAY: usize = 3;

@@ -18,9 +18,9 @@ use super::programs::{Compile, Programs, Sampled};
 use super::shaders::{self, OTHER_READS, Options, Used};
 use super::shadow::{ShadowMap, Shared, fitting};
 use super::textures::{Array, Use, arrays, cutoff, levels, place, within_budget};
-use crate::domain::AlphaMode;
-use crate::error::{Result, during};
-use crate::scene::Scene;
+use modalcast_model::domain::AlphaMode;
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::Scene;
 
 /// Twin of `material_of` in `shaders/shared/material.glsl`.
 #[repr(C)]
@@ -268,7 +268,7 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
         let place = texture.and_then(|texture| place(arrays, texture));
         place.map_or([-1.0; 2], |(array, layer)| [array as f32, layer as f32])
     };
-    let one = |material: &crate::domain::Material| {
+    let one = |material: &modalcast_model::domain::Material| {
         let cutoff = match material.alpha_mode {
             AlphaMode::Mask { cutoff } => cutoff,
             AlphaMode::Blend => scene.look.opaque_alpha,

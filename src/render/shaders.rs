@@ -11,7 +11,7 @@ use std::fmt::Write as _;
 use super::geometry::Kind;
 use super::gl;
 use super::textures::Use;
-use crate::scene::Shadow;
+use modalcast_model::scene::Shadow;
 
 pub(super) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
 const CLIP: &str = include_str!("../../shaders/shared/clip.glsl");
@@ -269,8 +269,8 @@ pub(super) fn seen(samples: u32) -> Source {
 mod tests {
     use super::super::geometry::tests::squares;
     use super::*;
-    use crate::domain::{AlphaMode, Material};
-    use crate::scene::Scene;
+    use modalcast_model::domain::{AlphaMode, Material};
+    use modalcast_model::scene::Scene;
 
     fn options(alpha_mode: AlphaMode) -> Options {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");

@@ -6,7 +6,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::Shot;
 use super::light::{Fit, LightBox, Side};
-use crate::scene::{Camera, Scene};
+use modalcast_model::scene::{Camera, Scene};
 
 /// The share of the logarithmic scheme in where the view is cut; the rest is cut evenly.
 const LOGARITHMIC: f64 = 0.5;
@@ -97,7 +97,7 @@ fn within(whole: &[Side; 2], part: &[Side; 2]) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Bounds, Lens, UpAxis, View};
+    use modalcast_model::scene::{Bounds, Lens, UpAxis, View};
 
     fn fit() -> Fit {
         let bounds = Bounds { min: [-50.0, 0.0, -50.0], max: [50.0, 5.0, 50.0] };
@@ -146,8 +146,8 @@ mod tests {
     #[test]
     fn extreme_cameras_leave_finite_parts_inside_the_whole() {
         let scene = |splits: u32| {
-            let mut parts = super::super::geometry::tests::squares(vec![crate::domain::Material::default()]);
-            parts.look.shadow = Some(crate::scene::Shadow { splits, ..Default::default() });
+            let mut parts = super::super::geometry::tests::squares(vec![modalcast_model::domain::Material::default()]);
+            parts.look.shadow = Some(modalcast_model::scene::Shadow { splits, ..Default::default() });
             Scene::new(parts).expect("good")
         };
         let turned = |near: f64, far: f64, eye: [f64; 3]| {

@@ -19,7 +19,7 @@ use super::scene_buffers::SceneBuffers;
 use super::splits::Splits;
 use super::target::{Form, Target};
 use super::{Image, Path, Paths, Ran, Renderer, Shot, cull, frame, passes};
-use crate::error::{Error, Result, during, invalid};
+use modalcast_model::error::{Error, Result, during, invalid};
 
 /// Bytes that one thread copies at a time: enough that starting it costs little of that.
 const STRETCH: usize = 1 << 20;

@@ -12,7 +12,7 @@ use super::seen::Seen;
 use super::shaders::{self, VALUE_UNIT};
 use super::target::{Form, image};
 use super::{Ran, Renderer, Shot, frame, passes};
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// What is read off a frame. Blended triangles are not there: what stands behind them is. Only depth knows the ground:
 /// elsewhere it hides nothing that hangs below it.

@@ -11,8 +11,8 @@ use super::lists::{HEAD, ListTarget};
 use super::region::{Region, Touched};
 use super::ring::Ring;
 use super::shaders::TILE;
-use crate::error::Result;
-use crate::scene::{Culling, Look};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Culling, Look};
 
 /// Pixels of a multisampled frame, at most: with depth, ids and a blended layer they take 704 MiB of device memory. A
 /// larger frame is drawn with one sample a pixel.

@@ -9,9 +9,9 @@ mod coverage;
 
 use std::sync::OnceLock;
 
-use crate::domain::{AlphaMode, Texture};
-use crate::error::{Result, invalid};
-use crate::scene::Scene;
+use modalcast_model::domain::{AlphaMode, Texture};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::Scene;
 
 use super::geometry::used_materials;
 
@@ -129,7 +129,7 @@ fn merge(mut arrays: Vec<Array>, limit: usize) -> Vec<Array> {
 /// From which alpha on a texture's texels are left, when nothing but cut-outs of one cutoff reads them.
 pub(super) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
     let materials = used_materials(scene).into_iter().map(|material| &scene.materials[material]);
-    let of_material = |material: &crate::domain::Material| match material.alpha_mode {
+    let of_material = |material: &modalcast_model::domain::Material| match material.alpha_mode {
         AlphaMode::Mask { cutoff } => Some(cutoff / material.alpha),
         _ => None,
     };

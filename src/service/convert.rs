@@ -4,9 +4,9 @@
 use modalcast_proto::v1;
 
 use crate::engine::{self, Delivery, Engine, Format, Host, Path, Policy, StepName, View, Which};
-use crate::error::{Result, invalid};
-use crate::scene::{Camera, RawUpdate, Rectangle, Scene, TransformFormat};
 use crate::telemetry::StageTimes;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Camera, RawUpdate, Rectangle, Scene, TransformFormat};
 
 mod camera;
 mod output;

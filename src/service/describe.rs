@@ -11,8 +11,8 @@ use tonic::{Response, Status};
 use super::convert::scene_info;
 use super::stream::{Outlet, Replies, pieces, respond};
 use crate::engine::{Host, checked_domains};
-use crate::error::{Result, invalid};
-use crate::scene::Scene;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::Scene;
 
 /// Describes the chosen domains and sends the arrays asked for.
 pub(super) fn scene(
@@ -117,7 +117,7 @@ async fn send_descriptions(
 fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
     let domain = &scene.domains[index as usize];
     let slot = scene.layout.slots[index as usize];
-    let numbers = |transform: &crate::domain::Transform| -> Bytes {
+    let numbers = |transform: &modalcast_model::domain::Transform| -> Bytes {
         transform.0.into_iter().flat_map(f32::to_le_bytes).collect::<Vec<u8>>().into()
     };
     let attachment = domain.attachment.as_ref();

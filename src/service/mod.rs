@@ -23,7 +23,7 @@ use tonic_health::server::HealthReporter;
 use self::routes::Routes;
 use crate::config::Config;
 use crate::engine::Engine;
-use crate::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, during};
 
 /// The largest message that the server sends: a chunk and its envelope.
 const LARGEST_REPLY: usize = 3 << 20;

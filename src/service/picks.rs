@@ -8,7 +8,7 @@ use super::convert::{pick, said, stages, step_id, which_of_pick};
 use super::status::status;
 use super::stream::{Deadline, Replies, respond};
 use crate::engine::{Engine, Picked, Picks, resolve_picks};
-use crate::scene::Scene;
+use modalcast_model::scene::Scene;
 
 /// Bytes of a hit without its modes, at most.
 const HIT_BYTES: usize = 256;

@@ -12,7 +12,7 @@ use super::describe;
 use super::status::{status, transport};
 use super::stream::{Replies, guarded};
 use crate::engine::{Engine, Upload};
-use crate::error::{Error, Result, during, invalid};
+use modalcast_model::error::{Error, Result, during, invalid};
 
 /// The most bytes of source names that a list carries.
 const MOST_SOURCES: usize = 512 << 10;

@@ -5,7 +5,7 @@ use modalcast_proto::v1::Rejection;
 use prost::Message as _;
 use tonic::{Code, Status};
 
-use crate::error::Error;
+use modalcast_model::error::Error;
 
 /// The most letters of one text of a refusal: it travels in headers or between steps, whatever a client has sent.
 const LONGEST: usize = 512;
@@ -69,7 +69,7 @@ mod tests {
 
     #[test]
     fn a_status_carries_the_rejection_and_stays_small() {
-        let error = crate::error::invalid("step.q", "8 bytes", "x".repeat(100_000));
+        let error = modalcast_model::error::invalid("step.q", "8 bytes", "x".repeat(100_000));
         let status = status(error);
         assert_eq!(status.code(), Code::InvalidArgument);
         let details = Rejection::decode(status.details()).expect("a rejection");

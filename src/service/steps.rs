@@ -12,7 +12,7 @@ use super::convert::{policy, raw_update, scene_info, stages, wire_policy};
 use super::status::{rejection, status, transport};
 use super::stream::{Deadline, Outlet, Replies, respond};
 use crate::engine::{Drive, Engine, Report};
-use crate::error::{Error, Result, invalid};
+use modalcast_model::error::{Error, Result, invalid};
 
 /// How many replies may wait for a client that does not read; beyond, the stream ends.
 const MOST_REPLIES: usize = 256;

@@ -13,7 +13,7 @@ use tonic::{Response, Status};
 
 use super::status::status;
 use crate::config::Config;
-use crate::error::{Error, Result};
+use modalcast_model::error::{Error, Result};
 
 /// A reply stream.
 pub(super) type Replies<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;

@@ -10,8 +10,8 @@ use tonic::{Request, Response, Status};
 use super::convert::{delivery, said, stages, step_id, which_of_vertices};
 use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
-use crate::deform::Wanted;
 use crate::engine::{Engine, Feed, Host, Packed, Selection, View, pack_vertices};
+use modalcast_model::deform::Wanted;
 
 /// `VertexService`.
 pub(super) struct Vertices(pub(super) Engine);

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Domain, Shape};
-use modalcast::scene::{Batches, Changed, Deformation, Normals, RawUpdate, Scene, State, Storage, Update};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Domain, Shape};
+use modalcast_model::scene::{Batches, Changed, Deformation, Normals, RawUpdate, Scene, State, Storage, Update};
 
 use super::readers::{kept, wrong_box};
 use super::{Shown, run, strip};

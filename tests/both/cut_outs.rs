@@ -1,9 +1,9 @@
 //! Soups of which a part is cut out, and what of them no two filters need agree on.
 
-use modalcast::raster::{AlphaImage, CutOuts, Surface};
-use modalcast::reference::raster::cut_out::{alpha, footprint};
-use modalcast::reference::raster::{Raster, corners, depth_at, outline, pieces};
-use modalcast::scene::{Faces, Group, Window};
+use modalcast_compute::reference::raster::cut_out::{alpha, footprint};
+use modalcast_compute::reference::raster::{Raster, corners, depth_at, outline, pieces};
+use modalcast_model::raster::{AlphaImage, CutOuts, Surface};
+use modalcast_model::scene::{Faces, Group, Window};
 
 use super::soups::{Soup, flat, perspective, soups};
 use crate::scenes::Random;

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Mesh, Modes, Shape, Transform};
-use modalcast::reference;
-use modalcast::scene::{Deformation, Scene, State, Storage};
+use modalcast_compute::reference;
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Mesh, Modes, Shape, Transform};
+use modalcast_model::scene::{Deformation, Scene, State, Storage};
 
 use super::{beyond, run, scene_of, strip, within};
 use crate::scenes::{self, Random};

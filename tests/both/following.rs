@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Domain, Follow, Mesh, Modes, Shape, Transform};
-use modalcast::reference::{self, orient_normals, orient_tangents};
-use modalcast::scene::{
+use modalcast_compute::reference::{self, orient_normals, orient_tangents};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Domain, Follow, Mesh, Modes, Shape, Transform};
+use modalcast_model::scene::{
     Changed, Deformation, Normals, Parts, RawUpdate, Scene, State, Storage, TransformFormat, Update,
 };
 

@@ -1,9 +1,9 @@
 //! The judge of positions: errors against the f64 twin as parts of their a-priori bounds.
 
-use modalcast::reference;
-use modalcast::scene::{Scene, State};
-use modalcast::storage::bound::{Reaches, Step};
-use modalcast::storage::{QUAD, TILE_QUADS, Tiles};
+use modalcast_compute::reference;
+use modalcast_compute::storage::bound::{Reaches, Step};
+use modalcast_compute::storage::{QUAD, TILE_QUADS, Tiles};
+use modalcast_model::scene::{Scene, State};
 
 const TILE: usize = QUAD * TILE_QUADS;
 

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Mesh, Modes, Shape};
-use modalcast::scene::{Batches, Bounds, Deformation, LightBounds, Scene, State};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Mesh, Modes, Shape};
+use modalcast_model::scene::{Batches, Bounds, Deformation, LightBounds, Scene, State};
 
 use super::{Shown, run, scene_of};
 use crate::scenes::{self, Random};

@@ -2,6 +2,7 @@
 //! of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
 
 pub(crate) mod changes;
+#[allow(dead_code, reason = "each test binary uses a part")]
 pub(crate) mod cut_outs;
 pub(crate) mod exact;
 pub(crate) mod extremes;
@@ -17,9 +18,9 @@ pub(crate) mod truncation;
 
 use std::sync::Arc;
 
-use modalcast::deform::{Deformed, Deformer, Surface};
-use modalcast::domain::{Domain, Mesh, Shape};
-use modalcast::scene::{Bounds, Deformation, LightBounds, Scene, State};
+use modalcast_model::deform::{Deformed, Deformer, Surface};
+use modalcast_model::domain::{Domain, Mesh, Shape};
+use modalcast_model::scene::{Bounds, Deformation, LightBounds, Scene, State};
 
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 pub(crate) use judge::{beyond, displacements_beyond, displacements_within, within};

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Domain, Shape};
-use modalcast::gpu::{Launch, plan};
-use modalcast::scene::{Deformation, Scene, State, Storage};
+use modalcast_compute::gpu::{Launch, plan};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Domain, Shape};
+use modalcast_model::scene::{Deformation, Scene, State, Storage};
 
 use super::{Shown, run, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::deform::{Deformer, Wanted};
-use modalcast::domain::{Domain, Transform};
 use modalcast::engine::Workbench;
-use modalcast::scene::{Bounds, Deformation, Scene, State, Storage};
+use modalcast_model::deform::{Deformer, Wanted};
+use modalcast_model::domain::{Domain, Transform};
+use modalcast_model::scene::{Bounds, Deformation, Scene, State, Storage};
 
 use super::extremes::columns_of;
 use super::neighbours::is_narrow;

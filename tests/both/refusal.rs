@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::deform::Deformer;
-use modalcast::domain::Transform;
 use modalcast::engine::Workbench;
-use modalcast::scene::{Deformation, Scene, State, Storage};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{Deformation, Scene, State, Storage};
 
 use super::{changes, run, scene_of, strip};
 use crate::scenes::{self, Random};

@@ -1,7 +1,7 @@
 //! Triangles that are hard to rasterise, and the windows that they are drawn in.
 
-use modalcast::reference::raster::Raster;
-use modalcast::scene::{Faces, Group, Window};
+use modalcast_compute::reference::raster::Raster;
+use modalcast_model::scene::{Faces, Group, Window};
 use nalgebra::{Matrix4, Point3, Vector3};
 
 use crate::scenes::Random;

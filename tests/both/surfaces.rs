@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Corners, Mesh, Shape, Transform};
-use modalcast::reference::{orient_normals, orient_tangents};
-use modalcast::scene::{Deformation, Normals, Scene, State};
+use modalcast_compute::reference::{orient_normals, orient_tangents};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Corners, Mesh, Shape, Transform};
+use modalcast_model::scene::{Deformation, Normals, Scene, State};
 
 use super::{run, scene_of, within};
 use crate::scenes::{self, Random};

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::scene::{Deformation, Scene, State, Storage};
+use modalcast_model::deform::Deformer;
+use modalcast_model::scene::{Deformation, Scene, State, Storage};
 
 use super::extremes::columns_of;
 use super::{beyond, changes, run, scene_of, strip, within};

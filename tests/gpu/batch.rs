@@ -2,16 +2,15 @@
 
 use std::sync::Arc;
 
-use modalcast::domain::Transform;
-use modalcast::gpu::{BatchMma, Cache, Device, Extent, Launch, Ours, Trial, gigabytes_per_second, time};
-use modalcast::scene::{Batches, Deformation, Normals, Parts, Scene, State, Storage};
-use modalcast::storage::bound::{Reaches, Step};
-use modalcast::storage::{Products, QUAD, TILE_QUADS, Tiles};
+use modalcast_compute::gpu::Launch;
+use modalcast_compute::storage::{QUAD, TILE_QUADS};
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{Batches, Deformation, Normals, Parts, Scene, Storage};
 
 use crate::both::following::grove;
 use crate::both::readers::wrong_box;
 use crate::both::{run, scene_of, strip, within};
-use crate::judge::same_bits;
+use crate::ensembles::{ensemble, states, stored};
 use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
@@ -22,26 +21,6 @@ fn both(mut parts: impl FnMut() -> Parts) -> [Arc<Scene>; 2] {
         parts.deformation.batches = batches;
         Scene::new(parts).expect("a scene")
     })
-}
-
-/// `count` domains of one shape, deformed so.
-fn ensemble((vertices, rank, count): (usize, usize, usize), deformation: Deformation) -> Parts {
-    let mut parts = scenes::parts(vec![scenes::shape(&mut Random(7), vertices, rank)]);
-    parts.domains = vec![scenes::domain(0, 0); count];
-    parts.deformation = deformation;
-    parts
-}
-
-fn stored(storage: Storage) -> Deformation {
-    Deformation { storage, ..Deformation::default() }
-}
-
-fn made(parts: Parts) -> Arc<Scene> {
-    Scene::new(parts).expect("a scene")
-}
-
-fn states(scene: &Scene) -> Vec<State> {
-    (1..=3).map(|seed| scenes::state(scene, seed)).collect()
 }
 
 /// Shows states of a scene with batches and without, and returns in how many a bit differs.
@@ -95,7 +74,7 @@ fn gpu_blocks_with_several_tiles_have_the_bits_of_domains_apart() {
     for (storage, vertices) in [(Storage::F32, 1_100_007), (Storage::Int8, 1_100_007), (Storage::F16, 1_600_001)] {
         let name = format!("{} n {vertices}", storage.name());
         let scenes = both(|| ensemble((vertices, 5, 3), Deformation { boxes: true, ..stored(storage) }));
-        let blocks = modalcast::gpu::plan(&scenes[0]).kernel(Launch::Batch).expect("a batch").blocks as usize;
+        let blocks = modalcast_compute::gpu::plan(&scenes[0]).kernel(Launch::Batch).expect("a batch").blocks as usize;
         assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
         assert_eq!(differences(&name, &scenes), 0, "{name}");
     }
@@ -134,65 +113,6 @@ fn gpu_batches_among_other_domains_agree_with_all_that_a_scene_may_ask_for() {
     }
 }
 
-/// The largest error of a vertex over the bound of its tile: of U in 16 bits, of q in two numbers of 16 bits, and of the
-/// tensor cores' own sums.
-fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
-    let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
-    let tiles = Tiles::new(shape, storage);
-    let (reaches, products) = (Reaches::new(shape, &tiles), Products::of(storage, tiles.rank()));
-    let vertices = shape.mesh.rest().len();
-    let want = modalcast::reference::deform(scene, state);
-    let share = |(packed, got): (usize, &[f32; 3])| {
-        let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));
-        let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated: false };
-        let bound = reaches.tile(tile, &step).total() + reaches.products(tile, &step, products);
-        let square = |axis: usize| (f64::from(got[axis]) - want[packed][axis]).powi(2);
-        let error = (0..3).map(square).sum::<f64>().sqrt();
-        if error.is_nan() { f64::INFINITY } else { error / bound }
-    };
-    positions.as_chunks::<3>().0.iter().enumerate().map(share).fold(0.0, f64::max)
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_count() {
-    let device = Device::open(0).expect("a CUDA device");
-    for storage in [Storage::F16, Storage::Bf16] {
-        for (vertices, rank, count) in [
-            (1, 3, 1),
-            (33, 0, 2),
-            (64, 1, 16),
-            (127, 4, 5),
-            (128, 33, 16),
-            (129, 16, 8),
-            (261, 31, 32),
-            (2000, 32, 16),
-            (5003, 512, 13),
-        ] {
-            let scene = made(ensemble((vertices, rank, count), stored(storage)));
-            let states = states(&scene);
-            let batch = BatchMma::new(&device, &scene, &states).expect("a trial");
-            let name = format!("{} n {vertices} r {rank}", batch.name());
-            for (turn, state) in states.iter().enumerate() {
-                batch.launch(&device, turn).expect("launches");
-                let got = batch.positions(&device).expect("copies");
-                let share = of_bound(&scene, state, &got);
-                assert!(share <= 1.0, "{name} turn {turn}: {share} of the bound");
-                let other = of_bound(&scene, &states[(turn + 1) % states.len()], &got);
-                assert!(other > 1.0, "{name}: the judge can fail");
-                batch.launch(&device, turn).expect("launches");
-                assert!(same_bits(&got, &batch.positions(&device).expect("copies")), "{name}: run after run");
-            }
-            for facts in batch.kernels() {
-                assert!(facts.spilled_bytes == 0, "{name}: {facts:?}");
-            }
-        }
-    }
-    let refused = |scene: &Arc<Scene>| BatchMma::new(&device, scene, &states(scene)).expect_err("refused");
-    assert!(refused(&made(ensemble((9, 2, 2), stored(Storage::F32)))).to_string().contains("f16 or bf16"));
-    assert!(refused(&made(ensemble((9, 2, 33), stored(Storage::F16)))).to_string().contains("at most 32"));
-}
-
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_what_overflows_on_its_way_in_f32_is_mended_in_a_batch_too() {
@@ -217,65 +137,4 @@ fn gpu_what_overflows_on_its_way_in_f32_is_mended_in_a_batch_too() {
         }
         assert_eq!([0, 1].map(|domain| got.boxes[domain].is_finite()), [true, false], "boxes tell who is lost");
     }
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
-fn gpu_sixteen_vectors_at_once_take_less_than_half_as_long_as_one_after_the_other() {
-    let device = Device::open(0).expect("a CUDA device");
-    let measure = |trial: &dyn Trial| {
-        let us = time(&device, trial, Cache::Warm, 200).expect("times").median_us;
-        let bytes: u64 = trial.bytes().iter().map(|(_, bytes)| bytes).sum();
-        let rate = gigabytes_per_second(bytes, us);
-        eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", trial.name(), trial.kernels());
-        us
-    };
-    for storage in Storage::ALL {
-        let batched = Deformation { batches: Batches::Always, ..stored(storage) };
-        let scene = made(ensemble((1_500_000, 32, 1), batched));
-        let state = scenes::state(&scene, 1);
-        let one = measure(&Ours::new(&device, &scene, &[state], Extent::Positions).expect("a trial"));
-        let scene = made(ensemble((1_500_000, 32, 16), batched));
-        let state = scenes::state(&scene, 1);
-        let sixteen = Ours::new(&device, &scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
-        assert_eq!(sixteen.kernels()[0].name, "batch");
-        let sixteen = measure(&sixteen);
-        eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
-        assert!(sixteen < 8.0 * one, "{storage:?} {one} {sixteen}");
-        if matches!(storage, Storage::F16 | Storage::Bf16) {
-            let products = measure(&BatchMma::new(&device, &scene, &[state]).expect("a trial"));
-            eprintln!("{} by tensor cores: {:.2} times as long as one", storage.name(), products / one);
-            assert!(products < 8.0 * one, "{storage:?} {one} {products}");
-        }
-    }
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
-fn gpu_scenes_that_choose_have_batches_where_they_pay() {
-    let device = Device::open(0).expect("a CUDA device");
-    let mut slow = Vec::new();
-    for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {
-        for count in [2, 3, 4, 8, 16, 64] {
-            if vertices * count * rank > 1 << 29 {
-                continue;
-            }
-            let of =
-                |batches| made(ensemble((vertices, rank, count), Deformation { batches, ..Deformation::default() }));
-            let [together, apart, chosen] = [Batches::Always, Batches::Never, Batches::Auto].map(of);
-            let state = scenes::state(&together, 1);
-            let measured = |scene: &Arc<Scene>| {
-                let ours = Ours::new(&device, scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
-                time(&device, &ours, Cache::Warm, 100).expect("times").median_us
-            };
-            let [batch, alone] = [&together, &apart].map(measured);
-            let chooses = modalcast::gpu::plan(&chosen).kernel(Launch::Batch).is_some();
-            eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
-            let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
-            if own > 1.5 * other + 2.0 {
-                slow.push((vertices, rank, count, own, other));
-            }
-        }
-    }
-    assert!(slow.is_empty(), "chosen and slower: {slow:?}");
 }

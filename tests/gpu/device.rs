@@ -1,8 +1,8 @@
 //! The device itself: what it agrees on with the host, what it refuses, what it gives back.
 
-use modalcast::deform::Deformer;
-use modalcast::error::Error;
-use modalcast::gpu::{CudaDeformer, Device, agreements, device_values, probe};
+use modalcast_compute::gpu::{CudaDeformer, Device, agreements, device_values, probe};
+use modalcast_model::deform::Deformer;
+use modalcast_model::error::Error;
 
 use crate::scenes;
 

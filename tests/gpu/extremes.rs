@@ -1,9 +1,9 @@
 //! Zero rows, the sign of what overflows, singular and tiny transforms. What holds of any deformer is in `tests/both`.
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Modes, Shape, Transform};
-use modalcast::reference::orient_normals;
-use modalcast::scene::{Scene, State};
+use modalcast_compute::reference::orient_normals;
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Modes, Shape, Transform};
+use modalcast_model::scene::{Scene, State};
 
 use crate::judge::{DIRECTION, check, largest_error, same_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random};

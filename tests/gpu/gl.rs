@@ -3,8 +3,8 @@
 use std::num::NonZeroU32;
 
 use glow::HasContext as _;
-use modalcast::raster::GlBuffer;
-use modalcast::render::{Prefer, Renderer};
+use modalcast_model::raster::GlBuffer;
+use modalcast_render::{Prefer, Renderer};
 
 /// The context of a renderer, which stays current on this thread.
 pub(crate) struct Gl {

@@ -2,16 +2,16 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::{Deformer, Wanted};
-use modalcast::gpu::{CudaDeformer, Device, GlBuffers};
-use modalcast::render::{FRAMES_UNDER_WAY, Prefer, Renderer, SceneBuffers, Shot};
-use modalcast::scene::{Camera, Scene};
+use modalcast_compute::gpu::{CudaDeformer, Device, GlBuffers};
+use modalcast_model::deform::{Deformer, Wanted};
+use modalcast_model::scene::{Camera, Scene};
+use modalcast_render::{FRAMES_UNDER_WAY, Prefer, Renderer, SceneBuffers, Shot};
 
 use crate::judge::{check, same_bits};
 use crate::scenes;
 
 fn shared(buffers: &SceneBuffers) -> GlBuffers {
-    let modalcast::render::SharedBuffers { positions, normals, tangents } = buffers.shared;
+    let modalcast_render::SharedBuffers { positions, normals, tangents } = buffers.shared;
     GlBuffers { positions, normals, tangents }
 }
 

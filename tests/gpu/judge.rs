@@ -1,9 +1,9 @@
 //! The judges: largest error of numbers against the f64 twin, in a form that a NaN cannot pass.
 
-use modalcast::deform::{Deformed, Deformer};
-use modalcast::gpu::CudaDeformer;
-use modalcast::reference::{orient_normals, orient_tangents};
-use modalcast::scene::{Bounds, Scene, State};
+use modalcast_compute::gpu::CudaDeformer;
+use modalcast_compute::reference::{orient_normals, orient_tangents};
+use modalcast_model::deform::{Deformed, Deformer};
+use modalcast_model::scene::{Bounds, Scene, State};
 
 /// Largest accepted error of a position, as a part of the scene's diagonal.
 pub(crate) const POSITION: f64 = 1e-5;
@@ -32,7 +32,7 @@ pub(crate) fn largest_error<const N: usize>(got: &[f32], want: &[[f64; N]], limi
 pub(crate) fn check(name: &str, scene: &Scene, state: &State, deformer: &mut CudaDeformer) -> Deformed {
     let deformed = deformer.deform(state).expect("deforms");
     let surface = deformer.surface().expect("copies");
-    let want = modalcast::reference::deform(scene, state);
+    let want = modalcast_compute::reference::deform(scene, state);
     let mut bounds = Bounds::EMPTY;
     want.iter().for_each(|position| bounds.include(*position));
     let diagonal = bounds.diagonal().max(f64::from(f32::MIN_POSITIVE));

@@ -5,6 +5,8 @@ mod batch;
 #[path = "../both/mod.rs"]
 mod both;
 mod device;
+#[expect(dead_code, reason = "shared with the benchmarks")]
+mod ensembles;
 mod extremes;
 mod gl;
 mod interop;
@@ -13,12 +15,8 @@ mod light;
 mod normals;
 mod overlap;
 mod paths;
-mod raster;
-mod raster_cut_outs;
 mod raster_gl;
 mod real;
-mod report;
 mod scenes;
 mod stability;
-mod trials;
 mod twins;

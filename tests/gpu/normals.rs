@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::domain::{Corners, Mesh, Modes, Shape, Transform};
-use modalcast::gpu::{CudaDeformer, Role};
-use modalcast::reference::{exact_normals, exact_tangents, orient_normals, orient_tangents};
-use modalcast::scene::{Normals, Scene, State};
+use modalcast_compute::gpu::{CudaDeformer, Role};
+use modalcast_compute::reference::{exact_normals, exact_tangents, orient_normals, orient_tangents};
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Transform};
+use modalcast_model::scene::{Normals, Scene, State};
 use nalgebra::Vector3;
 
 use crate::judge::{DIRECTION, largest_error, same_bits};
@@ -110,10 +110,10 @@ fn the_scenes_of_these_tests_bend_but_do_not_fold() {
         let scene = scene_of(vec![tube(&mut Random(seed), around, rows, rank)], 3, true, false);
         for seed in 5..11 {
             let state = scenes::state(&scene, seed);
-            let mut cpu = modalcast::cpu::CpuDeformer::new(&scene);
+            let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&scene);
             cpu.deform(&state).expect("deforms");
             let surface = cpu.surface().expect("a surface");
-            let positions = modalcast::reference::deform(&scene, &state);
+            let positions = modalcast_compute::reference::deform(&scene, &state);
             let want = exact_normals(&scene, &state, &positions);
             let turned = largest_angle(&surface.normals, &orient_normals(&scene, &state));
             assert!((5.0..150.0).contains(&turned), "{turned} degrees");

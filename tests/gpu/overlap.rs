@@ -3,11 +3,11 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use modalcast::deform::{Deformer, Fetch, Surface, Wanted};
-use modalcast::domain::{Domain, Follow};
-use modalcast::error::Error;
-use modalcast::gpu::{CudaDeformer, Device, MOST_UNDER_WAY, host_writes, overlap};
-use modalcast::scene::{Deformation, Normals, Scene, State, Storage};
+use modalcast_compute::gpu::{CudaDeformer, MOST_UNDER_WAY};
+use modalcast_model::deform::{Deformer, Fetch, Surface, Wanted};
+use modalcast_model::domain::{Domain, Follow};
+use modalcast_model::error::Error;
+use modalcast_model::scene::{Deformation, Normals, Scene, State, Storage};
 
 use crate::both::readers::kept;
 use crate::both::{self, changes};
@@ -278,7 +278,7 @@ fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_ste
     for (step, state) in states.iter().enumerate() {
         deformer.deform(state).expect("deforms");
         let fetch = deformer.fetch(wanted).expect("begins");
-        assert!(fetch.is_there());
+        assert!(fetch.is_ready());
         if let Some((step, fetch)) = before.replace((step, fetch)) {
             let got = deformer.fetched(&fetch).expect("is there");
             let alone = Surface {
@@ -298,23 +298,4 @@ fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_ste
     assert_eq!(deformer.outputs(), 2);
     let got = deformer.fetched(&fetch).expect("arrives");
     assert!(same_bits(&got.positions, &want[STEPS - 1].positions) && got.normals.is_empty() && got.boxes.is_empty());
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_overlap_is_measured_and_its_vertices_are_those_of_the_serial_way() {
-    let device = Device::open(0).expect("a CUDA device");
-    let scene = scenes::scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
-    let states: Vec<State> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();
-    let found = overlap(&device, &scene, &states, 50).expect("measures");
-    eprintln!("{found:#?}");
-    assert_eq!(found.differing, 0);
-    let times = [found.serial_us, found.fetched_us, found.overlapped_us, found.graph_us, found.copy_out_us];
-    assert!(times.iter().chain([&found.write_us, &found.step_us]).all(|time| time.is_finite() && *time > 0.0));
-    assert!(found.overlapped_us < found.serial_us, "what runs side by side takes less time");
-    assert!(found.overlapped_us > 0.5 * found.ideal_us, "and no less than its longest part");
-    assert!(overlap(&device, &scene, &[], 5).is_err() && overlap(&device, &scene, &states, 0).is_err());
-    for write in host_writes(&device, 20).expect("writes") {
-        eprintln!("{write:?}");
-    }
 }

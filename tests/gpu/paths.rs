@@ -4,13 +4,13 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::Deformer as _;
 use modalcast::engine::Workbench;
-use modalcast::gpu::{Device, GlRaster};
-use modalcast::raster::{Mesh, Rasteriser};
-use modalcast::render::{Image, Path, Paths, Pixels, Prefer, Renderer, Seen, Shot};
-use modalcast::scene::{Antialias, Camera, Look, Parts, Rastering, Scene, Shadow, State};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::gpu::{Device, GlRaster};
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::raster::{Mesh, Rasteriser};
+use modalcast_model::scene::{Antialias, Camera, Look, Parts, Rastering, Scene, Shadow, State};
+use modalcast_render::{Image, Path, Paths, Pixels, Prefer, Renderer, Seen, Shot};
 
 use crate::both::exact::{Exact, compare};
 use crate::scenes;
@@ -84,7 +84,7 @@ fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> Still {
 /// A soup of triangles that pierce each other, moved and mirrored; and a tree with cut-out leaves.
 fn scenes_and_states() -> [(&'static str, Arc<Scene>, State); 2] {
     let soup = scenes::scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
-    let tree = modalcast::load::open("tree").expect("built in");
+    let tree = modalcast_model::load::open("tree").expect("built in");
     let (moved, rest) = (scenes::state(&soup, 1), State::rest(&tree));
     [("soup", soup, moved), ("tree", tree, rest)]
 }

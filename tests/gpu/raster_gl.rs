@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer as _;
-use modalcast::gpu::{CudaDeformer, Device, GlBuffers, GlRaster};
-use modalcast::raster::{CutOuts, GlBuffer, Mesh, Rasteriser};
-use modalcast::reference::raster::Raster;
-use modalcast::scene::{Faces, Group, Window};
+use modalcast_compute::gpu::{CudaDeformer, Device, GlBuffers, GlRaster};
+use modalcast_compute::reference::raster::Raster;
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::raster::{CutOuts, GlBuffer, Mesh, Rasteriser};
+use modalcast_model::scene::{Faces, Group, Window};
 
 use crate::both::cut_outs::plain_holes;
 use crate::both::soups::{Soup, flat, soups};
@@ -173,7 +173,7 @@ fn gpu_positions_that_a_deformer_shares_are_drawn_step_by_step() {
     let mut stage = Stage::open();
     let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
     let buffers = stage.gl.renderer.load(&scene).expect("loads");
-    let modalcast::render::SharedBuffers { positions, normals, tangents } = buffers.shared;
+    let modalcast_render::SharedBuffers { positions, normals, tangents } = buffers.shared;
     let shared = GlBuffers { positions, normals, tangents };
     let mut deformer = CudaDeformer::new(&stage.device, &scene, Some(shared)).expect("a deformer");
     assert!(deformer.shares_buffers(), "interop was refused");

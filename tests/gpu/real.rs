@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use modalcast::scene::{Scene, State};
+use modalcast_model::scene::{Scene, State};
 
 use crate::judge::check;
 use crate::scenes::Random;
@@ -14,10 +14,10 @@ fn bent(scene: &Scene) -> State {
     let mut random = Random(8);
     let mut state = State::rest(scene);
     state.q.fill(0.0);
-    let still = modalcast::reference::deform(scene, &state);
+    let still = modalcast_compute::reference::deform(scene, &state);
     state.q.iter_mut().for_each(|coordinate| *coordinate = random.number());
     let largest = |state: &State| {
-        let moved = modalcast::reference::deform(scene, state);
+        let moved = modalcast_compute::reference::deform(scene, state);
         let distance = |(a, b): (&[f64; 3], &[f64; 3])| (0..3).map(|axis| (a[axis] - b[axis]).powi(2)).sum::<f64>();
         moved.iter().zip(&still).map(distance).fold(0.0, f64::max).sqrt()
     };
@@ -37,7 +37,7 @@ fn compare(name: &str, scene: &Arc<Scene>) {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_the_tree_equals_the_twin() {
-    compare("tree", &modalcast::load::open("tree").expect("the built-in scene"));
+    compare("tree", &modalcast_model::load::open("tree").expect("the built-in scene"));
 }
 
 #[test]
@@ -46,7 +46,7 @@ fn gpu_real_modal_inputs_equal_the_twin() {
     let root = std::env::var("MODALCAST_DATA").unwrap_or_else(|_| "../shared/data".into());
     for name in ["vega/simpleBridge", "vega/A", "gltf/MorphStressTest", "sofa/hexaBeam", "sofa/finger"] {
         let path = Path::new(&root).join(name);
-        let scene = modalcast::load::open(&path.to_string_lossy());
+        let scene = modalcast_model::load::open(&path.to_string_lossy());
         compare(name, &scene.unwrap_or_else(|error| panic!("{name}: {error}")));
     }
 }

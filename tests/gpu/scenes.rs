@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use modalcast::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-use modalcast::scene::{Parts, Scene, State};
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast_model::scene::{Parts, Scene, State};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 /// A small generator of repeatable numbers (splitmix64).

@@ -1,9 +1,9 @@
 //! The checks of any deformer, on the device, and scenes that only it is for.
 
 use modalcast::config::BackendChoice;
-use modalcast::domain::{Domain, Follow};
-use modalcast::gpu::{CudaDeformer, Launch, Role};
-use modalcast::scene::{Deformation, Scene};
+use modalcast_compute::gpu::{CudaDeformer, Launch, Role};
+use modalcast_model::domain::{Domain, Follow};
+use modalcast_model::scene::{Deformation, Scene};
 
 use crate::both::{self, changes, extremes, following, neighbours, readers, refusal, surfaces, truncation};
 use crate::scenes::{self, Random};

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer;
-use modalcast::gpu::{CudaDeformer, Device};
-use modalcast::scene::{Scene, State};
+use modalcast_compute::gpu::{CudaDeformer, Device};
+use modalcast_model::deform::Deformer;
+use modalcast_model::scene::{Scene, State};
 
 use crate::judge::{check, same_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random};

@@ -1,9 +1,9 @@
 //! What is left of a cut-out, against geometry.
 
-use modalcast::raster::{AlphaImage, CutOuts, Surface};
-use modalcast::reference::raster::cut_out::{Footprint, alpha, footprint};
-use modalcast::reference::raster::{Raster, corners};
-use modalcast::scene::Window;
+use modalcast_compute::reference::raster::cut_out::{Footprint, alpha, footprint};
+use modalcast_compute::reference::raster::{Raster, corners};
+use modalcast_model::raster::{AlphaImage, CutOuts, Surface};
+use modalcast_model::scene::Window;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::both::cut_outs::{floor, image, plain_holes, sheet};
@@ -158,7 +158,7 @@ fn images_that_say_the_same_everywhere_leave_all_of_a_triangle_or_nothing() {
             for triangle in group.first..group.first + group.triangles {
                 let own = triangle.checked_sub(cut_outs.first);
                 if own.is_none_or(|own| keeps[cut_outs.surfaces[own as usize] as usize]) {
-                    let one = modalcast::scene::Group { first: triangle, triangles: 1, faces: group.faces };
+                    let one = modalcast_model::scene::Group { first: triangle, triangles: 1, faces: group.faces };
                     kept.draw(&soup.positions, &soup.triangles, one);
                 }
             }

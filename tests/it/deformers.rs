@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::Deformer;
-use modalcast::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-use modalcast::reference;
-use modalcast::scene::{Parts, Scene, State};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::reference;
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast_model::scene::{Parts, Scene, State};
 
 use crate::tolerance::{Tolerance, first_wrong, largest_error};
 

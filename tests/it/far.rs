@@ -1,7 +1,7 @@
 //! Transforms in their three formats over the wire, and domains ten thousand kilometres away: vertices to the millimetre.
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::scene::Scene;
+use modalcast_model::scene::Scene;
 use modalcast_proto::v1;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use v1::TransformFormat::{AffineF32, RigidF32, RigidF64, Unspecified};

@@ -1,4 +1,4 @@
-//! The table in `src/lib.rs` holds: modules use only what their row names, files stay small, kernels have their twins.
+//! The tables in `src/lib.rs` hold: modules use only what their row names, files stay small, kernels have their twins.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -36,11 +36,19 @@ fn files(folder: &Path, endings: &[&str]) -> Vec<PathBuf> {
     found
 }
 
-/// The top-level module that a file of `src` belongs to.
-fn module_of(path: &Path) -> String {
+/// Folders of `src` that are crates of their own.
+const TIERS: [&str; 3] = ["compute", "model", "render"];
+
+/// Crate and top-level module of a file of `src`, as the table names them; none of a crate's root.
+fn module_of(path: &Path) -> Option<(String, String)> {
     let inside = path.strip_prefix(root().join("src")).expect("inside src");
-    let first = inside.components().next().expect("a name").as_os_str().to_string_lossy();
-    first.trim_end_matches(".rs").to_owned()
+    let mut names = inside.iter().map(|name| name.to_string_lossy().into_owned()).peekable();
+    let tier = names.next_if(|name| TIERS.contains(&name.as_str()));
+    let package = tier.map_or("modalcast".to_owned(), |tier| format!("modalcast-{tier}"));
+    let module = names.next().expect("a name").trim_end_matches(".rs").to_owned();
+    let is_root = module == "lib" || module == "main";
+    // Test support is compiled for tests only and may use everything.
+    (!is_root && module != "testing").then_some((package, module))
 }
 
 /// Every module that a text names as `crate::name` or in `crate::{...}`, outside its comments.
@@ -78,12 +86,13 @@ fn first_names(group: &str) -> Vec<&str> {
     entries
 }
 
-/// What a module uses without leave.
-fn illegal(module: &str, text: &str, table: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
-    let Some(allowed) = table.get(module) else { return vec![format!("{module} is not in the table")] };
+/// What a module uses of its own crate that its row does not name, and proto outside of `service`.
+fn illegal((package, module): (&str, &str), text: &str, table: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+    let row = |module: &str| table.get(&format!("{package}::{module}"));
+    let Some(allowed) = row(module) else { return vec![format!("{package}::{module} is not in the table")] };
     let mut wrong: Vec<String> = uses(text)
         .into_iter()
-        .filter(|name| name != module && table.contains_key(name) && !allowed.contains(name))
+        .filter(|name| name != module && row(name).is_some() && !allowed.contains(name))
         .map(|name| format!("{module} uses {name}"))
         .collect();
     if text.contains("modalcast_proto") && module != "service" {
@@ -97,20 +106,22 @@ fn modules_use_only_what_their_row_names() {
     let table = table(&fs::read_to_string(root().join("src/lib.rs")).expect("the page"));
     assert!(table.len() >= 10, "the table was read: {table:?}");
     for path in files(&root().join("src"), &["rs"]) {
-        let module = module_of(&path);
-        if module == "lib" || module == "main" {
+        let Some((package, module)) = module_of(&path).filter(|(package, _)| package != "modalcast-render") else {
             continue;
-        }
-        let wrong = illegal(&module, &fs::read_to_string(&path).expect("a file"), &table);
+        };
+        let wrong = illegal((&package, &module), &fs::read_to_string(&path).expect("a file"), &table);
         assert_eq!(wrong, Vec::<String>::new(), "{}", path.display());
     }
 }
 
 #[test]
-fn no_arrow_points_up() {
+fn module_dependencies_have_no_cycle() {
     let table = table(&fs::read_to_string(root().join("src/lib.rs")).expect("the page"));
-    // Peeling modules that use nothing left over empties the table unless there is a cycle.
-    let mut left = table;
+    // Names are unique over the crates. Peeling modules that use nothing left over empties the table unless there is a cycle.
+    let name = |row: &String| row.rsplit("::").next().unwrap_or_default().to_owned();
+    let mut left: BTreeMap<String, BTreeSet<String>> =
+        table.iter().filter(|(row, _)| row.contains("::")).map(|(row, uses)| (name(row), uses.clone())).collect();
+    assert!(left.len() >= 15, "{left:?}");
     while !left.is_empty() {
         let leaf = left.iter().find(|(_, uses)| uses.iter().all(|name| !left.contains_key(name)));
         let leaf = leaf.map(|(name, _)| name.clone()).unwrap_or_else(|| panic!("a cycle among {:?}", left.keys()));
@@ -118,15 +129,36 @@ fn no_arrow_points_up() {
     }
 }
 
+/// Cargo keeps the tiers apart only as long as no manifest names a tier above.
+#[test]
+fn manifests_depend_on_lower_tiers_only() {
+    let page = fs::read_to_string(root().join("src/lib.rs")).expect("the page");
+    let table = table(&page);
+    for (folder, package) in
+        [("src/compute", "modalcast-compute"), ("src/render", "modalcast-render"), ("src/model", "modalcast-model")]
+    {
+        let manifest = fs::read_to_string(root().join(folder).join("Cargo.toml")).expect("a manifest");
+        let named: BTreeSet<String> = manifest
+            .lines()
+            .filter_map(|line| line.split(['.', ' ', '=']).next().filter(|name| name.starts_with("modalcast")))
+            .map(str::to_owned)
+            .collect();
+        let row = table.iter().find(|(row, _)| row.starts_with(&format!("{package}` (")) || *row == package);
+        assert_eq!(Some(&named), row.map(|(_, uses)| uses), "{package}");
+    }
+}
+
 #[test]
 fn provoked_faults_are_seen() {
-    let table = table("//! | `low` | x | |\n//! | `high` | x | `low` |\n");
-    assert_eq!(illegal("high", "use crate::low::Thing;", &table), Vec::<String>::new());
-    assert_eq!(illegal("low", "use crate::high::Thing;", &table), ["low uses high"]);
-    assert_eq!(illegal("low", "use crate::{\n    own::{A, B},\n    high,\n};", &table), ["low uses high"]);
-    assert_eq!(illegal("low", "use crate::{own::{high}, error};", &table), Vec::<String>::new());
-    assert_eq!(illegal("stray", "", &table), ["stray is not in the table"]);
-    assert_eq!(illegal("low", "use modalcast_proto::v1;", &table), ["low names proto"]);
+    let table = table("//! | `a::low` | x | |\n//! | `a::high` | x | `low` |\n//! | `b::other` | x | |\n");
+    let none = Vec::<String>::new();
+    assert_eq!(illegal(("a", "high"), "use crate::low::Thing;", &table), none);
+    assert_eq!(illegal(("a", "low"), "use crate::high::Thing;", &table), ["low uses high"]);
+    assert_eq!(illegal(("a", "low"), "use crate::{\n    own::{A, B},\n    high,\n};", &table), ["low uses high"]);
+    assert_eq!(illegal(("a", "low"), "use crate::{own::{high}, error};", &table), none);
+    assert_eq!(illegal(("a", "low"), "use crate::other;", &table), none, "of another crate");
+    assert_eq!(illegal(("a", "stray"), "", &table), ["a::stray is not in the table"]);
+    assert_eq!(illegal(("a", "low"), "use modalcast_proto::v1;", &table), ["low names proto"]);
 }
 
 /// A kernel that only trials launch, or that computes what another one does by another way: its twin is a test of its
@@ -137,9 +169,9 @@ fn is_walked_in_tests(name: &str) -> bool {
 
 /// Kernels that put into one place what deformers on the host find there: their twin is a method of the scene's values.
 const TWINS_ELSEWHERE: [(&str, Twin); 3] = [
-    ("apply", Twin { file: "src/scene/state.rs", of: "State", method: "apply" }),
-    ("bounds", Twin { file: "src/scene/camera.rs", of: "Bounds", method: "union" }),
-    ("raster", Twin { file: "src/reference/raster.rs", of: "Raster", method: "draw" }),
+    ("apply", Twin { file: "src/model/scene/state.rs", of: "State", method: "apply" }),
+    ("bounds", Twin { file: "src/model/scene/camera.rs", of: "Bounds", method: "union" }),
+    ("raster", Twin { file: "src/compute/reference/raster.rs", of: "Raster", method: "draw" }),
 ];
 
 #[derive(Clone, Copy)]
@@ -172,13 +204,18 @@ fn a_twin_elsewhere_is_missed_when_its_method_is_or_when_the_kernel_does_not_nam
 
 #[test]
 fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
-    let kernels = files(&root().join("kernels"), &["cu"]);
-    assert!(!kernels.is_empty());
-    let launchers = files(&root().join("src/gpu"), &["rs"]);
-    for kernel in kernels {
+    // The server's kernels, then those of the benchmarks.
+    let mut pairs = Vec::new();
+    for (kernels, launchers) in [("kernels", "src/compute/gpu"), ("tests/bench/kernels", "tests/bench/src/kernels")] {
+        let found = files(&root().join(kernels), &["cu"]);
+        assert!(!found.is_empty(), "{kernels}");
+        pairs.extend(found.into_iter().map(|kernel| (kernel, launchers)));
+    }
+    for (kernel, folder) in pairs {
         let name = kernel.file_stem().expect("a name").to_string_lossy().into_owned();
+        let launchers = files(&root().join(folder), &["rs"]);
         let launcher = launchers.iter().find(|path| path.file_stem().is_some_and(|stem| *stem == *name));
-        let launcher = launcher.unwrap_or_else(|| panic!("{name} has no launcher below src/gpu"));
+        let launcher = launcher.unwrap_or_else(|| panic!("{name} has no launcher below {folder}"));
         if is_walked_in_tests(&name) {
             let text = fs::read_to_string(launcher).expect("a file");
             assert!(text.contains("    fn twin_of_"), "{} has no twin of {name}", launcher.display());
@@ -189,7 +226,7 @@ fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
             assert!(twin.is_in(&file, &text), "{name} and {}::{} do not know each other", twin.of, twin.method);
             continue;
         }
-        for folder in ["src/reference", "src/cpu"] {
+        for folder in ["src/compute/reference", "src/compute/cpu"] {
             let twin = root().join(folder).join(format!("{name}.rs"));
             assert!(twin.exists(), "{} is missing", twin.display());
         }
@@ -214,7 +251,7 @@ fn unsafe_has_its_addresses() {
         let text = fs::read_to_string(&path).expect("a file");
         let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
         let has = code.into_iter().any(|line| line.contains("unsafe {") || line.contains("unsafe fn"));
-        let may = inside.starts_with("src/gpu/") || inside.starts_with("src/render/");
+        let may = inside.starts_with("src/compute/gpu/") || inside.starts_with("src/render/");
         assert!(!has || may, "{inside} has unsafe code");
     }
 }

@@ -1,11 +1,11 @@
 //! What a shadow map gains by being fitted to the vertices in light space, not to the corners of their bounds.
 
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::{Deformed, Deformer};
-use modalcast::load;
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Shot, shadow_texel};
-use modalcast::scene::{Camera, Scene, State};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Deformed, Deformer};
+use modalcast_model::load;
+use modalcast_model::scene::{Camera, Scene, State};
+use modalcast_render::{Shot, shadow_texel};
 
 /// Sides of a texel in scene units, by a deformation.
 fn texel(scene: &Scene, deformed: &Deformed, is_lit: bool) -> [f64; 2] {

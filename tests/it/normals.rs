@@ -4,8 +4,8 @@ mod build;
 mod extremes;
 mod kept;
 
-use modalcast::reference;
-use modalcast::scene::Normals;
+use modalcast_compute::reference;
+use modalcast_model::scene::Normals;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use build::{
@@ -105,7 +105,7 @@ fn at_q_of_zero_exact_equals_rigid_however_rest_normals_were_made() {
     let normals = corners.normals.iter().map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let rest = authored.rest().iter().map(|[x, y, _]| [*x, *y, 0.3 * noise.next()]).collect();
     let triangles = authored.triangles().to_vec();
-    authored = modalcast::domain::Mesh::indexed(rest, normals, corners.uvs, triangles).expect("a sheet");
+    authored = modalcast_model::domain::Mesh::indexed(rest, normals, corners.uvs, triangles).expect("a sheet");
     let scene = scene(vec![with_mode(authored, parabola), with_mode(cube(), parabola)]);
     for linear in linear_parts() {
         let mut state = state(&scene, 0.0, linear, [1.0, -2.0, 0.5]);
@@ -150,7 +150,7 @@ fn both_sides_of_a_seam_keep_one_normal_and_without_groups_they_would_not() {
 fn rest_normals_against_the_winding_stay_against_it() {
     let mesh = sheet(9, 9);
     let down = vec![[0.0, 0.0, -1.0]; 81];
-    let flipped = modalcast::domain::Mesh::indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
+    let flipped = modalcast_model::domain::Mesh::indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
     let scene = scene(vec![with_mode(mesh, parabola), with_mode(flipped.expect("a sheet"), parabola)]);
     let (normals, _) = exact(&scene, &bent(&scene, 0.5));
     for corner in 0..81 {
@@ -181,7 +181,7 @@ fn a_transform_turns_bent_normals_by_its_cofactors_and_a_mirror_flips_tangent_si
 
 #[test]
 fn tangents_are_unit_and_orthogonal_to_their_normals_and_shapes_without_uvs_have_none() {
-    let bare = modalcast::domain::Mesh::indexed(
+    let bare = modalcast_model::domain::Mesh::indexed(
         sheet(5, 5).rest().to_vec(),
         vec![build::UP; 25],
         vec![],
@@ -208,7 +208,8 @@ fn tangents_are_unit_and_orthogonal_to_their_normals_and_shapes_without_uvs_have
 
 #[test]
 fn only_shapes_that_bend_in_a_scene_that_asks_have_groups() {
-    let rigid = modalcast::domain::Shape::new(sheet(3, 3), modalcast::domain::Modes::rigid()).expect("rigid");
+    let rigid =
+        modalcast_model::domain::Shape::new(sheet(3, 3), modalcast_model::domain::Modes::rigid()).expect("rigid");
     let shapes = || vec![with_mode(sheet(3, 3), parabola), rigid.clone()];
     let asks = scene(shapes());
     assert!(asks.needs.exact_normals);

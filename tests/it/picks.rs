@@ -1,9 +1,9 @@
 //! Picks and pictures of numbers over the wire. Needs an EGL that draws.
 
 use modalcast::config::{Config, RendererChoice};
-use modalcast::reference;
-use modalcast::scene::Scene;
 use modalcast_client::{Camera, Client, Code, Format, FrameRequest, Hit, Lens, Output, PickRequest, Picture, View};
+use modalcast_compute::reference;
+use modalcast_model::scene::Scene;
 use modalcast_proto::v1;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 

@@ -1,7 +1,9 @@
 //! The rasteriser's definition against geometry, and the kernel's own way through a mesh against the definition.
 
-use modalcast::reference::raster::{Corner, Dropped, NOTHING, Outline, Raster, depth_at, edge, outline, pieces};
-use modalcast::scene::{Faces, Group, Window};
+use modalcast_compute::reference::raster::{
+    Corner, Dropped, NOTHING, Outline, Raster, depth_at, edge, outline, pieces,
+};
+use modalcast_model::scene::{Faces, Group, Window};
 
 use crate::both::soups::{Soup, fan, flat, perspective, soups};
 

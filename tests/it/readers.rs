@@ -1,10 +1,10 @@
 //! Displacements and boxes over the wire: what the scene keeps is sent, alone if asked; what it does not keep is refused.
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::deform::{Deformer, Surface, Wanted};
 use modalcast::engine::{Delivery, View};
-use modalcast::reference::{self, ReferenceDeformer};
-use modalcast::scene::Bounds;
+use modalcast_compute::reference::{self, ReferenceDeformer};
+use modalcast_model::deform::{Deformer, Surface, Wanted};
+use modalcast_model::scene::Bounds;
 use modalcast_proto::v1;
 use tonic::Code;
 use v1::Policy;

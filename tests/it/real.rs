@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::Deformer;
-use modalcast::scene::{Scene, State};
-use modalcast::{load, reference};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::reference;
+use modalcast_model::deform::Deformer;
+use modalcast_model::load;
+use modalcast_model::scene::{Scene, State};
 
 use modalcast_proto::v1;
 

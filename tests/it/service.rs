@@ -1,8 +1,8 @@
 //! Scenes over the wire: open, describe, list, upload, delete; health, reflection and limits.
 
 use modalcast::engine::SceneSource;
-use modalcast::error::Result;
-use modalcast::scene::Scene;
+use modalcast_model::error::Result;
+use modalcast_model::scene::Scene;
 use modalcast_proto::v1;
 use prost::Message as _;
 use tokio_stream::StreamExt as _;
@@ -21,7 +21,7 @@ impl SceneSource for FailsOnce {
     fn open(&self, source: &str) -> Result<std::sync::Arc<Scene>> {
         if self.opened.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
             self.fail.lock().expect("unpoisoned").recv().expect("a word");
-            return Err(modalcast::error::invalid("source", "a second try", source));
+            return Err(modalcast_model::error::invalid("source", "a second try", source));
         }
         std::thread::sleep(std::time::Duration::from_millis(100));
         Ok(strips())

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use modalcast::load::Repository;
+use modalcast_model::load::Repository;
 use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
 use tonic::{Code, Status};

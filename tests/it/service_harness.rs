@@ -5,11 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::domain::{Attachment, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast::engine::{Engine, SceneSource};
-use modalcast::error::{Error, Result, invalid};
-use modalcast::scene::{Deformation, Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
-use modalcast::{reference, service};
+use modalcast::service;
+use modalcast_compute::reference;
+use modalcast_model::domain::{Attachment, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::scene::{Deformation, Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
 use modalcast_proto::v1;
 use prost::Message as _;
 use tokio::sync::{mpsc, oneshot};

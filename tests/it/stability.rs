@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use modalcast::config::BackendChoice;
-use modalcast::cpu::CpuDeformer;
-use modalcast::scene::Scene;
-use modalcast::storage::Truncation;
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::storage::Truncation;
+use modalcast_model::scene::Scene;
 
 use crate::both::{changes, extremes, following, light, neighbours, readers, refusal, surfaces, truncation};
 

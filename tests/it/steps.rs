@@ -1,7 +1,7 @@
 //! Steps over the wire: what is acknowledged is what the scene shows, in both policies.
 
-use modalcast::deform::Wanted;
 use modalcast::engine::{Delivery, View, Which};
+use modalcast_model::deform::Wanted;
 use modalcast_proto::v1;
 use v1::Policy;
 use v1::drive_scene_response::Kind as Told;
@@ -156,7 +156,7 @@ async fn a_subscriber_that_never_reads_is_cut_off_and_the_writer_goes_on() {
         driver.acked(step(number, &[0], &[0.1, 0.0])).await;
     }
     let cut = within(feed.cut_off()).await;
-    assert!(matches!(cut, modalcast::error::Error::Busy { .. }), "{cut}");
+    assert!(matches!(cut, modalcast_model::error::Error::Busy { .. }), "{cut}");
     within(feed.next()).await.expect("the first that it held");
     within(feed.next()).await.expect("the second");
     assert_eq!(within(feed.next()).await.expect_err("the end"), cut);

@@ -3,13 +3,13 @@
 
 use std::sync::Arc;
 
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::{Deformed, Deformer};
-use modalcast::domain::{Material, Modes, Shape, Transform};
-use modalcast::reference;
-use modalcast::scene::{Deformation, Parts, Scene, State, Storage};
-use modalcast::storage::bound::{Reaches, Step};
-use modalcast::storage::{QUAD, TILE_QUADS, Tiles};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::reference;
+use modalcast_compute::storage::bound::{Reaches, Step};
+use modalcast_compute::storage::{QUAD, TILE_QUADS, Tiles};
+use modalcast_model::deform::{Deformed, Deformer};
+use modalcast_model::domain::{Material, Modes, Shape, Transform};
+use modalcast_model::scene::{Deformation, Parts, Scene, State, Storage};
 
 use crate::deformers::{Noise, domain, shaken, strip};
 
@@ -41,7 +41,7 @@ fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> A
     parts.materials = vec![Material::default()];
     let flat = strip(vertices, 0, &mut Noise(1)).mesh;
     let mesh =
-        modalcast::domain::Mesh::new(vec![[0.0; 3]; vertices], flat.corners().clone(), flat.triangles().to_vec());
+        modalcast_model::domain::Mesh::new(vec![[0.0; 3]; vertices], flat.corners().clone(), flat.triangles().to_vec());
     let rank = columns.len() / (3 * vertices);
     let modes = Modes::from_columns(3 * vertices, rank, columns).expect("modes");
     parts.shapes = vec![Shape::new(mesh.expect("a mesh"), modes).expect("a shape")];

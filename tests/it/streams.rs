@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{Body, Delivery, Showing, Shown, View, Workbench};
-use modalcast::scene::{Camera, Lens};
+use modalcast_model::scene::{Camera, Lens};
 use modalcast_proto::v1;
 use v1::Policy;
 use v1::drive_scene_response::Kind as Told;
@@ -66,7 +66,7 @@ async fn frames_of_more_cameras_than_can_be_under_way_are_each_that_of_its_step_
     for camera in &cameras {
         feeds.push(host.watch(view(*camera), Delivery::Lossless).await.expect("a feed"));
     }
-    let positions = modalcast::deform::Wanted { positions: true, ..Default::default() };
+    let positions = modalcast_model::deform::Wanted { positions: true, ..Default::default() };
     let mut vertices = host.watch(View::Vertices(positions), Delivery::Lossless).await.expect("a feed");
     // One that leaves in the middle, and one that never reads.
     let mut leaver = Some(host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed"));

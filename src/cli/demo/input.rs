@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::super::options::working;
-use crate::error::Result;
-use crate::load;
-use crate::scene::Scene;
+use modalcast_model::error::Result;
+use modalcast_model::load;
+use modalcast_model::scene::Scene;
 
 pub(super) struct Input {
     pub(super) scene: Arc<Scene>,

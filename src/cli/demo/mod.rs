@@ -15,8 +15,8 @@ use super::options::Size;
 use super::options::working;
 use super::{Outcome, say};
 use crate::config::BackendChoice;
-use crate::error::{Result, during};
 use input::Input;
+use modalcast_model::error::{Result, during};
 use processes::{Process, program};
 use verdict::Verdict;
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, during};
 
 /// Lines that a child may be ahead of us. A child that prints more waits, which harms nobody here.
 const LINES: usize = 1024;

@@ -3,10 +3,10 @@
 use serde_json::{Value, json};
 
 use super::Ran;
-use crate::domain::Transform;
-use crate::error::{Result, invalid};
-use crate::reference;
-use crate::scene::{Scene, State};
+use modalcast_compute::reference;
+use modalcast_model::domain::Transform;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Scene, State};
 
 /// The largest error of received vertices, as a fraction of the scene's diagonal.
 const LARGEST_ERROR: f64 = 1e-5;
@@ -187,7 +187,7 @@ impl Joint {
     fn all(scene: &Scene, rest: &[[f64; 3]]) -> Vec<Self> {
         let state = State::rest(scene);
         let diagonal = scene.rest_bounds.diagonal();
-        let joint = |(child, domain): (usize, &crate::domain::Domain)| {
+        let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
             let mover = scene.movers.frame_of(child).is_none().then(|| scene.movers.of(child))?;
             let first = scene.layout.slots[attachment.parent].first_vertex;
@@ -279,7 +279,7 @@ mod tests {
 
     #[test]
     fn every_broken_promise_is_named_and_kept_ones_are_not() {
-        let scene = crate::load::open("tree").expect("the tree");
+        let scene = modalcast_model::load::open("tree").expect("the tree");
         let broken = |spoil: &dyn Fn(&mut Ran)| {
             let mut ran = at_rest(&scene);
             spoil(&mut ran);

@@ -5,11 +5,11 @@ use bytemuck::{Pod, Zeroable};
 use super::super::geometry::{Group, Kind};
 
 /// Triangles of a block, which one workgroup looks at.
-pub(in crate::render) const LANES: u32 = 256;
+pub(crate) const LANES: u32 = 256;
 /// Blocks of a super block, whose listed triangles are counted together.
-pub(in crate::render) const SUPER: u32 = 64;
+pub(crate) const SUPER: u32 = 64;
 /// Groups that a scene has at most: three kinds, with one side and with two.
-pub(in crate::render) const GROUPS: usize = 6;
+pub(crate) const GROUPS: usize = 6;
 /// Workgroups in a row of the dispatch over blocks.
 const ROW: u32 = 1 << 15;
 /// Words of an indexed draw, and what follows all of them before the totals.
@@ -19,7 +19,7 @@ const HEAD: usize = COMMAND * GROUPS + 2;
 /// Twin of `GroupBlock` in `shaders/shared/cull.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub(in crate::render) struct Groups {
+pub(crate) struct Groups {
     /// First triangle, triangles, first workgroup, first block.
     places: [[u32; 4]; GROUPS],
     /// Whether it has one side, and whether it is made of vertices alone.
@@ -34,7 +34,7 @@ const _: () = assert!(size_of::<Groups>() == 224, "Groups differs from shaders/s
 
 impl Groups {
     /// The groups of a scene, on a device that rounds places to this part of a pixel.
-    pub(in crate::render) fn new(groups: &[Group], grid: f32) -> Self {
+    pub(crate) fn new(groups: &[Group], grid: f32) -> Self {
         let mut own = Self { grid: [grid, 0.0, 0.0, 0.0], ..Self::zeroed() };
         let (mut work, mut block) = (0, 0);
         for ((place, way), group) in own.places.iter_mut().zip(&mut own.ways).zip(groups) {
@@ -50,22 +50,22 @@ impl Groups {
     }
 
     /// The dispatch over all blocks.
-    pub(in crate::render) fn dispatch(&self) -> [u32; 2] {
+    pub(crate) fn dispatch(&self) -> [u32; 2] {
         [self.count[1].min(ROW), self.count[1].div_ceil(ROW)]
     }
 
     /// Bytes of a bit for every triangle of every block.
-    pub(in crate::render) const fn bit_bytes(&self) -> usize {
+    pub(crate) const fn bit_bytes(&self) -> usize {
         self.count[2] as usize * LANES as usize / 8
     }
 
     /// Bytes of the ledger.
-    pub(in crate::render) const fn ledger_bytes(&self) -> usize {
+    pub(crate) const fn ledger_bytes(&self) -> usize {
         4 * (HEAD + (self.count[2] / SUPER) as usize)
     }
 
     /// An empty ledger: a draw of nothing for each group, and no totals.
-    pub(in crate::render) fn empty_ledger(&self) -> Vec<u8> {
+    pub(crate) fn empty_ledger(&self) -> Vec<u8> {
         let mut words = vec![0_u32; self.ledger_bytes() / 4];
         for (command, place) in words.chunks_exact_mut(COMMAND).zip(&self.places) {
             // Indices, instances, first index, base vertex, base instance.
@@ -76,7 +76,7 @@ impl Groups {
 }
 
 /// Where the draw of a group lies in the ledger, in bytes.
-pub(in crate::render) const fn command(group: usize) -> usize {
+pub(crate) const fn command(group: usize) -> usize {
     4 * COMMAND * group
 }
 

@@ -46,8 +46,8 @@ use super::gl::{self, Buffer, Gl, Limits, Program, Texture, VertexArray};
 use super::plan::{Allocation, Plan};
 use super::programs::Compile;
 use super::shaders::Options;
-use crate::error::Result;
-use crate::scene::{Culling, Scene};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Culling, Scene};
 
 /// The buffer of listed triangles, three indices each.
 pub(super) const LISTED: &str = "listed triangles";

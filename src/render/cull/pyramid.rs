@@ -6,7 +6,7 @@ use super::super::gl::{self, Buffer, Framebuffer, Gl, Texture};
 use super::super::programs::Sampled;
 use super::super::shaders::DEPTH_UNIT;
 use super::super::target::Form;
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 /// The coarsest level: squares of 2^8 pixels.
 pub(super) const TOP: u32 = 8;
@@ -17,7 +17,7 @@ const PYRAMID: u32 = 4;
 
 /// What occluders are drawn into, and the pyramid of it. For frames of one form.
 #[derive(Debug)]
-pub(in crate::render) struct Pyramid {
+pub(crate) struct Pyramid {
     /// The frame's depth alone.
     pub(super) occluders: Framebuffer,
     depths: Buffer,
@@ -34,7 +34,7 @@ fn texels([mut width, mut height]: [u32; 2]) -> u64 {
 }
 
 impl Pyramid {
-    pub(in crate::render) fn new(gl: &Rc<Gl>, form: Form, depth: &Texture) -> Result<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, form: Form, depth: &Texture) -> Result<Self> {
         let depths = gl.buffer(4 * texels([form.width, form.height]), gl::STREAM_COPY, None)?;
         Ok(Self { occluders: gl.framebuffer(None, depth)?, depths })
     }

@@ -10,7 +10,7 @@ use super::super::target::Target;
 use super::layout::Groups;
 use super::pyramid::packed;
 use super::{COUNT_BYTES, COUNTED, Culler};
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 const NAME_UNIT: u32 = 25;
 const GROUP_BLOCK: u32 = 3;
@@ -27,7 +27,7 @@ const STORED: [(&str, u32); 6] = [
 const REMEMBERED: u32 = 8;
 
 /// Nothing is counted yet.
-pub(in crate::render) fn begin(buffers: &SceneBuffers) {
+pub(crate) fn begin(buffers: &SceneBuffers) {
     if let Some(counts) = buffers.buffers.get(COUNTED) {
         counts.write(&[0; COUNT_BYTES]);
     }
@@ -63,7 +63,7 @@ fn empty(gl: &Gl, buffers: &SceneBuffers, culler: &Culler) {
 }
 
 /// Lists of what may cast a shadow into a layer of the map, whose side is `size`. `choose` tells a program in use the layer.
-pub(in crate::render) fn sun(gl: &Gl, buffers: &SceneBuffers, size: u32, choose: impl Fn(&Program)) -> Result<()> {
+pub(crate) fn sun(gl: &Gl, buffers: &SceneBuffers, size: u32, choose: impl Fn(&Program)) -> Result<()> {
     let (Some(culler), Some(programs)) = (&buffers.culler, &buffers.programs.sun) else { return Ok(()) };
     empty(gl, buffers, culler);
     programs.sift.bind(Some(size | size << 16));
@@ -73,13 +73,7 @@ pub(in crate::render) fn sun(gl: &Gl, buffers: &SceneBuffers, size: u32, choose:
 }
 
 /// Lists of what the camera may see.
-pub(in crate::render) fn camera(
-    gl: &Gl,
-    buffers: &SceneBuffers,
-    target: &Target,
-    sampled: &Sampled,
-    ran: &mut Ran,
-) -> Result<()> {
+pub(crate) fn camera(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
     let (Some(culler), Some(programs)) = (&buffers.culler, &sampled.cull) else { return Ok(()) };
     if let (Some(pyramid), Some(remembered)) = (&target.pyramid, &programs.remembered) {
         empty(gl, buffers, culler);
@@ -107,7 +101,7 @@ pub(in crate::render) fn camera(
 }
 
 /// Keeps in mind which triangles the ids name.
-pub(in crate::render) fn remember(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled) -> Result<()> {
+pub(crate) fn remember(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled) -> Result<()> {
     let Some(program) = sampled.cull.as_ref().and_then(|programs| programs.remember.as_ref()) else { return Ok(()) };
     gl.wait_for_stores();
     bind(buffers);

@@ -56,11 +56,11 @@ impl Options {
     }
 
     /// Whether triangles are culled at all, and by depth.
-    pub(in crate::render) fn culls(&self) -> bool {
+    pub(crate) fn culls(&self) -> bool {
         self.defines.contains(&"CULLED")
     }
 
-    pub(in crate::render) fn hides(&self) -> bool {
+    pub(crate) fn hides(&self) -> bool {
         self.defines.contains(&"REMEMBERS")
     }
 

@@ -9,9 +9,9 @@ use super::super::plan::planned;
 use super::super::shaders::Source;
 use super::super::{Prefer, Renderer, SceneBuffers, Shot};
 use super::{LISTED, allocations, chosen};
-use crate::deform::Surface;
-use crate::domain::{Material, Mesh, Modes, Shape};
-use crate::scene::{Camera, Culling, Lens, Scene, View};
+use modalcast_model::deform::Surface;
+use modalcast_model::domain::{Material, Mesh, Modes, Shape};
+use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};
 
 /// A sheet of 24 x 24 squares in front of which a smaller sheet stands, both of one side.
 fn sheets() -> Arc<Scene> {

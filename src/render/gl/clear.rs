@@ -7,14 +7,14 @@ use super::{Framebuffer, Gl};
 
 /// What is known of ids and their depth.
 #[derive(Debug, Default)]
-pub(in crate::render) struct Traces {
-    pub(in crate::render) ids: Touched,
-    pub(in crate::render) depth: Touched,
+pub(crate) struct Traces {
+    pub(crate) ids: Touched,
+    pub(crate) depth: Touched,
 }
 
 /// What a pass begins with. What is known of an image tells which pixels need it; without, all do.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::render) enum Clear<'a> {
+pub(crate) enum Clear<'a> {
     /// Depth of 1.
     Depth(Option<&'a Touched>),
     /// Depth of 1 and ids of 0.
@@ -38,7 +38,7 @@ enum Fill {
 
 impl Gl {
     /// Binds a framebuffer and clears; from then on draws reach this part of it alone.
-    pub(in crate::render) fn begin(&self, into: &Framebuffer, part: Region, clear: Clear<'_>) {
+    pub(crate) fn begin(&self, into: &Framebuffer, part: Region, clear: Clear<'_>) {
         let gl = self.on();
         let [width, height] = part.frame().map(|side| side as i32);
         // SAFETY: state with a complete framebuffer.

@@ -9,19 +9,14 @@ const SUBPIXEL_BITS: u32 = 0x0D50;
 
 impl Gl {
     /// The part of a pixel to which the rasteriser rounds places, at most.
-    pub(in crate::render) fn grid(&self) -> f32 {
+    pub(crate) fn grid(&self) -> f32 {
         // SAFETY: a plain question that every context answers, with 4 or more.
         let bits = unsafe { self.on().get_parameter_i32(SUBPIXEL_BITS) };
         0.5_f32.powi(bits.clamp(0, 16))
     }
 
     /// Copies `bytes` bytes, from and to a place in each buffer.
-    pub(in crate::render) fn copy_part(
-        &self,
-        (from, first): (&Buffer, usize),
-        (to, place): (&Buffer, usize),
-        bytes: usize,
-    ) {
+    pub(crate) fn copy_part(&self, (from, first): (&Buffer, usize), (to, place): (&Buffer, usize), bytes: usize) {
         let gl = self.on();
         // SAFETY: OpenGL refuses ranges outside either buffer.
         unsafe {

@@ -14,7 +14,7 @@ const KINDS: usize = 256;
 type Key = [u32; 3];
 
 /// Whether the log takes what a context that is debugged would say: `opengl` at `debug` or below (`RUST_LOG=opengl=debug`).
-pub(in crate::render) fn is_wanted() -> bool {
+pub(crate) fn is_wanted() -> bool {
     tracing::enabled!(target: "opengl", Level::DEBUG)
 }
 

@@ -6,18 +6,18 @@ use std::time::{Duration, Instant};
 use glow::HasContext as _;
 
 use super::Gl;
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// All commands that were given before it was made.
 #[derive(Debug)]
-pub(in crate::render) struct Fence {
+pub(crate) struct Fence {
     gl: Rc<Gl>,
     name: glow::Fence,
 }
 
 impl Gl {
     /// A fence behind all commands so far, which are sent on their way.
-    pub(in crate::render) fn fence(self: &Rc<Self>, stage: &'static str) -> Result<Fence> {
+    pub(crate) fn fence(self: &Rc<Self>, stage: &'static str) -> Result<Fence> {
         let gl = self.on();
         // SAFETY: a fresh fence, owned by the value that is returned.
         let name = unsafe {
@@ -31,12 +31,12 @@ impl Gl {
 
 impl Fence {
     /// Whether the commands are done, or will never be: then [`Self::wait`] says why.
-    pub(in crate::render) fn is_over(&self) -> bool {
+    pub(crate) fn is_over(&self) -> bool {
         self.is_over_within(Duration::ZERO)
     }
 
     /// The same after waiting for them, at most so long.
-    pub(in crate::render) fn is_over_within(&self, limit: Duration) -> bool {
+    pub(crate) fn is_over_within(&self, limit: Duration) -> bool {
         self.state(limit) != glow::TIMEOUT_EXPIRED
     }
 
@@ -44,7 +44,7 @@ impl Fence {
     ///
     /// # Errors
     /// `Fault` of `stage` when the device did not finish within `limit` or was lost.
-    pub(in crate::render) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
+    pub(crate) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
         let begin = Instant::now();
         loop {
             match self.state(limit.saturating_sub(begin.elapsed())) {
@@ -77,7 +77,7 @@ impl Drop for Fence {
 #[cfg(test)]
 impl Gl {
     /// A fence that the device has lost.
-    pub(in crate::render) fn lost_fence(self: &Rc<Self>) -> Fence {
+    pub(crate) fn lost_fence(self: &Rc<Self>) -> Fence {
         let fence = self.fence("test").expect("a fence");
         // SAFETY: a name that OpenGL does not know any more is an error wherever it is used.
         unsafe { self.on().delete_sync(fence.name) }

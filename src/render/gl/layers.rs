@@ -5,11 +5,11 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::{Framebuffer, Gl, Program, Texture};
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 impl Gl {
     /// A framebuffer of one layer of an image: of its depth, or of its one colour.
-    pub(in crate::render) fn layer_framebuffer(
+    pub(crate) fn layer_framebuffer(
         self: &Rc<Self>,
         image: &Texture,
         is_depth: bool,
@@ -32,7 +32,7 @@ impl Gl {
     }
 
     /// Draws a triangle over the whole of a framebuffer with the current program. Nothing is cleared.
-    pub(in crate::render) fn cover(&self, into: &Framebuffer, side: u32, nothing: &super::VertexArray) {
+    pub(crate) fn cover(&self, into: &Framebuffer, side: u32, nothing: &super::VertexArray) {
         let gl = self.on();
         // SAFETY: state and a draw without attributes into a complete framebuffer.
         unsafe {
@@ -46,7 +46,7 @@ impl Gl {
 
 impl Texture {
     /// Binds one layer as an image that a compute shader writes.
-    pub(in crate::render) fn bind_image_layer(&self, unit: u32, layer: u32) {
+    pub(crate) fn bind_image_layer(&self, unit: u32, layer: u32) {
         // SAFETY: level 0 of a texture whose format the shader names.
         unsafe {
             let gl = self.gl.on();
@@ -57,7 +57,7 @@ impl Texture {
 
 impl Program {
     /// Gives the program in use, which is this one, the layer that it writes: location 1.
-    pub(in crate::render) fn layer(&self, layer: u32) {
+    pub(crate) fn layer(&self, layer: u32) {
         // SAFETY: location 1 is declared by the shaders that are given a layer.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), layer as i32) }
     }

@@ -4,26 +4,26 @@ use glow::HasContext as _;
 
 /// What the context can do.
 #[derive(Debug, Clone, Default)]
-pub(in crate::render) struct Limits {
-    pub(in crate::render) renderer: String,
-    pub(in crate::render) version: String,
-    pub(in crate::render) software: bool,
-    pub(in crate::render) max_side: u32,
+pub(crate) struct Limits {
+    pub(crate) renderer: String,
+    pub(crate) version: String,
+    pub(crate) software: bool,
+    pub(crate) max_side: u32,
     /// Samples that colour, depth and integer images may all have.
-    pub(in crate::render) max_samples: u32,
+    pub(crate) max_samples: u32,
     /// Textures that one compute shader may read.
-    pub(in crate::render) max_reads: u32,
-    pub(in crate::render) max_layers: u32,
+    pub(crate) max_reads: u32,
+    pub(crate) max_layers: u32,
     /// Largest buffer texture.
-    pub(in crate::render) max_texels: u64,
+    pub(crate) max_texels: u64,
     /// Largest buffer that shaders write.
-    pub(in crate::render) max_storage: u64,
+    pub(crate) max_storage: u64,
     /// Whether fragments can know their samples that pass the depth test.
-    pub(in crate::render) post_depth: bool,
+    pub(crate) post_depth: bool,
     /// Whether buffers can stay mapped while they are written (OpenGL 4.4).
-    pub(in crate::render) persistent: bool,
+    pub(crate) persistent: bool,
     /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
-    pub(in crate::render) anisotropy: f32,
+    pub(crate) anisotropy: f32,
 }
 
 impl Limits {

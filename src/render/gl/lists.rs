@@ -5,16 +5,16 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::{Buffer, Framebuffer, Gl, Texture, VertexArray};
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 impl Gl {
     /// A framebuffer without depth.
-    pub(in crate::render) fn colour_framebuffer(self: &Rc<Self>, colour: &Texture) -> Result<Framebuffer> {
+    pub(crate) fn colour_framebuffer(self: &Rc<Self>, colour: &Texture) -> Result<Framebuffer> {
         self.attached(Some(colour), None)
     }
 
     /// Draws triangles of an array's index buffer as a command in a buffer says, which a shader may have written.
-    pub(in crate::render) fn draw_told(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
+    pub(crate) fn draw_told(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
         let gl = self.on();
         // SAFETY: the command names a checked range of the index buffer; of it shaders change the number of instances, or
         // of indices, which they have written themselves from checked ones and never beyond the range.
@@ -27,7 +27,7 @@ impl Gl {
     }
 
     /// Lets everything after this see what shaders wrote.
-    pub(in crate::render) fn wait_for_stores(&self) {
+    pub(crate) fn wait_for_stores(&self) {
         // SAFETY: only orders memory.
         unsafe { self.on().memory_barrier(glow::ALL_BARRIER_BITS) }
     }

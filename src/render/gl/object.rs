@@ -5,62 +5,62 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::Gl;
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// A buffer object of fixed size.
 #[derive(Debug)]
-pub(in crate::render) struct Buffer {
+pub(crate) struct Buffer {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Buffer,
-    pub(in crate::render) bytes: u64,
+    pub(crate) bytes: u64,
 }
 
 /// What a texture is made for.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::render) struct TextureKind {
-    pub(in crate::render) target: u32,
-    pub(in crate::render) format: u32,
-    pub(in crate::render) width: u32,
-    pub(in crate::render) height: u32,
+pub(crate) struct TextureKind {
+    pub(crate) target: u32,
+    pub(crate) format: u32,
+    pub(crate) width: u32,
+    pub(crate) height: u32,
     /// Layers of an array, samples of a multisampled image, else 1.
-    pub(in crate::render) depth: u32,
-    pub(in crate::render) levels: u32,
+    pub(crate) depth: u32,
+    pub(crate) levels: u32,
 }
 
 /// A texture object of fixed storage.
 #[derive(Debug)]
-pub(in crate::render) struct Texture {
+pub(crate) struct Texture {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Texture,
-    pub(in crate::render) kind: TextureKind,
+    pub(crate) kind: TextureKind,
 }
 
 #[derive(Debug)]
-pub(in crate::render) struct Program {
+pub(crate) struct Program {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Program,
 }
 
 #[derive(Debug)]
-pub(in crate::render) struct Framebuffer {
+pub(crate) struct Framebuffer {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Framebuffer,
 }
 
 #[derive(Debug)]
-pub(in crate::render) struct VertexArray {
+pub(crate) struct VertexArray {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::VertexArray,
 }
 
 impl Buffer {
     /// The name that other APIs register.
-    pub(in crate::render) fn name(&self) -> u32 {
+    pub(crate) fn name(&self) -> u32 {
         self.name.0.get()
     }
 
     /// Overwrites the first bytes.
-    pub(in crate::render) fn write(&self, data: &[u8]) {
+    pub(crate) fn write(&self, data: &[u8]) {
         let gl = self.gl.on();
         // SAFETY: OpenGL refuses more bytes than the buffer has.
         unsafe {
@@ -70,7 +70,7 @@ impl Buffer {
     }
 
     /// Copies the first bytes out. Waits for whatever still writes them.
-    pub(in crate::render) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
+    pub(crate) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
         let gl = self.gl.on();
         let bytes = bytes.min(self.bytes as usize);
         // SAFETY: the mapped range is inside the buffer, only read, and unmapped before anybody else may use it.
@@ -86,13 +86,13 @@ impl Buffer {
         }
     }
 
-    pub(in crate::render) fn bind_storage(&self, binding: u32) {
+    pub(crate) fn bind_storage(&self, binding: u32) {
         // SAFETY: binding points below the eight that every context has.
         unsafe { self.gl.on().bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.name)) }
     }
 
     /// Binds `bytes` bytes from `offset` on, a multiple of 256.
-    pub(in crate::render) fn bind_uniform(&self, binding: u32, offset: usize, bytes: usize) {
+    pub(crate) fn bind_uniform(&self, binding: u32, offset: usize, bytes: usize) {
         let (offset, bytes) = (offset as i32, bytes as i32);
         // SAFETY: as for storage; OpenGL refuses ranges outside the buffer.
         unsafe { self.gl.on().bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.name), offset, bytes) }
@@ -101,7 +101,7 @@ impl Buffer {
 
 impl Texture {
     /// Fills one layer of one level with RGBA8 pixels, first row first.
-    pub(in crate::render) fn fill(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
+    pub(crate) fn fill(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
             return Err(during("texture")(format!("{} bytes for {width} x {height} pixels", rgba.len())));
@@ -120,7 +120,7 @@ impl Texture {
     }
 
     /// How it is sampled: OpenGL's parameters and values.
-    pub(in crate::render) fn sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
+    pub(crate) fn sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
         let gl = self.gl.on();
         // SAFETY: plain parameters of a texture of this context.
         unsafe {
@@ -134,7 +134,7 @@ impl Texture {
         }
     }
 
-    pub(in crate::render) fn bind(&self, unit: u32) {
+    pub(crate) fn bind(&self, unit: u32) {
         let gl = self.gl.on();
         // SAFETY: units below the 96 that every context has over all stages.
         unsafe {
@@ -144,12 +144,12 @@ impl Texture {
     }
 
     /// Binds it as an image that a compute shader writes.
-    pub(in crate::render) fn bind_image(&self, unit: u32) {
+    pub(crate) fn bind_image(&self, unit: u32) {
         self.bind_image_for(unit, glow::WRITE_ONLY);
     }
 
     /// The same for a shader that also reads what was there.
-    pub(in crate::render) fn bind_image_both_ways(&self, unit: u32) {
+    pub(crate) fn bind_image_both_ways(&self, unit: u32) {
         self.bind_image_for(unit, glow::READ_WRITE);
     }
 
@@ -165,7 +165,7 @@ impl Texture {
 
 impl Program {
     /// Uses it; a number, as the first triangle, goes to location 0 of those programs that have one.
-    pub(in crate::render) fn bind(&self, number: Option<u32>) {
+    pub(crate) fn bind(&self, number: Option<u32>) {
         let gl = self.gl.on();
         // SAFETY: a linked program; location 0 is declared by the shaders that are given a number.
         unsafe {
@@ -179,13 +179,13 @@ impl Program {
 
 impl Program {
     /// Gives the program in use, which is this one, where its triangles begin: location 0.
-    pub(in crate::render) fn first(&self, number: u32) {
+    pub(crate) fn first(&self, number: u32) {
         // SAFETY: location 0 is declared by the shaders that are given a number.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
     }
 
     /// Says which turn it takes: location 1 of those programs that take several, while it is in use.
-    pub(in crate::render) fn turn(&self, turn: i32) {
+    pub(crate) fn turn(&self, turn: i32) {
         // SAFETY: a linked program, in use; location 1 is declared by the shaders that are given a turn.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), turn) }
     }

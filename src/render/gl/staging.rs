@@ -10,12 +10,12 @@ use std::time::Duration;
 use glow::HasContext as _;
 
 use super::{Buffer, Gl};
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
-pub(in crate::render) struct Staging {
-    pub(in crate::render) buffer: ManuallyDrop<Buffer>,
+pub(crate) struct Staging {
+    pub(crate) buffer: ManuallyDrop<Buffer>,
     /// Where it is mapped; none where it cannot stay so.
     mapped: Option<*const u8>,
     /// Hears when whoever reads it has done.
@@ -28,7 +28,7 @@ pub(super) type Retired = (Buffer, Receiver<()>);
 /// Bytes of a staging buffer, to be copied by any thread. The device does not write them and they stay mapped while this
 /// lives, so it must not live long.
 #[derive(Debug)]
-pub(in crate::render) enum Lent {
+pub(crate) enum Lent {
     /// Where they are mapped, and what tells the buffer that they were read when it is dropped.
     Mapped {
         first: *const u8,
@@ -44,7 +44,7 @@ unsafe impl Send for Lent {}
 
 impl Gl {
     /// A buffer of so many bytes that the host may read.
-    pub(in crate::render) fn staging(self: &Rc<Self>, bytes: u64) -> Result<Staging> {
+    pub(crate) fn staging(self: &Rc<Self>, bytes: u64) -> Result<Staging> {
         self.bury(Duration::ZERO);
         let reader = RefCell::default();
         if !self.limits.persistent {
@@ -71,7 +71,7 @@ impl Gl {
 
     /// Frees the buffers that were given up while somebody read them, after waiting for each reader at most so long. Those
     /// that are read even then stay, and so does the context: better some memory is lost than read when it is gone.
-    pub(in crate::render) fn bury(&self, limit: Duration) {
+    pub(crate) fn bury(&self, limit: Duration) {
         let mut retired = mem::take(&mut *self.retired.borrow_mut());
         retired.retain(|(_, reader)| !is_over(reader, limit));
         self.retired.borrow_mut().extend(retired);
@@ -84,7 +84,7 @@ impl Staging {
     ///
     /// # Errors
     /// `Fault` where the buffer cannot be mapped.
-    pub(in crate::render) fn lend(&self, bytes: usize) -> Result<Lent> {
+    pub(crate) fn lend(&self, bytes: usize) -> Result<Lent> {
         let Some(first) = self.mapped else { return self.buffer.read(bytes).map(Lent::Copied) };
         // Nothing is ever sent: its end is all it tells.
         let (done, reader) = mpsc::sync_channel(1);
@@ -93,7 +93,7 @@ impl Staging {
     }
 
     /// Waits until nobody reads it any more, at most `limit`; whether that is so.
-    pub(in crate::render) fn is_read(&self, limit: Duration) -> bool {
+    pub(crate) fn is_read(&self, limit: Duration) -> bool {
         let mut reader = self.reader.borrow_mut();
         let over = reader.as_ref().is_none_or(|reader| is_over(reader, limit));
         if over {
@@ -103,7 +103,7 @@ impl Staging {
     }
 
     /// A copy of some bytes, as [`Self::lend`] has them.
-    pub(in crate::render) fn read(&self, range: std::ops::Range<usize>) -> Result<Vec<u8>> {
+    pub(crate) fn read(&self, range: std::ops::Range<usize>) -> Result<Vec<u8>> {
         let lent = self.lend(range.end)?;
         Ok(lent.bytes().get(range).unwrap_or_default().to_vec())
     }
@@ -130,7 +130,7 @@ fn is_over(reader: &Receiver<()>, limit: Duration) -> bool {
 }
 
 impl Lent {
-    pub(in crate::render) fn bytes(&self) -> &[u8] {
+    pub(crate) fn bytes(&self) -> &[u8] {
         match self {
             // SAFETY: the range is inside the mapping, which stays, and nobody writes it while this lives.
             Self::Mapped { first, bytes, .. } => unsafe { std::slice::from_raw_parts(*first, *bytes) },
@@ -142,7 +142,7 @@ impl Lent {
 #[cfg(test)]
 impl Gl {
     /// Buffers that wait for their readers.
-    pub(in crate::render) fn retired(&self) -> usize {
+    pub(crate) fn retired(&self) -> usize {
         self.retired.borrow().len()
     }
 }

@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 use glow::HasContext as _;
 
 use super::Gl;
-use crate::error::{Result, during};
+use modalcast_model::error::{Result, during};
 
 /// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around waiting in software, where timer
 /// queries mean nothing.
 #[derive(Debug)]
-pub(in crate::render) enum Stopwatch {
+pub(crate) enum Stopwatch {
     Wall(f64),
     Query(Rc<Gl>, glow::Query),
 }
@@ -21,7 +21,7 @@ impl Gl {
     ///
     /// # Errors
     /// `Fault` of `stage` when the device did not finish within `limit`.
-    pub(in crate::render) fn wait(self: &Rc<Self>, stage: &'static str, limit: Duration) -> Result<()> {
+    pub(crate) fn wait(self: &Rc<Self>, stage: &'static str, limit: Duration) -> Result<()> {
         self.fence(stage)?.wait(stage, limit)
     }
 
@@ -30,7 +30,7 @@ impl Gl {
     ///
     /// # Errors
     /// Those of the commands; `Fault` of the pass when software did not finish.
-    pub(in crate::render) fn timed(
+    pub(crate) fn timed(
         self: &Rc<Self>,
         (pass, limit): (&'static str, Duration),
         commands: impl FnOnce() -> Result<()>,
@@ -61,7 +61,7 @@ impl Gl {
 
 impl Stopwatch {
     /// Milliseconds; for a stretch that was ended and waited for.
-    pub(in crate::render) fn ms(&self) -> f64 {
+    pub(crate) fn ms(&self) -> f64 {
         match self {
             Self::Wall(ms) => *ms,
             // SAFETY: the query was ended; its result is there or waited for.
@@ -72,7 +72,7 @@ impl Stopwatch {
     }
 
     /// Whether the device has done the stretch; nothing is waited for.
-    pub(in crate::render) fn is_over(&self) -> bool {
+    pub(crate) fn is_over(&self) -> bool {
         match self {
             Self::Wall(_) => true,
             // SAFETY: the query was ended; this only asks.
@@ -95,7 +95,7 @@ impl Drop for Stopwatch {
 #[cfg(test)]
 impl Gl {
     /// A stopwatch of a stretch that the device never comes to.
-    pub(in crate::render) fn stopped_watch(self: &Rc<Self>) -> Stopwatch {
+    pub(crate) fn stopped_watch(self: &Rc<Self>) -> Stopwatch {
         // SAFETY: a fresh name; asking for a query that was never begun is an error without a result.
         let query = unsafe { self.on().create_query() }.expect("a query");
         Stopwatch::Query(Rc::clone(self), query)

@@ -3,10 +3,10 @@
 use super::super::geometry::{Geometry, Kind, kind, used_materials};
 use super::super::scene_buffers::SceneBuffers;
 use super::super::textures::{Array, Use, arrays, cutoff, levels, place};
-use crate::domain::{AlphaMode, Material};
-use crate::error::Result;
-use crate::raster::{AlphaImage, CutOuts, GlBuffer, Mesh, Surface};
-use crate::scene::{Faces, Group, Scene};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::error::Result;
+use modalcast_model::raster::{AlphaImage, CutOuts, GlBuffer, Mesh, Surface};
+use modalcast_model::scene::{Faces, Group, Scene};
 
 /// The mesh of a scene, whose positions are those that its buffers share.
 pub(super) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<Mesh> {
@@ -78,7 +78,7 @@ fn alpha(scene: &Scene, arrays: &[Array], texture: usize) -> AlphaImage {
 mod tests {
     use super::super::super::geometry::tests::squares;
     use super::*;
-    use crate::domain::Texture;
+    use modalcast_model::domain::Texture;
 
     #[test]
     fn cut_outs_are_what_is_not_opaque_with_the_alpha_of_their_own_images() {

@@ -15,9 +15,9 @@ use super::scene_buffers::SceneBuffers;
 use super::shaders::TILE;
 use super::target::Target;
 use super::{Ran, Renderer, Shot};
-use crate::error::{Error, Result, during};
-use crate::raster::{GlBuffer, Mesh, Rasteriser};
-use crate::scene::{Scene, Window};
+use modalcast_model::error::{Error, Result, during};
+use modalcast_model::raster::{GlBuffer, Mesh, Rasteriser};
+use modalcast_model::scene::{Scene, Window};
 
 /// Who drew a pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]

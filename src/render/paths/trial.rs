@@ -3,7 +3,7 @@
 use super::super::scene_buffers::SceneBuffers;
 use super::super::{Image, Renderer, Shot};
 use super::{Path, Paths};
-use crate::error::Result;
+use modalcast_model::error::Result;
 
 /// Frames by each way; the first warms up, and of the others the median counts.
 const FRAMES: usize = 6;

@@ -1,11 +1,11 @@
 //! Sources of what is drawn only when somebody asks: picks, and pictures of numbers.
 
 use super::{CLIP, FRAME, IDS, LANES, Options, SHARES, Source};
-use crate::render::gl;
+use crate::gl;
 
 impl Options {
     /// Reads a field off the ids: `DEPTH` and `NORMALS` of one sample a pixel, `VALUES` of all samples.
-    pub(in crate::render) fn survey(&self, field: &'static str, samples: u32) -> Source {
+    pub(crate) fn survey(&self, field: &'static str, samples: u32) -> Source {
         let mut text = format!("#version 430 core\n#define LANES {LANES}\n#define {field}\n");
         // Only depth draws the ground, and only of a look that has one.
         let has_ground = field == "DEPTH" && self.defines.contains(&"GROUND_SEEN");
@@ -17,7 +17,7 @@ impl Options {
 }
 
 /// The triangles of a few pixels.
-pub(in crate::render) fn pick() -> Source {
+pub(crate) fn pick() -> Source {
     let head = format!("#version 430 core\n#define LANES {LANES}\n#define SAMPLES 1\n");
     let body = [&head, IDS, SHARES, include_str!("../../../shaders/pick.comp")].concat();
     Source { label: "pick".into(), stages: vec![(gl::COMPUTE_SHADER, body)] }

@@ -3,17 +3,17 @@
 use std::fmt::Write as _;
 
 use super::{CLIP, DRAWN, FRAME, LISTS, Options, PHONG, SHARES, Slopes, Source, TILE, TILE_ROW, TRIANGLE, drawn};
-use crate::render::geometry::Kind;
-use crate::render::gl;
+use crate::geometry::Kind;
+use crate::gl;
 
 /// Side of the square of pixels that a workgroup tallies.
-pub(in crate::render) const TALLY: u32 = 16;
+pub(crate) const TALLY: u32 = 16;
 /// Pixels are told apart by their fragments up to this many.
-pub(in crate::render) const BINS: usize = 256;
+pub(crate) const BINS: usize = 256;
 
 impl Options {
     /// Counts the blended fragments of pixels, and puts them in their lists.
-    pub(in crate::render) fn gather(&self, samples: u32) -> Source {
+    pub(crate) fn gather(&self, samples: u32) -> Source {
         // Extensions are named before anything else.
         let post_depth = samples > 1 && self.post_depth;
         let more: &[&str] = if post_depth { &["MASK", "POST_DEPTH"] } else { &["MASK"] };
@@ -28,7 +28,7 @@ impl Options {
     }
 
     /// Sorted lists to layers.
-    pub(in crate::render) fn resolve_lists(&self, samples: u32) -> Source {
+    pub(crate) fn resolve_lists(&self, samples: u32) -> Source {
         let mut text = self.head(&[]) + &bins() + &tiles() + &self.branches(&[Kind::Blend]);
         text += &[&self.sampling(samples), FRAME, CLIP, &self.sun(), LISTS].concat();
         text += &[&self.lookups(&[Kind::Blend], Slopes::Given), PHONG, SHARES, TRIANGLE].concat();
@@ -38,14 +38,14 @@ impl Options {
 }
 
 /// How many pixels have how many blended fragments.
-pub(in crate::render) fn tally() -> Source {
+pub(crate) fn tally() -> Source {
     let head = format!("#version 430 core\n#define SIDE {TALLY}\n{}", bins());
     let text = [&head, LISTS, include_str!("../../../shaders/tally.comp")].concat();
     Source { label: "tally".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
 }
 
 /// Where the list of each pixel begins.
-pub(in crate::render) fn place() -> Source {
+pub(crate) fn place() -> Source {
     let head = format!("#version 430 core\n{}{}", tiles(), bins());
     let text = [&head, LISTS, include_str!("../../../shaders/place.comp")].concat();
     Source { label: "place".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
@@ -64,8 +64,8 @@ fn tiles() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::shaders::Used;
-    use crate::scene::Shadow;
+    use crate::shaders::Used;
+    use modalcast_model::scene::Shadow;
 
     fn options(post_depth: bool) -> Options {
         let used = vec![Used { kind: Kind::Blend, colour: None, normal: None }];

@@ -17,8 +17,8 @@ use super::paths::Beside;
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::LANES;
-use crate::error::{Result, during};
-use crate::scene::{Blurring, Moments, Shadow};
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::{Blurring, Moments, Shadow};
 
 #[derive(Debug)]
 pub(super) struct ShadowMap {

@@ -5,12 +5,12 @@ use std::cell::Cell;
 
 use super::super::Shot;
 use super::super::scene_buffers::SceneBuffers;
-use crate::error::Result;
-use crate::scene::{Bounds, LightBounds};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Bounds, LightBounds};
 
 /// What the vertices are, and what the map was last drawn of.
 #[derive(Debug, Default)]
-pub(in crate::render) struct Shared {
+pub(crate) struct Shared {
     /// None: nobody says what the vertices are, and every frame draws the map.
     step: Cell<Option<u64>>,
     drawn: Cell<Option<Content>>,
@@ -18,7 +18,7 @@ pub(in crate::render) struct Shared {
 
 /// All that a map shows.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::render) struct Content {
+pub(crate) struct Content {
     step: u64,
     bounds: Bounds,
     light: Option<LightBounds>,
@@ -27,18 +27,18 @@ pub(in crate::render) struct Content {
 
 impl Shared {
     /// Forgets what the vertices are, because they were written.
-    pub(in crate::render) fn forget(&self) {
+    pub(crate) fn forget(&self) {
         self.step.set(None);
     }
 
     /// Whether the map does not show this content yet.
-    pub(in crate::render) fn is_wanted(&self, content: Option<Content>) -> bool {
+    pub(crate) fn is_wanted(&self, content: Option<Content>) -> bool {
         content.is_none() || content != self.drawn.get()
     }
 
     /// Draws the map by `draw` unless it shows this content already; whether that was needed. A map whose drawing failed shows
     /// nothing.
-    pub(in crate::render) fn draw_unless_there(
+    pub(crate) fn draw_unless_there(
         &self,
         content: Option<Content>,
         draw: impl FnOnce() -> Result<()>,
@@ -62,7 +62,7 @@ impl SceneBuffers {
     }
 
     /// What the map would show in this frame; none when it is this frame's alone.
-    pub(in crate::render) fn shadow_of(&self, shot: &Shot) -> Option<Content> {
+    pub(crate) fn shadow_of(&self, shot: &Shot) -> Option<Content> {
         let splits = self.scene.look.shadow.map_or(1, |shadow| shadow.splits);
         let step = self.shared_shadow.step.get().filter(|_| splits == 1)?;
         Some(Content { step, bounds: shot.bounds, light: shot.light, origin: self.origin })

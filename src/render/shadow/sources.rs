@@ -6,21 +6,21 @@ use super::super::geometry::Kind;
 use super::super::gl;
 use super::super::shaders::{CASTER, DRAWN, FRAME, LANES, Options, Slopes, Source, drawn};
 use super::strip::Strip;
-use crate::scene::{Blurring, Moments, Shadow, ShadowMethod};
+use modalcast_model::scene::{Blurring, Moments, Shadow, ShadowMethod};
 
 const SUN: &str = include_str!("../../../shaders/shared/sun.glsl");
 const SPLITS: &str = include_str!("../../../shaders/shared/splits.glsl");
 const MOMENTS: &str = include_str!("../../../shaders/shared/moments.glsl");
 
 /// Texels that one invocation of the blur makes, along its direction.
-pub(in crate::render) const RUN: u32 = 8;
+pub(crate) const RUN: u32 = 8;
 /// Lanes of a workgroup that blurs a tile.
 const TILE_LANES: u32 = 256;
 /// The shared memory that every device gives a workgroup.
 pub(super) const SHARED_BYTES: u32 = 32 << 10;
 
 /// The branches of a kind of map.
-pub(in crate::render) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'static str> {
+pub(crate) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'static str> {
     let method = match shadow.method {
         ShadowMethod::Variance => "VARIANCE",
         ShadowMethod::Standard => "STANDARD",
@@ -31,7 +31,7 @@ pub(in crate::render) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'stat
 }
 
 /// Texels of the map that a workgroup of the blur in one pass makes: columns and rows.
-pub(in crate::render) fn made_at_once(shadow: &Shadow) -> [u32; 2] {
+pub(crate) fn made_at_once(shadow: &Shadow) -> [u32; 2] {
     let tile = Tile::of(shadow);
     Strip::of(shadow).map_or([tile.wide, tile.tall], |strip| [strip.wide, strip.tall])
 }
@@ -72,7 +72,7 @@ impl Tile {
 
 impl Options {
     /// The function `lit`, for every shader that asks how much of the sun arrives.
-    pub(in crate::render) fn sun(&self) -> String {
+    pub(crate) fn sun(&self) -> String {
         let mut text = String::new();
         if self.has("VARIANCE") {
             writeln!(text, "const float DEVIATION = {:?};", self.shadow.deviation() as f32).ok();
@@ -86,7 +86,7 @@ impl Options {
         text + self.splits() + SUN
     }
 
-    pub(in crate::render) fn splits(&self) -> &'static str {
+    pub(crate) fn splits(&self) -> &'static str {
         if self.shadow.splits > 1 && self.has("SHADOWS") { SPLITS } else { "" }
     }
 
@@ -95,7 +95,7 @@ impl Options {
     }
 
     /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
-    pub(in crate::render) fn shadow(&self, kind: Kind) -> Source {
+    pub(crate) fn shadow(&self, kind: Kind) -> Source {
         let label = format!("shadow, {kind:?}");
         let vertex = |head: &str| [head, FRAME, self.splits(), include_str!("../../../shaders/shadow.vert")].concat();
         if kind == Kind::Opaque {
@@ -109,7 +109,7 @@ impl Options {
     }
 
     /// The programs that make blurred moments of depth, in order.
-    pub(in crate::render) fn blur(&self) -> Vec<Source> {
+    pub(crate) fn blur(&self) -> Vec<Source> {
         match self.shadow.blurring {
             Blurring::Fitting | Blurring::Tiles => vec![self.blur_at_once()],
             Blurring::Rows | Blurring::Fragments => vec![self.blur_along(true), self.blur_along(false)],
@@ -117,7 +117,7 @@ impl Options {
     }
 
     /// The first of them, for depth that lies in a buffer; none where there are none.
-    pub(in crate::render) fn blur_of_buffer(&self) -> Option<Source> {
+    pub(crate) fn blur_of_buffer(&self) -> Option<Source> {
         let Source { label, stages } = self.blur().into_iter().next().filter(|_| self.has("VARIANCE"))?;
         let version = |text: String| text.replacen('\n', "\n#define OF_BUFFER\n", 1);
         let stages = stages.into_iter().map(|(stage, text)| (stage, version(text))).collect();
@@ -196,7 +196,7 @@ fn taps(name: &str, arguments: &str, weights: &[f32], run: u32, fetch: impl Fn(i
 }
 
 /// Half a normalised Gaussian (equation 3.11 in one dimension), centre first, cut off at three deviations.
-pub(in crate::render) fn weights(deviation: f32) -> Vec<f32> {
+pub(crate) fn weights(deviation: f32) -> Vec<f32> {
     let deviation = f64::from(deviation);
     let reach = (3.0 * deviation).ceil() as i32;
     let bell = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / deviation).powi(2)).exp() };

@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 
-use crate::scene::Shadow;
+use modalcast_model::scene::Shadow;
 
 /// Lanes of a workgroup and rows of a turn: for a reach up to so far, and beyond. More sums leave registers for fewer lanes,
 /// which wait less often when a turn is long. Of 4096^2 on an H200: 15 taps took 135 us with the first and 154 with the
@@ -15,10 +15,10 @@ const WIDEST: u32 = 24;
 
 /// A workgroup's strip of the map: a column for each lane, and the rows that it makes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::render) struct Strip {
+pub(crate) struct Strip {
     /// Lanes: columns.
-    pub(in crate::render) wide: u32,
-    pub(in crate::render) tall: u32,
+    pub(crate) wide: u32,
+    pub(crate) tall: u32,
     /// Rows that are read at once.
     turn: u32,
     reach: u32,
@@ -27,7 +27,7 @@ pub(in crate::render) struct Strip {
 impl Strip {
     /// None where the blur reaches too far. A tall strip begins seldom, which costs 2 `reach` rows; a small map needs many
     /// strips, so that all of a device has work.
-    pub(in crate::render) fn of(shadow: &Shadow) -> Option<Self> {
+    pub(crate) fn of(shadow: &Shadow) -> Option<Self> {
         let reach = shadow.reach();
         let (wide, turn) = WALKS[usize::from(reach > NEAR)];
         let rows = (shadow.size / 32).clamp(16, 128) + 2 * reach;
@@ -42,7 +42,7 @@ impl Strip {
     }
 
     /// The shader behind its head, which tells LANES, for half a bell of these weights.
-    pub(in crate::render) fn text(self, weights: &[f32]) -> String {
+    pub(crate) fn text(self, weights: &[f32]) -> String {
         let Self { tall, turn, reach, .. } = self;
         let text = format!("#define TALL {tall}\n#define TURN {turn}\n#define REACH {reach}\n");
         let body = include_str!("../../../shaders/blur_strip.comp");

@@ -8,10 +8,10 @@ use std::time::Duration;
 use super::super::geometry::tests::squares;
 use super::super::ring::FRAMES_UNDER_WAY;
 use super::super::{Image, Prefer, Renderer, SceneBuffers, Shot};
-use crate::deform::Surface;
-use crate::domain::{AlphaMode, Material};
-use crate::error::Error;
-use crate::scene::{Camera, Scene, Transparency};
+use modalcast_model::deform::Surface;
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::error::Error;
+use modalcast_model::scene::{Camera, Scene, Transparency};
 
 /// A renderer whose passes are timed by queries, whatever it draws on, so that its frames are under way when they were
 /// submitted.

@@ -69,8 +69,8 @@ fn samples(image: &Linear) -> Vec<f32> {
 mod tests {
     use super::super::{Array, Use, levels};
     use super::*;
-    use crate::domain::Texture;
-    use crate::scene::Parts;
+    use modalcast_model::domain::Texture;
+    use modalcast_model::scene::Parts;
 
     /// The share that each level leaves, read back from its bytes.
     fn shares(texture: &Texture, cutoff: f32, kept: bool) -> Vec<f32> {
@@ -114,7 +114,7 @@ mod tests {
     #[test]
     fn only_images_that_nothing_but_cut_outs_reads_have_a_cutoff() {
         use super::super::super::geometry::tests::squares;
-        use crate::domain::{AlphaMode, Material};
+        use modalcast_model::domain::{AlphaMode, Material};
         let cutoff_of = |modes: &[(AlphaMode, f32)]| {
             let material = |(alpha_mode, alpha): &(AlphaMode, f32)| Material {
                 alpha_mode: *alpha_mode,
@@ -124,7 +124,7 @@ mod tests {
             };
             let mut parts: Parts = squares(modes.iter().map(material).collect());
             parts.textures.push(disc(0.5));
-            super::super::cutoff(&crate::scene::Scene::new(parts).expect("good"), 0)
+            super::super::cutoff(&modalcast_model::scene::Scene::new(parts).expect("good"), 0)
         };
         let mask = |cutoff: f32| AlphaMode::Mask { cutoff };
         assert_eq!(cutoff_of(&[(mask(0.5), 1.0), (mask(0.4), 0.8)]), Some(0.5));

@@ -2,8 +2,8 @@
 
 use modalcast_proto::v1;
 
-use crate::error::{Result, invalid};
-use crate::scene::{Camera, Lens, View};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Camera, Lens, View};
 
 /// The checked camera.
 pub(super) fn parse(framing: Camera, camera: v1::Camera) -> Result<Camera> {

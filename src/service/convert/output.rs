@@ -3,8 +3,8 @@
 use modalcast_proto::v1;
 
 use crate::engine::{Format, Showing, checked_mode};
-use crate::error::{Result, invalid};
-use crate::scene::Scene;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::Scene;
 
 /// The end of a colour map's scale must be below this, and above its inverse.
 const FARTHEST: f64 = 1e30;

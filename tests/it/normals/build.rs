@@ -2,10 +2,12 @@
 
 use std::sync::Arc;
 
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::{Deformer, Surface};
-use modalcast::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals};
-use modalcast::scene::{Normals, Parts, Scene, State};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_model::deform::{Deformer, Surface};
+use modalcast_model::domain::{
+    Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals,
+};
+use modalcast_model::scene::{Normals, Parts, Scene, State};
 use nalgebra::{Matrix3, Vector3};
 
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
@@ -151,9 +153,9 @@ pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &State) -> Surface {
 
 /// The exact normals and tangents of the reference.
 pub(crate) fn exact(scene: &Scene, state: &State) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
-    let positions = modalcast::reference::deform(scene, state);
-    let tangents = modalcast::reference::exact_tangents(scene, state, &positions);
-    (modalcast::reference::exact_normals(scene, state, &positions), tangents)
+    let positions = modalcast_compute::reference::deform(scene, state);
+    let tangents = modalcast_compute::reference::exact_tangents(scene, state, &positions);
+    (modalcast_compute::reference::exact_normals(scene, state, &positions), tangents)
 }
 
 /// The angle between two directions in degrees, NaN when one is.

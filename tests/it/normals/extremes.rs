@@ -1,7 +1,7 @@
 //! Exact normals at the edges of f32: no area, far away, tiny, huge, overflowed, folded over.
 
-use modalcast::reference;
-use modalcast::scene::Scene;
+use modalcast_compute::reference;
+use modalcast_model::scene::Scene;
 use nalgebra::{Matrix3, Vector3};
 
 use super::build::{bent, degrees, exact, largest_angle, on_cpu, scene, sheet, state, tube, with_mode};
@@ -67,7 +67,8 @@ fn triangles_without_area_add_nothing_and_corners_without_triangles_keep_their_n
     triangles.retain(|triangle| !triangle.contains(&24));
     let of = |triangles: Vec<[u32; 3]>| {
         let corners = corners.clone();
-        let mesh = modalcast::domain::Mesh::indexed(mesh.rest().to_vec(), corners.normals, corners.uvs, triangles);
+        let mesh =
+            modalcast_model::domain::Mesh::indexed(mesh.rest().to_vec(), corners.normals, corners.uvs, triangles);
         scene(vec![with_mode(mesh.expect("a sheet"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
     let (dirty, clean) = (of(triangles), of(clean));

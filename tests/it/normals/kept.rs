@@ -1,8 +1,8 @@
 //! Exact normals of domains that a step leaves alone are kept, and are those that a fresh deformer computes.
 
-use modalcast::cpu::CpuDeformer;
-use modalcast::deform::{Deformer, Surface};
-use modalcast::scene::{Scene, State};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_model::deform::{Deformer, Surface};
+use modalcast_model::scene::{Scene, State};
 
 use super::build::{cube, scene, sheet, sphere, state, tube, with_mode};
 use super::linear_parts;

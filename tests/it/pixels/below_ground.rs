@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer as _;
-use modalcast::domain::{Material, Transform};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Field, Hit, Shot};
-use modalcast::scene::{Camera, Ground, Rectangle, Scene, State, View};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::domain::{Material, Transform};
+use modalcast_model::scene::{Camera, Ground, Rectangle, Scene, State, View};
+use modalcast_render::{Field, Hit, Shot};
 use nalgebra::{Matrix4, Vector3};
 
 use super::build::{Stage, camera, facing, open};

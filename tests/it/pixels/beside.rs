@@ -4,14 +4,14 @@
 use std::sync::Arc;
 
 use glow::HasContext as _;
-use modalcast::deform::Deformer as _;
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::error::{Result, invalid};
-use modalcast::raster::{GlBuffer, Mesh, Order, Rasteriser};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::reference::raster::Raster;
-use modalcast::render::{Image, Path, Paths, Ran, Renderer, SceneBuffers, Seen, Shot};
-use modalcast::scene::{Blurring, Camera, Faces, Group, Lens, Scene, Shadow, State, View, Window};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_compute::reference::raster::Raster;
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::raster::{GlBuffer, Mesh, Order, Rasteriser};
+use modalcast_model::scene::{Blurring, Camera, Faces, Group, Lens, Scene, Shadow, State, View, Window};
+use modalcast_render::{Image, Path, Paths, Ran, Renderer, SceneBuffers, Seen, Shot};
 use nalgebra::{Matrix4, Vector3};
 
 use super::build::{Stage, facing, lying, open};
@@ -132,7 +132,7 @@ fn give(renderer: &mut Renderer, buffers: &mut SceneBuffers, by: By) {
 /// A wall, half of a box below the ground, and a lid, under a slanting sun.
 fn yard(shadow: Option<Shadow>, samples: u32) -> Stage {
     let mut stage = Stage::new();
-    let defaults = modalcast::scene::Look::default();
+    let defaults = modalcast_model::scene::Look::default();
     (stage.0.look.ground, stage.0.look.horizon) = (defaults.ground, defaults.horizon);
     (stage.0.look.sun, stage.0.look.shadow, stage.0.look.samples) = ([1.0, 3.0, 2.0], shadow, samples);
     let plain = || Material { double_sided: true, ..Material::default() };
@@ -246,7 +246,7 @@ fn what_it_may_not_draw_is_drawn_by_opengl() {
     assert_eq!(paths(yard(Some(base), 4)), Paths { shadow: cuda, visibility: opengl }, "four samples a pixel");
     let split = Shadow { splits: 2, ..base };
     assert_eq!(paths(yard(Some(split), 1)), Paths { shadow: opengl, visibility: cuda });
-    let standard = Shadow { method: modalcast::scene::ShadowMethod::Standard, ..base };
+    let standard = Shadow { method: modalcast_model::scene::ShadowMethod::Standard, ..base };
     assert_eq!(paths(yard(Some(standard), 1)), Paths { shadow: opengl, visibility: cuda });
     assert_eq!(paths(yard(None, 1)), Paths { shadow: None, visibility: cuda });
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..Material::default() };

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::{Deformed, Deformer as _};
-use modalcast::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Allocation, Image, Prefer, Ran, Renderer, Shot, plan};
-use modalcast::scene::{Camera, Lens, Parts, Scene, State, View};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Deformed, Deformer as _};
+use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast_model::scene::{Camera, Lens, Parts, Scene, State, View};
+use modalcast_render::{Allocation, Image, Prefer, Ran, Renderer, Shot, plan};
 
 /// A scene under construction: no shadow, no ground, a black sky, the sun behind the camera.
 pub(super) struct Stage(pub(super) Parts);

@@ -2,10 +2,12 @@
 
 use std::sync::{Arc, OnceLock};
 
-use modalcast::deform::Surface;
-use modalcast::domain::{AlphaMode, Material, Mesh};
-use modalcast::render::{Culled, Field, Ran, Renderer, SceneBuffers, Seen, Shot};
-use modalcast::scene::{Camera, Culling, Ground, Lens, Rectangle, Scene, Shadow, ShadowMethod, Transparency, View};
+use modalcast_model::deform::Surface;
+use modalcast_model::domain::{AlphaMode, Material, Mesh};
+use modalcast_model::scene::{
+    Camera, Culling, Ground, Lens, Rectangle, Scene, Shadow, ShadowMethod, Transparency, View,
+};
+use modalcast_render::{Culled, Field, Ran, Renderer, SceneBuffers, Seen, Shot};
 
 use super::build::{Stage, camera, facing, open};
 

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use modalcast::deform::Deformer as _;
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Culled, Renderer, Shot};
-use modalcast::scene::{Camera, Culling, Look, Parts, Scene, Shadow, State, Transparency};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::scene::{Camera, Culling, Look, Parts, Scene, Shadow, State, Transparency};
+use modalcast_render::{Culled, Renderer, Shot};
 
 use super::build::open;
 
@@ -44,7 +44,7 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_almond_culled_is_the_same_picture() {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
-    let scene = modalcast::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond");
+    let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond");
     let mut renderer = open();
     for transparency in [Transparency::Exact, Transparency::TwoPass] {
         let look = Look { transparency, shadow: Some(Shadow { size: 2048, ..Shadow::default() }), ..scene.look };

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::domain::Material;
 use modalcast::engine::Workbench;
-use modalcast::render::Image;
-use modalcast::scene::{
+use modalcast_model::domain::Material;
+use modalcast_model::scene::{
     Camera, GRID, Lens, Look, RawUpdate, Scene, Shadow, ShadowMethod, State, TransformFormat, Update, View,
 };
+use modalcast_render::Image;
 
 use super::build::{Stage, facing, lying};
 

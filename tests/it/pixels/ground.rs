@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Surface;
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::render::{Renderer, Seen, Shot};
-use modalcast::scene::{Bloom, Bounds, Camera, Culling, Ground, Lens, Look, Scene, Shadow, Transparency, View};
+use modalcast_model::deform::Surface;
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Bloom, Bounds, Camera, Culling, Ground, Lens, Look, Scene, Shadow, Transparency, View};
+use modalcast_render::{Renderer, Seen, Shot};
 
 use super::build::{Stage, facing, lying, open};
 
@@ -44,7 +44,7 @@ impl Frame {
     /// The scene at rest, all `sunk` lower, when it is told that its lowest point is at `lowest`.
     fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, (sunk, lowest): (f32, f64)) -> Self {
         let buffers = renderer.load(scene).expect("loads");
-        let of_all = |part: fn(&modalcast::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
+        let of_all = |part: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
             scene
                 .domains
                 .iter()

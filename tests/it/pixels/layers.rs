@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use modalcast::domain::{AlphaMode, Material, Mesh};
-use modalcast::render::Lists;
-use modalcast::scene::{Scene, Transparency};
+use modalcast_model::domain::{AlphaMode, Material, Mesh};
+use modalcast_model::scene::{Scene, Transparency};
+use modalcast_render::Lists;
 
 use super::build::{Picture, Stage, camera, close, draw, facing, open, picture};
 

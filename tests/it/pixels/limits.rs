@@ -1,10 +1,10 @@
 //! What a scene does not need is not made; extreme sizes, cameras and vertices; the same input gives the same bytes.
 
-use modalcast::deform::{Deformer as _, Surface};
-use modalcast::domain::{AlphaMode, Material, Mesh, Transform};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Prefer, Renderer, Shot, devices, plan};
-use modalcast::scene::{Bounds, Camera, Look, State, View};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
+use modalcast_model::scene::{Bounds, Camera, Look, State, View};
+use modalcast_render::{Prefer, Renderer, Shot, devices, plan};
 
 use super::build::{Stage, camera, draw, facing, lying, open, picture, planned_above};
 
@@ -17,7 +17,7 @@ fn full() -> Stage {
 #[test]
 fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_no_blended_pass() {
     let plain = picture(&full().add(lying(1.0, -0.5), Material::default()).scene());
-    let names = |list: &[modalcast::render::Allocation]| {
+    let names = |list: &[modalcast_render::Allocation]| {
         list.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
     };
     for absent in ["tangents", "uvs", "triangle materials"] {
@@ -90,7 +90,7 @@ fn a_frame_too_large_for_four_samples_is_drawn_with_one_and_keeps_its_cut_outs()
     let mut renderer = open();
     let side = 3400;
     let mut wide = camera(side);
-    wide.lens = modalcast::scene::Lens::FieldOfView(12.0);
+    wide.lens = modalcast_model::scene::Lens::FieldOfView(12.0);
     let shown = draw(&mut renderer, &scene, wide, side);
     assert_eq!(shown.ran.samples, 1);
     assert!(shown.at(side / 2 - 700, side / 2) == [0; 3] && shown.at(side / 2 + 700, side / 2) != [0; 3]);
@@ -107,7 +107,7 @@ fn the_same_input_gives_the_same_bytes_and_another_does_not() {
         "another context"
     );
     let mut moved = Camera::framing(&scene, 64, 64);
-    moved.lens = modalcast::scene::Lens::FieldOfView(33.0);
+    moved.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
     assert!(first.image.rgba != draw(&mut renderer, &scene, moved, 96).image.rgba, "control");
 }
 

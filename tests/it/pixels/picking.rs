@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::{Deformer as _, Surface};
-use modalcast::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Transform};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Hit, Renderer, SceneBuffers, Seen, Shot};
-use modalcast::scene::{Bounds, Camera, Ground, Lens, Rectangle, Scene, State, View};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Transform};
+use modalcast_model::scene::{Bounds, Camera, Ground, Lens, Rectangle, Scene, State, View};
+use modalcast_render::{Hit, Renderer, SceneBuffers, Seen, Shot};
 use nalgebra::Vector3;
 
 use super::build::{Stage, camera, facing, lying, open};

@@ -1,10 +1,10 @@
 //! Tone curves, glow, smoothed edges and mixed levels against arithmetic.
 
-use modalcast::deform::{Deformer as _, Surface};
-use modalcast::domain::{AlphaMode, Material, Mesh};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::Shot;
-use modalcast::scene::{Antialias, Bloom, Camera, Lens, Look, State, Tone};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::domain::{AlphaMode, Material, Mesh};
+use modalcast_model::scene::{Antialias, Bloom, Camera, Lens, Look, State, Tone};
+use modalcast_render::Shot;
 
 use super::build::{Picture, Stage, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb};
 

@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Deformer as _;
-use modalcast::domain::{Material, Mesh};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::reference::raster::Raster;
-use modalcast::render::{Seen, Shot};
-use modalcast::scene::{Camera, Culling, Faces, Group, Lens, Scene, State, View, Window};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_compute::reference::raster::Raster;
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::domain::{Material, Mesh};
+use modalcast_model::scene::{Camera, Culling, Faces, Group, Lens, Scene, State, View, Window};
+use modalcast_render::{Seen, Shot};
 use nalgebra::Matrix4;
 
 use super::build::{Stage, open};

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::render::{Renderer, SceneBuffers, Seen, Shot};
-use modalcast::scene::{Bounds, Camera, Culling, Look, Scene, Transparency};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Bounds, Camera, Culling, Look, Scene, Transparency};
+use modalcast_render::{Renderer, SceneBuffers, Seen, Shot};
 
 use super::build::{Stage, camera, facing, open};
 
@@ -26,7 +26,7 @@ fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
 /// The scene at rest, where every vertex is where its mesh says.
 fn loaded(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
     let buffers = renderer.load(scene).expect("loads");
-    let mut surface = modalcast::deform::Surface::default();
+    let mut surface = modalcast_model::deform::Surface::default();
     for domain in &scene.domains {
         let mesh = &scene.shapes[domain.shape].mesh;
         surface.positions.extend(mesh.rest().as_flattened());
@@ -39,7 +39,7 @@ fn loaded(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
 /// The camera so many pixels aside.
 fn aside([x, y]: [f64; 2]) -> Camera {
     let mut moved = camera(SIZE);
-    if let modalcast::scene::Lens::Intrinsics { cx, cy, .. } = &mut moved.lens {
+    if let modalcast_model::scene::Lens::Intrinsics { cx, cy, .. } = &mut moved.lens {
         (*cx, *cy) = (*cx + x, *cy + y);
     }
     moved

@@ -1,7 +1,7 @@
 //! Area, Phong, normal maps, cut-outs, blending, sky, and which way is up.
 
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::scene::{Camera, Lens, Transparency, View};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Camera, Lens, Transparency, View};
 use nalgebra::Vector3;
 
 use super::build::{Stage, camera, close, draw, facing, open, picture};

@@ -1,7 +1,7 @@
 //! The variance shadow map, seen on the ground.
 
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
 
 use super::build::{Picture, Stage, close, draw, facing, lying, open};
 
@@ -42,7 +42,8 @@ pub(super) fn with_square(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -
     let mut square = lying(1.0, 4.0).rest().to_vec();
     square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    let mesh = modalcast::domain::Mesh::indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
+    let mesh =
+        modalcast_model::domain::Mesh::indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
     stage.add(mesh.expect("a square"), material)
 }
 
@@ -194,13 +195,13 @@ fn every_up_axis_gives_the_same_picture() {
         let turn = up.from_y_up();
         let mut stage = Stage::new();
         stage.0.up = up;
-        stage.0.look = modalcast::scene::Look::default();
+        stage.0.look = modalcast_model::scene::Look::default();
         let mesh = lying(1.0, 1.0);
         let rotate = |vector: &[f32; 3]| (turn * nalgebra::Vector3::from(*vector).cast::<f64>()).cast::<f32>().into();
         let rest: Vec<[f32; 3]> = mesh.rest().iter().chain(lying(0.4, 0.0).rest()).map(rotate).collect();
         let normals = vec![rotate(&[0.0, 1.0, 0.0]); 8];
         let triangles = vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
-        let mesh = modalcast::domain::Mesh::indexed(rest, normals, vec![], triangles).expect("two squares");
+        let mesh = modalcast_model::domain::Mesh::indexed(rest, normals, vec![], triangles).expect("two squares");
         let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
         draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 64)
     };

@@ -1,10 +1,10 @@
 //! Suns, cameras and scenes at the ends of what is possible, with every kind of shadow map; and shadows that stay still.
 
-use modalcast::deform::Deformer as _;
-use modalcast::domain::{Material, Mesh};
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Image, Shot};
-use modalcast::scene::{Bounds, Camera, Lens, LightBounds, Look, Scene, Shadow, ShadowMethod, State, View};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::Deformer as _;
+use modalcast_model::domain::{Material, Mesh};
+use modalcast_model::scene::{Bounds, Camera, Lens, LightBounds, Look, Scene, Shadow, ShadowMethod, State, View};
+use modalcast_render::{Image, Shot};
 
 use super::build::{Stage, lying, open};
 

@@ -1,7 +1,7 @@
 //! The ground in the shadow map: it receives and never casts, where the map ends and where a wall stands on it.
 
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::scene::{Blurring, Camera, Lens, Shadow, ShadowMethod, View};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Blurring, Camera, Lens, Shadow, ShadowMethod, View};
 
 use super::build::{Picture, close, draw, facing, open};
 use super::shadow::{stage, with_square};

@@ -1,8 +1,8 @@
 //! Every kind of shadow map against the same arithmetic: the shadow of a straight edge on the ground.
 
-use modalcast::domain::{AlphaMode, Material, Mesh};
-use modalcast::render::plan;
-use modalcast::scene::{Blurring, Camera, Lens, Moments, Scene, Shadow, ShadowMethod, View};
+use modalcast_model::domain::{AlphaMode, Material, Mesh};
+use modalcast_model::scene::{Blurring, Camera, Lens, Moments, Scene, Shadow, ShadowMethod, View};
+use modalcast_render::plan;
 
 use super::build::{Picture, close, draw, lying, open, planned_above};
 use super::shadow::{stage, with_square};

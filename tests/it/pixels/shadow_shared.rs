@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::deform::{Deformer as _, Surface};
-use modalcast::domain::{AlphaMode, Material};
 use modalcast::engine::Workbench;
-use modalcast::reference::ReferenceDeformer;
-use modalcast::render::{Renderer, SceneBuffers, Shot};
-use modalcast::scene::{Bounds, Camera, Lens, LightBounds, Scene, Shadow, State};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Bounds, Camera, Lens, LightBounds, Scene, Shadow, State};
+use modalcast_render::{Renderer, SceneBuffers, Shot};
 
 use super::build::open;
 use super::shadow::{stage, with_square};

@@ -1,9 +1,9 @@
 //! Kept pictures, looked at when they were drawn. `tests/snapshots/tree.png`:
 //! `modalcast render tree --size 104x78 --eye 1.5,1.9,2.5 --target 0,1.8,0 --field-of-view 45` on llvmpipe.
 
-use modalcast::load;
-use modalcast::render::Image;
-use modalcast::scene::{Camera, Lens, View};
+use modalcast_model::load;
+use modalcast_model::scene::{Camera, Lens, View};
+use modalcast_render::Image;
 
 use super::build::{draw_sized, open};
 

@@ -1,8 +1,8 @@
 //! Pictures of numbers against arithmetic.
 
-use modalcast::domain::{AlphaMode, Material};
-use modalcast::render::{Field, Shot, Survey};
-use modalcast::scene::{Camera, Ground, Lens, View};
+use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::scene::{Camera, Ground, Lens, View};
+use modalcast_render::{Field, Shot, Survey};
 use nalgebra::Vector3;
 
 use super::build::{Stage, camera, facing, lying, open};
@@ -12,7 +12,7 @@ fn survey(stage: Stage, camera: Camera, size: u32, field: Field) -> Survey {
     let scene = stage.scene();
     let mut renderer = open();
     let mut buffers = renderer.load(&scene).expect("loads");
-    let mut surface = modalcast::deform::Surface::default();
+    let mut surface = modalcast_model::deform::Surface::default();
     for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
         let mesh = &scene.shapes[domain.shape].mesh;
         assert_eq!(slot.first_vertex, surface.positions.len() / 3);
@@ -132,7 +132,7 @@ fn numbers_cost_nothing_until_they_are_asked_for_and_leave_the_frame_as_it_was()
     let mut renderer = open();
     let mut buffers = renderer.load(&scene).expect("loads");
     let mesh = &scene.shapes[0].mesh;
-    let surface = modalcast::deform::Surface {
+    let surface = modalcast_model::deform::Surface {
         positions: mesh.rest().as_flattened().to_vec(),
         normals: mesh.corners().normals.as_flattened().to_vec(),
         tangents: vec![],

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast::deform::Surface;
-use modalcast::domain::{AlphaMode, Material, Mesh};
-use modalcast::render::{Seen, Shot};
-use modalcast::scene::{Camera, Ground, Lens, Scene, View};
+use modalcast_model::deform::Surface;
+use modalcast_model::domain::{AlphaMode, Material, Mesh};
+use modalcast_model::scene::{Camera, Ground, Lens, Scene, View};
+use modalcast_render::{Seen, Shot};
 use nalgebra::Vector3;
 
 use super::build::{Picture, Stage, camera, close, draw, facing, open, picture, srgb};

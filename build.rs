@@ -1,0 +1,28 @@
+//! Names this build by a hash of all sources, so that `modalcast` and `modalcast-report` can tell whether they belong together.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const SOURCES: [&str; 6] = ["Cargo.lock", "Cargo.toml", "kernels", "proto", "shaders", "src"];
+
+fn main() {
+    let mut files = Vec::new();
+    for source in SOURCES {
+        println!("cargo::rerun-if-changed={source}");
+        collect(Path::new(source), &mut files);
+    }
+    files.sort();
+    // FNV-1a, 64 bits.
+    let hash = files
+        .iter()
+        .flat_map(|path| fs::read(path).unwrap_or_default())
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
+    println!("cargo::rustc-env=MODALCAST_BUILD={hash:016x}");
+}
+
+fn collect(path: &Path, files: &mut Vec<PathBuf>) {
+    match fs::read_dir(path) {
+        Ok(entries) => entries.flatten().for_each(|entry| collect(&entry.path(), files)),
+        Err(_) => files.push(path.to_owned()),
+    }
+}

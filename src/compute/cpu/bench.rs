@@ -1,0 +1,50 @@
+//! How much of the memory's read rate the deformer reaches. Run with
+//! `cargo test --release --lib cpu::bench -- --ignored --nocapture`.
+
+use std::time::Instant;
+
+use super::*;
+use crate::testing::{Noise, scene};
+use modalcast_model::scene::{Deformation, Storage};
+
+/// The median time of a step, of at least 15 with other coordinates each, in seconds.
+fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
+    let mut noise = Noise(3);
+    let mut state = State::rest(scene);
+    let mut times: Vec<f64> = (0..20)
+        .map(|_| {
+            state.q.iter_mut().for_each(|number| *number = noise.next());
+            deformer.changes.follow(scene, &state);
+            let begin = Instant::now();
+            deformer.deform_positions(&state);
+            begin.elapsed().as_secs_f64()
+        })
+        .skip(5)
+        .collect();
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
+}
+
+#[test]
+#[ignore = "a measurement"]
+fn part_of_the_read_rate() {
+    // The first one stays in the caches: it shows what computing alone takes.
+    for (vertices, rank) in [(1 << 11, 32), (1 << 20, 10), (1 << 20, 32)] {
+        for storage in Storage::ALL {
+            for compensated in [false, true] {
+                let deformation = Deformation { storage, compensated, ..Deformation::default() };
+                let scene = scene(&[(vertices, rank)], deformation, &mut Noise(1));
+                let mut deformer = CpuDeformer::new(&scene);
+                let bytes = deformer.stored_bytes() + 12 * vertices;
+                let rate = bytes as f64 / median_step(&scene, &mut deformer) / 1e9;
+                let roof = read_rate(bytes, 10);
+                let name = storage.name();
+                println!(
+                    "n {vertices} r {rank} {name} compensated {compensated}: {rate:.1} of {roof:.1} GB/s, {:.2}",
+                    rate / roof
+                );
+                assert!(rate > 0.0 && roof > 0.0);
+            }
+        }
+    }
+}

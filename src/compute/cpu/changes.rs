@@ -1,0 +1,105 @@
+//! Which domains changed since the last step: their q or T differs in some bit.
+//!
+//! The values are compared, whatever the state's list of changes says: a list would miss numbers that were written by
+//! hand, and a state of another history with the same serial number.
+
+use rayon::prelude::*;
+
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{Scene, State};
+
+/// Remembers the values of the last step.
+#[derive(Debug, Default)]
+pub(super) struct Changes {
+    /// Values of the last step; none before the first.
+    last: Option<(Vec<f32>, Vec<Transform>)>,
+    flags: Vec<bool>,
+    domains: Vec<u32>,
+    every: bool,
+}
+
+impl Changes {
+    /// Compares a step with the one before and remembers it.
+    pub(super) fn follow(&mut self, scene: &Scene, state: &State) {
+        let count = scene.domains.len();
+        let Some((q, transforms)) = &mut self.last else {
+            self.last = Some((state.q.clone(), state.transforms.clone()));
+            (self.flags, self.every) = (vec![true; count], true);
+            self.domains = (0..count as u32).collect();
+            return;
+        };
+        let (last_q, last_transforms) = (&*q, &*transforms);
+        self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
+            let slot = &scene.layout.slots[domain];
+            let range = slot.first_q..slot.first_q + slot.rank;
+            let mover = scene.movers.of(domain);
+            *flag = bits(&last_transforms[mover].0) != bits(&state.transforms[mover].0)
+                || bits(&last_q[range.clone()]) != bits(&state.q[range]);
+        });
+        self.domains.clear();
+        self.domains.extend((0..count as u32).filter(|domain| self.flags[*domain as usize]));
+        self.every = self.domains.len() == count;
+        q.copy_from_slice(&state.q);
+        transforms.copy_from_slice(&state.transforms);
+    }
+
+    /// The domains that changed, ascending; `None` when all did.
+    pub(super) fn some(&self) -> Option<&[u32]> {
+        (!self.every).then_some(&self.domains)
+    }
+
+    /// Whether a domain changed.
+    pub(super) fn is(&self, domain: usize) -> bool {
+        self.flags[domain]
+    }
+}
+
+/// Zeros of both signs differ: they may give sums of zero different signs.
+fn bits(numbers: &[f32]) -> &[u8] {
+    bytemuck::cast_slice(numbers)
+}
+
+#[cfg(test)]
+impl Changes {
+    pub(super) fn all() -> Self {
+        Self { every: true, ..Self::default() }
+    }
+
+    pub(super) fn of(domains: &[u32]) -> Self {
+        Self { domains: domains.to_vec(), ..Self::default() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Noise, scene};
+
+    #[test]
+    fn only_domains_whose_numbers_changed_are_named() {
+        let scene = scene(&[(4, 2), (5, 0), (6, 3)], modalcast_model::scene::Deformation::default(), &mut Noise(1));
+        let mut state = State::rest(&scene);
+        let mut changes = Changes::default();
+        let mut follow = |state: &State| {
+            changes.follow(&scene, state);
+            (0..3).for_each(|domain| {
+                let named = changes.some().is_none_or(|domains| domains.contains(&(domain as u32)));
+                assert_eq!(changes.is(domain), named);
+            });
+            changes.some().map(<[u32]>::to_vec)
+        };
+        assert_eq!(follow(&state), None, "the first step changes all");
+        assert_eq!(follow(&state), Some(vec![]));
+        state.q[3] = 1e-45;
+        assert_eq!(follow(&state), Some(vec![2]));
+        state.q[3] = -0.0;
+        state.transforms[1].0[11] = 2.0;
+        assert_eq!(follow(&state), Some(vec![1, 2]));
+        state.q[3] = 0.0;
+        assert_eq!(follow(&state), Some(vec![2]), "zeros of both signs differ");
+        state.q.fill(1.0);
+        state.transforms[1].0[11] = 3.0;
+        assert_eq!(follow(&state), None);
+        assert_eq!(follow(&state), Some(vec![]));
+    }
+}

@@ -1,0 +1,120 @@
+//! The bounds of one tile, kept so that what did not change still counts.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use modalcast_model::scene::{Bounds, LightBounds};
+
+/// Bounds of f32 positions: all NaN as soon as one of them is not finite, `min > max` for none.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Extent {
+    min: [f32; 3],
+    max: [f32; 3],
+}
+
+const LANES: usize = 8;
+
+impl Extent {
+    pub(super) const EMPTY: Self = Self { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
+
+    /// Bounds of positions given by axis.
+    #[inline(always)]
+    pub(super) fn of(axes: [&[f32]; 3]) -> Self {
+        let mut extent = Self::EMPTY;
+        let mut poison = 0.0;
+        for (axis, numbers) in axes.into_iter().enumerate() {
+            let (mut min, mut max, mut sums) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES], [0.0_f32; LANES]);
+            let mut eights = numbers.chunks_exact(LANES);
+            for eight in eights.by_ref() {
+                for lane in 0..LANES {
+                    let number = eight[lane];
+                    min[lane] = if number < min[lane] { number } else { min[lane] };
+                    max[lane] = if number > max[lane] { number } else { max[lane] };
+                    // Infinity times zero is NaN, and NaN stays: one number tells whether all were finite.
+                    sums[lane] += number * 0.0;
+                }
+            }
+            for number in eights.remainder() {
+                (min[0], max[0], sums[0]) = (min[0].min(*number), max[0].max(*number), sums[0] + number * 0.0);
+            }
+            extent.min[axis] = min.into_iter().fold(f32::INFINITY, f32::min);
+            extent.max[axis] = max.into_iter().fold(f32::NEG_INFINITY, f32::max);
+            poison += sums.iter().sum::<f32>();
+        }
+        extent.poisoned(poison)
+    }
+
+    /// The smallest extent that holds both.
+    #[inline(always)]
+    pub(super) fn union(self, other: Self) -> Self {
+        // Of an empty extent nothing is finite, but nothing is NaN either.
+        let poison = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
+        Self {
+            min: std::array::from_fn(|axis| self.min[axis].min(other.min[axis])),
+            max: std::array::from_fn(|axis| self.max[axis].max(other.max[axis])),
+        }
+        .poisoned(poison)
+    }
+
+    /// Whether all positions were finite.
+    #[inline(always)]
+    pub(super) const fn is_finite(&self) -> bool {
+        self.min[0].is_finite()
+    }
+
+    /// Bounds of all tiles.
+    pub(super) fn all(extents: &[Self]) -> Bounds {
+        extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
+    }
+
+    /// What all tiles take up along these axes of light space, from the corners of their boxes.
+    pub(super) fn along(extents: &[Self], axes: &[Vector3<f64>; 3]) -> LightBounds {
+        let one = |extent: &Self| LightBounds::of_box(axes, &extent.to_bounds());
+        extents.par_iter().with_min_len(4096).map(one).reduce(|| LightBounds::EMPTY, LightBounds::union)
+    }
+
+    /// Bounds of the tiles of one domain.
+    pub(super) fn of_domain(extents: &[Self]) -> Bounds {
+        extents.iter().copied().fold(Self::EMPTY, Self::union).to_bounds()
+    }
+
+    fn to_bounds(self) -> Bounds {
+        Bounds { min: self.min.map(f64::from), max: self.max.map(f64::from) }
+    }
+
+    /// The same, not finite when `number` is not.
+    #[inline(always)]
+    pub(super) fn spoilt_by(self, number: f32) -> Self {
+        self.poisoned(number * 0.0)
+    }
+
+    /// Unchanged by 0, all NaN by NaN.
+    #[inline(always)]
+    fn poisoned(self, poison: f32) -> Self {
+        Self { min: self.min.map(|number| number + poison), max: self.max.map(|number| number + poison) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_extent_holds_every_position_and_any_that_is_not_finite_spoils_it() {
+        let axes: [Vec<f32>; 3] = [0, 1, 2].map(|axis| (0..21).map(|at| (at * 8 % 21 + axis) as f32).collect());
+        let of = |axes: &[Vec<f32>; 3]| Extent::of([&axes[0], &axes[1], &axes[2]]);
+        let extent = of(&axes);
+        assert_eq!((extent.min, extent.max), ([0.0, 1.0, 2.0], [20.0, 21.0, 22.0]));
+        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for place in 0..63 {
+                let mut spoiled = axes.clone();
+                spoiled[place % 3][place / 3] = bad;
+                assert!(!of(&spoiled).is_finite());
+                assert!(!Extent::all(&[extent, of(&spoiled), extent]).is_finite());
+            }
+        }
+        let other = Extent::of([&[30.0], &[-5.0], &[3.0]]);
+        let both = Extent::all(&[extent, other, Extent::EMPTY]);
+        assert_eq!((both.min, both.max), ([0.0, -5.0, 2.0], [30.0, 21.0, 22.0]));
+    }
+}

@@ -1,0 +1,133 @@
+//! Normals and tangents that follow the deformed triangles. Twin: `reference/normals.rs`, which defines them.
+//!
+//! Each corner gathers its group's ring: nothing is shared between threads, and the order of a sum is that of its ring.
+//! Positions and results are f32. Sums are f64: differences and products of two f32 neither over- nor underflow there,
+//! so that no input needs scaling, and gathering costs more than adding.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::orient::{self, cofactors};
+use super::tile::{self, Packed, Tile};
+use modalcast_model::deform::Surface;
+use modalcast_model::domain::{RING_START, Smoothing};
+use modalcast_model::scene::{Scene, State};
+
+/// As in the twin: the part of B that an area must exceed.
+const RESOLUTION: f64 = 1.0 / 262_144.0;
+
+/// As in the twin: squared length of the sum of two opposite unit vectors.
+const OPPOSITE: f64 = 1e-10;
+
+/// Writes three f32 per corner of these tiles into the normals and, where the scene has normal maps, four into the
+/// tangents, from the surface's positions.
+pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
+    let Surface { positions, normals, tangents, .. } = surface;
+    let positions = positions.as_slice();
+    // A tile of a scene without tangents has 0 numbers of them.
+    let tangents = Packed::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);
+    tile::spread(tiles, (Packed::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
+        for tile in tiles {
+            let (normals, tangents) = (normals.of(tile), tangents.of(tile));
+            orient::orient_normals(scene, state, tile, normals);
+            if !tangents.is_empty() {
+                orient::orient_tangents(scene, state, tile, tangents);
+            }
+            follow(&Bent::new(scene, state, tile.domain(), positions), tile.first(), normals, tangents);
+        }
+    });
+}
+
+/// Carries the rigid normals and tangents of a domain's corners from `first` on to where its surface turned.
+fn follow(bent: &Bent, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
+    let Some(smoothing) = bent.smoothing else { return };
+    let mut tangents = tangents.chunks_exact_mut(4);
+    for (group, normal) in smoothing.members()[first..].iter().zip(normals.chunks_exact_mut(3)) {
+        let tangent = tangents.next();
+        let Some(turn) = bent.turn(smoothing, *group as usize) else { continue };
+        let carried = turn.carry(vector(normal)).try_normalize(0.0).unwrap_or(turn.to);
+        normal.copy_from_slice(carried.cast::<f32>().as_slice());
+        if let Some(tangent) = tangent.filter(|tangent| tangent[3] != 0.0) {
+            let flat = beside(turn.carry(vector(tangent)), carried);
+            tangent[..3].copy_from_slice(flat.cast::<f32>().as_slice());
+        }
+    }
+}
+
+/// What a domain's surface is told by.
+struct Bent<'a> {
+    smoothing: Option<&'a Smoothing>,
+    /// Three f32 per vertex of the domain.
+    positions: &'a [f32],
+    /// Turns area vectors from rest to world.
+    area_turn: Matrix3<f64>,
+}
+
+impl<'a> Bent<'a> {
+    fn new(scene: &'a Scene, state: &State, domain: usize, positions: &'a [f32]) -> Self {
+        let slot = scene.layout.slots[domain];
+        Self {
+            smoothing: scene.shape_of(domain).smoothing(),
+            positions: &positions[3 * slot.first_vertex..][..3 * slot.vertices],
+            area_turn: cofactors(&state.composed(scene, domain).linear()),
+        }
+    }
+
+    /// How the surface around a group turned; nothing where that cannot be told.
+    fn turn(&self, smoothing: &Smoothing, group: usize) -> Option<Turn> {
+        let (sum, rounding) = self.area(smoothing.ring(group));
+        let resolved = sum.norm() > RESOLUTION * rounding;
+        let from = self.area_turn * Vector3::from(smoothing.normals()[group]).cast();
+        // Scaled, because the square of cofactors of tiny entries may underflow.
+        let largest = from.amax();
+        (resolved && largest > 0.0).then(|| Turn { from: (from / largest).normalize(), to: sum.normalize() })
+    }
+
+    /// The area vectors around a ring, and what the twin calls B.
+    fn area(&self, ring: &[u32]) -> (Vector3<f64>, f64) {
+        let at = |entry: u32| vector(&self.positions[3 * (entry & !RING_START) as usize..]);
+        let own = at(ring[0]);
+        let height = own.abs().sum();
+        let (mut sum, mut rounding) = (Vector3::zeros(), 0.0);
+        let (mut before, mut reach_before) = (Vector3::zeros(), 0.0);
+        for entry in &ring[1..] {
+            let edge = at(*entry) - own;
+            let length = edge.abs().sum();
+            let reach = length * (length + height);
+            if entry & RING_START == 0 {
+                sum += before.cross(&edge);
+                rounding += reach_before + reach;
+            }
+            (before, reach_before) = (edge, reach);
+        }
+        (sum, rounding)
+    }
+}
+
+/// The unit directions between which a surface turned.
+struct Turn {
+    from: Vector3<f64>,
+    to: Vector3<f64>,
+}
+
+impl Turn {
+    /// The least rotation from one to the other.
+    fn carry(&self, rigid: Vector3<f64>) -> Vector3<f64> {
+        let along = self.from.dot(&rigid);
+        let across = rigid - self.from * along;
+        let middle = self.from + self.to;
+        let square = middle.norm_squared();
+        let reflected = if square < OPPOSITE { across } else { across - middle * (2.0 * middle.dot(&across) / square) };
+        self.to * along + reflected
+    }
+}
+
+/// A tangent without its part along the normal; where nothing else is left, any unit vector across.
+fn beside(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
+    let flat = tangent - normal * normal.dot(&tangent);
+    let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
+    flat.try_normalize(1e-6).unwrap_or_else(|| normal.cross(&axis).normalize())
+}
+
+fn vector(numbers: &[f32]) -> Vector3<f64> {
+    Vector3::new(numbers[0], numbers[1], numbers[2]).cast()
+}

@@ -1,0 +1,66 @@
+//! Normals by the inverse transpose of A, tangents by A, in f32. Twin: `reference/orient.rs`.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::tile::{self, Packed, Tile};
+use modalcast_model::deform::Surface;
+use modalcast_model::scene::{Scene, State};
+
+/// Writes three f32 per corner into the normals and, where the scene has normal maps, four into the tangents.
+pub(super) fn orient(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
+    tile::spread(tiles, Packed::new(3, &mut surface.normals), &|tiles, mut out| {
+        tiles.iter().for_each(|tile| orient_normals(scene, state, tile, out.of(tile)));
+    });
+    if scene.needs.normal_maps {
+        tile::spread(tiles, Packed::new(4, &mut surface.tangents), &|tiles, mut out| {
+            tiles.iter().for_each(|tile| orient_tangents(scene, state, tile, out.of(tile)));
+        });
+    }
+}
+
+/// World normals of a tile.
+pub(super) fn orient_normals(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
+    let linear = state.composed(scene, tile.domain()).linear();
+    // Without shear A itself turns normals, up to a mirror's sign, which the cofactors carry.
+    let turn = if scene.needs.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
+    let turn = scaled(turn);
+    let normals = &scene.shape_of(tile.domain()).mesh.corners().normals[tile.first()..][..tile.count()];
+    for (normal, out) in normals.iter().zip(out.chunks_exact_mut(3)) {
+        out.copy_from_slice(unit(turn * Vector3::from(*normal)).as_slice());
+    }
+}
+
+/// World tangents of a tile; left as they are where the shape has none.
+pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
+    let tangents = scene.shape_of(tile.domain()).tangents();
+    if tangents.is_empty() {
+        return;
+    }
+    let linear = state.composed(scene, tile.domain()).linear();
+    let hand = linear.determinant().signum() as f32;
+    let turn = scaled(linear);
+    for ([x, y, z, sign], out) in tangents[tile.first()..][..tile.count()].iter().zip(out.chunks_exact_mut(4)) {
+        out[..3].copy_from_slice(unit(turn * Vector3::new(*x, *y, *z)).as_slice());
+        out[3] = sign * hand;
+    }
+}
+
+/// Scaled to entries of at most 1, so that squares of very large or small transforms stay inside f32.
+fn scaled(matrix: Matrix3<f64>) -> Matrix3<f32> {
+    let largest = matrix.abs().max();
+    if largest > 0.0 { (matrix / largest).cast() } else { matrix.cast() }
+}
+
+pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
+    let adjugate = |row: usize, column: usize| {
+        let at = |i: usize, j: usize| linear[((row + i) % 3, (column + j) % 3)];
+        at(1, 1) * at(2, 2) - at(1, 2) * at(2, 1)
+    };
+    Matrix3::from_fn(adjugate)
+}
+
+/// A vector over its length, +Z when it has none.
+pub(super) fn unit(vector: Vector3<f32>) -> Vector3<f32> {
+    let square = vector.norm_squared();
+    if square > 1e-30 { vector / square.sqrt() } else { Vector3::z() }
+}

@@ -1,0 +1,293 @@
+//! u = U q of one tile: a chain of fused multiply-adds per coordinate of a vertex, over the modes in ascending order.
+
+use super::decode::{self, Columns};
+#[cfg(target_arch = "x86_64")]
+use super::fused;
+use crate::storage::{Plane, TILE_QUADS, Tile, Tiles};
+use modalcast_model::domain::MAX_RANK;
+use modalcast_model::scene::Storage;
+
+/// Coordinates of a tile's vertices, `[axis][vertex]`.
+pub(super) type Coordinates = [f32; 12 * TILE_QUADS];
+
+/// What sums of a tile need besides U: it stays in the first-level cache.
+#[derive(Debug)]
+pub(super) struct Scratch {
+    pub(super) sums: Coordinates,
+    /// What the sums lost by rounding; used by compensated sums alone.
+    lost: Coordinates,
+    columns: Columns,
+    amounts: [f32; MAX_RANK],
+}
+
+impl Scratch {
+    pub(super) const fn new() -> Self {
+        let zeros = [0.0; 12 * TILE_QUADS];
+        Self { sums: zeros, lost: zeros, columns: [0.0; 48 * TILE_QUADS], amounts: [0.0; MAX_RANK] }
+    }
+}
+
+/// The modes of a domain that are summed.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Summed<'a> {
+    /// Coordinates, zero where a mode is left out.
+    pub(super) q: &'a [f32],
+    /// Chunks with a mode that is not left out, ascending.
+    pub(super) chunks: &'a [u16],
+}
+
+/// Writes u into the sums. `COMPENSATED` carries the rounding errors along (Ogita, Rump, Oishi, Accurate Sum and Dot
+/// Product, 2005, algorithm Dot2 with a fused multiply-add): as if summed in twice the precision, then rounded.
+#[inline(always)]
+pub(super) fn sum<const COMPENSATED: bool>(tiles: &Tiles, tile: &Tile, summed: Summed, scratch: &mut Scratch) {
+    #[cfg(target_arch = "x86_64")]
+    if let (false, Some(simd)) = (COMPENSATED, pulp::x86::V3::try_new()) {
+        return sum_fused(simd, tiles, tile, summed, scratch);
+    }
+    sum_columns::<COMPENSATED>(tiles, tile, summed, scratch);
+}
+
+#[inline(always)]
+fn sum_columns<const COMPENSATED: bool>(tiles: &Tiles, tile: &Tile, summed: Summed, scratch: &mut Scratch) {
+    let Scratch { sums, lost, columns, amounts } = scratch;
+    let length = 12 * tile.quads;
+    weigh(tiles, tile, summed.q, amounts);
+    let sums = &mut sums[..length];
+    let lost = &mut lost[..if COMPENSATED { length } else { 0 }];
+    sums.fill(0.0);
+    lost.fill(0.0);
+    let mut target = Sums::<COMPENSATED> { sums, lost };
+    let parts = Parts::of(tiles, tile, summed, amounts);
+    match tiles.storage() {
+        Storage::F32 => target.add_floats(parts),
+        Storage::F16 => target.add_halves(parts, columns, decode::halves),
+        Storage::Bf16 => target.add_halves(parts, columns, decode::brains),
+        Storage::Int8 => target.add_codes(parts, columns),
+    }
+    if COMPENSATED {
+        for (sum, lost) in target.sums.iter_mut().zip(target.lost) {
+            *sum += *lost;
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn sum_fused(simd: pulp::x86::V3, tiles: &Tiles, tile: &Tile, summed: Summed, scratch: &mut Scratch) {
+    let Scratch { sums, amounts, .. } = scratch;
+    weigh(tiles, tile, summed.q, amounts);
+    let sums = &mut sums[..12 * tile.quads];
+    sums.fill(0.0);
+    let parts = Parts::of(tiles, tile, summed, amounts);
+    match tiles.storage() {
+        Storage::F32 => Sums::<false> { sums, lost: &mut [] }.add_floats(parts),
+        Storage::F16 => parts.fuse_halves::<fused::Halves>(simd, sums),
+        Storage::Bf16 => parts.fuse_halves::<fused::Brains>(simd, sums),
+        Storage::Int8 => parts.fuse_codes(simd, sums),
+    }
+}
+
+/// q times the factors or scales that stored entries are short of, rounded once.
+#[inline(always)]
+fn weigh(tiles: &Tiles, tile: &Tile, q: &[f32], amounts: &mut [f32; MAX_RANK]) {
+    let rank = q.len();
+    let factors = match tiles.storage() {
+        Storage::F32 => &[][..],
+        Storage::F16 | Storage::Bf16 => tiles.factors(),
+        Storage::Int8 => &tiles.scales()[tile.first_scale..][..rank],
+    };
+    amounts[..rank].copy_from_slice(q);
+    amounts[..rank].iter_mut().zip(factors).for_each(|(amount, factor)| *amount *= factor);
+    // Modes that fill up the last chunk.
+    amounts[rank..MAX_RANK.min(rank + 3)].fill(0.0);
+}
+
+/// A tile's chunks and what they are multiplied by.
+#[derive(Clone, Copy)]
+struct Parts<'a> {
+    planes: &'a [Plane],
+    quads: usize,
+    chunks: &'a [u16],
+    amounts: &'a [f32; MAX_RANK],
+}
+
+impl<'a> Parts<'a> {
+    #[inline(always)]
+    fn of(tiles: &'a Tiles, tile: &Tile, summed: Summed<'a>, amounts: &'a [f32; MAX_RANK]) -> Self {
+        let planes = &tiles.planes()[tile.first_plane..][..3 * tiles.chunks() * tile.quads];
+        Self { planes, quads: tile.quads, chunks: summed.chunks, amounts }
+    }
+
+    #[inline(always)]
+    fn chunk(&self, chunk: u16) -> &'a [Plane] {
+        &self.planes[3 * self.quads * usize::from(chunk)..][..3 * self.quads]
+    }
+
+    /// The amounts of a chunk of K modes.
+    #[inline(always)]
+    fn amounts<const K: usize>(&self, chunk: u16) -> [f32; K] {
+        std::array::from_fn(|mode| self.amounts[K * usize::from(chunk) + mode])
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Parts<'_> {
+    #[inline(always)]
+    fn fuse_halves<D: fused::Decode<2>>(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
+        let part = |chunk: u16| (self.chunk(chunk), self.amounts(chunk));
+        let mut pairs = self.chunks.chunks_exact(2);
+        for pair in pairs.by_ref() {
+            fused::add::<D, 2, 2, 2>(simd, [part(pair[0]), part(pair[1])], sums);
+        }
+        for chunk in pairs.remainder() {
+            fused::add::<D, 2, 2, 1>(simd, [part(*chunk)], sums);
+        }
+    }
+
+    #[inline(always)]
+    fn fuse_codes(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
+        for chunk in self.chunks {
+            fused::add::<fused::Codes, 4, 4, 1>(simd, [(self.chunk(*chunk), self.amounts(*chunk))], sums);
+        }
+    }
+}
+
+struct Sums<'a, const COMPENSATED: bool> {
+    sums: &'a mut [f32],
+    lost: &'a mut [f32],
+}
+
+impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
+    // Four modes at a time keep the sums in registers four times as long; the order of the sum stays that of the modes.
+    #[inline(always)]
+    fn add_floats(&mut self, parts: Parts) {
+        let column = |chunk: u16| bytemuck::cast_slice(parts.chunk(chunk));
+        let mut fours = parts.chunks.chunks_exact(4);
+        for four in fours.by_ref() {
+            let chunks = [four[0], four[1], four[2], four[3]];
+            self.add(chunks.map(column), chunks.map(|chunk| parts.amounts[usize::from(chunk)]));
+        }
+        for chunk in fours.remainder() {
+            self.add([column(*chunk)], parts.amounts(*chunk));
+        }
+    }
+
+    #[inline(always)]
+    fn add_halves(&mut self, parts: Parts, columns: &mut Columns, decode: impl Fn(&[Plane], &mut [f32])) {
+        let length = self.sums.len();
+        let mut pairs = parts.chunks.chunks_exact(2);
+        for pair in pairs.by_ref() {
+            let ([a, b], [c, d]) = (parts.amounts(pair[0]), parts.amounts(pair[1]));
+            decode(parts.chunk(pair[0]), &mut columns[..2 * length]);
+            decode(parts.chunk(pair[1]), &mut columns[2 * length..4 * length]);
+            self.add(split(columns, length), [a, b, c, d]);
+        }
+        for chunk in pairs.remainder() {
+            decode(parts.chunk(*chunk), &mut columns[..2 * length]);
+            self.add::<2>(split(columns, length), parts.amounts(*chunk));
+        }
+    }
+
+    #[inline(always)]
+    fn add_codes(&mut self, parts: Parts, columns: &mut Columns) {
+        let length = self.sums.len();
+        for chunk in parts.chunks {
+            decode::codes(parts.chunk(*chunk), &mut columns[..4 * length]);
+            self.add::<4>(split(columns, length), parts.amounts(*chunk));
+        }
+    }
+
+    #[expect(clippy::needless_range_loop, reason = "one index for all columns leaves no check inside the loop")]
+    #[inline(always)]
+    fn add<const N: usize>(&mut self, columns: [&[f32]; N], amounts: [f32; N]) {
+        let length = self.sums.len();
+        let columns = columns.map(|column| &column[..length]);
+        if COMPENSATED {
+            let lost = &mut self.lost[..length];
+            for at in 0..length {
+                let mut pair = (self.sums[at], lost[at]);
+                for mode in 0..N {
+                    pair = add_exactly(pair, columns[mode][at], amounts[mode]);
+                }
+                (self.sums[at], lost[at]) = pair;
+            }
+        } else {
+            for at in 0..length {
+                let mut sum = self.sums[at];
+                for mode in 0..N {
+                    sum = columns[mode][at].mul_add(amounts[mode], sum);
+                }
+                self.sums[at] = sum;
+            }
+        }
+    }
+}
+
+/// The next sum, and all that was lost so far: TwoProduct by fused multiply-add, TwoSum of Knuth.
+#[inline(always)]
+fn add_exactly((sum, lost): (f32, f32), entry: f32, amount: f32) -> (f32, f32) {
+    let product = entry * amount;
+    let product_lost = entry.mul_add(amount, -product);
+    let next = sum + product;
+    let part = next - sum;
+    let sum_lost = (sum - (next - part)) + (product - part);
+    (next, lost + (product_lost + sum_lost))
+}
+
+/// The first N columns of decoded ones.
+#[inline(always)]
+fn split<const N: usize>(columns: &Columns, length: usize) -> [&[f32]; N] {
+    std::array::from_fn(|mode| &columns[mode * length..][..length])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Noise, with_columns};
+    use modalcast_model::domain::Shape;
+
+    /// The chains of one tile of f32.
+    fn plain(shape: &Shape, tile: &Tile, q: &[f32]) -> Vec<f32> {
+        let chain = |vertex: usize, axis: usize| {
+            (0..q.len()).fold(0.0_f32, |sum, mode| shape.modes.at(vertex, axis, mode).mul_add(q[mode], sum))
+        };
+        let vertices = || tile.first_vertex..tile.first_vertex + tile.vertices;
+        (0..3).flat_map(|axis| vertices().map(move |vertex| chain(vertex, axis))).collect()
+    }
+
+    #[test]
+    fn vectors_columns_and_plain_chains_agree_bit_by_bit_for_whole_and_chosen_chunks() {
+        let mut noise = Noise(1);
+        for (vertices, rank) in [(128, 32), (4, 1), (12, 5), (128, 7), (140, 33), (52, 512)] {
+            // Every fifth entry is so small that f16 holds it as a subnormal.
+            let entry = |at: usize, value: f32| if at.is_multiple_of(5) { value * 1e-8 } else { value };
+            let columns = (0..3 * vertices * rank).map(|at| entry(at, noise.next())).collect();
+            let shape = with_columns(vertices, rank, columns, &mut noise);
+            for storage in Storage::ALL {
+                let tiles = Tiles::new(&shape, storage);
+                let mut q: Vec<f32> = (0..rank).map(|_| noise.next()).collect();
+                let per_chunk = crate::storage::modes_per_chunk(storage);
+                let every: Vec<u16> = (0..tiles.chunks() as u16).collect();
+                let odd: Vec<u16> = every.iter().copied().filter(|chunk| chunk % 2 == 0).collect();
+                for chunks in [every, odd] {
+                    (0..rank)
+                        .filter(|mode| !chunks.contains(&((mode / per_chunk) as u16)))
+                        .for_each(|mode| q[mode] = 0.0);
+                    let summed = Summed { q: &q, chunks: &chunks };
+                    for index in 0..tiles.count() {
+                        let tile = tiles.tile(index);
+                        let (mut fused, mut columns) = (Scratch::new(), Scratch::new());
+                        crate::cpu::simd::vectorized(|| sum::<false>(&tiles, &tile, summed, &mut fused));
+                        sum_columns::<false>(&tiles, &tile, summed, &mut columns);
+                        let bits = |sums: &[f32]| sums.iter().map(|sum| sum.to_bits()).collect::<Vec<_>>();
+                        assert_eq!(bits(&fused.sums), bits(&columns.sums), "{storage:?} {vertices} x {rank}");
+                        if storage == Storage::F32 && tile.vertices == 4 * tile.quads {
+                            let plain = plain(&shape, &tile, &q);
+                            assert_eq!(bits(&fused.sums[..plain.len()]), bits(&plain), "{vertices} x {rank}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

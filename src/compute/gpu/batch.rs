@@ -1,0 +1,286 @@
+//! Launches `kernels/batch.cu`: x = T_b (x0 + U q_b) of groups of domains b that share a shape, whose U is read once for
+//! each group, and a box of each warp's vertices.
+
+use cudarc::driver::sys::CUfunction_attribute;
+use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
+
+use super::device::Device;
+use super::inputs::Values;
+use super::layout::BatchArgs;
+use super::memory::{address, upload};
+use super::plan::{Kernel, KernelSource, Launch, Source, storage_define};
+use super::work::batches::{Batched, MOST};
+use crate::storage::modes_per_chunk;
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::Scene;
+
+/// The other numbers of vectors that the kernel is compiled for, with their macros.
+const FEWER: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
+
+/// Warps of a block; bytes of shared memory of each, and for each vector besides q.
+const WARPS: usize = 2;
+const OWN: usize = 9984 + 72;
+const VECTOR: usize = 64;
+
+/// The kernel and its work.
+#[derive(Debug)]
+pub(super) struct Batch {
+    pub function: CudaFunction,
+    config: LaunchConfig,
+    blocks: CudaSlice<u8>,
+    groups: CudaSlice<u8>,
+    members: CudaSlice<u8>,
+}
+
+/// Device addresses of what `deform` has too.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Shared {
+    pub words: u64,
+    pub rest: u64,
+    pub scales: u64,
+    pub boxes: u64,
+}
+
+impl Batch {
+    /// Puts the work onto the device.
+    pub(super) fn new(device: &Device, kernel: &Kernel, batched: &Batched) -> Result<Self> {
+        let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
+        let shared = shared_bytes(batched, &kernel.defines);
+        // As many blocks as registers allow, so nothing is left to the L1 cache.
+        let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
+        let most = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
+        for (attribute, value) in [(carveout, 100), (most, shared as i32)] {
+            function.set_attribute(attribute, value).map_err(during("batch"))?;
+        }
+        Ok(Self {
+            function,
+            config: LaunchConfig {
+                grid_dim: (kernel.blocks, 1, 1),
+                block_dim: (kernel.threads, 1, 1),
+                shared_mem_bytes: shared as u32,
+            },
+            blocks: upload(device, &batched.blocks)?,
+            groups: upload(device, &batched.groups)?,
+            members: upload(device, &batched.members)?,
+        })
+    }
+
+    /// Starts the kernel; the header among the values says where everything goes.
+    pub(super) fn launch(&self, device: &Device, values: Values, shared: Shared) -> Result<()> {
+        let Shared { words, rest, scales, boxes } = shared;
+        let at = |buffer: &CudaSlice<u8>| address(device, buffer);
+        let args = BatchArgs {
+            header: values.header,
+            blocks: at(&self.blocks),
+            groups: at(&self.groups),
+            members: at(&self.members),
+            words,
+            rest,
+            scales,
+            transforms: values.transforms,
+            following: values.following,
+            frames: values.frames,
+            q: values.q,
+            boxes,
+        };
+        let mut launch = device.stream().launch_builder(&self.function);
+        // SAFETY: `BatchArgs` is the kernel's only argument. Blocks name groups, groups members, and both the words, x0,
+        // scales, transforms, q and boxes of `Work`, from which the buffers were made; a group has no more members than
+        // the kernel was compiled for; shared memory has room for the longest; and the header's positions have the size
+        // that `Output` checked.
+        unsafe { launch.arg(&args).launch(self.config) }.map_err(during("batch"))?;
+        Ok(())
+    }
+}
+
+/// What a scene compiles and launches.
+pub(super) fn kernel(scene: &Scene, batched: &Batched, source: KernelSource) -> Kernel {
+    let vectors = FEWER.iter().find(|(vectors, _)| batched.most <= *vectors).map(|(_, name)| *name);
+    let follows = scene.needs.followers.then_some("FOLLOWERS");
+    Kernel {
+        launch: Launch::Batch,
+        name: source.name,
+        defines: storage_define(scene.deformation.storage).into_iter().chain(vectors).chain(follows).collect(),
+        blocks: batched.blocks.len() as u32,
+        threads: 32 * WARPS as u32,
+        source: Source(source.source),
+    }
+}
+
+/// Device bytes of the work.
+pub(super) fn bytes(batched: &Batched) -> u64 {
+    let Batched { groups, members, blocks, .. } = batched;
+    let sizes = [size_of_val(groups.as_slice()), size_of_val(members.as_slice()), size_of_val(blocks.as_slice())];
+    sizes.iter().sum::<usize>() as u64
+}
+
+/// Domains of a group as the kernel was compiled with these macros.
+fn vectors_of(defines: &[&str]) -> usize {
+    FEWER.iter().find(|(_, name)| defines.contains(name)).map_or(MOST, |(vectors, _)| *vectors)
+}
+
+/// Shared memory of a block: what each warp has, T and members of all vectors, and q.
+fn shared_bytes(batched: &Batched, defines: &[&str]) -> usize {
+    let storages = modalcast_model::scene::Storage::ALL.into_iter();
+    let storage =
+        storages.into_iter().find(|storage| storage_define(*storage).is_some_and(|own| defines.contains(&own)));
+    let (vectors, modes) = (vectors_of(defines), batched.chunks * modes_per_chunk(storage.unwrap_or_default()));
+    WARPS * OWN + VECTOR * vectors + 4 * vectors * modes
+}
+
+#[cfg(test)]
+mod warp;
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::super::pack::tests::alike;
+    use super::super::plan::{Role, plan};
+    use super::super::work::{Coordinates, Work};
+    use super::warp::{Tables, Warp};
+    use super::*;
+    use crate::testing::{Noise, scene_and_state, transformed_axis};
+    use modalcast_model::scene::{Batches, Deformation, Parts, State, Storage};
+
+    /// Shapes of so many vertices and modes, each used by `instances` domains, and a state of them.
+    fn ensemble(storage: Storage, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, State) {
+        let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
+        let mut parts = Parts::named("ensemble");
+        (parts.shapes, parts.materials) = (one.shapes.clone(), one.materials.clone());
+        parts.deformation = Deformation { storage, batches: Batches::Always, ..Deformation::default() };
+        parts.domains = (0..instances * shapes.len()).map(|at| one.domains[at % shapes.len()].clone()).collect();
+        let scene = Scene::new(parts).expect("a scene");
+        let (mut random, mut state) = (Noise(instances as u64), State::rest(&scene));
+        state.q.iter_mut().for_each(|coordinate| *coordinate = random.next());
+        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.next()));
+        (scene, state)
+    }
+
+    /// `batch` block by block, with its rings, stages and ways out.
+    fn twin_of_batch(tables: &Tables) -> Vec<f32> {
+        let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
+        let tiles =
+            tables.work.batched.blocks.iter().flat_map(|block| (block.tile..block.end).map(|tile| (block.group, tile)));
+        for (place, warp) in tiles.flat_map(|place| [0, 1].map(|warp| (place, warp))) {
+            let mut warp = Warp::new(tables, place, warp);
+            if warp.quads > 0 {
+                let sums = warp.sums();
+                for member in (0..warp.group.members as usize).step_by(2) {
+                    warp.store(&warp.staged(&sums, member), member, &mut positions);
+                }
+            }
+        }
+        positions
+    }
+
+    /// x of a vertex by the same arithmetic on U as it is given.
+    fn x_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f32; 3] {
+        let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
+        let rest = shape.mesh.rest()[vertex];
+        let bent = [0, 1, 2].map(|axis| {
+            let entry = |(mode, q): (usize, &f32)| (shape.modes.at(vertex, axis, mode), *q);
+            rest[axis] + q.iter().enumerate().map(entry).fold(0.0_f32, |sum, (entry, q)| entry.mul_add(q, sum))
+        });
+        [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], bent))
+    }
+
+    /// Shapes, and how many domains each has.
+    const LOADS: [(&[(usize, usize)], usize); 6] = [
+        (&[(1, 3), (63, 13)], 2),
+        (&[(64, 4), (300, 0)], 16),
+        (&[(65, 16), (128, 32), (7, 1)], 3),
+        (&[(129, 5)], 8),
+        (&[(192, 17), (256, 33)], 21),
+        (&[(261, 12), (320, 50)], 40),
+    ];
+
+    #[test]
+    fn every_number_of_a_batch_is_written_once_and_has_the_bits_of_the_plain_sum() {
+        for (shapes, instances) in LOADS {
+            let (scene, state) = ensemble(Storage::F32, shapes, instances);
+            let got = twin_of_batch(&Tables::of(&scene, &state));
+            for (domain, slot) in scene.layout.slots.iter().enumerate() {
+                for vertex in 0..slot.vertices {
+                    let got = &got[3 * (slot.first_vertex + vertex)..][..3];
+                    if slot.rank == 0 {
+                        assert!(got.iter().all(|number| number.is_nan()), "left to `deform`");
+                        continue;
+                    }
+                    let bits = |x: &[f32]| x.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
+                    assert_eq!(bits(got), bits(&x_of(&scene, &state, domain, vertex)), "{shapes:?} {domain} {vertex}");
+                    let next = (domain + shapes.len()) % scene.domains.len();
+                    assert_ne!(bits(got), bits(&x_of(&scene, &state, next, vertex)), "the judge can fail");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_storage_finds_its_entries_scales_and_factors_in_a_batch() {
+        for (storage, tolerance) in Storage::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
+            for (shapes, instances) in LOADS {
+                let (scene, state) = ensemble(storage, shapes, instances);
+                let got = twin_of_batch(&Tables::of(&scene, &state));
+                for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
+                    for vertex in 0..slot.vertices {
+                        let (got, want) =
+                            (&got[3 * (slot.first_vertex + vertex)..][..3], x_of(&scene, &state, domain, vertex));
+                        let near = got.iter().zip(want).all(|(got, want)| (got - want).abs() < tolerance);
+                        assert!(near, "{storage:?} {shapes:?}: {got:?} not {want:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn groups_are_as_large_as_each_other_and_side_by_side_in_each_tile() {
+        let (scene, _) = ensemble(Storage::F32, &[(261, 12)], 40);
+        let work = Work::new(&scene, &Coordinates::new(&scene));
+        let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.members).collect();
+        assert_eq!(sizes, [14, 14, 12]);
+        let blocks: Vec<(u32, u32)> = work.batched.blocks.iter().map(|block| (block.tile, block.group)).collect();
+        assert_eq!(blocks, [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]);
+        assert_eq!((work.launched, work.tiles.len()), (120, 240), "three tiles of corners and three of vertices each");
+        let members: Vec<u32> = work.batched.members.iter().map(|member| member.first_tile).collect();
+        assert!(members.iter().zip(&work.spans).all(|(first, spans)| *first == spans[0].0), "boxes lie by tiles");
+    }
+
+    #[test]
+    fn blocks_of_large_scenes_have_runs_of_tiles_that_cover_each_shape_once() {
+        let (scene, _) = ensemble(Storage::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
+        let batched = Work::new(&scene, &Coordinates::new(&scene)).batched;
+        assert!(batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))), "9001 tiles");
+        for (group, tiles) in [6001, 3000].into_iter().enumerate() {
+            let own = batched.blocks.iter().filter(|block| block.group == group as u32);
+            let covered: Vec<u32> = own.flat_map(|block| block.tile..block.end).collect();
+            assert_eq!(covered, (0..tiles).collect::<Vec<u32>>());
+        }
+    }
+
+    #[test]
+    fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
+        let defines = |instances: usize| {
+            let plan = plan(&ensemble(Storage::F16, &[(261, 12)], instances).0);
+            let kernel = plan.kernel(Launch::Batch).expect("a batch").clone();
+            (kernel.defines.join(" "), kernel.blocks)
+        };
+        assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
+        assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
+        assert_eq!(defines(17), ("STORE_F16".into(), 6));
+        let none = plan(&alike(&[(261, 12)]));
+        assert!(none.kernel(Launch::Batch).is_none(), "too few to pay");
+        assert_eq!(none.bytes(Role::Batches), 0);
+    }
+
+    #[test]
+    fn shared_memory_holds_all_modes_of_every_batch() {
+        let longest = Batched { chunks: modalcast_model::domain::MAX_RANK, ..Batched::default() };
+        // 64 KiB is what the smallest device has.
+        assert!(shared_bytes(&longest, &[]) <= 64 << 10);
+        assert_eq!(shared_bytes(&Batched::default(), &["BATCH_4"]), 2 * OWN + 64 * 4);
+        let chunks = Batched { chunks: 3, ..Batched::default() };
+        assert_eq!(shared_bytes(&chunks, &["STORE_INT8"]) - shared_bytes(&Batched::default(), &[]), 4 * 16 * 12);
+    }
+}

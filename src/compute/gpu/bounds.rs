@@ -1,0 +1,165 @@
+//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`, those in light space where the
+//! look has a shadow, and those of each domain where the scene keeps boxes.
+
+use cudarc::driver::{CudaFunction, LaunchConfig};
+use nalgebra::Vector3;
+
+use super::boxes::Boxes;
+use super::chain;
+use super::deform::config;
+use super::device::Device;
+use super::inputs::Values;
+use super::layout::{BoundsArgs, Piece};
+use super::plan::Kernel;
+use modalcast_model::error::Result;
+use modalcast_model::scene::{LightBounds, Scene};
+
+/// The kernel.
+#[derive(Debug)]
+pub struct Bounds {
+    pub function: CudaFunction,
+    config: LaunchConfig,
+    /// The axes of light space, of a scene with a shadow.
+    light: Option<[Vector3<f64>; 3]>,
+    /// Of a scene that keeps them.
+    pub(super) boxes: Option<Boxes>,
+}
+
+impl Bounds {
+    /// With `pieces`, a box of each domain is made too.
+    pub fn new(device: &Device, scene: &Scene, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
+        Ok(Self {
+            function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
+            config: config(kernel),
+            light: scene.light_axes(),
+            boxes: pieces.map(|pieces| Boxes::new(device, pieces)).transpose()?,
+        })
+    }
+
+    /// Words of its result.
+    pub(super) const fn words(&self) -> usize {
+        if self.light.is_some() { 12 } else { 6 }
+    }
+
+    /// Starts the kernel on `count` boxes; the result goes into the header among the values.
+    pub fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
+        let (pieces, piece_boxes, piece_count) = self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
+        let Values { header, stamps, .. } = values;
+        let args = BoundsArgs {
+            header,
+            boxes,
+            pieces,
+            stamps,
+            piece_boxes,
+            count,
+            piece_count,
+            light: narrow(self.light),
+            reserved: 0,
+        };
+        // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
+        // allocated them, and `piece_boxes` for each piece. Pieces name boxes, vertices and domains of the same scene.
+        // The kernel waits first.
+        unsafe { chain::launch(device, &self.function, self.config, &args) }
+    }
+}
+
+/// Axes as the kernel takes them.
+fn narrow(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
+    let axes = axes.unwrap_or_default();
+    std::array::from_fn(|at| axes[at / 3][at % 3] as f32)
+}
+
+/// The bounds in light space that the last six of twelve keys stand for; none where there are but six.
+///
+/// The kernel's sums round up, but its axes are f32: a component of a unit vector is off by 2^-25 at most, so an end by as
+/// much of the sum of the largest coordinates. Twice that is added.
+pub(super) fn light_of(keys: &[u32]) -> Option<LightBounds> {
+    let (world, light) = keys.split_at_checked(6).filter(|(_, light)| light.len() == 6)?;
+    let world = bounds_of(world);
+    let farthest: f64 = world.min.iter().zip(&world.max).map(|(min, max)| min.abs().max(max.abs())).sum();
+    Some(LightBounds(bounds_of(light)).widened(farthest * f64::from(f32::EPSILON) / 2.0))
+}
+
+/// The bounds that the six keys stand for.
+pub(super) fn bounds_of(keys: &[u32]) -> modalcast_model::scene::Bounds {
+    let mut bounds = modalcast_model::scene::Bounds::EMPTY;
+    for axis in 0..3 {
+        bounds.min[axis] = -f64::from(number_of(keys[axis]));
+        bounds.max[axis] = f64::from(number_of(keys[3 + axis]));
+    }
+    bounds
+}
+
+/// `unordered` of `kernels/ordered.cuh`, the inverse of `ordered`. Zero, which no number has, gives a NaN like the NaN's own key.
+fn number_of(key: u32) -> f32 {
+    f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `ordered` of the kernel, word by word.
+    fn ordered(x: f32) -> u32 {
+        match x {
+            x if x.is_nan() => u32::MAX,
+            x if x.is_sign_negative() => !x.to_bits(),
+            x => x.to_bits() | 0x8000_0000,
+        }
+    }
+
+    #[test]
+    fn light_bounds_are_the_last_six_keys_and_hold_what_the_axes_lost_in_f32() {
+        let world = [1000.0_f32, 10.0, 1.0, 2000.0, 10.0, -0.5].map(ordered);
+        let light = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(ordered);
+        assert_eq!(light_of(&world), None, "without a shadow there are six");
+        let LightBounds(got) = light_of(&[world, light].concat()).expect("twelve");
+        let margin = (2000.0 + 10.0 + 1.0) * 2.0_f64.powi(-24);
+        for (end, want) in [(got.min, [-1.0, 2.0, 0.0]), (got.max, [4.0, 5.0, 6.0])] {
+            let out = |axis: usize| if want[axis] == end[axis] { 0.0 } else { (want[axis] - end[axis]).abs() };
+            assert!((0..3).all(|axis| (out(axis) - margin).abs() < 1e-12), "{end:?}");
+        }
+        assert!(got.min[0] < -1.0 && got.max[2] > 6.0, "outwards");
+        let mut lost = light;
+        lost[4] = ordered(f32::NAN);
+        assert!(!light_of(&[world, lost].concat()).is_some_and(|light| light.is_sound()));
+        assert!(!light_of(&[0; 12]).is_some_and(|light| light.is_sound()), "nothing was measured");
+    }
+
+    #[test]
+    fn the_margin_covers_axes_in_f32_whatever_the_sun() {
+        let mut worst = 0.0_f64;
+        for step in 0..1000 {
+            let angle = 0.1 * f64::from(step);
+            let sun = Vector3::new(angle.sin(), (1.7 * angle).cos(), (0.3 * angle).sin()).normalize();
+            let axes = modalcast_model::scene::light_axes(sun, modalcast_model::scene::UpAxis::Y);
+            for (axis, narrow) in axes.iter().zip(narrow(Some(axes)).chunks_exact(3)) {
+                (0..3).for_each(|at| worst = worst.max((axis[at] - f64::from(narrow[at])).abs()));
+            }
+        }
+        assert!(worst <= 2.0_f64.powi(-25) && worst > 2.0_f64.powi(-28), "{worst}");
+        assert_eq!(narrow(None), [0.0; 9]);
+    }
+
+    #[test]
+    fn keys_keep_the_order_of_numbers_and_a_nan_or_nothing_is_not_finite() {
+        let rising = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
+        for pair in rising.windows(2) {
+            assert!(ordered(pair[0]) < ordered(pair[1]), "{pair:?}");
+            assert!(ordered(pair[0]) > 0);
+        }
+        for number in rising {
+            assert_eq!(number_of(ordered(number)).to_bits(), number.to_bits());
+        }
+        assert!(number_of(ordered(f32::NAN)).is_nan());
+        assert!(number_of(0).is_nan());
+        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(ordered);
+        assert_eq!(bounds_of(&good), modalcast_model::scene::Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
+        for bad in [f32::NAN, f32::INFINITY] {
+            let mut keys = good;
+            keys[4] = ordered(bad);
+            assert!(!bounds_of(&keys).is_finite());
+        }
+        assert!(!bounds_of(&[0; 6]).is_finite());
+    }
+}

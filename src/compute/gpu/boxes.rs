@@ -1,0 +1,158 @@
+//! A box of each domain: the pieces that `bounds` makes boxes of, and what comes back from it.
+//!
+//! A domain with tiles of its own is cut into pieces of tiles, whose boxes `deform` left; one that shares a tile is a
+//! piece of its positions. So a domain of millions of vertices keeps as many threads busy as 200,000 leaves do. The few
+//! boxes of a large domain are united here.
+
+use cudarc::driver::{CudaSlice, PinnedHostSlice};
+
+use super::bounds::bounds_of;
+use super::device::Device;
+use super::layout::{Piece, TILE_LAST};
+use super::memory::{address, download, room, upload};
+use super::work::Work;
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::{Bounds, Scene};
+
+/// The most tiles of a piece, of four boxes each.
+const PIECE_TILES: u32 = 32;
+
+/// Keys of a box.
+const SIDES: usize = 6;
+
+/// The pieces of all domains, in their order.
+pub(super) fn pieces(scene: &Scene, work: &Work) -> Vec<Piece> {
+    let mut pieces = Vec::with_capacity(scene.domains.len());
+    for (index, ([(first, count), _], slot)) in work.spans.iter().zip(&scene.layout.slots).enumerate() {
+        let domain = index as u32;
+        if work.tiles[*first as usize].kind & TILE_LAST == 0 {
+            let (first, count) = (slot.first_vertex as u32, slot.vertices as u32);
+            pieces.push(Piece { first, count, domain, of_vertices: 1 });
+            continue;
+        }
+        let part = |tile: u32| {
+            let tiles = PIECE_TILES.min(first + count - tile);
+            Piece { first: 4 * tile, count: 4 * tiles, domain, of_vertices: 0 }
+        };
+        pieces.extend((*first..first + count).step_by(PIECE_TILES as usize).map(part));
+    }
+    pieces
+}
+
+/// Device bytes of so many pieces, and of their boxes.
+pub(super) const fn bytes(pieces: usize) -> (u64, u64) {
+    ((pieces * size_of::<Piece>()) as u64, (pieces * 4 * SIDES) as u64)
+}
+
+/// Pieces and their boxes on the device.
+#[derive(Debug)]
+pub(super) struct Boxes {
+    pieces: CudaSlice<u8>,
+    boxes: CudaSlice<u8>,
+    /// The domain of each piece.
+    domains: Vec<u32>,
+    /// What comes back, page-locked; made when somebody asks.
+    keys: Option<PinnedHostSlice<u32>>,
+}
+
+impl Boxes {
+    pub(super) fn new(device: &Device, list: &[Piece]) -> Result<Self> {
+        let (_, boxes) = bytes(list.len());
+        let domains = list.iter().map(|piece| piece.domain).collect();
+        Ok(Self { pieces: upload(device, list)?, boxes: room(device, boxes)?, domains, keys: None })
+    }
+
+    /// Where the pieces and their boxes lie, and how many there are.
+    pub(super) fn addresses(&self, device: &Device) -> (u64, u64, u32) {
+        (address(device, &self.pieces), address(device, &self.boxes), self.domains.len() as u32)
+    }
+
+    /// Copies the boxes of all domains, and waits for them.
+    pub(super) fn read(&mut self, device: &Device, to: &mut Vec<Bounds>) -> Result<()> {
+        let from = address(device, &self.boxes);
+        let keys = match &mut self.keys {
+            Some(keys) => keys,
+            none => {
+                // SAFETY: the copy below writes all of it before it is read.
+                let pinned = unsafe { device.context().alloc_pinned_with_flags(SIDES * self.domains.len(), 0) };
+                none.insert(pinned.map_err(during("allocate"))?)
+            }
+        };
+        let keys = keys.as_mut_slice().map_err(during("download"))?;
+        // SAFETY: the boxes have six words for each piece, so has `keys`.
+        unsafe { download(device, from, keys) }?;
+        unite(&self.domains, keys, to);
+        Ok(())
+    }
+}
+
+/// One box for each domain, from the keys of its pieces.
+fn unite(domains: &[u32], keys: &[u32], to: &mut Vec<Bounds>) {
+    to.clear();
+    for (domain, keys) in domains.iter().zip(keys.chunks_exact(SIDES)) {
+        let piece = bounds_of(keys);
+        match to.get_mut(*domain as usize) {
+            Some(all) => *all = all.union(piece),
+            None => to.push(piece),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::layout::TILE_VERTICES;
+    use super::super::pack::tests::{scene, used_once};
+    use super::super::work::Coordinates;
+    use super::*;
+
+    /// How often each vertex of a domain lies in one of its pieces.
+    fn seen(scene: &Scene, work: &Work, domain: usize) -> Vec<u32> {
+        let slot = scene.layout.slots[domain];
+        let mut seen = vec![0; slot.vertices];
+        for piece in pieces(scene, work).iter().filter(|piece| piece.domain as usize == domain) {
+            let range = piece.first as usize..(piece.first + piece.count) as usize;
+            if piece.of_vertices == 1 {
+                range.for_each(|vertex| seen[vertex - slot.first_vertex] += 1);
+                continue;
+            }
+            assert!(range.start % 4 == 0 && range.end % 4 == 0, "whole tiles");
+            for tile in &work.tiles[range.start / 4..range.end / 4] {
+                assert_eq!((tile.domain as usize, tile.kind & TILE_VERTICES), (domain, TILE_VERTICES));
+                let items = 4 * (usize::from(tile.width) - 1) + usize::from(tile.kind & TILE_LAST);
+                let first = tile.first as usize - slot.first_vertex;
+                seen[first..first + items].iter_mut().for_each(|count| *count += 1);
+            }
+        }
+        seen
+    }
+
+    #[test]
+    fn every_vertex_lies_in_one_piece_of_its_domain_whatever_its_tiles() {
+        let sizes = [(7, 2), (64, 0), (65, 3), (128, 1), (129, 0), (9_000, 4), (1, 1)];
+        for scene in [scene(&sizes, false, false), used_once(&sizes)] {
+            let work = Work::new(&scene, &Coordinates::new(&scene));
+            let list = pieces(&scene, &work);
+            assert!(list.iter().any(|piece| piece.of_vertices == 1) && list.len() > scene.domains.len());
+            assert!(list.is_sorted_by_key(|piece| piece.domain));
+            assert!(list.iter().all(|piece| piece.of_vertices == 1 || piece.count <= 4 * PIECE_TILES));
+            for (domain, slot) in scene.layout.slots.iter().enumerate() {
+                assert_eq!(seen(&scene, &work, domain), vec![1; slot.vertices], "domain {domain}");
+            }
+        }
+    }
+
+    #[test]
+    fn boxes_of_pieces_unite_to_those_of_domains_and_a_nan_stays() {
+        // Keys of -x and x: `ordered` of positive numbers sets the first bit, of negative ones turns all.
+        let key = |x: f32| if x.is_sign_negative() { !x.to_bits() } else { x.to_bits() | 1 << 31 };
+        let cube = |low: f32, high: f32| [[key(-low); 3], [key(high); 3]].concat();
+        let keys = [cube(-1.0, 2.0), cube(0.5, 0.75), cube(-3.0, 0.25)].concat();
+        let mut boxes = vec![Bounds::EMPTY; 7];
+        unite(&[0, 1, 1], &keys, &mut boxes);
+        let want = |low: f64, high: f64| Bounds { min: [low; 3], max: [high; 3] };
+        assert_eq!(boxes, [want(-1.0, 2.0), want(-3.0, 0.75)]);
+        let spoilt = [&keys[..17], &[u32::MAX]].concat();
+        unite(&[0, 1, 1], &spoilt, &mut boxes);
+        assert!(boxes[0].is_finite() && !boxes[1].is_finite());
+    }
+}

@@ -1,0 +1,41 @@
+//! Launches a kernel that may be put onto the device while the one before it ends (`kernels/chain.cuh`): what a launch
+//! costs then passes while the other still works. The kernel itself waits before it touches anything.
+
+use std::ffi::c_void;
+
+use cudarc::driver::{CudaFunction, LaunchConfig, sys};
+
+use super::device::Device;
+use modalcast_model::error::{Result, during};
+
+/// The first compute capability whose kernels can wait for each other.
+const CHAINS: (i32, i32) = (9, 0);
+
+/// Starts `function` behind what the stream holds.
+///
+/// # Safety
+/// `args` is the kernel's only argument and names memory as the kernel expects it, and the kernel calls
+/// `await_previous` before all else.
+pub(super) unsafe fn launch<T>(device: &Device, function: &CudaFunction, config: LaunchConfig, args: &T) -> Result<()> {
+    let serialise = sys::CUlaunchAttributeID::CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION;
+    let value = sys::CUlaunchAttributeValue { programmaticStreamSerializationAllowed: 1 };
+    let mut attribute = sys::CUlaunchAttribute { id: serialise, pad: [0; 4], value };
+    let config = sys::CUlaunchConfig {
+        gridDimX: config.grid_dim.0,
+        gridDimY: config.grid_dim.1,
+        gridDimZ: config.grid_dim.2,
+        blockDimX: config.block_dim.0,
+        blockDimY: config.block_dim.1,
+        blockDimZ: config.block_dim.2,
+        sharedMemBytes: config.shared_mem_bytes,
+        hStream: device.stream().cu_stream(),
+        attrs: &mut attribute,
+        numAttrs: u32::from(device.capability() >= CHAINS),
+    };
+    let mut pointers = [std::ptr::from_ref(args).cast_mut().cast::<c_void>()];
+    // SAFETY: the attribute and the argument outlive the call, which copies both; the rest is the caller's promise.
+    unsafe {
+        sys::cuLaunchKernelEx(&config, function.cu_function(), pointers.as_mut_ptr(), std::ptr::null_mut()).result()
+    }
+    .map_err(during("launch"))
+}

@@ -1,0 +1,49 @@
+//! What NVRTC and its assembler make of a kernel, for tests: it needs no device.
+
+#![allow(clippy::expect_used, clippy::panic, reason = "a test may fail")]
+
+use super::nvrtc::{Job, nvrtc};
+
+/// Machine code of one variant of a kernel, and the log of the assembler.
+#[derive(Debug)]
+pub struct Assembled {
+    pub cubin: Vec<u8>,
+    pub log: String,
+}
+
+impl Assembled {
+    /// Compiles a source with macros and asks for what the assembler says of registers.
+    pub fn new(name: &str, source: &str, defines: &[&str], capability: (i32, i32)) -> Self {
+        let mut job = Job::new(name, source, defines, capability);
+        job.options.push("--ptxas-options=-v".into());
+        let (cubin, log) = nvrtc().expect("NVRTC").compile_with_log(&job).expect("compiles");
+        assert!(cubin.starts_with(b"\x7fELF"), "machine code is an ELF file");
+        Self { cubin, log }
+    }
+
+    /// Bytes that all functions together store for want of registers.
+    pub fn spilled(&self) -> usize {
+        spilled(&self.log)
+    }
+}
+
+pub(super) fn spilled(log: &str) -> usize {
+    let stores: Vec<&str> = log.split(" bytes spill stores").collect();
+    assert!(stores.len() > 1, "the assembler says what it spills: {log}");
+    let number = |before: &&str| before.rsplit(' ').next().and_then(|word| word.parse::<usize>().ok());
+    stores[..stores.len() - 1].iter().map(|before| number(before).expect("a number")).sum()
+}
+
+/// Compiles a source with each list of macros for four architectures. Panics when a variant does not compile, lacks one of
+/// the `functions` (the first names the program), or spills registers.
+pub fn assert_compiles(source: &str, functions: &[&str], variants: &[&[&str]]) {
+    for capability in [(7, 5), (8, 0), (9, 0), (12, 0)] {
+        for defines in variants {
+            let compiled = Assembled::new(functions[0], source, defines, capability);
+            for function in functions {
+                assert!(compiled.log.contains(&format!("'{function}'")), "{function} is not in: {}", compiled.log);
+            }
+            assert_eq!(compiled.spilled(), 0, "{defines:?} {capability:?}: {}", compiled.log);
+        }
+    }
+}

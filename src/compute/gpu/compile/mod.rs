@@ -1,0 +1,41 @@
+//! Kernels to machine code: by NVRTC, or from disk where an earlier run left it.
+
+#[cfg(any(test, feature = "testing"))]
+mod assembled;
+mod cache;
+mod nvrtc;
+#[cfg(test)]
+mod tests;
+
+use std::path::PathBuf;
+
+#[cfg(any(test, feature = "testing"))]
+pub use self::assembled::{Assembled, assert_compiles};
+use self::cache::{Cache, key_of};
+use self::nvrtc::Job;
+pub(super) use self::nvrtc::nvrtc;
+use modalcast_model::error::Result;
+
+/// Machine code (a cubin) of a source with macros for compute capability `major.minor`.
+///
+/// # Errors
+/// `Unavailable` when NVRTC is missing or does not know the architecture; `Fault` with the compiler's log.
+pub(super) fn cubin(name: &str, source: &str, defines: &[&str], capability: (i32, i32)) -> Result<Vec<u8>> {
+    let nvrtc = nvrtc()?;
+    let job = Job::new(name, source, defines, capability);
+    let version = format!("{}.{}", nvrtc.version.0, nvrtc.version.1);
+    let mut ingredients = job.ingredients();
+    ingredients.push(&version);
+    let (cache, key) = (Cache::of_environment(), key_of(&ingredients));
+    if let Some(cubin) = cache.get(&key) {
+        return Ok(cubin);
+    }
+    let cubin = nvrtc.compile(&job)?;
+    cache.put(&key, &cubin);
+    Ok(cubin)
+}
+
+/// Where compiled kernels are kept, if anywhere.
+pub(super) fn folder() -> Option<PathBuf> {
+    Cache::of_environment().folder().map(PathBuf::from)
+}

@@ -1,0 +1,318 @@
+//! CUDA C++ source to machine code for one architecture, by NVRTC, found and bound at run time.
+
+use std::ffi::{CStr, CString, c_char, c_int, c_void};
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use libloading::Library;
+
+use modalcast_model::error::{Error, Result, during};
+
+/// What brings NVRTC to a machine without it.
+const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip install --target .tools/nvrtc \
+                      'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
+
+/// Headers that kernels may include, by name.
+const HEADERS: [(&str, &str); 11] = [
+    ("layout.cuh", include_str!("../../../../kernels/layout.cuh")),
+    ("batch_load.cuh", include_str!("../../../../kernels/batch_load.cuh")),
+    ("chain.cuh", include_str!("../../../../kernels/chain.cuh")),
+    ("chunk.cuh", include_str!("../../../../kernels/chunk.cuh")),
+    ("cut_out.cuh", include_str!("../../../../kernels/cut_out.cuh")),
+    ("follow.cuh", include_str!("../../../../kernels/follow.cuh")),
+    ("ordered.cuh", include_str!("../../../../kernels/ordered.cuh")),
+    ("raster.cuh", include_str!("../../../../kernels/raster.cuh")),
+    ("tile.cuh", include_str!("../../../../kernels/tile.cuh")),
+    ("orient.cuh", include_str!("../../../../kernels/orient.cuh")),
+    ("turn.cuh", include_str!("../../../../kernels/turn.cuh")),
+];
+
+/// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not know.
+const INVALID_OPTION: c_int = 5;
+
+type Program = *mut c_void;
+
+/// The ten functions that are used, and the library they live in.
+struct Functions {
+    version: unsafe extern "C" fn(*mut c_int, *mut c_int) -> c_int,
+    error: unsafe extern "C" fn(c_int) -> *const c_char,
+    create: unsafe extern "C" fn(
+        *mut Program,
+        *const c_char,
+        *const c_char,
+        c_int,
+        *const *const c_char,
+        *const *const c_char,
+    ) -> c_int,
+    destroy: unsafe extern "C" fn(*mut Program) -> c_int,
+    compile: unsafe extern "C" fn(Program, c_int, *const *const c_char) -> c_int,
+    cubin_size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
+    cubin: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
+    log_size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
+    log: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
+    _libraries: Vec<Library>,
+}
+
+/// A loaded NVRTC.
+pub(in super::super) struct Nvrtc {
+    functions: Functions,
+    /// Where it was found: a path, or a name that the loader resolved.
+    pub path: PathBuf,
+    /// Major and minor version.
+    pub version: (i32, i32),
+}
+
+impl std::fmt::Debug for Nvrtc {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("Nvrtc").field("path", &self.path).field("version", &self.version).finish()
+    }
+}
+
+/// A source and the options to compile it with.
+#[derive(Debug)]
+pub(super) struct Job<'a> {
+    pub name: &'a str,
+    pub source: &'a str,
+    pub options: Vec<String>,
+}
+
+impl<'a> Job<'a> {
+    /// Compiles `source` for compute capability `major.minor`, with the macros in `defines`.
+    pub(super) fn new(name: &'a str, source: &'a str, defines: &[&str], capability: (i32, i32)) -> Self {
+        let (major, minor) = capability;
+        // Stated rather than left to defaults: results must be those of IEEE arithmetic, denormals included.
+        let mut options: Vec<String> =
+            ["--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true"]
+                .map(String::from)
+                .into();
+        options.push(format!("--gpu-architecture=sm_{major}{minor}"));
+        options.extend(defines.iter().map(|define| format!("--define-macro={define}")));
+        Self { name, source, options }
+    }
+
+    /// Everything that decides the machine code, besides the compiler.
+    pub(super) fn ingredients(&self) -> Vec<&str> {
+        let headers = HEADERS.iter().flat_map(|(name, text)| [*name, *text]);
+        [self.name, self.source].into_iter().chain(headers).chain(self.options.iter().map(String::as_str)).collect()
+    }
+}
+
+/// The NVRTC of this process, loaded at the first call.
+///
+/// # Errors
+/// `Unavailable` naming what was tried and the wheel that brings it.
+pub(in super::super) fn nvrtc() -> Result<&'static Nvrtc> {
+    static LOADED: OnceLock<Result<Nvrtc>> = OnceLock::new();
+    LOADED.get_or_init(|| Nvrtc::find(&candidates())).as_ref().map_err(Clone::clone)
+}
+
+impl Nvrtc {
+    fn find(candidates: &[PathBuf]) -> Result<Self> {
+        let mut reason = format!("none of {} places has it", candidates.len());
+        for candidate in candidates {
+            match Self::load(candidate) {
+                Ok(nvrtc) => return Ok(nvrtc),
+                // A file that is there but does not load tells more than a name that nobody knows.
+                Err(error) if candidate.is_file() || candidates.len() == 1 => {
+                    reason = format!("{}: {error}", candidate.display());
+                }
+                Err(_) => {}
+            }
+        }
+        Err(Error::Unavailable { what: "NVRTC", reason, remedy: REMEDY.into() })
+    }
+
+    fn load(path: &Path) -> Result<Self> {
+        let fail = during("nvrtc");
+        // SAFETY: NVRTC's initialisers do nothing but set up the library; the name or path is the operator's choice.
+        let library = unsafe { Library::new(path) }.map_err(|error| fail(error.to_string()))?;
+        let functions = Functions::bind(library, builtins(path)).map_err(|error| fail(error.to_string()))?;
+        let (mut major, mut minor) = (0, 0);
+        // SAFETY: both pointers are to live integers.
+        let code = unsafe { (functions.version)(&mut major, &mut minor) };
+        functions.check(code).map_err(fail)?;
+        let nvrtc = Self { functions, path: path.to_path_buf(), version: (major, minor) };
+        // Only compiling shows whether it finds its own second file.
+        nvrtc.compile(&Job { name: "nothing", source: "", options: Vec::new() })?;
+        Ok(nvrtc)
+    }
+
+    /// Machine code (a cubin) of a job.
+    ///
+    /// # Errors
+    /// `Fault` with the compiler's log; `Unavailable` when this NVRTC does not know the architecture.
+    pub(super) fn compile(&self, job: &Job) -> Result<Vec<u8>> {
+        self.compile_with_log(job).map(|(cubin, _)| cubin)
+    }
+
+    /// The same, and what the compiler said.
+    pub(super) fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
+        let fail = during("compile");
+        let options = strings(job.options.iter().map(String::as_str))?;
+        let pointers: Vec<_> = options.iter().map(|option| option.as_ptr()).collect();
+        let program = Running::create(&self.functions, job)?;
+        // SAFETY: the program is live, and `pointers` holds as many NUL-terminated strings as it says.
+        let code = unsafe { (self.functions.compile)(program.handle, pointers.len() as c_int, pointers.as_ptr()) };
+        let log = program.bytes(self.functions.log_size, self.functions.log).unwrap_or_default();
+        let log = String::from_utf8_lossy(&log).trim_end_matches('\0').trim().to_owned();
+        if code == INVALID_OPTION {
+            let reason = format!("version {}.{} refused {:?}: {log}", self.version.0, self.version.1, job.options);
+            return Err(Error::Unavailable { what: "NVRTC for this device", reason, remedy: REMEDY.into() });
+        }
+        self.functions.check(code).map_err(|error| fail(format!("{}: {error}: {log}", job.name)))?;
+        let cubin = program.bytes(self.functions.cubin_size, self.functions.cubin).map_err(fail)?;
+        Ok((cubin, log))
+    }
+}
+
+impl Functions {
+    fn bind(library: Library, companions: Vec<Library>) -> Result<Self, libloading::Error> {
+        // SAFETY: the types are those of nvrtc.h of CUDA 11.1 to 13; the library is kept as long as the functions.
+        unsafe {
+            Ok(Self {
+                version: *library.get(b"nvrtcVersion\0")?,
+                error: *library.get(b"nvrtcGetErrorString\0")?,
+                create: *library.get(b"nvrtcCreateProgram\0")?,
+                destroy: *library.get(b"nvrtcDestroyProgram\0")?,
+                compile: *library.get(b"nvrtcCompileProgram\0")?,
+                cubin_size: *library.get(b"nvrtcGetCUBINSize\0")?,
+                cubin: *library.get(b"nvrtcGetCUBIN\0")?,
+                log_size: *library.get(b"nvrtcGetProgramLogSize\0")?,
+                log: *library.get(b"nvrtcGetProgramLog\0")?,
+                _libraries: std::iter::once(library).chain(companions).collect(),
+            })
+        }
+    }
+
+    fn check(&self, code: c_int) -> Result<(), String> {
+        if code == 0 {
+            return Ok(());
+        }
+        // SAFETY: NVRTC answers any code with a NUL-terminated string of static lifetime.
+        Err(unsafe { CStr::from_ptr((self.error)(code)) }.to_string_lossy().into_owned())
+    }
+}
+
+/// A program inside NVRTC; destroyed when dropped.
+struct Running<'a> {
+    functions: &'a Functions,
+    handle: Program,
+}
+
+impl<'a> Running<'a> {
+    fn create(functions: &'a Functions, job: &Job) -> Result<Self> {
+        let texts = strings([job.source, job.name])?;
+        let names = strings(HEADERS.iter().map(|(name, _)| *name))?;
+        let headers = strings(HEADERS.iter().map(|(_, text)| *text))?;
+        let names: Vec<_> = names.iter().map(|name| name.as_ptr()).collect();
+        let headers: Vec<_> = headers.iter().map(|text| text.as_ptr()).collect();
+        let mut handle = std::ptr::null_mut();
+        let count = HEADERS.len() as c_int;
+        // SAFETY: all strings are NUL-terminated and outlive the call, which copies them; the lists have `count` items.
+        let code = unsafe {
+            let (source, name) = (texts[0].as_ptr(), texts[1].as_ptr());
+            (functions.create)(&mut handle, source, name, count, headers.as_ptr(), names.as_ptr())
+        };
+        functions.check(code).map_err(during("compile"))?;
+        Ok(Self { functions, handle })
+    }
+
+    /// Asks for a size, then for that many bytes.
+    fn bytes(
+        &self,
+        size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
+        read: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
+    ) -> Result<Vec<u8>, String> {
+        let mut length = 0;
+        // SAFETY: the program is live and `length` a live integer.
+        self.functions.check(unsafe { size(self.handle, &mut length) })?;
+        let mut bytes = vec![0_u8; length];
+        // SAFETY: NVRTC writes as many bytes as it said; the buffer has them.
+        self.functions.check(unsafe { read(self.handle, bytes.as_mut_ptr().cast()) })?;
+        Ok(bytes)
+    }
+}
+
+impl Drop for Running<'_> {
+    fn drop(&mut self) {
+        // SAFETY: the handle came from `create` and is destroyed once. A failure leaves nothing to be done.
+        let _ = unsafe { (self.functions.destroy)(&mut self.handle) };
+    }
+}
+
+/// NVRTC asks the loader for its builtins by bare name, which nobody finds in a folder off the search path; one that is
+/// loaded already answers to that name.
+fn builtins(nvrtc: &Path) -> Vec<Library> {
+    let folder = nvrtc.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let files = folder.map(entries).unwrap_or_default().into_iter();
+    let wanted = |file: &PathBuf| {
+        file.file_name().is_some_and(|name| name.to_string_lossy().starts_with("libnvrtc-builtins.so"))
+    };
+    // SAFETY: a library of data without initialisers, from the folder that the operator chose for NVRTC.
+    files.filter(wanted).filter_map(|file| unsafe { Library::new(file) }.ok()).collect()
+}
+
+fn strings<'a>(texts: impl IntoIterator<Item = &'a str>) -> Result<Vec<CString>> {
+    texts.into_iter().map(|text| CString::new(text).map_err(during("compile"))).collect()
+}
+
+/// Where NVRTC may be, best first. A path in MODALCAST_NVRTC is the only candidate: an explicit wish is not overruled.
+fn candidates() -> Vec<PathBuf> {
+    if let Some(path) = std::env::var_os("MODALCAST_NVRTC").filter(|path| !path.is_empty()) {
+        return vec![path.into()];
+    }
+    let mut found: Vec<PathBuf> = ["libnvrtc.so.13", "libnvrtc.so"].map(PathBuf::from).into();
+    let beside = std::env::current_exe().ok();
+    let above = beside.iter().flat_map(|exe| exe.ancestors().skip(1).take(4));
+    // Never the working directory: starting the server somewhere must not run what lies there.
+    for folder in above {
+        find_below(&folder.join(".tools/nvrtc"), 5, &mut found);
+    }
+    for toolkit in entries(Path::new("/usr/local")) {
+        if toolkit.file_name().is_some_and(|name| name.to_string_lossy().starts_with("cuda")) {
+            let folder = toolkit.join("lib64");
+            found.extend(["libnvrtc.so.13", "libnvrtc.so"].map(|name| folder.join(name)));
+        }
+    }
+    found.push("libnvrtc.so.12".into());
+    found
+}
+
+/// Adds every `libnvrtc.so.13` at most `depth` folders below `folder`.
+fn find_below(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) {
+    for entry in entries(folder) {
+        if entry.file_name().is_some_and(|name| name == "libnvrtc.so.13") {
+            found.push(entry);
+        } else if depth > 0 && entry.is_dir() {
+            find_below(&entry, depth - 1, found);
+        }
+    }
+}
+
+/// What lies in a folder, sorted; nothing when it cannot be read.
+fn entries(folder: &Path) -> Vec<PathBuf> {
+    let mut list: Vec<_> =
+        std::fs::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path())).collect();
+    list.sort();
+    list
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_missing_or_broken_nvrtc_is_refused_with_the_wheel_that_brings_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let missing = Nvrtc::find(&[folder.path().join("libnvrtc.so.13")]).expect_err("missing").to_string();
+        assert!(missing.contains("nvidia-cuda-nvrtc==13.0.*"), "{missing}");
+        let broken = folder.path().join("nvidia/cu13/lib/libnvrtc.so.13");
+        std::fs::create_dir_all(broken.parent().expect("a parent")).expect("a folder");
+        std::fs::write(&broken, b"no library").expect("a file");
+        let mut found = Vec::new();
+        find_below(folder.path(), 5, &mut found);
+        assert_eq!(found, std::slice::from_ref(&broken));
+        let refusal = Nvrtc::find(&found).expect_err("broken").to_string();
+        assert!(refusal.contains(&broken.display().to_string()), "{refusal}");
+    }
+}

@@ -1,0 +1,176 @@
+//! What NVRTC makes of every kernel, for several architectures: it needs no device.
+
+use rayon::prelude::*;
+
+use super::assembled::{Assembled, spilled};
+use super::nvrtc::{Job, nvrtc};
+use crate::gpu::{layout, plan};
+use modalcast_model::error::Error;
+
+#[test]
+fn spills_of_all_functions_are_added_and_a_log_without_them_is_no_proof() {
+    let line = |bytes: usize| format!("    0 bytes stack frame, {bytes} bytes spill stores, 9 bytes spill loads\n");
+    assert_eq!(spilled(&[line(0), line(24), line(4)].concat()), 28);
+    assert_eq!(spilled(&line(0)), 0);
+    assert!(std::panic::catch_unwind(|| spilled("compiled")).is_err());
+}
+
+/// Macros of a variant, and the architecture.
+type Variant = (Vec<&'static str>, (i32, i32));
+
+/// Macros of `deform` that no scene asks for: those of lists.
+const MORE: [&str; 1] = ["LISTED"];
+
+/// U in f32, and in each type that has a macro.
+fn storages() -> impl Iterator<Item = Vec<&'static str>> {
+    std::iter::once(Vec::new()).chain(plan::STORAGES.map(|storage| vec![storage]))
+}
+
+/// All subsets of a few macros.
+fn subsets(of: &[&'static str]) -> Vec<Vec<&'static str>> {
+    let chosen = |set: usize| (0..of.len()).filter(move |bit| set >> bit & 1 == 1);
+    (0..1 << of.len()).map(|set| chosen(set).map(|bit| of[bit]).collect()).collect()
+}
+
+/// Variants of `deform` that are looked at: all that its features allow would take hours.
+fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
+    let large = (9, 0);
+    let mut list: Vec<Variant> = features.iter().chain(&MORE).map(|feature| (vec![*feature], large)).collect();
+    // What the sum, the shape of a tile and the way to normals each take of the registers; lists are always narrow.
+    let shapes: [&[&str]; 3] = [&[], &["NARROW"], &["NARROW", "LISTED"]];
+    let orient: [&[&str]; 4] =
+        [&[], &["ORIENT"], &["ORIENT", "NORMAL_MAPS"], &["ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]];
+    let mut with = |sum: &[&'static str], orient: &[&[&'static str]], more: &[&'static str]| {
+        let ends = shapes.into_iter().flat_map(|shape| orient.iter().map(move |orient| [shape, *orient].concat()));
+        list.extend(ends.map(|defines| ([sum, &defines, more].concat(), large)));
+    };
+    for more in subsets(&["DISPLACEMENTS", "FOLLOWERS"]) {
+        with(&[], &orient, &more);
+    }
+    for storage in storages() {
+        let sum = |more: &[&'static str]| [&["MODES"], storage.as_slice(), more].concat();
+        for more in subsets(&["TRUNCATED", "COMPENSATED"]) {
+            with(&sum(&more), &orient, &[]);
+        }
+        // What readers and followers add, to the least and to the most.
+        for more in [&[][..], &["TRUNCATED", "COMPENSATED"]] {
+            with(&sum(more), &orient[1..3], &["DISPLACEMENTS"]);
+            with(&sum(more), &orient[1..3], &["FOLLOWERS"]);
+        }
+    }
+    for storage in storages() {
+        let smallest = [&["MODES"], storage.as_slice()].concat();
+        let largest = [features, &MORE, &storage].concat();
+        list.push(([smallest.as_slice(), &["DISPLACEMENTS", "WITHOUT_POSITIONS"]].concat(), large));
+        list.push((largest.clone(), large));
+        for capability in [(7, 5), (8, 0), (12, 0)] {
+            list.extend([&smallest, &largest].map(|defines| (defines.clone(), capability)));
+        }
+    }
+    list
+}
+
+/// All that `batch` is compiled with on a large device, and the most vectors elsewhere.
+fn variants_of_batch(features: &[&'static str]) -> Vec<Variant> {
+    let counts = subsets(features).into_iter().filter(|set| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8")));
+    let large: Vec<Vec<&str>> =
+        counts.flat_map(|set| storages().map(move |storage| [set.clone(), storage].concat())).collect();
+    let others = [(7, 5), (8, 0), (12, 0)].into_iter();
+    let others = others.flat_map(|capability| storages().map(move |storage| (storage, capability)));
+    large.into_iter().map(|set| (set, (9, 0))).chain(others).collect()
+}
+
+/// All that the other kernels have.
+fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
+    let capabilities = [(7, 5), (8, 0), (9, 0), (12, 0)];
+    capabilities
+        .into_iter()
+        .flat_map(|capability| subsets(features).into_iter().map(move |set| (set, capability)))
+        .collect()
+}
+
+/// Compiles all variants on all cores. NVRTC keeps programs apart.
+fn compiled(kernel: &plan::KernelSource, variants: &[Variant]) -> Vec<Assembled> {
+    let one = |(defines, capability): &Variant| Assembled::new(kernel.name, kernel.source, defines, *capability);
+    variants.par_iter().map(one).collect()
+}
+
+#[test]
+#[ignore = "needs NVRTC: deploy/check installs it"]
+fn nvrtc_compiles_every_kernel_without_spilling() {
+    for kernel in plan::KERNELS {
+        let variants = match kernel.name {
+            "deform" => variants_of_deform,
+            "batch" => variants_of_batch,
+            _ => variants_of_others,
+        }(kernel.features);
+        let spills = |(variant, compiled): (&Variant, Assembled)| {
+            let spilled = compiled.spilled();
+            // Its header says what, and how seldom.
+            let allowed = if kernel.name == "batch" { 16 } else { 0 };
+            (spilled > allowed).then(|| format!("{variant:?}: {spilled} bytes"))
+        };
+        let spilling: Vec<String> = variants.iter().zip(compiled(&kernel, &variants)).filter_map(spills).collect();
+        assert_eq!(spilling, Vec::<String>::new(), "{} of {} of {}", spilling.len(), variants.len(), kernel.name);
+    }
+}
+
+/// Macros that add code, each with the macro that it builds on; the others choose among code of about the same length.
+const ADD: [(&str, &str, &[&str]); 14] = [
+    ("deform", "MODES", &[]),
+    ("deform", "COMPENSATED", &["MODES"]),
+    ("deform", "DISPLACEMENTS", &["MODES"]),
+    ("bounds", "LIGHT", &[]),
+    ("bounds", "BOXES", &[]),
+    ("deform", "ORIENT", &[]),
+    ("deform", "SHIFTED", &["ORIENT"]),
+    ("deform", "NORMAL_MAPS", &["ORIENT"]),
+    ("deform", "SHEAR", &["ORIENT"]),
+    ("deform", "FOLLOWERS", &[]),
+    ("batch", "FOLLOWERS", &[]),
+    ("normals", "NORMAL_MAPS", &[]),
+    ("normals", "SHEAR", &[]),
+    ("normals", "FOLLOWERS", &[]),
+];
+/// `apply` asks one question more with followers, which is less than what its file is filled up to.
+const CHOOSE: [(&str, &str); 5] =
+    [("batch", "BATCH_8"), ("batch", "BATCH_4"), ("deform", "NARROW"), ("deform", "TRUNCATED"), ("apply", "FOLLOWERS")];
+
+#[test]
+#[ignore = "needs NVRTC: deploy/check installs it"]
+fn nvrtc_leaves_out_the_code_of_a_feature_that_is_left_out() {
+    for kernel in plan::KERNELS {
+        let bytes = |defines: &[&'static str]| Assembled::new(kernel.name, kernel.source, defines, (9, 0)).cubin.len();
+        assert_eq!(bytes(&["UNKNOWN"]), bytes(&[]), "a macro that nothing reads changes nothing");
+        for feature in kernel.features.iter().filter(|feature| !CHOOSE.contains(&(kernel.name, feature))) {
+            let (.., base) = ADD.iter().find(|(name, own, _)| (name, own) == (&kernel.name, feature)).expect("known");
+            let (without, with) = (bytes(base), bytes(&[*base, &[*feature]].concat()));
+            assert!(without < with, "{} of {}: {without} and {with} bytes", feature, kernel.name);
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs NVRTC: deploy/check installs it"]
+fn nvrtc_agrees_with_the_host_on_every_size_and_offset_and_would_notice() {
+    let nvrtc = nvrtc().expect("NVRTC");
+    let check = |agreement: &layout::Agreement, host: u32| {
+        let source = format!("{}static_assert(({}) == {host}u, \"\");", layout::PRELUDE, agreement.expression);
+        nvrtc.compile(&Job::new("layout", &source, &[], (8, 0)))
+    };
+    for agreement in layout::agreements() {
+        check(&agreement, agreement.host).expect("host and device agree");
+        check(&agreement, agreement.host ^ 4).expect_err("the judge can fail");
+    }
+    nvrtc.compile(&Job::new("report", &layout::report_source(), &[], (9, 0))).expect("the report compiles");
+}
+
+#[test]
+#[ignore = "needs NVRTC: deploy/check installs it"]
+fn nvrtc_refusals_carry_the_log() {
+    let nvrtc = nvrtc().expect("NVRTC");
+    let broken = nvrtc.compile(&Job::new("broken", "__global__ void f() { wrong; }", &[], (8, 0)));
+    assert!(broken.expect_err("no C++").to_string().contains("wrong"), "the log names the culprit");
+    let ancient = nvrtc.compile(&Job::new("empty", "", &[], (1, 0))).expect_err("sm_10 is gone");
+    assert!(matches!(ancient, Error::Unavailable { .. }), "{ancient}");
+}

@@ -1,0 +1,294 @@
+//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents, and a box of
+//! each warp's vertices.
+
+use std::sync::Arc;
+
+use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
+
+use super::apply::most_domains;
+use super::batch::{Batch, Shared};
+use super::device::Device;
+use super::inputs::{Listing, Packing, Values};
+use super::layout::{DeformArgs, Piece};
+use super::memory::{address, room, upload};
+use super::plan::{Kernel, Tables};
+use super::work::{Source, Work, rest_directions, rest_positions, side_by_side};
+use crate::storage::{Plane, TILE_QUADS, Tiles};
+use modalcast_model::error::{Error, Result, during};
+use modalcast_model::scene::Scene;
+
+/// Tiles of `deform` that take as long as `batch` does for a tile of a group, about.
+const WORK_OF_TILE: usize = 2;
+
+/// Words of U that go to the device in one piece while packing, so that packing needs little memory of its own.
+const PIECE: usize = 1 << 22;
+
+/// The kernel and what it reads of a scene.
+#[derive(Debug)]
+pub struct Deform {
+    function: CudaFunction,
+    config: LaunchConfig,
+    /// For the domains whose U is read once for several of them.
+    batch: Option<Batch>,
+    /// The same for a list of tiles, and the list, where there can be one.
+    listed: Option<CudaFunction>,
+    tiles: CudaSlice<u8>,
+    lanes: CudaSlice<u8>,
+    lane_scales: CudaSlice<u8>,
+    words: CudaSlice<u8>,
+    rest: CudaSlice<u8>,
+    normals: CudaSlice<u8>,
+    tangents: CudaSlice<u8>,
+    corner_shifts: CudaSlice<u8>,
+    scales: CudaSlice<u8>,
+    list: CudaSlice<u8>,
+    /// Four boxes of six keys per tile.
+    boxes: CudaSlice<u8>,
+    /// Of tiles, and of those that a whole step launches.
+    count: u32,
+    launched: u32,
+    /// Quads before the first that has normals.
+    directed: u64,
+    packing: Arc<Packing>,
+    /// Of which `bounds` makes boxes, where the scene keeps them.
+    pieces: Option<Vec<Piece>>,
+}
+
+impl Deform {
+    /// Packs what the tables name onto the device. `batch` is the kernel of scenes with batches.
+    pub fn new(
+        device: &Device,
+        scene: &Arc<Scene>,
+        (kernel, batch): (&Kernel, Option<&Kernel>),
+        tables: Tables,
+    ) -> Result<Self> {
+        let Tables { coordinates, work, pieces } = tables;
+        let mut load = Load::new(device, scene, &work)?;
+        work.sources.iter().try_for_each(|source| load.add(source))?;
+        let (words, load) = load.finish()?;
+        let (scales, factors) = (upload(device, &load.scales)?, load.factors);
+        let [normals, tangents] = rest_directions(scene, &work);
+        let has_lists = most_domains(scene) > 0;
+        // What turns no normals has nothing to do in tiles of corners alone.
+        let launched = if kernel.defines.contains(&"ORIENT") { work.launched } else { work.with_vertices };
+        let config = LaunchConfig { grid_dim: (blocks(kernel, launched), 1, 1), ..config(kernel) };
+        Ok(Self {
+            function: function(device, kernel)?,
+            config,
+            batch: batch.map(|kernel| Batch::new(device, kernel, &work.batched)).transpose()?,
+            listed: has_lists.then(|| listed(device, kernel)).transpose()?,
+            tiles: upload(device, &work.tiles)?,
+            lanes: upload(device, &work.lanes)?,
+            lane_scales: upload(device, &work.lane_scales)?,
+            words,
+            rest: upload(device, &rest_positions(scene, &work))?,
+            normals: upload(device, &normals)?,
+            tangents: upload(device, &tangents)?,
+            corner_shifts: upload(device, &work.corner_shifts)?,
+            scales,
+            list: room(device, if has_lists { 4 * work.tiles.len() as u64 } else { 0 })?,
+            boxes: room(device, 96 * work.tiles.len() as u64)?,
+            count: work.tiles.len() as u32,
+            launched: launched as u32,
+            directed: work.quads.directed,
+            pieces: scene.needs.boxes.then_some(pieces),
+            packing: Arc::new(Packing {
+                scene: Arc::clone(scene),
+                coordinates,
+                factors,
+                listing: Listing {
+                    spans: work.spans,
+                    tiles: work.tiles.len(),
+                    whole: work.launched + WORK_OF_TILE * work.batched.tiles(),
+                },
+            }),
+        })
+    }
+
+    /// How coordinates are to be laid out for it.
+    pub const fn packing(&self) -> &Arc<Packing> {
+        &self.packing
+    }
+
+    /// What boxes of domains are made of, where the scene keeps them.
+    pub fn pieces(&self) -> Option<&[Piece]> {
+        self.pieces.as_deref()
+    }
+
+    /// The address of its boxes, and how many there are.
+    pub fn boxes(&self, device: &Device) -> (u64, u32) {
+        (address(device, &self.boxes), 4 * self.count)
+    }
+
+    /// Where `apply` puts the list of tiles.
+    pub fn list(&self, device: &Device) -> u64 {
+        address(device, &self.list)
+    }
+
+    /// What a whole step launches.
+    pub fn kernels(&self) -> Vec<(&'static str, &CudaFunction)> {
+        let batch = self.batch.as_ref().map(|batch| ("batch", &batch.function));
+        batch.into_iter().chain((self.launched > 0).then_some(("deform", &self.function))).collect()
+    }
+
+    /// Starts the kernels of a whole step; the header among the values says where everything goes.
+    pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
+        if let Some(batch) = &self.batch {
+            let [words, rest, scales, boxes] =
+                [&self.words, &self.rest, &self.scales, &self.boxes].map(|buffer| address(device, buffer));
+            batch.launch(device, values, Shared { words, rest, scales, boxes })?;
+        }
+        // Nothing may be left to do.
+        if self.launched == 0 {
+            return Ok(());
+        }
+        self.launch_as(device, values, (&self.function, self.config))
+    }
+
+    /// Starts it on the tiles of the list, as many as the header says.
+    pub fn launch_listed(&self, device: &Device, values: Values) -> Result<()> {
+        let grid_dim = ((4 * self.count).min(LISTED_BLOCKS), 1, 1);
+        let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
+        let missing = || Error::Fault { stage: "deform", reason: "the scene has no lists".into() };
+        self.launch_as(device, values, (self.listed.as_ref().ok_or_else(missing)?, config))
+    }
+
+    fn launch_as(
+        &self,
+        device: &Device,
+        values: Values,
+        (function, config): (&CudaFunction, LaunchConfig),
+    ) -> Result<()> {
+        let at = |buffer: &CudaSlice<u8>| address(device, buffer);
+        let args = DeformArgs {
+            header: values.header,
+            tiles: at(&self.tiles),
+            lanes: at(&self.lanes),
+            words: at(&self.words),
+            rest: at(&self.rest),
+            // Quads without normals come first and have no room; no tile of corners names them.
+            rest_normals: at(&self.normals).wrapping_sub(48 * self.directed),
+            rest_tangents: at(&self.tangents).wrapping_sub(64 * self.directed),
+            corner_shifts: at(&self.corner_shifts),
+            scales: at(&self.scales),
+            lane_scales: at(&self.lane_scales),
+            transforms: values.transforms,
+            following: values.following,
+            frames: values.frames,
+            q: values.q,
+            list: at(&self.list),
+            kept_counts: values.kept_counts,
+            kept: values.kept,
+            boxes: at(&self.boxes),
+            count: self.launched,
+            reserved: 0,
+        };
+        let mut launch = device.stream().launch_builder(function);
+        // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
+        // words, x0, normals, transforms and q of the same scene, and the list names such tiles; there are as many boxes
+        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are
+        // read only by a kernel that was compiled for a scene that has them.
+        unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
+        Ok(())
+    }
+}
+
+/// Blocks that so many tiles take.
+pub(super) fn blocks(kernel: &Kernel, tiles: usize) -> u32 {
+    let warps = tiles * if kernel.defines.contains(&"NARROW") { 4 } else { 1 };
+    warps.div_ceil(kernel.threads as usize / TILE_QUADS) as u32
+}
+
+/// The function of a kernel, refused when it is made for other blocks than were planned.
+fn function(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
+    let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
+    let most = function.max_threads_per_block().map_err(during("deform"))?;
+    if most == kernel.threads as i32 {
+        return Ok(function);
+    }
+    let reason = format!("the kernel is made for {most} threads a block, {} were planned", kernel.threads);
+    Err(Error::Fault { stage: "deform", reason })
+}
+
+/// The function of the kernel that computes the tiles of a list.
+fn listed(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
+    // A lane for each item: lists are short, and would else leave most of the device without work.
+    let defines = kernel.defines.iter().copied().filter(|define| *define != "NARROW");
+    let listed: Vec<&str> = defines.chain(["NARROW", "LISTED"]).collect();
+    device.function(kernel.name, kernel.source.0, &listed)
+}
+
+/// Blocks that walk over a list of tiles: as many as a large device holds at once.
+const LISTED_BLOCKS: u32 = 132 * 12;
+
+pub(super) fn config(kernel: &Kernel) -> LaunchConfig {
+    LaunchConfig { grid_dim: (kernel.blocks, 1, 1), block_dim: (kernel.threads, 1, 1), shared_mem_bytes: 0 }
+}
+
+/// U on its way to the device, source by source, and what is small of all shapes, kept until the end.
+struct Load<'a> {
+    device: &'a Device,
+    scene: &'a Scene,
+    work: &'a Work,
+    words: CudaSlice<u8>,
+    sent: usize,
+    piece: Vec<Plane>,
+    scales: Vec<f32>,
+    factors: Vec<Vec<f32>>,
+}
+
+impl<'a> Load<'a> {
+    fn new(device: &'a Device, scene: &'a Scene, work: &'a Work) -> Result<Self> {
+        Ok(Self {
+            device,
+            scene,
+            work,
+            words: room(device, 16 * work.words)?,
+            sent: 0,
+            piece: Vec::new(),
+            scales: vec![0.0; work.scales as usize],
+            factors: vec![Vec::new(); scene.shapes.len()],
+        })
+    }
+
+    fn add(&mut self, source: &Source) -> Result<()> {
+        match source {
+            Source::Shape(shape) => {
+                let tiles = self.tiles_of(*shape);
+                self.piece.extend_from_slice(tiles.planes());
+            }
+            Source::Mixed(shapes) => {
+                let all: Vec<Tiles> = shapes.iter().map(|shape| self.tiles_of(*shape)).collect();
+                self.piece.extend(side_by_side(&all));
+            }
+        }
+        if self.piece.len() >= PIECE { self.send() } else { Ok(()) }
+    }
+
+    /// The tiles of a shape; what is small of them is kept.
+    fn tiles_of(&mut self, shape: usize) -> Tiles {
+        let tiles = Tiles::new(&self.scene.shapes[shape], self.scene.deformation.storage);
+        let scale = self.work.first_scale[shape] as usize;
+        self.scales[scale..][..tiles.scales().len()].copy_from_slice(tiles.scales());
+        self.factors[shape] = tiles.factors().to_vec();
+        tiles
+    }
+
+    fn send(&mut self) -> Result<()> {
+        let bytes: &[u8] = bytemuck::cast_slice(&self.piece);
+        let mut part = self.words.slice_mut(self.sent..self.sent + bytes.len());
+        self.device.stream().memcpy_htod(bytes, &mut part).map_err(during("upload"))?;
+        self.sent += bytes.len();
+        self.piece.clear();
+        Ok(())
+    }
+
+    /// The words, all there, and what is small.
+    fn finish(mut self) -> Result<(CudaSlice<u8>, Self)> {
+        if !self.piece.is_empty() {
+            self.send()?;
+        }
+        let words = std::mem::replace(&mut self.words, room(self.device, 0)?);
+        Ok((words, self))
+    }
+}

@@ -1,0 +1,338 @@
+//! The structs of `kernels/layout.cuh`, field by field; both sides assert the sizes, tests compare the offsets.
+
+use bytemuck::{Pod, Zeroable};
+use cudarc::driver::DeviceRepr;
+
+use crate::storage::TILE_QUADS;
+use modalcast_model::domain::RING_START;
+use modalcast_model::scene::Movers;
+
+/// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
+pub(super) const BLOCK: u32 = 256;
+
+/// `first_tangent` of a shape without tangents.
+pub(super) const NO_TANGENTS: u32 = u32::MAX;
+
+/// `first_member` of a shape without smoothing groups.
+pub(super) const NO_GROUPS: u32 = u32::MAX;
+
+/// `frame` of a domain that follows no other.
+pub(super) const NO_FRAME: u32 = Movers::NO_FRAME;
+
+/// Parts of [`Tile`]'s kind: the items of the last quad, or 0 in a mixed tile; what is computed of the items.
+pub(super) const TILE_LAST: u8 = 7;
+pub(super) const TILE_VERTICES: u8 = 8;
+pub(super) const TILE_CORNERS: u8 = 16;
+
+/// The start of a step's inputs; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct Header {
+    pub positions: u64,
+    pub normals: u64,
+    pub tangents: u64,
+    pub displacements: u64,
+    pub since: u32,
+    pub everything: u32,
+    pub step: u32,
+    pub changed: u32,
+    pub stale: u32,
+    pub reserved: [u32; 3],
+    pub bounds: [u32; 12],
+}
+
+/// The work of one warp of `deform`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Tile {
+    pub first_word: u64,
+    pub first: u32,
+    pub rest: u32,
+    pub domain: u32,
+    pub first_q: u32,
+    pub first_scale: u32,
+    pub chunks: u16,
+    pub width: u8,
+    pub kind: u8,
+}
+
+/// A quad of a mixed tile.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Lane {
+    pub item: u32,
+    pub rest: u32,
+    pub domain: u32,
+    pub first_q: u32,
+}
+
+/// A changed domain in the list of `apply`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Change {
+    pub domain: u32,
+    pub first_q: u32,
+    pub count: u32,
+    pub source: u32,
+}
+
+/// Whose transform a domain has, and which frame it has in it; in scenes with followers.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Following {
+    pub mover: u32,
+    pub frame: u32,
+}
+
+/// Arguments of `deform`; pointers are device addresses, as in all arguments below.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct DeformArgs {
+    pub header: u64,
+    pub tiles: u64,
+    pub lanes: u64,
+    pub words: u64,
+    pub rest: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub corner_shifts: u64,
+    pub scales: u64,
+    pub lane_scales: u64,
+    pub transforms: u64,
+    pub following: u64,
+    pub frames: u64,
+    pub q: u64,
+    pub list: u64,
+    pub kept_counts: u64,
+    pub kept: u64,
+    pub boxes: u64,
+    pub count: u32,
+    pub reserved: u32,
+}
+
+/// Domains of one shape whose U `batch` reads once.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Group {
+    pub first_word: u64,
+    pub rest: u32,
+    pub first_scale: u32,
+    pub vertices: u32,
+    pub first_member: u32,
+    pub chunks: u32,
+    pub members: u32,
+}
+
+/// One of them.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Member {
+    pub first: u32,
+    pub first_q: u32,
+    pub domain: u32,
+    pub first_tile: u32,
+}
+
+/// The work of one block of `batch`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct Block {
+    pub group: u32,
+    pub tile: u32,
+    pub end: u32,
+    pub reserved: u32,
+}
+
+/// Arguments of `batch`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct BatchArgs {
+    pub header: u64,
+    pub blocks: u64,
+    pub groups: u64,
+    pub members: u64,
+    pub words: u64,
+    pub rest: u64,
+    pub scales: u64,
+    pub transforms: u64,
+    pub following: u64,
+    pub frames: u64,
+    pub q: u64,
+    pub boxes: u64,
+}
+
+/// A part of a domain of which `bounds` makes a box.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub struct Piece {
+    pub first: u32,
+    pub count: u32,
+    pub domain: u32,
+    pub of_vertices: u32,
+}
+
+/// Arguments of `bounds`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct BoundsArgs {
+    pub header: u64,
+    pub boxes: u64,
+    pub pieces: u64,
+    pub stamps: u64,
+    pub piece_boxes: u64,
+    pub count: u32,
+    pub piece_count: u32,
+    pub light: [f32; 9],
+    pub reserved: u32,
+}
+
+/// Arguments of `apply`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct ApplyArgs {
+    pub header: u64,
+    pub changes: u64,
+    pub new_transforms: u64,
+    pub new_q: u64,
+    pub stale: u64,
+    pub following: u64,
+    pub transforms: u64,
+    pub q: u64,
+    pub stamps: u64,
+    pub list: u64,
+}
+
+/// Where the corners of one domain lie, and the vertices around which `normals` gathers.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(super) struct NormalSlot {
+    pub first: u32,
+    pub first_normal: u32,
+    pub first_tangent: u32,
+    pub first_vertex: u32,
+    pub first_member: u32,
+}
+
+/// Arguments of `normals`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct NormalsArgs {
+    pub header: u64,
+    pub slots: u64,
+    pub first_domains: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub transforms: u64,
+    pub following: u64,
+    pub frames: u64,
+    pub stamps: u64,
+    pub members: u64,
+    pub begins: u64,
+    pub rings: u64,
+    pub group_normals: u64,
+    pub corners: u32,
+    pub rest_corners: u32,
+    pub groups: u32,
+    pub reserved: u32,
+}
+
+const _: () = assert!(size_of::<Header>() == 112, "Header differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Following>() == 8, "Following differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Group>() == 32, "Group differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Member>() == 16, "Member differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Block>() == 16, "Block differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchArgs>() == 96, "BatchArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Piece>() == 16, "Piece differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoundsArgs>() == 88, "BoundsArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from kernels/layout.cuh");
+
+// SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in kernels/layout.cuh.
+unsafe impl DeviceRepr for DeformArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for BatchArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for BoundsArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for ApplyArgs {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for NormalsArgs {}
+
+/// A size or an offset that both sides must agree on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Agreement {
+    /// The C++ expression, e.g. `OFFSET(VertexSlot, rank)`.
+    pub expression: String,
+    /// Its value on the host.
+    pub host: u32,
+}
+
+macro_rules! agreements {
+    ($($of:ident { $($field:ident),* })*) => {
+        vec![$(
+            Agreement { expression: concat!("sizeof(", stringify!($of), ")").into(), host: size_of::<$of>() as u32 },
+            $(Agreement {
+                expression: concat!("OFFSET(", stringify!($of), ", ", stringify!($field), ")").into(),
+                host: std::mem::offset_of!($of, $field) as u32,
+            },)*
+        )*]
+    };
+}
+
+/// Every size, offset and constant that host and device share, with the host's value.
+pub fn agreements() -> Vec<Agreement> {
+    let mut list = agreements! {
+        Header {
+            positions, normals, tangents, displacements, since, everything, step, changed, stale, reserved, bounds
+        }
+        Tile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
+        Lane { item, rest, domain, first_q }
+        Change { domain, first_q, count, source }
+        Following { mover, frame }
+        DeformArgs {
+            header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
+            transforms, following, frames, q, list, kept_counts, kept, boxes, count, reserved
+        }
+        Group { first_word, rest, first_scale, vertices, first_member, chunks, members }
+        Member { first, first_q, domain, first_tile }
+        Block { group, tile, end, reserved }
+        BatchArgs {
+            header, blocks, groups, members, words, rest, scales, transforms, following, frames, q, boxes
+        }
+        Piece { first, count, domain, of_vertices }
+        BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count, light, reserved }
+        ApplyArgs { header, changes, new_transforms, new_q, stale, following, transforms, q, stamps, list }
+        NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
+        NormalsArgs {
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, following, frames, stamps, members,
+            begins, rings, group_normals, corners, rest_corners, groups, reserved
+        }
+    };
+    for (name, host) in [("TILE_LAST", TILE_LAST), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)] {
+        list.push(Agreement { expression: name.into(), host: u32::from(host) });
+    }
+    list.push(Agreement { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
+    list.push(Agreement { expression: "BLOCK".into(), host: BLOCK });
+    list.push(Agreement { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
+    list.push(Agreement { expression: "NO_GROUPS".into(), host: NO_GROUPS });
+    list.push(Agreement { expression: "NO_FRAME".into(), host: NO_FRAME });
+    list.push(Agreement { expression: "RING_START".into(), host: RING_START });
+    list
+}
+
+/// The start of a source that states agreements: NVRTC has no `offsetof`, so this is what that macro expands to.
+pub(super) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
+
+/// A kernel `report` that writes the device's value of every agreement, in order, into its only argument.
+pub(super) fn report_source() -> String {
+    let line = |(index, agreement): (usize, &Agreement)| {
+        format!("    values[{index}] = (unsigned)({});\n", agreement.expression)
+    };
+    let lines: String = agreements().iter().enumerate().map(line).collect();
+    format!("{PRELUDE}extern \"C\" __global__ void report(unsigned* values) {{\n{lines}}}\n")
+}

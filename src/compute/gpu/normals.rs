@@ -1,0 +1,86 @@
+//! Launches `kernels/normals.cu`: world normals and tangents that follow the deformed triangles, of all corners at once.
+
+use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig};
+
+use super::chain;
+use super::deform::config;
+use super::device::Device;
+use super::inputs::Values;
+use super::layout::NormalsArgs;
+use super::memory::{address, upload};
+use super::pack;
+use super::plan::Kernel;
+use super::rings::{self, Rings};
+use modalcast_model::error::Result;
+use modalcast_model::scene::Scene;
+
+/// The kernel and what it reads of a scene.
+#[derive(Debug)]
+pub struct Normals {
+    pub function: CudaFunction,
+    config: LaunchConfig,
+    slots: CudaSlice<u8>,
+    first_domains: CudaSlice<u8>,
+    rest_normals: CudaSlice<u8>,
+    rest_tangents: Option<CudaSlice<u8>>,
+    members: CudaSlice<u8>,
+    begins: CudaSlice<u8>,
+    rings: CudaSlice<u8>,
+    group_normals: CudaSlice<u8>,
+    corners: u32,
+    rest_corners: u32,
+    groups: u32,
+}
+
+impl Normals {
+    pub fn new(device: &Device, scene: &Scene, kernel: &Kernel) -> Result<Self> {
+        let slots = rings::slots(scene);
+        let firsts = pack::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners);
+        let tangents = || upload(device, &pack::rest_tangents(scene));
+        let tables = Rings::new(scene);
+        Ok(Self {
+            function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
+            config: config(kernel),
+            slots: upload(device, &slots)?,
+            first_domains: upload(device, &firsts)?,
+            rest_normals: upload(device, &pack::rest_normals(scene))?,
+            rest_tangents: scene.needs.normal_maps.then(tangents).transpose()?,
+            members: upload(device, &tables.members)?,
+            begins: upload(device, &tables.begins)?,
+            rings: upload(device, &tables.rings)?,
+            group_normals: upload(device, &tables.normals)?,
+            corners: scene.layout.corners as u32,
+            rest_corners: pack::rest_corners(scene) as u32,
+            groups: (tables.normals.len() / 3) as u32,
+        })
+    }
+
+    /// Starts the kernel, behind the one that writes the positions; the header among the values says where they lie and
+    /// where normals and tangents go.
+    pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
+        let args = NormalsArgs {
+            header: values.header,
+            slots: address(device, &self.slots),
+            first_domains: address(device, &self.first_domains),
+            rest_normals: address(device, &self.rest_normals),
+            rest_tangents: self.rest_tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
+            transforms: values.transforms,
+            following: values.following,
+            frames: values.frames,
+            stamps: values.stamps,
+            members: address(device, &self.members),
+            begins: address(device, &self.begins),
+            rings: address(device, &self.rings),
+            group_normals: address(device, &self.group_normals),
+            corners: self.corners,
+            rest_corners: self.rest_corners,
+            groups: self.groups,
+            reserved: 0,
+        };
+        // SAFETY: `NormalsArgs` is the kernel's only argument, and the kernel waits first. The tables come from `pack` and `rings`: members name
+        // groups, rings name vertices of their shape, and slots lie inside the rest normals, tangents, positions and
+        // transforms of the same scene. The header's outputs have the sizes that `Output` checked, and tangents are
+        // read and written only by a kernel that was compiled for a scene with normal maps.
+        unsafe { chain::launch(device, &self.function, self.config, &args) }
+    }
+}

@@ -1,0 +1,262 @@
+//! Launches `kernels/raster.cu`: which triangle each sample of a window sees and how deep, or depth alone, by atomic minima.
+//!
+//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels; of larger and clipped ones a warp draws
+//! a tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
+//! stay on the device. Of a cut-out a sample is kept where alpha is large enough, asked before the minimum; meshes without
+//! any compile nothing of that.
+//!
+//! | file | what |
+//! |---|---|
+//! | `form` | the variants of the kernels |
+//! | [`check`] | which meshes are refused |
+//! | `cut_out` | texture coordinates, surfaces and images of cut-outs |
+//! | `opengl` | positions and samples in OpenGL's buffers |
+
+mod check;
+mod cut_out;
+mod form;
+mod opengl;
+
+use bytemuck::{Pod, Zeroable};
+use cudarc::driver::sys::{self, CUdevice_attribute};
+use cudarc::driver::{CudaFunction, CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+
+pub use self::check::{check, check_cut_outs};
+use self::cut_out::Cut;
+pub(super) use self::form::{FUNCTIONS, SOURCE, WHOLE};
+pub use self::form::{RasterForm, Spread};
+pub use self::opengl::GlRaster;
+use super::device::Device;
+use super::memory::{address, download, room, upload};
+use modalcast_model::error::{Result, during};
+use modalcast_model::raster::CutOuts;
+use modalcast_model::scene::{Faces, Group, Window};
+
+/// Threads of a block, and blocks of a multiprocessor where blocks take turns.
+const BLOCK: u32 = 128;
+const RESIDENT: u32 = 16;
+
+/// What a sample holds before anything is drawn.
+const NOTHING: u32 = u32::MAX;
+
+/// Arguments of all kernels; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct RasterArgs {
+    positions: u64,
+    triangles: u64,
+    target: u64,
+    medium: u64,
+    large: u64,
+    tally: u64,
+    uvs: u64,
+    surfaces: u64,
+    table: u64,
+    clip: [f32; 16],
+    half: [f32; 2],
+    guard: [f32; 2],
+    size: [u32; 2],
+    first: u32,
+    count: u32,
+    faces: u32,
+    cut: u32,
+}
+
+const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from kernels/raster.cuh");
+
+// SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
+unsafe impl DeviceRepr for RasterArgs {}
+
+/// What was queued and counted.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct Tally {
+    medium: u32,
+    pad: u32,
+    large: u64,
+    counts: [u32; 8],
+}
+
+const _: () = assert!(size_of::<Tally>() == 48, "Tally differs from kernels/raster.cuh");
+
+/// Bytes of an entry of the large queue.
+const LARGE: u64 = 16;
+
+/// The compiled kernels of one form.
+#[derive(Debug)]
+pub struct Functions {
+    form: RasterForm,
+    raster: CudaFunction,
+    /// Where there are cut-outs.
+    raster_cut: Option<CudaFunction>,
+    raster_warps: CudaFunction,
+    raster_tiles: CudaFunction,
+}
+
+impl Functions {
+    /// Compiles a form, or takes it from the cache.
+    ///
+    /// # Errors
+    /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
+    pub fn new(device: &Device, form: RasterForm, cut: bool) -> Result<Self> {
+        let names: &[&str] = if cut { &FUNCTIONS } else { &WHOLE };
+        let mut list = device.functions(names, SOURCE, &form.defines(cut))?.into_iter();
+        let mut next = || list.next().ok_or_else(|| during("load kernel")("a function is missing"));
+        Ok(Self {
+            form,
+            raster: next()?,
+            raster_cut: if cut { Some(next()?) } else { None },
+            raster_warps: next()?,
+            raster_tiles: next()?,
+        })
+    }
+
+    /// Each with its name.
+    pub fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
+        let list = [Some(&self.raster), self.raster_cut.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
+        FUNCTIONS.into_iter().zip(list).filter_map(|(name, function)| function.map(|function| (name, function)))
+    }
+}
+
+/// What is drawn where, once: addresses on the device, of as many vertices as [`check`] was told and of a sample for each
+/// pixel.
+#[derive(Debug, Clone, Copy)]
+pub struct Pass<'a> {
+    pub functions: &'a Functions,
+    pub groups: &'a [Group],
+    pub window: &'a Window,
+    pub positions: u64,
+    pub target: u64,
+}
+
+/// A mesh's triangles on the device, and the queues for them.
+#[derive(Debug)]
+pub struct Core {
+    triangles: CudaSlice<u8>,
+    medium: CudaSlice<u8>,
+    large: CudaSlice<u8>,
+    tally: CudaSlice<u8>,
+    cut: Option<Cut>,
+    /// Blocks of the kernels that take turns.
+    blocks: u32,
+}
+
+impl Core {
+    /// Puts triangles and cut-outs that [`check`] and [`check_cut_outs`] let pass onto the device.
+    ///
+    /// # Errors
+    /// `Fault` when the device refuses.
+    pub fn new(device: &Device, triangles: &[[u32; 3]], cut_outs: Option<&CutOuts>) -> Result<Self> {
+        let units = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT);
+        let units = u32::try_from(units.map_err(during("device"))?).unwrap_or(1);
+        let count = triangles.len() as u64;
+        Ok(Self {
+            triangles: upload(device, triangles.as_flattened())?,
+            medium: room(device, 4 * count)?,
+            large: room(device, LARGE * count)?,
+            tally: room(device, size_of::<Tally>() as u64)?,
+            cut: cut_outs.map(|cut_outs| Cut::new(device, cut_outs)).transpose()?,
+            blocks: RESIDENT * units,
+        })
+    }
+
+    /// Whether its passes need functions with cut-outs.
+    pub const fn is_cut(&self) -> bool {
+        self.cut.is_some()
+    }
+
+    /// Clears the target and draws into it, on the device's stream.
+    ///
+    /// # Errors
+    /// `Fault` when the device refuses.
+    pub fn draw(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
+        self.clear(device, pass)?;
+        let (args, functions) = (self.args(device, pass), pass.functions);
+        for group in pass.groups {
+            let (whole, cut) = self.split(*group);
+            for (function, own) in [(Some(&functions.raster), whole), (functions.raster_cut.as_ref(), cut)] {
+                if let Some(function) = function.filter(|_| own.triangles > 0) {
+                    let faces = u32::from(own.faces == Faces::Fronts);
+                    let args = RasterArgs { first: own.first, count: own.triangles, faces, ..args };
+                    start(device, function, own.triangles.div_ceil(BLOCK), args)?;
+                }
+            }
+        }
+        start(device, &functions.raster_warps, self.blocks, args)?;
+        start(device, &functions.raster_tiles, self.blocks, args)
+    }
+
+    /// Launches of a pass over these groups.
+    pub fn launches(&self, groups: &[Group]) -> usize {
+        let of_group = |group: &Group| {
+            let (whole, cut) = self.split(*group);
+            usize::from(whole.triangles > 0) + usize::from(cut.triangles > 0)
+        };
+        2 + groups.iter().map(of_group).sum::<usize>()
+    }
+
+    /// The part of a group before the first cut-out, and the rest.
+    fn split(&self, group: Group) -> (Group, Group) {
+        let first = self.cut.as_ref().map_or(u32::MAX, |cut| cut.first);
+        let whole = first.saturating_sub(group.first).min(group.triangles);
+        let cut = Group { first: group.first + whole, triangles: group.triangles - whole, ..group };
+        (Group { triangles: whole, ..group }, cut)
+    }
+
+    /// Triangles of the last pass by what became of them, as the kernels' paths are numbered; zeros unless its form counts.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub fn counts(&self, device: &Device) -> Result<[u32; 8]> {
+        let mut tally = [Tally::zeroed()];
+        // SAFETY: the buffer is one tally.
+        unsafe { download(device, address(device, &self.tally), &mut tally) }?;
+        Ok(tally[0].counts)
+    }
+
+    fn args(&self, device: &Device, pass: &Pass<'_>) -> RasterArgs {
+        let cut = self.cut.as_ref();
+        let addresses = cut.map(|cut| cut.addresses(device)).unwrap_or_default();
+        RasterArgs {
+            positions: pass.positions,
+            triangles: address(device, &self.triangles),
+            target: pass.target,
+            medium: address(device, &self.medium),
+            large: address(device, &self.large),
+            tally: address(device, &self.tally),
+            clip: *pass.window.clip(),
+            half: pass.window.half(),
+            guard: pass.window.guard(),
+            size: pass.window.size(),
+            uvs: addresses.uvs,
+            surfaces: addresses.surfaces,
+            table: addresses.table,
+            cut: cut.map_or(u32::MAX, |cut| cut.first),
+            ..RasterArgs::zeroed()
+        }
+    }
+
+    /// Empty queues and samples without anything.
+    fn clear(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
+        let form = pass.functions.form;
+        let nothing = if form.depth_only { 1.0_f32.to_bits() } else { NOTHING };
+        let words = form.bytes(pass.window) / 4;
+        let tally = (address(device, &self.tally), 0, size_of::<Tally>() as u64 / 4);
+        for (buffer, word, words) in [(pass.target, nothing, words), tally] {
+            let stream = device.stream().cu_stream();
+            // SAFETY: the buffer has these words, all of which are written on the stream that orders its readers.
+            let set = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
+            set.result().map_err(during("raster"))?;
+        }
+        Ok(())
+    }
+}
+
+fn start(device: &Device, function: &CudaFunction, blocks: u32, args: RasterArgs) -> Result<()> {
+    let mut launch = device.stream().launch_builder(function);
+    let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
+    // SAFETY: `RasterArgs` is the kernels' only argument. `check` saw that triangles name vertices that are there and
+    // groups triangles; queues have room for each of them, and the target a sample for each pixel.
+    unsafe { launch.arg(&args).launch(config) }.map_err(during("raster"))?;
+    Ok(())
+}

@@ -1,0 +1,118 @@
+//! Smoothing groups of a scene to the tables that `normals` reads. Pure.
+
+use super::layout::{NO_GROUPS, NormalSlot};
+use super::pack;
+use modalcast_model::domain::{Shape, Smoothing};
+use modalcast_model::scene::Scene;
+
+/// The tables, with the groups of all shapes numbered through.
+#[derive(Debug, Default)]
+pub(super) struct Rings {
+    /// The group of each corner of the shapes that have groups.
+    pub members: Vec<u32>,
+    /// Where each group's ring begins, and where the last ends.
+    pub begins: Vec<u32>,
+    pub rings: Vec<u32>,
+    /// Geometric normals at rest, a plane per axis.
+    pub normals: Vec<f32>,
+}
+
+/// Their lengths.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Counts {
+    pub members: u64,
+    pub groups: u64,
+    pub rings: u64,
+}
+
+fn smoothings(scene: &Scene) -> impl Iterator<Item = &Smoothing> {
+    scene.shapes.iter().filter_map(Shape::smoothing)
+}
+
+impl Counts {
+    pub(super) fn of(scene: &Scene) -> Self {
+        smoothings(scene).fold(Self::default(), |sum, smoothing| Self {
+            members: sum.members + smoothing.members().len() as u64,
+            groups: sum.groups + smoothing.groups() as u64,
+            rings: sum.rings + smoothing.rings().len() as u64,
+        })
+    }
+
+    /// Bytes of the members that a scene with exact normals would have; what its rings would take is not known before
+    /// they are made.
+    pub(super) fn bytes_of_possible_members(scene: &Scene) -> u64 {
+        let shapes = scene.shapes.iter().filter(|shape| shape.modes.rank() > 0);
+        shapes.map(|shape| 4 * shape.mesh.corners().vertices.len() as u64).sum()
+    }
+}
+
+impl Rings {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let mut all = Self::default();
+        for smoothing in smoothings(scene) {
+            // Every index fits: a scene has at most `MAX_RING_TRIANGLES` triangles in rings.
+            let (group, ring) = (all.begins.len() as u32, all.rings.len() as u32);
+            all.members.extend(smoothing.members().iter().map(|member| member + group));
+            all.begins.extend(smoothing.begins()[..smoothing.groups()].iter().map(|begin| begin + ring));
+            all.rings.extend_from_slice(smoothing.rings());
+        }
+        all.begins.push(all.rings.len() as u32);
+        let plane = |axis: usize| smoothings(scene).flat_map(Smoothing::normals).map(move |normal| normal[axis]);
+        all.normals = (0..3).flat_map(plane).collect();
+        all
+    }
+}
+
+/// One slot per domain, for `normals`.
+pub(super) fn slots(scene: &Scene) -> Vec<NormalSlot> {
+    let mut members = 0;
+    let first_member = |shape: &Shape| {
+        shape.smoothing().map_or(NO_GROUPS, |smoothing| {
+            let first = members;
+            members += smoothing.members().len() as u32;
+            first
+        })
+    };
+    let first_members: Vec<u32> = scene.shapes.iter().map(first_member).collect();
+    let slot = |(corner, (domain, slot)): (
+        super::pack::CornerSlot,
+        (&modalcast_model::domain::Domain, &modalcast_model::scene::Slot),
+    )| {
+        NormalSlot {
+            first: corner.first,
+            first_normal: corner.first_normal,
+            first_tangent: corner.first_tangent,
+            first_vertex: slot.first_vertex as u32,
+            first_member: first_members[domain.shape],
+        }
+    };
+    let domains = scene.domains.iter().zip(&scene.layout.slots);
+    pack::corner_slots(scene).into_iter().zip(domains).map(slot).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pack::tests::exact;
+    use super::*;
+
+    #[test]
+    fn every_corner_finds_the_ring_and_the_normal_of_its_group_and_rigid_shapes_have_none() {
+        let scene = exact(&[(7, 2), (300, 0), (8, 5), (513, 1)]);
+        let (rings, slots, counts) = (Rings::new(&scene), slots(&scene), Counts::of(&scene));
+        assert_eq!(counts.members as usize, rings.members.len());
+        assert_eq!((counts.groups as usize + 1, counts.rings as usize), (rings.begins.len(), rings.rings.len()));
+        assert_eq!(slots[2].first_member, NO_GROUPS);
+        assert_eq!(slots[4].first_member, slots[5].first_member, "instances share");
+        for (domain, slot) in slots.iter().enumerate() {
+            assert_eq!(slot.first_vertex as usize, scene.layout.slots[domain].first_vertex);
+            let Some(smoothing) = scene.shape_of(domain).smoothing() else { continue };
+            for (corner, member) in smoothing.members().iter().enumerate() {
+                let group = rings.members[slot.first_member as usize + corner] as usize;
+                let ring = &rings.rings[rings.begins[group] as usize..rings.begins[group + 1] as usize];
+                assert_eq!(ring, smoothing.ring(*member as usize));
+                let normal = [0, 1, 2].map(|axis| rings.normals[axis * counts.groups as usize + group]);
+                assert_eq!(normal, smoothing.normals()[*member as usize]);
+            }
+        }
+    }
+}

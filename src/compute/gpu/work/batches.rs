@@ -1,0 +1,111 @@
+//! Domains that share a shape, in groups for which `batch` reads U once. Pure.
+
+use super::super::layout::{Block, Group, Member};
+use super::{Coordinates, Work, chunks_of, quads_of};
+use crate::storage::TILE_QUADS;
+use modalcast_model::scene::{Batches, Scene};
+
+/// The most domains of a group.
+pub(in super::super) const MOST: usize = 16;
+
+/// In scenes that choose, a shape has batches when its U takes so many bytes, about a third of a large device's L2 cache,
+const LARGE: u64 = 16 << 20;
+/// or when all its domains together would read so many. Below either, reading from the cache again is faster: a batch takes
+/// a warp of few, and long. Measured on an H200, where both ways took as long as each other at about 100 MB of 16,000
+/// vertices, and at 20 MB of two domains.
+const MUCH: u64 = 128 << 20;
+
+/// Blocks that keep a large device busy to the end; beyond so many, a block has several tiles, for which it loads T and q
+/// once, up to [`LONGEST`].
+const ENOUGH_BLOCKS: usize = 4096;
+const LONGEST: usize = 8;
+
+/// What `batch` computes of a scene.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(in super::super) struct Batched {
+    pub groups: Vec<Group>,
+    pub members: Vec<Member>,
+    pub blocks: Vec<Block>,
+    /// The most chunks of modes of a group.
+    pub chunks: usize,
+    /// The most members of a group.
+    pub most: usize,
+}
+
+/// Of each shape, whether its domains are deformed together.
+pub(in super::super) fn shapes(scene: &Scene) -> Vec<bool> {
+    let needs = scene.needs;
+    // They sum in other ways, or write more.
+    let never = needs.truncation || needs.compensated || needs.displacements;
+    let mut users = vec![0_usize; scene.shapes.len()];
+    scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
+    let chosen = |(shape, users): (usize, usize)| {
+        let of = &scene.shapes[shape];
+        let bytes = (48 * quads_of(of) * chunks_of(scene, of)) as u64;
+        let pays = bytes >= LARGE || users as u64 * bytes >= MUCH;
+        match scene.deformation.batches {
+            Batches::Never => false,
+            Batches::Auto => users > 1 && pays,
+            Batches::Always => users > 1,
+        }
+    };
+    let has_modes = |shape: usize| scene.shapes[shape].modes.rank() > 0;
+    users.into_iter().enumerate().map(|user| !never && has_modes(user.0) && chosen(user)).collect()
+}
+
+impl Batched {
+    /// Tiles of all groups.
+    pub(in super::super) fn tiles(&self) -> usize {
+        self.blocks.iter().map(|block| (block.end - block.tile) as usize).sum()
+    }
+
+    /// Of the tiles that are there; `first_words` are those of the shapes.
+    pub(super) fn new(
+        scene: &Scene,
+        (work, coordinates): (&Work, &Coordinates),
+        (batched, first_words): (&[bool], &[Option<u64>]),
+    ) -> Self {
+        let mut shapes: Vec<usize> = (0..scene.shapes.len()).filter(|shape| batched[*shape]).collect();
+        shapes.sort_by_key(|shape| std::cmp::Reverse(chunks_of(scene, &scene.shapes[*shape])));
+        let mut users = vec![Vec::new(); scene.shapes.len()];
+        scene.domains.iter().enumerate().for_each(|(index, domain)| users[domain.shape].push(index));
+        let mut all = Self::default();
+        let tiles_of = |shape: usize| quads_of(&scene.shapes[shape]).div_ceil(TILE_QUADS);
+        let work_items = shapes.iter().map(|shape| tiles_of(*shape) * users[*shape].len().div_ceil(MOST));
+        let run = (work_items.sum::<usize>() / ENOUGH_BLOCKS).clamp(1, LONGEST);
+        for shape in shapes {
+            let of = &scene.shapes[shape];
+            let first_group = all.groups.len();
+            let users = &users[shape];
+            // Groups of the same size: none of them is nearly empty.
+            let count = users.len().div_ceil(MOST);
+            for list in users.chunks(users.len().div_ceil(count)) {
+                all.groups.push(Group {
+                    first_word: first_words[shape].unwrap_or(0),
+                    rest: work.quads.vertices[shape],
+                    first_scale: work.first_scale[shape],
+                    vertices: of.mesh.rest().len() as u32,
+                    first_member: all.members.len() as u32,
+                    chunks: chunks_of(scene, of) as u32,
+                    members: list.len() as u32,
+                });
+                all.members.extend(list.iter().map(|domain| Member {
+                    first: scene.layout.slots[*domain].first_vertex as u32,
+                    first_q: coordinates.first[*domain],
+                    domain: *domain as u32,
+                    first_tile: work.spans[*domain][0].0,
+                }));
+                all.most = all.most.max(list.len());
+            }
+            all.chunks = all.chunks.max(chunks_of(scene, of));
+            // Groups of one shape side by side: what one reads of U the next one finds in the cache.
+            let groups = first_group as u32..all.groups.len() as u32;
+            let end = tiles_of(shape) as u32;
+            all.blocks.extend((0..end).step_by(run).flat_map(|tile| {
+                let end = end.min(tile + run as u32);
+                groups.clone().map(move |group| Block { group, tile, end, reserved: 0 })
+            }));
+        }
+        all
+    }
+}

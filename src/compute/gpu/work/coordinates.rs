@@ -1,0 +1,34 @@
+//! Where reduced coordinates lie on the device. Pure.
+
+use crate::storage::modes_per_chunk;
+use modalcast_model::scene::{Scene, Storage};
+
+/// Where a domain's coordinates lie on the device: whole chunks of them.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Coordinates {
+    /// Of each domain.
+    pub first: Vec<u32>,
+    /// Numbers of all, a multiple of four.
+    pub total: usize,
+    /// Whether they lie as in the scene's own packing.
+    pub as_packed: bool,
+}
+
+impl Coordinates {
+    pub fn new(scene: &Scene) -> Self {
+        let storage = scene.deformation.storage;
+        // Factors belong to a shape and lists of modes to a domain, so those who share coordinates cannot share these.
+        if storage == Storage::F32 && !scene.needs.truncation {
+            let first = scene.layout.slots.iter().map(|slot| slot.first_q as u32).collect();
+            return Self { first, total: scene.layout.coordinates.next_multiple_of(4), as_packed: true };
+        }
+        let mut total = 0;
+        let place = |slot: &modalcast_model::scene::Slot| {
+            let first = total;
+            total += slot.rank.next_multiple_of(modes_per_chunk(storage));
+            first as u32
+        };
+        let first = scene.layout.slots.iter().map(place).collect();
+        Self { first, total: total.next_multiple_of(4), as_packed: false }
+    }
+}

@@ -1,0 +1,328 @@
+//! A scene to the work list of `deform`: one tile per warp, whatever domains it holds. Pure.
+//!
+//! A tile computes vertices, or corners, or both where corner i of a shape is its vertex i.
+//! A shape of more than `SMALL` quads, or one with modes that several domains share, is cut into tiles of its own, and
+//! its U lies on the device once. The quads of smaller domains with the same number of chunks fill tiles together, so
+//! that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first: a long tile that began last would be
+//! waited for. Vertices of domains that `batches` puts into groups have tiles too, behind all others: a whole step leaves
+//! them to `batch`, and a list of changed domains names them.
+
+pub(super) mod batches;
+mod coordinates;
+mod quads;
+#[cfg(test)]
+pub(super) mod tests;
+
+use batches::Batched;
+pub use coordinates::Coordinates;
+pub(super) use quads::{Quads, rest_directions, rest_positions};
+
+use super::layout::{Lane, TILE_CORNERS, TILE_VERTICES, Tile};
+use crate::storage::{Plane, TILE_QUADS, Tiles, modes_per_chunk};
+use modalcast_model::domain::Shape;
+use modalcast_model::scene::{Scene, Storage};
+
+/// The most quads of a domain that shares a tile with others.
+const SMALL: usize = TILE_QUADS / 2;
+
+/// Vertices of a quad.
+const QUAD: usize = crate::storage::QUAD;
+
+/// What lies in the words, in order.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Source {
+    /// All tiles of a shape.
+    Shape(usize),
+    /// The quads of these shapes side by side.
+    Mixed(Vec<usize>),
+}
+
+/// The work list, and where everything it names lies.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Work {
+    pub tiles: Vec<Tile>,
+    /// Of each shape, whether one lane has a vertex and its corner: different kernels compute those of batches.
+    pub alike: Vec<bool>,
+    /// Tiles before those that a whole step leaves to `batch`.
+    pub launched: usize,
+    /// Of those, the first that have vertices; tiles of corners alone follow.
+    pub with_vertices: usize,
+    pub batched: Batched,
+    pub lanes: Vec<Lane>,
+    /// The first scale of each lane; only with `Int8`.
+    pub lane_scales: Vec<u32>,
+    pub sources: Vec<Source>,
+    /// Words of 16 bytes.
+    pub words: u64,
+    pub quads: Quads,
+    /// Of each shape, its first scale, and the scales of all.
+    pub first_scale: Vec<u32>,
+    pub scales: u64,
+    /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
+    pub spans: Vec<[(u32, u32); 2]>,
+    /// Of each domain, from its first vertex to its first corner, wrapping; empty when all are at the same place.
+    pub corner_shifts: Vec<u32>,
+}
+
+/// Whether corner i of a shape is its vertex i, so that one lane has both.
+fn is_alike(shape: &Shape) -> bool {
+    let corners = &shape.mesh.corners().vertices;
+    corners.len() == shape.mesh.rest().len() && corners.iter().enumerate().all(|(at, vertex)| at as u32 == *vertex)
+}
+
+/// Whether `deform` turns normals; those that follow the surface come after it.
+pub(super) fn orients(scene: &Scene) -> bool {
+    !scene.needs.exact_normals
+}
+
+/// What a domain's tile computes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Role {
+    chunks: usize,
+    /// Parts of [`Tile`]'s kind.
+    flags: u8,
+}
+
+/// One tile before it has its place: of one domain, or of the whole of several.
+enum Item {
+    Own { domain: usize, tile: usize },
+    Mixed(Vec<usize>),
+}
+
+impl Work {
+    pub(super) fn new(scene: &Scene, coordinates: &Coordinates) -> Self {
+        let batched = batches::shapes(scene);
+        let alike = scene.shapes.iter().zip(&batched).map(|(shape, batched)| !batched && is_alike(shape)).collect();
+        let mut work = Self::empty(scene, alike);
+        let mut items = items(scene, &work.alike);
+        let is_batched = |role: Role, item: &Item| match item {
+            Item::Own { domain, .. } => role.flags & TILE_VERTICES > 0 && batched[scene.domains[*domain].shape],
+            Item::Mixed(_) => false,
+        };
+        let has_vertices = |role: &Role| role.flags & TILE_VERTICES > 0;
+        items
+            .sort_by_key(|(role, item)| (is_batched(*role, item), std::cmp::Reverse(role.chunks), !has_vertices(role)));
+        work.launched = items.partition_point(|(role, item)| !is_batched(*role, item));
+        work.with_vertices = items[..work.launched].partition_point(|(role, _)| has_vertices(role));
+        let mut first_words: Vec<Option<u64>> = vec![None; scene.shapes.len()];
+        for (role, item) in items {
+            let index = work.tiles.len() as u32;
+            match item {
+                Item::Own { domain, tile } => {
+                    let first_word =
+                        work.place_words(scene, scene.domains[domain].shape, role.chunks, &mut first_words);
+                    let own = work.own_tile(scene, coordinates, role, (domain, tile));
+                    let before = (3 * role.chunks * TILE_QUADS * tile) as u64;
+                    work.tiles.push(Tile { first_word: first_word + before, ..own });
+                    work.note_span(domain, role, index);
+                }
+                Item::Mixed(domains) => {
+                    work.push_mixed(scene, coordinates, role, &domains);
+                    domains.iter().for_each(|domain| work.note_span(*domain, role, index));
+                }
+            }
+        }
+        if scene.deformation.storage != Storage::Int8 {
+            work.lane_scales.clear();
+        }
+        work.batched = Batched::new(scene, (&work, coordinates), (&batched, &first_words));
+        work
+    }
+
+    /// Room for scales of every shape, and no tiles yet.
+    fn empty(scene: &Scene, alike: Vec<bool>) -> Self {
+        let storage = scene.deformation.storage;
+        let (mut scales, mut first_scale) = (0_u64, Vec::new());
+        for shape in &scene.shapes {
+            first_scale.push(scales as u32);
+            if storage == Storage::Int8 {
+                let per_tile = shape.modes.rank().next_multiple_of(modes_per_chunk(storage));
+                scales += (per_tile * quads_of(shape).div_ceil(TILE_QUADS)) as u64;
+            }
+        }
+        Self {
+            tiles: Vec::new(),
+            launched: 0,
+            with_vertices: 0,
+            batched: Batched::default(),
+            lanes: Vec::new(),
+            lane_scales: Vec::new(),
+            sources: Vec::new(),
+            words: 0,
+            quads: Quads::new(scene, &alike),
+            alike,
+            first_scale,
+            scales,
+            spans: vec![[(0, 0); 2]; scene.domains.len()],
+            corner_shifts: corner_shifts(scene),
+        }
+    }
+
+    /// The first word of a shape that is stored by itself; its place is taken at the first call.
+    fn place_words(&mut self, scene: &Scene, shape: usize, chunks: usize, places: &mut [Option<u64>]) -> u64 {
+        if chunks == 0 {
+            return 0;
+        }
+        *places[shape].get_or_insert_with(|| {
+            self.sources.push(Source::Shape(shape));
+            let first = self.words;
+            self.words += (3 * chunks * quads_of(&scene.shapes[shape])) as u64;
+            first
+        })
+    }
+
+    /// The tiles of a domain's role follow each other.
+    fn note_span(&mut self, domain: usize, role: Role, index: u32) {
+        let (first, count) = &mut self.spans[domain][usize::from(role.flags & TILE_VERTICES == 0)];
+        if *count == 0 {
+            *first = index;
+        }
+        *count += 1;
+    }
+
+    fn own_tile(&self, scene: &Scene, coordinates: &Coordinates, role: Role, (domain, tile): (usize, usize)) -> Tile {
+        let place = self.place(scene, role, domain);
+        let items = place.items - QUAD * TILE_QUADS * tile;
+        let width = items.div_ceil(QUAD).min(TILE_QUADS);
+        let shape = scene.domains[domain].shape;
+        let scales = if role.chunks == 0 { 0 } else { tile * role.chunks * modes_per_chunk(scene.deformation.storage) };
+        Tile {
+            first_word: 0,
+            first: place.first + (QUAD * TILE_QUADS * tile) as u32,
+            rest: place.rest + (TILE_QUADS * tile) as u32,
+            domain: domain as u32,
+            first_q: coordinates.first[domain],
+            first_scale: self.first_scale[shape] + scales as u32,
+            chunks: role.chunks as u16,
+            width: width as u8,
+            kind: role.flags | (items.min(QUAD * TILE_QUADS) - QUAD * (width - 1)) as u8,
+        }
+    }
+
+    fn push_mixed(&mut self, scene: &Scene, coordinates: &Coordinates, role: Role, domains: &[usize]) {
+        let first = self.lanes.len() as u32;
+        for domain in domains {
+            let place = self.place(scene, role, *domain);
+            for quad in 0..place.items.div_ceil(QUAD) {
+                let count = (place.items - QUAD * quad).min(QUAD);
+                self.lanes.push(Lane {
+                    item: place.first + (QUAD * quad) as u32,
+                    rest: place.rest + quad as u32,
+                    domain: (QUAD * domain + count - 1) as u32,
+                    first_q: coordinates.first[*domain],
+                });
+                self.lane_scales.push(self.first_scale[scene.domains[*domain].shape]);
+            }
+        }
+        let width = self.lanes.len() as u32 - first;
+        self.tiles.push(Tile {
+            first_word: self.words,
+            first,
+            rest: 0,
+            domain: 0,
+            first_q: 0,
+            first_scale: 0,
+            chunks: role.chunks as u16,
+            width: width as u8,
+            kind: role.flags,
+        });
+        if role.chunks > 0 {
+            self.sources.push(Source::Mixed(domains.iter().map(|domain| scene.domains[*domain].shape).collect()));
+            self.words += (3 * role.chunks) as u64 * u64::from(width);
+        }
+    }
+
+    /// The vertices of a domain, or its corners in a tile of corners alone.
+    fn place(&self, scene: &Scene, role: Role, domain: usize) -> Place {
+        let (slot, shape) = (scene.layout.slots[domain], scene.domains[domain].shape);
+        if role.flags & TILE_VERTICES > 0 {
+            Place { items: slot.vertices, first: slot.first_vertex as u32, rest: self.quads.vertices[shape] }
+        } else {
+            Place { items: slot.corners, first: slot.first_corner as u32, rest: self.quads.corners[shape] }
+        }
+    }
+}
+
+/// Items of a domain, the first packed one, and the first quad of what they are at rest.
+struct Place {
+    items: usize,
+    first: u32,
+    rest: u32,
+}
+
+/// Whether so many items of a domain are too many to share a tile.
+const fn has_own_tiles(items: usize) -> bool {
+    items.div_ceil(QUAD) > SMALL
+}
+
+/// Of each shape, whether its vertices have tiles of their own.
+fn own_tiles(scene: &Scene) -> Vec<bool> {
+    let mut users = vec![0_usize; scene.shapes.len()];
+    scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
+    let own = |(shape, users): (&Shape, usize)| {
+        has_own_tiles(shape.mesh.rest().len()) || (shape.modes.rank() > 0 && users > 1)
+    };
+    scene.shapes.iter().zip(users).map(own).collect()
+}
+
+/// Every tile with its role, in the order of the domains.
+fn items(scene: &Scene, alike: &[bool]) -> Vec<(Role, Item)> {
+    let own = own_tiles(scene);
+    let mut items = Vec::new();
+    // Per role, the domains that wait for their tile to fill up, and its quads.
+    let mut open: std::collections::BTreeMap<Role, (Vec<usize>, usize)> = std::collections::BTreeMap::new();
+    let mut add = |domain: usize, role: Role, count: usize, own: bool| {
+        let quads = count.div_ceil(QUAD);
+        if own {
+            items.extend((0..quads.div_ceil(TILE_QUADS)).map(|tile| (role, Item::Own { domain, tile })));
+            return;
+        }
+        let (waiting, filled) = open.entry(role).or_default();
+        if *filled + quads > TILE_QUADS {
+            items.push((role, Item::Mixed(std::mem::take(waiting))));
+            *filled = 0;
+        }
+        waiting.push(domain);
+        *filled += quads;
+    };
+    for (index, domain) in scene.domains.iter().enumerate() {
+        let (shape, slot) = (&scene.shapes[domain.shape], scene.layout.slots[index]);
+        let chunks = chunks_of(scene, shape);
+        let both = orients(scene) && alike[domain.shape];
+        let flags = TILE_VERTICES | if both { TILE_CORNERS } else { 0 };
+        add(index, Role { chunks, flags }, slot.vertices, own[domain.shape]);
+        if orients(scene) && !both {
+            add(index, Role { chunks: 0, flags: TILE_CORNERS }, slot.corners, has_own_tiles(slot.corners));
+        }
+    }
+    let rest: Vec<_> = open.into_iter().map(|(role, (waiting, _))| (role, Item::Mixed(waiting))).collect();
+    items.extend(rest);
+    items
+}
+
+fn corner_shifts(scene: &Scene) -> Vec<u32> {
+    let shift = |slot: &modalcast_model::scene::Slot| (slot.first_corner as u32).wrapping_sub(slot.first_vertex as u32);
+    let shifts: Vec<u32> = scene.layout.slots.iter().map(shift).collect();
+    if orients(scene) && shifts.iter().any(|shift| *shift != 0) { shifts } else { Vec::new() }
+}
+
+fn quads_of(shape: &Shape) -> usize {
+    shape.mesh.rest().len().div_ceil(QUAD)
+}
+
+fn chunks_of(scene: &Scene, shape: &Shape) -> usize {
+    shape.modes.rank().div_ceil(modes_per_chunk(scene.deformation.storage))
+}
+
+/// The quads of whole small shapes side by side: [chunk][3][width], from [chunk][3][own width] of each.
+pub(super) fn side_by_side(shapes: &[Tiles]) -> Vec<Plane> {
+    let rows = 3 * shapes.first().map_or(0, Tiles::chunks);
+    let mut words = Vec::with_capacity(shapes.iter().map(|tiles| tiles.planes().len()).sum());
+    for row in 0..rows {
+        for tiles in shapes {
+            let width = tiles.quads();
+            words.extend_from_slice(&tiles.planes()[row * width..][..width]);
+        }
+    }
+    words
+}

@@ -1,0 +1,104 @@
+//! Where x0, normals and tangents at rest lie on the device, in quads as `deform` reads them. Pure.
+
+use super::{QUAD, Work, has_own_tiles, orients, own_tiles};
+use crate::storage::TILE_QUADS;
+use modalcast_model::domain::Shape;
+use modalcast_model::scene::Scene;
+
+/// Where quads of x0, normals and tangents lie: first x0 of shapes whose corners are others than their vertices, then
+/// x0, normals and tangents of those whose corner i is vertex i, then normals and tangents of the others.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in super::super) struct Quads {
+    /// Of each shape, its first quad of x0.
+    pub vertices: Vec<u32>,
+    /// Of each shape, its first quad of normals and tangents.
+    pub corners: Vec<u32>,
+    /// Quads of x0, and the first that has normals.
+    pub rest: u64,
+    pub directed: u64,
+    /// The end of all quads.
+    pub end: u64,
+}
+
+impl Quads {
+    /// `alike`: of each shape, whether one lane has a vertex and its corner.
+    pub(super) fn new(scene: &Scene, alike: &[bool]) -> Self {
+        let orients = orients(scene);
+        let places = |own: &dyn Fn(&Shape, bool) -> Option<usize>, next: &mut u64| -> Vec<u32> {
+            let place = |(shape, alike): (&Shape, &bool)| {
+                let first = *next;
+                *next += own(shape, *alike).map_or(0, |items| items.div_ceil(QUAD)) as u64;
+                first as u32
+            };
+            scene.shapes.iter().zip(alike).map(place).collect()
+        };
+        let vertices = |shape: &Shape| shape.mesh.rest().len();
+        let mut next = 0;
+        let before = places(&|shape, alike| (!alike).then(|| vertices(shape)), &mut next);
+        let directed = next;
+        let both = places(&|shape, alike| alike.then(|| vertices(shape)), &mut next);
+        let rest = next;
+        let corners = |shape: &Shape| shape.mesh.corners().vertices.len();
+        let behind = places(&|shape, alike| (orients && !alike).then(|| corners(shape)), &mut next);
+        let choose = |others: &[u32]| {
+            let each = alike.iter().zip(&both).zip(others);
+            each.map(|((alike, both), other)| if *alike { *both } else { *other }).collect()
+        };
+        Self { vertices: choose(&before), corners: choose(&behind), rest, directed, end: next }
+    }
+}
+
+/// x0 of all shapes, three fours a quad.
+pub(in super::super) fn rest_positions(scene: &Scene, work: &Work) -> Vec<[f32; 4]> {
+    let mut all = vec![[0.0; 4]; 3 * work.quads.rest as usize];
+    let own = own_tiles(scene);
+    for (index, shape) in scene.shapes.iter().enumerate() {
+        let fours = arranged(&quads_of_items(shape.mesh.rest()), own[index]);
+        all[3 * work.quads.vertices[index] as usize..][..fours.len()].copy_from_slice(&fours);
+    }
+    all
+}
+
+/// Normals and tangents at rest of all shapes, three and four fours a quad from the first that has any; none where a
+/// scene needs none.
+pub(in super::super) fn rest_directions(scene: &Scene, work: &Work) -> [Vec<[f32; 4]>; 2] {
+    if !orients(scene) {
+        return [Vec::new(), Vec::new()];
+    }
+    let count = (work.quads.end - work.quads.directed) as usize;
+    let mut normals = vec![[0.0; 4]; 3 * count];
+    let mut tangents = vec![[0.0; 4]; if scene.needs.normal_maps { 4 * count } else { 0 }];
+    let vertices = own_tiles(scene);
+    for (index, shape) in scene.shapes.iter().enumerate() {
+        let corners = &shape.mesh.corners().normals;
+        let own = if work.alike[index] { vertices[index] } else { has_own_tiles(corners.len()) };
+        let first = (u64::from(work.quads.corners[index]) - work.quads.directed) as usize;
+        let fours = arranged(&quads_of_items(corners), own);
+        normals[3 * first..][..fours.len()].copy_from_slice(&fours);
+        if !shape.tangents().is_empty() {
+            let fours = arranged(&quads_of_items(shape.tangents()), own);
+            tangents[4 * first..][..fours.len()].copy_from_slice(&fours);
+        }
+    }
+    [normals, tangents]
+}
+
+/// Quads of N numbers as the kernel reads them: per tile of its own `[N][width]` fours, else `[N]` fours a quad.
+fn arranged<const N: usize>(quads: &[[[f32; 4]; N]], own: bool) -> Vec<[f32; 4]> {
+    if !own {
+        return quads.as_flattened().to_vec();
+    }
+    let tile = |tile: &[[[f32; 4]; N]]| -> Vec<[f32; 4]> {
+        (0..N).flat_map(|number| tile.iter().map(move |quad| quad[number])).collect()
+    };
+    quads.chunks(TILE_QUADS).flat_map(tile).collect()
+}
+
+/// Numbers of items, as quads: what fills up is zero.
+fn quads_of_items<const N: usize>(items: &[[f32; N]]) -> Vec<[[f32; 4]; N]> {
+    let mut quads = vec![[[0.0; 4]; N]; items.len().div_ceil(QUAD)];
+    for (at, item) in items.iter().enumerate() {
+        (0..N).for_each(|number| quads[at / QUAD][number][at % QUAD] = item[number]);
+    }
+    quads
+}

@@ -1,0 +1,46 @@
+//! x = T (x0 + U q), equation 3.9 of the thesis, for every vertex of every domain. Twin of `kernels/deform.cu`.
+
+use modalcast_model::domain::Shape;
+use modalcast_model::scene::{Scene, State};
+
+/// World positions relative to their domains' cells, three f64 per vertex, packed as the layout says.
+pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
+    let mut positions = Vec::with_capacity(scene.layout.vertices);
+    for domain in 0..scene.domains.len() {
+        let shape = scene.shape_of(domain);
+        let q = state.q_of(scene, domain);
+        let world_from_domain = state.composed(scene, domain).exact();
+        for (vertex, rest) in shape.mesh.rest().iter().enumerate() {
+            let mut bent = rest.map(f64::from);
+            add_modes(shape, q, vertex, &mut bent);
+            positions.push(std::array::from_fn(|row| {
+                let [x, y, z, offset] = std::array::from_fn(|column| world_from_domain[4 * row + column]);
+                x * bent[0] + y * bent[1] + z * bent[2] + offset
+            }));
+        }
+    }
+    positions
+}
+
+/// u = U q of every vertex in the frame of its domain, three f64 each, packed as the layout says.
+pub fn displacements(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
+    let mut displacements = Vec::with_capacity(scene.layout.vertices);
+    for domain in 0..scene.domains.len() {
+        let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
+        for vertex in 0..shape.mesh.rest().len() {
+            let mut moved = [0.0; 3];
+            add_modes(shape, q, vertex, &mut moved);
+            displacements.push(moved);
+        }
+    }
+    displacements
+}
+
+/// Adds a vertex's three rows of U q.
+fn add_modes(shape: &Shape, q: &[f32], vertex: usize, coordinates: &mut [f64; 3]) {
+    for (component, coordinate) in coordinates.iter_mut().enumerate() {
+        for (mode, amount) in q.iter().enumerate() {
+            *coordinate += f64::from(shape.modes.at(vertex, component, mode)) * f64::from(*amount);
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! The definition in f64, plain and without cleverness. Shares no code with the other deformers.
+
+mod deform;
+mod normals;
+mod orient;
+pub mod raster;
+
+use std::sync::Arc;
+use std::time::Instant;
+
+pub use deform::{deform, displacements};
+pub use normals::{exact_normals, exact_tangents};
+pub use orient::{orient_normals, orient_tangents};
+
+use modalcast_model::deform::{Backend, Deformed, Deformer, Surface};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Bounds, LightBounds, Scene, Slot, State};
+
+/// The deformer `reference`: computes in f64 and rounds once.
+#[derive(Debug)]
+pub struct ReferenceDeformer {
+    scene: Arc<Scene>,
+    surface: Surface,
+}
+
+impl ReferenceDeformer {
+    /// A deformer of one scene.
+    pub fn new(scene: &Arc<Scene>) -> Self {
+        Self { scene: Arc::clone(scene), surface: Surface::default() }
+    }
+
+    /// What readers want besides vertices. A displacement that f32 does not hold spoils the bounds.
+    fn keep(&mut self, state: &State, bounds: &mut Bounds) {
+        let (scene, surface) = (&self.scene, &mut self.surface);
+        if scene.needs.displacements {
+            surface.displacements = round(displacements(scene, state));
+            if !surface.displacements.iter().all(|number| number.is_finite()) {
+                bounds.include([f64::NAN; 3]);
+            }
+        }
+        if scene.needs.boxes {
+            let box_of = |slot: &Slot| Bounds::of(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
+            surface.boxes = scene.layout.slots.iter().map(box_of).collect();
+        }
+    }
+}
+
+impl Deformer for ReferenceDeformer {
+    fn backend(&self) -> Backend {
+        Backend::Reference
+    }
+
+    fn deform(&mut self, state: &State) -> Result<Deformed> {
+        let begin = Instant::now();
+        let positions = deform(&self.scene, state);
+        let light = self.scene.light_axes().map(|axes| {
+            let one = |position: &[f64; 3]| LightBounds::of_box(&axes, &Bounds { min: *position, max: *position });
+            positions.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union)
+        });
+        let (normals, tangents) = if self.scene.needs.exact_normals {
+            (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
+        } else {
+            (orient_normals(&self.scene, state), orient_tangents(&self.scene, state))
+        };
+        self.surface.positions = round(positions);
+        self.surface.normals = round(normals);
+        self.surface.tangents = round(tangents);
+        let mut bounds = Bounds::of(&self.surface.positions);
+        self.keep(state, &mut bounds);
+        Ok(Deformed { bounds, light, ms: begin.elapsed().as_secs_f64() * 1e3 })
+    }
+
+    fn surface(&mut self) -> Result<&Surface> {
+        Ok(&self.surface)
+    }
+}
+
+fn round<const N: usize>(list: Vec<[f64; N]>) -> Vec<f32> {
+    list.into_flattened().into_iter().map(|number| number as f32).collect()
+}

@@ -1,0 +1,152 @@
+//! Normals and tangents that follow the deformed triangles. Twin of `kernels/normals.cu`.
+//!
+//! # Definition
+//! Around each smoothing group (see [`modalcast_model::domain::Smoothing`]) the area vectors (b - a) x (c - a) of its triangles
+//! are summed: once at rest, turned by the cofactors of A as area vectors are, and once over the positions x of this
+//! step. The least rotation that takes the first direction to the second, applied to the rigid normal of
+//! `reference/orient.rs`, is the exact normal. So
+//! - at q = 0 it is the rigid normal, whatever an author made of it (smoothed, weighted, bent on purpose);
+//! - where rest normals are those of the triangles, it is the area-weighted normal of the deformed triangles, and where
+//!   they oppose the winding, its opposite: a rotation that takes g to h takes -g to -h;
+//! - a mirroring T needs no rule of its own: it turns both sums alike, and the rigid normal has its sign;
+//! - corners of one group with one rest normal keep one normal: seams stay closed and hard edges stay hard.
+//!
+//! A tangent is carried by the same rotation, then made orthogonal to the new normal; the bitangent keeps its sign, or
+//! is flipped by a mirroring T as in the rigid case. That takes no memory and no reads beyond those of rigid tangents
+//! and exact normals. It follows how the surface tilts, not how modes turn or shear it within itself: that would take
+//! texture gradients per triangle, and so 8 more bytes per entry of every ring.
+//!
+//! # What is kept
+//! A corner keeps its rigid normal and tangent where there is nothing to follow: its shape has no modes; its group has
+//! no area at rest, or areas that cancel; or its area in this step is not above [`RESOLUTION`] times
+//! B = sum of l (l + w) over both edges of each triangle, with l the sum of an edge's absolute components and w that of
+//! the group's own position. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area
+//! vectors by at most 2^-23 B: what is followed is off by at most asin(2^-23 B / |sum|) < 1.8 degrees for positions
+//! that were rounded once, and what rounding alone could have made is not followed. One metre of domain at 10^7 metres
+//! thus shows rigid normals; put the scene's origin near it.
+//!
+//! Close to half a turn the axis of the least rotation is ill determined: rest normals that differ from the geometric
+//! ones by an angle d may be off by 2 d there, and in the limit the part across is left where it was.
+
+use nalgebra::Vector3;
+
+use super::orient::{cofactors, orient_normals, orient_tangents};
+use modalcast_model::domain::Mesh;
+use modalcast_model::scene::{Scene, State};
+
+/// 2^-18: the part of B that an area must exceed.
+const RESOLUTION: f64 = 1.0 / 262_144.0;
+
+/// Squared length of the sum of two unit vectors below which they are opposite: half a turn, within 1e-5 rad.
+const OPPOSITE: f64 = 1e-10;
+
+/// World unit normals, one per corner, of a surface at `positions` (what `deform` returned for the same state).
+pub fn exact_normals(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    let mut normals = orient_normals(scene, state);
+    for_each_turned(scene, state, positions, |corner, turn| {
+        normals[corner] = turned_normal(turn, normals[corner]).into()
+    });
+    normals
+}
+
+/// World unit tangents and bitangent signs, one per corner; empty when the scene has no normal map. A shape without
+/// tangents gives zeros.
+pub fn exact_tangents(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> Vec<[f64; 4]> {
+    let mut tangents = orient_tangents(scene, state);
+    if tangents.is_empty() {
+        return tangents;
+    }
+    let rigid = orient_normals(scene, state);
+    for_each_turned(scene, state, positions, |corner, turn| {
+        let [x, y, z, sign] = tangents[corner];
+        if sign != 0.0 {
+            let flat = beside(turn.carry(Vector3::new(x, y, z)), turned_normal(turn, rigid[corner]));
+            tangents[corner] = [flat.x, flat.y, flat.z, sign];
+        }
+    });
+    tangents
+}
+
+/// The unit directions between which a group's surface turned.
+struct Turn {
+    from: Vector3<f64>,
+    to: Vector3<f64>,
+}
+
+impl Turn {
+    /// The least rotation from one to the other: the part along `from` goes along `to`; the part across is reflected
+    /// at the plane across their middle.
+    fn carry(&self, vector: Vector3<f64>) -> Vector3<f64> {
+        let along = self.from.dot(&vector);
+        let across = vector - self.from * along;
+        let middle = self.from + self.to;
+        if middle.norm_squared() < OPPOSITE {
+            return self.to * along + across;
+        }
+        self.to * along + across - middle * (2.0 * middle.dot(&across) / middle.norm_squared())
+    }
+}
+
+fn turned_normal(turn: &Turn, rigid: [f64; 3]) -> Vector3<f64> {
+    direction(turn.carry(rigid.into())).unwrap_or(turn.to)
+}
+
+/// A tangent without its part along the normal; where nothing else is left, any unit vector across.
+fn beside(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
+    let flat = tangent - normal * normal.dot(&tangent);
+    let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
+    if flat.norm() > 1e-6 { flat.normalize() } else { normal.cross(&axis).normalize() }
+}
+
+/// Calls `act` with each packed corner whose surface has turned in a way that can be told.
+fn for_each_turned(scene: &Scene, state: &State, positions: &[[f64; 3]], mut act: impl FnMut(usize, &Turn)) {
+    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+        let shape = scene.shape_of(domain);
+        let Some(smoothing) = shape.smoothing() else { continue };
+        let rest = areas(&shape.mesh, smoothing.members(), |vertex| shape.mesh.rest()[vertex].map(f64::from));
+        let now = areas(&shape.mesh, smoothing.members(), |vertex| positions[slot.first_vertex + vertex]);
+        let area_turn = cofactors(&state.composed(scene, domain).linear());
+        for (corner, group) in smoothing.members().iter().enumerate() {
+            let group = *group as usize;
+            let has_normal = smoothing.normals()[group] != [0.0; 3];
+            let resolved = now[group].sum.norm() > RESOLUTION * now[group].rounding;
+            let ends = (direction(area_turn * rest[group].sum), direction(now[group].sum));
+            if let (true, (Some(from), Some(to))) = (has_normal && resolved, ends) {
+                act(slot.first_corner + corner, &Turn { from, to });
+            }
+        }
+    }
+}
+
+/// The area vectors around a group, and B.
+#[derive(Clone, Default)]
+struct Area {
+    sum: Vector3<f64>,
+    rounding: f64,
+}
+
+/// Of each group.
+fn areas(mesh: &Mesh, members: &[u32], position: impl Fn(usize) -> [f64; 3]) -> Vec<Area> {
+    let mut areas = vec![Area::default(); members.len()];
+    let l1 = |vector: Vector3<f64>| vector.abs().sum();
+    for triangle in mesh.triangles() {
+        let [a, b, c] = triangle.map(|corner| mesh.corners().vertices[corner as usize]);
+        if a == b || b == c || c == a {
+            continue;
+        }
+        let place = |at: usize| Vector3::from(position(mesh.corners().vertices[triangle[at % 3] as usize] as usize));
+        for at in 0..3 {
+            let (own, edge, other) = (place(at), place(at + 1) - place(at), place(at + 2) - place(at));
+            let area = &mut areas[members[triangle[at] as usize] as usize];
+            area.sum += edge.cross(&other);
+            area.rounding += [edge, other].map(|edge| l1(edge) * (l1(edge) + l1(own))).iter().sum::<f64>();
+        }
+    }
+    areas
+}
+
+/// A vector over its length, which neither over- nor underflows.
+fn direction(vector: Vector3<f64>) -> Option<Vector3<f64>> {
+    let largest = vector.amax();
+    (largest > 0.0 && largest.is_finite()).then(|| (vector / largest).normalize())
+}

@@ -1,0 +1,268 @@
+//! What a rasteriser draws, sample by sample: the definition of `kernels/raster.cu`, in plain loops.
+//!
+//! Corners are taken into clip space in f32, each sum and product rounded by itself, clipped by the near plane and a guard
+//! around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and snapped to 1/256 pixel. From there
+//! on coverage is exact, in integers: a sample belongs to the triangle on whose inner side of all edges it lies; one on an
+//! edge belongs to the triangle that has it as its top or left edge. So triangles that share an edge cover every sample
+//! between them once. Depth is z/w, linear in the window, in f32 from the exact edge values. Of a cut-out that is left where
+//! alpha is large enough ([`cut_out`]).
+
+pub mod cut_out;
+
+use modalcast_model::raster::CutOuts;
+use modalcast_model::scene::{Faces, Group, Window};
+
+/// Parts of a pixel, and the least w that is divided by.
+const CELL: i32 = 256;
+const LEAST_W: f32 = f32::from_bits((127 - 100) << 23);
+
+/// What a sample holds before anything is drawn.
+pub const NOTHING: u64 = u64::MAX;
+
+/// A corner in the window: 1/256 pixel with y down, and depth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Corner {
+    pub x: i32,
+    pub y: i32,
+    pub z: f32,
+}
+
+/// Why a triangle has no sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Dropped {
+    /// A corner is no finite point of clip space.
+    NotFinite,
+    /// Beyond one plane of the view, or nothing of it is left by the planes that clip.
+    Outside,
+    /// Snapped, it has no area.
+    Flat,
+    Back,
+    /// No sample lies in the box of its corners.
+    Missed,
+}
+
+/// The samples of a box, both ends included: least x and y, largest x and y.
+pub type Samples = [i32; 4];
+
+/// A triangle after clipping.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outline {
+    /// 3 to 8 corners of a convex polygon; not turned.
+    pub corners: Vec<Corner>,
+    /// Twice its area in (1/256 pixel)^2, positive where the corners follow clockwise on the screen.
+    pub area: i64,
+    pub samples: Samples,
+    /// Whether a plane clipped it.
+    pub clipped: bool,
+}
+
+/// Samples of a window: the least depth of each and whose it is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Raster {
+    window: Window,
+    /// Row by row from the top: the bits of depth, then the triangle; [`NOTHING`] where there is none.
+    pub keys: Vec<u64>,
+}
+
+impl Raster {
+    /// A window without anything.
+    pub fn new(window: Window) -> Self {
+        Self { window, keys: vec![NOTHING; window.pixels()] }
+    }
+
+    /// Draws the triangles of a group; positions are three numbers a vertex.
+    pub fn draw(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: Group) {
+        self.draw_where(positions, triangles, group, |_, _| true);
+    }
+
+    /// The same of a mesh of which some triangles are cut out.
+    pub fn draw_cut_out(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: Group, cut_outs: &CutOuts) {
+        let window = self.window;
+        self.draw_where(positions, triangles, group, |triangle, pixel| {
+            let corners = corners(&window, positions, triangles[triangle as usize]);
+            cut_out::keeps(cut_outs, &window, (triangle, &corners), pixel)
+        });
+    }
+
+    fn draw_where(
+        &mut self,
+        positions: &[f32],
+        triangles: &[[u32; 3]],
+        group: Group,
+        keeps: impl Fn(u32, [i32; 2]) -> bool,
+    ) {
+        for triangle in group.first..group.first + group.triangles {
+            if let Ok(outline) = outline(&self.window, positions, triangles[triangle as usize], group.faces) {
+                self.fill(&outline, triangle, |pixel| keeps(triangle, pixel));
+            }
+        }
+    }
+
+    /// Depths, 1 where there is nothing.
+    pub fn depths(&self) -> Vec<f32> {
+        let depth = |key: &u64| if *key == NOTHING { 1.0 } else { f32::from_bits((key >> 32) as u32) };
+        self.keys.iter().map(depth).collect()
+    }
+
+    /// The triangle of each sample.
+    pub fn ids(&self) -> Vec<Option<u32>> {
+        self.keys.iter().map(|key| (*key != NOTHING).then_some(*key as u32)).collect()
+    }
+
+    fn fill(&mut self, outline: &Outline, triangle: u32, keeps: impl Fn([i32; 2]) -> bool) {
+        let [x0, y0, x1, y1] = outline.samples;
+        let width = self.window.size()[0] as usize;
+        for piece in pieces(outline) {
+            for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
+                if let Some(depth) = depth_at(&piece, column, row).filter(|_| keeps([column, row])) {
+                    let key = &mut self.keys[row as usize * width + column as usize];
+                    *key = (*key).min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
+                }
+            }
+        }
+    }
+}
+
+/// A triangle clipped and snapped, or why it is not drawn.
+///
+/// # Errors
+/// Why it is dropped.
+pub fn outline(window: &Window, positions: &[f32], triangle: [u32; 3], faces: Faces) -> Result<Outline, Dropped> {
+    let corners = corners(window, positions, triangle);
+    if !corners.as_flattened().iter().all(|number| number.is_finite()) {
+        return Err(Dropped::NotFinite);
+    }
+    if is_outside(&corners) {
+        return Err(Dropped::Outside);
+    }
+    let whole = |corner: &[f32; 4]| (0..5).all(|plane| inside(window, corner, plane) >= 0.0) && corner[3] >= LEAST_W;
+    let clipped = !corners.iter().all(whole);
+    let kept = if clipped { clip(window, &corners) } else { corners.to_vec() };
+    if kept.len() < 3 || !kept.iter().all(|corner| corner[3] >= LEAST_W) {
+        return Err(Dropped::Outside);
+    }
+    let corners: Vec<Corner> = kept.iter().map(|corner| snap(window, corner)).collect();
+    let area = (1..corners.len() - 1).map(|at| area(&[corners[0], corners[at], corners[at + 1]])).sum();
+    let samples = samples(window, &corners);
+    if area == 0 {
+        return Err(Dropped::Flat);
+    }
+    if faces == Faces::Fronts && area > 0 {
+        return Err(Dropped::Back);
+    }
+    if samples[0] > samples[2] || samples[1] > samples[3] {
+        return Err(Dropped::Missed);
+    }
+    Ok(Outline { corners, area, samples, clipped })
+}
+
+/// A triangle's corners in clip space.
+pub fn corners(window: &Window, positions: &[f32], triangle: [u32; 3]) -> [[f32; 4]; 3] {
+    triangle.map(|vertex| to_clip(window, &positions[3 * vertex as usize..][..3]))
+}
+
+/// The triangles of a fan over the outline, each turned so that its corners follow clockwise on the screen.
+pub fn pieces(outline: &Outline) -> Vec<[Corner; 3]> {
+    let corners = &outline.corners;
+    let turned = |at: usize| {
+        let (b, c) = if outline.area < 0 { (at + 1, at) } else { (at, at + 1) };
+        [corners[0], corners[b], corners[c]]
+    };
+    (1..corners.len() - 1).map(turned).filter(|piece| area(piece) > 0).collect()
+}
+
+/// Depth of a piece at a pixel's sample, if it lies inside and not behind the far plane.
+pub fn depth_at(piece: &[Corner; 3], column: i32, row: i32) -> Option<f32> {
+    let (x, y) = (CELL * column + CELL / 2, CELL * row + CELL / 2);
+    let [a, b, c] = piece;
+    let edges = [(b, c), (c, a), (a, b)].map(|(from, to)| (edge(from, to, x, y), least(from, to)));
+    if edges.iter().any(|(value, least)| value < least) {
+        return None;
+    }
+    let inverse = 1.0 / area(piece) as f32;
+    let [share_b, share_c] = [1, 2].map(|at| edges[at].0 as f32 * inverse);
+    let z = a.z + (share_b * (b.z - a.z) + share_c * (c.z - a.z));
+    (z <= 1.0).then_some(if z > 0.0 { z } else { 0.0 })
+}
+
+/// The value of an edge at a point: positive on its right, where y goes down.
+pub fn edge(from: &Corner, to: &Corner, x: i32, y: i32) -> i64 {
+    let [across, down] = [to.x - from.x, to.y - from.y].map(i64::from);
+    across * i64::from(y - from.y) - down * i64::from(x - from.x)
+}
+
+/// Top and left edges take the samples on them.
+fn least(from: &Corner, to: &Corner) -> i64 {
+    i64::from(!(to.y < from.y || (to.y == from.y && to.x > from.x)))
+}
+
+fn area(piece: &[Corner; 3]) -> i64 {
+    edge(&piece[0], &piece[1], piece[2].x, piece[2].y)
+}
+
+fn to_clip(window: &Window, position: &[f32]) -> [f32; 4] {
+    let m = window.clip();
+    std::array::from_fn(|row| {
+        let row = &m[4 * row..][..4];
+        row[0] * position[0] + row[1] * position[1] + row[2] * position[2] + row[3]
+    })
+}
+
+fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
+    let beyond = |axis: usize, side: f32| corners.iter().all(|corner| side * corner[axis] > corner[3]);
+    (0..3).any(|axis| beyond(axis, 1.0) || beyond(axis, -1.0))
+}
+
+/// Not negative on the inner side of a plane: the near one, then the sides of the guard.
+fn inside(window: &Window, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
+    let [guard_x, guard_y] = window.guard().map(|guard| guard * w);
+    [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
+}
+
+fn clip(window: &Window, corners: &[[f32; 4]; 3]) -> Vec<[f32; 4]> {
+    let mut list = corners.to_vec();
+    for plane in 0..5 {
+        let mut kept = Vec::with_capacity(8);
+        for (at, a) in list.iter().enumerate() {
+            let b = &list[(at + 1) % list.len()];
+            let [of_a, of_b] = [a, b].map(|corner| inside(window, corner, plane));
+            if of_a >= 0.0 {
+                kept.push(*a);
+            }
+            if (of_a >= 0.0) != (of_b >= 0.0) {
+                kept.push(if of_a >= 0.0 { cut(a, b, of_a, of_b) } else { cut(b, a, of_b, of_a) });
+            }
+        }
+        // Rounding may bend a polygon by a hair; a convex one gets one corner more from a plane, at most.
+        kept.truncate(8);
+        list = kept;
+    }
+    list
+}
+
+/// From the inner end of an edge towards its outer one, whichever triangle of the edge asks.
+fn cut(inner: &[f32; 4], outer: &[f32; 4], of_inner: f32, of_outer: f32) -> [f32; 4] {
+    let t = of_inner / (of_inner - of_outer);
+    std::array::from_fn(|axis| inner[axis] + t * (outer[axis] - inner[axis]))
+}
+
+fn snap(window: &Window, [x, y, z, w]: &[f32; 4]) -> Corner {
+    let [half_width, half_height] = window.half();
+    let inverse = 1.0 / w;
+    let across = x * inverse * half_width + half_width;
+    let down = -(y * inverse) * half_height + half_height;
+    let snapped = |pixels: f32| (pixels * CELL as f32).round_ties_even() as i32;
+    Corner { x: snapped(across), y: snapped(down), z: z * inverse * 0.5 + 0.5 }
+}
+
+/// The samples in the box of the corners, cut by the window.
+fn samples(window: &Window, corners: &[Corner]) -> Samples {
+    let ends = |of: fn(&Corner) -> i32, side: u32| {
+        let all = || corners.iter().map(of);
+        let (low, high) = (all().min().unwrap_or(0), all().max().unwrap_or(0));
+        (((low + CELL / 2 - 1) >> 8).max(0), ((high - CELL / 2) >> 8).min(side as i32 - 1))
+    };
+    let [width, height] = window.size();
+    let ((x0, x1), (y0, y1)) = (ends(|corner| corner.x, width), ends(|corner| corner.y, height));
+    [x0, y0, x1, y1]
+}

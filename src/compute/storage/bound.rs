@@ -1,0 +1,273 @@
+//! How far a deformer's x may be off, before it has computed anything: one number per source of error.
+//!
+//! The sum of a vertex is a chain of fused multiply-adds from +0 over its modes in ascending order, then `+ x0`, then
+//! three fused multiply-adds per row of T, all in f32. With u = 2^-24 and gamma_k = k u / (1 - k u) a chain of k
+//! roundings is off by at most gamma_k times the sum of the magnitudes of its terms (Higham, Accuracy and Stability of
+//! Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding that underflows. A
+//! compensated sum is off by u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot Product, 2005,
+//! proposition 5.5), plus 5 k 2^-149.
+//!
+//! T of a follower is a product T_m F, rounded as [`Composed::rounded`] says: three roundings an entry, so that entry by
+//! entry it is off by at most gamma_3 |T_m| |F|, and its translation by gamma_3 (|T_m| |f| + |t_m|).
+//!
+//! A bound is a length: that of the error of a vertex's position, in scene units. It holds for sums without overflow, and
+//! is infinite where q times a factor overflows f32.
+
+use rayon::prelude::*;
+
+use super::{Products, Tiles};
+use modalcast_model::domain::{Composed, Shape, Transform};
+use modalcast_model::scene::Storage;
+
+/// A little more than what the few thousand f64 operations of a bound can lose.
+const ROUND_UP: f64 = 1.0 + 1e-12;
+/// Half a unit in the last place of f32, relative.
+const UNIT: f64 = 1.0 / (1 << 24) as f64;
+/// Half of the smallest f32.
+const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
+const SQRT_3: f64 = 1.732_050_807_568_878;
+
+/// The largest error of a vertex of one tile or domain by source, in scene units.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
+pub struct Bound {
+    /// Entries of U as they are stored: of r modes `sum_j |q_j| step_j / 2` per axis.
+    pub storage: f64,
+    /// q times the factor or scale of a mode, rounded to f32.
+    pub coordinates: f64,
+    /// The sum over the modes.
+    pub accumulation: f64,
+    /// `x0 + u`.
+    pub rest: f64,
+    /// Multiplying with A and adding the translation.
+    pub transform: f64,
+    /// Multiplying the transform of a mover with the frame of its follower; 0 of a mover.
+    pub frame: f64,
+}
+
+impl Bound {
+    /// All sources together.
+    pub fn total(&self) -> f64 {
+        (self.storage + self.coordinates + self.accumulation + self.rest + self.transform + self.frame) * ROUND_UP
+    }
+
+    /// Source by source the larger one.
+    pub fn max(self, other: Self) -> Self {
+        Self {
+            storage: self.storage.max(other.storage),
+            coordinates: self.coordinates.max(other.coordinates),
+            accumulation: self.accumulation.max(other.accumulation),
+            rest: self.rest.max(other.rest),
+            transform: self.transform.max(other.transform),
+            frame: self.frame.max(other.frame),
+        }
+    }
+}
+
+/// What a bound depends on besides the shape.
+#[derive(Debug, Clone, Copy)]
+pub struct Step<'a> {
+    /// Coordinates of the domain; zero where a mode is left out.
+    pub q: &'a [f32],
+    /// As [`modalcast_model::scene::State::composed`] has it.
+    pub transform: Composed,
+    pub compensated: bool,
+}
+
+/// A mode of a tile.
+#[derive(Debug, Clone, Copy, Default)]
+struct Reach {
+    /// The longest of its vertices' rows, as stored.
+    length: f64,
+    /// An entry is off by at most this.
+    half_step: f64,
+    /// Its stored entries times this are its decoded ones.
+    factor: f32,
+}
+
+/// What bounds need to know of one shape in one storage type.
+#[derive(Debug, Clone)]
+pub struct Reaches {
+    rank: usize,
+    /// `[tile][mode]`.
+    modes: Vec<Reach>,
+    /// The longest x0 per tile.
+    rest: Vec<f64>,
+}
+
+impl Reaches {
+    /// Looks at every entry of `shape`, which `tiles` were made of.
+    pub fn new(shape: &Shape, tiles: &Tiles) -> Self {
+        let modes = |tile: usize| (0..tiles.rank()).map(move |mode| reach(shape, tiles, tile, mode));
+        let rest = |tile: usize| {
+            let place = tiles.tile(tile);
+            let rest = &shape.mesh.rest()[place.first_vertex..][..place.vertices];
+            rest.iter().map(|vertex| length(vertex.map(f64::from))).fold(0.0, f64::max) * ROUND_UP
+        };
+        Self {
+            rank: tiles.rank(),
+            modes: (0..tiles.count()).into_par_iter().flat_map_iter(modes).collect(),
+            rest: (0..tiles.count()).map(rest).collect(),
+        }
+    }
+
+    /// Bounds of the vertices of tile `tile`.
+    pub fn tile(&self, tile: usize, step: &Step) -> Bound {
+        let modes = &self.modes[self.rank * tile..][..self.rank];
+        let (mut storage, mut lost, mut moved, mut terms) = (0.0, 0.0, 0.0, 0.0);
+        for (reach, q) in modes.iter().zip(step.q) {
+            let amount = f64::from(q.abs());
+            storage += amount * reach.half_step;
+            if amount == 0.0 || reach.length == 0.0 {
+                continue;
+            }
+            // The product of two f32 is exact in f64, so what its rounding loses is known.
+            let (exact, rounded) = (amount * f64::from(reach.factor), f64::from(q.abs() * reach.factor));
+            lost += stored_length(reach) * (exact - rounded).abs();
+            moved += stored_length(reach) * rounded;
+            terms += 1.0;
+        }
+        self.finish(tile, step, [SQRT_3 * storage, lost, moved, terms])
+    }
+
+    /// What taking its sums from tensor cores adds to the bounds of tile `tile`, scene units.
+    pub fn products(&self, tile: usize, step: &Step, products: Products) -> f64 {
+        let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(step.q);
+        let amount = |(reach, q): (&Reach, &f32)| f64::from(q.abs() * reach.factor);
+        let largest = modes().map(amount).fold(Products::least(), f64::max);
+        let one = |(reach, q): (&Reach, &f32)| {
+            let own = amount((reach, q)) * (products.coordinate + products.sum);
+            stored_length(reach) * (own + products.floor * largest)
+        };
+        modes().map(one).sum::<f64>() * norm(&step.transform) * ROUND_UP
+    }
+
+    /// Bounds of all vertices.
+    pub fn domain(&self, step: &Step) -> Bound {
+        (0..self.rest.len()).map(|tile| self.tile(tile, step)).fold(Bound::default(), Bound::max)
+    }
+
+    /// How far u may be off at the vertices of a tile, in scene units of the domain: neither x0 nor T has a part in it.
+    pub fn displacement(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
+        let step = Step { q, transform: Transform::IDENTITY.into(), compensated };
+        let Bound { storage, coordinates, accumulation, .. } = self.tile(tile, &step);
+        (storage + coordinates + accumulation) * ROUND_UP
+    }
+
+    fn finish(&self, tile: usize, step: &Step, parts: [f64; 4]) -> Bound {
+        let [storage, lost, moved, terms] = parts.map(|part| part * ROUND_UP);
+        let accumulation = match step.compensated {
+            false => gamma(terms) * moved + 2.0 * SQRT_3 * terms * UNDERFLOW,
+            true => UNIT * moved + gamma(terms).powi(2) * moved + 10.0 * SQRT_3 * terms * UNDERFLOW,
+        };
+        let bent = self.rest[tile] + moved + accumulation;
+        let rest = if terms > 0.0 { UNIT * bent } else { 0.0 };
+        let (own, stretch) = (step.transform.rounded(), norm(&step.transform));
+        let entries = own.linear().norm() * ROUND_UP;
+        let offset = own.translation().norm() * ROUND_UP;
+        let [turned, moved] = rounding(&step.transform);
+        let frame = (turned * (bent + rest) + moved) * ROUND_UP;
+        let transform = gamma(3.0) * (entries * (bent + rest) + offset) + 6.0 * SQRT_3 * UNDERFLOW;
+        let [storage, coordinates, accumulation, rest] =
+            [storage, lost, accumulation, rest].map(|part| part * stretch * ROUND_UP);
+        Bound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP, frame }
+    }
+}
+
+/// How far the linear part (in the Frobenius norm) and the translation of [`Composed::rounded`] may be from the exact
+/// product; zeros of a mover.
+fn rounding(transform: &Composed) -> [f64; 2] {
+    let Some(frame) = transform.frame else { return [0.0; 2] };
+    let sizes =
+        Composed { mover: Transform(transform.mover.0.map(f32::abs)), frame: Some(Transform(frame.0.map(f32::abs))) };
+    let entries = sizes.exact();
+    let length = |of: &mut dyn Iterator<Item = f64>| {
+        of.map(|entry| (gamma(3.0) * entry + 3.0 * UNDERFLOW).powi(2)).sum::<f64>().sqrt() * ROUND_UP
+    };
+    let is_linear = |at: &usize| at % 4 != 3;
+    let all = 0..entries.len();
+    let linear = length(&mut all.clone().filter(is_linear).map(|at| entries[at]));
+    [linear, length(&mut all.filter(|at| !is_linear(at)).map(|at| entries[at]))]
+}
+
+/// At least `||A||_2` of the linear part, as it is and as deformers round it. By at most 1e-7 of itself too large, and
+/// for a follower by what rounding the product of its frame may add.
+pub fn norm(transform: &Composed) -> f64 {
+    let [turned, _] = rounding(transform);
+    (norm_of(&transform.rounded()) + turned) * ROUND_UP
+}
+
+/// At least `||A||_2`, by at most 1e-7 of itself too large. The root of the largest eigenvalue of A^T A, by the
+/// trigonometric formula for 3x3 matrices (Smith, Eigenvalues of a symmetric 3x3 matrix, 1961).
+fn norm_of(transform: &Transform) -> f64 {
+    let linear = transform.linear();
+    let largest = linear.abs().max();
+    if largest == 0.0 {
+        return 0.0;
+    }
+    // Of entries of at most 1, so that no square leaves f64.
+    let linear = linear / largest;
+    let gram = linear.transpose() * linear;
+    let mean = gram.trace() / 3.0;
+    let off = gram - nalgebra::Matrix3::identity() * mean;
+    let spread = (off.norm_squared() / 6.0).sqrt();
+    let eigenvalue = if spread > 0.0 {
+        let angle = ((off / spread).determinant() / 2.0).clamp(-1.0, 1.0).acos() / 3.0;
+        mean + 2.0 * spread * angle.cos()
+    } else {
+        mean
+    };
+    eigenvalue.sqrt() * largest * (1.0 + 5e-8)
+}
+
+/// gamma_k of f32.
+fn gamma(roundings: f64) -> f64 {
+    roundings * UNIT / (1.0 - roundings * UNIT)
+}
+
+fn length(vector: [f64; 3]) -> f64 {
+    vector.iter().map(|number| number * number).sum::<f64>().sqrt()
+}
+
+fn reach(shape: &Shape, tiles: &Tiles, tile: usize, mode: usize) -> Reach {
+    let place = tiles.tile(tile);
+    let row = |vertex| length([0, 1, 2].map(|axis| tiles.decoded(vertex, axis, mode)));
+    let longest = (place.first_vertex..place.first_vertex + place.vertices).map(row).fold(0.0, f64::max);
+    let entries = &shape.modes.column(mode)[3 * place.first_vertex..][..3 * place.vertices];
+    let largest = entries.iter().fold(0.0, |largest: f32, entry| largest.max(entry.abs()));
+    Reach {
+        length: longest * ROUND_UP,
+        half_step: half_step(tiles, tile, mode, largest),
+        factor: factor(tiles, tile, mode),
+    }
+}
+
+/// The longest row in units of the factor; 0 for a mode of zeros.
+fn stored_length(reach: &Reach) -> f64 {
+    if reach.factor > 0.0 { reach.length / f64::from(reach.factor) } else { 0.0 }
+}
+
+fn factor(tiles: &Tiles, tile: usize, mode: usize) -> f32 {
+    match tiles.storage() {
+        Storage::F32 => 1.0,
+        Storage::F16 | Storage::Bf16 => tiles.factors()[mode],
+        Storage::Int8 => tiles.scales()[tiles.tile(tile).first_scale + mode],
+    }
+}
+
+/// The most that rounding to the storage type moves an entry of a tile whose largest one is `largest`.
+fn half_step(tiles: &Tiles, tile: usize, mode: usize, largest: f32) -> f64 {
+    let factor = f64::from(factor(tiles, tile, mode));
+    // Half the distance of neighbours: 2^-11 of the power of two below f16, 2^-8 below bf16; both have a smallest one.
+    let below = f64::exp2(f64::from(super::pack::exponent(largest)));
+    match tiles.storage() {
+        _ if largest == 0.0 => 0.0,
+        Storage::F32 => 0.0,
+        Storage::F16 => (below * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
+        // A whole smallest step: an f32 lies between, so a value there may be rounded twice.
+        Storage::Bf16 => (below * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
+        Storage::Int8 => factor / 2.0 * ROUND_UP,
+    }
+}
+
+#[cfg(test)]
+mod tests;

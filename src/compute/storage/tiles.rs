@@ -1,0 +1,275 @@
+//! The tiles of one shape, and what one entry is worth in them.
+
+use std::ops::Range;
+
+use half::{bf16, f16};
+
+use super::{QUAD, TILE_QUADS, modes_per_chunk, pack};
+use modalcast_model::domain::Shape;
+use modalcast_model::scene::Storage;
+
+/// 16 bytes of a quad's chunk: what one lane loads at once.
+#[repr(C, align(16))]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct Plane(pub [u8; 16]);
+
+/// Where one tile lies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Tile {
+    /// The first quad in the shape, and the count W of quads.
+    pub first_quad: usize,
+    pub quads: usize,
+    /// The first vertex in the shape, and the count of vertices that are there.
+    pub first_vertex: usize,
+    pub vertices: usize,
+    /// The first of its `3 C W` planes.
+    pub first_plane: usize,
+    /// The first of its `C K` scales, if the storage has any.
+    pub first_scale: usize,
+}
+
+/// U and x0 of one shape in tiles. The module's page says how they lie.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tiles {
+    storage: Storage,
+    vertices: usize,
+    rank: usize,
+    planes: Vec<Plane>,
+    scales: Vec<f32>,
+    factors: Vec<f32>,
+    rest: Vec<[f32; 12]>,
+}
+
+impl Tiles {
+    /// Rounds a shape's U to the storage type.
+    ///
+    /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15) or in
+    /// [1, 2); `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
+    pub fn new(shape: &Shape, storage: Storage) -> Self {
+        let rest = shape.mesh.rest();
+        let rank = shape.modes.rank();
+        let mut tiles = Self {
+            storage,
+            vertices: rest.len(),
+            rank,
+            planes: Vec::new(),
+            scales: Vec::new(),
+            factors: pack::factors(&shape.modes, storage),
+            rest: rest.chunks(QUAD).map(pack::rest_quad).collect(),
+        };
+        tiles.planes = bytemuck::zeroed_vec(3 * tiles.chunks() * tiles.quads());
+        if rank == 0 {
+            return tiles;
+        }
+        let places: Vec<Tile> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
+        if storage == Storage::Int8 {
+            tiles.scales = vec![0.0; tiles.count() * tiles.chunks() * modes_per_chunk(storage)];
+            pack::fill_codes(&shape.modes, &places, &mut tiles.planes, &mut tiles.scales);
+        } else {
+            pack::fill_floats(&shape.modes, &places, (storage, &tiles.factors), &mut tiles.planes);
+        }
+        tiles
+    }
+
+    /// The type that entries are stored in.
+    pub const fn storage(&self) -> Storage {
+        self.storage
+    }
+
+    /// n.
+    pub const fn vertices(&self) -> usize {
+        self.vertices
+    }
+
+    /// r.
+    pub const fn rank(&self) -> usize {
+        self.rank
+    }
+
+    /// Q, a quarter of n rounded up.
+    pub const fn quads(&self) -> usize {
+        self.vertices.div_ceil(QUAD)
+    }
+
+    /// C, the chunks of modes; 0 without modes.
+    pub const fn chunks(&self) -> usize {
+        self.rank.div_ceil(modes_per_chunk(self.storage))
+    }
+
+    /// The count of tiles.
+    pub const fn count(&self) -> usize {
+        self.quads().div_ceil(TILE_QUADS)
+    }
+
+    /// Where tile `tile` lies.
+    pub fn tile(&self, tile: usize) -> Tile {
+        let first_quad = TILE_QUADS * tile;
+        let quads = TILE_QUADS.min(self.quads() - first_quad);
+        let first_vertex = QUAD * first_quad;
+        Tile {
+            first_quad,
+            quads,
+            first_vertex,
+            vertices: (QUAD * quads).min(self.vertices - first_vertex),
+            first_plane: 3 * self.chunks() * first_quad,
+            first_scale: tile * self.chunks() * modes_per_chunk(self.storage),
+        }
+    }
+
+    /// All planes, tile after tile without gaps: `48 C Q` bytes.
+    pub fn planes(&self) -> &[Plane] {
+        &self.planes
+    }
+
+    /// The planes as bytes, as a device takes them.
+    pub fn bytes(&self) -> &[u8] {
+        bytemuck::cast_slice(&self.planes)
+    }
+
+    /// The bytes of tile `tile` in [`Self::bytes`].
+    pub fn byte_range(&self, tile: usize) -> Range<usize> {
+        let place = self.tile(tile);
+        let first = 16 * place.first_plane;
+        first..first + 48 * self.chunks() * place.quads
+    }
+
+    /// `Int8`: the step between codes per tile and mode, `[tile][C K]`, zero for modes that only fill up. Else empty.
+    pub fn scales(&self) -> &[f32] {
+        &self.scales
+    }
+
+    /// `F16` and `Bf16`: per mode the power of two that its stored entries are multiplied by. Else empty.
+    pub fn factors(&self) -> &[f32] {
+        &self.factors
+    }
+
+    /// x0 per quad, element `4 axis + vertex in quad`.
+    pub fn rest(&self) -> &[[f32; 12]] {
+        &self.rest
+    }
+
+    /// Entry of vertex `vertex`, axis `axis`, mode `mode`, as it is stored: exact in f64.
+    pub fn decoded(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
+        let per_chunk = modes_per_chunk(self.storage);
+        let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
+        let place = self.tile(tile);
+        let element = (mode % per_chunk * 3 + axis) * QUAD + vertex % QUAD;
+        let size = 4 / per_chunk;
+        let (plane, within) = (element * size / 16, element * size % 16);
+        let at = place.first_plane + (mode / per_chunk * 3 + plane) * place.quads + quad - place.first_quad;
+        let bytes = &self.planes[at].0[within..within + size];
+        match self.storage {
+            Storage::F32 => f64::from(bytemuck::pod_read_unaligned::<f32>(bytes)),
+            Storage::F16 => f16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
+            Storage::Bf16 => bf16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
+            Storage::Int8 => (f64::from(bytes[0]) - 128.0) * f64::from(self.scales[place.first_scale + mode]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Noise, shape};
+
+    const SIZES: [(usize, usize); 12] = [
+        (1, 1),
+        (1, 0),
+        (3, 5),
+        (4, 3),
+        (7, 2),
+        (127, 4),
+        (128, 31),
+        (129, 33),
+        (255, 7),
+        (300, 8),
+        (1500, 6),
+        (9, 512),
+    ];
+
+    /// Half the distance between neighbours of an entry, in units of the entry's mode.
+    fn half_step(tiles: &Tiles, tile: Tile, mode: usize, entry: f64) -> f64 {
+        let exponent = |value: f64| value.abs().log2().floor();
+        match tiles.storage() {
+            Storage::F32 => 0.0,
+            Storage::F16 => {
+                let factor = f64::from(tiles.factors()[mode]);
+                f64::exp2((exponent(entry / factor) - 11.0).max(-25.0)) * factor
+            }
+            Storage::Bf16 => f64::exp2(exponent(entry) - 8.0),
+            Storage::Int8 => f64::from(tiles.scales()[tile.first_scale + mode]) * 0.5 * (1.0 + 1e-12),
+        }
+    }
+
+    #[test]
+    fn every_entry_is_the_nearest_that_its_storage_can_hold() {
+        let mut noise = Noise(1);
+        for (vertices, rank) in SIZES {
+            let shape = shape(vertices, rank, &mut noise);
+            for storage in Storage::ALL {
+                let tiles = Tiles::new(&shape, storage);
+                for vertex in 0..vertices {
+                    let tile = tiles.tile(vertex / QUAD / TILE_QUADS);
+                    for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
+                        let entry = f64::from(shape.modes.at(vertex, axis, mode));
+                        let error = (tiles.decoded(vertex, axis, mode) - entry).abs();
+                        let allowed = half_step(&tiles, tile, mode, entry);
+                        assert!(error <= allowed, "{storage:?} {vertices} {rank}: {error} of {entry} over {allowed}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn tiles_follow_each_other_without_gaps_and_what_fills_up_is_zero() {
+        let mut noise = Noise(2);
+        for (vertices, rank) in SIZES {
+            let shape = shape(vertices, rank, &mut noise);
+            for storage in Storage::ALL {
+                let tiles = Tiles::new(&shape, storage);
+                assert_eq!(tiles.bytes().len(), 48 * tiles.chunks() * tiles.quads());
+                let ends = (0..tiles.count()).fold((0, 0, 0), |(byte, quad, vertex), tile| {
+                    let place = tiles.tile(tile);
+                    let range = tiles.byte_range(tile);
+                    assert_eq!((range.start, place.first_quad, place.first_vertex), (byte, quad, vertex));
+                    (range.end, quad + place.quads, vertex + place.vertices)
+                });
+                assert_eq!(ends, (tiles.bytes().len(), tiles.quads(), vertices));
+                let filled = tiles.chunks() * modes_per_chunk(storage);
+                for vertex in vertices..QUAD * tiles.quads() {
+                    for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
+                        assert_eq!(tiles.decoded(vertex, axis, mode), 0.0);
+                    }
+                }
+                if storage == Storage::Int8 && filled > rank {
+                    let place = tiles.tile(0);
+                    assert!(tiles.scales()[rank..filled].iter().all(|scale| *scale == 0.0));
+                    // The last chunk's last byte is vertex 3, axis 2 of a mode that only fills up.
+                    assert_eq!(tiles.planes()[place.first_plane + (3 * tiles.chunks() - 1) * place.quads].0[15], 128);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn bytes_lie_where_the_page_says() {
+        let shape = shape(9, 5, &mut Noise(3));
+        let tiles = Tiles::new(&shape, Storage::F32);
+        let float = |at: usize| f32::from_ne_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
+        // Three quads: mode 2, axis 1, vertex 6 is quad 1, place 2.
+        assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.at(6, 1, 2));
+        assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest()[6][1]);
+        assert_eq!(tiles.rest()[2][1], 0.0);
+        let tiles = Tiles::new(&shape, Storage::Int8);
+        // Chunk 0, mode 2 is group 7 of 4 vertices: plane 1, bytes 12 to 15.
+        let code = tiles.planes()[3 + 1].0[12 + 2];
+        let want = (shape.modes.at(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
+        assert_eq!(f32::from(code), want);
+        let tiles = Tiles::new(&shape, Storage::F16);
+        // Chunk 1, mode 3 is its second: group 4 is plane 2, bytes 0 to 7.
+        let bytes = &tiles.planes()[9 + 2 * 3 + 1].0[4..6];
+        let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
+        assert_eq!(f16::from_f32(shape.modes.at(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);
+    }
+}

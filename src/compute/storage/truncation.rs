@@ -1,0 +1,210 @@
+//! Which modes cannot matter at a step's q, and what leaving them out costs.
+//!
+//! Leaving modes D out moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, because a sum is not
+//! longer than its parts together and A lengthens nothing by more than its norm. A mode whose q crosses a limit back
+//! and forth would pop in and out: it goes only when all that is out stays within half the budget, and comes back when
+//! the whole budget is exceeded.
+
+use modalcast_model::domain::Modes;
+
+/// A little more than the roundings of 513 additions and three products in f64.
+const ROUND_UP: f64 = 1.0 + 1e-12;
+
+/// `max_i ||U_ij||_2` per mode, rounded up, scene units per unit of q: the farthest that a mode moves a vertex.
+pub fn reaches(modes: &Modes) -> Vec<f64> {
+    let square = |row: &[f32]| row.iter().map(|entry| f64::from(*entry).powi(2)).sum::<f64>();
+    let reach = |mode: usize| modes.column(mode).chunks_exact(3).map(square).fold(0.0, f64::max).sqrt() * ROUND_UP;
+    (0..modes.rank()).map(reach).collect()
+}
+
+/// What decides in one step which modes of a domain matter.
+#[derive(Debug, Clone, Copy)]
+pub struct Amounts<'a> {
+    /// Finite coordinates, r of them.
+    pub q: &'a [f32],
+    /// From [`reaches`].
+    pub reaches: &'a [f64],
+    /// At least `||A||_2`, as [`super::bound::norm`] gives it.
+    pub norm: f64,
+}
+
+/// The modes of one domain that are left out, from step to step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Truncation {
+    out: Vec<bool>,
+    costs: Vec<f64>,
+    ascending: Vec<u16>,
+    kept: Vec<u16>,
+    bound: f64,
+}
+
+impl Truncation {
+    /// Of a domain of `rank` modes, none left out yet.
+    pub fn new(rank: usize) -> Self {
+        let all: Vec<u16> = (0..rank as u16).collect();
+        Self { out: vec![false; rank], costs: vec![0.0; rank], ascending: all.clone(), kept: all, bound: 0.0 }
+    }
+
+    /// Keeps all modes until the next step is decided, as if none had been before.
+    pub fn forget(&mut self) {
+        *self = Self::new(self.out.len());
+    }
+
+    /// Decides for a step. `budget` is the farthest that a vertex may be off, in scene units.
+    pub fn update(&mut self, amounts: Amounts, budget: f64) {
+        for (cost, (q, reach)) in self.costs.iter_mut().zip(amounts.q.iter().zip(amounts.reaches)) {
+            *cost = amounts.norm * (f64::from(q.abs()) * reach);
+        }
+        let costs = &self.costs;
+        self.ascending.sort_unstable_by(|a, b| {
+            let order = costs[usize::from(*a)].total_cmp(&costs[usize::from(*b)]);
+            order.then(a.cmp(b))
+        });
+        let total = self.bring_back(budget);
+        self.bound = self.leave_out(total, budget / 2.0) * ROUND_UP;
+        self.kept.clear();
+        self.kept.extend((0..self.out.len() as u16).filter(|mode| !self.out[usize::from(*mode)]));
+    }
+
+    /// The modes to sum, ascending.
+    pub fn kept(&self) -> &[u16] {
+        &self.kept
+    }
+
+    /// No vertex is off by more than this for the modes that are left out, in scene units. Within the budget.
+    pub const fn bound(&self) -> f64 {
+        self.bound
+    }
+
+    /// The costliest modes return until the rest fits. Returns what the rest costs.
+    fn bring_back(&mut self, budget: f64) -> f64 {
+        let mut total = 0.0;
+        for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
+            if self.out[mode] {
+                let with = total + self.costs[mode];
+                self.out[mode] = with * ROUND_UP <= budget;
+                total = if self.out[mode] { with } else { total };
+            }
+        }
+        total
+    }
+
+    /// The cheapest modes go while all that is out fits. Returns what it costs then.
+    fn leave_out(&mut self, mut total: f64, budget: f64) -> f64 {
+        for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
+            if self.out[mode] {
+                continue;
+            }
+            let with = total + self.costs[mode];
+            if with * ROUND_UP > budget {
+                break;
+            }
+            self.out[mode] = true;
+            total = with;
+        }
+        total
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Noise, shape};
+    use modalcast_model::domain::Shape;
+
+    fn decide(truncation: &mut Truncation, q: &[f32], reaches: &[f64], budget: f64) {
+        truncation.update(Amounts { q, reaches, norm: 1.0 }, budget);
+    }
+
+    /// The farthest that leaving out all but `kept` moves a vertex.
+    fn farthest(shape: &Shape, q: &[f32], kept: &[u16]) -> f64 {
+        let dropped = || (0..q.len()).filter(|mode| !kept.contains(&(*mode as u16)));
+        let part = |vertex: usize, axis: usize| -> f64 {
+            dropped().map(|mode| f64::from(q[mode]) * f64::from(shape.modes.at(vertex, axis, mode))).sum()
+        };
+        let length = |vertex| (0..3).map(|axis| part(vertex, axis).powi(2)).sum::<f64>().sqrt();
+        (0..shape.modes.vertices()).map(length).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn no_vertex_is_off_by_more_than_the_bound_and_the_bound_stays_within_the_budget() {
+        let (mut left_out, mut seen) = (0, 0);
+        for seed in 0..120 {
+            let mut noise = Noise(seed);
+            let rank = 1 + seed as usize % 40;
+            let shape = shape(30, rank, &mut noise);
+            let reaches = reaches(&shape.modes);
+            let mut truncation = Truncation::new(rank);
+            for step in 0..4 {
+                let q: Vec<f32> = (0..rank).map(|mode| noise.next() * f32::exp2(-(mode as f32))).collect();
+                let budget = 0.4 / f64::from(1 << (4 * step));
+                decide(&mut truncation, &q, &reaches, budget);
+                let error = farthest(&shape, &q, truncation.kept());
+                assert!(error <= truncation.bound() && truncation.bound() <= budget, "seed {seed}: {error}");
+                assert!(truncation.kept().is_sorted());
+                left_out += rank - truncation.kept().len();
+                // One mode more than it says: the judge can fail.
+                let one_less = truncation.kept().split_first().map_or(&[][..], |(_, rest)| rest);
+                seen += usize::from(farthest(&shape, &q, one_less) > truncation.bound());
+            }
+        }
+        assert!(left_out > 1000, "{left_out} modes were left out");
+        assert!(seen > 300, "one mode more was seen {seen} times");
+    }
+
+    #[test]
+    fn one_mode_on_one_vertex_meets_the_bound_exactly() {
+        let shape = shape(1, 1, &mut Noise(5));
+        let reaches = reaches(&shape.modes);
+        let mut truncation = Truncation::new(1);
+        decide(&mut truncation, &[0.25], &reaches, 10.0);
+        let error = farthest(&shape, &[0.25], &[]);
+        assert!(truncation.kept().is_empty());
+        assert!(error <= truncation.bound() && truncation.bound() <= error * (1.0 + 1e-11));
+    }
+
+    #[test]
+    fn a_mode_that_swings_about_a_limit_does_not_flicker_and_would_without_the_half_budget() {
+        let swing = |step: i32| (0.5 + 0.1 * f64::from(step).sin()) as f32;
+        let mut truncation = Truncation::new(2);
+        let (mut changes, mut naive_changes) = (0, 0);
+        let mut before = truncation.kept().to_vec();
+        let mut naive_before = before.len();
+        for step in 0..200 {
+            let q = [1.0, swing(step)];
+            decide(&mut truncation, &q, &[1.0, 1.0], 1.0);
+            changes += usize::from(truncation.kept() != before);
+            before = truncation.kept().to_vec();
+            // Without memory: whatever fits into half the budget goes.
+            let mut naive = Truncation::new(2);
+            decide(&mut naive, &q, &[1.0, 1.0], 1.0);
+            naive_changes += usize::from(naive.kept().len() != naive_before);
+            naive_before = naive.kept().len();
+        }
+        assert_eq!(changes, 1, "it goes once and stays away");
+        assert!(naive_changes > 50, "{naive_changes} changes without memory");
+    }
+
+    #[test]
+    fn a_mode_that_grows_returns_once_the_whole_budget_is_exceeded_and_goes_below_half_of_it() {
+        let mut truncation = Truncation::new(1);
+        let mut kept = |q: f32| {
+            decide(&mut truncation, &[q], &[1.0], 1.0);
+            truncation.kept().len()
+        };
+        assert_eq!([0.6, 0.51, 0.49, 0.9, 0.99, 1.01, 0.8, 0.51, 0.4].map(&mut kept), [1, 1, 0, 0, 0, 1, 1, 1, 0]);
+    }
+
+    #[test]
+    fn huge_tiny_and_zero_amounts_are_decided_without_overflow() {
+        let huge = [f32::MAX, 1e-45, 0.0, -f32::MAX];
+        let reaches = [f64::from(f32::MAX); 4];
+        let mut truncation = Truncation::new(4);
+        truncation.update(Amounts { q: &huge, reaches: &reaches, norm: 1e39 }, 1e-6);
+        assert_eq!(truncation.kept(), [0, 1, 3]);
+        assert_eq!(truncation.bound(), 0.0);
+        let mut none = Truncation::new(0);
+        decide(&mut none, &[], &[], 1.0);
+        assert!(none.kept().is_empty());
+    }
+}

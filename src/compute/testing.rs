@@ -1,0 +1,118 @@
+//! Input and judges for tests of this crate and of crates that add kernels: seeded scenes, exact results, and what the
+//! compiler reports of a kernel. Compiled for tests and with the feature `testing` only.
+
+#![allow(clippy::expect_used, clippy::panic, missing_docs, reason = "a test may fail")]
+
+use std::sync::Arc;
+
+pub use crate::gpu::{Assembled, assert_compiles};
+
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::scene::{Deformation, Parts, Scene, State};
+
+/// Deterministic numbers in -1 to 1.
+#[derive(Debug)]
+pub struct Noise(pub u64);
+
+impl Noise {
+    /// The next number. Not an iterator: it never ends.
+    #[expect(clippy::should_implement_trait, reason = "an iterator would need an adapter at every use")]
+    pub fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
+    }
+}
+
+/// Vertices in the unit cube with modes of noise.
+pub fn shape(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
+    let columns = (0..3 * vertices * rank).map(|_| noise.next()).collect();
+    with_columns(vertices, rank, columns, noise)
+}
+
+/// Vertices in the unit cube with these columns.
+pub fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, noise: &mut Noise) -> Shape {
+    let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
+    let normals = vec![[0.0, 0.0, 1.0]; vertices];
+    let mesh = Mesh::indexed(rest, normals, vec![], vec![[0; 3]]).expect("a mesh");
+    let modes =
+        if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, columns).expect("modes") };
+    Shape::new(mesh, modes).expect("a shape")
+}
+
+/// A scene of shapes of noise, one domain each per (n, r).
+pub fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &mut Noise) -> Arc<Scene> {
+    let mut parts = Parts::named("noise");
+    parts.deformation = deformation;
+    parts.materials = vec![Material::default()];
+    for (at, (vertices, rank)) in sizes.iter().enumerate() {
+        parts.shapes.push(shape(*vertices, *rank, noise));
+        parts.domains.push(domain(at));
+    }
+    Scene::new(parts).expect("a scene")
+}
+
+fn domain(shape: usize) -> Domain {
+    Domain {
+        name: format!("noise {shape}"),
+        shape,
+        material: 0,
+        runs: vec![],
+        placement: Transform::IDENTITY,
+        attachment: None,
+        follows: None,
+        rest_q: vec![],
+        shares_q_with: None,
+        metadata: Metadata::default(),
+    }
+}
+
+/// One domain for each (vertices, rank, triangles), with random corner normals, and a random state.
+pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, State) {
+    let mut noise = Noise(shapes.len() as u64);
+    let mut parts = Parts::named("noise");
+    parts.materials = vec![Material::default()];
+    for (at, (vertices, rank, triangles)) in shapes.iter().enumerate() {
+        parts.shapes.push(shape_with_corners(&mut noise, *vertices, *rank, *triangles));
+        parts.domains.push(domain(at));
+    }
+    let scene = Scene::new(parts).expect("a scene");
+    let mut state = State::rest(&scene);
+    state.q.iter_mut().for_each(|coordinate| *coordinate = noise.next());
+    state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| noise.next()));
+    (scene, state)
+}
+
+fn shape_with_corners(noise: &mut Noise, vertices: usize, rank: usize, triangles: usize) -> Shape {
+    let rest = (0..vertices).map(|_| [0; 3].map(|_| noise.next())).collect();
+    let corners = Corners {
+        vertices: (0..vertices as u32).collect(),
+        normals: (0..vertices).map(|_| [0; 3].map(|_| noise.next())).collect(),
+        uvs: Vec::new(),
+    };
+    let corner = |index: usize| (index % vertices) as u32;
+    let triangles = (0..triangles).map(|first| [3 * first, 3 * first + 1, 3 * first + 2].map(corner)).collect();
+    let entries = (0..3 * vertices * rank).map(|_| noise.next()).collect();
+    let modes = Modes::from_columns(3 * vertices, rank, entries).expect("modes");
+    Shape::new(Mesh::new(rest, corners, triangles).expect("a mesh"), modes).expect("a shape")
+}
+
+/// u = U q of a vertex, in f64.
+pub fn displacement_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f64; 3] {
+    let modes = &scene.shape_of(domain).modes;
+    let q = state.q_of(scene, domain);
+    [0, 1, 2]
+        .map(|axis| q.iter().enumerate().map(|(mode, q)| f64::from(modes.at(vertex, axis, mode)) * f64::from(*q)).sum())
+}
+
+/// x = T (x0 + u) of a vertex, in f64.
+pub fn position_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f64; 3] {
+    let (u, rest) = (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest()[vertex]);
+    let (linear, offset) = (state.transforms[domain].linear(), state.transforms[domain].translation());
+    let bent = nalgebra::Vector3::from([0, 1, 2].map(|axis| f64::from(rest[axis]) + u[axis]));
+    (linear * bent + offset).into()
+}
+
+/// One row of T (x, y, z, 1) with fused multiply-adds, in the order of the kernels that batch.
+pub fn transformed_axis(row: &[f32], [x, y, z]: [f32; 3]) -> f32 {
+    row[0].mul_add(x, row[1].mul_add(y, row[2].mul_add(z, row[3])))
+}

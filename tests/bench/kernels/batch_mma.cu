@@ -1,0 +1,266 @@
+// x = T_b (x0 + U q_b) for up to VECTORS domains b of one shape, by tensor cores. Only trials use it.
+//   words      U in 16 bits an entry, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)         (in)
+//   rest       x0, [quads][12] f32: 4 x, 4 y, 4 z                                                       (in)
+//   transforms [VECTORS][3] float4: the rows of T; zeros where there is no domain                       (in)
+//   shrinks    [VECTORS] f32: powers of two that take back by what q was multiplied                     (in)
+//   halves     q in two numbers of 16 bits each, [steps][VECTORS / 8][32 lanes] words of 16 bytes: of
+//              vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first what q
+//              is rounded to, then what that leaves, rounded likewise                                   (in)
+//   positions  [vertices][3] f32; domain b begins at vertex `first[b]`                                  (out)
+// Launch: a block of WARPS warps for each tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
+//
+// Not the bits of `deform`: q keeps 22 bits (f16) or 16 (bf16), and a tensor core sums the 16 products of a step in an
+// order and with a rounding of its own. The launcher's bound has both. Nothing that overflows is computed again.
+//
+// Why it looks like this. The U of a quad and a chunk is 12 rows (axis, vertex) of two modes. The fragment that
+// mma.m16n8k16 takes of a lane is rows g and g + 8 at columns 2 t + {0, 1} and 2 t + {8, 9}, with g = lane / 4 and
+// t = lane % 4. Which row and which mode those are is free: a lane takes quad g and chunks t and t + 4, six loads of 16
+// bytes in whole lines of 128, and has the fragments of six products by two byte permutations a register. U passes no
+// shared memory. What comes back is all 12 sums of quad g for a quarter of the domains, so a lane places whole vertices.
+// The sums of 16 vectors, two steps of U and q take 160 registers: 12 warps a multiprocessor, with 72 KB on their way.
+#if defined(STORE_BF16)
+#define OPERANDS "bf16.bf16"
+#else
+#define OPERANDS "f16.f16"
+#endif
+
+#if defined(BATCH_8)
+constexpr unsigned VECTORS = 8;
+constexpr unsigned RESIDENT = 4;
+#elif defined(BATCH_32)
+constexpr unsigned VECTORS = 32;
+constexpr unsigned RESIDENT = 2;
+#else
+constexpr unsigned VECTORS = 16;
+constexpr unsigned RESIDENT = 3;
+#endif
+constexpr unsigned MOST = 32;
+constexpr unsigned EIGHTS = VECTORS / 8;
+
+// A warp has eight quads of a tile of 32; a step is eight chunks of two modes.
+constexpr unsigned WARPS = 4;
+constexpr unsigned QUADS = 8;
+constexpr unsigned TILE = WARPS * QUADS;
+constexpr unsigned STEP_CHUNKS = 8;
+// Numbers of 16 bytes of a domain's eight quads of x, and from one domain's to the next: two more keep the lanes of a
+// quarter of a warp in different banks.
+constexpr unsigned FOURS = 3 * QUADS;
+constexpr unsigned STRIDE = FOURS + 2;
+
+// Twin: tests/bench/src/kernels/batch_mma.rs.
+struct BatchMmaArgs {
+    const uint4* words;
+    const float4* rest;
+    const float4* transforms;
+    const float* shrinks;
+    const uint4* halves;
+    float* positions;
+    unsigned first[MOST]; // packed vertex of each domain
+    unsigned domains;
+    unsigned vertices; // of the shape
+    unsigned chunks;
+    unsigned aligned; // whether every domain begins at 16 bytes
+};
+static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
+
+#if __CUDA_ARCH__ >= 800
+__device__ __forceinline__ unsigned lane_of() {
+    return threadIdx.x % 32;
+}
+
+// A warp's part of a tile.
+struct Part {
+    const uint4* words; // of the lane's quad
+    unsigned width;     // quads of the tile
+    unsigned rest;      // the lane's quad of the shape
+    unsigned first;     // the warp's first vertex in the shape
+    unsigned numbers;   // of the warp's vertices, three each; 0 without any
+};
+
+// A lane beyond the last quad looks at that one; nothing of it is stored.
+__device__ __forceinline__ Part part_of(const BatchMmaArgs& args) {
+    const unsigned tile = TILE * blockIdx.x, before = QUADS * (threadIdx.x / 32);
+    Part part;
+    part.width = min(TILE, (args.vertices + 3) / 4 - tile);
+    const unsigned quad = min(before + lane_of() / 4, part.width - 1);
+    part.words = args.words + 3 * (size_t)args.chunks * tile + quad;
+    part.rest = tile + quad;
+    part.first = 4 * (tile + before);
+    part.numbers = args.vertices > part.first ? 3 * min(4 * QUADS, args.vertices - part.first) : 0;
+    return part;
+}
+
+// A quad's two modes: words 2 axis + {0, 1} of one mode, then of the other, each of two vertices.
+struct Chunk {
+    unsigned words[12];
+};
+
+// Zeros beyond the last chunk: what is not a number times zero would not be.
+__device__ __forceinline__ void load(Chunk& chunk, const BatchMmaArgs& args, const Part& part, unsigned index) {
+#pragma unroll
+    for (unsigned plane = 0; plane < 3; ++plane) {
+        const uint4* from = part.words + (3 * (size_t)index + plane) * part.width;
+        const uint4 word = index < args.chunks ? __ldcs(from) : make_uint4(0, 0, 0, 0);
+        chunk.words[4 * plane] = word.x;
+        chunk.words[4 * plane + 1] = word.y;
+        chunk.words[4 * plane + 2] = word.z;
+        chunk.words[4 * plane + 3] = word.w;
+    }
+}
+
+// Both chunks of a lane in a step.
+struct Step {
+    Chunk low, high;
+};
+
+__device__ __forceinline__ void load(Step& step, const BatchMmaArgs& args, const Part& part, unsigned index) {
+    const unsigned chunk = STEP_CHUNKS * index + lane_of() % 4;
+    load(step.low, args, part, chunk);
+    load(step.high, args, part, chunk + 4);
+}
+
+// [2 axis + pair of vertices][eight of domains][2 (vertex of the pair) + domain of the lane's two]
+typedef float Sums[6][EIGHTS][4];
+
+__device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4], unsigned q0, unsigned q1) {
+    asm("mma.sync.aligned.m16n8k16.row.col.f32." OPERANDS ".f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
+        "{%0, %1, %2, %3};"
+        : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
+        : "r"(u[0]), "r"(u[1]), "r"(u[2]), "r"(u[3]), "r"(q0), "r"(q1));
+}
+
+// The modes of a step: what q was rounded to leaves comes first, while sums are small.
+__device__ __forceinline__ void add(Sums& sums, const Step& step, const uint4* halves) {
+    uint4 q[EIGHTS];
+#pragma unroll
+    for (unsigned eight = 0; eight < EIGHTS; ++eight) {
+        q[eight] = __ldg(halves + 32 * eight + lane_of());
+    }
+#pragma unroll
+    for (unsigned row = 0; row < 6; ++row) {
+        const unsigned *low = step.low.words, *high = step.high.words;
+        const unsigned u[4] = {
+            __byte_perm(low[row], low[6 + row], 0x5410),
+            __byte_perm(low[row], low[6 + row], 0x7632),
+            __byte_perm(high[row], high[6 + row], 0x5410),
+            __byte_perm(high[row], high[6 + row], 0x7632),
+        };
+#pragma unroll
+        for (unsigned eight = 0; eight < EIGHTS; ++eight) {
+            multiply(sums[row][eight], u, q[eight].z, q[eight].w);
+            multiply(sums[row][eight], u, q[eight].x, q[eight].y);
+        }
+    }
+}
+
+// All modes, two steps on their way at once.
+__device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const Part& part, Sums& sums) {
+    const unsigned steps = (args.chunks + STEP_CHUNKS - 1) / STEP_CHUNKS;
+    const uint4* halves = args.halves;
+    Step even, odd;
+    load(even, args, part, 0);
+    load(odd, args, part, 1);
+#pragma unroll 1
+    for (unsigned step = 0; step < steps; step += 2) {
+        add(sums, even, halves);
+        load(even, args, part, step + 2);
+        if (step + 1 < steps) {
+            add(sums, odd, halves + 32 * EIGHTS);
+            load(odd, args, part, step + 3);
+        }
+        halves += 2 * 32 * EIGHTS;
+    }
+}
+
+__device__ __forceinline__ float placed(const float4& row, float x, float y, float z) {
+    return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
+}
+
+// Puts x of the lane's quad for one domain at its place of a stage, 48 bytes.
+__device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
+                                      unsigned domain, float4* staged) {
+    const float4 *rows = args.transforms + 3 * domain, a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
+    const float shrink = __ldg(args.shrinks + domain);
+    const float x0[3][4] = {{rest[0].x, rest[0].y, rest[0].z, rest[0].w},
+                            {rest[1].x, rest[1].y, rest[1].z, rest[1].w},
+                            {rest[2].x, rest[2].y, rest[2].z, rest[2].w}};
+    float world[12];
+#pragma unroll
+    for (unsigned vertex = 0; vertex < 4; ++vertex) {
+        const float x = x0[0][vertex] + u[0][vertex] * shrink, y = x0[1][vertex] + u[1][vertex] * shrink,
+                    z = x0[2][vertex] + u[2][vertex] * shrink;
+        world[3 * vertex] = placed(a, x, y, z);
+        world[3 * vertex + 1] = placed(b, x, y, z);
+        world[3 * vertex + 2] = placed(c, x, y, z);
+    }
+#pragma unroll
+    for (unsigned i = 0; i < 3; ++i) {
+        staged[i] = make_float4(world[4 * i], world[4 * i + 1], world[4 * i + 2], world[4 * i + 3]);
+    }
+}
+
+// Writes what the warp staged of four domains, every second from `domain` on: eight lanes a domain, 128 bytes together.
+__device__ __forceinline__ void store(const BatchMmaArgs& args, const Part& part, unsigned domain,
+                                      const float4* staged) {
+    const unsigned own = lane_of() / 8;
+    domain += 2 * own;
+    if (domain >= args.domains) {
+        return;
+    }
+    float* to = args.positions + 3 * ((size_t)args.first[domain] + part.first);
+#pragma unroll
+    for (unsigned i = 0; i < 3; ++i) {
+        const unsigned four = 8 * i + lane_of() % 8;
+        const float4 numbers = staged[STRIDE * own + four];
+        if (args.aligned && 4 * four + 4 <= part.numbers) {
+            __stcs((float4*)to + four, numbers);
+        } else {
+            const float each[4] = {numbers.x, numbers.y, numbers.z, numbers.w};
+#pragma unroll
+            for (unsigned k = 0; k < 4; ++k) {
+                if (4 * four + k < part.numbers) {
+                    __stcs(to + 4 * four + k, each[k]);
+                }
+            }
+        }
+    }
+}
+
+__device__ __forceinline__ void place(const BatchMmaArgs& args, const Part& part, const Sums& sums, float4* staged) {
+    float4 rest[3];
+#pragma unroll
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        rest[axis] = __ldg(args.rest + 3 * (size_t)part.rest + axis);
+    }
+    const unsigned quad = lane_of() / 4, pair = lane_of() % 4;
+#pragma unroll
+    for (unsigned eight = 0; eight < EIGHTS; ++eight) {
+#pragma unroll
+        for (unsigned of_pair = 0; of_pair < 2; ++of_pair) {
+            float u[3][4];
+#pragma unroll
+            for (unsigned i = 0; i < 12; ++i) {
+                u[i / 4][i % 4] = sums[2 * (i / 4) + i % 4 / 2][eight][2 * (i % 2) + of_pair];
+            }
+            const unsigned domain = 8 * eight + of_pair;
+            stage(args, rest, u, domain + 2 * pair, staged + STRIDE * pair + 3 * quad);
+            __syncwarp();
+            store(args, part, domain, staged);
+            __syncwarp();
+        }
+    }
+}
+#endif
+
+extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch_mma(const __grid_constant__ BatchMmaArgs args) {
+#if __CUDA_ARCH__ >= 800
+    __shared__ float4 staged[WARPS][4 * STRIDE];
+    const Part part = part_of(args);
+    if (part.numbers == 0) {
+        return;
+    }
+    Sums sums = {};
+    sum_modes(args, part, sums);
+    place(args, part, sums, staged[threadIdx.x / 32]);
+#endif
+}

@@ -1,0 +1,58 @@
+// x = T (x0 + u) of every packed vertex: what follows a product that a library computed. Only trials use it.
+//   slots       [domains] PlainSlot                                                                              (in)
+//   domains     [vertices] u32: the domain of each packed vertex; not read with SINGLE                           (in)
+//   rest        [vertices][3] f32                                                                                (in)
+//   transforms  [domains][3] float4: rows of T                                                                   (in)
+//   u           f32, three per vertex of a domain with modes                                                     (in)
+//   positions   [vertices][3] f32                                                                                (out)
+// Launch: 256 threads a block, a thread a vertex.
+// CPU twin: the tests of tests/bench/src/kernels/plain_update.rs.
+constexpr unsigned BLOCK = 256;
+constexpr unsigned long long RIGID = 0xffffffffffffffffull;
+
+struct PlainSlot {
+    unsigned long long first_u; // float of `u`, or RIGID
+    unsigned first;             // packed vertex
+    unsigned reserved;
+};
+static_assert(sizeof(PlainSlot) == 16, "PlainSlot differs from tests/bench/src/kernels/plain_update.rs");
+
+struct PlainArgs {
+    const PlainSlot* slots;
+    const unsigned* domains;
+    const float* rest;
+    const float4* transforms;
+    const float* u;
+    float* positions;
+    unsigned vertices;
+    unsigned reserved;
+};
+static_assert(sizeof(PlainArgs) == 56, "PlainArgs differs from tests/bench/src/kernels/plain_update.rs");
+
+extern "C" __global__ void __launch_bounds__(BLOCK) plain_update(const PlainArgs args) {
+    const unsigned vertex = blockIdx.x * BLOCK + threadIdx.x;
+    if (vertex >= args.vertices) {
+        return;
+    }
+#ifdef SINGLE
+    const unsigned domain = 0;
+#else
+    const unsigned domain = args.domains[vertex];
+#endif
+    const PlainSlot slot = args.slots[domain];
+    const float* rest = args.rest + 3 * (size_t)vertex;
+    float x = rest[0], y = rest[1], z = rest[2];
+    if (slot.first_u != RIGID) {
+        const float* u = args.u + slot.first_u + 3 * (size_t)(vertex - slot.first);
+        x += u[0];
+        y += u[1];
+        z += u[2];
+    }
+    const float4* rows = args.transforms + 3 * (size_t)domain;
+    float* position = args.positions + 3 * (size_t)vertex;
+#pragma unroll
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        const float4 row = rows[axis];
+        position[axis] = fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
+    }
+}

@@ -1,0 +1,94 @@
+// What the memory of the device can do, and the helpers of the stopwatch. None of it deforms anything.
+//   fill     a buffer with numbers that look random                                          `to`: [words] u32   (out)
+//   copy     `from` to `to`; one copy reads and writes the bytes of the buffer
+//   read     `from`, all of it; writes to `to` only if the bits of every word that a thread read combine to ones, which
+//            nothing here ever does, but the compiler cannot know
+//   hold     the stream, for a time
+//   nothing  at all
+// Launch of copy and read: BLOCK threads a block, LOADS words of 16 bytes a thread, as many blocks as the buffer has
+// tiles of BLOCK * LOADS words; buffers are whole tiles.
+// CPU twins: the tests of tests/bench/src/kernels/roof.rs.
+#ifndef LOADS
+#define LOADS 1
+#endif
+
+constexpr unsigned BLOCK = 256;
+
+__device__ uint4 load(const uint4* from) {
+#ifdef STREAMING
+    return __ldcs(from);
+#else
+    return __ldg(from);
+#endif
+}
+
+__device__ void store(uint4* to, uint4 word) {
+#ifdef STREAMING
+    __stcs(to, word);
+#else
+    *to = word;
+#endif
+}
+
+// The first word of a thread; its others follow, a block's width apart.
+__device__ size_t first_word() {
+    return (size_t)blockIdx.x * (BLOCK * LOADS) + threadIdx.x;
+}
+
+extern "C" __global__ void __launch_bounds__(BLOCK) copy(const uint4* from, uint4* to) {
+    const size_t first = first_word();
+    uint4 words[LOADS];
+#pragma unroll
+    for (unsigned i = 0; i < LOADS; ++i) {
+        words[i] = load(from + first + i * BLOCK);
+    }
+#pragma unroll
+    for (unsigned i = 0; i < LOADS; ++i) {
+        store(to + first + i * BLOCK, words[i]);
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(BLOCK) read(const uint4* from, uint4* to) {
+    const size_t first = first_word();
+    uint4 words[LOADS];
+#pragma unroll
+    for (unsigned i = 0; i < LOADS; ++i) {
+        words[i] = load(from + first + i * BLOCK);
+    }
+    unsigned all = 0xffffffffu;
+#pragma unroll
+    for (unsigned i = 0; i < LOADS; ++i) {
+        all &= words[i].x & words[i].y & words[i].z & words[i].w;
+    }
+    if (all == 0xffffffffu) {
+        to[first] = words[0];
+    }
+}
+
+// The finaliser of MurmurHash3 with its top bit cleared, so that no word is all ones.
+extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* to, unsigned long long words) {
+    const size_t index = (size_t)blockIdx.x * BLOCK + threadIdx.x;
+    if (index < words) {
+        unsigned key = (unsigned)index;
+        key ^= key >> 16;
+        key *= 0x85ebca6bu;
+        key ^= key >> 13;
+        key *= 0xc2b2ae35u;
+        key ^= key >> 16;
+        to[index] = key & 0x7fffffffu;
+    }
+}
+
+__device__ unsigned long long now() {
+    unsigned long long nanoseconds;
+    asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(nanoseconds));
+    return nanoseconds;
+}
+
+extern "C" __global__ void hold(unsigned long long nanoseconds) {
+    const unsigned long long begin = now();
+    while (now() - begin < nanoseconds) {
+    }
+}
+
+extern "C" __global__ void nothing() {}

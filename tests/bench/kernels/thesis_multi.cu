@@ -1,0 +1,38 @@
+// BASELINE: u = U q of many domains with the group concept of chapter 3.2.2 of the thesis. Kept to be measured against,
+// not to be used.
+//   entries  [lanes] float4: U'' of all domains of one group width, 32 a warp                                    (in)
+//   meta     [lanes] uint4: where u goes (floats) or IDLE, where q lies (float4), n_vr, nothing                  (in)
+//   q        float4 of coordinates of each domain                                                                (in)
+//   u        [vertices with modes] float4, the fourth number never written                                       (out)
+// Launch: 256 threads a block, a thread a lane; the lanes fill whole blocks. WIDTH is w_g.
+// CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_multi.rs.
+#ifndef WIDTH
+#define WIDTH 8
+#endif
+
+constexpr unsigned LANES = 32;
+constexpr unsigned WARPS = 8;
+constexpr unsigned IDLE = 0xffffffffu;
+
+extern "C" __global__ void __launch_bounds__(WARPS * LANES)
+    thesis_multi(const float4* entries, const uint4* meta, const float4* q, float* u) {
+    __shared__ float sub_sums[WARPS][LANES];
+    const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const size_t index = (size_t)blockIdx.x * (WARPS * LANES) + threadIdx.x;
+    const uint4 mine = meta[index];
+    const bool busy = mine.x != IDLE;
+    float sum = 0.0f;
+    if (busy) {
+        const float4 four = entries[index], part = q[mine.y];
+        sum = four.x * part.x + four.y * part.y + four.z * part.z + four.w * part.w;
+    }
+    sub_sums[warp][lane] = sum;
+    __syncwarp();
+    if (busy && lane % WIDTH % mine.z == 0) {
+        float total = 0.0f;
+        for (unsigned k = 0; k < mine.z; ++k) {
+            total += sub_sums[warp][lane + k];
+        }
+        u[mine.x] = total;
+    }
+}

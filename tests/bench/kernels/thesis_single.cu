@@ -1,0 +1,50 @@
+// BASELINE: u = U q of one domain as chapter 3.2.1 of the thesis computes it. Kept to be measured against, not to be used.
+//   lines   [lines][passes][32] float4: rows of U in fours of modes, as many whole rows as 32 lanes hold         (in)
+//   q       [rank] f32                                                                                           (in)
+//   u       [vertices] float4, the fourth number never written                                                   (out)
+// Launch: 256 threads a block, a warp a line, ceil(lines / 8) blocks. Rows of more than 32 fours (rank above 128, which
+// the text leaves open) take several passes, and so does equation 3.3.
+// CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_single.rs.
+constexpr unsigned LANES = 32;
+constexpr unsigned WARPS = 8;
+constexpr unsigned LARGEST_RANK = 512;
+
+extern "C" __global__ void __launch_bounds__(WARPS * LANES)
+    thesis_single(const float4* lines, const float* q, float* u, unsigned rank, unsigned rows) {
+    __shared__ float shared_q[LARGEST_RANK];
+    __shared__ float sub_sums[WARPS][LANES];
+    const unsigned fours = (rank + 3) / 4;                      // n_vr
+    const unsigned width = min(fours, LANES);                   // lanes of a row
+    const unsigned rows_of_line = LANES / width;                // n_g
+    const unsigned passes = (fours + LANES - 1) / LANES;
+    // Thread (i, j) loads q[4 j + i] to the place of equation 3.3, which is i * 32 + j.
+    for (unsigned place = threadIdx.x; place < passes * 4 * LANES; place += WARPS * LANES) {
+        const unsigned mode = place / 128 * 128 + 4 * (place % LANES) + place / LANES % 4;
+        shared_q[place] = mode < rank ? q[mode] : 0.0f;
+    }
+    __syncthreads();
+    const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const unsigned line = blockIdx.x * WARPS + warp;
+    const unsigned row = line * rows_of_line + lane / width;
+    const bool busy = lane < rows_of_line * width && row < rows;
+    float sum = 0.0f;
+    if (busy) {
+        for (unsigned pass = 0; pass < passes; ++pass) {
+            const unsigned k = lane % width;
+            if (pass * LANES + k < fours) {
+                const float4 four = lines[((size_t)line * passes + pass) * LANES + lane];
+                const float* part = shared_q + pass * 4 * LANES + k;
+                sum += four.x * part[0] + four.y * part[LANES] + four.z * part[2 * LANES] + four.w * part[3 * LANES];
+            }
+        }
+    }
+    sub_sums[warp][lane] = sum; // equation 3.4
+    __syncwarp();
+    if (busy && lane % width == 0) {
+        float total = 0.0f;
+        for (unsigned k = 0; k < width; ++k) {
+            total += sub_sums[warp][lane + k];
+        }
+        u[4 * (size_t)(row / 3) + row % 3] = total;
+    }
+}

@@ -1,0 +1,72 @@
+// BASELINE: the vertex update of chapter 3.2.3 of the thesis: x = T (x0 + u), normals and tangents turned, for the
+// vertices of unfolded triangles. Kept to be measured against, not to be used.
+//   warps       [ceil(vertices / 64) * 8] uint4: the two domains whose vertices a warp meets, and which of its eight
+//               vertices is the first of the second; 8 when there is only one                                    (in)
+//   sources     [vertices] u32: the vertex of u, or RIGID                                                        (in)
+//   rest_*      [vertices] float4; the fourth number of a position is 1, of a direction 0; tangents with TANGENTS (in)
+//   transforms  [domains][4] float4: rows of T                                                                   (in)
+//   u           float4                                                                                           (in)
+//   positions, normals, tangents  [vertices] float4                                                              (out)
+// Launch: 256 threads a block, four threads a vertex, one number each; ceil(vertices / 64) blocks.
+// CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_update.rs.
+constexpr unsigned LANES = 32;
+constexpr unsigned WARPS = 8;
+constexpr unsigned VERTICES = WARPS * LANES / 4; // of a block: n_vb
+constexpr unsigned RIGID = 0xffffffffu;
+
+struct UpdateArgs {
+    const uint4* warps;
+    const unsigned* sources;
+    const float* rest_positions;
+    const float* rest_normals;
+    const float* rest_tangents;
+    const float* transforms;
+    const float* u;
+    float* positions;
+    float* normals;
+    float* tangents;
+    unsigned vertices;
+    unsigned reserved;
+};
+static_assert(sizeof(UpdateArgs) == 88, "UpdateArgs differs from tests/bench/src/kernels/thesis/thesis_update.rs");
+
+__device__ float product(const float* row, const float* rest) {
+    return row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] * rest[3];
+}
+
+extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const UpdateArgs args) {
+    __shared__ float matrices[WARPS][2][16];
+    __shared__ float rest_positions[VERTICES][4];
+    __shared__ float rest_normals[VERTICES][4];
+#ifdef TANGENTS
+    __shared__ float rest_tangents[VERTICES][4];
+#endif
+    const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
+    const unsigned local = threadIdx.x / 4, element = lane % 4;
+    const unsigned vertex = blockIdx.x * VERTICES + local;
+    const size_t place = 4 * (size_t)vertex + element;
+    const uint4 domains = args.warps[blockIdx.x * WARPS + warp];
+    const unsigned domain = lane < 16 ? domains.x : domains.y;
+    matrices[warp][lane / 16][lane % 16] = args.transforms[16 * (size_t)domain + lane % 16];
+    if (vertex < args.vertices) {
+        float position = args.rest_positions[place];
+        const unsigned source = args.sources[vertex];
+        if (source != RIGID) {
+            position += args.u[4 * (size_t)source + element];
+        }
+        rest_positions[local][element] = position;
+        rest_normals[local][element] = args.rest_normals[place];
+#ifdef TANGENTS
+        rest_tangents[local][element] = args.rest_tangents[place];
+#endif
+    }
+    __syncthreads();
+    if (vertex < args.vertices) {
+        const float* row = matrices[warp][lane / 4 < domains.z ? 0 : 1] + 4 * element;
+        args.positions[place] = product(row, rest_positions[local]);
+        args.normals[place] = product(row, rest_normals[local]);
+#ifdef TANGENTS
+        args.tangents[place] = product(row, rest_tangents[local]);
+#endif
+    }
+}

@@ -1,0 +1,212 @@
+//! The command line of `modalcast-report`, which `modalcast report` starts.
+
+mod render;
+
+use std::path::PathBuf;
+
+use clap::{CommandFactory as _, Parser, Subcommand};
+
+use crate::bench::Machine;
+use crate::loads::{Kind, Size};
+use crate::{Progress, Report, Request, Source, deform};
+use modalcast::cli::options::working;
+use modalcast::cli::{EXIT_CODES, Outcome, finish, say};
+use modalcast_model::error::Result;
+
+/// Measures error against run time on this machine and writes tables and plots.
+#[derive(Debug, Parser)]
+#[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
+struct Cli {
+    /// Print the build that this program belongs to, and end.
+    #[arg(long)]
+    build: bool,
+    #[command(subcommand)]
+    what: Option<What>,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    Deform(DeformArgs),
+    Render(render::Args),
+}
+
+const EXAMPLES: &str = "Examples:
+  modalcast report deform --out report
+  modalcast report deform --out report --quick
+  modalcast report deform --out report --load single-22-30 --load plants
+  modalcast report deform --out report --load c --variant 'cuda*' --variant 'cpu f32'
+  modalcast report deform --out report --load c --load plants --variant 'cuda overlap'
+  modalcast report deform --out report --scene path/to/finger
+  modalcast report deform --out report --scene tree --trajectory path/to/record
+  modalcast report render --out report --quick";
+
+const LOADS: &str = "Loads:
+  single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P 14 to 22, R 10 to 30)
+  a, a-positions      one domain of 1.5 M vertices, r = 32, with normals and tangents, or without
+  b                   1,000 domains of 1,500 vertices, r mixed 0 to 64
+  c                   200,000 domains of 7 vertices, 95 % of them rigid
+  cancel              one domain whose modes nearly cancel in pairs
+  batch               16 instances of one domain of 2^18 vertices and 32 modes
+  plant-1 .. plant-12 the plants of table 4.5 of the thesis
+  single, plants, all groups of them";
+
+/// Error against run time of the deformation: validates every variant, then times it.
+///
+/// Writes report.json, report.csv, report.md, report.svg and report.png, anew after each load: a run that is stopped
+/// keeps what was done, and names what is missing. Exit code 1 when a variant exceeds its
+/// a-priori error bound.
+#[derive(Debug, clap::Args)]
+#[command(after_help = format!("{LOADS}\n\n{EXAMPLES}"))]
+struct DeformArgs {
+    /// The folder to write to; files of an earlier report there are replaced.
+    #[arg(long)]
+    out: PathBuf,
+    /// A scene: a built-in name, or a path to a model or a scene folder.
+    #[arg(long)]
+    scene: Option<String>,
+    /// Its trajectory: a .csv of time,q0,q1,..., or a folder with q.npy as modalcast-sim --record writes it. Without it,
+    /// the only .q.csv beside the scene is taken.
+    #[arg(long, requires = "scene")]
+    trajectory: Option<PathBuf>,
+    /// A synthetic scene; may be repeated. Without any, and without --scene: all.
+    #[arg(long = "load", value_name = "NAME")]
+    loads: Vec<String>,
+    /// Random states per load; 100 without it, 10 with --quick.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    seeds: Option<u32>,
+    /// Repetitions per median, at least 20; 100 without it, 20 with --quick.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    replays: Option<u32>,
+    /// The most steps of a trajectory to look at; all without it.
+    #[arg(long)]
+    steps: Option<usize>,
+    /// Only this variant, or all whose names begin so: "cuda*"; may be repeated.
+    #[arg(long = "variant", value_name = "NAME")]
+    variants: Vec<String>,
+    /// Build every load at a fraction of its size, for machines without a GPU; the report says which.
+    #[arg(long)]
+    quick: bool,
+}
+
+/// Runs the command line and returns the process's exit code.
+pub fn run() -> u8 {
+    let cli = Cli::parse();
+    if cli.build {
+        say(modalcast::BUILD);
+        return 0;
+    }
+    modalcast::telemetry::log_to_stderr();
+    finish(match &cli.what {
+        Some(What::Deform(args)) => run_deform(args),
+        Some(What::Render(args)) => render::run(args),
+        None => {
+            Cli::command().print_help().ok(); // Nobody reads it.
+            return 2;
+        }
+    })
+}
+
+fn run_deform(args: &DeformArgs) -> Outcome {
+    let request = request(args)?;
+    let hear = |told: Progress<'_>| match told {
+        Progress::Begins(what) => {
+            tracing::info!(load = what, "measuring");
+            Ok(())
+        }
+        // After each load, so that a run that is stopped keeps what was done.
+        Progress::Measured(report) => report.write(&args.out),
+    };
+    let report = working("measuring", || deform(&request, &Machine::open(), hear))?;
+    lines(&report).into_iter().for_each(say);
+    say(format!("written to {}", args.out.display()));
+    Ok(report.passed())
+}
+
+fn request(args: &DeformArgs) -> Result<Request> {
+    let mut sources = Vec::new();
+    if let Some(source) = &args.scene {
+        sources.push(Source::Scene { source: source.clone(), record: args.trajectory.clone() });
+    }
+    for name in &args.loads {
+        sources.extend(Kind::named(name)?.into_iter().map(Source::Synthetic));
+    }
+    if sources.is_empty() {
+        sources.extend(Kind::all().into_iter().map(Source::Synthetic));
+    }
+    let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
+    let number = |given: Option<u32>, usual: usize| given.map_or(usual, |given| given as usize);
+    Ok(Request {
+        sources,
+        seeds: number(args.seeds, seeds),
+        replays: number(args.replays, replays),
+        steps: args.steps.unwrap_or(usize::MAX),
+        variants: args.variants.clone(),
+        size,
+    })
+}
+
+fn lines(report: &Report) -> Vec<String> {
+    let mut lines = report.remarks.clone();
+    lines.push(format!(
+        "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
+        "load", "variant", "cache", "median us", "GB/s", "largest m", "of bound", "passed"
+    ));
+    for row in &report.rows {
+        let show =
+            |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
+        let errors = row.found.as_ref().map(|found| found.errors);
+        lines.push(format!(
+            "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
+            row.load,
+            row.name,
+            row.cache.name(),
+            show(row.timing.map(|timing| timing.median_us), 2),
+            show(row.gbs, 2),
+            errors.map_or("-".into(), |errors| format!("{:.3e}", errors.metres.largest)),
+            show(errors.map(|errors| errors.of_bound), 4),
+            match (row.passed, row.left_out) {
+                (true, _) => "yes",
+                (false, true) => "left out",
+                (false, false) => "NO",
+            }
+        ));
+    }
+    lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn args() -> DeformArgs {
+        let out = PathBuf::from("out");
+        DeformArgs {
+            out,
+            scene: None,
+            trajectory: None,
+            loads: vec![],
+            seeds: None,
+            replays: None,
+            steps: None,
+            variants: vec![],
+            quick: false,
+        }
+    }
+
+    #[test]
+    fn nothing_named_means_every_load_and_quick_means_fewer_states() {
+        let all = request(&args()).expect("fits");
+        assert_eq!((all.sources.len(), all.seeds, all.replays, all.size), (Kind::all().len(), 100, 100, Size::Full));
+        let quick = request(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("fits");
+        assert_eq!((quick.seeds, quick.replays, quick.size), (3, 20, Size::Quick));
+    }
+
+    #[test]
+    fn a_scene_and_loads_are_taken_together_and_a_wrong_name_is_refused() {
+        let both = DeformArgs { scene: Some("tree".into()), loads: vec!["plants".into(), "c".into()], ..args() };
+        assert_eq!(request(&both).expect("fits").sources.len(), 14);
+        let wrong = request(&DeformArgs { loads: vec!["d".into()], ..args() }).expect_err("no such load");
+        assert!(wrong.to_string().starts_with("load: expected single-P-R"), "{wrong}");
+    }
+}

@@ -1,0 +1,270 @@
+//! `modalcast report render`: what every way to draw costs in error against brute force, and what it saves in time.
+
+use std::path::PathBuf;
+
+use crate::render::loads::Kind;
+use crate::render::{self, Report, Request, variants};
+use crate::thesis::PLANTS;
+use modalcast::cli::options::{Size, working};
+use modalcast::cli::{Outcome, say};
+use modalcast_model::error::{Result, invalid};
+
+const LOADS: &str = "Loads:
+  square       a square that floats over the ground
+  shelf        a shelf just above the ground, from nearby
+  panes        three translucent panes, listed in the wrong order
+  images       panels with images of many sizes, each repeated
+  tree, grove  the built-in tree, and four of them
+  triangles-N  a rolling field of about N triangles with poles on it
+  plants, plant-1 .. plant-12
+               the plants of table 4.5 of the thesis, deformed and drawn: times and memory, no references
+
+Examples:
+  modalcast report render --out report
+  modalcast report render --out report --quick
+  modalcast report render --out report --load tree --load triangles-3000000 --size 1920x1080
+  modalcast report render --out report --load square --variant 'variance 512*'
+  modalcast report render --out report --raster --load triangles-3000000 --size 1920x1080
+  modalcast report render --out figures --figures
+  modalcast report render --out figures --figures --scene path/to/plant --size 1280x960";
+
+/// Error against run time of the renderer: validates every variant against references by brute force, then times it.
+///
+/// Writes report.json, report.csv, report.md, report.svg, report.png and pictures/ with the references, and of every
+/// variant a strip of rendered, reference and difference. Exit code 1 when a variant exceeds its bounds.
+#[derive(Debug, clap::Args)]
+#[command(after_help = LOADS)]
+pub(super) struct Args {
+    /// The folder to write to; files of an earlier report there are replaced.
+    #[arg(long)]
+    out: PathBuf,
+    /// A scene; may be repeated. Without any: all.
+    #[arg(long = "load", value_name = "NAME")]
+    loads: Vec<String>,
+    /// Only this variant, or all whose names begin so: "variance 512*"; may be repeated.
+    #[arg(long = "variant", value_name = "GLOB")]
+    variants: Vec<String>,
+    /// The size of still pictures in pixels, 640x360 without it; those of moving ones are a quarter of it on each side. Of
+    /// a figure's single pictures, 640x480 without it.
+    #[arg(long)]
+    size: Option<Size>,
+    /// Frames per median, at least 20; 100 without it, 20 with --quick.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    replays: Option<u32>,
+    /// Fewer variants but for those named in full, 16 samples a pixel and a smaller field, for machines without a GPU.
+    #[arg(long)]
+    quick: bool,
+    /// Draws the figures of the thesis's chapter 4.2 instead, from our own scenes: nothing is measured.
+    #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
+    figures: bool,
+    /// Only the rasteriser in CUDA beside OpenGL's bare passes, on the loads, a room and two triangles that fill the frame:
+    /// raster.json and raster.md. Needs an NVIDIA GPU.
+    #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
+    raster: bool,
+    /// A scene of your own, a path to a model or a scene folder; may be repeated. With --figures a picture of it too;
+    /// alone its frame times and nothing else: times.json and a picture.
+    #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["loads", "variants", "quick"])]
+    scenes: Vec<String>,
+}
+
+/// Sizes that nobody asked for: of the report, and of the figures' pictures.
+const USUAL: [Size; 2] = [Size { width: 640, height: 360 }, Size { width: 640, height: 480 }];
+
+/// The largest side of a picture: each of its pixels is traced by 64 rays and more.
+const LARGEST: u32 = 4096;
+
+pub(super) fn run(args: &Args) -> Outcome {
+    if args.figures {
+        return figures(args);
+    }
+    if !args.scenes.is_empty() {
+        return timed(args);
+    }
+    let request = request(args)?;
+    if args.raster {
+        return rasters(args, &request);
+    }
+    let report = working("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
+    report.write(&args.out)?;
+    lines(&report).into_iter().for_each(say);
+    say(format!("written to {}", args.out.display()));
+    Ok(report.passed())
+}
+
+fn rasters(args: &Args, request: &Request) -> Outcome {
+    let rasters = working("measuring", || render::rasters(request, |what| tracing::info!(what, "measuring")))?;
+    rasters.write(&args.out)?;
+    rasters.rows.iter().for_each(|row| say(row.line()));
+    rasters.frames.iter().for_each(|row| say(row.line()));
+    say(format!("written to {}", args.out.display()));
+    Ok(rasters.passed())
+}
+
+fn figures(args: &Args) -> Outcome {
+    let request = render::figures::Request { size: size(args, USUAL[1])?, scenes: args.scenes.clone() };
+    let hear = |what: &str| tracing::info!(what, "drawing");
+    let figures = working("drawing", || render::figures::figures(&request, hear))?;
+    figures.write(&args.out)?;
+    for figure in &figures.figures {
+        say(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.shows.join("; ")));
+    }
+    say(format!("written to {}", args.out.display()));
+    Ok(true)
+}
+
+fn timed(args: &Args) -> Outcome {
+    let replays = args.replays.map_or(100, |replays| replays as usize);
+    let request = render::timed::Request { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
+    let timed = working("measuring", || render::timed::timed(&request, |what| tracing::info!(what, "timing")))?;
+    timed.write(&args.out)?;
+    for scene in &timed.scenes {
+        let frame = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
+        say(format!("{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us", scene.name, scene.whole.median_us));
+    }
+    say(format!("written to {}", args.out.display()));
+    Ok(true)
+}
+
+/// The size that was asked for, in bounds.
+fn size(args: &Args, usual: Size) -> Result<render::Size> {
+    let Size { width, height } = args.size.unwrap_or(usual);
+    match [width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
+        true => Ok(render::Size { width, height }),
+        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), Size { width, height })),
+    }
+}
+
+fn request(args: &Args) -> Result<Request> {
+    let (mut loads, mut plants) = (Vec::new(), Vec::new());
+    for name in &args.loads {
+        match plants_named(name) {
+            Some(named) => plants.extend(named),
+            None => loads.push(Kind::named(name)?),
+        }
+    }
+    if args.loads.is_empty() {
+        (loads, plants) = (Kind::all(args.quick), (0..PLANTS.len()).collect());
+    }
+    let request = Request {
+        loads,
+        plants,
+        variants: args.variants.clone(),
+        size: size(args, USUAL[0])?,
+        quick: args.quick,
+        replays: args.replays.map_or(if args.quick { 20 } else { 100 }, |replays| replays as usize),
+    };
+    match request.wanted().is_empty() {
+        false => Ok(request),
+        true => {
+            let names: Vec<String> = variants::all(false).into_iter().map(|variant| variant.name).collect();
+            Err(invalid("variant", format!("one or more of: {}", names.join("; ")), args.variants.join("; ")))
+        }
+    }
+}
+
+/// The plants that a name stands for, counted from 0; none when it is another load's.
+fn plants_named(name: &str) -> Option<Vec<usize>> {
+    if name == "plants" {
+        return Some((0..PLANTS.len()).collect());
+    }
+    let number: usize = name.strip_prefix("plant-")?.parse().ok()?;
+    (1..=PLANTS.len()).contains(&number).then(|| vec![number - 1])
+}
+
+fn lines(report: &Report) -> Vec<String> {
+    let head = ["frame us", "colour", "of aim", "light", "penumbra", "bleeding", "flicker", "passed"];
+    let mut lines = vec![format!("{:<18}{:<40}{}", "load", "variant", head.map(|word| format!("{word:>10}")).concat())];
+    for row in &report.rows {
+        let show =
+            |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
+        let cells = [
+            show(row.median_us(), 1),
+            show(Some(row.colour.mean), 3),
+            show(Some(row.colour_of_aim.mean), 3),
+            show(Some(row.light_of_aim.all.mean), 4),
+            show(Some(row.light_of_aim.penumbra.mean), 4),
+            show(row.light_of_aim.in_umbra, 4),
+            show(row.flicker.map(|flicker| flicker.mean), 3),
+            match (row.passed, row.to_fail) {
+                (true, _) => "yes".into(),
+                (false, true) => "as stated".into(),
+                (false, false) => "NO".into(),
+            },
+        ];
+        lines.push(format!("{:<18}{:<40}{}", row.load, row.name, cells.map(|cell| format!("{cell:>10}")).concat()));
+    }
+    lines.extend(report.readback.iter().map(|row| {
+        let (load, none, all, loss) = (&row.load, row.unread_fps, row.ring_fps, row.ring_loss);
+        format!("{load:<18}{none:.1} frames/s when none is read, {all:.1} when each is: {loss:.1} % fewer")
+    }));
+    for plant in &report.plants {
+        lines.push(format!(
+            "{:<18}{:<24}t_vbr {:>9.3} ms{:>10.1} FPS{:>9.1} MB  O_vbr {:>5.1} %",
+            plant.load,
+            plant.thesis.name,
+            plant.vbr.median_us / 1e3,
+            plant.fps,
+            plant.bytes as f64 / 1e6,
+            100.0 * plant.occupation
+        ));
+    }
+    for bare in &report.bare {
+        let (depth, visibility) = (bare.depth.median_us, bare.visibility.median_us);
+        lines.push(format!(
+            "{:<18}map {}: bare depth {depth:.1} us, bare visibility {visibility:.1} us",
+            bare.load, bare.map
+        ));
+        lines.extend([&bare.unculled, &bare.usual].map(|frame| {
+            format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.beyond_us)
+        }));
+    }
+    lines.extend(report.raster.iter().map(render::Rastered::line));
+    lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn args() -> Args {
+        let size = Some(Size { width: 64, height: 48 });
+        Args {
+            out: PathBuf::from("out"),
+            loads: vec![],
+            variants: vec![],
+            size,
+            replays: None,
+            quick: true,
+            figures: false,
+            raster: false,
+            scenes: vec![],
+        }
+    }
+
+    #[test]
+    fn nothing_named_means_every_load_and_wrong_names_and_sizes_are_refused() {
+        let all = request(&args()).expect("fits");
+        assert_eq!((all.loads.len(), all.plants.len(), all.replays), (Kind::all(true).len(), 12, 20));
+        let plants = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
+        let plants = request(&plants).expect("fits");
+        assert_eq!((plants.loads.len(), plants.plants.len(), plants.plants[0]), (1, 13, 2));
+        let named = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
+        assert_eq!(request(&named).expect("fits").loads, [Kind::Square, Kind::Triangles(10)]);
+        // The frame that bare passes are held against, of a quick run too.
+        let variants = ["variance 4096, blur 1.5", "culling*"].map(String::from).to_vec();
+        let named = request(&Args { variants, ..args() }).expect("fits").wanted();
+        let names: Vec<&str> = named.iter().map(|variant| variant.name.as_str()).collect();
+        assert_eq!(names, ["variance 4096, blur 1.5", "culling none", "culling triangles", "culling depth"]);
+        assert_eq!(request(&args()).expect("fits").wanted().len(), variants::all(true).len());
+        for wrong in [
+            Args { loads: vec!["cube".into()], ..args() },
+            Args { loads: vec!["plant-13".into()], ..args() },
+            Args { variants: vec!["varience*".into()], ..args() },
+            Args { size: Some(Size { width: 0, height: 5 }), ..args() },
+            Args { size: Some(Size { width: 5, height: 5000 }), ..args() },
+        ] {
+            assert!(request(&wrong).is_err(), "{wrong:?}");
+        }
+    }
+}

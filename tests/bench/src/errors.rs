@@ -1,0 +1,400 @@
+//! How far a surface in f32 is from what it should be: metres, fractions of the diagonal, pixels, degrees.
+
+use nalgebra::{Matrix4, Point3, Vector3};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::exact::Judged;
+use modalcast_model::scene::{Camera, Scene};
+
+/// The image in which pixels are counted.
+pub const IMAGE: (u32, u32) = (1920, 1080);
+
+/// Metres and pixels of a scene.
+#[derive(Debug, Clone)]
+pub struct Yardstick {
+    /// Metres per scene unit.
+    unit: f64,
+    /// Metres.
+    diagonal: f64,
+    clip_from_world: Matrix4<f64>,
+}
+
+impl Yardstick {
+    /// The yardstick of a scene, seen by a camera in an image of [`IMAGE`] pixels.
+    pub fn new(scene: &Scene, camera: &Camera) -> Self {
+        let clip = camera.clip_from_camera(IMAGE.0, IMAGE.1, &scene.rest_bounds) * camera.camera_from_world();
+        Self { unit: scene.unit, diagonal: scene.unit * scene.rest_bounds.diagonal(), clip_from_world: clip }
+    }
+
+    /// Metres per scene unit.
+    pub const fn unit(&self) -> f64 {
+        self.unit
+    }
+
+    /// Pixels between two points; `None` when one is not before the camera.
+    fn pixels(&self, one: [f64; 3], other: [f64; 3]) -> Option<f64> {
+        let place = |point: [f64; 3]| {
+            let clip = self.clip_from_world * Point3::from(point).to_homogeneous();
+            let half = [f64::from(IMAGE.0) / 2.0, f64::from(IMAGE.1) / 2.0];
+            (clip.w > 0.0).then(|| [clip.x / clip.w * half[0], clip.y / clip.w * half[1]])
+        };
+        let (one, other) = (place(one)?, place(other)?);
+        Some((one[0] - other[0]).hypot(one[1] - other[1]))
+    }
+}
+
+/// Largest and root of the mean square of something.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Spread {
+    pub largest: f64,
+    pub rms: f64,
+}
+
+/// A [`Spread`] while it is collected.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Collect {
+    largest: f64,
+    squares: f64,
+    count: f64,
+}
+
+impl Collect {
+    pub(super) fn add(&mut self, value: f64) {
+        self.largest = self.largest.max(value);
+        self.squares += value * value;
+        self.count += 1.0;
+    }
+
+    pub(super) fn join(self, other: Self) -> Self {
+        Self {
+            largest: self.largest.max(other.largest),
+            squares: self.squares + other.squares,
+            count: self.count + other.count,
+        }
+    }
+
+    /// What was collected, times `scale`; `None` when nothing was.
+    pub(super) fn spread(self, scale: f64) -> Option<Spread> {
+        let rms = (self.squares / self.count).sqrt();
+        (self.count > 0.0).then_some(Spread { largest: self.largest * scale, rms: rms * scale })
+    }
+}
+
+/// Errors of positions over all vertices and all states that were looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Errors {
+    /// Lengths of the error vectors.
+    pub metres: Spread,
+    /// The same in fractions of the diagonal of the scene at rest.
+    pub of_diagonal: Spread,
+    /// In an image of [`IMAGE`] pixels that frames the scene.
+    pub pixels: Option<Spread>,
+    /// Mean signed error along each axis, metres.
+    pub bias_metres: [f64; 3],
+    /// The largest a-priori bound, metres.
+    pub bound_metres: f64,
+    /// The largest quotient of an error and the bound of its own vertex: at most 1, or the variant fails.
+    pub of_bound: f64,
+    /// Coordinates that are no finite number.
+    pub not_finite: u64,
+    /// States that were looked at.
+    pub states: usize,
+}
+
+/// [`Errors`] while they are collected, in scene units.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Tally {
+    length: Collect,
+    pixels: Collect,
+    bias: [f64; 3],
+    bound: f64,
+    of_bound: f64,
+    not_finite: u64,
+    states: usize,
+}
+
+impl Tally {
+    /// Adds one state: three f32 per vertex, and what they should be.
+    pub fn add(&mut self, yardstick: &Yardstick, got: &[f32], want: &[Judged]) {
+        let got = got.as_chunks::<3>().0;
+        let vertex = |at: usize, tally: &mut Self| tally.vertex(yardstick, got[at], &want[at]);
+        let sum = in_pieces(got.len().min(want.len()), vertex, Self::join);
+        *self = Self { states: 1, ..sum }.join(*self);
+    }
+
+    fn vertex(&mut self, yardstick: &Yardstick, got: [f32; 3], want: &Judged) {
+        let got = got.map(f64::from);
+        let broken = got.iter().filter(|number| !number.is_finite()).count();
+        self.not_finite += broken as u64;
+        if broken > 0 {
+            return;
+        }
+        let error: [f64; 3] = std::array::from_fn(|axis| got[axis] - want.at[axis]);
+        let length = norm(error);
+        self.length.add(length);
+        self.bias = std::array::from_fn(|axis| self.bias[axis] + error[axis]);
+        self.bound = self.bound.max(want.bound);
+        self.of_bound = self.of_bound.max(length / want.bound);
+        if let Some(pixels) = yardstick.pixels(got, want.at) {
+            self.pixels.add(pixels);
+        }
+    }
+
+    fn join(self, other: Self) -> Self {
+        Self {
+            length: self.length.join(other.length),
+            pixels: self.pixels.join(other.pixels),
+            bias: std::array::from_fn(|axis| self.bias[axis] + other.bias[axis]),
+            bound: self.bound.max(other.bound),
+            of_bound: self.of_bound.max(other.of_bound),
+            not_finite: self.not_finite + other.not_finite,
+            states: self.states + other.states,
+        }
+    }
+
+    /// What was collected.
+    pub fn errors(&self, yardstick: &Yardstick) -> Errors {
+        let metres = self.length.spread(yardstick.unit).unwrap_or_default();
+        let share = |length: f64| if yardstick.diagonal > 0.0 { length / yardstick.diagonal } else { 0.0 };
+        Errors {
+            metres,
+            of_diagonal: Spread { largest: share(metres.largest), rms: share(metres.rms) },
+            pixels: self.pixels.spread(1.0),
+            bias_metres: self.bias.map(|sum| yardstick.unit * sum / self.length.count.max(1.0)),
+            bound_metres: self.bound * yardstick.unit,
+            of_bound: self.of_bound,
+            not_finite: self.not_finite,
+            states: self.states,
+        }
+    }
+}
+
+impl Errors {
+    /// Whether every number is finite and no error is above its own bound.
+    pub fn passed(&self) -> bool {
+        self.not_finite == 0 && self.of_bound <= 1.0
+    }
+}
+
+/// Error of the step from one state to the next: that of x(k + 1) - x(k), scene units.
+pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
+    let [before, after] = got.map(|got| got.as_chunks::<3>().0);
+    let [from, to] = want;
+    let error = |at: usize| -> f64 {
+        let step = |axis: usize| {
+            f64::from(after[at][axis]) - f64::from(before[at][axis]) - (to[at].at[axis] - from[at].at[axis])
+        };
+        norm(std::array::from_fn(step))
+    };
+    let count = before.len().min(after.len()).min(from.len()).min(to.len());
+    in_pieces(count, |at, collect: &mut Collect| collect.add(error(at)), Collect::join)
+}
+
+/// Items 0 to `count` added on all cores, piece by piece; pieces are joined in their order, so that a sum has one order.
+pub(super) fn in_pieces<T: Default + Send>(
+    count: usize,
+    add: impl Fn(usize, &mut T) + Sync,
+    join: impl Fn(T, T) -> T,
+) -> T {
+    let piece = |piece: usize| {
+        let mut sum = T::default();
+        (PIECE * piece..count.min(PIECE * (piece + 1))).for_each(|at| add(at, &mut sum));
+        sum
+    };
+    let pieces: Vec<T> = (0..count.div_ceil(PIECE)).into_par_iter().map(piece).collect();
+    pieces.into_iter().fold(T::default(), join)
+}
+
+/// Items of a piece of a sum.
+const PIECE: usize = 4096;
+
+/// Errors of directions, in degrees.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Orientation {
+    /// From the normals that the variant means to give: by T, or of the deformed surface.
+    pub normals_degrees: Option<Spread>,
+    /// From the normals of the deformed surface, whatever the variant means to give.
+    pub normals_to_surface_degrees: Option<Spread>,
+    pub tangents_degrees: Option<Spread>,
+    /// |n . t|: 0 when they are orthogonal.
+    pub normal_dot_tangent: Option<Spread>,
+    /// Directions that are no finite numbers, and bitangent signs that are wrong.
+    pub broken: u64,
+}
+
+/// [`Orientation`] while it is collected.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Turned {
+    normals: Collect,
+    to_surface: Collect,
+    tangents: Collect,
+    dots: Collect,
+    broken: u64,
+}
+
+impl Turned {
+    /// Adds normals, three f32 per corner. Does nothing when the variant gives none.
+    pub fn add_normals(&mut self, got: &[f32], want: &[[f64; 3]]) {
+        let got = got.as_chunks::<3>().0;
+        let corner = |at: usize, sum: &mut Self| match degrees(got[at].map(f64::from), want[at]) {
+            Some(angle) => sum.normals.add(angle),
+            None => sum.broken += 1,
+        };
+        *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
+    }
+
+    /// Adds how far normals are from those of the deformed surface.
+    pub fn add_to_surface(&mut self, got: &[f32], want: &[[f64; 3]]) {
+        let got = got.as_chunks::<3>().0;
+        let corner = |at: usize, sum: &mut Self| {
+            degrees(got[at].map(f64::from), want[at]).into_iter().for_each(|angle| sum.to_surface.add(angle));
+        };
+        *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
+    }
+
+    /// Adds tangents, four f32 per corner, and what they make with the normals. Shapes without tangents have zeros.
+    pub fn add_tangents(&mut self, got: &[f32], want: &[[f64; 4]], normals: &[f32]) {
+        let (got, normals) = (got.as_chunks::<4>().0, normals.as_chunks::<3>().0);
+        let corner = |at: usize, sum: &mut Self| {
+            if want[at][3] != 0.0 {
+                sum.add_tangent(got[at].map(f64::from), want[at], normals.get(at));
+            }
+        };
+        *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
+    }
+
+    fn add_tangent(&mut self, [x, y, z, sign]: [f64; 4], want: [f64; 4], normal: Option<&[f32; 3]>) {
+        match degrees([x, y, z], [want[0], want[1], want[2]]) {
+            Some(angle) if sign == want[3] => self.tangents.add(angle),
+            _ => self.broken += 1,
+        }
+        if let Some(normal) = normal {
+            self.dots.add(Vector3::from(normal.map(f64::from)).dot(&Vector3::new(x, y, z)).abs());
+        }
+    }
+
+    fn join(self, other: Self) -> Self {
+        Self {
+            normals: self.normals.join(other.normals),
+            to_surface: self.to_surface.join(other.to_surface),
+            tangents: self.tangents.join(other.tangents),
+            dots: self.dots.join(other.dots),
+            broken: self.broken + other.broken,
+        }
+    }
+
+    /// What was collected.
+    pub fn orientation(&self) -> Orientation {
+        Orientation {
+            normals_degrees: self.normals.spread(1.0),
+            normals_to_surface_degrees: self.to_surface.spread(1.0),
+            tangents_degrees: self.tangents.spread(1.0),
+            normal_dot_tangent: self.dots.spread(1.0),
+            broken: self.broken,
+        }
+    }
+}
+
+/// The angle between two directions; `None` when one is none. Exact for small angles, where the cosine is not.
+fn degrees(one: [f64; 3], other: [f64; 3]) -> Option<f64> {
+    let (one, other) = (Vector3::from(one), Vector3::from(other));
+    let angle = one.cross(&other).norm().atan2(one.dot(&other)).to_degrees();
+    (angle.is_finite() && one.norm() > 0.5 && other.norm() > 0.5).then_some(angle)
+}
+
+fn norm(vector: [f64; 3]) -> f64 {
+    vector.iter().map(|number| number * number).sum::<f64>().sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use modalcast_model::scene::{Lens, View};
+
+    /// One pixel is a hundredth of a unit at the target.
+    fn yardstick() -> Yardstick {
+        let scene = modalcast_model::load::open("tree").expect("the tree");
+        let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+        let (width, height) = (f64::from(IMAGE.0), f64::from(IMAGE.1));
+        let lens = Lens::Intrinsics { fx: 1000.0, fy: 1000.0, cx: width / 2.0, cy: height / 2.0 };
+        let yardstick = Yardstick::new(&scene, &Camera { view, lens, near: 1.0, far: 100.0 });
+        Yardstick { unit: 2.0, diagonal: 20.0, ..yardstick }
+    }
+
+    fn judged(at: [f64; 3], bound: f64) -> Judged {
+        Judged { at, bound, condition: 1.0 }
+    }
+
+    #[test]
+    fn errors_of_a_hand_made_surface_are_exact() {
+        let yardstick = yardstick();
+        let mut tally = Tally::default();
+        // Off by (3, 4, 0) and by nothing: lengths 5 and 0.
+        tally.add(&yardstick, &[3.0, 4.0, 0.0, 1.0, 1.0, 1.0], &[judged([0.0; 3], 10.0), judged([1.0; 3], 1.0)]);
+        let errors = tally.errors(&yardstick);
+        assert_eq!((errors.metres.largest, errors.metres.rms), (10.0, 2.0 * 12.5_f64.sqrt()));
+        assert_eq!(errors.of_diagonal.largest, 0.5);
+        assert_eq!(errors.bias_metres, [3.0, 4.0, 0.0]);
+        assert_eq!((errors.bound_metres, errors.of_bound, errors.states), (20.0, 0.5, 1));
+        assert!((errors.pixels.expect("in sight").largest - 500.0).abs() < 1e-9, "{errors:?}");
+        assert!(errors.passed());
+        // The mirror image takes the bias away, and keeps the rest.
+        tally.add(&yardstick, &[-3.0, -4.0, 0.0, 1.0, 1.0, 1.0], &[judged([0.0; 3], 10.0), judged([1.0; 3], 1.0)]);
+        let both = tally.errors(&yardstick);
+        assert_eq!((both.bias_metres, both.metres, both.states), ([0.0; 3], errors.metres, 2));
+    }
+
+    #[test]
+    fn an_error_above_its_own_bound_fails_even_when_another_bound_is_larger() {
+        let yardstick = yardstick();
+        let mut tally = Tally::default();
+        let want = [judged([0.0; 3], 1.0), judged([0.0; 3], 100.0)];
+        tally.add(&yardstick, &[1.1, 0.0, 0.0, 0.0, 0.0, 0.0], &want);
+        assert!(!tally.errors(&yardstick).passed());
+        let mut broken = Tally::default();
+        broken.add(&yardstick, &[f32::NAN, 0.0, 0.0, 0.0, f32::INFINITY, 0.0], &want);
+        assert_eq!((broken.errors(&yardstick).not_finite, broken.errors(&yardstick).passed()), (2, false));
+    }
+
+    #[test]
+    fn a_point_behind_the_camera_has_no_pixels() {
+        let yardstick = yardstick();
+        assert_eq!(yardstick.pixels([0.0, 0.0, 11.0], [0.0; 3]), None);
+        let apart = yardstick.pixels([0.01, 0.0, 0.0], [0.0; 3]).expect("before it");
+        assert!((apart - 1.0).abs() < 1e-12, "{apart}");
+    }
+
+    #[test]
+    fn a_constant_offset_is_no_error_of_a_step() {
+        let want = [[judged([0.0; 3], 1.0)], [judged([1.0, 0.0, 0.0], 1.0)]];
+        let steps = |got: [[f32; 3]; 2]| step_errors([&got[0], &got[1]], [&want[0], &want[1]]).spread(1.0);
+        assert_eq!(steps([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]]), Some(Spread::default()));
+        assert_eq!(steps([[0.0; 3], [1.5, 0.0, 0.0]]).map(|spread| spread.largest), Some(0.5));
+    }
+
+    #[test]
+    fn directions_are_compared_in_degrees_down_to_the_smallest() {
+        let mut turned = Turned::default();
+        turned.add_normals(&[0.0, 1.0, 0.0, 1.0, 1e-7, 0.0], &[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]);
+        let normals = turned.orientation().normals_degrees.expect("two");
+        assert_eq!(normals.largest, 90.0);
+        let mut small = Turned::default();
+        small.add_normals(&[1.0, 1e-7, 0.0], &[[1.0, 0.0, 0.0]]);
+        let angle = small.orientation().normals_degrees.expect("one").largest;
+        assert!((angle / 1e-7f64.to_degrees() - 1.0).abs() < 1e-6, "{angle}");
+    }
+
+    #[test]
+    fn wrong_signs_and_missing_directions_are_counted_and_shapes_without_tangents_are_not() {
+        let mut turned = Turned::default();
+        let want = [[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0; 4]];
+        let got = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0];
+        turned.add_tangents(&got, &want, &[0.6, 0.8, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+        turned.add_normals(&[f32::NAN, 0.0, 0.0], &[[1.0, 0.0, 0.0]]);
+        let found = turned.orientation();
+        assert_eq!((found.broken, found.tangents_degrees), (2, Some(Spread::default())));
+        let dot = found.normal_dot_tangent.expect("dots").largest;
+        assert!((dot - f64::from(0.6_f32)).abs() < 1e-12, "{dot}");
+    }
+}

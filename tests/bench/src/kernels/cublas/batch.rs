@@ -1,0 +1,299 @@
+//! A scene to the products that cuBLAS is asked for: which domains go together, padded to what, and where all lies. Pure.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::library::Product;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Scene, State};
+
+/// Ways to u = U q with cuBLAS.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Peer {
+    /// One domain, `sgemv`, U column-major.
+    SgemvColumns,
+    /// One domain, `sgemv`, U row-major.
+    SgemvRows,
+    /// All domains padded to the largest, one strided batched `sgemm`.
+    Padded,
+    /// The same as one strided batched `sgemv`.
+    PaddedGemv,
+    /// Domains of similar rank and size padded alike, a strided batched `sgemm` per bucket.
+    Bucketed,
+    /// The same as strided batched `sgemv`.
+    BucketedGemv,
+    /// Nothing padded: one grouped batched `sgemm`, a group per rank and size.
+    Grouped,
+    /// Domains that are instances of one shape: one `sgemm` with a column of q for each.
+    Instances,
+}
+
+impl Peer {
+    /// All of them.
+    pub const ALL: [Self; 8] = [
+        Self::SgemvColumns,
+        Self::SgemvRows,
+        Self::Padded,
+        Self::PaddedGemv,
+        Self::Bucketed,
+        Self::BucketedGemv,
+        Self::Grouped,
+        Self::Instances,
+    ];
+
+    /// The name of its trial.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::SgemvColumns => "cublas_sgemv_columns",
+            Self::SgemvRows => "cublas_sgemv_rows",
+            Self::Padded => "cublas_padded",
+            Self::PaddedGemv => "cublas_padded_gemv",
+            Self::Bucketed => "cublas_bucketed",
+            Self::BucketedGemv => "cublas_bucketed_gemv",
+            Self::Grouped => "cublas_grouped",
+            Self::Instances => "cublas_instances",
+        }
+    }
+
+    /// Whether vectors are multiplied rather than matrices of one column.
+    pub(super) const fn as_vectors(self) -> bool {
+        matches!(self, Self::PaddedGemv | Self::BucketedGemv)
+    }
+
+    /// Domains of one key go into one batch. A bucket holds ranks up to the next multiple of 8 and sizes up to the next
+    /// power of two.
+    const fn key(self, rows: usize, rank: usize) -> (usize, usize) {
+        match self {
+            Self::Bucketed | Self::BucketedGemv => (rank.next_multiple_of(8), rows.next_power_of_two()),
+            Self::Grouped => (rank, rows),
+            _ => (0, 0),
+        }
+    }
+}
+
+/// Products of one kind, and whose they are.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Batch {
+    pub product: Product,
+    pub domains: Vec<usize>,
+    /// First floats of U, q and u.
+    pub first: [u64; 3],
+}
+
+/// All products of a step.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Batches {
+    pub list: Vec<Batch>,
+    /// Floats of U, q and u.
+    pub floats: [u64; 3],
+}
+
+impl Batches {
+    /// # Errors
+    /// `Invalid` when the scene is not one that `peer` is for, or is too large for the library's integers.
+    pub(super) fn of(scene: &Scene, peer: Peer) -> Result<Self> {
+        check(scene, peer)?;
+        let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
+        for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
+            groups.entry(peer.key(3 * slot.vertices, slot.rank)).or_default().push(domain);
+        }
+        let (mut list, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
+        for domains in groups.into_values() {
+            let product = product(scene, peer, &domains)?;
+            let matrices = if peer == Peer::Instances { 1 } else { domains.len() as u64 };
+            let sizes = [matrices, domains.len() as u64, domains.len() as u64];
+            let first = floats;
+            for ((total, stride), count) in floats.iter_mut().zip(product.strides).zip(sizes) {
+                // Batches begin where a float4 may.
+                *total = (*total + stride.unsigned_abs() * count).next_multiple_of(4);
+            }
+            list.push(Batch { product, domains, first });
+        }
+        Ok(Self { list, floats })
+    }
+
+    /// Where u of each domain begins, in floats; only domains with modes have one.
+    pub(super) fn places_of_u(&self, domains: usize) -> Vec<Option<u64>> {
+        let mut places = vec![None; domains];
+        for batch in &self.list {
+            for (index, domain) in batch.domains.iter().enumerate() {
+                places[*domain] = Some(batch.place(index, 2));
+            }
+        }
+        places
+    }
+
+    /// All q, padded with zeros.
+    pub(super) fn pack_q(&self, scene: &Scene, state: &State) -> Vec<f32> {
+        let mut packed = vec![0.0; self.floats[1] as usize];
+        for batch in &self.list {
+            for (index, domain) in batch.domains.iter().enumerate() {
+                let q = state.q_of(scene, *domain);
+                packed[batch.place(index, 1) as usize..][..q.len()].copy_from_slice(q);
+            }
+        }
+        packed
+    }
+}
+
+impl Batch {
+    /// The first float of U (0), q (1) or u (2) of the domain at an index of this batch.
+    pub(super) fn place(&self, index: usize, of: usize) -> u64 {
+        self.first[of] + self.product.strides[of].unsigned_abs() * index as u64
+    }
+
+    /// U of one domain as the product wants it, padded with zeros.
+    pub(super) fn matrix(&self, scene: &Scene, domain: usize, by_rows: bool) -> Vec<f32> {
+        let modes = &scene.shape_of(domain).modes;
+        let (rows, rank) = (3 * modes.vertices(), modes.rank());
+        if by_rows {
+            return (0..rows).flat_map(|row| (0..rank).map(move |mode| modes.at(row / 3, row % 3, mode))).collect();
+        }
+        let lead = self.product.lead as usize;
+        let mut matrix = vec![0.0; lead * self.product.inner as usize];
+        for (mode, column) in matrix.chunks_exact_mut(lead).take(rank).enumerate() {
+            column[..rows].copy_from_slice(modes.column(mode));
+        }
+        matrix
+    }
+}
+
+/// The product of a batch, as large as its largest domain.
+fn product(scene: &Scene, peer: Peer, domains: &[usize]) -> Result<Product> {
+    let int = |number: usize| {
+        i32::try_from(number).map_err(|_| invalid("scene.size", format!("at most {} for cuBLAS", i32::MAX), number))
+    };
+    let slots = || domains.iter().map(|domain| scene.layout.slots[*domain]);
+    let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
+    let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
+    // Columns that begin at 16 bytes are what the library is fastest with; rows one after the other have no gaps.
+    let lead = if peer == Peer::SgemvRows { rows } else { rows.next_multiple_of(4) };
+    let (columns, count) = if peer == Peer::Instances { (domains.len(), 1) } else { (1, domains.len()) };
+    let strides = [lead as i64 * rank as i64, rank as i64, lead as i64];
+    Ok(Product {
+        rows: int(rows)?,
+        inner: int(rank)?,
+        columns: int(columns)?,
+        lead: int(lead)?,
+        count: int(count)?,
+        strides,
+    })
+}
+
+fn check(scene: &Scene, peer: Peer) -> Result<()> {
+    let domains = scene.domains.len();
+    if !scene.needs.modes {
+        return Err(invalid("modes", format!("some, for {}", peer.name()), 0));
+    }
+    match peer {
+        Peer::SgemvColumns | Peer::SgemvRows if domains != 1 => {
+            Err(invalid("scene.domains", format!("1 for {}", peer.name()), domains))
+        }
+        Peer::Instances if scene.domains.iter().any(|domain| domain.shape != scene.domains[0].shape) => {
+            Err(invalid("scene.domains", "instances of one shape for cublas_instances", "several shapes"))
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use modalcast_compute::testing::{displacement_of, scene_and_state};
+
+    /// What cuBLAS computes of a batch: C = A B for column-major matrices at strides.
+    fn multiply(batch: &Batch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
+        let Product { rows, inner, columns, lead, count, strides } = batch.product;
+        let at = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
+        for index in 0..count {
+            let [a0, b0, c0] = [0, 1, 2].map(|of| at(batch.first[of], strides[of], index));
+            for (row, column) in
+                (0..rows as usize).flat_map(|row| (0..columns as usize).map(move |column| (row, column)))
+            {
+                let entry = |mode: usize| match by_rows {
+                    true => a[a0 + row * inner as usize + mode],
+                    false => a[a0 + mode * lead as usize + row],
+                };
+                let q = |mode: usize| b[b0 + column * inner as usize + mode];
+                c[c0 + column * lead as usize + row] = (0..inner as usize).map(|mode| entry(mode) * q(mode)).sum();
+            }
+        }
+    }
+
+    fn check_peer(scene: &Scene, state: &State, peer: Peer) -> Batches {
+        let batches = Batches::of(scene, peer).expect("batches");
+        let by_rows = peer == Peer::SgemvRows;
+        let mut matrices = vec![0.0; batches.floats[0] as usize];
+        for batch in &batches.list {
+            let stored = if peer == Peer::Instances { 1 } else { batch.domains.len() };
+            for (index, domain) in batch.domains.iter().enumerate().take(stored) {
+                let matrix = batch.matrix(scene, *domain, by_rows);
+                matrices[batch.place(index, 0) as usize..][..matrix.len()].copy_from_slice(&matrix);
+            }
+        }
+        let (q, mut u) = (batches.pack_q(scene, state), vec![f32::NAN; batches.floats[2] as usize]);
+        for batch in &batches.list {
+            multiply(batch, by_rows, [&matrices, &q], &mut u);
+        }
+        for (domain, place) in batches.places_of_u(scene.domains.len()).iter().enumerate() {
+            assert_eq!(place.is_some(), scene.rank_of(domain) > 0);
+            let Some(place) = place else { continue };
+            for vertex in 0..scene.layout.slots[domain].vertices {
+                for (axis, want) in displacement_of(scene, state, domain, vertex).iter().enumerate() {
+                    let got = f64::from(u[*place as usize + 3 * vertex + axis]);
+                    assert!((got - want).abs() < 1e-4, "{} domain {domain} vertex {vertex}", peer.name());
+                }
+            }
+        }
+        batches
+    }
+
+    #[test]
+    fn every_way_to_put_domains_together_gives_each_its_own_u() {
+        let shapes: Vec<_> = (0..30).map(|index| (1 + index * 11 % 40, index % 13, 1)).collect();
+        let (many, state) = scene_and_state(&shapes);
+        let deformable = shapes.iter().filter(|(_, rank, _)| *rank > 0);
+        let needed: u64 = deformable.clone().map(|(vertices, rank, _)| (3 * vertices * rank) as u64).sum();
+        let stored = |peer: Peer| check_peer(&many, &state, peer).floats[0];
+        let (padded, bucketed, grouped) = (stored(Peer::Padded), stored(Peer::Bucketed), stored(Peer::Grouped));
+        assert!(needed <= grouped && grouped < bucketed && bucketed < padded, "{grouped} {bucketed} {padded}");
+        assert_eq!(check_peer(&many, &state, Peer::Padded).list.len(), 1);
+        assert_eq!(check_peer(&many, &state, Peer::Grouped).list.len(), deformable.count(), "all differ here");
+        let (one, state) = scene_and_state(&[(23, 10, 1)]);
+        for peer in Peer::ALL {
+            let batches = check_peer(&one, &state, peer);
+            assert_eq!(batches.list.len(), 1, "{}", peer.name());
+        }
+    }
+
+    #[test]
+    fn instances_share_one_matrix_and_have_a_column_each() {
+        use modalcast_model::scene::Parts;
+        let (one, _) = scene_and_state(&[(23, 10, 1)]);
+        let mut parts = Parts::named("instances");
+        parts.shapes = one.shapes.clone();
+        parts.materials = one.materials.clone();
+        parts.domains = vec![one.domains[0].clone(); 16];
+        let instances = Scene::new(parts).expect("a scene");
+        let mut state = State::rest(&instances);
+        state.q.iter_mut().enumerate().for_each(|(index, q)| *q = (index as f32).sin());
+        let batches = check_peer(&instances, &state, Peer::Instances);
+        assert_eq!(batches.floats, [72 * 10, 160, 72 * 16]);
+        assert_eq!((batches.list[0].product.columns, batches.list[0].product.count), (16, 1));
+    }
+
+    #[test]
+    fn scenes_that_a_peer_is_not_for_are_refused_by_name() {
+        let (two, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
+        for peer in [Peer::SgemvColumns, Peer::SgemvRows, Peer::Instances] {
+            let refusal = Batches::of(&two, peer).expect_err("two shapes").to_string();
+            assert!(refusal.starts_with("scene.domains") && refusal.contains(peer.name()), "{refusal}");
+        }
+        let (rigid, _) = scene_and_state(&[(5, 0, 1)]);
+        for peer in Peer::ALL {
+            assert!(Batches::of(&rigid, peer).expect_err("no modes").to_string().starts_with("modes"));
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! cuBLAS as a peer: u = U q as its products, each followed by a plain vertex update. Loaded at run time; nothing but
+//! trials uses it.
+
+mod batch;
+mod library;
+
+pub use batch::Peer;
+pub use library::cublas_version;
+
+use std::sync::Arc;
+
+use cudarc::driver::CudaSlice;
+
+use super::plain_update::PlainUpdate;
+use super::trial::{KernelFacts, Trial};
+use super::turns::{Part, Turns};
+use batch::Batches;
+use library::{Blas, Grouped, Product};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, download, room, upload};
+use modalcast_model::error::{Error, Result, during};
+use modalcast_model::scene::{Scene, State};
+
+/// cuBLAS over a scene, for several steps.
+#[derive(Debug)]
+pub struct Cublas {
+    // Declared first, so dropped first: it waits for its work on what follows.
+    blas: Blas,
+    peer: Peer,
+    part: Part,
+    batches: Batches,
+    u_matrices: CudaSlice<u8>,
+    u: CudaSlice<u8>,
+    update: Option<PlainUpdate>,
+    /// Where u of each domain begins, in floats.
+    places: Vec<Option<u64>>,
+    turns: Turns,
+    pointers: Option<Pointers>,
+}
+
+/// Device arrays of pointers, one a problem: to U, to u, and to q for each turn.
+#[derive(Debug)]
+struct Pointers {
+    matrices: CudaSlice<u8>,
+    outputs: CudaSlice<u8>,
+    q: CudaSlice<u8>,
+    problems: u64,
+}
+
+impl Cublas {
+    /// Packs a scene for one way to multiply.
+    ///
+    /// # Errors
+    /// `Invalid` when the scene is not one that `peer` is for, or there is no state; `Unavailable` when cuBLAS is
+    /// missing, too old or the device's memory too small; `Fault` when the device refuses.
+    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], (peer, part): (Peer, Part)) -> Result<Self> {
+        let batches = Batches::of(scene, peer)?;
+        check_memory(device, &batches)?;
+        let blas = Blas::new(device)?;
+        blas.check_has(peer == Peer::Grouped, peer.as_vectors())?;
+        let places = batches.places_of_u(scene.domains.len());
+        let u_matrices = upload_matrices(device, scene, &batches, peer)?;
+        let u = room(device, 4 * batches.floats[2])?;
+        let transforms = |state: &State| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
+        let turns = Turns::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
+        let pointers = (peer == Peer::Grouped).then(|| Pointers::new(device, &batches, [&u_matrices, &u], &turns));
+        let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &places)).transpose()?;
+        Ok(Self { blas, peer, part, pointers: pointers.transpose()?, batches, u_matrices, u, update, places, turns })
+    }
+
+    fn multiply(&self, device: &Device, q: u64, turn: usize) -> Result<()> {
+        if let Some(pointers) = &self.pointers {
+            let groups: Vec<Product> = self.batches.list.iter().map(|batch| batch.product).collect();
+            let q = address(device, &pointers.q) + 8 * pointers.problems * (turn % self.turns.count()) as u64;
+            let pointers = [address(device, &pointers.matrices), q, address(device, &pointers.outputs)];
+            // SAFETY: the arrays have a pointer for each problem, in the order of the groups, each to memory of the size
+            // that `Batches` planned.
+            return unsafe { self.blas.grouped(&Grouped { groups: &groups, pointers }) };
+        }
+        let bases = [address(device, &self.u_matrices), q, address(device, &self.u)];
+        for batch in &self.batches.list {
+            let at: [u64; 3] = std::array::from_fn(|of| bases[of] + 4 * batch.first[of]);
+            // SAFETY: the three buffers have the floats that `Batches` planned, and this batch lies inside them; the
+            // products of the first three kinds have a `count` of 1, and the first two one column.
+            unsafe {
+                match self.peer {
+                    Peer::SgemvColumns | Peer::SgemvRows => {
+                        self.blas.gemv(batch.product, self.peer == Peer::SgemvRows, at)?;
+                    }
+                    Peer::Instances => self.blas.gemm(batch.product, at)?,
+                    _ => self.blas.strided(batch.product, self.peer.as_vectors(), at)?,
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Trial for Cublas {
+    fn name(&self) -> String {
+        self.part.named(self.peer.name())
+    }
+
+    fn turns(&self) -> usize {
+        self.turns.count()
+    }
+
+    fn launch(&self, device: &Device, turn: usize) -> Result<()> {
+        let values = self.turns.start(device, turn);
+        self.multiply(device, values.q, turn)?;
+        let u = address(device, &self.u);
+        self.update.as_ref().map_or(Ok(()), |update| update.launch(device, values.transforms, u))
+    }
+
+    fn positions(&self, device: &Device) -> Result<Vec<f32>> {
+        if let Some(update) = &self.update {
+            return update.positions(device);
+        }
+        let mut u = vec![0.0_f32; self.batches.floats[2] as usize];
+        // SAFETY: the buffer has as many floats.
+        unsafe { download(device, address(device, &self.u), &mut u) }?;
+        let places = &self.places;
+        Ok(self.turns.finish_on_host(|domain, vertex| {
+            let of = |first: u64| [0, 1, 2].map(|axis| u[first as usize + 3 * vertex + axis]);
+            places[domain].map_or([0.0; 3], of)
+        }))
+    }
+
+    /// U counts as it is stored, padding included.
+    fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let [matrices, q, u] = self.batches.floats.map(|floats| 4 * floats);
+        let mut bytes = vec![("U as stored", matrices), ("q", q), ("u written", u)];
+        bytes.extend(self.pointers.iter().map(|pointers| ("pointers", 24 * pointers.problems)));
+        bytes.extend(self.update.iter().flat_map(PlainUpdate::bytes));
+        bytes
+    }
+
+    /// Calls of the library, which may launch more than one kernel each, and the update.
+    fn launches(&self) -> usize {
+        let calls = if self.pointers.is_some() { 1 } else { self.batches.list.len() };
+        calls + usize::from(self.update.is_some())
+    }
+
+    /// Of the update alone: the library keeps its own kernels to itself.
+    fn kernels(&self) -> Vec<KernelFacts> {
+        self.update.iter().map(|update| update.facts().clone()).collect()
+    }
+}
+
+impl Pointers {
+    fn new(device: &Device, batches: &Batches, [matrices, u]: [&CudaSlice<u8>; 2], turns: &Turns) -> Result<Self> {
+        let problems =
+            || batches.list.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
+        let list = |base: u64, of: usize| problems().map(move |(batch, index)| base + 4 * batch.place(index, of));
+        let of_turn = |turn: usize| list(turns.start(device, turn).q, 1);
+        Ok(Self {
+            matrices: upload(device, &list(address(device, matrices), 0).collect::<Vec<u64>>())?,
+            outputs: upload(device, &list(address(device, u), 2).collect::<Vec<u64>>())?,
+            q: upload(device, &(0..turns.count()).flat_map(of_turn).collect::<Vec<u64>>())?,
+            problems: problems().count() as u64,
+        })
+    }
+}
+
+fn upload_matrices(device: &Device, scene: &Scene, batches: &Batches, peer: Peer) -> Result<CudaSlice<u8>> {
+    let mut buffer = room(device, 4 * batches.floats[0])?;
+    for batch in &batches.list {
+        let stored = if peer == Peer::Instances { 1 } else { batch.domains.len() };
+        for (index, domain) in batch.domains.iter().enumerate().take(stored) {
+            let matrix = batch.matrix(scene, *domain, peer == Peer::SgemvRows);
+            let begin = 4 * batch.place(index, 0) as usize;
+            let mut part = buffer.slice_mut(begin..begin + size_of_val(matrix.as_slice()));
+            let bytes = bytemuck::cast_slice::<f32, u8>(&matrix);
+            device.stream().memcpy_htod(bytes, &mut part).map_err(during("upload"))?;
+        }
+    }
+    Ok(buffer)
+}
+
+/// Refuses what padding makes too large, before half of it is there.
+fn check_memory(device: &Device, batches: &Batches) -> Result<()> {
+    let (free, _) = device.memory()?;
+    let bytes: u64 = batches.floats.iter().map(|floats| 4 * floats).sum();
+    if bytes <= free as u64 {
+        return Ok(());
+    }
+    let reason = format!("the products need {bytes} bytes, {free} are free on {}", device.name());
+    Err(Error::Unavailable { what: "GPU memory", reason, remedy: "Leave this trial out for this scene".into() })
+}

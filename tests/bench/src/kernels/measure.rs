@@ -1,0 +1,248 @@
+//! The stopwatch: how long a step's kernels take on the device, as replays of CUDA graphs between two events.
+
+use std::time::{Duration, Instant};
+
+use cudarc::driver::sys::{CUdevice_attribute, CUevent_flags, CUgraphInstantiate_flags, CUstreamCaptureMode};
+use cudarc::driver::{CudaEvent, CudaFunction, CudaGraph, CudaSlice, LaunchConfig, PushKernelArg as _};
+use serde::Serialize;
+
+use super::roof;
+use super::trial::Trial;
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, room};
+use modalcast_model::error::{Error, Result, during, invalid};
+
+/// Replays that are put into the stream at once, behind a kernel that holds it up meanwhile: the host's own pace stays
+/// out of the times. The stream takes about a thousand entries before it blocks the host.
+const BATCH: usize = 25;
+
+/// How long the stream is held up for each replay of a batch, microseconds: longer than the host needs for its calls.
+const HOLD_US: u64 = 40;
+
+/// The most turns that are rotated: enough that no replay finds the q of the one before.
+pub(super) const MOST_GRAPHS: usize = 8;
+
+/// How long a trial runs before it is timed, so that the clocks are up.
+const WARM_UP: Duration = Duration::from_millis(30);
+
+/// The cold sweep reads a buffer so many times as large as the L2.
+const SWEEPS: u64 = 4;
+
+/// What lies in the L2 cache when a replay begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Cache {
+    /// What the replay before it left there.
+    Warm,
+    /// Nothing of the trial's: a buffer several times the L2 was read in between, outside the timed span. It is read
+    /// rather than written, so that the trial does not pay for writing back what the sweep left.
+    Cold,
+}
+
+/// Times of one step, microseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Timing {
+    pub median_us: f64,
+    /// The first and the third quartile.
+    pub q1_us: f64,
+    pub q3_us: f64,
+    pub replays: usize,
+}
+
+impl Timing {
+    /// Median and quartiles of times in any order, interpolated between neighbours.
+    ///
+    /// # Errors
+    /// `Invalid` when there is none.
+    pub fn of(mut times_us: Vec<f64>) -> Result<Self> {
+        if times_us.is_empty() {
+            return Err(invalid("replays", "at least 1", 0));
+        }
+        times_us.sort_by(f64::total_cmp);
+        let at = |part: f64| {
+            let place = part * (times_us.len() - 1) as f64;
+            let (below, above) = (place.floor() as usize, place.ceil() as usize);
+            times_us[below] + (times_us[above] - times_us[below]) * place.fract()
+        };
+        Ok(Self { median_us: at(0.5), q1_us: at(0.25), q3_us: at(0.75), replays: times_us.len() })
+    }
+}
+
+/// Times a trial's step: one CUDA graph per turn, replayed in rotation, each replay between two events.
+///
+/// # Errors
+/// `Invalid` when `replays` is 0; `Unavailable` when NVRTC is missing; `Fault` when the device fails or a launch cannot
+/// be captured.
+pub fn time(device: &Device, trial: &dyn Trial, cache: Cache, replays: usize) -> Result<Timing> {
+    if replays == 0 {
+        return Err(invalid("replays", "at least 1", 0));
+    }
+    let hold = Hold::new(device)?;
+    let sweep = matches!(cache, Cache::Cold).then(|| Sweep::new(device)).transpose()?;
+    // A launch outside any graph comes first: code is loaded and workspaces are made at the first call, and neither is
+    // allowed in a capture.
+    trial.launch(device, 0)?;
+    let turns = trial.turns().min(MOST_GRAPHS);
+    let graphs = (0..turns).map(|turn| capture(device, trial, turn)).collect::<Result<Vec<_>>>()?;
+    let begin = Instant::now();
+    while begin.elapsed() < WARM_UP {
+        graphs.iter().try_for_each(|graph| graph.launch().map_err(during("replay")))?;
+        device.stream().synchronize().map_err(during("replay"))?;
+    }
+    let mut times = Vec::with_capacity(replays);
+    while times.len() < replays {
+        let batch = BATCH.min(replays - times.len());
+        let first = times.len();
+        let spans: Vec<Span> = (0..batch).map(|_| Span::new(device)).collect::<Result<_>>()?;
+        hold.launch(device, HOLD_US * batch as u64)?;
+        for (index, span) in spans.iter().enumerate() {
+            sweep.as_ref().map_or(Ok(()), |sweep| sweep.launch(device))?;
+            span.around(device, || graphs[(first + index) % graphs.len()].launch().map_err(during("replay")))?;
+        }
+        device.stream().synchronize().map_err(during("replay"))?;
+        for span in &spans {
+            times.push(span.microseconds()?);
+        }
+    }
+    Timing::of(times)
+}
+
+/// Times a graph that does nothing but one launch: what no step can be faster than.
+///
+/// # Errors
+/// As [`time`].
+pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
+    struct Nothing(CudaFunction);
+    impl Trial for Nothing {
+        fn name(&self) -> String {
+            "empty".into()
+        }
+        fn turns(&self) -> usize {
+            1
+        }
+        fn launch(&self, device: &Device, _: usize) -> Result<()> {
+            let mut launch = device.stream().launch_builder(&self.0);
+            // SAFETY: the kernel has no arguments and does nothing.
+            unsafe { launch.launch(SINGLE) }.map_err(during("replay"))?;
+            Ok(())
+        }
+        fn launches(&self) -> usize {
+            1
+        }
+    }
+    let nothing = Nothing(device.function("nothing", roof::CODE.source, &[])?);
+    time(device, &nothing, Cache::Warm, replays)
+}
+
+const SINGLE: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
+
+/// A graph of one step.
+fn capture(device: &Device, trial: &dyn Trial, turn: usize) -> Result<CudaGraph> {
+    let fail = during("capture");
+    let stream = device.stream();
+    // Relaxed: libraries may ask the driver things in their calls that a stricter mode refuses.
+    stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
+    let launched = trial.launch(device, turn);
+    // The capture ends whatever happened, or the stream would stay in it.
+    let graph = stream.end_capture(CUgraphInstantiate_flags(0));
+    launched?;
+    let nothing = || Error::Fault { stage: "capture", reason: format!("{} launches nothing", trial.name()) };
+    let graph = graph.map_err(&fail)?.ok_or_else(nothing)?;
+    graph.upload().map_err(&fail)?;
+    Ok(graph)
+}
+
+/// Two events of the device's stream.
+pub(super) struct Span {
+    begin: CudaEvent,
+    end: CudaEvent,
+}
+
+impl Span {
+    pub(super) fn new(device: &Device) -> Result<Self> {
+        let event = || device.context().new_event(Some(CUevent_flags::CU_EVENT_DEFAULT)).map_err(during("event"));
+        Ok(Self { begin: event()?, end: event()? })
+    }
+
+    /// Puts the events around what `work` starts.
+    pub(super) fn around(&self, device: &Device, work: impl FnOnce() -> Result<()>) -> Result<()> {
+        self.begin.record(device.stream()).map_err(during("event"))?;
+        work()?;
+        self.end.record(device.stream()).map_err(during("event"))
+    }
+
+    /// The time between them; waits for it.
+    pub(super) fn microseconds(&self) -> Result<f64> {
+        self.begin.elapsed_ms(&self.end).map(|ms| 1e3 * f64::from(ms)).map_err(during("event"))
+    }
+}
+
+/// Holds the stream up for a given time.
+struct Hold(CudaFunction);
+
+impl Hold {
+    fn new(device: &Device) -> Result<Self> {
+        device.function("hold", roof::CODE.source, &[]).map(Self)
+    }
+
+    fn launch(&self, device: &Device, us: u64) -> Result<()> {
+        let nanoseconds = 1000 * us;
+        let mut launch = device.stream().launch_builder(&self.0);
+        // SAFETY: the kernel's only argument is a number of nanoseconds; it touches no memory.
+        unsafe { launch.arg(&nanoseconds).launch(SINGLE) }.map_err(during("replay"))?;
+        Ok(())
+    }
+}
+
+/// Fills the L2 with lines that nobody else uses.
+struct Sweep {
+    function: CudaFunction,
+    buffer: CudaSlice<u8>,
+    blocks: u32,
+}
+
+impl Sweep {
+    fn new(device: &Device) -> Result<Self> {
+        let l2 = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_L2_CACHE_SIZE);
+        let l2 = u64::try_from(l2.map_err(during("device"))?).unwrap_or(0);
+        let tiles = (SWEEPS * l2).div_ceil(roof::tile(roof::SWEEP_LOADS)).max(1);
+        Ok(Self {
+            function: device.function("read", roof::CODE.source, roof::SWEEP)?,
+            buffer: room(device, tiles * roof::tile(roof::SWEEP_LOADS))?,
+            blocks: tiles as u32,
+        })
+    }
+
+    fn launch(&self, device: &Device) -> Result<()> {
+        // Zeros never make the kernel write, so that it may be given its own input to write to.
+        let from = address(device, &self.buffer);
+        roof::launch(device, &self.function, self.blocks, [from, from])
+    }
+}
+
+/// Rate of `bytes` in a time, GB/s (1e9 bytes).
+pub fn gigabytes_per_second(bytes: u64, us: f64) -> f64 {
+    bytes as f64 / (1e3 * us)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quartiles_are_those_of_the_sorted_times_whatever_their_order() {
+        let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("times");
+        assert_eq!(timing, Timing { median_us: 3.0, q1_us: 2.0, q3_us: 4.0, replays: 5 });
+        let even = Timing::of(vec![4.0, 1.0, 2.0, 3.0]).expect("times");
+        assert_eq!(even, Timing { median_us: 2.5, q1_us: 1.75, q3_us: 3.25, replays: 4 });
+        let one = Timing::of(vec![7.0]).expect("a time");
+        assert_eq!((one.q1_us, one.median_us, one.q3_us), (7.0, 7.0, 7.0));
+        assert!(Timing::of(Vec::new()).is_err());
+    }
+
+    #[test]
+    fn a_rate_is_bytes_by_time() {
+        assert_eq!(gigabytes_per_second(4_000_000_000, 1e6), 4.0);
+        assert_eq!(gigabytes_per_second(4_000, 1.0), 4.0);
+    }
+}

@@ -1,0 +1,309 @@
+//! The deformer's own kernels as a trial: the same launchers and tables, on values that lie on the device already.
+
+use std::sync::Arc;
+
+use cudarc::driver::CudaSlice;
+use serde::Serialize;
+
+use super::measure::MOST_GRAPHS;
+use super::trial::{KernelFacts, Trial};
+use super::turns::Turns;
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::apply::{Apply, Lengths};
+use modalcast_compute::gpu::bounds::Bounds;
+use modalcast_compute::gpu::deform::Deform;
+use modalcast_compute::gpu::inputs::{Inputs, Pinned, Values};
+use modalcast_compute::gpu::layout::Header;
+use modalcast_compute::gpu::memory::{address, download, room};
+use modalcast_compute::gpu::normals::Normals;
+use modalcast_compute::gpu::plan::{Kernel, Launch, Plan, Role, Tables, plan_of};
+use modalcast_compute::storage::modes_per_chunk;
+use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::scene::{Scene, State};
+
+/// Which part of a step is launched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Extent {
+    /// u = U q alone, of scenes without batches. For the judge, x = T (x0 + u) follows on the host, in f64.
+    Uq,
+    /// Positions, and a box of each warp's.
+    Positions,
+    /// Positions, the bounds of all, normals, and tangents where the scene has normal maps.
+    Whole,
+}
+
+impl Extent {
+    const fn suffix(self) -> &'static str {
+        match self {
+            Self::Uq => "_uq",
+            Self::Positions => "_positions",
+            Self::Whole => "",
+        }
+    }
+}
+
+/// The deformer `cuda` over a scene, for several steps.
+#[derive(Debug)]
+pub struct Ours {
+    name: String,
+    extent: Extent,
+    scene: Arc<Scene>,
+    deform: Deform,
+    bounds: Bounds,
+    normals: Option<Normals>,
+    listed: bool,
+    inputs: Vec<Inputs>,
+    outputs: CudaSlice<u8>,
+    turns: Turns,
+    plan: Plan,
+    /// Vertices and coordinates that are computed, and what is read for them.
+    counts: Counts,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Counts {
+    vertices: u64,
+    /// Bytes.
+    transforms: u64,
+    coordinates: u64,
+    words: u64,
+    rest: u64,
+}
+
+impl Ours {
+    /// Packs the scene and the values of each state onto the device.
+    ///
+    /// # Errors
+    /// `Invalid` when there is no state, or u alone is asked of a scene with batches; `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
+    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], extent: Extent) -> Result<Self> {
+        Self::of_changed(device, scene, states, (extent, None))
+    }
+
+    /// The same, with all domains but these passed over as unchanged: they show what [`Trial::complete`] computed.
+    ///
+    /// # Errors
+    /// As [`Self::new`], and `Invalid` when the list is longer than a list of changes may be.
+    pub fn of_changed(
+        device: &Device,
+        scene: &Arc<Scene>,
+        states: &[State],
+        (extent, changed): (Extent, Option<&[u32]>),
+    ) -> Result<Self> {
+        let tables = Tables::new(scene);
+        let plan = plan_of(scene, &tables);
+        if extent == Extent::Uq && plan.kernel(Launch::Batch).is_some() {
+            return Err(invalid("deform.batches", "never, where u alone is computed", "batches"));
+        }
+        let normals = plan.kernel(Launch::Normals).filter(|_| extent == Extent::Whole);
+        let normals = normals.map(|kernel| Normals::new(device, scene, kernel)).transpose()?;
+        let mut deform = plan.needed(Launch::Deform)?.clone();
+        leave_out(&mut deform, extent);
+        let deform = Deform::new(device, scene, (&deform, plan.kernel(Launch::Batch)), tables)?;
+        let outputs = room(device, outputs_of(&plan).iter().sum())?;
+        let mut ours = Self {
+            name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
+            extent,
+            scene: Arc::clone(scene),
+            bounds: Bounds::new(device, scene, plan.needed(Launch::Bounds)?, deform.pieces())?,
+            normals,
+            listed: changed.is_some(),
+            inputs: Vec::new(),
+            outputs,
+            turns: Turns::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
+            counts: counts(scene, &plan, changed),
+            deform,
+            plan,
+        };
+        let mut pinned = None;
+        for state in states {
+            let header = Header { everything: 1, step: 1, ..ours.header(device) };
+            let mut inputs = Inputs::new(device, ours.deform.packing())?;
+            let pinned = match &mut pinned {
+                Some(pinned) => pinned,
+                none => none.insert(inputs.pinned(device)?),
+            };
+            send(device, (&mut inputs, pinned), &header, state)?;
+            ours.inputs.push(inputs);
+        }
+        changed.map_or(Ok(()), |changed| ours.apply(device, states, changed))?;
+        Ok(ours)
+    }
+
+    /// Makes the values of each turn those of a step that changed these domains.
+    fn apply(&mut self, device: &Device, states: &[State], changed: &[u32]) -> Result<()> {
+        let allowed = "a quarter of the domains at most, no truncation, and less work than a whole step";
+        let too_many = || invalid("changed", allowed, changed.len());
+        let mut apply =
+            Apply::new(device, self.deform.packing(), self.plan.kernel(Launch::Apply).ok_or_else(too_many)?)?;
+        let mut list = apply.list(device)?;
+        let old = Header { everything: 1, ..self.header(device) };
+        for (inputs, state) in self.inputs.iter_mut().zip(states) {
+            let mut pinned = inputs.pinned(device)?;
+            let lengths = apply.write(&mut list, self.deform.packing(), state, (changed, &[]))?;
+            let Lengths { changed, stale } = lengths.ok_or_else(too_many)?;
+            let header = Header { since: 1, step: 2, changed, stale, ..old };
+            send(device, (inputs, &mut pinned), &header, state)?;
+            apply.launch(device, &mut list, inputs.values(device), self.deform.list(device))?;
+            device.stream().synchronize().map_err(during("upload"))?;
+        }
+        Ok(())
+    }
+
+    fn header(&self, device: &Device) -> Header {
+        let [positions, normals, tangents, _] = outputs_of(&self.plan);
+        let begin = address(device, &self.outputs);
+        debug_assert!(positions + normals + tangents > 0);
+        Header {
+            positions: begin,
+            normals: begin + positions,
+            tangents: begin + positions + normals,
+            // Alone, u lies where positions would.
+            displacements: if self.extent == Extent::Uq { begin } else { begin + positions + normals + tangents },
+            ..Header::default()
+        }
+    }
+
+    /// Of the chunks of modes of all domains that have any, those that are summed, mean over the turns that are timed.
+    fn kept(&self) -> Option<f64> {
+        let per_chunk = modes_per_chunk(self.scene.deformation.storage);
+        let weigh = |chunks: &dyn Fn(usize) -> usize| -> f64 {
+            let slots = self.scene.layout.slots.iter().enumerate();
+            slots.map(|(domain, slot)| slot.vertices as f64 * chunks(domain) as f64).sum()
+        };
+        let all = weigh(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
+        let shares = self.inputs.iter().take(MOST_GRAPHS).map(|inputs| {
+            let kept = inputs.kept_chunks()?;
+            Some(weigh(&|domain| kept[domain] as usize) / all.max(1.0))
+        });
+        let shares: Vec<f64> = shares.collect::<Option<_>>()?;
+        Some(shares.iter().sum::<f64>() / shares.len().max(1) as f64)
+    }
+
+    fn values(&self, device: &Device, turn: usize) -> Values {
+        self.inputs[turn % self.inputs.len()].values(device)
+    }
+}
+
+/// Removes the defines of features that this part of a step does not compute.
+fn leave_out(kernel: &mut Kernel, extent: Extent) {
+    if extent != Extent::Whole {
+        kernel.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"].contains(define));
+    }
+    if extent == Extent::Uq {
+        kernel.defines.retain(|define| *define != "DISPLACEMENTS");
+        kernel.defines.extend(["DISPLACEMENTS", "WITHOUT_POSITIONS"]);
+    }
+}
+
+fn send(device: &Device, (inputs, pinned): (&mut Inputs, &mut Pinned), header: &Header, state: &State) -> Result<()> {
+    inputs.write(pinned, header, state)?;
+    inputs.send(device, pinned, None)?;
+    device.stream().synchronize().map_err(during("upload"))
+}
+
+/// Bytes of positions, normals, tangents and displacements, each filled up so that the next begins where a float4 may.
+fn outputs_of(plan: &Plan) -> [u64; 4] {
+    [Role::Positions, Role::Normals, Role::Tangents, Role::Displacements]
+        .map(|role| plan.bytes(role).next_multiple_of(16))
+}
+
+fn counts(scene: &Scene, plan: &Plan, changed: Option<&[u32]>) -> Counts {
+    let slots = &scene.layout.slots;
+    // With followers every domain reads whom it follows, and its own T or frame.
+    let transform = if scene.needs.followers { 56 } else { 48 };
+    match changed {
+        None => Counts {
+            vertices: scene.layout.vertices as u64,
+            transforms: transform * slots.len() as u64,
+            coordinates: scene.layout.coordinates as u64,
+            words: plan.bytes(Role::Words),
+            rest: plan.bytes(Role::Rest),
+        },
+        Some(list) => {
+            let chosen = || list.iter().map(|domain| slots[*domain as usize]);
+            let share = |slot: modalcast_model::scene::Slot| (slot.vertices * slot.rank) as u64;
+            let all: u64 = slots.iter().map(|slot| share(*slot)).sum();
+            let own: u64 = chosen().map(share).sum();
+            let vertices: u64 = chosen().map(|slot| slot.vertices as u64).sum();
+            Counts {
+                vertices,
+                transforms: transform * list.len() as u64,
+                coordinates: chosen().map(|slot| slot.rank as u64).sum(),
+                words: plan.bytes(Role::Words) * own / all.max(1),
+                rest: 12 * vertices,
+            }
+        }
+    }
+}
+
+impl Trial for Ours {
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn turns(&self) -> usize {
+        self.inputs.len()
+    }
+
+    fn complete(&self, device: &Device, turn: usize) -> Result<()> {
+        if self.listed { self.deform.launch(device, self.values(device, turn)) } else { Ok(()) }
+    }
+
+    fn launch(&self, device: &Device, turn: usize) -> Result<()> {
+        let values = self.values(device, turn);
+        self.turns.start(device, turn);
+        if self.listed {
+            self.deform.launch_listed(device, values)?;
+        } else {
+            self.deform.launch(device, values)?;
+        }
+        if self.extent == Extent::Whole {
+            self.bounds.launch(device, values, self.deform.boxes(device))?;
+        }
+        self.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, values))
+    }
+
+    fn positions(&self, device: &Device) -> Result<Vec<f32>> {
+        let mut numbers = vec![0.0_f32; (self.plan.bytes(Role::Positions) / 4) as usize];
+        // SAFETY: the outputs begin with three floats per vertex.
+        unsafe { download(device, address(device, &self.outputs), &mut numbers) }?;
+        if self.extent != Extent::Uq {
+            return Ok(numbers);
+        }
+        let slots = &self.scene.layout.slots;
+        Ok(self.turns.finish_on_host(|domain, vertex| {
+            let at = 3 * (slots[domain].first_vertex + vertex);
+            [numbers[at], numbers[at + 1], numbers[at + 2]]
+        }))
+    }
+
+    fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let Counts { vertices, transforms, coordinates, words, rest } = self.counts;
+        let words = self.kept().map_or(("U", words), |share| ("U kept", (share * words as f64) as u64));
+        let mut bytes = vec![words, ("scales", self.plan.bytes(Role::Scales)), ("q", 4 * coordinates)];
+        bytes.push(("u or x", 12 * vertices));
+        if self.scene.needs.displacements && self.extent != Extent::Uq {
+            bytes.push(("u kept", 12 * vertices));
+        }
+        if self.extent != Extent::Uq {
+            bytes.extend([("x0", rest), ("T", transforms)]);
+        }
+        if self.extent == Extent::Whole {
+            let roles = [Role::RestNormals, Role::Normals, Role::RestTangents, Role::Tangents];
+            bytes.push(("normals and tangents", roles.iter().map(|role| self.plan.bytes(*role)).sum()));
+        }
+        bytes
+    }
+
+    fn launches(&self) -> usize {
+        let more = [self.extent == Extent::Whole, self.normals.is_some()].map(usize::from);
+        self.deform.kernels().len() + more[0] + more[1]
+    }
+
+    fn kernels(&self) -> Vec<KernelFacts> {
+        let functions = self.deform.kernels().into_iter().chain([("bounds", &self.bounds.function)]);
+        let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
+        functions.filter_map(|(name, function)| KernelFacts::of(name, function).ok()).collect()
+    }
+}

@@ -1,0 +1,274 @@
+//! Figure 3.1 of the thesis, measured: steps whose vertices the host reads, one thing after the other and side by side.
+//!
+//! ```text
+//! serial:      write k, [copy in][kernels], [copy out], write k+1, ...
+//! overlapped:  while the device computes k+1, the host writes k+2 and k is on its way out
+//! ```
+
+use std::collections::VecDeque;
+use std::hint::black_box;
+use std::sync::Arc;
+use std::time::Instant;
+
+use cudarc::driver::PinnedHostSlice;
+use serde::Serialize;
+
+use super::measure::{Span, Timing};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::inputs::{Inputs, Listing, Packing, Writer};
+use modalcast_compute::gpu::layout::Header;
+use modalcast_compute::gpu::staging::{PARALLEL, copy_on_all_cores};
+use modalcast_compute::gpu::work::Coordinates;
+use modalcast_compute::gpu::{CudaDeformer, MOST_UNDER_WAY};
+use modalcast_model::deform::{Deformer as _, Surface, Wanted};
+use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::scene::{Scene, State};
+
+/// Times that each way runs through all steps; they take turns, and medians count.
+const ROUNDS: usize = 5;
+
+/// Times of one step, microseconds, and what they are made of.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Overlap {
+    /// Steps of a round.
+    pub steps: usize,
+    /// Threads that write.
+    pub cores: usize,
+    pub bytes_in: u64,
+    /// Positions and normals.
+    pub bytes_out: u64,
+    /// The host writes a step's values to pinned memory: on one core, and as the deformer does it.
+    pub write_one_core_us: f64,
+    pub write_us: f64,
+    /// The device copies them in, computes, and copies the bounds out.
+    pub graph_us: f64,
+    /// The vertices' way to the host.
+    pub copy_out_us: f64,
+    /// A whole step that nobody reads.
+    pub step_us: f64,
+    /// Every step is read before the next is written.
+    pub serial_us: f64,
+    /// Every step is fetched, and waited for behind the next, as the server does it.
+    pub fetched_us: f64,
+    /// Two steps are under way, so that the host writes too while the device works.
+    pub overlapped_us: f64,
+    /// `serial_us` by `overlapped_us`.
+    pub gain: f64,
+    /// The longest of the three that run side by side: writing, the graph, and the way out.
+    pub ideal_us: f64,
+    /// Steps of the overlapped way whose vertices differ in a bit from those of the serial way: none, or it is wrong.
+    pub differing: usize,
+}
+
+/// Measures a scene over states in rotation.
+///
+/// # Errors
+/// `Invalid` without states or steps; those of making a deformer; `Fault` when the device fails.
+pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<Overlap> {
+    if states.is_empty() || steps == 0 {
+        return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
+    }
+    let mut deformer = CudaDeformer::new(device, scene, None)?;
+    let differing = differing(&mut deformer, states, steps)?;
+    let mut times = [Vec::new(), Vec::new(), Vec::new()];
+    for _ in 0..ROUNDS {
+        for (way, times) in [serial, fetched, overlapped].iter().zip(&mut times) {
+            let begin = Instant::now();
+            way(&mut deformer, states, steps, &mut |_, surface| {
+                black_box(surface.positions.first());
+            })?;
+            times.push(since(begin) / steps as f64);
+        }
+    }
+    let [serial_us, fetched_us, overlapped_us] = times.map(median);
+    let [step_us, copy_out_us] = alone(&mut deformer, states, steps)?;
+    let (bytes_in, [write_one_core_us, write_us]) = writes(device, scene, states, steps)?;
+    let graph_us = graph(device, &deformer, steps)?;
+    let read = deformer.fetch(Wanted::VERTICES)?;
+    let surface = deformer.fetched(&read)?;
+    Ok(Overlap {
+        steps,
+        cores: rayon::current_num_threads(),
+        bytes_in,
+        bytes_out: (size_of_val(surface.positions.as_slice()) + size_of_val(surface.normals.as_slice())) as u64,
+        write_one_core_us,
+        write_us,
+        graph_us,
+        copy_out_us,
+        step_us,
+        serial_us,
+        fetched_us,
+        overlapped_us,
+        gain: serial_us / overlapped_us,
+        ideal_us: write_us.max(graph_us).max(copy_out_us),
+        differing,
+    })
+}
+
+type Read<'a> = &'a mut dyn FnMut(usize, &Surface);
+
+fn serial(deformer: &mut CudaDeformer, states: &[State], steps: usize, read: Read<'_>) -> Result<()> {
+    for step in 0..steps {
+        deformer.deform(&states[step % states.len()])?;
+        let fetch = deformer.fetch(Wanted::VERTICES)?;
+        read(step, &*deformer.fetched(&fetch)?);
+    }
+    Ok(())
+}
+
+fn fetched(deformer: &mut CudaDeformer, states: &[State], steps: usize, read: Read<'_>) -> Result<()> {
+    let mut before = None;
+    for step in 0..=steps {
+        let next = match step < steps {
+            true => {
+                deformer.deform(&states[step % states.len()])?;
+                Some(deformer.fetch(Wanted::VERTICES)?)
+            }
+            false => None,
+        };
+        if let Some(fetch) = std::mem::replace(&mut before, next) {
+            read(step - 1, &*deformer.fetched(&fetch)?);
+        }
+    }
+    Ok(())
+}
+
+fn overlapped(deformer: &mut CudaDeformer, states: &[State], steps: usize, read: Read<'_>) -> Result<()> {
+    let mut fetches = VecDeque::new();
+    for step in 0..steps + MOST_UNDER_WAY {
+        let finished = step.checked_sub(MOST_UNDER_WAY);
+        if finished.is_some_and(|finished| finished < steps) {
+            deformer.finish()?;
+        }
+        if step < steps {
+            deformer.submit(&states[step % states.len()])?;
+            fetches.push_back(deformer.fetch(Wanted::VERTICES)?);
+        }
+        if let (Some(finished), true) = (finished, fetches.len() > MOST_UNDER_WAY || step >= steps)
+            && let Some(fetch) = fetches.pop_front()
+        {
+            read(finished, &*deformer.fetched(&fetch)?);
+        }
+    }
+    Ok(())
+}
+
+/// Steps whose vertices the other two ways get differently.
+fn differing(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<usize> {
+    let mut want = Vec::new();
+    serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
+    let mut differing = 0;
+    for way in [fetched, overlapped] {
+        let mut seen = 0;
+        way(deformer, states, steps, &mut |step, surface| {
+            seen += 1;
+            differing += usize::from(!same_bits(surface, &want[step % states.len()]));
+        })?;
+        differing += steps.abs_diff(seen);
+    }
+    Ok(differing)
+}
+
+fn same_bits(one: &Surface, other: &Surface) -> bool {
+    let same =
+        |one: &[f32], other: &[f32]| bytemuck::cast_slice::<f32, u32>(one) == bytemuck::cast_slice::<f32, u32>(other);
+    same(&one.positions, &other.positions) && same(&one.normals, &other.normals)
+}
+
+/// A step that nobody reads, and the way out by itself.
+fn alone(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<[f64; 2]> {
+    let [mut whole, mut out] = [Vec::new(), Vec::new()];
+    for step in 0..steps {
+        let begin = Instant::now();
+        deformer.deform(&states[step % states.len()])?;
+        whole.push(since(begin));
+        let begin = Instant::now();
+        let fetch = deformer.fetch(Wanted::VERTICES)?;
+        deformer.fetched(&fetch)?;
+        out.push(since(begin));
+    }
+    Ok([whole, out].map(median))
+}
+
+/// Bytes of a step's values, and the times of writing them on one core and on all.
+fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<(u64, [f64; 2])> {
+    // Only the amount counts here: factors and tiles are left empty.
+    let (coordinates, factors) = (Coordinates::new(scene), vec![Vec::new(); scene.shapes.len()]);
+    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() };
+    let packing = Arc::new(packing);
+    let mut pinned = Inputs::new(device, &packing)?.pinned(device)?;
+    let words = pinned.as_mut_slice().map_err(during("write"))?;
+    let mut writer = Writer::new(&packing);
+    let bytes = size_of_val(words) as u64;
+    let mut run = move || {
+        let mut write = |step: usize| {
+            let begin = Instant::now();
+            writer.write(words, &Header::default(), &states[step % states.len()]);
+            since(begin)
+        };
+        write(0);
+        median((0..steps).map(&mut write).collect())
+    };
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().map_err(during("write"))?;
+    Ok((bytes, [one.install(&mut run), run()]))
+}
+
+/// The last step's graph by itself, between two events.
+fn graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
+    let mut times = Vec::with_capacity(steps);
+    for _ in 0..steps {
+        let span = Span::new(device)?;
+        span.around(device, || deformer.replay())?;
+        times.push(span.microseconds()?);
+    }
+    Ok(median(times))
+}
+
+fn since(begin: Instant) -> f64 {
+    begin.elapsed().as_secs_f64() * 1e6
+}
+
+fn median(times: Vec<f64>) -> f64 {
+    Timing::of(times).map_or(f64::NAN, |timing| timing.median_us)
+}
+
+/// Copying so many bytes to pinned, write-combined memory, microseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct HostWrite {
+    pub bytes: u64,
+    pub one_core_us: f64,
+    pub all_cores_us: f64,
+    /// Whether steps of this size are written on all cores.
+    pub on_all_cores: bool,
+}
+
+/// Where several cores begin to pay: powers of two from 64 KiB to 64 MiB.
+///
+/// # Errors
+/// `Invalid` when `replays` is 0; `Fault` when the driver gives no memory.
+pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
+    const LARGEST: usize = 64 << 20;
+    // SAFETY: the memory is only written here.
+    let pinned: std::result::Result<PinnedHostSlice<f32>, _> = unsafe { device.context().alloc_pinned(LARGEST / 4) };
+    let mut pinned = pinned.map_err(during("write"))?;
+    let to = pinned.as_mut_slice().map_err(during("write"))?;
+    let from = vec![1.0_f32; LARGEST / 4];
+    let mut row = |bytes: usize| {
+        let (to, from) = (&mut to[..bytes / 4], &from[..bytes / 4]);
+        let mut time = |copy: &dyn Fn(&mut [f32], &[f32])| {
+            let once = |_| {
+                let begin = Instant::now();
+                copy(to, from);
+                since(begin)
+            };
+            Timing::of((0..replays).map(once).collect()).map(|timing| timing.median_us)
+        };
+        Ok(HostWrite {
+            bytes: bytes as u64,
+            one_core_us: time(&|to, from| to.copy_from_slice(from))?,
+            all_cores_us: time(&copy_on_all_cores)?,
+            on_all_cores: bytes >= PARALLEL,
+        })
+    };
+    (16..=26).map(|power| row(1 << power)).collect()
+}

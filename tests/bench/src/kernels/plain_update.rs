@@ -1,0 +1,202 @@
+//! Launches `kernels/plain_update.cu`: x = T (x0 + u) after a product that a library computed. Only trials use it.
+
+use bytemuck::{Pod, Zeroable};
+use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+
+use super::trial::{Code, Compiled, KernelFacts};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, download, room, upload};
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::Scene;
+
+pub(super) const CODE: Code = Code {
+    source: include_str!("../../kernels/plain_update.cu"),
+    functions: &["plain_update"],
+    variants: &[&[], &["SINGLE"]],
+};
+
+const BLOCK: u32 = 256;
+
+/// `first_u` of a domain that has no u.
+const RIGID: u64 = u64::MAX;
+
+/// Where a domain's u and vertices lie.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+struct PlainSlot {
+    first_u: u64,
+    first: u32,
+    reserved: u32,
+}
+
+/// Arguments of `plain_update`; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct PlainArgs {
+    slots: u64,
+    domains: u64,
+    rest: u64,
+    transforms: u64,
+    u: u64,
+    positions: u64,
+    vertices: u32,
+    reserved: u32,
+}
+
+const _: () = assert!(size_of::<PlainSlot>() == 16, "PlainSlot differs from kernels/plain_update.cu");
+const _: () = assert!(size_of::<PlainArgs>() == 56, "PlainArgs differs from kernels/plain_update.cu");
+
+// SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
+unsafe impl DeviceRepr for PlainArgs {}
+
+/// The kernel, what it reads of a scene and what it writes.
+#[derive(Debug)]
+pub(super) struct PlainUpdate {
+    compiled: Compiled,
+    slots: CudaSlice<u8>,
+    domains: Option<CudaSlice<u8>>,
+    rest: CudaSlice<u8>,
+    positions: CudaSlice<u8>,
+    vertices: usize,
+    /// Bytes of the transforms, and of u.
+    read: [u64; 2],
+}
+
+impl PlainUpdate {
+    /// `first_u` is the first float of each domain's u; only domains with modes have one.
+    pub(super) fn new(device: &Device, scene: &Scene, first_u: &[Option<u64>]) -> Result<Self> {
+        let (single, vertices) = (scene.domains.len() == 1, scene.layout.vertices);
+        let defines: &[&str] = if single { &["SINGLE"] } else { &[] };
+        let moving = scene.layout.slots.iter().filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64);
+        Ok(Self {
+            compiled: Compiled::new(device, &CODE, defines)?,
+            slots: upload(device, &slots(scene, first_u))?,
+            domains: (!single).then(|| upload(device, &domains(scene))).transpose()?,
+            rest: upload(device, &rest(scene))?,
+            positions: room(device, 12 * vertices as u64)?,
+            vertices,
+            read: [48 * scene.domains.len() as u64, moving.sum()],
+        })
+    }
+
+    pub(super) fn launch(&self, device: &Device, transforms: u64, u: u64) -> Result<()> {
+        let args = PlainArgs {
+            slots: address(device, &self.slots),
+            domains: self.domains.as_ref().map_or(0, |domains| address(device, domains)),
+            rest: address(device, &self.rest),
+            transforms,
+            u,
+            positions: address(device, &self.positions),
+            vertices: self.vertices as u32,
+            reserved: 0,
+        };
+        let blocks = args.vertices.div_ceil(BLOCK);
+        let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
+        let mut launch = device.stream().launch_builder(&self.compiled.function);
+        // SAFETY: `PlainArgs` is the kernel's only argument. Its tables are of one scene, and the caller placed three
+        // floats of u for each vertex of a domain that has a first one.
+        unsafe { launch.arg(&args).launch(config) }.map_err(during("plain_update"))?;
+        Ok(())
+    }
+
+    pub(super) fn positions(&self, device: &Device) -> Result<Vec<f32>> {
+        let mut positions = vec![0.0_f32; 3 * self.vertices];
+        // SAFETY: the buffer has three floats for each vertex.
+        unsafe { download(device, address(device, &self.positions), &mut positions) }?;
+        Ok(positions)
+    }
+
+    pub(super) fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let vertices = self.vertices as u64;
+        let domains = if self.domains.is_some() { 4 * vertices } else { 0 };
+        vec![
+            ("x0", 12 * vertices),
+            ("domains of vertices", domains),
+            ("T", self.read[0]),
+            ("u read", self.read[1]),
+            ("x written", 12 * vertices),
+        ]
+    }
+
+    pub(super) fn facts(&self) -> &KernelFacts {
+        &self.compiled.facts
+    }
+}
+
+fn slots(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainSlot> {
+    let slot = |(slot, first_u): (&modalcast_model::scene::Slot, &Option<u64>)| PlainSlot {
+        first_u: first_u.unwrap_or(RIGID),
+        first: slot.first_vertex as u32,
+        reserved: 0,
+    };
+    scene.layout.slots.iter().zip(first_u).map(slot).collect()
+}
+
+fn domains(scene: &Scene) -> Vec<u32> {
+    let slots = scene.layout.slots.iter().enumerate();
+    slots.flat_map(|(domain, slot)| std::iter::repeat_n(domain as u32, slot.vertices)).collect()
+}
+
+fn rest(scene: &Scene) -> Vec<f32> {
+    let shapes = (0..scene.domains.len()).map(|domain| scene.shape_of(domain));
+    shapes.flat_map(|shape| shape.mesh.rest().as_flattened()).copied().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::trial::tests::compile_all;
+    use super::*;
+    use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
+
+    /// `plain_update` of one vertex.
+    fn twin_of_plain_update(tables: (&[PlainSlot], &[u32], &[f32]), t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
+        let (slots, domains, rest) = tables;
+        let domain = domains[vertex] as usize;
+        let slot = slots[domain];
+        let mut bent: [f32; 3] = std::array::from_fn(|axis| rest[3 * vertex + axis]);
+        if slot.first_u != RIGID {
+            let u = &u[slot.first_u as usize + 3 * (vertex - slot.first as usize)..];
+            bent.iter_mut().zip(u).for_each(|(bent, u)| *bent += u);
+        }
+        std::array::from_fn(|axis| {
+            let row = &t[12 * domain + 4 * axis..][..4];
+            row[0].mul_add(bent[0], row[1].mul_add(bent[1], row[2].mul_add(bent[2], row[3])))
+        })
+    }
+
+    #[test]
+    fn the_twin_puts_every_vertex_at_t_of_x0_plus_u_wherever_its_u_lies() {
+        let (scene, state) = scene_and_state(&[(5, 2, 1), (9, 0, 2), (40, 7, 30)]);
+        let first_u = [Some(200), None, Some(3)];
+        let mut u = vec![f32::NAN; 215];
+        for (domain, first) in first_u.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
+            for vertex in 0..scene.layout.slots[domain].vertices {
+                let numbers = displacement_of(&scene, &state, domain, vertex).map(|number| number as f32);
+                u[first as usize + 3 * vertex..][..3].copy_from_slice(&numbers);
+            }
+        }
+        let (slots, domains, rest) = (slots(&scene, &first_u), domains(&scene), rest(&scene));
+        let transforms: &[f32] = bytemuck::cast_slice(&state.transforms);
+        for (domain, slot) in scene.layout.slots.iter().enumerate() {
+            for vertex in 0..slot.vertices {
+                let packed = slot.first_vertex + vertex;
+                let got = twin_of_plain_update((&slots, &domains, &rest), transforms, &u, packed);
+                for (want, got) in position_of(&scene, &state, domain, vertex).iter().zip(got) {
+                    assert!((want - f64::from(got)).abs() < 1e-5, "domain {domain} vertex {vertex}: {got} not {want}");
+                }
+                let other = twin_of_plain_update((&slots, &domains, &rest), transforms, &u, (packed + 1) % 54);
+                assert_ne!(other, got_of(&scene, &state, domain, vertex), "the judge can fail");
+            }
+        }
+    }
+
+    fn got_of(scene: &Scene, state: &modalcast_model::scene::State, domain: usize, vertex: usize) -> [f32; 3] {
+        position_of(scene, state, domain, vertex).map(|number| number as f32)
+    }
+
+    #[test]
+    #[ignore = "needs NVRTC: deploy/check installs it"]
+    fn nvrtc_compiles_plain_update() {
+        compile_all(&CODE);
+    }
+}

@@ -1,0 +1,159 @@
+//! BASELINE. Launches `kernels/thesis_multi.cu`: u = U q of many domains in groups of lanes (chapter 3.2.2).
+//!
+//! The kernels of a split run one after the other; the text lets them overlap in streams (figure 3.5).
+
+use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
+
+use super::super::trial::{Code, Compiled, KernelFacts};
+use super::group::{BLOCK, LARGEST_RANK, Split, pack};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, upload};
+use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::scene::Scene;
+
+pub(super) const CODE: Code = Code {
+    source: include_str!("../../../kernels/thesis_multi.cu"),
+    functions: &["thesis_multi"],
+    variants: &[&["WIDTH=5"], &["WIDTH=6"], &["WIDTH=7"], &["WIDTH=8"]],
+};
+
+/// The kernel of one group width and what it reads.
+#[derive(Debug)]
+struct Kernel {
+    compiled: Compiled,
+    entries: CudaSlice<u8>,
+    meta: CudaSlice<u8>,
+    lanes: usize,
+    busy: u64,
+}
+
+/// The kernels of a split.
+#[derive(Debug)]
+pub(super) struct Multi {
+    kernels: Vec<Kernel>,
+    /// Rows of U of all domains.
+    rows: u64,
+}
+
+impl Multi {
+    /// # Errors
+    /// `Invalid` when a domain has more modes than a group holds.
+    pub(super) fn new(device: &Device, scene: &Scene, split: Split) -> Result<Self> {
+        let slots = &scene.layout.slots;
+        if let Some(domain) = slots.iter().position(|slot| slot.rank > LARGEST_RANK) {
+            let field = format!("domain {domain}: modes");
+            return Err(invalid(field, format!("at most {LARGEST_RANK} for groups"), slots[domain].rank));
+        }
+        let rows = slots.iter().filter(|slot| slot.rank > 0).map(|slot| 3 * slot.vertices as u64).sum();
+        let mut kernels = Vec::new();
+        for width in split.widths() {
+            let packed = pack(scene, split, *width);
+            if packed.meta.is_empty() {
+                continue;
+            }
+            let define = format!("WIDTH={width}");
+            kernels.push(Kernel {
+                compiled: Compiled::new(device, &CODE, &[&define])?,
+                entries: upload(device, &packed.entries)?,
+                meta: upload(device, &packed.meta)?,
+                lanes: packed.meta.len(),
+                busy: packed.busy(),
+            });
+        }
+        Ok(Self { kernels, rows })
+    }
+
+    pub(super) fn launch(&self, device: &Device, q: u64, u: u64) -> Result<()> {
+        for kernel in &self.kernels {
+            let blocks = (kernel.lanes / BLOCK) as u32;
+            let config =
+                LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
+            let (entries, meta) = (address(device, &kernel.entries), address(device, &kernel.meta));
+            let mut launch = device.stream().launch_builder(&kernel.compiled.function);
+            launch.arg(&entries).arg(&meta).arg(&q).arg(&u);
+            // SAFETY: these are the kernel's arguments. Entries and meta data have a float4 and a uint4 for each thread
+            // of the whole blocks; the places in the meta data lie inside `u` and `q`, as `pack` made all of them of one
+            // scene.
+            unsafe { launch.launch(config) }.map_err(during("thesis_multi"))?;
+        }
+        Ok(())
+    }
+
+    pub(super) fn launches(&self) -> usize {
+        self.kernels.len()
+    }
+
+    /// Bytes of a step; `q` is those of the packed coordinates.
+    pub(super) fn bytes(&self, q: u64) -> Vec<(&'static str, u64)> {
+        let (busy, all) =
+            self.kernels.iter().fold((0, 0), |(busy, all), kernel| (busy + kernel.busy, all + kernel.lanes as u64));
+        vec![
+            ("U in fours of modes", 16 * busy),
+            ("meta data of lanes", 16 * all),
+            ("q", q),
+            ("u written", 4 * self.rows),
+        ]
+    }
+
+    pub(super) fn facts(&self) -> Vec<KernelFacts> {
+        self.kernels.iter().map(|kernel| kernel.compiled.facts.clone()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::trial::tests::compile_all;
+    use super::super::group::{IDLE, Packed, WARP, packed_q, places_of_u};
+    use super::*;
+    use modalcast_compute::testing::{displacement_of, scene_and_state};
+
+    /// `thesis_multi` thread by thread; counts how often each number of u is written.
+    fn twin_of_thesis_multi(packed: &Packed, q: &[f32], u: &mut [f32], written: &mut [usize]) {
+        for first in (0..packed.meta.len()).step_by(WARP) {
+            let busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
+            let mut sub_sums = [0.0_f32; WARP];
+            for lane in (0..WARP).filter(busy) {
+                let q = &q[4 * packed.meta[first + lane][1] as usize..][..4];
+                sub_sums[lane] = packed.entries[first + lane].iter().zip(q).map(|(entry, q)| entry * q).sum();
+            }
+            for lane in (0..WARP).filter(busy) {
+                let [place, _, fours, _] = packed.meta[first + lane].map(|number| number as usize);
+                if (lane % packed.width).is_multiple_of(fours) {
+                    u[place] = sub_sums[lane..lane + fours].iter().sum();
+                    written[place] += 1;
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_twin_writes_every_row_of_every_domain_once_with_one_two_and_four_kernels() {
+        let shapes: Vec<_> = (0..70).map(|index| (1 + index * 11 % 40, index % 33, 1)).collect();
+        let (scene, state) = scene_and_state(&shapes);
+        let (places, vertices) = places_of_u(&scene);
+        let q = packed_q(&scene, &state);
+        for split in Split::ALL {
+            let (mut u, mut written) = (vec![f32::NAN; 4 * vertices], vec![0; 4 * vertices]);
+            for width in split.widths() {
+                twin_of_thesis_multi(&pack(&scene, split, *width), &q, &mut u, &mut written);
+            }
+            assert!(written.iter().enumerate().all(|(place, times)| *times == usize::from(place % 4 < 3)), "{split:?}");
+            let mut largest = 0.0_f64;
+            for (domain, first) in places.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
+                for vertex in 0..scene.layout.slots[domain].vertices {
+                    let want = displacement_of(&scene, &state, domain, vertex);
+                    let got = &u[4 * (first as usize + vertex)..][..3];
+                    largest =
+                        want.iter().zip(got).map(|(want, got)| (want - f64::from(*got)).abs()).fold(largest, f64::max);
+                }
+            }
+            assert!(largest > 0.0 && largest < 1e-5, "{split:?}: {largest}");
+        }
+    }
+
+    #[test]
+    #[ignore = "needs NVRTC: deploy/check installs it"]
+    fn nvrtc_compiles_thesis_multi() {
+        compile_all(&CODE);
+    }
+}

@@ -1,0 +1,187 @@
+//! BASELINE. Launches `kernels/thesis_single.cu`: u = U q of one domain (chapter 3.2.1).
+
+use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
+
+use super::super::trial::{Code, Compiled, KernelFacts};
+use super::group::{BLOCK, WARP, entry, fours};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, upload};
+use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::scene::Scene;
+
+pub(super) const CODE: Code =
+    Code { source: include_str!("../../../kernels/thesis_single.cu"), functions: &["thesis_single"], variants: &[&[]] };
+
+/// How rows of U are laid out in lines of 32 float4 (figure 3.3).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Lines {
+    /// Rows of U, 3n.
+    rows: usize,
+    rank: usize,
+    /// Lanes of a row: n_vr, at most a warp.
+    width: usize,
+    /// Lines that a row longer than a warp takes.
+    passes: usize,
+    /// Lines of rows; each is `passes` times 32 float4.
+    lines: usize,
+}
+
+impl Lines {
+    fn of(vertices: usize, rank: usize) -> Self {
+        let (rows, width) = (3 * vertices, fours(rank).min(WARP));
+        Self { rows, rank, width, passes: fours(rank).div_ceil(WARP), lines: rows.div_ceil(WARP / width) }
+    }
+
+    /// The lines, in order.
+    fn pack(self, scene: &Scene) -> Vec<[f32; 4]> {
+        let rows_of_line = WARP / self.width;
+        let mut lines = Vec::with_capacity(self.lines * self.passes * WARP);
+        for line in 0..self.lines {
+            for (pass, lane) in (0..self.passes).flat_map(|pass| (0..WARP).map(move |lane| (pass, lane))) {
+                let (row, k) = (line * rows_of_line + lane / self.width, pass * WARP + lane % self.width);
+                let busy = lane < rows_of_line * self.width && row < self.rows && k < fours(self.rank);
+                lines.push(if busy { entry(scene, 0, row, k) } else { [0.0; 4] });
+            }
+        }
+        lines
+    }
+}
+
+/// The kernel and the lines of U.
+#[derive(Debug)]
+pub(super) struct Single {
+    compiled: Compiled,
+    buffer: CudaSlice<u8>,
+    lines: Lines,
+}
+
+impl Single {
+    /// # Errors
+    /// `Invalid` when the scene is not one domain with modes.
+    pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
+        let [slot] = scene.layout.slots[..] else {
+            return Err(invalid("scene.domains", "1 for the single-domain kernel", scene.domains.len()));
+        };
+        if slot.rank == 0 {
+            return Err(invalid("modes", "at least 1 for the single-domain kernel", 0));
+        }
+        let lines = Lines::of(slot.vertices, slot.rank);
+        let compiled = Compiled::new(device, &CODE, &[])?;
+        Ok(Self { compiled, buffer: upload(device, &lines.pack(scene))?, lines })
+    }
+
+    pub(super) fn launch(&self, device: &Device, q: u64, u: u64) -> Result<()> {
+        let blocks = self.lines.lines.div_ceil(BLOCK / WARP) as u32;
+        let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
+        let (lines, rank, rows) = (address(device, &self.buffer), self.lines.rank as u32, self.lines.rows as u32);
+        let mut launch = device.stream().launch_builder(&self.compiled.function);
+        launch.arg(&lines).arg(&q).arg(&u).arg(&rank).arg(&rows);
+        // SAFETY: these are the kernel's arguments. `buffer` has every line of `lines`, `q` the rank of the scene's only
+        // domain, and `u` a float4 per vertex; warps beyond the last row touch none of them.
+        unsafe { launch.launch(config) }.map_err(during("thesis_single"))?;
+        Ok(())
+    }
+
+    pub(super) fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let rows = self.lines.rows as u64;
+        vec![
+            ("U in fours of modes", 16 * rows * fours(self.lines.rank) as u64),
+            ("q", 4 * self.lines.rank as u64),
+            ("u written", 4 * rows),
+        ]
+    }
+
+    pub(super) fn facts(&self) -> &KernelFacts {
+        &self.compiled.facts
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::trial::tests::compile_all;
+    use super::*;
+    use modalcast_compute::testing::{displacement_of, scene_and_state};
+
+    /// The place of q_i in shared memory, in floats (equation 3.3).
+    const fn place_of_q(i: usize) -> usize {
+        i % 4 * 32 + i / 4
+    }
+
+    /// `thesis_single` thread by thread.
+    fn twin_of_thesis_single(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
+        let (rank, width) = (q.len(), fours(q.len()).min(WARP));
+        let (rows_of_line, passes) = (WARP / width, fours(rank).div_ceil(WARP));
+        let mut shared_q = [f32::NAN; 512];
+        for (place, slot) in shared_q.iter_mut().enumerate().take(passes * 4 * WARP) {
+            let mode = place / 128 * 128 + 4 * (place % WARP) + place / WARP % 4;
+            *slot = q.get(mode).copied().unwrap_or(0.0);
+        }
+        let mut u = vec![f32::NAN; 4 * rows.div_ceil(3)];
+        for line in 0..lines.len() / (WARP * passes) {
+            let mut sub_sums = [0.0_f32; WARP];
+            let busy = |lane: usize| lane < rows_of_line * width && line * rows_of_line + lane / width < rows;
+            for lane in (0..WARP).filter(|lane| busy(*lane)) {
+                for pass in (0..passes).filter(|pass| pass * WARP + lane % width < fours(rank)) {
+                    let four = lines[(line * passes + pass) * WARP + lane];
+                    let part = &shared_q[pass * 4 * WARP + lane % width..];
+                    sub_sums[lane] += (0..4).map(|index| four[index] * part[index * WARP]).sum::<f32>();
+                }
+            }
+            for lane in (0..WARP).filter(|lane| busy(*lane) && lane % width == 0) {
+                let row = line * rows_of_line + lane / width;
+                u[4 * (row / 3) + row % 3] = sub_sums[lane..lane + width].iter().sum();
+            }
+        }
+        u
+    }
+
+    #[test]
+    fn the_twin_sums_every_row_whatever_the_rank_and_notices_another_q() {
+        for rank in [1, 3, 4, 5, 9, 10, 20, 30, 31, 32, 33, 127, 128, 129, 300, 512] {
+            let (scene, state) = scene_and_state(&[(23, rank, 1)]);
+            let lines = Lines::of(23, rank).pack(&scene);
+            let largest = |q: &[f32]| {
+                let u = twin_of_thesis_single(&lines, q, 69);
+                let error = |row: usize| {
+                    let want = displacement_of(&scene, &state, 0, row / 3)[row % 3];
+                    let error = (f64::from(u[4 * (row / 3) + row % 3]) - want).abs();
+                    if error.is_nan() { f64::INFINITY } else { error }
+                };
+                (0..69).map(error).fold(0.0, f64::max)
+            };
+            assert!(largest(&state.q) < 1e-4, "rank {rank}: {}", largest(&state.q));
+            let mut other = state.q.clone();
+            other[rank - 1] += 1.0;
+            assert!(largest(&other) > 1e-3, "rank {rank}: the judge can fail");
+        }
+    }
+
+    #[test]
+    fn equation_3_3_keeps_the_lanes_of_a_warp_in_different_banks_and_holds_up_to_rank_128() {
+        let places = |rank: usize| (0..rank).map(place_of_q).collect::<std::collections::BTreeSet<_>>().len();
+        assert_eq!(places(128), 128, "no two coordinates share a place");
+        assert!(places(129) < 129, "the 129th has the place of the second");
+        // In the kernel's loop, place i * 32 + j takes q[4 j + i]: the same map, from the other side.
+        assert!((0..128).all(|place| place_of_q(4 * (place % 32) + place / 32) == place));
+        for part in 0..4 {
+            let banks: std::collections::BTreeSet<usize> = (0..32).map(|k| place_of_q(4 * k + part) % 32).collect();
+            assert_eq!(banks.len(), 32);
+        }
+    }
+
+    #[test]
+    fn a_line_holds_whole_rows_and_begins_at_128_bytes() {
+        // r = 30 of figure 3.2: eight lanes a row, four rows a warp.
+        let lines = Lines::of(4, 30);
+        assert_eq!((lines.width, lines.passes, lines.lines), (8, 1, 3));
+        assert_eq!(WARP * size_of::<[f32; 4]>() % 128, 0);
+        assert_eq!(Lines::of(4, 10), Lines { rows: 12, rank: 10, width: 3, passes: 1, lines: 2 });
+        assert_eq!(Lines::of(1, 512), Lines { rows: 3, rank: 512, width: 32, passes: 4, lines: 3 });
+    }
+
+    #[test]
+    #[ignore = "needs NVRTC: deploy/check installs it"]
+    fn nvrtc_compiles_thesis_single() {
+        compile_all(&CODE);
+    }
+}

@@ -1,0 +1,285 @@
+//! BASELINE. Launches `kernels/thesis_update.cu`: the vertex update of unfolded triangles (chapter 3.2.3).
+
+use bytemuck::{Pod, Zeroable};
+use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+
+use super::super::trial::{Code, Compiled, KernelFacts};
+use super::group::{BLOCK, places_of_u};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, download, room, upload};
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::{Scene, State};
+
+pub(super) const CODE: Code = Code {
+    source: include_str!("../../../kernels/thesis_update.cu"),
+    functions: &["thesis_update"],
+    variants: &[&[], &["TANGENTS"]],
+};
+
+/// Vertices of a warp and of a block.
+const OF_WARP: usize = 8;
+const OF_BLOCK: usize = 64;
+
+/// The source of a vertex that has no u.
+const RIGID: u32 = u32::MAX;
+
+/// The text assumes three triangles a domain: then eight vertices in a row meet at most two domains.
+const FEWEST_TRIANGLES: usize = 3;
+
+/// Arguments of `thesis_update`; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct UpdateArgs {
+    warps: u64,
+    sources: u64,
+    rest_positions: u64,
+    rest_normals: u64,
+    rest_tangents: u64,
+    transforms: u64,
+    u: u64,
+    positions: u64,
+    normals: u64,
+    tangents: u64,
+    vertices: u32,
+    reserved: u32,
+}
+
+const _: () = assert!(size_of::<UpdateArgs>() == 88, "UpdateArgs differs from kernels/thesis_update.cu");
+
+// SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
+unsafe impl DeviceRepr for UpdateArgs {}
+
+/// The vertices of unfolded triangles, three per triangle.
+#[derive(Debug, Default)]
+struct Unfolded {
+    warps: Vec<[u32; 4]>,
+    /// The vertex of u, or RIGID.
+    sources: Vec<u32>,
+    /// The packed vertex of the scene's layout.
+    targets: Vec<u32>,
+    positions: Vec<[f32; 4]>,
+    normals: Vec<[f32; 4]>,
+    tangents: Vec<[f32; 4]>,
+}
+
+impl Unfolded {
+    /// A domain with fewer than three triangles repeats its last one.
+    fn of(scene: &Scene) -> Self {
+        let (places, _) = places_of_u(scene);
+        let mut unfolded = Self::default();
+        let mut domains = Vec::new();
+        for (domain, slot) in scene.layout.slots.iter().enumerate() {
+            let shape = scene.shape_of(domain);
+            let (corners, triangles) = (shape.mesh.corners(), shape.mesh.triangles());
+            let fewest = triangles.len().max(FEWEST_TRIANGLES);
+            let corner_of = |index: usize| triangles[(index / 3).min(triangles.len() - 1)][index % 3] as usize;
+            for corner in (0..3 * fewest).map(corner_of) {
+                let vertex = corners.vertices[corner];
+                unfolded.sources.push(places[domain].map_or(RIGID, |first| first + vertex));
+                unfolded.targets.push(slot.first_vertex as u32 + vertex);
+                unfolded.positions.push(four(shape.mesh.rest()[vertex as usize], 1.0));
+                unfolded.normals.push(four(corners.normals[corner], 0.0));
+                if scene.needs.normal_maps {
+                    let [x, y, z, _] = shape.tangents().get(corner).copied().unwrap_or_default();
+                    unfolded.tangents.push([x, y, z, 0.0]);
+                }
+                domains.push(domain as u32);
+            }
+        }
+        unfolded.warps = domains.chunks(OF_WARP).map(warp).collect();
+        unfolded.warps.resize(domains.len().div_ceil(OF_BLOCK) * OF_BLOCK / OF_WARP, [0, 0, OF_WARP as u32, 0]);
+        unfolded
+    }
+}
+
+/// The two domains of a warp and where the second begins.
+fn warp(domains: &[u32]) -> [u32; 4] {
+    let first = domains[0];
+    let second = domains.iter().position(|domain| *domain != first);
+    second.map_or([first, first, OF_WARP as u32, 0], |at| [first, domains[at], at as u32, 0])
+}
+
+const fn four([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
+    [x, y, z, w]
+}
+
+/// T of every domain as four rows of four.
+pub(super) fn matrices(scene: &Scene, state: &State) -> Vec<f32> {
+    let transforms = state.world_transforms(scene);
+    transforms.iter().flat_map(|transform| transform.0.into_iter().chain([0.0, 0.0, 0.0, 1.0])).collect()
+}
+
+/// The kernel, what it reads and what it writes.
+#[derive(Debug)]
+pub(super) struct Update {
+    compiled: Compiled,
+    /// Warps, sources, rest positions, normals and tangents.
+    tables: [CudaSlice<u8>; 5],
+    /// Positions, normals and tangents.
+    outputs: [CudaSlice<u8>; 3],
+    targets: Vec<u32>,
+    tangents: bool,
+    /// Bytes of the transforms, and of u.
+    read: [u64; 2],
+}
+
+impl Update {
+    pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
+        let unfolded = Unfolded::of(scene);
+        let (tangents, bytes) = (scene.needs.normal_maps, 16 * unfolded.targets.len() as u64);
+        let defines: &[&str] = if tangents { &["TANGENTS"] } else { &[] };
+        Ok(Self {
+            compiled: Compiled::new(device, &CODE, defines)?,
+            tables: [
+                upload(device, &unfolded.warps)?,
+                upload(device, &unfolded.sources)?,
+                upload(device, &unfolded.positions)?,
+                upload(device, &unfolded.normals)?,
+                upload(device, &unfolded.tangents)?,
+            ],
+            outputs: [room(device, bytes)?, room(device, bytes)?, room(device, if tangents { bytes } else { 0 })?],
+            targets: unfolded.targets,
+            tangents,
+            read: [64 * scene.domains.len() as u64, 16 * places_of_u(scene).1 as u64],
+        })
+    }
+
+    pub(super) fn launch(&self, device: &Device, transforms: u64, u: u64) -> Result<()> {
+        let [warps, sources, rest_positions, rest_normals, rest_tangents] =
+            self.tables.each_ref().map(|table| address(device, table));
+        let [positions, normals, tangents] = self.outputs.each_ref().map(|output| address(device, output));
+        let vertices = self.targets.len();
+        let args = UpdateArgs {
+            warps,
+            sources,
+            rest_positions,
+            rest_normals,
+            rest_tangents,
+            transforms,
+            u,
+            positions,
+            normals,
+            tangents,
+            vertices: vertices as u32,
+            reserved: 0,
+        };
+        let blocks = vertices.div_ceil(OF_BLOCK) as u32;
+        let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
+        let mut launch = device.stream().launch_builder(&self.compiled.function);
+        // SAFETY: `UpdateArgs` is the kernel's only argument. Its tables are of one scene, as `Unfolded::of` made them:
+        // sources lie inside `u`, domains inside `transforms`, and the outputs have a float4 for every vertex.
+        unsafe { launch.arg(&args).launch(config) }.map_err(during("thesis_update"))?;
+        Ok(())
+    }
+
+    /// The positions of unfolded triangles folded back, three numbers for each of `vertices` packed vertices. A vertex
+    /// that no triangle names was not computed: it is NaN.
+    pub(super) fn positions(&self, device: &Device, vertices: usize) -> Result<Vec<f32>> {
+        let mut unfolded = vec![[0.0_f32; 4]; self.targets.len()];
+        // SAFETY: the buffer has a float4 for each target.
+        unsafe { download(device, address(device, &self.outputs[0]), &mut unfolded) }?;
+        Ok(fold(&unfolded, &self.targets, vertices))
+    }
+
+    pub(super) fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let vertices = self.targets.len() as u64;
+        let kinds = if self.tangents { 3 } else { 2 };
+        vec![
+            ("unfolded rest state", 16 * kinds * vertices),
+            ("sources and domains of vertices", 4 * vertices + 2 * vertices.next_multiple_of(OF_BLOCK as u64)),
+            ("T", self.read[0]),
+            ("u read", self.read[1]),
+            ("unfolded vertices written", 16 * kinds * vertices),
+        ]
+    }
+
+    pub(super) fn facts(&self) -> &KernelFacts {
+        &self.compiled.facts
+    }
+}
+
+fn fold(unfolded: &[[f32; 4]], targets: &[u32], vertices: usize) -> Vec<f32> {
+    let mut positions = vec![f32::NAN; 3 * vertices];
+    for (position, target) in unfolded.iter().zip(targets) {
+        positions[3 * *target as usize..][..3].copy_from_slice(&position[..3]);
+    }
+    positions
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::trial::tests::compile_all;
+    use super::*;
+    use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
+
+    /// The positions of `thesis_update`, thread by thread.
+    fn twin_of_thesis_update(unfolded: &Unfolded, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
+        let count = unfolded.targets.len();
+        let mut positions = vec![[f32::NAN; 4]; count];
+        for thread in 0..count.div_ceil(OF_BLOCK) * BLOCK {
+            let (vertex, element, warp) = (thread / 4, thread % 4, thread / 32);
+            let [first, second, split, _] = unfolded.warps[warp];
+            let domain = if (thread % 32 / 4) < split as usize { first } else { second };
+            if vertex < count {
+                let mut rest = unfolded.positions[vertex];
+                if unfolded.sources[vertex] != RIGID {
+                    rest.iter_mut().zip(u[unfolded.sources[vertex] as usize]).for_each(|(rest, u)| *rest += u);
+                }
+                let row = &transforms[16 * domain as usize + 4 * element..][..4];
+                positions[vertex][element] = row.iter().zip(rest).map(|(row, rest)| row * rest).sum();
+            }
+        }
+        positions
+    }
+
+    #[test]
+    fn the_twin_puts_every_named_vertex_at_t_of_x0_plus_u_and_leaves_the_others_out() {
+        // The first domain names 3 of its 5 vertices, and has one triangle of the three that the text assumes.
+        let shapes = [(5, 2, 1), (9, 0, 2), (40, 7, 30), (4, 0, 1), (6, 3, 2), (3, 1, 5)];
+        let (scene, state) = scene_and_state(&shapes);
+        let unfolded = Unfolded::of(&scene);
+        assert_eq!(unfolded.targets.len(), 3 * (3 + 3 + 30 + 3 + 3 + 5));
+        let (places, vertices) = places_of_u(&scene);
+        let mut u = vec![[0.0_f32; 4]; vertices];
+        for (domain, first) in places.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
+            for vertex in 0..scene.layout.slots[domain].vertices {
+                u[first as usize + vertex] =
+                    four(displacement_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
+            }
+        }
+        let positions = twin_of_thesis_update(&unfolded, &matrices(&scene, &state), &u);
+        let folded = fold(&positions, &unfolded.targets, scene.layout.vertices);
+        let mut left_out = 0;
+        for (domain, slot) in scene.layout.slots.iter().enumerate() {
+            for vertex in 0..slot.vertices {
+                let got = &folded[3 * (slot.first_vertex + vertex)..][..3];
+                left_out += usize::from(got[0].is_nan());
+                for (want, got) in position_of(&scene, &state, domain, vertex).iter().zip(got) {
+                    let named = vertex < 3 * shapes[domain].2;
+                    assert_eq!((want - f64::from(*got)).abs() < 1e-5, named, "domain {domain} vertex {vertex}");
+                }
+            }
+        }
+        assert_eq!(left_out, 2 + 3 + 1, "vertices that no triangle names");
+    }
+
+    #[test]
+    fn three_triangles_a_domain_are_what_two_matrices_a_warp_need() {
+        let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
+        let unfolded = Unfolded::of(&scene);
+        let domain = |vertex: usize| unfolded.targets[vertex] / 3;
+        for (index, [first, second, split, _]) in unfolded.warps.iter().enumerate().take(450 / OF_WARP) {
+            for vertex in 0..OF_WARP {
+                let expected = if vertex < *split as usize { first } else { second };
+                assert_eq!(domain(OF_WARP * index + vertex), *expected);
+            }
+        }
+        assert_eq!(unfolded.warps.len(), 450_usize.div_ceil(OF_BLOCK) * 8);
+    }
+
+    #[test]
+    #[ignore = "needs NVRTC: deploy/check installs it"]
+    fn nvrtc_compiles_thesis_update() {
+        compile_all(&CODE);
+    }
+}

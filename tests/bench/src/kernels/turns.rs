@@ -1,0 +1,125 @@
+//! What the trials share: the values of several steps on the device, and the end of a deformation on the host.
+
+use std::cell::Cell;
+use std::sync::Arc;
+
+use cudarc::driver::CudaSlice;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, upload};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Scene, State};
+
+/// Which part of a step a trial launches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Part {
+    /// u = U q alone. For the judge, x = T (x0 + u) follows on the host, in f64.
+    Uq,
+    /// The vertex update too.
+    Whole,
+}
+
+impl Part {
+    /// The name of a trial that launches this part.
+    pub(super) fn named(self, name: &str) -> String {
+        match self {
+            Self::Uq => format!("{name}_uq"),
+            Self::Whole => name.to_owned(),
+        }
+    }
+}
+
+/// The fewest vertices that a core places on the host at a time.
+const SHARE: usize = 4096;
+
+/// The values of one turn, as addresses on the device.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Values {
+    pub q: u64,
+    pub transforms: u64,
+}
+
+/// The values of several steps of a scene, on the device and on the host.
+#[derive(Debug)]
+pub(super) struct Turns {
+    scene: Arc<Scene>,
+    states: Vec<State>,
+    q: CudaSlice<u8>,
+    transforms: CudaSlice<u8>,
+    /// Bytes from one turn to the next: of q and of the transforms.
+    strides: [u64; 2],
+    last: Cell<usize>,
+}
+
+impl Turns {
+    /// Uploads q and transforms of each state as `pack` lays them out; each must give all states the same length.
+    ///
+    /// # Errors
+    /// `Invalid` when there is no state or one is not of this scene; `Fault` when the device refuses.
+    pub(super) fn new(
+        device: &Device,
+        scene: &Arc<Scene>,
+        states: &[State],
+        pack: impl Fn(&State) -> [Vec<f32>; 2],
+    ) -> Result<Self> {
+        if states.is_empty() {
+            return Err(invalid("states", "at least 1", 0));
+        }
+        let fits = |state: &&State| {
+            state.q.len() != scene.layout.coordinates || state.transforms.len() != scene.movers.count()
+        };
+        if let Some(wrong) = states.iter().find(fits) {
+            let expected = format!("{} coordinates, {} transforms", scene.layout.coordinates, scene.movers.count());
+            let given = format!("{} and {}", wrong.q.len(), wrong.transforms.len());
+            return Err(invalid("states", expected, given));
+        }
+        let [mut q, mut transforms] = [Vec::new(), Vec::new()];
+        for state in states {
+            let packed = pack(state);
+            for (all, one) in [&mut q, &mut transforms].into_iter().zip(packed) {
+                all.extend_from_slice(&one);
+                // Turns begin where a float4 may.
+                all.resize(all.len().next_multiple_of(4), 0.0);
+            }
+        }
+        let strides = [&q, &transforms].map(|all| 4 * (all.len() / states.len()) as u64);
+        let (q, transforms) = (upload(device, &q)?, upload(device, &transforms)?);
+        let (scene, states) = (Arc::clone(scene), states.to_vec());
+        Ok(Self { scene, states, q, transforms, strides, last: Cell::new(0) })
+    }
+
+    pub(super) const fn count(&self) -> usize {
+        self.states.len()
+    }
+
+    /// The values of a turn, which is remembered as the last.
+    pub(super) fn start(&self, device: &Device, turn: usize) -> Values {
+        let turn = turn % self.states.len();
+        self.last.set(turn);
+        let [q, transforms] = self.strides.map(|stride| stride * turn as u64);
+        Values { q: address(device, &self.q) + q, transforms: address(device, &self.transforms) + transforms }
+    }
+
+    /// x = T (x0 + u) of the last turn, in f64 and rounded once, so that the error of u alone is left.
+    pub(super) fn finish_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
+        let state = &self.states[self.last.get()];
+        let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
+        let mut placed: Vec<[f32; 3]> = Vec::new();
+        for domain in 0..self.scene.domains.len() {
+            let t = state.composed(&self.scene, domain).exact();
+            let place = |(vertex, rest): (usize, &[f32; 3])| {
+                let u = u(domain, vertex);
+                let [x, y, z] = [0, 1, 2].map(|axis| f64::from(rest[axis]) + f64::from(u[axis]));
+                let row = |row: usize| t[4 * row] * x + t[4 * row + 1] * y + t[4 * row + 2] * z + t[4 * row + 3];
+                [0, 1, 2].map(|axis| row(axis) as f32)
+            };
+            let rest = self.scene.shape_of(domain).mesh.rest().par_iter().enumerate();
+            rest.with_min_len(SHARE).map(place).collect_into_vec(&mut placed);
+            positions.extend_from_slice(placed.as_flattened());
+        }
+        positions
+    }
+}

@@ -1,0 +1,200 @@
+//! Synthetic scenes of known sizes, equal on every machine: seeded, and cheap to build even with millions of vertices.
+//!
+//! | name | what it is |
+//! |---|---|
+//! | `single-P-R` | one domain of 2^P vertices and R modes, positions only (table 4.4 of the thesis) |
+//! | `a`, `a-positions` | one domain of 1.5 M vertices, r = 32, with normals and tangents, or without |
+//! | `b` | 1,000 domains of 1,500 vertices, r mixed 0 to 64, about 17 on average |
+//! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
+//! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
+//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q for one U, beside `single-18-32` |
+//! | `plant-1` to `plant-12` | the plants of table 4.5 |
+//! | `plant-1-follows` to `plant-12-follows` | the same, each leaf on a branch by a constant frame: T for branches alone |
+//!
+//! `single`, `plants` and `follows` name whole groups, `all` everything, but of the last group the largest plant alone.
+
+mod build;
+mod plant;
+
+use std::sync::Arc;
+
+use super::thesis::{PLANTS, POWERS, RANKS};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Deformation, Parts, Scene};
+
+/// How large a load is built.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Size {
+    Full,
+    /// A fraction of the vertices or domains, for machines without a GPU; the load says which.
+    Quick,
+}
+
+/// Which synthetic scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// 2^power vertices, `rank` modes.
+    Single {
+        power: u32,
+        rank: usize,
+    },
+    A {
+        dressed: bool,
+    },
+    B,
+    C,
+    Cancelling,
+    Batch,
+    /// Index into the thesis's plants.
+    Plant(usize),
+    /// The same, but its leaves follow its branches.
+    Follows(usize),
+}
+
+/// A scene to measure on.
+#[derive(Debug, Clone)]
+pub struct Load {
+    pub name: String,
+    pub scene: Arc<Scene>,
+    /// Modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
+    pub paired: bool,
+    /// Which plant of the thesis it is.
+    pub species: Option<usize>,
+    /// Every rounding and reduction of what its name promises.
+    pub remarks: Vec<String>,
+}
+
+impl Kind {
+    /// Every load, in the order of the report.
+    pub fn all() -> Vec<Self> {
+        let mut kinds = Self::singles();
+        kinds.extend([
+            Self::A { dressed: false },
+            Self::A { dressed: true },
+            Self::B,
+            Self::C,
+            Self::Cancelling,
+            Self::Batch,
+        ]);
+        kinds.extend((0..PLANTS.len()).map(Self::Plant));
+        let largest = (0..PLANTS.len()).max_by_key(|index| PLANTS[*index].domains);
+        kinds.extend(largest.map(Self::Follows));
+        kinds
+    }
+
+    fn singles() -> Vec<Self> {
+        RANKS.iter().flat_map(|rank| POWERS.map(|power| Self::Single { power, rank: *rank })).collect()
+    }
+
+    /// The loads that a name of the command line stands for.
+    ///
+    /// # Errors
+    /// `Invalid` when there is no such load.
+    pub fn named(name: &str) -> Result<Vec<Self>> {
+        let number = |text: &str| text.parse::<usize>().ok();
+        let plant =
+            |index: &str| number(index).filter(|index| (1..=PLANTS.len()).contains(index)).map(|index| index - 1);
+        let found = match name.split('-').collect::<Vec<_>>()[..] {
+            ["all"] => Some(Self::all()),
+            ["single"] => Some(Self::singles()),
+            ["single", power, rank] => {
+                let power = number(power).filter(|power| (2..=22).contains(power));
+                let rank = number(rank).filter(|rank| (0..=modalcast_model::domain::MAX_RANK).contains(rank));
+                power.zip(rank).map(|(power, rank)| vec![Self::Single { power: power as u32, rank }])
+            }
+            ["a"] => Some(vec![Self::A { dressed: true }]),
+            ["a", "positions"] => Some(vec![Self::A { dressed: false }]),
+            ["b"] => Some(vec![Self::B]),
+            ["c"] => Some(vec![Self::C]),
+            ["cancel"] => Some(vec![Self::Cancelling]),
+            ["batch"] => Some(vec![Self::Batch]),
+            ["plants"] => Some((0..PLANTS.len()).map(Self::Plant).collect()),
+            ["follows"] => Some((0..PLANTS.len()).map(Self::Follows).collect()),
+            ["plant", index] => plant(index).map(|index| vec![Self::Plant(index)]),
+            ["plant", index, "follows"] => plant(index).map(|index| vec![Self::Follows(index)]),
+            _ => None,
+        };
+        let expected = "single-P-R (2^P vertices, P 2 to 22, R modes), a, a-positions, b, c, cancel, batch, plant-1 to \
+                        plant-12, each also with -follows, or one of the groups single, plants, follows, all";
+        found.ok_or_else(|| invalid("load", expected, name))
+    }
+
+    /// The name that [`Self::named`] takes.
+    pub fn name(self) -> String {
+        match self {
+            Self::Single { power, rank } => format!("single-{power}-{rank}"),
+            Self::A { dressed: true } => "a".into(),
+            Self::A { dressed: false } => "a-positions".into(),
+            Self::B => "b".into(),
+            Self::C => "c".into(),
+            Self::Cancelling => "cancel".into(),
+            Self::Batch => "batch".into(),
+            Self::Plant(index) => format!("plant-{}", index + 1),
+            Self::Follows(index) => format!("plant-{}-follows", index + 1),
+        }
+    }
+
+    /// Builds the scene.
+    ///
+    /// # Errors
+    /// None that a scene of these sizes could cause; those of [`Scene::new`].
+    pub fn build(self, size: Size) -> Result<Load> {
+        build::build(self, size)
+    }
+}
+
+/// The same scene, deformed in another way.
+///
+/// # Errors
+/// `Invalid` when the choices make no sense.
+pub fn restated(scene: &Scene, deformation: Deformation) -> Result<Arc<Scene>> {
+    Scene::new(Parts { deformation, ..scene.parts() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use modalcast_model::scene::Storage;
+
+    #[test]
+    fn every_load_is_found_by_its_own_name_and_nothing_else_is() {
+        for kind in Kind::all() {
+            assert_eq!(Kind::named(&kind.name()), Ok(vec![kind]));
+        }
+        assert_eq!(Kind::named("plants").map(|list| list.len()), Ok(12));
+        assert_eq!(Kind::named("follows").map(|list| list.len()), Ok(12));
+        assert_eq!(Kind::named("single").map(|list| list.len()), Ok(15));
+        for wrong in [
+            "",
+            "d",
+            "plant-0",
+            "plant-13",
+            "single-23-10",
+            "single-14",
+            "single-14-513",
+            "a-b",
+            "b-",
+            "plant-13-follows",
+            "plant-1-",
+            "b-follows",
+        ] {
+            assert!(Kind::named(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_load_is_the_same_whenever_it_is_built() {
+        let [one, two] = [0, 1].map(|_| Kind::B.build(Size::Quick).expect("built").scene);
+        assert_eq!(one.shapes[7].modes, two.shapes[7].modes);
+        assert_eq!(one.shapes[7].mesh, two.shapes[7].mesh);
+        assert_ne!(one.shapes[7].mesh, one.shapes[8].mesh);
+    }
+
+    #[test]
+    fn a_scene_can_be_restated_with_another_storage() {
+        let scene = Kind::A { dressed: true }.build(Size::Quick).expect("built").scene;
+        let other = restated(&scene, Deformation { storage: Storage::Int8, ..Deformation::default() }).expect("fits");
+        assert_eq!((other.deformation.storage, &other.layout), (Storage::Int8, &scene.layout));
+        assert!(restated(&scene, Deformation { truncation: Some(-1.0), ..Deformation::default() }).is_err());
+    }
+}

@@ -1,0 +1,83 @@
+//! Where and from what a report was made.
+
+use std::process::Command;
+
+use serde::Serialize;
+
+use modalcast_compute::gpu;
+
+/// The machine, the program and the command.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Provenance {
+    pub cpu: String,
+    pub threads: usize,
+    /// CUDA devices with their memory, driver, CUDA and NVRTC versions; what is missing is said in words.
+    pub cuda: gpu::Probe,
+    pub version: &'static str,
+    /// `MODALCAST_COMMIT`, else what git says of the current folder.
+    pub commit: Option<String>,
+    pub command: Vec<String>,
+    /// The compiler of this machine, if it has one.
+    pub toolchain: Option<String>,
+    /// Whether the program was built with optimisation; without it the times mean little.
+    pub release: bool,
+    pub os: &'static str,
+}
+
+impl Provenance {
+    /// Looks at this machine and this process.
+    pub fn here() -> Self {
+        let commit = std::env::var("MODALCAST_COMMIT").ok().filter(|commit| !commit.is_empty());
+        Self {
+            cpu: cpu(),
+            threads: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+            cuda: gpu::probe(),
+            version: env!("CARGO_PKG_VERSION"),
+            commit: commit.or_else(|| output("git", &["rev-parse", "HEAD"])),
+            command: std::env::args().collect(),
+            toolchain: output("rustc", &["--version"]),
+            release: !cfg!(debug_assertions),
+            os: std::env::consts::OS,
+        }
+    }
+
+    /// One line for titles.
+    pub fn line(&self) -> String {
+        let devices: Vec<&str> = self.cuda.devices.iter().map(|device| device.name.as_str()).collect();
+        let devices = if devices.is_empty() { "no CUDA device".into() } else { devices.join(", ") };
+        let built = if self.release { "" } else { ", unoptimised build" };
+        format!("{}, {} threads; {devices}{built}", self.cpu, self.threads)
+    }
+}
+
+/// What a program prints, in one line; none when it is not there or fails.
+fn output(program: &str, arguments: &[&str]) -> Option<String> {
+    let output = Command::new(program).args(arguments).output().ok().filter(|output| output.status.success())?;
+    String::from_utf8(output.stdout).ok().map(|text| text.trim().to_owned())
+}
+
+fn cpu() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    name.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_that_is_not_there_or_fails_says_nothing() {
+        assert_eq!(output("no-such-program", &[]), None);
+        assert_eq!(output("false", &[]), None);
+        assert_eq!(output("echo", &["x"]).as_deref(), Some("x"));
+    }
+
+    #[test]
+    fn the_line_names_cpu_threads_and_device_or_its_absence() {
+        let here = Provenance::here();
+        assert!(here.threads >= 1 && !here.cpu.is_empty() && !here.command.is_empty());
+        let device = here.cuda.devices.first().map_or("no CUDA device", |device| &device.name);
+        assert!(here.line().contains(device) && here.line().contains("threads"), "{}", here.line());
+    }
+}

@@ -1,0 +1,265 @@
+//! Seeded coordinates and transforms of a scene, and what was recorded of a real one.
+//!
+//! A physics process computes in f64 and sends f32, so the truth here is f64 and a state is its rounding.
+
+use std::f64::consts::TAU;
+use std::sync::Arc;
+
+use fastrand::Rng;
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use rayon::prelude::*;
+
+use super::loads::Load;
+use super::record::Record;
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{Changed, Scene, State};
+
+/// The largest displacement by the first mode alone, as a share of the diagonal of its domain.
+const SHARE: f64 = 0.05;
+/// The largest turn and shift of a domain about its placement: radians, and shares of its diagonal.
+const TURN: f64 = 0.2;
+const SHIFT: f64 = 0.05;
+/// Steps of a made-up trajectory, their distance in seconds, and the frequency of the slowest mode in hertz.
+const STEPS: usize = 24;
+const DT: f64 = 1.0 / 60.0;
+const SLOWEST: f64 = 1.0;
+
+/// What a physics process means, before anything is rounded: relative to the scene's origin.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Truth {
+    /// Packed coordinates.
+    pub q: Vec<f64>,
+    /// `world_from_domain` of each mover ([`modalcast_model::scene::Movers`]), 3x4 row-major.
+    pub transforms: Vec<[f64; 12]>,
+}
+
+impl Truth {
+    /// What of it reaches a deformer: every number rounded to f32.
+    pub fn state(&self) -> State {
+        let transforms = self.transforms.iter().map(|entries| Transform(entries.map(|entry| entry as f32)));
+        let q = self.q.iter().map(|number| *number as f32).collect();
+        let transforms = transforms.collect();
+        State { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
+    }
+
+    /// A state as a truth of its own.
+    pub fn of(state: &State) -> Self {
+        Self {
+            q: state.q.iter().map(|number| f64::from(*number)).collect(),
+            transforms: state.transforms.iter().map(|transform| transform.0.map(f64::from)).collect(),
+        }
+    }
+
+    /// `world_from_domain` of a domain: of a follower the product of its mover's and its frame.
+    pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+        let mover = &self.transforms[scene.movers.of(domain)];
+        match scene.movers.frame_of(domain) {
+            None => *mover,
+            Some(frame) => product(mover, &frame.0.map(f64::from)),
+        }
+    }
+
+    /// The same of absolute values: no entry of the product, however it is rounded, is larger by more than that.
+    pub(super) fn size_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+        let mover = self.transforms[scene.movers.of(domain)].map(f64::abs);
+        match scene.movers.frame_of(domain) {
+            None => mover,
+            Some(frame) => product(&mover, &frame.0.map(|entry| f64::from(entry.abs()))),
+        }
+    }
+}
+
+/// The product of two affine transforms, 3x4 row-major.
+fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
+    std::array::from_fn(|at| {
+        let (row, column) = (&t[at / 4 * 4..][..4], at % 4);
+        let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];
+        if column == 3 { sum + row[3] } else { sum }
+    })
+}
+
+/// All motions of one load.
+#[derive(Debug, Clone)]
+pub struct Motion {
+    scene: Arc<Scene>,
+    paired: bool,
+    /// Per packed coordinate: standard deviation, and frequency over that of the domain's slowest mode.
+    spread: Vec<(f64, f64)>,
+    record: Option<Record>,
+}
+
+impl Motion {
+    /// Motions that fit a load. Amplitudes fall with the frequency as those of a stiff object do: from the eigenvalues
+    /// where the scene states them, else as 1 / j.
+    pub fn new(load: &Load, record: Option<Record>) -> Self {
+        let scene = &load.scene;
+        let mut spread = vec![(0.0, 1.0); scene.layout.coordinates];
+        let parts: Vec<_> = (0..scene.domains.len()).into_par_iter().map(|domain| spread_of(scene, domain)).collect();
+        for (slot, part) in scene.layout.slots.iter().zip(parts) {
+            spread[slot.first_q..][..part.len()].copy_from_slice(&part);
+        }
+        Self { scene: Arc::clone(scene), paired: load.paired, spread, record }
+    }
+
+    /// Seed `seed`: Gaussian coordinates and small rigid moves. Odd seeds nearly cancel: in pairs where modes are paired,
+    /// else in one random row of every domain, whose largest entry takes the opposite of all others.
+    pub fn seed(&self, seed: usize) -> Truth {
+        let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let mut q: Vec<f64> = self.spread.iter().map(|(spread, _)| spread * gauss(&mut rng)).collect();
+        if seed % 2 == 1 {
+            self.cancel(&mut q, &mut rng);
+        }
+        let movers = self.scene.movers.domains();
+        let transforms = movers.map(|domain| self.moved(domain as usize, &mut rng)).collect();
+        Truth { q, transforms }
+    }
+
+    /// How many steps the trajectory has.
+    pub fn steps(&self) -> usize {
+        self.record.as_ref().map_or(STEPS, Record::steps)
+    }
+
+    /// Whether the trajectory was recorded.
+    pub const fn is_recorded(&self) -> bool {
+        self.record.is_some()
+    }
+
+    /// Step `step` of the trajectory: the recorded one, else every mode in its own oscillation.
+    pub fn step(&self, step: usize) -> Truth {
+        if let Some(record) = &self.record {
+            return record.step(&self.scene, step);
+        }
+        let time = step as f64 * DT;
+        let mut rng = Rng::with_seed(0x7EA7);
+        let mut swing = |(spread, ratio): &(f64, f64)| {
+            let (size, phase) = (spread * gauss(&mut rng), TAU * rng.f64());
+            size * (TAU * SLOWEST * ratio * time + phase).cos()
+        };
+        let q = self.spread.iter().map(&mut swing).collect();
+        let turn = |domain: u32| {
+            let (phase, domain) = (f64::from(domain), domain as usize);
+            let axis = Vector3::new(phase.sin(), 1.0, phase.cos()) * (TURN * (TAU * SLOWEST * time + phase).sin());
+            place(&self.scene, domain, &Rotation3::new(axis * 0.5).into_inner(), &Vector3::zeros())
+        };
+        Truth { q, transforms: self.scene.movers.domains().map(turn).collect() }
+    }
+
+    fn moved(&self, domain: usize, rng: &mut Rng) -> [f64; 12] {
+        let mut any = |most: f64| Vector3::from_fn(|_, _| most * (2.0 * rng.f64() - 1.0) / 3f64.sqrt());
+        let (turn, shift) = (any(TURN), any(SHIFT * diagonal(&self.scene, domain)));
+        place(&self.scene, domain, &Rotation3::new(turn).into_inner(), &shift)
+    }
+
+    fn cancel(&self, q: &mut [f64], rng: &mut Rng) {
+        for (domain, slot) in self.scene.layout.slots.iter().enumerate() {
+            let own = &mut q[slot.first_q..][..slot.rank];
+            if self.paired {
+                own.chunks_exact_mut(2).for_each(|pair| pair[1] = -pair[0]);
+            } else if slot.rank > 1 {
+                let modes = &self.scene.shape_of(domain).modes;
+                let row = rng.usize(0..3 * slot.vertices);
+                let entry = |mode: usize| f64::from(modes.at(row / 3, row % 3, mode));
+                let largest = (0..slot.rank).max_by(|a, b| entry(*a).abs().total_cmp(&entry(*b).abs())).unwrap_or(0);
+                let others: f64 =
+                    (0..slot.rank).filter(|mode| *mode != largest).map(|mode| entry(mode) * own[mode]).sum();
+                // A row of zeros, as of a clamped vertex, cancels by itself.
+                if entry(largest) != 0.0 {
+                    own[largest] = -others / entry(largest);
+                }
+            }
+        }
+    }
+}
+
+/// Standard deviation and relative frequency of each mode of a domain.
+fn spread_of(scene: &Scene, domain: usize) -> Vec<(f64, f64)> {
+    let (modes, known) = (&scene.shape_of(domain).modes, &scene.domains[domain].metadata.eigenvalues);
+    let slowest = known.first().copied().filter(|value| *value > 0.0 && known.len() == modes.rank());
+    let reach = SHARE * diagonal(scene, domain);
+    let one = |mode: usize| {
+        let ratio = slowest.map_or((mode + 1) as f64, |slowest| (known[mode] / slowest).max(1.0).sqrt());
+        let largest = modes.column(mode).iter().fold(0.0_f32, |largest, entry| largest.max(entry.abs()));
+        // A mode that moves nothing may have any coordinate.
+        let size = if largest > 0.0 { reach / f64::from(largest) } else { 1.0 };
+        (size / ratio, ratio)
+    };
+    (0..modes.rank()).map(one).collect()
+}
+
+/// Diagonal of a domain at rest, in scene units.
+fn diagonal(scene: &Scene, domain: usize) -> f64 {
+    let mut bounds = modalcast_model::scene::Bounds::EMPTY;
+    scene.shape_of(domain).mesh.rest().iter().for_each(|position| bounds.include(position.map(f64::from)));
+    bounds.diagonal()
+}
+
+/// The placement of a domain, turned in its own frame and shifted in the world's.
+fn place(scene: &Scene, domain: usize, turn: &Matrix3<f64>, shift: &Vector3<f64>) -> [f64; 12] {
+    let placement = scene.domains[domain].placement;
+    let (linear, translation) = (placement.linear() * turn, placement.translation() + shift);
+    std::array::from_fn(|at| match (at / 4, at % 4) {
+        (row, 3) => translation[row],
+        (row, column) => linear[(row, column)],
+    })
+}
+
+/// A standard normal number (Box and Muller).
+fn gauss(rng: &mut Rng) -> f64 {
+    (-2.0 * (1.0 - rng.f64()).ln()).sqrt() * (TAU * rng.f64()).cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::loads::{Kind, Size};
+
+    fn motion(kind: Kind) -> Motion {
+        Motion::new(&kind.build(Size::Quick).expect("built"), None)
+    }
+
+    #[test]
+    fn gaussians_have_the_mean_0_and_the_deviation_1() {
+        let mut rng = Rng::with_seed(1);
+        let draws: Vec<f64> = (0..20_000).map(|_| gauss(&mut rng)).collect();
+        let mean = draws.iter().sum::<f64>() / 2e4;
+        let square = draws.iter().map(|draw| draw * draw).sum::<f64>() / 2e4;
+        assert!(mean.abs() < 0.03 && (square - 1.0).abs() < 0.05, "{mean} {square}");
+    }
+
+    #[test]
+    fn a_seed_repeats_itself_and_its_numbers_are_no_f32() {
+        let motion = motion(Kind::B);
+        assert_eq!(motion.seed(3), motion.seed(3));
+        assert_ne!(motion.seed(3), motion.seed(5));
+        let truth = motion.seed(0);
+        assert_ne!(Truth::of(&truth.state()), truth, "rounding shows");
+        assert!(truth.state().transforms.iter().all(|transform| transform.is_similarity()));
+    }
+
+    #[test]
+    fn odd_seeds_cancel_in_one_row_and_even_ones_do_not() {
+        let motion = motion(Kind::Single { power: 10, rank: 10 });
+        let modes = &motion.scene.shapes[0].modes;
+        let condition = |seed: usize| {
+            let q = motion.seed(seed).q;
+            let row = |row: usize| {
+                let terms = (0..10).map(|mode| f64::from(modes.at(row / 3, row % 3, mode)) * q[mode]);
+                terms.clone().map(f64::abs).sum::<f64>() / terms.sum::<f64>().abs()
+            };
+            (0..3 * modes.vertices()).map(row).fold(0.0, f64::max)
+        };
+        assert!(condition(1) > 1e12, "{}", condition(1));
+        assert!(condition(0) < 1e6, "{}", condition(0));
+    }
+
+    #[test]
+    fn slow_modes_swing_far_and_neighbouring_steps_are_near() {
+        let motion = motion(Kind::A { dressed: false });
+        assert!(motion.spread[0].0 > 10.0 * motion.spread[31].0);
+        let [first, second] = [0, 1].map(|step| motion.step(step));
+        assert_ne!(first, second);
+        let largest = motion.spread[0].0;
+        assert!((first.q[0] - second.q[0]).abs() < largest);
+        assert_eq!(motion.steps(), STEPS);
+    }
+}

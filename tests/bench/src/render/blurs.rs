@@ -1,0 +1,102 @@
+//! What making the same map of blurred moments takes in compute shaders and, as the thesis draws it, in fragment shaders.
+
+use serde::Serialize;
+
+use super::Row;
+use modalcast_model::scene::{Blurring, Shadow};
+
+/// One map, made both ways.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Blurs {
+    pub load: String,
+    /// Side of the map, and depths that each direction of the blur weighs.
+    pub size: u32,
+    pub taps: u32,
+    /// Microseconds, medians: the faster of the ways in compute, and fragments.
+    pub compute_us: f64,
+    pub fragments_us: f64,
+    pub ratio: f64,
+}
+
+/// How many times as fast as fragments compute is to be at 4096 texels a side on an H200, and microseconds that it may take.
+pub(super) const TIMES_AS_FAST: f64 = 40.0;
+pub(super) const MOST_US: f64 = 200.0;
+
+impl Blurs {
+    /// Every map that was timed both ways.
+    pub(super) fn of(rows: &[Row]) -> Vec<Self> {
+        let by = |row: &Row, wanted: fn(Blurring) -> bool| row.shadow.filter(|shadow| wanted(shadow.blurring));
+        let fragments = rows.iter().filter_map(|row| Some((row, by(row, |way| way == Blurring::Fragments)?)));
+        let beside = |(row, shadow): (&Row, Shadow)| {
+            let same = |other: &&Row| {
+                let own = by(other, |way| way != Blurring::Fragments);
+                other.load == row.load && own.map(|own| Shadow { blurring: shadow.blurring, ..own }) == Some(shadow)
+            };
+            let compute_us = rows.iter().filter(same).filter_map(blur_us).min_by(f64::total_cmp)?;
+            let fragments_us = blur_us(row)?;
+            let ratio = fragments_us / compute_us;
+            let taps = 2 * shadow.reach() + 1;
+            Some(Self { load: row.load.clone(), size: shadow.size, taps, compute_us, fragments_us, ratio })
+        };
+        fragments.filter_map(beside).collect()
+    }
+}
+
+fn blur_us(row: &Row) -> Option<f64> {
+    row.passes.iter().find(|pass| pass.name == "blur").map(|pass| pass.timing.median_us)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::Pass;
+    use crate::render::metrics::{Light, Spread};
+    use crate::render::variants::{BOUNDS, Method};
+    use crate::timing::Timing;
+    use modalcast_model::scene::Culling;
+
+    fn row(load: &str, shadow: Shadow, us: f64) -> Row {
+        let timing = Timing::of(vec![us]).expect("one");
+        Row {
+            load: load.into(),
+            name: String::new(),
+            method: Method::Variance,
+            shadow: Some(shadow),
+            packing: None,
+            culling: Culling::default(),
+            bounds: BOUNDS,
+            passed: true,
+            to_fail: false,
+            faults: Vec::new(),
+            colour: Spread::default(),
+            colour_of_aim: Spread::default(),
+            light: Light::default(),
+            light_of_aim: Light::default(),
+            flicker: None,
+            no_flicker: None,
+            passes: vec![Pass { name: "blur", timing }],
+            bytes: 0,
+            shadow_bytes: 0,
+            image_bytes: 0,
+            samples: 4,
+            draws: 1,
+            culled: None,
+        }
+    }
+
+    #[test]
+    fn fragments_stand_beside_the_fastest_compute_that_makes_the_same_map_and_no_other() {
+        let map = |size: u32, blurring: Blurring| Shadow { size, blur: 2.3, blurring, ..Shadow::default() };
+        let rows = [
+            row("a", map(4096, Blurring::Tiles), 200.0),
+            row("a", map(4096, Blurring::Rows), 400.0),
+            row("a", map(4096, Blurring::Fragments), 9000.0),
+            row("a", map(1024, Blurring::Tiles), 1.0),
+            row("b", map(4096, Blurring::Tiles), 1.0),
+            row("b", map(1024, Blurring::Fragments), 50.0),
+        ];
+        let [only] = &Blurs::of(&rows)[..] else { panic!("one map was made both ways") };
+        assert_eq!((only.load.as_str(), only.size, only.taps), ("a", 4096, 15));
+        assert_eq!((only.compute_us, only.fragments_us, only.ratio), (200.0, 9000.0, 45.0));
+    }
+}

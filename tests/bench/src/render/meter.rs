@@ -1,0 +1,79 @@
+//! A scene as a light meter: white matt surfaces of the same shapes and holes, so that a frame with shadows over the same
+//! without tells the share of the sunlight that arrives.
+
+use std::sync::Arc;
+
+use super::picture::LEAST_LIGHT;
+use super::texels::linear_from_srgb;
+use modalcast_model::domain::{Material, Texture};
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Ground, Look, Parts, Scene};
+
+/// A scene with another look, all else being equal.
+///
+/// # Errors
+/// `Invalid` when the look makes no sense.
+pub(super) fn relit(scene: &Scene, look: Look) -> Result<Arc<Scene>> {
+    Scene::new(Parts { look, ..scene.parts() })
+}
+
+/// The light meter of a scene. A blended surface keeps its alpha, a cut-out its holes; the sun is as bright as the display.
+///
+/// # Errors
+/// None that the scene itself would not have caused.
+pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
+    let look = Look {
+        sunlight: [1.0; 3],
+        skylight: [0.0; 3],
+        zenith: [0.0; 3],
+        horizon: [0.0; 3],
+        ground: scene.look.ground.map(|_| Ground { colour: [1.0; 3] }),
+        ..scene.look
+    };
+    let mut parts = Parts { look, ..scene.parts() };
+    for material in &mut parts.materials {
+        *material = Material { ambient: [0.0; 3], diffuse: [1.0; 3], specular: [0.0; 3], ..material.clone() };
+    }
+    let colours: std::collections::BTreeSet<usize> =
+        parts.materials.iter().filter_map(|material| material.colour_texture).collect();
+    for index in colours {
+        let texture = &parts.textures[index];
+        let white = texture.rgba().chunks_exact(4).flat_map(|texel| [255, 255, 255, texel[3]]).collect();
+        let white = Texture::new(texture.name.clone(), texture.width(), texture.height(), white)?;
+        // One image may be colours here and normals there: the normals keep theirs.
+        parts.textures.push(white);
+        let last = parts.textures.len() - 1;
+        for material in parts.materials.iter_mut().filter(|material| material.colour_texture == Some(index)) {
+            material.colour_texture = Some(last);
+        }
+    }
+    Scene::new(parts)
+}
+
+/// The share of the light that arrives, per pixel, from frames of the light meter with and without shadows. Bytes tell it
+/// to one part in a hundred where least light falls, and better elsewhere.
+pub(super) fn read(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
+    let linear = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);
+    let pairs = shadowed.chunks_exact(4).zip(unshadowed.chunks_exact(4));
+    pairs
+        .map(|(some, all)| (linear(some), linear(all)))
+        .map(|(some, all)| (all >= LEAST_LIGHT).then(|| (some / all) as f32))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::texels::srgb_from_linear;
+
+    #[test]
+    fn a_meter_reads_the_share_that_arrives_and_nothing_where_too_little_falls() {
+        let byte = |linear: f64| (255.0 * srgb_from_linear(linear)).round() as u8;
+        let pixel = |linear: f64| [byte(linear); 4];
+        for (all, share) in [(1.0, 0.5), (0.5, 0.25), (0.11, 1.0), (0.8, 0.0)] {
+            let read = read(&pixel(all * share), &pixel(all))[0].expect("enough light");
+            assert!((f64::from(read) - share).abs() < 0.01, "{all} {share}: {read}");
+        }
+        assert_eq!(read(&pixel(0.05), &pixel(0.05)), [None]);
+    }
+}

@@ -1,0 +1,234 @@
+//! The files of a report: JSON, CSV, Markdown, the plot as SVG and PNG, and the pictures.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::plants::Plant;
+use super::{Report, Row, page, plot};
+use crate::plot::png;
+use crate::timing::Timing;
+use modalcast_model::error::{Result, during};
+
+/// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
+const COLUMNS: [(&str, &str); 55] = [
+    ("load", "/load"),
+    ("variant", "/name"),
+    ("method", "/method"),
+    ("map_size", "/shadow/size"),
+    ("blur", "/shadow/blur"),
+    ("moments", "/shadow/moments"),
+    ("splits", "/shadow/splits"),
+    ("bleeding_cut", "/shadow/bleeding"),
+    ("passed", "/passed"),
+    ("to_fail", "/to_fail"),
+    ("bleeding_bound", "/bounds/bleeding"),
+    ("frame_us", "frame"),
+    ("frame_q1_us", "frame"),
+    ("frame_q3_us", "frame"),
+    ("shadow_us", "shadow"),
+    ("blur_us", "blur"),
+    ("draw_us", "draw"),
+    ("cull_us", "cull"),
+    ("visibility_us", "visibility"),
+    ("blended_us", "blended"),
+    ("shade_us", "shade"),
+    ("bloom_us", "bloom"),
+    ("encode_us", "encode"),
+    ("read_us", "read"),
+    ("bytes", "/bytes"),
+    ("shadow_bytes", "/shadow_bytes"),
+    ("image_bytes", "/image_bytes"),
+    ("samples", "/samples"),
+    ("draws", "/draws"),
+    ("culling", "/culling"),
+    ("listed", "/culled/camera/listed"),
+    ("hidden", "/culled/camera/hidden"),
+    ("colour_mean", "/colour/mean"),
+    ("colour_p99", "/colour/p99"),
+    ("colour_largest", "/colour/largest"),
+    ("colour_of_aim_mean", "/colour_of_aim/mean"),
+    ("colour_of_aim_p99", "/colour_of_aim/p99"),
+    ("colour_of_aim_largest", "/colour_of_aim/largest"),
+    ("light_mean", "/light/all/mean"),
+    ("light_p99", "/light/all/p99"),
+    ("light_largest", "/light/all/largest"),
+    ("light_in_hard_umbra", "/light/in_umbra"),
+    ("light_of_aim_mean", "/light_of_aim/all/mean"),
+    ("light_of_aim_p99", "/light_of_aim/all/p99"),
+    ("light_of_aim_largest", "/light_of_aim/all/largest"),
+    ("light_of_aim_bias", "/light_of_aim/bias"),
+    ("penumbra_mean", "/light_of_aim/penumbra/mean"),
+    ("penumbra_p99", "/light_of_aim/penumbra/p99"),
+    ("penumbra_pixels", "/light_of_aim/penumbra/count"),
+    ("bleeding", "/light_of_aim/in_umbra"),
+    ("lost", "/light_of_aim/lost"),
+    ("flicker_mean", "/flicker/mean"),
+    ("flicker_p99", "/flicker/p99"),
+    ("no_flicker", "/no_flicker"),
+    ("faults", ""),
+];
+
+impl Report {
+    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes, and raster and blurs both ways), `plants.csv`, `report.md`,
+    /// `report.svg`, `report.png` and `pictures/` into a folder, which is made.
+    ///
+    /// # Errors
+    /// `Fault` when a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let pictures = folder.join("pictures");
+        std::fs::create_dir_all(&pictures).map_err(during("report"))?;
+        let svg = plot::svg(self);
+        let files = [
+            ("report.json", serde_json::to_vec_pretty(self).map_err(during("report"))?),
+            ("report.csv", csv(&self.rows)?),
+            ("passes.csv", passes_csv(self)?),
+            ("plants.csv", plants_csv(&self.plants)?),
+            ("report.md", page::markdown(self).into_bytes()),
+            ("report.png", png(&svg)?),
+            ("report.svg", svg.into_bytes()),
+        ];
+        for (name, bytes) in files {
+            std::fs::write(folder.join(name), bytes).map_err(during("report"))?;
+        }
+        for file in &self.pictures {
+            std::fs::write(pictures.join(&file.name), &file.png).map_err(during("report"))?;
+        }
+        Ok(())
+    }
+}
+
+fn csv(rows: &[Row]) -> Result<Vec<u8>> {
+    let mut lines = Vec::new();
+    for row in rows {
+        let value = serde_json::to_value(row).map_err(during("report"))?;
+        lines.push(COLUMNS.map(|column| cell(row, &value, column)));
+    }
+    table(COLUMNS.map(|(name, _)| name.to_owned()), lines)
+}
+
+/// Bare passes and blurs: a line each, with the row that they stand beside.
+fn passes_csv(report: &Report) -> Result<Vec<u8>> {
+    let head =
+        ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
+    let mut lines = Vec::new();
+    for bare in &report.bare {
+        let passes =
+            [("bare depth pass", bare.map, bare.depth), ("bare visibility pass", bare.samples, bare.visibility)];
+        for (what, number, timing) in passes {
+            let [size, many] = if what == "bare depth pass" {
+                [number.to_string(), "1".into()]
+            } else {
+                [format!("{}x{}", report.size.width, report.size.height), number.to_string()]
+            };
+            let median = timing.median_us.to_string();
+            lines.push([&bare.load, what, &size, &many, &median, "", "", "", ""].map(String::from));
+        }
+        let both = (bare.depth.median_us + bare.visibility.median_us).to_string();
+        for frame in [&bare.unculled, &bare.usual] {
+            let [own, beyond, size] = [frame.frame_us.to_string(), frame.beyond_us.to_string(), bare.map.to_string()];
+            let what = "both bare passes";
+            lines.push([&bare.load, what, &size, "", &both, &frame.name, &own, &beyond, ""].map(String::from));
+        }
+    }
+    for (own, passes) in report.raster.iter().filter_map(|own| own.passes.map(|passes| (own, passes))) {
+        let frame = format!("{}x{}", report.size.width, report.size.height);
+        let both = [
+            ("raster depth in CUDA", own.map.to_string(), passes.depth),
+            ("raster ids in CUDA", frame, passes.visibility),
+        ];
+        for (what, size, pair) in both {
+            let [cuda, opengl, ratio] =
+                [pair.cuda.median_us, pair.opengl.median_us, pair.ratio()].map(|us| us.to_string());
+            lines.push([&own.load, what, &size, "1", &cuda, "in OpenGL", &opengl, "", &ratio].map(String::from));
+        }
+    }
+    for blurs in &report.blurs {
+        let [size, taps] = [blurs.size, blurs.taps].map(|number| number.to_string());
+        let [own, other, ratio] = [blurs.compute_us, blurs.fragments_us, blurs.ratio].map(|number| number.to_string());
+        let what = "moments and blur in compute";
+        lines.push([&blurs.load, what, &size, &taps, &own, "in fragments", &other, "", &ratio].map(String::from));
+    }
+    table(head.map(String::from), lines)
+}
+
+/// Ours and the thesis's, a plant a line.
+fn plants_csv(plants: &[Plant]) -> Result<Vec<u8>> {
+    let head =
+        ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
+    let head = head.into_iter().chain(["render_ms", "t_vbr_ms", "frame_ms", "fps", "memory_mb", "o_vbr"]);
+    let head = head.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
+    let line = |plant: &Plant| {
+        let ms = |timing: Timing| (timing.median_us / 1e3).to_string();
+        let printed = plant.thesis.drawn;
+        let (backend, shared, full) = (plant.backend.name(), plant.shared, plant.full);
+        let own = [plant.load.clone(), plant.thesis.name.into(), full.to_string(), backend.into(), shared.to_string()];
+        let sizes = [plant.triangles, plant.domains, plant.map as usize].map(|number| number.to_string());
+        let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(ms);
+        let rest = [plant.fps, plant.bytes as f64 / 1e6, plant.occupation];
+        let thesis = [printed.gpu_vbr_ms, printed.gpu_fps, printed.gpu_mb, printed.gpu_vbr_occupation];
+        let numbers = rest.iter().chain(&thesis).map(|number| number.to_string());
+        own.into_iter().chain(sizes).chain(times).chain(numbers).collect::<Vec<String>>()
+    };
+    table(head.map(String::from), plants.iter().map(line))
+}
+
+fn table<L: IntoIterator<Item = String>>(
+    head: impl IntoIterator<Item = String>,
+    lines: impl IntoIterator<Item = L>,
+) -> Result<Vec<u8>> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    writer.write_record(head).map_err(during("report"))?;
+    for line in lines {
+        writer.write_record(line).map_err(during("report"))?;
+    }
+    writer.into_inner().map_err(during("report"))
+}
+
+fn cell(row: &Row, value: &Value, (name, place): (&str, &str)) -> String {
+    if name == "faults" {
+        return row.faults.join("; ");
+    }
+    if !place.starts_with('/') {
+        let timing = row.passes.iter().find(|pass| pass.name == place).map(|pass| pass.timing);
+        let us = timing.map(|timing| match name {
+            "frame_q1_us" => timing.q1_us,
+            "frame_q3_us" => timing.q3_us,
+            _ => timing.median_us,
+        });
+        return us.map_or_else(String::new, |us| us.to_string());
+    }
+    match value.pointer(place) {
+        None | Some(Value::Null) => String::new(),
+        Some(Value::String(text)) => text.clone(),
+        Some(other) => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::loads::Kind;
+    use crate::render::meter::relit;
+    use crate::render::studio::{Size, Studio};
+    use modalcast_model::scene::{Bloom, Culling, Look};
+
+    #[test]
+    fn every_pass_of_a_frame_has_a_column_and_the_parts_of_drawing_add_up_to_it() {
+        let stage = Kind::Triangles(2_000).stage().expect("built");
+        let look = Look { culling: Culling::Depth, bloom: Some(Bloom::default()), ..stage.scene.look };
+        let mut studio = Studio::open().expect("OpenGL");
+        let mut set = studio.set(&relit(&stage.scene, look).expect("fits")).expect("loads");
+        studio.pose(&mut set, &stage.state(0)).expect("poses");
+        let size = Size { width: 64, height: 36 };
+        let passes = studio.draw(&set, stage.camera(size), size).expect("draws").passes;
+        for (name, _) in &passes {
+            assert!(COLUMNS.iter().any(|(_, place)| place == name), "{name}");
+        }
+        let sum =
+            |names: &[&str]| -> f64 { passes.iter().filter(|pass| names.contains(&pass.0)).map(|pass| pass.1).sum() };
+        let (draw, parts) = (sum(&["draw"]), ["cull", "visibility", "blended", "shade", "bloom", "encode"]);
+        assert!((draw - sum(&parts)).abs() < 1e-9 * draw, "{passes:?}");
+        assert!(sum(&parts[1..]) < draw && sum(&["bloom"]) > 0.0, "control: culling takes time");
+    }
+}

@@ -1,0 +1,72 @@
+//! Materials as the reference reads them: f64, with their decoded images.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+
+use super::texels::{Texels, Use};
+use modalcast_model::domain::AlphaMode;
+use modalcast_model::scene::Scene;
+
+/// What happens to alpha.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Opaque,
+    Mask,
+    Blend,
+}
+
+/// One material. Colours are linear.
+#[derive(Debug, Clone)]
+pub(super) struct Paint {
+    pub(super) kind: Kind,
+    pub(super) double_sided: bool,
+    pub(super) ambient: Vector3<f64>,
+    pub(super) diffuse: Vector3<f64>,
+    pub(super) specular: Vector3<f64>,
+    pub(super) exponent: f64,
+    pub(super) alpha: f64,
+    /// A mask shows from this alpha on.
+    pub(super) cutoff: f64,
+    /// What is not opaque casts a shadow from this alpha on.
+    pub(super) caster: f64,
+    pub(super) colour: Option<Arc<Texels>>,
+    pub(super) normal: Option<Arc<Texels>>,
+}
+
+impl Paint {
+    /// The materials of a scene in their order; each image is decoded once per use.
+    pub(super) fn all(scene: &Scene) -> Vec<Self> {
+        let mut decoded: BTreeMap<(usize, bool), Arc<Texels>> = BTreeMap::new();
+        let mut image = |texture: Option<usize>, purpose: Use| {
+            texture.map(|index| {
+                let slot = decoded.entry((index, purpose == Use::Colour));
+                Arc::clone(slot.or_insert_with(|| Arc::new(Texels::new(&scene.textures[index], purpose))))
+            })
+        };
+        let threshold = scene.look.shadow.unwrap_or_default().alpha_threshold;
+        let wide = |colour: [f32; 3]| Vector3::from(colour).cast::<f64>();
+        let paint = |material: &modalcast_model::domain::Material| {
+            let (kind, cutoff, caster) = match material.alpha_mode {
+                AlphaMode::Opaque => (Kind::Opaque, 0.0, 0.0),
+                AlphaMode::Mask { cutoff } => (Kind::Mask, cutoff, cutoff),
+                AlphaMode::Blend => (Kind::Blend, 0.0, threshold),
+            };
+            Self {
+                kind,
+                double_sided: material.double_sided,
+                ambient: wide(material.ambient),
+                diffuse: wide(material.diffuse),
+                specular: wide(material.specular),
+                exponent: f64::from(material.shininess),
+                alpha: f64::from(material.alpha),
+                cutoff: f64::from(cutoff),
+                caster: f64::from(caster),
+                colour: image(material.colour_texture, Use::Colour),
+                normal: image(material.normal_texture, Use::Normal),
+            }
+        };
+        scene.materials.iter().map(paint).collect()
+    }
+}

@@ -1,0 +1,217 @@
+//! Whole frames by OpenGL's rasteriser and by CUDA's, in one run: the same scene with its materials, a variance map and one
+//! sample a pixel, its edges smoothed after. What both saw and showed is compared before anything is timed.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use super::loads::{add, room, screen};
+use super::measure::STILL;
+use super::meter::relit;
+use super::metrics::{Spread, colours};
+use super::raster::{MAPS, MOST_DIFFERING};
+use super::studio::{Pass, Set, Size, Studio};
+use super::{Request, studio};
+use modalcast_compute::gpu::Device;
+use modalcast_model::error::Result;
+use modalcast_model::scene::{Antialias, Camera, Culling, Look, Parts, Scene, Shadow, State};
+use modalcast_render::{Culled, Paths, Seen};
+
+/// One load by both ways.
+#[derive(Debug, Clone, Serialize)]
+pub struct Frames {
+    pub load: String,
+    pub triangles: usize,
+    /// Side of the shadow map, and taps of its blur.
+    pub map: u32,
+    pub taps: u32,
+    /// Who drew what where CUDA was given.
+    pub paths: Paths,
+    /// Pixels whose id is not OpenGL's, of all.
+    pub differing: usize,
+    pub pixels: usize,
+    /// How far the picture is from OpenGL's, of 255.
+    pub colours: Spread,
+    /// By OpenGL as the load is culled there; "frame" is all but reading back.
+    pub opengl: Vec<Pass>,
+    pub culled: Option<Culled>,
+    /// None where too many ids differ.
+    pub cuda: Option<Vec<Pass>>,
+}
+
+impl Frames {
+    /// How many times as fast CUDA's frame is.
+    pub fn ratio(&self) -> Option<f64> {
+        let frame = |passes: &[Pass]| passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us);
+        Some(frame(&self.opengl)? / frame(self.cuda.as_deref()?)?)
+    }
+
+    /// The figures as a line for people.
+    pub fn line(&self) -> String {
+        let us = |passes: &[Pass]| {
+            let one = |pass: &Pass| format!("{} {:.1}", pass.name, pass.timing.median_us);
+            passes.iter().map(one).collect::<Vec<_>>().join(", ")
+        };
+        format!(
+            "{:<18}opengl: {}; cuda: {}; {:.1} times as fast; {} of {} ids differ, pixels by {:.3} of 255 on average, {} at most",
+            self.load,
+            us(&self.opengl),
+            self.cuda.as_deref().map_or("not timed".into(), us),
+            self.ratio().unwrap_or(f64::NAN),
+            self.differing,
+            self.pixels,
+            self.colours.mean,
+            self.colours.largest
+        )
+    }
+}
+
+/// A scene that is lit for this, how it stands and what sees it.
+struct Job {
+    name: String,
+    scene: Arc<Scene>,
+    state: State,
+    camera: Camera,
+}
+
+/// Measures the loads of a request, a room and two triangles that fill the frame.
+///
+/// # Errors
+/// Those of drawing, and of the device.
+pub(super) fn measure(
+    studio: &mut Studio,
+    device: &Arc<Device>,
+    request: &Request,
+    progress: &mut dyn FnMut(&str),
+) -> Result<Vec<Frames>> {
+    let mut jobs = Vec::new();
+    for kind in &request.loads {
+        let stage = kind.stage()?;
+        jobs.push(Job::new(&stage.name, &stage.scene, (stage.state(STILL), stage.camera(request.size)), request)?);
+    }
+    for (name, (mesh, camera)) in [("room", room()?), ("screen", screen()?)] {
+        let mut parts = Parts::named(name);
+        add(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
+        let scene = Scene::new(parts)?;
+        jobs.push(Job::new(name, &scene, (State::rest(&scene), camera), request)?);
+    }
+    let mut list = Vec::new();
+    for job in jobs {
+        progress(&format!("{}: frames by OpenGL and by CUDA", job.name));
+        let mut set = studio.set(&job.scene)?;
+        let measured = job.measure(studio, &mut set, device, request);
+        studio.strike(set);
+        list.push(measured?);
+    }
+    Ok(list)
+}
+
+impl Job {
+    fn new(name: &str, scene: &Scene, (state, camera): (State, Camera), request: &Request) -> Result<Self> {
+        let size = if request.quick { MAPS.1 } else { MAPS.0 };
+        let shadow = Some(Shadow { size, ..Shadow::default() });
+        let look = Look { shadow, antialias: Antialias::Fxaa, culling: Culling::Fitting, ..scene.look };
+        Ok(Self { name: name.into(), scene: relit(scene, look)?, state, camera })
+    }
+
+    fn measure(&self, studio: &mut Studio, set: &mut Set, device: &Arc<Device>, request: &Request) -> Result<Frames> {
+        let (size, replays) = (request.size, request.replays);
+        studio.pose(set, &self.state)?;
+        let want = self.shown(studio, set, size)?;
+        let opengl = studio.time(set, self.camera, size, replays)?;
+        let culled = studio.renderer.ran().culled;
+        studio.draw_beside(set, device)?;
+        let got = self.shown(studio, set, size)?;
+        let paths = studio.renderer.ran().paths;
+        let differing = got.1.iter().zip(&want.1).filter(|(got, want)| got != want).count();
+        let agrees = differing as f64 <= MOST_DIFFERING * want.1.len() as f64;
+        let cuda = if agrees { Some(studio.time(set, self.camera, size, replays)?) } else { None };
+        let reference: Vec<[f32; 3]> =
+            want.0.chunks_exact(4).map(|pixel| [0, 1, 2].map(|channel| f32::from(pixel[channel]))).collect();
+        let shadow = self.scene.look.shadow.unwrap_or_default();
+        Ok(Frames {
+            load: self.name.clone(),
+            triangles: self.scene.layout.triangles,
+            map: shadow.size,
+            taps: 2 * shadow.reach() + 1,
+            paths,
+            differing,
+            pixels: want.1.len(),
+            colours: colours(&got.0, &reference),
+            opengl,
+            culled,
+            cuda,
+        })
+    }
+
+    /// The picture, and what each of its pixels sees.
+    fn shown(&self, studio: &mut Studio, set: &Set, size: Size) -> Result<(Vec<u8>, Vec<Seen>)> {
+        let image = studio.draw(set, self.camera, size)?;
+        Ok((image.rgba, studio.renderer.seen()?))
+    }
+}
+
+/// What of these frames is not as it should be.
+pub(super) fn faults(list: &[Frames]) -> Vec<String> {
+    let untimed = list.iter().filter(|own| own.cuda.is_none());
+    untimed
+        .map(|own| format!("{}: {} of {} pixels see another triangle", own.load, own.differing, own.pixels))
+        .collect()
+}
+
+/// The table of `raster.md`.
+pub(super) fn markdown(list: &[Frames]) -> String {
+    use crate::peers::{dash, line, rule};
+    let head = [
+        "load",
+        "triangles",
+        "map",
+        "taps",
+        "drawn by CUDA",
+        "frame us: OpenGL",
+        "CUDA",
+        "times as fast",
+        "raster",
+        "shadow",
+        "blur",
+        "visibility",
+        "shade",
+        "encode",
+        "ids that differ",
+        "colours: mean",
+        "p99",
+        "largest",
+    ];
+    let mut text = format!(
+        "\n## Whole frames\n\nOne sample a pixel, edges smoothed after, by OpenGL as the load is culled there and with CUDA's \
+         rasteriser where it may draw, in the same run. A pass with two numbers: OpenGL / CUDA, us; \"raster\" is by \
+         CUDA and counted to \"shadow\", as is the blur. Where more than {} % of the ids differ nothing is timed.\n\n",
+        100.0 * MOST_DIFFERING
+    );
+    text.push_str(&line(head.map(String::from)));
+    text.push_str(&rule(head.len()));
+    for own in list {
+        let of = |passes: &[studio::Pass], name: &str| {
+            passes
+                .iter()
+                .find(|pass| pass.name == name)
+                .map_or_else(dash, |pass| format!("{:.1}", pass.timing.median_us))
+        };
+        let cuda = own.cuda.as_deref().unwrap_or_default();
+        let both = |name: &str| format!("{} / {}", of(&own.opengl, name), of(cuda, name));
+        let by_cuda: Vec<&str> = [("shadow", own.paths.shadow), ("visibility", own.paths.visibility)]
+            .into_iter()
+            .filter(|(_, path)| *path == Some(modalcast_render::Path::Cuda))
+            .map(|(name, _)| name)
+            .collect();
+        let first = [own.load.clone(), own.triangles.to_string(), own.map.to_string(), own.taps.to_string()];
+        let frames = [by_cuda.join(", "), of(&own.opengl, "frame"), of(cuda, "frame")];
+        let ratio = own.ratio().map_or_else(dash, |ratio| format!("{ratio:.1}"));
+        let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(both);
+        let ids = format!("{} of {}", own.differing, own.pixels);
+        let colours = [own.colours.mean, own.colours.p99, own.colours.largest].map(|own| format!("{own:.3}"));
+        let cells = first.into_iter().chain(frames).chain([ratio]).chain(passes).chain([ids]).chain(colours);
+        text.push_str(&line(cells));
+    }
+    text
+}

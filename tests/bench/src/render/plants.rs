@@ -1,0 +1,221 @@
+//! The plants of table 4.5 deformed and drawn: the columns of tables 4.6 and 4.7 that have to do with rendering, beside
+//! those that the thesis printed.
+//!
+//! As the thesis defines them: `t_vbr` is updating the vertices and rendering, `O_vbr` its share of the whole frame, FPS whole
+//! frames a second, s the memory of the device. Ours: `t_vbr` is a step of the deformer with q and T on their way to it and
+//! U q, the upload where it does not write the renderer's buffers, and all passes but reading back; the frame is that, the
+//! waits between, and the pixels in host memory. The thesis's frame has its simulation in it, ours has none.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::Serialize;
+
+use super::studio::{Size, Studio};
+use super::{Request, meter};
+use crate::loads::{Kind, Load, Size as Scale};
+use crate::motion::Motion;
+use crate::thesis::{PLANTS, Species};
+use crate::timing::{FEWEST, Timing};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::gpu::{self, CudaDeformer, Device, GlBuffers, Role};
+use modalcast_model::deform::{Backend, Deformed, Deformer, Wanted};
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::{Camera, Look, Scene, Shadow, State};
+use modalcast_render::{SceneBuffers, Shot};
+
+/// One plant, the thesis's figures and ours.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Plant {
+    pub load: String,
+    pub thesis: Species,
+    /// Whether it has the size of its row of table 4.5; only then are the two comparable.
+    pub full: bool,
+    pub remarks: Vec<String>,
+    pub backend: Backend,
+    /// Whether the deformer writes the renderer's buffers, so that no vertex passes through the host.
+    pub shared: bool,
+    pub triangles: usize,
+    pub domains: usize,
+    /// Side of its variance shadow map.
+    pub map: u32,
+    /// A step of the deformer, the upload (0 where there is none), the passes of shadow and drawing.
+    pub deform: Timing,
+    pub upload: Timing,
+    pub render: Timing,
+    /// `t_vbr`: the three together.
+    pub vbr: Timing,
+    pub frame: Timing,
+    pub fps: f64,
+    /// `O_vbr`: a share of the frame.
+    pub occupation: f64,
+    /// s: bytes of the scene on the device, of the renderer and of a deformer that runs there; what both use counts once.
+    pub bytes: u64,
+}
+
+/// States over which frames rotate.
+const STATES: usize = 8;
+/// Sides of the shadow map, in full and in a quick run.
+const MAPS: (u32, u32) = (4096, 1024);
+
+/// The CUDA device that deforms, where there is one and it is the one that draws or any other.
+pub(super) fn device() -> Option<Arc<Device>> {
+    Device::open(0).ok().filter(|device| device.check_compiler().is_ok())
+}
+
+/// What deforms a plant and what draws it. The deformer goes first: it may write the buffers.
+struct Rig {
+    deformer: Box<dyn Deformer>,
+    /// Device bytes that it has besides the buffers.
+    bytes: u64,
+    buffers: SceneBuffers,
+}
+
+/// Measures plant `index`.
+pub(super) fn measure(
+    studio: &mut Studio,
+    device: Option<&Arc<Device>>,
+    request: &Request,
+    index: usize,
+) -> Result<Plant> {
+    let scale = if request.quick { Scale::Quick } else { Scale::Full };
+    let load = Kind::Plant(index).build(scale)?;
+    let map = if request.quick { MAPS.1 } else { MAPS.0 };
+    let shadow = Some(Shadow { size: map, ..Shadow::default() });
+    let scene = meter::relit(&load.scene, Look { shadow, ..load.scene.look })?;
+    let states = states(&Load { scene: Arc::clone(&scene), ..load.clone() });
+    let mut rig = rig(studio, device, &scene)?;
+    let times = times(studio, &mut rig, &scene, (request.size, request.replays), &states)?;
+    let Rig { deformer, bytes, buffers } = rig;
+    let (backend, shared) = (deformer.backend(), deformer.shares_buffers());
+    let bytes = bytes + buffers.plan().bytes();
+    drop(deformer);
+    studio.renderer.unload(buffers);
+    let [deform, upload, render, vbr, frame] = times;
+    Ok(Plant {
+        load: load.name,
+        thesis: PLANTS[index],
+        full: scale == Scale::Full,
+        remarks: load.remarks,
+        backend,
+        shared,
+        triangles: scene.layout.triangles,
+        domains: scene.domains.len(),
+        map,
+        deform,
+        upload,
+        render,
+        vbr,
+        frame,
+        fps: 1e6 / frame.median_us,
+        occupation: vbr.median_us / frame.median_us,
+        bytes,
+    })
+}
+
+fn states(load: &Load) -> Vec<State> {
+    let motion = Motion::new(load, None);
+    let state = |step: usize| State { step: step as u64 + 1, serial: step as u64 + 1, ..motion.step(step).state() };
+    (0..STATES).map(state).collect()
+}
+
+fn rig(studio: &mut Studio, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<Rig> {
+    let buffers = studio.renderer.load(scene)?;
+    let Some(device) = device else {
+        return Ok(Rig { deformer: Box::new(CpuDeformer::new(scene)), bytes: 0, buffers });
+    };
+    let shared = buffers.shared;
+    let gl = GlBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents };
+    let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
+    let gl = (draws == Some(Some(device.ordinal()))).then_some(gl);
+    let deformer = CudaDeformer::new(device, scene, gl)?;
+    Ok(Rig { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
+}
+
+/// Bytes of a deformer's plan without the outputs that lie in the renderer's buffers.
+fn beside(plan: &gpu::Plan, shared: bool) -> u64 {
+    let outputs = [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role));
+    plan.total_bytes() - if shared { outputs.iter().sum() } else { 0 }
+}
+
+/// Deforming, uploading, rendering, these together, and the whole frame.
+fn times(
+    studio: &mut Studio,
+    rig: &mut Rig,
+    scene: &Arc<Scene>,
+    (size, replays): (Size, usize),
+    states: &[State],
+) -> Result<[Timing; 5]> {
+    let camera = Camera::framing(scene, size.width, size.height);
+    let begin = Instant::now();
+    let mut warm = 0;
+    // The first frames compile, allocate and let clocks rise.
+    while warm < 2 || (!studio.renderer.info().software && begin.elapsed() < super::studio::WARM_UP) {
+        frame(studio, rig, (camera, size), &states[warm % states.len()])?;
+        warm += 1;
+    }
+    let mut lists: [Vec<f64>; 5] = Default::default();
+    for replay in 0..replays.max(FEWEST) {
+        let times = frame(studio, rig, (camera, size), &states[replay % states.len()])?;
+        lists.iter_mut().zip(times).for_each(|(list, time)| list.push(time));
+    }
+    let timing = |list: Vec<f64>| Timing::of(list).ok_or_else(|| during("plants")("no frame was drawn"));
+    let [deform, upload, render, vbr, frame] = lists;
+    Ok([timing(deform)?, timing(upload)?, timing(render)?, timing(vbr)?, timing(frame)?])
+}
+
+/// One frame; microseconds as [`times`] has them.
+fn frame(studio: &mut Studio, rig: &mut Rig, (camera, size): (Camera, Size), state: &State) -> Result<[f64; 5]> {
+    let us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
+    let whole = Instant::now();
+    let Deformed { bounds, light, .. } = rig.deformer.deform(state)?;
+    let deform = us(whole);
+    let begin = Instant::now();
+    let mut upload = 0.0;
+    if !rig.deformer.shares_buffers() {
+        studio.renderer.upload(&rig.buffers, rig.deformer.read(Wanted::VERTICES)?)?;
+        upload = us(begin);
+    }
+    let shot = Shot { camera, width: size.width, height: size.height, bounds, light };
+    let image = studio.renderer.draw(&rig.buffers, &shot)?;
+    let frame = us(whole);
+    let passes = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));
+    let render: f64 = passes.map(|(_, ms)| 1e3 * ms).sum();
+    Ok([deform, upload, render, deform + upload + render, frame])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plant_is_deformed_and_drawn_and_its_shares_are_those_of_its_times() {
+        let mut studio = Studio::open().expect("OpenGL");
+        let request = Request {
+            loads: vec![],
+            plants: vec![1],
+            variants: vec![],
+            size: Size { width: 48, height: 32 },
+            quick: true,
+            replays: 1,
+        };
+        let plant = measure(&mut studio, None, &request, 1).expect("measured");
+        assert_eq!(
+            (plant.thesis.name, plant.full, plant.backend, plant.shared),
+            ("Conifer", false, Backend::Cpu, false)
+        );
+        assert!(plant.vbr.median_us > plant.deform.median_us && plant.render.median_us > 0.0);
+        assert!(plant.frame.median_us >= plant.vbr.median_us * 0.5 && plant.bytes > 0);
+        assert!((plant.occupation - plant.vbr.median_us / plant.frame.median_us).abs() < 1e-12);
+        assert!((plant.fps * plant.frame.median_us - 1e6).abs() < 1.0);
+        assert_eq!(plant.frame.replays, FEWEST);
+    }
+
+    #[test]
+    fn outputs_in_shared_buffers_count_once() {
+        let scene = Kind::Plant(0).build(Scale::Quick).expect("built").scene;
+        let plan = gpu::plan(&scene);
+        let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
+        assert_eq!(beside(&plan, false) - beside(&plan, true), outputs);
+    }
+}

@@ -1,0 +1,96 @@
+//! Error against time of every load: a panel each, the Pareto front marked.
+
+use std::fmt::Write as _;
+
+use super::{Report, Row};
+use crate::plot::panel::{Look, Panel, Point, filled, mark, width_of};
+use crate::plot::{COLOURS, HEAD, LEGEND, MARGIN, PANEL, text};
+use modalcast_model::deform::Backend;
+
+/// Panels side by side.
+const COLUMNS: usize = 3;
+
+/// The drawing.
+pub(super) fn svg(report: &Report) -> String {
+    let mut names: Vec<&str> = Vec::new();
+    for row in &report.rows {
+        if !names.contains(&row.name.as_str()) {
+            names.push(&row.name);
+        }
+    }
+    let columns = report.loads.len().clamp(1, COLUMNS);
+    let width = 2.0 * MARGIN + columns as f64 * PANEL.0;
+    let (legend, lines) = legend(&names, width);
+    let top = MARGIN + HEAD + lines as f64 * LEGEND;
+    let height = top + report.loads.len().div_ceil(columns) as f64 * PANEL.1 + MARGIN;
+    let mut out = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+         viewBox=\"0 0 {width} {height}\" font-family=\"'DejaVu Sans', Verdana, sans-serif\">\n\
+         <rect width=\"{width}\" height=\"{height}\" fill=\"#ffffff\"/>\n"
+    );
+    head(&mut out, report);
+    out.push_str(&legend);
+    let words = ["median time of a frame without reading it back", "mean error of a pixel, of 255"];
+    for (index, load) in report.loads.iter().enumerate() {
+        let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
+        let points = report.rows.iter().filter(|row| row.load == load.name).filter_map(point).collect();
+        Panel::new(corner, &load.name, words, points).draw(&mut out, |name| look(&names, name));
+    }
+    out.push_str("</svg>\n");
+    out
+}
+
+fn head(out: &mut String, report: &Report) {
+    let title = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
+    let small = "font-size=\"12\" fill=\"#555555\"";
+    text(out, (MARGIN + 8.0, MARGIN + 18.0), title, "Rendering: error against run time");
+    let size = format!("{} x {}", report.size.width, report.size.height);
+    let lines = [
+        report.made.line(),
+        format!(
+            "{}, {size} pixels; error against hard shadow rays, {} samples a pixel",
+            report.renderer.renderer,
+            samples(report)
+        ),
+        "ringed: Pareto front".into(),
+    ];
+    for (line, words) in lines.iter().enumerate() {
+        text(out, (MARGIN + 8.0, MARGIN + 40.0 + 16.0 * line as f64), small, words);
+    }
+}
+
+fn samples(report: &Report) -> usize {
+    report.loads.iter().map(|load| load.samples).min().unwrap_or(0)
+}
+
+fn point(row: &Row) -> Option<Point<'_>> {
+    Some(Point { name: &row.name, at: (row.median_us()?, row.colour.mean), filled: true, rival: true })
+}
+
+fn look(names: &[&str], name: &str) -> Look {
+    let index = names.iter().position(|own| *own == name).unwrap_or(0);
+    // Circles, then squares and triangles.
+    let (backend, round) = match index / COLOURS.len() {
+        0 => (Backend::Cpu, 0),
+        round => (Backend::Cuda, round - 1),
+    };
+    Look { colour: COLOURS[index % COLOURS.len()], backend, round }
+}
+
+/// The legend and its number of lines.
+fn legend(names: &[&str], width: f64) -> (String, usize) {
+    let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
+    for name in names {
+        let wide = 30.0 + width_of(name, 13.0);
+        if x + wide > width - MARGIN && x > MARGIN + 8.0 {
+            (x, line) = (MARGIN + 8.0, line + 1);
+        }
+        let (y, look) = (MARGIN + HEAD + line as f64 * LEGEND, look(names, name));
+        mark(&mut out, (x + 6.0, y - 4.0), look, &filled(look.colour));
+        // Writing into a string cannot fail.
+        let _ = writeln!(out);
+        text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
+        x += wide + 10.0;
+    }
+    (out, line + 1)
+}

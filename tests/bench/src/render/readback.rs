@@ -1,0 +1,312 @@
+//! What it costs to read every frame: frames drawn a second when none is read, when each is read before the next is begun,
+//! and when each is read through the ring while the next ones are drawn.
+//!
+//! All three wait for a frame before as many others are under way as the ring has places, so that they differ in nothing but
+//! the reading. Rounds of the three take turns; the medians of their rounds are compared. Two more rounds, unread and through
+//! the ring, upload the vertices of another step before every frame, as a scene that moves does.
+//!
+//! Before that, frames of two cameras that take turns come back through the ring and must be, one by one, those that were
+//! drawn alone: with steps between them and without.
+
+use std::collections::VecDeque;
+use std::sync::mpsc::{self, SyncSender};
+use std::time::Instant;
+
+use serde::Serialize;
+
+use super::Request;
+use super::loads::{Kind, Stage};
+use super::measure::STILL;
+use super::studio::{Set, Size, Studio};
+use crate::peers::{line, rule};
+use crate::timing::FEWEST;
+use modalcast_model::deform::Surface;
+use modalcast_model::error::{Result, during};
+use modalcast_model::scene::{Camera, View};
+use modalcast_render::{FRAMES_UNDER_WAY, Image, Shot};
+
+/// Rounds of each way.
+const ROUNDS: usize = 5;
+
+/// Frames a second of one load.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Readback {
+    pub load: String,
+    pub size: Size,
+    /// Frames of a round.
+    pub frames: usize,
+    pub unread_fps: f64,
+    pub at_once_fps: f64,
+    pub ring_fps: f64,
+    /// Percent of the frames a second that are lost by reading them.
+    pub at_once_loss: f64,
+    pub ring_loss: f64,
+    /// The same where the vertices of another step are uploaded before every frame.
+    pub stepped_unread_fps: f64,
+    pub stepped_ring_fps: f64,
+    pub stepped_ring_loss: f64,
+}
+
+/// What is drawn: frames of even and of odd numbers.
+struct Feed {
+    shots: [Shot; 2],
+    /// What is uploaded before each of them, if anything is.
+    steps: Option<[Surface; 2]>,
+}
+
+/// Steps between the two that are uploaded in turns.
+const APART: usize = 7;
+
+/// Who reads the frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    Unread,
+    AtOnce,
+    Ring,
+}
+
+/// Measures one load under its own look.
+///
+/// # Errors
+/// Those of drawing it; `Fault` when a frame that was read through the ring is not the one that was drawn alone.
+pub(super) fn measure(studio: &mut Studio, request: &Request, kind: Kind) -> Result<Readback> {
+    let stage = kind.stage()?;
+    let camera = stage.camera(request.size);
+    let mut set = studio.set(&stage.scene)?;
+    let stepped = Feed::stepped(studio, &mut set, &stage, request.size)?;
+    let still = Feed { shots: stepped.shots, steps: None };
+    [&still, &stepped].into_iter().try_for_each(|feed| validate(studio, &set, feed))?;
+    // One camera, so that all rounds draw the same.
+    let [still, stepped] = [still, stepped].map(|feed| Feed { shots: [feed.shots[0]; 2], ..feed });
+    studio.warm_up(&set, camera, request.size)?;
+    // In software each takes as long as a thousand elsewhere.
+    let frames = if studio.renderer.info().software { FEWEST } else { request.replays.max(FEWEST) };
+    let ways = [Way::Unread, Way::AtOnce, Way::Ring].map(|way| (way, &still));
+    let ways = ways.into_iter().chain([Way::Unread, Way::Ring].map(|way| (way, &stepped)));
+    let mut fps = [const { Vec::new() }; 5];
+    for _ in 0..ROUNDS {
+        for ((way, feed), list) in ways.clone().zip(&mut fps) {
+            list.push(round(studio, &set, feed, (way, frames))?);
+        }
+    }
+    studio.strike(set);
+    let [unread, at_once, ring, stepped_unread, stepped_ring] = fps.map(median);
+    Ok(Readback {
+        load: stage.name,
+        size: request.size,
+        frames,
+        unread_fps: unread,
+        at_once_fps: at_once,
+        ring_fps: ring,
+        at_once_loss: loss(unread, at_once),
+        ring_loss: loss(unread, ring),
+        stepped_unread_fps: stepped_unread,
+        stepped_ring_fps: stepped_ring,
+        stepped_ring_loss: loss(stepped_unread, stepped_ring),
+    })
+}
+
+impl Feed {
+    /// Two cameras, and the vertices of two steps; the shadow holds both.
+    fn stepped(studio: &mut Studio, set: &mut Set, stage: &Stage, size: Size) -> Result<Self> {
+        let mut pose = |step: usize| -> Result<_> {
+            studio.pose(set, &stage.state(step))?;
+            Ok((set.surface()?.clone(), set.extents()))
+        };
+        let ((later, far), (first, near)) = (pose(STILL + APART)?, pose(STILL)?);
+        let camera = stage.camera(size);
+        let light = near.1.zip(far.1).map(|(near, far)| near.union(far));
+        let shot = |camera: Camera| Shot { bounds: near.0.union(far.0), light, ..set.shot(camera, size) };
+        Ok(Self { shots: [camera, farther(camera)].map(shot), steps: Some([first, later]) })
+    }
+
+    /// Makes the device hold what the frame of this number shows.
+    fn step(&self, studio: &mut Studio, set: &Set, frame: usize) -> Result<()> {
+        self.steps.as_ref().map_or(Ok(()), |steps| studio.renderer.upload(&set.buffers, &steps[frame % 2]))
+    }
+}
+
+/// The same view from a quarter farther away.
+fn farther(camera: Camera) -> Camera {
+    let View::LookAt { eye, target, up } = camera.view else { return camera };
+    let eye = std::array::from_fn(|axis| target[axis] + 1.25 * (eye[axis] - target[axis]));
+    Camera { view: View::LookAt { eye, target, up }, ..camera }
+}
+
+/// Percent of `all` that `left` lacks.
+fn loss(all: f64, left: f64) -> f64 {
+    100.0 * (1.0 - left / all)
+}
+
+fn median(mut list: Vec<f64>) -> f64 {
+    list.sort_by(f64::total_cmp);
+    list[list.len() / 2]
+}
+
+/// Frames through the full ring are those that are drawn one by one, each in its place.
+fn validate(studio: &mut Studio, set: &Set, feed: &Feed) -> Result<()> {
+    let mut alone = |frame: usize| {
+        feed.step(studio, set, frame)?;
+        studio.renderer.draw(&set.buffers, &feed.shots[frame])
+    };
+    let alone = [alone(0)?, alone(1)?];
+    let frames = 2 * FRAMES_UNDER_WAY + 1;
+    let (images, taken) = mpsc::sync_channel(frames);
+    under_way(studio, set, feed, (frames, Some(images)))?;
+    check(&alone, &taken.iter().collect::<Vec<_>>(), frames)
+}
+
+/// Whether all frames came back, those of even numbers as the first that was drawn alone and those of odd ones as the
+/// second.
+fn check(alone: &[Image; 2], taken: &[(usize, Image)], frames: usize) -> Result<()> {
+    if alone[0].rgba == alone[1].rgba {
+        return Err(during("readback")("two cameras show the same: frames that are mixed up would not be noticed"));
+    }
+    let numbers: std::collections::BTreeSet<usize> = taken.iter().map(|(frame, _)| *frame).collect();
+    let wrong = taken.iter().filter(|(frame, image)| image.rgba != alone[frame % 2].rgba).count();
+    match (numbers.len() == frames && taken.len() == frames, wrong) {
+        (true, 0) => Ok(()),
+        (false, _) => Err(during("readback")(format!("{} of {frames} frames came back", numbers.len()))),
+        _ => Err(during("readback")(format!("{wrong} frames through the ring differ from those drawn alone"))),
+    }
+}
+
+/// Frames a second of one round. Whoever takes the images drops them, on a thread of its own.
+fn round(studio: &mut Studio, set: &Set, feed: &Feed, (way, frames): (Way, usize)) -> Result<f64> {
+    // Room for all, so that nobody who copies pixels waits.
+    let (images, taken) = mpsc::sync_channel::<(usize, Image)>(frames);
+    let begin = Instant::now();
+    let taker = std::thread::spawn(move || taken.iter().filter(|(_, image)| !image.rgba.is_empty()).count());
+    match way {
+        Way::AtOnce => {
+            for frame in 0..frames {
+                feed.step(studio, set, frame)?;
+                let image = studio.renderer.draw(&set.buffers, &feed.shots[frame % 2])?;
+                images.send((frame, image)).map_err(during("readback"))?;
+            }
+            drop(images);
+        }
+        Way::Unread => under_way(studio, set, feed, (frames, None)).map(|()| drop(images))?,
+        Way::Ring => under_way(studio, set, feed, (frames, Some(images)))?,
+    }
+    let taken = taker.join().map_err(|_| during("readback")("the taker of frames panicked"))?;
+    let seconds = begin.elapsed().as_secs_f64();
+    match taken == if way == Way::Unread { 0 } else { frames } {
+        true => Ok(frames as f64 / seconds),
+        false => Err(during("readback")(format!("{taken} of {frames} frames came back"))),
+    }
+}
+
+/// Draws with as many frames under way as the ring has places. `to`: who gets their pixels, copied on other threads, with
+/// the number of the frame.
+fn under_way(
+    studio: &mut Studio,
+    set: &Set,
+    feed: &Feed,
+    (frames, to): (usize, Option<SyncSender<(usize, Image)>>),
+) -> Result<()> {
+    let mut tickets = VecDeque::new();
+    for frame in 0..frames + FRAMES_UNDER_WAY {
+        if let Some(ticket) = if frame < FRAMES_UNDER_WAY { None } else { tickets.pop_front() } {
+            let pixels = studio.renderer.retrieve(ticket)?;
+            if let Some(to) = to.clone() {
+                rayon::spawn(move || {
+                    // Whoever takes them counts them.
+                    to.send((frame - FRAMES_UNDER_WAY, pixels.into_image())).ok();
+                });
+            }
+        }
+        if frame < frames {
+            feed.step(studio, set, frame)?;
+            let shot = &feed.shots[frame % 2];
+            tickets.push_back(match &to {
+                Some(_) => studio.renderer.submit(&set.buffers, shot)?,
+                None => studio.renderer.submit_unread(&set.buffers, shot)?,
+            });
+        }
+    }
+    Ok(())
+}
+
+/// The table of a page.
+pub(super) fn section(list: &[Readback]) -> String {
+    let head = ["load", "frames/s, none read", "each read at once", "loss", "each read through the ring", "loss"];
+    let head = [&head[..], &["a step before each, none read", "a step before each, through the ring", "loss"]].concat();
+    let mut text = String::from(
+        "\n## Reading every frame back\n\nThe same vertices again and again; and with those of another step uploaded from host \
+         memory before every frame.\n\n",
+    );
+    text.push_str(&line(head.iter().map(|name| String::from(*name))));
+    text.push_str(&rule(head.len()));
+    for row in list {
+        let percent = |loss: f64| format!("{loss:.1} %");
+        text.push_str(&line([
+            row.load.clone(),
+            format!("{:.1}", row.unread_fps),
+            format!("{:.1}", row.at_once_fps),
+            percent(row.at_once_loss),
+            format!("{:.1}", row.ring_fps),
+            percent(row.ring_loss),
+            format!("{:.1}", row.stepped_unread_fps),
+            format!("{:.1}", row.stepped_ring_fps),
+            percent(row.stepped_ring_loss),
+        ]));
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_load_is_drawn_in_three_ways_and_its_table_has_a_row() {
+        let request = Request {
+            loads: vec![],
+            plants: vec![],
+            variants: vec![],
+            size: Size { width: 64, height: 36 },
+            quick: true,
+            replays: 20,
+        };
+        let mut studio = Studio::open().expect("EGL");
+        let row = measure(&mut studio, &request, Kind::Square).expect("measured");
+        assert!(row.unread_fps > 0.0 && row.at_once_fps > 0.0 && row.ring_fps > 0.0, "{row:?}");
+        assert!(row.stepped_unread_fps > 0.0 && row.stepped_ring_fps > 0.0 && row.stepped_ring_loss < 100.0);
+        assert!(row.ring_loss < 100.0 && row.at_once_loss < 100.0 && row.frames >= 20);
+        let page = section(std::slice::from_ref(&row));
+        assert!(page.lines().any(|line| line.contains("square") && line.contains('%')), "{page}");
+        assert_eq!((loss(200.0, 190.0), median(vec![3.0, 1.0, 2.0])), (5.000000000000004, 2.0));
+    }
+
+    #[test]
+    fn frames_that_came_back_wrong_swapped_or_not_at_all_are_noticed() {
+        let stage = Kind::Square.stage().expect("a load");
+        let size = Size { width: 64, height: 36 };
+        let mut studio = Studio::open().expect("EGL");
+        let mut set = studio.set(&stage.scene).expect("loads");
+        let mut feed = Feed::stepped(&mut studio, &mut set, &stage, size).expect("poses");
+        validate(&mut studio, &set, &feed).expect("control: with steps");
+        let alone = [0, 1].map(|frame| {
+            feed.step(&mut studio, &set, frame).expect("uploads");
+            studio.renderer.draw(&set.buffers, &feed.shots[frame]).expect("draws")
+        });
+        let (images, taken) = mpsc::sync_channel(6);
+        under_way(&mut studio, &set, &feed, (6, Some(images))).expect("draws");
+        // Copied by several threads, so they arrive in any order: the swap below needs two that differ.
+        let mut frames: Vec<(usize, Image)> = taken.iter().collect();
+        frames.sort_by_key(|(number, _)| *number);
+        check(&alone, &frames, 6).expect("control: all are right");
+        let why = |frames: &[(usize, Image)]| check(&alone, frames, 6).expect_err("noticed").to_string();
+        assert!(why(&frames[1..]).contains("5 of 6"));
+        (frames[2].0, frames[3].0) = (frames[3].0, frames[2].0);
+        assert!(why(&frames).contains("2 frames"), "two that are swapped");
+        (frames[2].0, frames[3].0) = (frames[3].0, frames[2].0);
+        frames[4].1.rgba[100] ^= 1;
+        assert!(why(&frames).contains("1 frames"), "one byte is wrong");
+        feed.shots[1] = feed.shots[0];
+        feed.steps = None;
+        let same = validate(&mut studio, &set, &feed).expect_err("nothing could be told apart");
+        assert!(same.to_string().contains("two cameras show the same"), "{same}");
+    }
+}

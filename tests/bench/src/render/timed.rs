@@ -1,0 +1,144 @@
+//! Frame times of scenes of the user: no references, no variants; and all that another program needs to draw the same view.
+
+use std::path::Path;
+use std::time::Instant;
+
+use serde::Serialize;
+
+use super::pictures::{self, File};
+use super::studio::{Pass, Size, Studio};
+use crate::machine::Provenance;
+use crate::timing::{FEWEST, Timing};
+use modalcast_model::error::{Result, during};
+use modalcast_model::load;
+use modalcast_model::scene::{Camera, Look, State};
+use modalcast_render::{Info, Paths};
+
+/// What to time.
+#[derive(Debug, Clone)]
+pub struct Request {
+    /// Scenes as the command line names them.
+    pub scenes: Vec<String>,
+    pub size: Size,
+    /// Frames per median.
+    pub replays: usize,
+}
+
+/// One scene at rest.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Sample {
+    pub name: String,
+    pub vertices: usize,
+    pub triangles: usize,
+    pub look: Look,
+    /// Samples a pixel.
+    pub samples: u32,
+    /// Who drew it.
+    pub paths: Paths,
+    /// `clip_from_world`, column by column; the camera frames the scene.
+    pub clip_from_world: Vec<f64>,
+    pub eye: [f64; 3],
+    pub to_sun: [f64; 3],
+    /// "frame" is all passes but reading back.
+    pub passes: Vec<Pass>,
+    /// The wall clock around a whole frame, its pixels in host memory.
+    pub whole: Timing,
+    pub picture: String,
+}
+
+/// All of them.
+#[derive(Debug, Clone, Serialize)]
+pub struct Timed {
+    pub made: Provenance,
+    pub renderer: Info,
+    pub size: Size,
+    pub scenes: Vec<Sample>,
+    #[serde(skip)]
+    files: Vec<File>,
+}
+
+/// Times scenes; `progress` hears which.
+///
+/// # Errors
+/// `Unavailable` without OpenGL; those of loading and drawing a scene.
+pub fn timed(request: &Request, mut progress: impl FnMut(&str)) -> Result<Timed> {
+    let mut studio = Studio::open()?;
+    let (mut scenes, mut files) = (Vec::new(), Vec::new());
+    for source in &request.scenes {
+        progress(source);
+        let (sample, file) = sample(&mut studio, request, source)?;
+        scenes.push(sample);
+        files.push(file);
+    }
+    let renderer = studio.renderer.info().clone();
+    Ok(Timed { made: Provenance::here(), renderer, size: request.size, scenes, files })
+}
+
+fn sample(studio: &mut Studio, request: &Request, source: &str) -> Result<(Sample, File)> {
+    let (scene, size) = (load::open(source)?, request.size);
+    let name = Path::new(source).file_stem().map_or_else(|| "scene".into(), |stem| stem.to_string_lossy());
+    let mut set = studio.set(&scene)?;
+    studio.pose(&mut set, &State::rest(&scene))?;
+    let camera = Camera::framing(&scene, size.width, size.height);
+    studio.draw_as_named(&mut set, camera, size)?;
+    let passes = studio.time(&set, camera, size, request.replays)?;
+    let mut times = Vec::new();
+    for _ in 0..request.replays.max(FEWEST) {
+        let begin = Instant::now();
+        studio.draw(&set, camera, size)?;
+        times.push(begin.elapsed().as_secs_f64() * 1e6);
+    }
+    let (image, shot) = (studio.draw(&set, camera, size)?, set.shot(camera, size));
+    let file = pictures::sheet(&name, size, 1, &[image.rgba])?;
+    let clip = camera.clip_from_camera(size.width, size.height, &shot.bounds) * camera.camera_from_world();
+    let sample = Sample {
+        name: name.into_owned(),
+        vertices: scene.layout.vertices,
+        triangles: scene.layout.triangles,
+        look: scene.look,
+        samples: studio.renderer.ran().samples,
+        paths: studio.renderer.ran().paths,
+        clip_from_world: clip.iter().copied().collect(),
+        eye: camera.eye().into(),
+        to_sun: scene.look.to_sun(scene.up).into(),
+        passes,
+        whole: Timing::of(times).ok_or_else(|| during("time")("no frame was drawn"))?,
+        picture: file.name.clone(),
+    };
+    studio.strike(set);
+    Ok((sample, file))
+}
+
+impl Timed {
+    /// Writes the pictures and `times.json` into a folder, which is made.
+    ///
+    /// # Errors
+    /// `Fault` when a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        std::fs::create_dir_all(folder).map_err(during("times"))?;
+        let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).map_err(during("times"));
+        self.files.iter().try_for_each(|file| write(&file.name, &file.png))?;
+        write("times.json", &serde_json::to_vec_pretty(self).map_err(during("times"))?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scene_is_timed_and_its_matrix_brings_what_it_frames_into_the_picture() {
+        let request = Request { scenes: vec!["tree".into()], size: Size { width: 32, height: 24 }, replays: 1 };
+        let timed = timed(&request, |_| {}).expect("timed");
+        let sample = &timed.scenes[0];
+        assert!(sample.whole.median_us > 0.0 && sample.whole.replays == FEWEST);
+        assert!(sample.passes.iter().any(|pass| pass.name == "frame"));
+        let scene = load::open("tree").expect("built");
+        let clip = nalgebra::Matrix4::from_column_slice(&sample.clip_from_world);
+        let middle = clip.transform_point(&scene.rest_bounds.centre());
+        assert!(middle.x.abs() < 1e-9 && middle.y.abs() < 1e-9, "{middle}");
+        let folder = tempfile::tempdir().expect("a folder");
+        timed.write(folder.path()).expect("written");
+        assert!(folder.path().join("times.json").exists() && folder.path().join("tree.png").exists());
+    }
+}

@@ -1,0 +1,120 @@
+//! The camera's rays, and what of a frame is no triangle: ground, sky and light.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::soup::Ray;
+use modalcast_model::scene::{Lens, Scene};
+use modalcast_render::Shot;
+
+/// Everything about one frame but its triangles. Colours are linear, lengths scene units.
+#[derive(Debug, Clone)]
+pub(super) struct View {
+    pub(super) width: u32,
+    pub(super) height: u32,
+    pub(super) eye: Vector3<f64>,
+    /// Depth along the camera's axis between which triangles are seen.
+    pub(super) range: (f64, f64),
+    pub(super) to_sun: Vector3<f64>,
+    pub(super) sunlight: Vector3<f64>,
+    pub(super) skylight: Vector3<f64>,
+    pub(super) up: Vector3<f64>,
+    pub(super) ground: Option<Plane>,
+    zenith: Vector3<f64>,
+    horizon: Vector3<f64>,
+    world_from_camera: Matrix3<f64>,
+    /// Focal lengths and principal point in pixels, from the top left.
+    lens: [f64; 4],
+}
+
+/// The ground: a plane that fades into the horizon.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Plane {
+    height: f64,
+    centre: Vector3<f64>,
+    fade: f64,
+    colour: Vector3<f64>,
+}
+
+impl View {
+    /// The numbers of a shot of a scene whose positions are relative to its origin.
+    pub(super) fn new(scene: &Scene, shot: &Shot) -> Self {
+        let look = &scene.look;
+        let wide = |colour: [f32; 3]| Vector3::from(colour).cast::<f64>();
+        let (width, height) = (f64::from(shot.width), f64::from(shot.height));
+        let lens = match shot.camera.lens {
+            Lens::FieldOfView(degrees) => {
+                let focal = 0.5 * height / (0.5 * degrees).to_radians().tan();
+                [focal, focal, 0.5 * width, 0.5 * height]
+            }
+            Lens::Intrinsics { fx, fy, cx, cy } => [fx, fy, cx, cy],
+        };
+        let rotation = shot.camera.camera_from_world().fixed_view::<3, 3>(0, 0).into_owned();
+        let clip = shot.camera.clip_from_camera(shot.width, shot.height, &shot.bounds.union(scene.rest_bounds));
+        let (scale, shift) = (clip[(2, 2)], clip[(2, 3)]);
+        let eye = shot.camera.eye();
+        let up = scene.up.index();
+        let above = eye[up] > scene.rest_bounds.min[up];
+        Self {
+            width: shot.width,
+            height: shot.height,
+            eye,
+            range: (shift / (scale - 1.0), shift / (scale + 1.0)),
+            to_sun: look.to_sun(scene.up),
+            sunlight: wide(look.sunlight),
+            skylight: wide(look.skylight),
+            up: scene.up.vector(),
+            ground: look.ground.filter(|_| above).map(|ground| Plane::new(scene, eye, wide(ground.colour))),
+            zenith: wide(look.zenith),
+            horizon: wide(look.horizon),
+            world_from_camera: rotation.try_inverse().unwrap_or_else(Matrix3::identity),
+            lens,
+        }
+    }
+
+    /// The ray through a point of the image in pixels from its top left; t is the depth along the camera's axis.
+    pub(super) fn ray(&self, x: f64, y: f64) -> Ray {
+        let [fx, fy, cx, cy] = self.lens;
+        let along = Vector3::new((x - cx) / fx, (cy - y) / fy, -1.0);
+        Ray { from: self.eye, along: self.world_from_camera * along }
+    }
+
+    /// The sky in a direction: 1 - exp(-6 s s / (s + 0.06)) of the way from the horizon to the zenith, s the sine of its
+    /// elevation.
+    pub(super) fn sky(&self, along: &Vector3<f64>) -> Vector3<f64> {
+        let sine = along.normalize().dot(&self.up).max(0.0);
+        let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
+        self.horizon.lerp(&self.zenith, share)
+    }
+
+    /// Where a ray meets the ground ahead.
+    pub(super) fn ground_at(&self, ray: &Ray) -> Option<f64> {
+        let plane = self.ground?;
+        let fall = self.up.dot(&ray.along);
+        let t = (plane.height - self.up.dot(&ray.from)) / fall;
+        (fall < 0.0 && t > 0.0 && t.is_finite()).then_some(t)
+    }
+
+    /// How much of the ground's own colour is left in the haze, from 1 under the scene to 0 far away.
+    pub(super) fn clear(&self, point: &Vector3<f64>) -> f64 {
+        let share = |plane: Plane| (point - plane.centre).norm_squared() / (plane.fade * plane.fade);
+        self.ground.map_or(0.0, |plane| (-share(plane)).exp())
+    }
+
+    /// The ground's colour, and that of the haze over it.
+    pub(super) fn ground_colours(&self) -> (Vector3<f64>, Vector3<f64>) {
+        (self.ground.map_or(Vector3::zeros(), |plane| plane.colour), self.horizon)
+    }
+}
+
+impl Plane {
+    /// It lies at the lowest rest position and fades over 3.5 times the scene's diagonal, or the eye's distance aside.
+    fn new(scene: &Scene, eye: Vector3<f64>, colour: Vector3<f64>) -> Self {
+        let (rest, up) = (scene.rest_bounds, scene.up.index());
+        let height = rest.min[up];
+        let mut centre = rest.centre().coords;
+        centre[up] = height;
+        let mut aside = eye - centre;
+        aside[up] = 0.0;
+        Self { height, centre, fade: 3.5 * rest.diagonal().max(aside.norm()).max(1e-6), colour }
+    }
+}

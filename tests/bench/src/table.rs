@@ -1,0 +1,304 @@
+//! The table of the report: a row per variant, load and cache.
+
+use serde::Serialize;
+use serde_json::Value;
+
+use super::bench::Roofs;
+use super::timing::{Cache, Timing};
+use super::traffic::{self, Part};
+use super::validate::Found;
+use super::variant::Label;
+use crate::kernels::KernelFacts;
+use modalcast_model::deform::Backend;
+use modalcast_model::error::{Error, Result, during};
+use modalcast_model::scene::{Normals, Storage};
+
+/// One variant on one load with one state of the caches.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Row {
+    pub load: String,
+    pub name: String,
+    pub backend: Backend,
+    pub storage: Storage,
+    /// The budget of mode truncation, metres.
+    pub truncation_metres: Option<f64>,
+    pub normals: Normals,
+    pub compensated: bool,
+    pub cache: Cache,
+    pub passed: bool,
+    /// Why not, in words.
+    pub faults: Vec<String>,
+    /// Whether something that it needs is not here, so that it did not fail by not passing.
+    pub left_out: bool,
+    /// None when it did not pass, or cannot be timed so.
+    pub timing: Option<Timing>,
+    pub bytes: u64,
+    pub traffic: Vec<Part>,
+    /// Bytes over the median time, 10^9 a second.
+    pub gbs: Option<f64>,
+    /// The same over the rate of the best copy, and of the best pure read, of the same run.
+    pub of_copy: Option<f64>,
+    pub of_read: Option<f64>,
+    /// Kernel launches of a step, and what the driver says of each kernel; nothing on the CPU.
+    pub launches: usize,
+    pub kernels: Vec<KernelFacts>,
+    /// None when the variant could not be made.
+    pub found: Option<Found>,
+}
+
+impl Row {
+    /// The row of a variant that was looked at.
+    pub fn new(load: &str, label: &Label, found: Found, traffic: Vec<Part>, time: (Cache, Option<Timing>)) -> Self {
+        let (cache, timing) = time;
+        let bytes = traffic::total(&traffic);
+        Self {
+            cache,
+            passed: found.passed(),
+            faults: found.faults.clone(),
+            left_out: found.left_out,
+            timing,
+            bytes,
+            traffic,
+            gbs: timing.map(|timing| bytes as f64 / timing.median_us / 1e3),
+            found: Some(found),
+            ..Self::blank(load, label)
+        }
+    }
+
+    /// The row of a variant that could not be made.
+    pub fn unmade(load: &str, label: &Label, error: &Error) -> Self {
+        let left_out = matches!(error, Error::Unavailable { .. });
+        Self { faults: vec![error.to_string()], left_out, ..Self::blank(load, label) }
+    }
+
+    fn blank(load: &str, label: &Label) -> Self {
+        Self {
+            load: load.into(),
+            name: label.name.clone(),
+            backend: label.backend,
+            storage: label.deformation.storage,
+            truncation_metres: label.deformation.truncation,
+            normals: label.deformation.normals,
+            compensated: label.deformation.compensated,
+            cache: Cache::Warm,
+            passed: false,
+            faults: Vec::new(),
+            left_out: false,
+            timing: None,
+            bytes: 0,
+            traffic: Vec::new(),
+            gbs: None,
+            of_copy: None,
+            of_read: None,
+            launches: 0,
+            kernels: Vec::new(),
+            found: None,
+        }
+    }
+
+    /// The same row with its rate held against roofs.
+    pub fn under(mut self, roofs: Roofs) -> Self {
+        let share = |roof: Option<f64>| Some(self.gbs? / roof.filter(|roof| *roof > 0.0)?);
+        (self.of_copy, self.of_read) = (share(roofs.copy_gbs), share(roofs.read_gbs));
+        self
+    }
+
+    /// Median time in microseconds and largest error as a fraction of the diagonal, of a row that has both.
+    pub fn point(&self) -> Option<(f64, f64)> {
+        let found = self.found.as_ref().filter(|_| self.passed)?;
+        Some((self.timing?.median_us, found.errors.of_diagonal.largest))
+    }
+}
+
+/// The columns of `report.csv`: name, and where the value stands in a row of `report.json`.
+const COLUMNS: [(&str, &str); 56] = [
+    ("load", "/load"),
+    ("variant", "/name"),
+    ("backend", "/backend"),
+    ("storage", "/storage"),
+    ("truncation_m", "/truncation_metres"),
+    ("normals", "/normals"),
+    ("compensated", "/compensated"),
+    ("cache", "/cache"),
+    ("passed", "/passed"),
+    ("median_us", "/timing/median_us"),
+    ("q1_us", "/timing/q1_us"),
+    ("q3_us", "/timing/q3_us"),
+    ("replays", "/timing/replays"),
+    ("bytes", "/bytes"),
+    ("gb_per_s", "/gbs"),
+    ("launches", "/launches"),
+    ("of_copy", "/of_copy"),
+    ("of_read", "/of_read"),
+    ("states", "/found/errors/states"),
+    ("largest_m", "/found/errors/metres/largest"),
+    ("rms_m", "/found/errors/metres/rms"),
+    ("largest_of_diagonal", "/found/errors/of_diagonal/largest"),
+    ("rms_of_diagonal", "/found/errors/of_diagonal/rms"),
+    ("largest_px", "/found/errors/pixels/largest"),
+    ("rms_px", "/found/errors/pixels/rms"),
+    ("bias_x_m", "/found/errors/bias_metres/0"),
+    ("bias_y_m", "/found/errors/bias_metres/1"),
+    ("bias_z_m", "/found/errors/bias_metres/2"),
+    ("step_largest_m", "/found/step_metres/largest"),
+    ("step_rms_m", "/found/step_metres/rms"),
+    ("bound_m", "/found/errors/bound_metres"),
+    ("of_bound", "/found/errors/of_bound"),
+    ("not_finite", "/found/errors/not_finite"),
+    ("repeatable", "/found/repeatable"),
+    ("storage_largest_m", "/found/sources/storage/largest"),
+    ("storage_rms_m", "/found/sources/storage/rms"),
+    ("q_largest_m", "/found/sources/q/largest"),
+    ("q_rms_m", "/found/sources/q/rms"),
+    ("accumulation_largest_m", "/found/sources/accumulation/largest"),
+    ("accumulation_rms_m", "/found/sources/accumulation/rms"),
+    ("transform_largest_m", "/found/sources/transform/largest"),
+    ("transform_rms_m", "/found/sources/transform/rms"),
+    ("origin_largest_m", "/found/sources/origin/largest"),
+    ("origin_rms_m", "/found/sources/origin/rms"),
+    ("truncation_largest_m", "/found/sources/truncation/largest"),
+    ("truncation_rms_m", "/found/sources/truncation/rms"),
+    ("normals_largest_deg", "/found/orientation/normals_degrees/largest"),
+    ("normals_rms_deg", "/found/orientation/normals_degrees/rms"),
+    ("normals_to_surface_largest_deg", "/found/orientation/normals_to_surface_degrees/largest"),
+    ("normals_to_surface_rms_deg", "/found/orientation/normals_to_surface_degrees/rms"),
+    ("left_out", "/left_out"),
+    ("tangents_largest_deg", "/found/orientation/tangents_degrees/largest"),
+    ("tangents_rms_deg", "/found/orientation/tangents_degrees/rms"),
+    ("normal_dot_tangent", "/found/orientation/normal_dot_tangent/largest"),
+    ("bytes_by_formula", ""),
+    ("faults", ""),
+];
+
+/// The rows as CSV with a header.
+///
+/// # Errors
+/// `Fault` when writing into memory fails.
+pub fn csv(rows: &[Row]) -> Result<Vec<u8>> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    writer.write_record(COLUMNS.map(|(name, _)| name)).map_err(during("report"))?;
+    for row in rows {
+        let value = serde_json::to_value(row).map_err(during("report"))?;
+        let cell = |(name, place): (&str, &str)| match (name, value.pointer(place)) {
+            ("bytes_by_formula", _) => traffic::line(&row.traffic),
+            ("faults", _) => row.faults.join("; "),
+            (_, None | Some(Value::Null)) => String::new(),
+            (_, Some(Value::String(text))) => text.clone(),
+            (_, Some(other)) => other.to_string(),
+        };
+        writer.write_record(COLUMNS.map(cell)).map_err(during("report"))?;
+    }
+    writer.into_inner().map_err(during("report"))
+}
+
+/// Indices of the points that no other point beats in both numbers, by ascending first number.
+pub fn pareto(points: &[(f64, f64)]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..points.len()).collect();
+    order.sort_by(|a, b| points[*a].0.total_cmp(&points[*b].0).then(points[*a].1.total_cmp(&points[*b].1)));
+    let mut least = f64::INFINITY;
+    let mut best = |index: &usize| {
+        let better = points[*index].1 < least;
+        least = least.min(points[*index].1);
+        better
+    };
+    order.retain(|index| best(index));
+    order
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::errors::{Errors, Orientation, Spread};
+    use crate::sources::Sources;
+
+    /// A row with these numbers and everything else at nought.
+    pub(crate) fn row(load: &str, name: &str, cache: Cache, (us, error): (f64, f64)) -> Row {
+        let label = Label { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
+        let spread = Spread { largest: error, rms: error / 2.0 };
+        let errors = Errors {
+            metres: spread,
+            of_diagonal: spread,
+            pixels: None,
+            bias_metres: [0.5, -0.5, 0.0],
+            bound_metres: 1.0,
+            of_bound: 0.5,
+            not_finite: 0,
+            states: 1,
+        };
+        let found = Found {
+            errors,
+            step_metres: spread,
+            sources: Sources::default(),
+            orientation: Orientation::default(),
+            repeatable: true,
+            faults: Vec::new(),
+            left_out: false,
+        };
+        let timing = Timing { median_us: us, q1_us: us, q3_us: us, replays: 20 };
+        let traffic = vec![Part { name: "U", formula: "4 x sum 3 n r", bytes: 2_000 }];
+        Row::new(load, &label, found, traffic, (cache, Some(timing)))
+    }
+
+    #[test]
+    fn the_front_holds_what_no_other_point_beats() {
+        let points = [(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (3.0, 0.5), (4.0, 0.5), (0.5, 9.0)];
+        assert_eq!(pareto(&points), [5, 0, 3]);
+        assert_eq!(pareto(&[]), [0; 0]);
+        assert_eq!(pareto(&[(1.0, 1.0), (1.0, 1.0)]).len(), 1, "twins count once");
+    }
+
+    #[test]
+    fn rates_are_bytes_over_time_and_fractions_are_of_what_was_measured() {
+        let row = row("a", "x", Cache::Warm, (2.0, 0.1));
+        assert_eq!((row.gbs, row.of_copy), (Some(1.0), None));
+        let under = row.under(Roofs { copy_gbs: Some(4.0), ..Roofs::default() });
+        assert_eq!((under.of_copy, under.of_read), (Some(0.25), None));
+    }
+
+    #[test]
+    fn the_csv_reads_back_with_every_column_and_quoted_texts() {
+        let mut odd = row("a", "odd, \"name\"", Cache::Cold, (3.0, 1e-9));
+        odd.faults = vec!["one".into(), "two, three".into()];
+        let rows = [row("a", "x", Cache::Warm, (2.0, 0.125)), odd];
+        let bytes = csv(&rows).expect("written");
+        let mut reader = csv::Reader::from_reader(bytes.as_slice());
+        let header = reader.headers().expect("a header").clone();
+        assert_eq!(header.len(), COLUMNS.len());
+        let records: Vec<csv::StringRecord> = reader.records().map(|record| record.expect("a record")).collect();
+        let cell = |row: usize, name: &str| {
+            let at = header.iter().position(|column| column == name).expect("a column");
+            records[row][at].to_owned()
+        };
+        assert_eq!(
+            (cell(0, "largest_m"), cell(0, "median_us"), cell(0, "cache")),
+            ("0.125".into(), "2.0".into(), "warm".into())
+        );
+        assert_eq!((cell(1, "variant"), cell(1, "faults")), ("odd, \"name\"".into(), "one; two, three".into()));
+        assert_eq!((cell(0, "bias_y_m"), cell(0, "largest_px")), ("-0.5".into(), String::new()));
+        assert_eq!(cell(0, "bytes_by_formula"), "U: 4 x sum 3 n r = 2000");
+    }
+
+    #[test]
+    fn every_column_but_the_texts_names_a_place_that_a_full_row_has() {
+        let mut full = row("a", "x", Cache::Warm, (2.0, 0.125)).under(Roofs {
+            copy_gbs: Some(1.0),
+            read_gbs: Some(1.0),
+            ..Roofs::default()
+        });
+        full.truncation_metres = Some(1e-3);
+        let found = full.found.as_mut().expect("found");
+        let spread = Some(Spread::default());
+        found.errors.pixels = spread;
+        found.orientation = Orientation {
+            normals_degrees: spread,
+            normals_to_surface_degrees: spread,
+            tangents_degrees: spread,
+            normal_dot_tangent: spread,
+            broken: 0,
+        };
+        let value = serde_json::to_value(&full).expect("JSON");
+        for (name, place) in COLUMNS.iter().filter(|(_, place)| !place.is_empty()) {
+            assert!(value.pointer(place).is_some_and(|value| !value.is_null()), "{name}");
+        }
+    }
+}

@@ -1,0 +1,194 @@
+use super::*;
+use bench::{Offer, Wanted, offer};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_model::error::invalid;
+use testing::Damaged;
+use variant::{Driven, Label};
+
+/// The CPU, healthy and damaged, and a variant that cannot be made.
+struct Mixed {
+    damage: f32,
+}
+
+impl Bench for Mixed {
+    fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
+        let label = |name: &str| Label::new(name, Backend::Cpu, &load.scene);
+        let cpu = |label: Label| Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
+        let bad = |label: Label| Ok(Damaged::new(cpu(label), self.damage));
+        vec![offer(wanted, label("good"), |label| Ok(cpu(label))), offer(wanted, label("bad"), bad)]
+    }
+
+    fn roofs(&self, _backend: Backend) -> Roofs {
+        Roofs { copy_gbs: Some(10.0), read_gbs: Some(12.0), ..Roofs::default() }
+    }
+}
+
+fn request(sources: Vec<Source>) -> Request {
+    Request { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
+}
+
+fn report(damage: f32) -> Report {
+    let sources = vec![Source::Synthetic(Kind::Plant(1)), Source::Synthetic(Kind::Single { power: 14, rank: 10 })];
+    let mut heard = Vec::new();
+    let hear = |told: Progress<'_>| {
+        heard.push(match told {
+            Progress::Begins(what) => what.to_owned(),
+            Progress::Measured(report) => format!("{} {:?}", report.rows.len(), report.missing),
+        });
+        Ok(())
+    };
+    let report = deform(&request(sources), &Mixed { damage }, hear).expect("a report");
+    assert!(heard[0].starts_with("plant-2: ") && heard[2].starts_with("single-14-10: "), "{heard:?}");
+    assert_eq!([&heard[1], &heard[3]], ["4 [\"single-14-10\"]", "8 []"]);
+    report
+}
+
+#[test]
+fn a_run_that_is_cut_short_has_written_what_it_had_and_says_what_is_missing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let absent = Source::Scene { source: "absent".into(), record: None };
+    let request = request(vec![Source::Synthetic(Kind::C), absent]);
+    let keep = |told: Progress<'_>| match told {
+        Progress::Measured(report) => report.write(folder.path()),
+        Progress::Begins(_) => Ok(()),
+    };
+    deform(&request, &Mixed { damage: 0.0 }, keep).expect_err("no such scene");
+    let json = std::fs::read(folder.path().join("report.json")).expect("written");
+    let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
+    assert_eq!((&json["missing"][0], json["rows"].as_array().map(Vec::len)), (&"absent".into(), Some(4)));
+    let page = std::fs::read_to_string(folder.path().join("report.md")).expect("written");
+    assert!(page.contains("Not measured yet: absent."), "{page}");
+    let mut names = std::fs::read_dir(folder.path()).expect("listed").map(|entry| entry.expect("one").file_name());
+    assert!(
+        names.all(|name| name.to_string_lossy().starts_with("report.") && !name.to_string_lossy().ends_with("part"))
+    );
+}
+
+#[test]
+fn a_report_writes_all_files_and_they_read_back() {
+    let report = report(0.0);
+    assert!(report.passed(), "{:?}", report.failed);
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("new");
+    report.write(&out).expect("written");
+    let read = |name: &str| std::fs::read(out.join(name)).expect(name);
+    let json: serde_json::Value = serde_json::from_slice(&read("report.json")).expect("JSON");
+    assert_eq!(json["rows"].as_array().map(Vec::len), Some(8), "two loads, two variants, two caches");
+    assert_eq!(json["rows"][0]["passed"], true);
+    assert!(json["rows"][0]["of_read"].as_f64().expect("a share") > 0.0);
+    assert_eq!(json["made"]["version"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(json["thesis"]["tables_4_5_to_4_7"].as_array().map(Vec::len), Some(12));
+    let records = csv::Reader::from_reader(read("report.csv").as_slice()).records().count();
+    assert_eq!(records, 8);
+    assert!(String::from_utf8(read("report.md")).expect("UTF-8").contains("plant-2"));
+    assert!(read("report.svg").starts_with(b"<svg"));
+    let image = image::load_from_memory(&read("report.png")).expect("a PNG");
+    assert!(image.width() > 400);
+}
+
+#[test]
+fn a_damaged_variant_fails_the_report_by_name_and_is_not_timed() {
+    let report = report(0.01);
+    assert!(!report.passed());
+    assert_eq!(report.failed.len(), 2);
+    assert!(report.failed[0].starts_with("plant-2: bad: "), "{:?}", report.failed);
+    for row in &report.rows {
+        assert_eq!((row.passed, row.timing.is_some()), (row.name == "good", row.name == "good"));
+    }
+}
+
+#[test]
+fn a_variant_that_cannot_be_made_fails_the_report_by_name() {
+    struct Broken;
+    impl Bench for Broken {
+        fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
+            let label = Label::new("lost", Backend::Cuda, &load.scene);
+            vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
+        }
+    }
+    let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Broken, |_| Ok(())).expect("a report");
+    assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, given none"]);
+    assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
+}
+
+#[test]
+fn a_variant_that_lacks_what_is_not_here_is_left_out_with_the_reason_and_fails_nothing() {
+    struct Lacking;
+    impl Bench for Lacking {
+        fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
+            let label = Label::new("peer", Backend::Cuda, &load.scene);
+            let (reason, remedy) = ("not found".into(), "install it".into());
+            vec![(label, Err(modalcast_model::error::Error::Unavailable { what: "a library", reason, remedy }))]
+        }
+    }
+    let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| Ok(())).expect("a report");
+    assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
+    assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
+}
+
+#[test]
+fn steps_that_differ_when_they_are_read_beside_the_next_fail_the_report_and_equal_ones_are_shown() {
+    struct Beside(usize);
+    impl Bench for Beside {
+        fn variants(&self, _load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
+            Vec::new()
+        }
+
+        fn overlap(
+            &self,
+            _load: &Load,
+            states: &[modalcast_model::scene::State],
+            steps: usize,
+        ) -> Option<Result<Overlap>> {
+            assert_eq!(states.len(), ROTATING);
+            let us = 12.5;
+            let (cores, [bytes_in, bytes_out]) = (2, [1, 2]);
+            let [write_one_core_us, write_us, graph_us, copy_out_us, step_us, ideal_us] = [us; 6];
+            let [serial_us, fetched_us, overlapped_us, gain] = [4.0 * us, 3.0 * us, 2.0 * us, 2.0];
+            let differing = self.0;
+            Some(Ok(Overlap {
+                steps,
+                cores,
+                bytes_in,
+                bytes_out,
+                write_one_core_us,
+                write_us,
+                graph_us,
+                copy_out_us,
+                step_us,
+                serial_us,
+                fetched_us,
+                overlapped_us,
+                gain,
+                ideal_us,
+                differing,
+            }))
+        }
+    }
+    let made = |differing, variants: &[&str]| {
+        let variants = variants.iter().map(|name| (*name).to_owned()).collect();
+        let request = Request { variants, ..request(vec![Source::Synthetic(Kind::C)]) };
+        deform(&request, &Beside(differing), |_| Ok(())).expect("a report")
+    };
+    assert_eq!(made(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
+    let good = made(0, &["cuda overlap"]);
+    assert!(good.passed());
+    assert!(page::markdown(&good).contains("50.0 one after the other, 37.5"));
+    assert_eq!(made(3, &["cpu*"]).loads[0].overlap, None, "not asked for");
+}
+
+#[test]
+fn a_scene_of_the_user_is_measured_under_its_own_name() {
+    let source = Source::Scene { source: "tree".into(), record: None };
+    let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| Ok(())).expect("a report");
+    assert!(report.passed(), "{:?}", report.failed);
+    assert_eq!((report.loads[0].name.as_str(), report.loads[0].recorded), ("tree", false));
+    assert!(
+        deform(
+            &request(vec![Source::Scene { source: "absent".into(), record: None }]),
+            &Mixed { damage: 0.0 },
+            |_| Ok(())
+        )
+        .is_err()
+    );
+}

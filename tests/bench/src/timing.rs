@@ -1,0 +1,149 @@
+//! Medians of run times, with caches warm or swept.
+
+use std::time::Instant;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use modalcast_model::error::Result;
+
+/// What the caches hold when a step begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Cache {
+    /// What the step before left there.
+    Warm,
+    /// Nothing of use: something larger than the last level was swept through before.
+    Cold,
+}
+
+impl Cache {
+    /// The name in tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Warm => "warm",
+            Self::Cold => "cold",
+        }
+    }
+}
+
+/// Median and quartiles of a step's run time, microseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Timing {
+    pub median_us: f64,
+    pub q1_us: f64,
+    pub q3_us: f64,
+    pub replays: usize,
+}
+
+/// The fewest repetitions that a median is taken of.
+pub const FEWEST: usize = 20;
+/// After so many seconds no repetition beyond [`FEWEST`] begins.
+const PATIENCE: f64 = 5.0;
+/// The sweep of a machine that does not tell its caches.
+const SWEEP: usize = 64 << 20;
+
+impl Timing {
+    /// Median and quartiles of some times; `None` of none.
+    pub fn of(mut times: Vec<f64>) -> Option<Self> {
+        times.sort_by(f64::total_cmp);
+        let last = times.len().checked_sub(1)?;
+        let at = |share: f64| {
+            let place = share * last as f64;
+            let (below, above) = (times[place.floor() as usize], times[place.ceil() as usize]);
+            below + (above - below) * place.fract()
+        };
+        Some(Self { median_us: at(0.5), q1_us: at(0.25), q3_us: at(0.75), replays: times.len() })
+    }
+
+    /// Runs `step` with 0, 1, 2, ... by the wall clock: once for nothing, then [`FEWEST`] to `replays` times.
+    ///
+    /// # Errors
+    /// Those of `step`.
+    pub fn by_wall_clock(
+        cache: Cache,
+        replays: usize,
+        mut step: impl FnMut(usize) -> Result<()>,
+    ) -> Result<Option<Self>> {
+        let mut sweep = (cache == Cache::Cold).then(Sweep::new);
+        step(0)?;
+        let (start, mut times) = (Instant::now(), Vec::new());
+        for replay in 0..replays.max(FEWEST) {
+            if replay >= FEWEST && start.elapsed().as_secs_f64() > PATIENCE {
+                break;
+            }
+            if let Some(sweep) = &mut sweep {
+                sweep.run();
+            }
+            let begin = Instant::now();
+            step(1 + replay)?;
+            times.push(begin.elapsed().as_secs_f64() * 1e6);
+        }
+        Ok(Self::of(times))
+    }
+}
+
+/// A buffer larger than all caches together.
+struct Sweep(Vec<u64>);
+
+impl Sweep {
+    fn new() -> Self {
+        // Each of several sockets has a last level; twice one of them and the usual minimum cover what machines have.
+        Self(vec![1; (2 * largest_cache()).max(SWEEP) / 8])
+    }
+
+    /// Writes all of it from all cores.
+    fn run(&mut self) {
+        let each = self.0.len().div_ceil(4 * rayon::current_num_threads()).max(1);
+        self.0.par_chunks_mut(each).for_each(|part| part.iter_mut().for_each(|word| *word = word.wrapping_add(1)));
+    }
+}
+
+/// Bytes of the last-level cache, as Linux tells; 0 elsewhere.
+fn largest_cache() -> usize {
+    let size = |index: usize| {
+        let path = format!("/sys/devices/system/cpu/cpu0/cache/index{index}/size");
+        let text = std::fs::read_to_string(path).ok()?;
+        let text = text.trim();
+        let (number, unit) = text.split_at(text.find(|letter: char| !letter.is_ascii_digit()).unwrap_or(text.len()));
+        let unit = match unit {
+            "K" => 1 << 10,
+            "M" => 1 << 20,
+            _ => 1,
+        };
+        Some(number.parse::<usize>().ok()? * unit)
+    };
+    (0..8).filter_map(size).max().unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_median_and_the_quartiles_of_five_numbers_are_its_second_third_and_fourth() {
+        let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("five");
+        assert_eq!((timing.q1_us, timing.median_us, timing.q3_us, timing.replays), (2.0, 3.0, 4.0, 5));
+        assert_eq!(Timing::of(vec![1.0, 2.0]).map(|timing| timing.median_us), Some(1.5));
+        assert_eq!(Timing::of(vec![]), None);
+    }
+
+    #[test]
+    fn at_least_twenty_repetitions_are_timed_and_one_is_thrown_away() {
+        for (cache, replays, want) in [(Cache::Warm, 3, 20), (Cache::Warm, 31, 31), (Cache::Cold, 1, 20)] {
+            let mut runs = Vec::new();
+            let timing = Timing::by_wall_clock(cache, replays, |run| {
+                runs.push(run);
+                Ok(())
+            });
+            assert_eq!(timing.expect("timed").map(|timing| timing.replays), Some(want));
+            assert_eq!(runs, (0..=want).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn a_step_that_fails_ends_it() {
+        let fault = modalcast_model::error::invalid("x", "y", "z");
+        assert_eq!(Timing::by_wall_clock(Cache::Warm, 20, |_| Err(fault.clone())), Err(fault));
+    }
+}

@@ -1,0 +1,133 @@
+//! Many coordinate vectors for one U: tensor cores against their bound, and what batches cost.
+
+use std::sync::Arc;
+
+use modalcast_bench::kernels::{BatchMma, Cache, Extent, Ours, Trial, gigabytes_per_second, time};
+use modalcast_compute::gpu::{Device, Launch};
+use modalcast_compute::storage::bound::{Reaches, Step};
+use modalcast_compute::storage::{Products, QUAD, TILE_QUADS, Tiles};
+use modalcast_model::scene::{Batches, Deformation, Scene, State, Storage};
+
+use crate::ensembles::{ensemble, made, states, stored};
+use crate::judge::same_bits;
+use crate::scenes;
+
+/// The largest error of a vertex over the bound of its tile: of U in 16 bits, of q in two numbers of 16 bits, and of the
+/// tensor cores' own sums.
+fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
+    let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
+    let tiles = Tiles::new(shape, storage);
+    let (reaches, products) = (Reaches::new(shape, &tiles), Products::of(storage, tiles.rank()));
+    let vertices = shape.mesh.rest().len();
+    let want = modalcast_compute::reference::deform(scene, state);
+    let share = |(packed, got): (usize, &[f32; 3])| {
+        let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));
+        let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated: false };
+        let bound = reaches.tile(tile, &step).total() + reaches.products(tile, &step, products);
+        let square = |axis: usize| (f64::from(got[axis]) - want[packed][axis]).powi(2);
+        let error = (0..3).map(square).sum::<f64>().sqrt();
+        if error.is_nan() { f64::INFINITY } else { error / bound }
+    };
+    positions.as_chunks::<3>().0.iter().enumerate().map(share).fold(0.0, f64::max)
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_count() {
+    let device = Device::open(0).expect("a CUDA device");
+    for storage in [Storage::F16, Storage::Bf16] {
+        for (vertices, rank, count) in [
+            (1, 3, 1),
+            (33, 0, 2),
+            (64, 1, 16),
+            (127, 4, 5),
+            (128, 33, 16),
+            (129, 16, 8),
+            (261, 31, 32),
+            (2000, 32, 16),
+            (5003, 512, 13),
+        ] {
+            let scene = made(ensemble((vertices, rank, count), stored(storage)));
+            let states = states(&scene);
+            let batch = BatchMma::new(&device, &scene, &states).expect("a trial");
+            let name = format!("{} n {vertices} r {rank}", batch.name());
+            for (turn, state) in states.iter().enumerate() {
+                batch.launch(&device, turn).expect("launches");
+                let got = batch.positions(&device).expect("copies");
+                let share = of_bound(&scene, state, &got);
+                assert!(share <= 1.0, "{name} turn {turn}: {share} of the bound");
+                let other = of_bound(&scene, &states[(turn + 1) % states.len()], &got);
+                assert!(other > 1.0, "{name}: the judge can fail");
+                batch.launch(&device, turn).expect("launches");
+                assert!(same_bits(&got, &batch.positions(&device).expect("copies")), "{name}: run after run");
+            }
+            for facts in batch.kernels() {
+                assert!(facts.spilled_bytes == 0, "{name}: {facts:?}");
+            }
+        }
+    }
+    let refused = |scene: &Arc<Scene>| BatchMma::new(&device, scene, &states(scene)).expect_err("refused");
+    assert!(refused(&made(ensemble((9, 2, 2), stored(Storage::F32)))).to_string().contains("f16 or bf16"));
+    assert!(refused(&made(ensemble((9, 2, 33), stored(Storage::F16)))).to_string().contains("at most 32"));
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_sixteen_vectors_at_once_take_less_than_half_as_long_as_one_after_the_other() {
+    let device = Device::open(0).expect("a CUDA device");
+    let measure = |trial: &dyn Trial| {
+        let us = time(&device, trial, Cache::Warm, 200).expect("times").median_us;
+        let bytes: u64 = trial.bytes().iter().map(|(_, bytes)| bytes).sum();
+        let rate = gigabytes_per_second(bytes, us);
+        eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", trial.name(), trial.kernels());
+        us
+    };
+    for storage in Storage::ALL {
+        let batched = Deformation { batches: Batches::Always, ..stored(storage) };
+        let scene = made(ensemble((1_500_000, 32, 1), batched));
+        let state = scenes::state(&scene, 1);
+        let one = measure(&Ours::new(&device, &scene, &[state], Extent::Positions).expect("a trial"));
+        let scene = made(ensemble((1_500_000, 32, 16), batched));
+        let state = scenes::state(&scene, 1);
+        let sixteen = Ours::new(&device, &scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
+        assert_eq!(sixteen.kernels()[0].name, "batch");
+        let sixteen = measure(&sixteen);
+        eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
+        assert!(sixteen < 8.0 * one, "{storage:?} {one} {sixteen}");
+        if matches!(storage, Storage::F16 | Storage::Bf16) {
+            let products = measure(&BatchMma::new(&device, &scene, &[state]).expect("a trial"));
+            eprintln!("{} by tensor cores: {:.2} times as long as one", storage.name(), products / one);
+            assert!(products < 8.0 * one, "{storage:?} {one} {products}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_scenes_that_choose_have_batches_where_they_pay() {
+    let device = Device::open(0).expect("a CUDA device");
+    let mut slow = Vec::new();
+    for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {
+        for count in [2, 3, 4, 8, 16, 64] {
+            if vertices * count * rank > 1 << 29 {
+                continue;
+            }
+            let of =
+                |batches| made(ensemble((vertices, rank, count), Deformation { batches, ..Deformation::default() }));
+            let [together, apart, chosen] = [Batches::Always, Batches::Never, Batches::Auto].map(of);
+            let state = scenes::state(&together, 1);
+            let measured = |scene: &Arc<Scene>| {
+                let ours = Ours::new(&device, scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
+                time(&device, &ours, Cache::Warm, 100).expect("times").median_us
+            };
+            let [batch, alone] = [&together, &apart].map(measured);
+            let chooses = modalcast_compute::gpu::plan(&chosen).kernel(Launch::Batch).is_some();
+            eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
+            let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
+            if own > 1.5 * other + 2.0 {
+                slow.push((vertices, rank, count, own, other));
+            }
+        }
+    }
+    assert!(slow.is_empty(), "chosen and slower: {slow:?}");
+}

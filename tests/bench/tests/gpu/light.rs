@@ -1,0 +1,38 @@
+//! What measuring light space costs of a step.
+
+use modalcast_bench::kernels::{Cache, Extent, Ours, Trial, time};
+use modalcast_compute::gpu::Device;
+use modalcast_model::scene::Scene;
+
+use crate::scenes::{self, Random};
+
+/// Microseconds of a whole step of a scene with a shadow and without.
+fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
+    let device = Device::open(0).expect("a CUDA device");
+    let with = [true, false].map(|is_lit| {
+        let mut parts = scenes::parts(vec![scenes::shape(&mut Random(9), vertices, rank)]);
+        parts.domains = vec![scenes::domain(0, 0); instances];
+        parts.look.shadow = parts.look.shadow.filter(|_| is_lit);
+        let scene = Scene::new(parts).expect("a scene");
+        let trial = Ours::new(&device, &scene, &[scenes::state(&scene, 1)], Extent::Whole).expect("a trial");
+        trial.kernels().iter().for_each(|facts| eprintln!("{name}, shadow {is_lit}: {facts:?}"));
+        time(&device, &trial, Cache::Warm, 300).expect("times").median_us
+    });
+    eprintln!("{name}: {:.2} us a step with light space, {:.2} us without", with[0], with[1]);
+    with
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_light_space_costs_little_of_a_step() {
+    // Shapes are of so many vertices and modes.
+    for (name, shape, instances) in [
+        ("one domain of 16,085", (16_085, 20), 1),
+        ("a million vertices", (1_000_000, 32), 1),
+        ("20,000 domains of 7", (7, 3), 20_000),
+        ("200,000 domains of 60", (60, 0), 200_000),
+    ] {
+        let [with, without] = costs(name, shape, instances);
+        assert!(with > 0.0 && with < 1.1 * without + 5.0, "{name}: {with} and {without} us");
+    }
+}

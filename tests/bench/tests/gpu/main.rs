@@ -1,0 +1,21 @@
+//! The benchmarks on a real device. Everything that needs one is ignored without it; run with
+//! `--include-ignored --test-threads=1`. The binary needs no build tree.
+
+mod batch;
+#[path = "../../../both/cut_outs.rs"]
+mod cut_outs;
+#[path = "../../../gpu/ensembles.rs"]
+mod ensembles;
+#[expect(dead_code, reason = "shared with the tests of the deformer")]
+#[path = "../../../gpu/judge.rs"]
+mod judge;
+mod light;
+mod overlap;
+mod raster;
+mod raster_cut_outs;
+mod report;
+#[path = "../../../gpu/scenes.rs"]
+mod scenes;
+#[path = "../../../both/soups.rs"]
+mod soups;
+mod trials;

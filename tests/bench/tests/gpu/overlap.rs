@@ -1,0 +1,26 @@
+//! Steps that the host reads, one after the other and overlapped.
+
+use modalcast_bench::kernels::{host_writes, overlap};
+use modalcast_compute::gpu::Device;
+use modalcast_model::scene::State;
+
+use crate::scenes;
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_overlap_is_measured_and_its_vertices_are_those_of_the_serial_way() {
+    let device = Device::open(0).expect("a CUDA device");
+    let scene = scenes::scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
+    let states: Vec<State> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();
+    let found = overlap(&device, &scene, &states, 50).expect("measures");
+    eprintln!("{found:#?}");
+    assert_eq!(found.differing, 0);
+    let times = [found.serial_us, found.fetched_us, found.overlapped_us, found.graph_us, found.copy_out_us];
+    assert!(times.iter().chain([&found.write_us, &found.step_us]).all(|time| time.is_finite() && *time > 0.0));
+    assert!(found.overlapped_us < found.serial_us, "what runs side by side takes less time");
+    assert!(found.overlapped_us > 0.5 * found.ideal_us, "and no less than its longest part");
+    assert!(overlap(&device, &scene, &[], 5).is_err() && overlap(&device, &scene, &states, 0).is_err());
+    for write in host_writes(&device, 20).expect("writes") {
+        eprintln!("{write:?}");
+    }
+}

@@ -1,0 +1,126 @@
+//! Cut-outs on the device, whoever draws them, against the definition: the same bits where the filter has nothing to say,
+//! and away from the threshold where it has.
+
+use modalcast_bench::kernels::{Raster, RasterMesh, Trial as _};
+use modalcast_compute::gpu::{Device, RasterForm, Spread};
+
+use crate::cut_outs::{Holes, floor, image, plain_holes, sheet};
+use crate::scenes::Random;
+
+/// Hardware mixes texels and levels by weights of 8 bits (CUDA C++ programming guide, "Texture fetching"): three mixes are
+/// 3/256. It finds the level by a logarithm of its own, taken here to be right to a sixteenth of a level, where levels
+/// differ by half at most.
+const TOLERANCE: f32 = 1.0 / 16.0;
+
+const SPREADS: [Spread; 3] = [Spread::BySize, Spread::Warps, Spread::Tiles];
+
+fn launched(device: &Device, holes: &Holes, form: RasterForm) -> Raster {
+    let soup = &holes.soup;
+    let (positions, triangles, groups) = (&soup.positions, &soup.triangles, &soup.groups);
+    let mesh = RasterMesh { positions, triangles, groups, cut_outs: Some(&holes.cut_outs) };
+    let raster = Raster::new(device, mesh, soup.window, form).expect("a raster");
+    (0..2).for_each(|_| raster.launch(device, 0).expect("launches"));
+    raster
+}
+
+fn keys(device: &Device, holes: &Holes, spread: Spread) -> Vec<u64> {
+    let form = RasterForm { spread, ..RasterForm::default() };
+    launched(device, holes, form).keys(device).expect("keys")
+}
+
+fn depths(device: &Device, holes: &Holes) -> Vec<u32> {
+    let form = RasterForm { depth_only: true, ..RasterForm::default() };
+    launched(device, holes, form).depths(device).expect("depths").into_iter().map(f32::to_bits).collect()
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_images_that_say_the_same_everywhere_have_the_bits_of_the_definition_on_every_path() {
+    let device = Device::open(0).expect("a CUDA device");
+    for holes in plain_holes() {
+        let want = holes.drawn();
+        for spread in SPREADS {
+            let got = keys(&device, &holes, spread);
+            let wrong = got.iter().zip(&want.keys).filter(|(got, want)| got != want).count();
+            assert_eq!(wrong, 0, "{} by {spread:?}: of {} samples", holes.soup.name, got.len());
+        }
+        let bits: Vec<u32> = want.depths().into_iter().map(f32::to_bits).collect();
+        assert!(depths(&device, &holes) == bits, "{}: depth alone", holes.soup.name);
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_sheet_is_its_image_texel_by_texel_and_its_next_level_at_half_the_size() {
+    let device = Device::open(0).expect("a CUDA device");
+    let mut random = Random(3);
+    let own = image(64, 64, |_, _, _| if random.number() < 0.0 { 0 } else { 255 });
+    for level in [0, 1] {
+        for spread in SPREADS {
+            let holes = sheet(64 >> level, own.clone());
+            let got: Vec<bool> = keys(&device, &holes, spread).iter().map(|key| *key != u64::MAX).collect();
+            let want: Vec<bool> = own.levels[level].iter().map(|texel| *texel == 255).collect();
+            assert!(got == want, "level {level} by {spread:?}");
+            assert!(got.iter().rev().ne(&want), "the judge can fail");
+        }
+    }
+}
+
+/// Samples that differ where nothing is in doubt, and those in doubt.
+fn beyond_doubt(holes: &Holes, got: &[u64]) -> (usize, usize) {
+    let (want, doubtful) = (holes.drawn().keys, holes.doubtful(TOLERANCE));
+    let wrong = (0..got.len()).filter(|at| got[*at] != want[*at] && !doubtful[*at]).count();
+    (wrong, doubtful.iter().filter(|doubt| **doubt).count())
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_a_floor_in_perspective_that_goes_on_behind_the_eye_is_cut_out_as_the_definition_says() {
+    let device = Device::open(0).expect("a CUDA device");
+    let mut holes = floor(1);
+    let got = keys(&device, &holes, Spread::BySize);
+    let (wrong, doubtful) = beyond_doubt(&holes, &got);
+    eprintln!("a floor: {wrong} of {} samples differ, {doubtful} are in doubt", got.len());
+    assert_eq!(wrong, 0, "{doubtful} of {} in doubt", got.len());
+    assert!(doubtful < got.len() / 8, "{doubtful} of {} in doubt", got.len());
+    // Controls: another threshold, and coordinates that are off by a tenth.
+    holes.cut_outs.table[0].least += 4.0 * TOLERANCE;
+    assert!(beyond_doubt(&holes, &got).0 > 100);
+    holes.cut_outs.table[0].least -= 4.0 * TOLERANCE;
+    holes.cut_outs.uvs.as_flattened_mut().iter_mut().for_each(|uv| uv[0] += 0.1);
+    assert!(beyond_doubt(&holes, &got).0 > 100);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_small_and_medium_pieces_of_a_floor_are_cut_out_as_the_definition_says() {
+    let device = Device::open(0).expect("a CUDA device");
+    for (cuts, spread) in [(60_u32, Spread::BySize), (12, Spread::BySize), (12, Spread::Warps), (12, Spread::Tiles)] {
+        let holes = floor(cuts);
+        let got = keys(&device, &holes, spread);
+        let (wrong, doubtful) = beyond_doubt(&holes, &got);
+        assert_eq!(wrong, 0, "{cuts} by {spread:?}, {doubtful} of {} in doubt", got.len());
+        assert!(doubtful < got.len() / 8, "{doubtful} of {} in doubt", got.len());
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_filtering_along_the_footprint_keeps_more_of_far_stripes_than_the_mean_of_all() {
+    let device = Device::open(0).expect("a CUDA device");
+    let mut holes = floor(1);
+    // Stripes along the view: their levels are grey soon, which is below the threshold.
+    holes.cut_outs.images[0] = image(64, 32, |level, column, _| match (level, column / 8 % 2) {
+        (0, 0) => 255,
+        (0, _) => 0,
+        _ => 90,
+    });
+    let floor_samples = |holes: &Holes| {
+        let got = keys(&device, holes, Spread::BySize);
+        got.iter().filter(|key| **key != u64::MAX && **key as u32 >= 2).count()
+    };
+    let alike = floor_samples(&holes);
+    holes.cut_outs.anisotropy = 16.0;
+    let along = floor_samples(&holes);
+    assert!(along > alike + alike / 20, "{along} samples along the footprint, {alike} alike in all directions");
+}

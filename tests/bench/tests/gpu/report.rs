@@ -1,0 +1,25 @@
+//! The report with everything that a device has: every trial stays within its bound, and every load has timed ones.
+
+use modalcast_bench::bench::Machine;
+use modalcast_bench::loads::{Kind, Size};
+use modalcast_bench::{Request, Source, deform};
+use modalcast_model::deform::Backend;
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_every_variant_of_small_loads_stays_within_its_bound_and_is_timed() {
+    let names = ["single-14-20", "a", "a-positions", "b", "c", "cancel", "batch", "plant-2", "plant-5"];
+    let kinds = names.iter().flat_map(|name| Kind::named(name).expect("a load"));
+    let sources = kinds.map(Source::Synthetic).collect();
+    let (steps, variants) = (usize::MAX, Vec::new());
+    let request = Request { sources, seeds: 4, replays: 20, steps, variants, size: Size::Quick };
+    let report = deform(&request, &Machine::open(), |_| Ok(())).expect("a report");
+    assert!(report.passed(), "{:#?}", report.failed);
+    assert!(report.remarks.is_empty(), "{:?}", report.remarks);
+    for load in names {
+        let timed = |row: &&modalcast_bench::table::Row| row.load == load && row.backend == Backend::Cuda;
+        let rows: Vec<_> = report.rows.iter().filter(timed).filter(|row| !row.left_out).collect();
+        assert!(rows.iter().filter(|row| row.timing.is_some() && row.of_copy.is_some()).count() >= 4, "{load}");
+        assert!(rows.iter().any(|row| !row.kernels.is_empty()), "{load}: no kernel tells its registers");
+    }
+}

@@ -1,0 +1,168 @@
+//! What is measured beside the deformer: the roofs of the device, and the trials, each judged by the f64 twin.
+
+use std::sync::Arc;
+
+use modalcast_bench::kernels::{Cache, Cublas, Part, Peer, Split, Thesis, Trial, empty_replay, roofs, time};
+use modalcast_compute::gpu::Device;
+use modalcast_model::error::Error;
+use modalcast_model::scene::{Bounds, Scene, State};
+
+use crate::judge::{POSITION, largest_error};
+use crate::scenes;
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_roofs_are_of_one_size_and_an_empty_replay_takes_time() {
+    let device = Device::open(0).expect("a CUDA device");
+    let roofs = roofs(&device).expect("roofs");
+    eprintln!("{}: {roofs:?}", device.name());
+    assert!(roofs.copy_gbs > 20.0 && roofs.pinned_h2d_gbs > 1.0 && roofs.pinned_d2h_gbs > 1.0, "{roofs:?}");
+    assert!((0.8..1.6).contains(&(roofs.read_gbs / roofs.copy_gbs)), "reading is about as fast as copying: {roofs:?}");
+    assert!(roofs.pinned_h2d_gbs < roofs.copy_gbs, "{roofs:?}");
+    let empty = empty_replay(&device, 100).expect("replays");
+    assert!(empty.replays == 100 && empty.q1_us <= empty.median_us && empty.median_us <= empty.q3_us, "{empty:?}");
+    assert!((0.1..100.0).contains(&empty.median_us), "{empty:?}");
+    assert!(empty_replay(&device, 0).is_err());
+}
+
+/// Whether a triangle names each packed vertex: those that none names are not computed from unfolded triangles.
+fn named(scene: &Scene) -> Vec<bool> {
+    let mut named = vec![false; scene.layout.vertices];
+    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+        let mesh = &scene.shape_of(domain).mesh;
+        for corner in mesh.triangles().as_flattened() {
+            named[slot.first_vertex + mesh.corners().vertices[*corner as usize] as usize] = true;
+        }
+    }
+    named
+}
+
+/// The largest error of a trial's positions where a triangle names the vertex, as a part of the diagonal.
+fn judge(scene: &Scene, state: &State, positions: &[f32]) -> Result<f64, String> {
+    let (named, want) = (named(scene), modalcast_compute::reference::deform(scene, state));
+    if positions.len() != 3 * named.len() {
+        return Err(format!("{} numbers for {} vertices", positions.len(), named.len()));
+    }
+    let mut bounds = Bounds::EMPTY;
+    want.iter().for_each(|position| bounds.include(*position));
+    // One vertex has no diagonal; shapes lie in a cube of side 2.
+    let diagonal = bounds.diagonal().max(1.0);
+    let kept = |vertex: &usize| named[*vertex];
+    let got: Vec<f32> = (0..named.len()).filter(kept).flat_map(|at| positions[3 * at..][..3].to_vec()).collect();
+    let want: Vec<[f64; 3]> = (0..named.len()).filter(kept).map(|vertex| want[vertex]).collect();
+    largest_error(&got, &want, POSITION * diagonal).map(|error| error / diagonal)
+}
+
+/// Judges every turn of a trial, launched and replayed.
+fn check(device: &Device, scene: &Arc<Scene>, states: &[State], trial: &dyn Trial) {
+    let name = trial.name();
+    assert_eq!(trial.turns(), states.len(), "{name}");
+    for (turn, state) in states.iter().enumerate() {
+        trial.launch(device, turn).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let positions = trial.positions(device).expect("copies");
+        let error = judge(scene, state, &positions).unwrap_or_else(|error| panic!("{name} turn {turn}: {error}"));
+        assert!(judge(scene, &states[(turn + 1) % states.len()], &positions).is_err(), "{name}: the judge can fail");
+        eprintln!("{name} turn {turn}: {error:.2e} of the diagonal");
+    }
+    // The last replay is of the last turn.
+    for cache in [Cache::Warm, Cache::Cold] {
+        trial.launch(device, 0).expect("launches");
+        let timing = time(device, trial, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let positions = trial.positions(device).expect("copies");
+        let last = states.len() - 1;
+        judge(scene, &states[last], &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
+        eprintln!("{name} {cache:?}: {timing:?}, {} launches", trial.launches());
+    }
+    assert!(trial.bytes().iter().map(|(_, bytes)| bytes).sum::<u64>() > 0, "{name}");
+    for facts in trial.kernels() {
+        assert!(facts.registers > 0 && facts.spilled_bytes == 0, "{name}: {facts:?}");
+    }
+}
+
+fn states(scene: &Scene) -> Vec<State> {
+    (1..=3).map(|seed| scenes::state(scene, seed)).collect()
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_thesis_s_single_domain_kernel_equals_the_twin_at_its_own_ranks() {
+    single(&[1, 10, 33]);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_thesis_s_single_domain_kernel_equals_the_twin_at_every_rank() {
+    single(&[3, 20, 30, 32, 129, 512]);
+}
+
+fn single(ranks: &[usize]) {
+    let device = Device::open(0).expect("a CUDA device");
+    for rank in ranks.iter().copied() {
+        for (vertices, normal_maps) in [(1, false), (33, true), (5003, false)] {
+            let scene = scenes::scene(&[(vertices, rank)], 1, normal_maps, false);
+            for part in [Part::Uq, Part::Whole] {
+                let trial = Thesis::single(&device, &scene, &states(&scene), part).expect("a trial");
+                check(&device, &scene, &states(&scene), &trial);
+            }
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_the_thesis_s_grouped_kernels_equal_the_twin_with_one_two_and_four_kernels() {
+    let device = Device::open(0).expect("a CUDA device");
+    let shapes: Vec<_> = (0..66).map(|index| (1 + index * 29 % 611, index % 33)).collect();
+    let scene = scenes::scene(&shapes, 2, true, false);
+    for split in Split::ALL {
+        for part in [Part::Uq, Part::Whole] {
+            let trial = Thesis::multi(&device, &scene, &states(&scene), (split, part)).expect("a trial");
+            check(&device, &scene, &states(&scene), &trial);
+            assert_eq!(trial.launches(), split.widths().len() + usize::from(part == Part::Whole));
+        }
+    }
+    let rigid = scenes::scene(&[(40, 0)], 3, false, true);
+    let update_alone = Thesis::multi(&device, &rigid, &states(&rigid), (Split::Two, Part::Whole)).expect("a trial");
+    check(&device, &rigid, &states(&rigid), &update_alone);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_cublas_gives_every_domain_its_u_however_domains_are_put_together() {
+    let device = Device::open(0).expect("a CUDA device");
+    let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
+    let many = scenes::scene(&shapes, 2, false, false);
+    let (one, instances) =
+        (scenes::scene(&[(5003, 30)], 1, false, false), scenes::scene(&[(5003, 32)], 16, false, false));
+    for peer in Peer::ALL {
+        let scene = match peer {
+            Peer::SgemvColumns | Peer::SgemvRows => &one,
+            Peer::Instances => &instances,
+            _ => &many,
+        };
+        for part in [Part::Uq, Part::Whole] {
+            match Cublas::new(&device, scene, &states(scene), (peer, part)) {
+                Ok(trial) => check(&device, scene, &states(scene), &trial),
+                Err(Error::Unavailable { what: "cuBLAS", reason, .. }) => {
+                    eprintln!("{} not judged: {reason}", peer.name())
+                }
+                Err(error) => panic!("{}: {error}", peer.name()),
+            }
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_trials_refuse_scenes_that_they_are_not_for() {
+    let device = Device::open(0).expect("a CUDA device");
+    let (large, two) = (scenes::scene(&[(40, 33)], 1, false, false), scenes::scene(&[(40, 3)], 2, false, false));
+    let field = |refusal: Result<Thesis, Error>| match refusal {
+        Err(Error::Invalid { field, .. }) => field,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(field(Thesis::multi(&device, &large, &states(&large), (Split::Two, Part::Uq))), "domain 0: modes");
+    assert_eq!(field(Thesis::single(&device, &two, &states(&two), Part::Uq)), "scene.domains");
+    assert_eq!(field(Thesis::single(&device, &large, &[], Part::Uq)), "states");
+    assert_eq!(field(Thesis::single(&device, &large, &states(&two), Part::Uq)), "states");
+}
