@@ -14,7 +14,7 @@
 //! | blended | light of translucent triangles over each other; no depth writes | two-pass transparency, some triangle is blended |
 //! | count, scan, fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
 //! | resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |
-//! | backdrop | shades tiles that see sky and ground only; lists the other tiles (compute) | always |
+//! | backdrop | shades tiles that see no opaque triangle; lists the other tiles (compute) | always |
 //! | shade | Phong shading in the listed tiles; samples to pixels (compute) | some triangle is not blended |
 //! | bloom | spreads bright light, then applies the tone curve (compute) | the look has a bloom |
 //! | encode | linear light to sRGB bytes, top row first; smooths edges and dithers (compute) | always |
