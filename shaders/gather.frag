@@ -1,5 +1,5 @@
-// Adds a fragment of a blended triangle to the list of its pixel. One program takes three turns, so that all turns see
-// the same fragments. The first turn counts them, the second fills the lists, and the third adds ids to the kept depths
+// Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases see
+// the same fragments. The first phase counts them, the second fills the lists, and the third adds ids to the kept depths
 // of pixels with too many fragments. Early depth tests reject fragments behind opaque surfaces; fully transparent
 // fragments are skipped.
 layout(early_fragment_tests) in;

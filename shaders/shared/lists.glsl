@@ -12,7 +12,7 @@ layout(std430, binding = 3) buffer Ledger {
     uint most;           // maximum number of records per pixel
     uint used;           // allocated records
     uint budget;         // capacity in records
-    uint commands[10];   // two indirect draws of the turn for pixels above the maximum
+    uint commands[10];   // two indirect draws of the last phase, for pixels above the maximum
     uint bins[BINS];     // pixels with 1, 2, 3 ... fragments; the last bin also counts those with more
 } ledger;
 const uint ALL = 0xFFFFFFFFu;

@@ -33,7 +33,7 @@ const RECORD_BYTES: u64 = 8;
 /// Default budget in fragments per pixel, and its minimum per frame.
 const USUAL: u64 = 8;
 const FEWEST: u64 = 1 << 20;
-/// Turns of the gather program: count, fill, and add ids to the kept depths.
+/// Phases of the gather program: count, fill, and add ids to the kept depths.
 const COUNT: i32 = 0;
 const FILL: i32 = 1;
 const JOIN: i32 = 2;
@@ -225,7 +225,7 @@ pub(super) fn draw(
 /// The passes of exact transparency.
 pub(super) const PASSES: [&str; 4] = ["count", "scan", "fill", "resolve"];
 
-/// Draws all blended triangles for one turn. In the last turn the ledger gives the number of instances: none when all
+/// Draws all blended triangles for one phase. In the last phase the ledger gives the number of instances: none when all
 /// fragments fit.
 fn gather(
     gl: &Gl,

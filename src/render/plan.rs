@@ -134,8 +134,8 @@ fn culled(culling: Culling) -> Vec<&'static str> {
     }
 }
 
-/// Draw calls without occluders. Exact transparency draws blended triangles in three turns, the third only on demand;
-/// two-pass transparency draws their opaque parts in a second turn.
+/// Draw calls without occluders. Exact transparency draws blended triangles in three phases, the third only on demand;
+/// two-pass transparency draws their opaque parts in a second phase.
 fn draws(scene: &Scene, groups: &[Group]) -> usize {
     let blended = groups.iter().filter(|group| group.kind == Kind::Blend).count();
     let turns = match scene.look.transparency {

@@ -185,9 +185,9 @@ impl Program {
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
     }
 
-    /// Sets the turn of a program with several turns (location 1). This must be the bound program.
+    /// Sets the phase of a program with several phases (location 1). This must be the bound program.
     pub(crate) fn turn(&self, turn: i32) {
-        // SAFETY: a linked, bound program; shaders with several turns declare location 1.
+        // SAFETY: a linked, bound program; shaders with several phases declare location 1.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), turn) }
     }
 }
