@@ -102,7 +102,7 @@ impl Renderer {
             (ran.lists, ran.culled) =
                 (told(listed)?.map(|head| lists::told(&head)), told(culled)?.map(|counts| cull::told(&counts)));
         }
-        // The camera's triangles were not culled when the compute rasterizer drew the visibility.
+        // When the compute rasterizer drew the visibility there are no camera counts; the sun's are dropped with them.
         ran.culled = ran.culled.filter(|_| ran.paths.visibility != Some(Path::Cuda));
         let lent = staging.map(|staging| staging.lend(form.bytes() as usize)).transpose()?;
         self.gl.check("read")?;
