@@ -1,7 +1,8 @@
-// A translucent surface over the layers before it: the layer keeps the light of all of them, and in alpha the share of
-// what lies behind that still comes through. Shaded like all else.
+// Blends a translucent surface over the layers drawn before: the layer accumulates their light, and in alpha the
+// transmittance. Shading is the same as for opaque surfaces.
 in vec3 world;
-// Centroids: at the rim of a triangle the middle of the pixel may lie outside it, where images repeat and normals overshoot.
+// Centroid sampling: at the edge of a triangle the pixel center may lie outside it, where texture coordinates wrap
+// around and normals overshoot.
 centroid in vec3 normal_world;
 #ifdef UVS
 centroid in vec2 uv_image;
@@ -25,7 +26,7 @@ void main() {
 #endif
     normal = gl_FrontFacing ? normal : -normal;
 #ifdef OPAQUE_PARTS
-    // What reaches the threshold was drawn as opaque.
+    // Samples that reach the threshold were drawn as opaque.
     cut_in(material.ambient.a * tint.a, material.diffuse.a);
 #endif
     colour = vec4(phong(material, tint.rgb, normal, unbumped, world), material.ambient.a * tint.a);

@@ -1,4 +1,4 @@
-// One corner: its vertex of the deformed positions, its deformed normal and tangent, its texture coordinates.
+// A corner: position of its vertex, normal and tangent, all deformed, and texture coordinates.
 layout(location = 0) in uint vertex;
 layout(location = 1) in vec3 normal;
 layout(binding = 13) uniform samplerBuffer positions;

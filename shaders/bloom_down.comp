@@ -1,6 +1,6 @@
-// Halves a picture: texel d is the mean of texels 2 d - 1 to 2 d + 2 in each direction with weights 1, 3, 3, 1 (a quadratic
-// B-spline, which keeps sum and centroid; the pyramid is that of Burt and Adelson 1983). Beyond an edge the texel at the
-// edge is repeated, which keeps the sum too where the size is even.
+// Downsamples by two: texel d is the mean of texels 2 d - 1 to 2 d + 2 in each direction with weights 1, 3, 3, 1 (a
+// quadratic B-spline, which preserves sum and centroid; the pyramid is that of Burt and Adelson 1983). The edge texel
+// is repeated outside the image, which also preserves the sum for even sizes.
 //   from  [height][width]                RGBA16F (in)
 //   to    [ceil height/2][ceil width/2]  RGBA16F (out)
 layout(local_size_x = TILE, local_size_y = TILE) in;

@@ -1,7 +1,7 @@
-// Doubles a picture, with weights 3/4 and 1/4 of the nearest two texels in each direction (Chaikin 1974: repeated, it tends
-// to a quadratic B-spline), and adds it to the next finer one. All levels count the same: what comes from below is the
-// mean of `coarser` levels. The last adds the glow to the shaded picture, from which what began to glow is taken: what is
-// shown goes back to light and through the tone curve again.
+// Upsamples by two, with weights 3/4 and 1/4 of the nearest two texels in each direction (Chaikin 1974; repeated, it
+// converges to a quadratic B-spline), and adds the result to the next finer level. All levels have the same weight: the
+// input is the mean of `coarser` levels. The last step adds the glow to the shaded picture, from which the shading has
+// removed the light that began to glow: displayed values are converted back to light and through the tone curve again.
 //   from  [ceil height/2][ceil width/2]  RGBA16F (in)
 //   to    [height][width]                RGBA16F (in and out)
 layout(local_size_x = TILE, local_size_y = TILE) in;

@@ -1,6 +1,6 @@
-// One direction of the Gaussian blur (equation 3.11) for rasterisers in software, where reading a texture is cheaper
-// than shared memory. The first direction reads depth, the second the moments that the first wrote. One invocation
-// makes RUN texels in a row along its direction, so that a texel is read once for all of them.
+// One direction of the Gaussian blur (equation 3.11) for software rasterizers, where texture reads are cheaper than
+// shared memory. The first direction reads depth, the second the moments that the first wrote. An invocation writes RUN
+// consecutive texels along its direction, so that it reads each texel once for all of them.
 layout(local_size_x = LANES) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D to;
 
@@ -16,7 +16,7 @@ void main() {
     if (at.x >= side) return;
     vec2 sums[RUN];
     blur(at, along, side, sums);
-    // Stores beyond the edge of the map are dropped.
+    // Stores outside the map have no effect.
     for (int index = 0; index < RUN; index++) {
         imageStore(to, at + index * along, vec4(sums[index], 0.0, 0.0));
     }

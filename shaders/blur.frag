@@ -1,4 +1,4 @@
-// One direction of the Gaussian blur as the thesis draws it, a fragment for each texel: the baseline of the report.
+// One direction of the Gaussian blur as in the thesis, with one fragment per texel: the baseline of the report.
 layout(location = 0) out vec4 blurred;
 
 void main() {

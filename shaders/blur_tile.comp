@@ -1,7 +1,7 @@
-// Both directions of the Gaussian blur (equation 3.11) in one pass: depth in, blurred moments out. A workgroup makes
-// WIDE x TALL texels. It reads their depths and those around them once, BAND rows at a time, blurs each row into shared
-// memory, then blurs the columns of that. Sums run over RUN texels at once, so that a number is loaded once for all of
-// them. Rows have an odd pitch: lanes that go down a column then meet different banks.
+// Both directions of the Gaussian blur (equation 3.11) in one pass: depth in, blurred moments out. A workgroup writes
+// WIDE x TALL texels. It reads their depths and a margin once, BAND rows at a time, blurs each row into shared memory,
+// then blurs the columns of the result. An invocation computes RUN sums at once, so that it loads each number once for
+// all of them. Rows have an odd pitch, so that lanes that walk down columns access different banks.
 layout(local_size_x = LANES) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D to;
 
@@ -31,7 +31,7 @@ void main() {
         ivec2 at = ivec2(run % WIDE, run / WIDE * RUN);
         vec2 sums[RUN];
         down((at.y + REACH) * PITCH + at.x, sums);
-        // Stores beyond the edge of the map are dropped.
+        // Stores outside the map have no effect.
         for (int index = 0; index < RUN; index++) {
             imageStore(to, corner + at + ivec2(0, index), vec4(sums[index], 0.0, 0.0));
         }

@@ -1,13 +1,13 @@
-// Linear light to sRGB bytes, opaque, top row first; with FXAA edges are smoothed before, with DITHER levels are mixed.
+// Converts linear light to sRGB bytes, opaque, top row first; with FXAA after anti-aliasing, with DITHER dithered.
 //   picture  [height][width]  RGBA16F, 0 to 1, bottom row first (in)
 //   pixels   [height][width]  RGBA8 in one word                 (out)
 layout(local_size_x = LANES) in;
 layout(std430, binding = 0) writeonly buffer Pixels { uint pixels[]; };
 
 #ifdef DITHER
-// A threshold for each pixel, in levels, -63/128 to 63/128 in steps of 1/64, each once in every 8 x 8 pixels (Bayer 1973):
-// the bits of y and of x ^ y in turn, the lowest first. A mean over a square keeps what rounding loses, and a value on a
-// level stays there.
+// Ordered dithering threshold of a pixel, in output levels: -63/128 to 63/128 in steps of 1/64, each once in every 8 x
+// 8 pixels (Bayer 1973). Its bits alternate between y and x ^ y, lowest bits first. The mean over a square preserves
+// what rounding would lose, and a value exactly on a level is not changed.
 float threshold(ivec2 at) {
     uint x = uint(at.x ^ at.y), y = uint(at.y);
     uint place = (x & 1u) << 5 | (y & 1u) << 4 | (x & 2u) << 2 | (y & 2u) << 1 | (x & 4u) >> 1 | (y & 4u) >> 2;

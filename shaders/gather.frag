@@ -1,9 +1,10 @@
-// One fragment of a blended triangle to its pixel's list. One program takes three turns, so that all see the same
-// fragments: they are counted; they are put in lists; and where a pixel has more than it may, ids join the depths that were
-// kept. What is behind opaque surfaces fails the depth test before; what is wholly transparent changes nothing.
+// Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases see
+// the same fragments. The first phase counts them, the second fills the lists, and the third adds ids to the kept depths
+// of pixels with too many fragments. Early depth tests reject fragments behind opaque surfaces; fully transparent
+// fragments are skipped.
 layout(early_fragment_tests) in;
 #if SAMPLES > 1 && defined(POST_DEPTH)
-// The samples that pass the depth test, rather than all that the triangle covers.
+// Coverage after the depth test, instead of the triangle's full coverage.
 layout(post_depth_coverage) in;
 #endif
 #ifdef TEXTURES
@@ -20,13 +21,13 @@ uint covered() {
 #elif defined(POST_DEPTH)
     return uint(gl_SampleMaskIn[0]) & 15u;
 #else
-    // Naming the sample runs this once for each that passes.
+    // Using gl_SampleID runs the shader once for each sample that passes.
     return 1u << gl_SampleID;
 #endif
 }
 
-// The nearest depths of a pixel, in order: each slot keeps the least that comes by and hands the rest on, so that in the
-// end all slots are sorted, whoever came first.
+// Keeps the nearest depths of a pixel in order. Each slot keeps the minimum of all depths it gets and passes the other
+// on, so that in the end the slots are sorted regardless of the order of the fragments.
 void keep_depth(uint first, uint depth) {
     for (uint index = 0u; index < ledger.most && depth != ALL; index++) {
         uint there = atomicMin(records[2u * (first + index)], depth);
@@ -34,7 +35,7 @@ void keep_depth(uint first, uint depth) {
     }
 }
 
-// The same for ids, among slots of their depth: the latest first, and too many are dropped in that order.
+// The same for ids, among slots of the same depth: later triangles first; excess ids are dropped in that order.
 void keep_id(uint first, uint depth, uint word) {
     for (uint index = 0u; index < ledger.most && word != 0u; index++) {
         if (records[2u * (first + index)] != depth) continue;

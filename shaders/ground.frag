@@ -1,4 +1,4 @@
-// The ground is a thing that is seen, like a triangle; it is shaded where the picture is.
+// Writes the id of the ground, which is shaded later like the triangles.
 in vec2 image;
 layout(location = 0) out uint id;
 

@@ -1,5 +1,6 @@
-// The plane of the ground as one triangle over the picture. As depth over w is linear in the picture, three corners say it
-// all; corners of a square in the world would lie behind the eye, and what a rasteriser makes of those is no plane any more.
+// The ground plane as one triangle over the whole image. Normalized device depth is linear in the image, so three
+// corners define it. Corners of a square in world space could lie behind the eye, and the depth of the clipped
+// triangles would deviate from the plane.
 out vec2 image;
 
 void main() {

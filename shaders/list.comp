@@ -1,8 +1,9 @@
-// The triangles whose bits are set, in their order: three indices each for the draw, and the name that its fragments write.
-// A group's list begins where the group does. Where a block's part begins is counted, not taken in whatever order blocks
-// come: super blocks before it, then bits of the blocks before it.
+// Compacts the triangles whose bits are set, in their order: three indices each for the draw, and the index in the draw
+// order that their fragments write as id. A group's list begins at the offset of the group. A prefix sum gives the
+// offset of each block, so that the order does not depend on scheduling: totals of the preceding super blocks, then
+// bits of the preceding blocks.
 //   indices  [triangles][3]  of vertices, or of corners
-//   names    [triangles]     places in the order of the groups
+//   names    [triangles]     indices in the draw order
 layout(local_size_x = LANES) in;
 layout(binding = 17) uniform usamplerBuffer triangle_corners;
 layout(binding = 18) uniform usamplerBuffer triangle_vertices;

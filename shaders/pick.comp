@@ -1,5 +1,5 @@
-// The triangles that the pixels of a small rectangle see, whole: the host meets them in f64.
-//   ids     [height][width]  R32UI; the rectangle lies in the lower left, bottom row first (in)
+// Reads back the triangles that the pixels of a small rectangle see; the host computes the intersections in f64.
+//   ids     [height][width]  R32UI; the rectangle is at the lower left, bottom row first (in)
 //   picked  [rows][columns]  top row first: id, three corners, three positions, three normals; 22 words (out)
 layout(local_size_x = LANES) in;
 layout(location = 0) uniform int rectangle; // columns, and rows shifted by 16

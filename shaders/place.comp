@@ -1,5 +1,6 @@
-// Room for each pixel's list: an exclusive scan of the counts of a tile, which takes its room in one piece. Tiles take
-// theirs in whatever order they come, and no picture shows it. Tiles with lists are listed for the dispatch over them.
+// Allocates the list of each pixel: an exclusive prefix sum over the counts of a tile, which allocates its records in
+// one piece. The order of the tiles varies, but does not affect the picture. Tiles with lists are listed for the
+// indirect dispatch over them.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 2) writeonly buffer Records { uint records[]; };
 layout(std430, binding = 1) buffer Tiles {
@@ -12,8 +13,9 @@ shared uint most;
 shared uint first;
 shared uint any_here;
 
-// The most records a pixel for which those of all pixels fit: where all fragments do, no bound. With b_k pixels of k
-// fragments, one record more for every pixel that still has some costs sum of b_j over j > k.
+// Maximum number of records per pixel for which all lists fit; unlimited if all fragments fit. With b_k pixels of k
+// fragments, raising the maximum from k to k + 1 costs one record for each pixel with more than k fragments: the sum of
+// b_j over j > k.
 uint fair() {
     if (ledger.total[1] == 0u && ledger.total[0] <= ledger.budget) return ALL;
     uint more = 0u;
@@ -34,7 +36,7 @@ void main() {
         most = fair();
         if (gl_WorkGroupID.xy == uvec2(0u)) {
             ledger.most = most;
-            // Instances: none when nothing is left out.
+            // Instance counts: none when nothing is dropped.
             ledger.commands[1] = ledger.commands[6] = most == ALL ? 0u : 1u;
         }
     }

@@ -1,6 +1,6 @@
-// Depth to the farthest depth of ever larger squares: four levels a turn, a workgroup for 16 x 16 texels of the level that
-// it begins with. Levels follow each other, each half as wide and high, rounded up. Texels beyond the picture hide nothing
-// and show nothing: they count as 0.
+// Builds the depth pyramid, the farthest depth of ever larger squares: a dispatch adds four levels, a workgroup reduces
+// 16 x 16 texels of the first one. The levels are stored one after another, each with half the width and height,
+// rounded up. Texels outside the image count as 0: they neither hide nor show anything.
 layout(local_size_x = 16, local_size_y = 16) in;
 layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
 layout(std430, binding = 4) buffer Pyramid { float depths[]; };

@@ -1,4 +1,4 @@
-// The triangles that some sample sees, as bits: they are drawn first in the next frame.
+// Records in a bitmap the triangles that some sample sees: the occluders of the next frame.
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(std430, binding = 3) buffer Seen { uint seen[]; };
 

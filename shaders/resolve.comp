@@ -1,6 +1,6 @@
-// A pixel's list to one layer a sample: sorted, shaded like all else, and blended from front to back. A fragment is shaded
-// once, in the middle of the samples that it covers.
-//   layers  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, share of what lies behind that they let by
+// Resolves the list of a pixel to one layer per sample: sorts and shades the fragments like opaque surfaces, and blends
+// them front to back. A fragment is shaded once, at the center of the samples that it covers.
+//   layers  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, transmittance
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(rgba16f, binding = 3) uniform writeonly image2DArray layers;
 layout(std430, binding = 2) buffer Records { uvec2 records[]; };
@@ -25,7 +25,7 @@ void sort_by_insertion(uint first, uint many) {
     }
 }
 
-// Lets a record sink below those that come after it in the order.
+// Heap sift-down: moves a record below its children that come after it in the order.
 void sink(uint first, uint place, uint many) {
     uvec2 record = records[first + place];
     uint below = 2u * place + 1u;
@@ -39,7 +39,7 @@ void sink(uint first, uint place, uint many) {
     records[first + place] = record;
 }
 
-// For long ones: no list takes more than length log length steps.
+// For long lists: n log n steps at most.
 void sort_by_heap(uint first, uint many) {
     for (uint place = many / 2u; place > 0u; place--) sink(first, place - 1u, many);
     for (uint last = many - 1u; last > 0u; last--) {
@@ -71,7 +71,7 @@ void main() {
     uint many = min(found, ledger.most);
     uint first = imageLoad(ends, at).x;
     if (found <= ledger.most) {
-        // Of a list that was filled in any order this is the end; the others are sorted.
+        // For lists that were filled in any order, `ends` is the end of the list; the others are sorted already.
         first -= many;
         if (many <= 32u) sort_by_insertion(first, many);
         else sort_by_heap(first, many);

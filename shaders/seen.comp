@@ -1,4 +1,4 @@
-// What the first sample of each pixel sees, top row first.
+// Packs the id of the first sample of each pixel, top row first.
 //   ids   [height][width][SAMPLES]  R32UI, bottom row first (in)
 //   seen  [height][width]           the ids                 (out)
 layout(local_size_x = LANES) in;

@@ -1,17 +1,17 @@
-// What every sample sees to the colour of its pixel, in linear light. A triangle is shaded once in a pixel, in the middle of
-// the samples that see it, however many those are; the mean of the samples, as they are shown, is the pixel.
+// Deferred shading: converts ids to the color of each pixel, in linear light. A triangle is shaded once per pixel, at
+// the center of the samples that see it. The pixel is the mean of its samples after the tone curve.
 //   ids      [height][width][SAMPLES]  R32UI, bottom row first: NOTHING, GROUND, or triangle + 1; NOTHING for ground
-//                                      that was not drawn                                               (in)
+//                                      that was not rasterized                                          (in)
 //   drawn    [height][width][SAMPLES]  depth: 1 where there is no id                                    (in)
-//   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, share that they let by   (in)
+//   layers   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, transmittance            (in)
 //   picture  [height][width]           RGBA16F, bottom row first                                        (out)
-//   glare    [height][width]           RGBA16F: light that glows                                        (out)
-// Two dispatches: with BACKDROP for all tiles of pixels, to paint those that see sky and ground alone and to list the
-// others; then for the listed tiles. A software rasteriser runs both sides of every branch, and most tiles of most pictures
-// see no triangle.
+//   glare    [height][width]           RGBA16F: bright light for the bloom                              (out)
+// Runs as two dispatches. The first, with BACKDROP, covers all tiles of pixels: it shades those that see only sky and
+// ground, and lists the others. The second covers the listed tiles. A software rasterizer executes both sides of every
+// branch, and most tiles of most pictures see no triangle.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 #ifdef LISTED
-// Of exact transparency: a layer a sample, written where there are blended fragments alone.
+// Exact transparency: one array layer per sample, written only where there are blended fragments.
 layout(binding = 22) uniform sampler2DArray layers;
 layout(binding = 23) uniform usampler2D kept;
 #elif defined(LAYERS)
@@ -25,7 +25,8 @@ layout(rgba16f, binding = 0) uniform writeonly image2D picture;
 #ifdef BLOOM
 layout(rgba16f, binding = 1) uniform writeonly image2D glare;
 #endif
-// The number of groups of the second dispatch, in rows; then the tiles, x and y in one word, in any order.
+// Indirect dispatch arguments of the second dispatch, in rows of workgroups; then the tiles, x and y in one word, in
+// any order.
 layout(std430, binding = 1) buffer Tiles {
     uint groups[3];
     uint count;
@@ -37,14 +38,14 @@ shared uint sees_triangle;
 
 #ifdef GROUND_SEEN
 vec3 ground_seen(vec3 direction) {
-    // Rasterised ground is below the eye, and the direction to it goes down; a rounded one must not turn back.
+    // Rasterized ground is below the eye, and the ray to it points down; rounding must not turn the ray upwards.
     float fall = min(dot(direction, frame.up.xyz), -1e-9 * length(direction));
     float way = (frame.up.w - dot(frame.eye.xyz, frame.up.xyz)) / fall;
     return ground(frame.eye.xyz + way * direction);
 }
 #endif
 
-// What a sample sees. Ground that was not drawn lies behind all else.
+// Id of a sample. Ground that was not rasterized is behind everything else.
 uint seen_by(ivec2 at, int index, ivec2 size) {
     uint id = id_at(at, index);
 #ifdef GROUND_SEEN
@@ -68,7 +69,7 @@ vec3 shaded(uint id, vec2 image, vec2 texel) {
     return light;
 }
 
-// What a pixel's samples show together.
+// Mean of a pixel's samples as they are displayed.
 vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
     vec2 texel = 2.0 / vec2(size);
     Gathered sum = Gathered(vec3(0.0), vec3(0.0));
@@ -76,7 +77,7 @@ vec3 pixel(ivec2 at, ivec2 size, uint seen[SAMPLES]) {
 #ifdef LISTED
     bool blended = texelFetch(kept, at, 0).x > 0u;
 #endif
-    // The loop is left at its end: a software rasteriser runs the body of a loop for lanes that are done.
+    // The condition is tested at the end, because a software rasterizer runs the loop body for inactive lanes.
     do {
         uint id = NOTHING;
         for (int index = SAMPLES - 1; index >= 0; index--) {

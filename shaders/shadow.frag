@@ -1,4 +1,4 @@
-// Leaves holes in the shadow of what is cut out, and lets what is nearly transparent cast none (the thesis's t_alpha).
+// Discards cut-out texels and nearly transparent fragments, which cast no shadow (the thesis's t_alpha).
 #ifdef UVS
 in vec2 uv_image;
 #endif

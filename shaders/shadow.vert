@@ -1,4 +1,4 @@
-// One corner seen from the sun; of a solid triangle, one vertex.
+// Projects a corner to the shadow map; for opaque triangles, a vertex.
 #ifdef SOLID
 layout(location = 0) in vec3 position;
 #else

@@ -1,6 +1,7 @@
-// Which triangles the rasteriser must see: all but those that it is certain to make nothing of. Each bound is widened by
-// what rounding may do on the way from a vertex to a place on the device's grid, so that what is left out changes no bit
-// of the picture. A triangle that the rasteriser may have to clip is only left out as a whole, outside one plane.
+// Tests which triangles the rasterizer must process: all except those that certainly produce no sample. Each bound is
+// widened by the rounding errors between a vertex and its position on the device's subpixel grid, so that culling
+// changes no bit of the picture. A triangle that the rasterizer may have to clip is culled only if it lies entirely
+// outside one plane.
 layout(local_size_x = LANES) in;
 layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
 layout(binding = 13) uniform samplerBuffer positions;
@@ -24,17 +25,17 @@ shared uint words[WORDS];
 shared uint tally[VERDICTS];
 
 #ifndef REMEMBERED
-// Two evaluations of a matrix by a vector differ by less than this share of the sum of the terms' sizes: four products and
-// three sums round by 2^-24 of it each, in each evaluation.
+// Two evaluations of a matrix-vector product differ by less than this share of the sum of the terms' magnitudes: four
+// products and three sums each round by 2^-24 of the sum, in each evaluation.
 const float ROUNDING = 1.0 / 1048576.0;
-// What a float of the size of 1 may be off after a few operations.
+// Error of a float of magnitude 1 after a few operations.
 const float FEW = 1.0 / 4194304.0;
-// Where terms are larger than this, one evaluation may overflow and another may not.
+// Above this magnitude of the terms, one evaluation may overflow and another may not.
 const float LARGE = 1e30;
 
 struct Corner {
     vec4 clip;
-    vec4 slack; // how far the rasteriser's own may be from it
+    vec4 slack; // bound on the difference to the rasterizer's clip position
 };
 
 #ifdef SUN
@@ -59,7 +60,7 @@ Corner corner_at(vec3 world) {
 }
 #endif
 
-// A vertex without a place is put before the near plane, as the vertex shaders do.
+// A vertex that is not finite is placed in front of the near plane, as in the vertex shaders.
 Corner corner_of(vec3 world) {
     bool bad = any(isnan(world)) || any(isinf(world));
     if (bad) return Corner(vec4(0.0, 0.0, -2.0, 1.0), vec4(0.0));
@@ -69,7 +70,7 @@ Corner corner_of(vec3 world) {
 #ifdef HIDDEN
 layout(std430, binding = 4) readonly buffer Pyramid { float depths[]; };
 
-// Whether all of a rectangle of pixels is nearer than a depth.
+// Whether the pyramid is nearer than a depth in a whole rectangle of pixels.
 bool all_nearer(uvec2 low, uvec2 high, uvec2 size, float depth) {
     uint level = 0u, base = 0u;
     while (level < TOP && any(greaterThan((high >> level) - (low >> level), uvec2(3u)))) {
@@ -89,7 +90,7 @@ bool all_nearer(uvec2 low, uvec2 high, uvec2 size, float depth) {
 }
 #endif
 
-// A triangle of which no corner is outside any plane.
+// Verdict for a triangle with no corner outside any plane.
 uint verdict_inside(Corner corners[3], bool one_sided) {
     vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), at[3];
     float nearest = 1.0, farthest = 0.0, depth[3], blurred = 0.0, off = 0.0;
@@ -120,8 +121,8 @@ uint verdict_inside(Corner corners[3], bool one_sided) {
 #ifdef HIDDEN
     float safe = abs(area) - unsure;
     if (!(safe > 0.0)) return LISTED_IN;
-    // The slope of depth at most, a pixel; and how far a plane through rounded corners may be from the surface, at a sample
-    // that lies up to the rounding outside of it.
+    // Upper bound of the depth slope per pixel; and the deviation of a plane through rounded corners from the surface,
+    // at a sample that lies outside the triangle by up to the rounding.
     vec2 dz = abs(vec2(depth[1], depth[2]) - depth[0]) + 2.0 * blurred;
     float slope = (dz.x * (abs(b.x) + abs(b.y)) + dz.y * (abs(a.x) + abs(a.y))) / safe;
     vec2 extent = high - low;
@@ -186,11 +187,11 @@ void main() {
     if (lane < WORDS) {
         bits[block.place * WORDS + lane] = words[lane];
 #ifdef HIDDEN
-        // What is remembered was used: the ids of this frame come next.
+        // The remembered triangles were used; the ids of this frame are recorded next.
         seen[block.place * WORDS + lane] = 0u;
 #endif
     }
-    // Sums of whole numbers: whoever comes first.
+    // Integer sums do not depend on the order of the workgroups.
     if (lane == 0u && tally[LISTED_IN] > 0u) {
         atomicAdd(ledger.commands[5u * block.group], 3u * tally[LISTED_IN]);
         atomicAdd(ledger.totals[block.place / SUPER], tally[LISTED_IN]);

@@ -1,10 +1,10 @@
-// A number, or three, for every pixel instead of its colour, top row first.
+// AOV (arbitrary output variable) readback: one number or three for each pixel, top row first.
 //   ids      [height][width][SAMPLES]  R32UI, bottom row first                                         (in)
-//   values   [vertices]                a number per vertex                          (in, with VALUES)
-//   words    DEPTH    [height][width]           f32 along the view axis times `scale`; infinite: nothing       (out)
-//            NORMALS  [height][width][3]        f32, unit, on the side that is seen; zeros: nothing
-//            VALUES   [height][width][SAMPLES]  value times `scale` and the cosine to the eye, 16 bits each;
-//                                               0: nothing, else the cosine is at least 1 / 65535
+//   values   [vertices]                a scalar per vertex                                (in, with VALUES)
+//   words    DEPTH    [height][width]           f32 along the view axis times `scale`; infinite without an id  (out)
+//            NORMALS  [height][width][3]        f32, unit normal on the visible side; zeros without an id
+//            VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine to the eye, 16 bits each;
+//                                               0 without an id, else the cosine is at least 1 / 65535
 layout(local_size_x = LANES) in;
 layout(location = 0) uniform int scale_bits;
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
@@ -12,12 +12,12 @@ layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
 layout(binding = 24) uniform samplerBuffer values;
 #endif
 
-// A triangle at a place of the picture.
+// A triangle, evaluated at an image point.
 struct Met {
     vec3 share;
     vec3 depths;
     vec3 world;
-    vec3 normal; // on the side that is seen; not a unit vector
+    vec3 normal; // on the visible side; not normalized
     ivec3 vertices;
 };
 
@@ -46,7 +46,7 @@ vec3 unit_or_zero(vec3 v) {
 }
 
 #ifdef DEPTH
-// The ground is met by the direction that goes one unit of depth.
+// For the ground: the ray has unit length along the view axis, so the ray parameter is the depth.
 float depth(uint id, vec2 image) {
     if (id == NOTHING) return uintBitsToFloat(0x7F800000u);
 #ifdef GROUND_SEEN

@@ -1,4 +1,4 @@
-// How many blended fragments there are, and how many pixels have how many.
+// Histogram of the number of blended fragments per pixel, and their total.
 layout(local_size_x = SIDE, local_size_y = SIDE) in;
 shared uint own_bins[BINS];
 shared uint sum;

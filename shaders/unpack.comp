@@ -1,15 +1,17 @@
-// What CUDA's rasteriser saw to ids, and the ground among them. Its keys come with rows from the top; images begin below.
-//   keys  [height][width]  uvec2: triangle, bits of its depth; all ones where nothing is, top row first  (in)
-//   ids   [height][width]  R32UI: NOTHING, GROUND, or triangle + 1                                       (out)
+// Converts the visibility keys of the compute rasterizer to ids, and adds the ground. Keys are stored top row first,
+// images bottom row first.
+//   keys  [height][width]  uvec2: triangle, bits of its depth; all ones without a triangle, top row first  (in)
+//   ids   [height][width]  R32UI: NOTHING, GROUND, or triangle + 1                                         (out)
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 0) readonly buffer Keys { uvec2 keys[]; };
 layout(r32ui, binding = 0) uniform writeonly uimage2D seen;
 
 #ifdef GROUND_SEEN
-// Eight steps of a depth just below 1: what lies in the plane of the ground is seen. Twin: `Fixed::behind` in src/render/gl.rs.
+// Eight rounding steps of a depth just below 1: surfaces in the ground plane stay visible. Twin: `Fixed::behind` in
+// src/render/gl.rs.
 const float BEHIND = 8.0 / 16777216.0;
 
-// Depth of the ground at a place of the picture, drawn a little behind itself as OpenGL draws it; 2 where it is not seen.
+// Depth of the ground at an image point, with the same offset as in OpenGL; 2 where the ground is not visible.
 float ground_behind(vec2 image, vec2 texel) {
     if (!meets_ground(towards(image))) return 2.0;
     vec2 slope;
@@ -26,7 +28,7 @@ void main() {
     bool empty = key == uvec2(0xFFFFFFFFu);
     uint id = empty ? NOTHING : key.x + 1u;
 #ifdef GROUND_SEEN
-    // Ground that hides nothing is found by the shading.
+    // The shading finds ground that hides nothing.
     vec2 texel = 2.0 / vec2(size);
     float depth = frame.to_sun.w == 0.0 ? 2.0 : ground_behind((vec2(at) + 0.5) * texel - 1.0, texel);
     if (depth <= (empty ? 1.0 : uintBitsToFloat(key.y))) id = GROUND;

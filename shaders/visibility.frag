@@ -1,6 +1,7 @@
-// Which triangle a sample sees. What is cut away discards before the id is written.
+// Writes the id of a triangle. Fragments that are cut out are discarded before.
 #if defined(MASK) && defined(TEXTURES)
-// Centroids: at the rim of a triangle the middle of the pixel may lie outside it, where images repeat.
+// Centroid sampling: at the edge of a triangle the pixel center may lie outside it, where texture coordinates wrap
+// around.
 centroid in vec2 uv_image;
 #endif
 layout(location = 0) out uint id;

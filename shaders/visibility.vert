@@ -1,5 +1,4 @@
-// One corner as the camera sees it. Opaque triangles have no need of corners: their vertices are enough, and are shared by
-// more triangles.
+// Projects a corner to the screen. Opaque triangles use vertices instead of corners, which more triangles share.
 #ifdef MASK
 layout(location = 0) in uint vertex;
 layout(binding = 13) uniform samplerBuffer positions;

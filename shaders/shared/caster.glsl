@@ -1,4 +1,4 @@
-// A fragment that is cut away, or too translucent, casts no shadow.
+// Discards fragments whose alpha is below the threshold: they cast no shadow.
 void cast_or_not(float alpha, float least) {
     if (alpha < least) discard;
 }

@@ -1,5 +1,5 @@
-// Where a vertex is on the screen. One that overflowed is put behind the camera, and its place in the world at the origin:
-// no NaN reaches the rasteriser, and what is shaded is what was rasterised.
+// Clip-space position of a vertex. A vertex that overflows is placed outside the view volume, and its world position at
+// the origin: no NaN reaches the rasterizer, and shading uses the same position as rasterization.
 vec4 to_clip(inout vec3 world) {
     vec4 clip = frame.clip_from_world * vec4(world, 1.0);
     bool bad = any(isnan(clip)) || any(isinf(clip));

@@ -1,14 +1,14 @@
-// Which triangles of which groups are looked at, and what is listed of them. A workgroup looks at a block: LANES triangles
-// of one group. Twins: `Groups` and `Ledger` in src/render/cull/layout.rs.
-//   ledger  commands [GROUPS] five words of an indexed draw; totals [supers] listed triangles of SUPER blocks
-//   bits    [blocks][LANES / 32]  the triangles of a block that are listed
+// Groups and blocks of triangles that culling tests, and its results. A workgroup tests a block: LANES triangles of one
+// group. Twins: `Groups` and `Groups::empty_ledger` in src/render/cull/layout.rs.
+//   ledger  commands [GROUPS] indexed indirect draws of five words; totals [supers] listed triangles per SUPER blocks
+//   bits    [blocks][LANES / 32]  one bit per triangle of a block: whether it is listed
 const uint WORDS = uint(LANES) / 32u;
 
 layout(std140, binding = 3) uniform GroupBlock {
     uvec4 places[GROUPS]; // first triangle, triangles, first workgroup, first block
-    uvec4 ways[GROUPS];   // whether it has one side; whether it is made of vertices alone, without corners
-    uvec4 count;          // groups, workgroups
-    vec4 grid;            // the part of a pixel to which the rasteriser rounds places
+    uvec4 ways[GROUPS];   // whether it is single-sided; whether it uses vertices only, without corners
+    uvec4 count;          // groups, workgroups, blocks
+    vec4 grid;            // step of the rasterizer's subpixel grid, in pixels
 } groups;
 
 layout(std430, binding = 0) buffer Ledger {
@@ -18,7 +18,7 @@ layout(std430, binding = 0) buffer Ledger {
 } ledger;
 layout(std430, binding = 1) buffer Bits { uint bits[]; };
 
-// The block of this workgroup: its group, its place, and the triangle of this lane within the group.
+// The block of this workgroup: its group, its index, and the triangle of this lane within the group.
 struct Block {
     uint group;
     uint place;

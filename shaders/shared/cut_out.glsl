@@ -1,6 +1,7 @@
-// Which samples of a pixel a cut-out surface covers: those where alpha, continued from the pixel by its slope, reaches the
-// cutoff. Integer targets switch alpha to coverage off, and samples that lie side by side cover more truly anyhow. Where
-// alpha changes fast, as on a leaf seen edge on, the slope is bounded so that 0 still covers nothing and 1 everything.
+// Bit mask of the samples of a pixel that a cut-out surface covers: those where alpha, extrapolated from the pixel by
+// its screen-space derivatives, reaches the cutoff. Integer render targets disable alpha to coverage, and contiguous
+// samples match the shape better anyway. Where alpha changes fast, as on a leaf seen edge-on, the slope is clamped so
+// that alpha 0 still covers no sample and alpha 1 all of them.
 int reached(float alpha, float cutoff) {
 #if SAMPLES > 1
     vec2 slope = vec2(dFdx(alpha), dFdy(alpha));
@@ -17,7 +18,7 @@ int reached(float alpha, float cutoff) {
 #endif
 }
 
-// Keeps those samples alone.
+// Keeps the samples that reach the cutoff.
 void cut_out(float alpha, float cutoff) {
     int kept = reached(alpha, cutoff);
     if (kept == 0) discard;
@@ -26,7 +27,7 @@ void cut_out(float alpha, float cutoff) {
 #endif
 }
 
-// Keeps the others.
+// Keeps the samples that do not reach the cutoff.
 void cut_in(float alpha, float cutoff) {
     int kept = (1 << SAMPLES) - 1 & ~reached(alpha, cutoff);
     if (kept == 0) discard;

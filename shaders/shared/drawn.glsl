@@ -1,5 +1,5 @@
-// Which triangle of the scene a fragment belongs to; one draw call begins at `first_triangle`. A call that draws from a list
-// of triangles gives the complement of where its list begins.
+// Index of a fragment's triangle in the draw order. A draw call begins at `first_triangle`; a draw call of a culled
+// list passes the complement of the list's first entry instead.
 layout(location = 0) uniform int first_triangle;
 #ifdef CULLED
 layout(binding = 25) uniform usamplerBuffer names;

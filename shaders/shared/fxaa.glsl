@@ -1,24 +1,24 @@
-// Edges of a picture of one sample a pixel, smoothed after Lottes 2009, "FXAA" (NVIDIA white paper): where brightness jumps,
-// the jump is followed to both ends of its row of pixels, and the pixel takes a share of its neighbour across the edge: what
-// a straight line from end to end covers of it. Edges are judged by brightness as it is seen, but light is mixed, as the
-// samples of a pixel are. A pixel without an edge is not changed at all.
+// Anti-aliasing of images with one sample per pixel, after Lottes 2009, "FXAA" (NVIDIA white paper). Where luma jumps,
+// both ends of the edge are searched along its row of pixels; the pixel is blended with its neighbor across the edge by
+// the area that a straight line between the ends covers. Edges are detected in perceptual luma but linear light is
+// blended, as in multisampling. Pixels without an edge do not change.
 
-// Chosen by the error of the tree's picture against 8 x 8 samples a pixel.
-// A jump counts from this share of the brightest pixel around on, and from this brightness on.
+// Thresholds chosen by the error of the tree's picture against 8 x 8 samples per pixel. An edge needs a contrast of at
+// least this share of the brightest pixel around, and of at least this luma.
 const float LEAST_SHARE = 0.2;
 const float LEAST_JUMP = 0.0416;
-// Pixels along an edge that are searched, to each side.
+// Maximum length of the edge search to each side, in pixels.
 const int REACH = 16;
-// The most that a lone pixel takes from a neighbour, where no line explains it.
+// Maximum blend weight of an isolated pixel, which no edge explains.
 const float MOST_ALONE = 0.5;
 
 ivec2 within(ivec2 at) { return clamp(at, ivec2(0), textureSize(picture, 0) - 1); }
 
-// Brightness as it is seen, 0 to 1: the root is near the curve of sRGB.
+// Perceptual luma, 0 to 1: the square root approximates the sRGB curve.
 float luma(ivec2 at) { return sqrt(dot(texelFetch(picture, within(at), 0).rgb, vec3(0.2126, 0.7152, 0.0722))); }
 
-// Pixels from the middle of a pixel to the end of its edge, along one direction: where the mean across the edge leaves that
-// at the pixel. In y, by how much it does.
+// Distance in pixels from the center of a pixel to the end of its edge in one direction, where the mean across the edge
+// differs from that at the pixel. y: the difference.
 vec2 end_of_edge(ivec2 at, ivec2 along, ivec2 across, float mean, float slack) {
     float off = 0.0;
     int steps = 0;
@@ -41,7 +41,7 @@ vec3 smoothed(ivec2 at) {
 
     float ne = luma(at + ivec2(1, 1)), nw = luma(at + ivec2(-1, 1));
     float se = luma(at + ivec2(1, -1)), sw = luma(at + ivec2(-1, -1));
-    // Second differences across rows and across columns: the edge lies along the smaller.
+    // Second differences across rows and across columns: the edge runs along the direction with the smaller one.
     float rows = abs(nw + sw - 2.0 * w) + 2.0 * abs(n + s - 2.0 * m) + abs(ne + se - 2.0 * e);
     float columns = abs(nw + ne - 2.0 * n) + 2.0 * abs(w + e - 2.0 * m) + abs(sw + se - 2.0 * s);
     bool flat_edge = rows >= columns;
@@ -56,11 +56,11 @@ vec3 smoothed(ivec2 at) {
     vec2 one = end_of_edge(at, along, across, mean, slack);
     vec2 other = end_of_edge(at, -along, across, mean, slack);
     vec2 nearer = one.x < other.x ? one : other;
-    // The line crosses the middle of the row half way between its ends. At the nearer end it lies on this pixel's side only
-    // if the row goes over to the colour of the other.
+    // The fitted line crosses the middle of the row halfway between its ends. At the nearer end it is on this pixel's
+    // side only if the row changes to the other side's color there.
     float taken = 0.0;
     if ((nearer.y < 0.0) != (m < mean)) taken = 0.5 - nearer.x / (one.x + other.x);
-    // A pixel that differs from all around it, as a thin line or a leaf smaller than it.
+    // A pixel that differs from all its neighbors, like a thin line or a leaf smaller than a pixel.
     float around = (2.0 * (n + s + e + w) + ne + nw + se + sw) / 12.0;
     float lone = smoothstep(0.0, 1.0, min(abs(around - m) / jump, 1.0));
     taken = max(taken, MOST_ALONE * lone * lone);

@@ -1,4 +1,4 @@
-// Lambert's law on the ground, its shadow, and the haze in which it meets the sky.
+// Color of the ground: Lambert shading with shadow, fading into the horizon with distance.
 vec3 ground(vec3 world) {
     float facing = max(dot(frame.up.xyz, frame.to_sun.xyz), 0.0);
     vec3 light = frame.skylight.rgb + lit(world, frame.up.xyz) * facing * frame.sunlight.rgb;

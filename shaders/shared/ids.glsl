@@ -1,5 +1,5 @@
-// What a sample of the visibility image holds: nothing, the ground, or a triangle's place in the index buffer plus one.
-// Twin: `Seen` in src/render/seen.rs.
+// Id of a sample in the visibility image: nothing, the ground, or a triangle's index in the draw order plus 1. Twin:
+// `Seen` in src/render/seen.rs.
 const uint NOTHING = 0u;
 const uint GROUND = 0xFFFFFFFFu;
 
@@ -7,8 +7,9 @@ const uint GROUND = 0xFFFFFFFFu;
 #if SAMPLES > 1
 layout(binding = 21) uniform usampler2DMS ids;
 ivec2 size_of_ids() { return textureSize(ids); }
-// Depth of the same samples. An id is there where something was drawn, before the far plane: clearing the ids of four samples
-// would take as long as clearing their depth, 0.59 ms at 1920 x 1080 on an H200.
+// Depth of the same samples. An id is valid where something was drawn, that is, nearer than the far plane. The ids are
+// not cleared: clearing those of four samples would take as long as clearing their depth, 0.59 ms at 1920 x 1080 on an
+// H200.
 layout(binding = 26) uniform sampler2DMS drawn;
 uint id_at(ivec2 at, int index) { return texelFetch(drawn, at, index).x < 1.0 ? texelFetch(ids, at, index).x : NOTHING; }
 #else

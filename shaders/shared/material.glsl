@@ -1,14 +1,15 @@
-// The material of a triangle, by its number in the index buffer. Twin: `PackedMaterial` in src/render/scene_buffers.rs.
-//   materials           [materials][STRIDE]  RGBA32F, fetched and never filtered: ambient with the array of the normal map,
-//                                            diffuse with its layer, specular with the exponent; and all that a cut-out asks
-//                                            for: array and layer of the colour texture, alpha, cutoff
-//   triangle_materials  [triangles]          R32UI; not read where all these triangles have one
-// Buffer textures: a software rasteriser fetches eight of their texels at once, but storage words one by one.
+// Material of a triangle, by the triangle's index in the draw order. Twin: `PackedMaterial` in
+// src/render/scene_buffers.rs.
+//   materials           [materials][STRIDE]  RGBA32F, fetched without filtering: ambient and array of the normal map,
+//                                            diffuse and layer of the normal map, specular and exponent; then the data
+//                                            of cut-outs: array and layer of the color texture, alpha, cutoff
+//   triangle_materials  [triangles]          R32UI; not read if all these triangles have the same material
+// Buffer textures, because a software rasterizer fetches eight of their texels at once, but storage words one by one.
 struct Material {
-    vec4 ambient;   // and alpha
-    vec4 diffuse;   // and the cutoff of a mask
-    vec4 specular;  // and the exponent
-    ivec4 images;   // array and layer of the colour texture, array and layer of the normal map; -1 for none
+    vec4 ambient;   // w: alpha
+    vec4 diffuse;   // w: cutoff of a mask
+    vec4 specular;  // w: exponent
+    ivec4 images;   // array and layer of the color texture, array and layer of the normal map; -1 for none
 };
 
 layout(binding = 14) uniform samplerBuffer materials;

@@ -1,13 +1,13 @@
-// Phong (equation 3.12) with clamped dots and unshadowed ambient light:
+// Phong shading (equation 3.12) with clamped dot products and unshadowed ambient light:
 //   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e,
-// v_l to the sun, v_e to the eye, s_f the share of the sun that arrives. The printed v_e comes from the eye: its v_e'
-// points into the surface, and the highlight would lie on the far side of it.
-// A texel multiplies Ca and Cd where the material has a colour image (equation 3.14, whose printed s_tex is the wrong way
-// round): with white Ca and Cd it takes their place.
+// with v_l to the sun, v_e to the eye, and s_f the share of the sun's light that arrives. In the thesis v_e points from
+// the eye, so that v_e' points into the surface and the highlight lies on its far side. A texel multiplies Ca and Cd if
+// the material has a color image (equation 3.14, whose printed s_tex is inverted): with white Ca and Cd it replaces
+// them.
 vec3 unit(vec3 v) { return v * inversesqrt(max(dot(v, v), 1e-30)); }
 
 #ifdef NORMAL_MAPS
-// A unit normal turned by a texel of a normal map. No tangent, no turn.
+// Perturbs a unit normal by a texel of a normal map. Without a tangent the normal does not change.
 vec3 bumped(vec3 normal, vec4 along_u, vec3 texel) {
     if (dot(along_u.xyz, along_u.xyz) <= 0.0) return normal;
     texel = (texel * 255.0 - 128.0) / 127.0;
@@ -17,7 +17,7 @@ vec3 bumped(vec3 normal, vec4 along_u, vec3 texel) {
 }
 #endif
 
-// `unbumped` is the normal without the turn of a normal map: the plane in which the shadow is looked up.
+// `unbumped` is the normal before normal mapping: the plane that the shadow lookup uses.
 vec3 phong(Material material, vec3 tint, vec3 normal, vec3 unbumped, vec3 world) {
     vec3 to_sun = frame.to_sun.xyz;
     vec3 light = frame.skylight.rgb * material.ambient.rgb * tint;

@@ -1,11 +1,12 @@
-// A triangle at a place of the picture, fetched from the scene's buffers: perspective-correct shares of its corners with
-// their analytic slopes.
+// Evaluates a triangle at an image point from the scene's buffers: perspective-correct barycentric coordinates of its
+// corners with analytic derivatives.
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 16) uniform samplerBuffer normals;
 layout(binding = 17) uniform usamplerBuffer triangle_corners;
 layout(binding = 18) uniform usamplerBuffer triangle_vertices;
 
-// Shares of the three corners; their slopes along x and y of the picture, per pixel; and whether the front is seen.
+// Barycentric coordinates; their derivatives along x and y of the image, per pixel; and whether the front side is
+// visible.
 struct Shares {
     vec3 at;
     vec3 along_x;
@@ -13,9 +14,9 @@ struct Shares {
     bool front;
 };
 
-// With c_i = (x, y, w) of the corners on the screen, seen from the place, corner i has the share (c_j x c_k).z of their sum:
-// homogeneous, so that corners behind the camera need no clipping. Taking the place off first keeps the digits that tell
-// small triangles apart.
+// With c_i = (x, y, w) of the corners in clip space relative to the image point, corner i has the share (c_j x c_k).z
+// of their sum. This is homogeneous, so corners behind the camera need no clipping. Subtracting the image point first
+// avoids the cancellation that small triangles would suffer.
 Shares shares(vec3 a, vec3 b, vec3 c, vec2 texel) {
     float scale = 1.0 / max(max(abs(a.z), abs(b.z)), max(abs(c.z), 1e-30));
     a *= scale, b *= scale, c *= scale;
@@ -24,7 +25,7 @@ Shares shares(vec3 a, vec3 b, vec3 c, vec2 texel) {
     float sum = inside.x + inside.y + inside.z;
     Shares found;
     found.front = sum > 0.0;
-    // The place lies inside but for rounding. A triangle without area has no sum: any share is right.
+    // The point lies inside except for rounding. A triangle without area has no sum; any coordinates are right.
     found.at = clamp(inside / sum, 0.0, 1.0);
     float whole = found.at.x + found.at.y + found.at.z;
     found.at = whole > 0.5 ? found.at / whole : vec3(1.0 / 3.0);

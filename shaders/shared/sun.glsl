@@ -1,5 +1,5 @@
-// lit: how much of the sun reaches a point of a surface with this normal, 0 to 1, from every kind of shadow map. It
-// takes no derivatives, so that fragment and compute shaders may call it, and a NaN in gives a number out.
+// `lit`: share of the sun's light that reaches a surface point, 0 to 1, for all shadow methods. It uses no derivatives,
+// so that fragment and compute shaders can call it. NaN inputs give a finite result.
 #ifdef SHADOWS
 layout(binding = 0) uniform sampler2DArray shadow_map;
 
@@ -9,22 +9,22 @@ vec2 finer(int layer) { return splits.places[layer].xy; }
 vec2 finer(int layer) { return vec2(1.0); }
 #endif
 
-// The plane of the surface, as the map sees it: by how much its depth changes from a texel to the next, in x and in y.
+// Slope of the surface plane in the map: change of its depth per texel in x and in y.
 vec2 slope(vec3 normal, int layer) {
-    // The rows of the map's matrix are the axes of light space, scaled; the third looks away from the sun.
+    // The rows of the map's matrix are the scaled axes of light space; the third points away from the sun.
     mat3 axes = transpose(mat3(frame.map_from_world));
     vec3 part = vec3(dot(normal, axes[0]), dot(normal, axes[1]), dot(normal, axes[2]));
     vec3 square = vec3(dot(axes[0], axes[0]), dot(axes[1], axes[1]), dot(axes[2], axes[2]));
-    // Steeper than ten to one is taken for ten to one: there the sun only grazes.
+    // Slopes steeper than ten to one are clamped: the sun only grazes there.
     float facing = max(abs(part.z), 0.1 * sqrt(square.z)) * (part.z < 0.0 ? -1.0 : 1.0);
     return -(part.xy / square.xy) * (square.z / facing) / (frame.shadow.w * finer(layer));
 }
 
 #ifdef VARIANCE
-// By how much the ground draws the mean depth towards the sun beside the line where a surface meets it. It casts no
-// shadow, so that the surface is let off that much. With h the height over that line, in deviations, and k what surface
-// and ground part by in one, the mean of what the ground is nearer is k (phi(h) - h Q(h)); 0.4 k (1 - h / 2)^2 is not less
-// up to h = 1.9.
+// Bias that compensates for ground depth leaking into the blurred mean near a contact line, which would pull the mean
+// towards the sun. The ground casts no shadow, so the bias is subtracted. With h the height above the line in standard
+// deviations, and k the depth difference of surface and ground per standard deviation, the ground shifts the mean by k
+// (phi(h) - h Q(h)); 0.4 k (1 - h / 2)^2 is an upper bound up to h = 1.9.
 float let_off(vec3 at, int layer, vec3 normal) {
     vec2 whole = at.xy;
 #ifdef SPLITS
@@ -36,8 +36,8 @@ float let_off(vec3 at, int layer, vec3 normal) {
     return near > 0.0 ? 0.4 * apart * near * near : 0.0;
 }
 
-// Chebyshev's bound on the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1; depth is counted from
-// the middle of its range, where floats are finest).
+// Chebyshev's bound on the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1). Depth is measured
+// from the center of its range, where floats are finest.
 float arrives(vec3 at, int layer, vec3 normal) {
     vec2 moments = textureLod(shadow_map, vec3(at.xy, float(layer)), 0.0).xy;
     float behind = clamp(at.z, 0.0, 1.0) - 0.5 - moments.x - let_off(at, layer, normal);
@@ -47,21 +47,21 @@ float arrives(vec3 at, int layer, vec3 normal) {
     return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
 }
 #else
-// Texels are compared with the plane of the surface in place of the point's own depth, so that no slope shadows itself.
-// A caster is seen from one side of a texel before that plane on. This is for curved surfaces, whose triangles are not
-// quite as their normals say, and for the roundings of depth.
+// Bias of the comparison. Texels are compared with the plane of the surface instead of the point's own depth, so that a
+// slope does not shadow itself; a caster counts from one texel side in front of that plane. The bias covers curved
+// surfaces, whose triangles deviate from their normals, and the rounding of depth.
 float margin(int layer) {
     vec3 away = vec3(frame.map_from_world[0].z, frame.map_from_world[1].z, frame.map_from_world[2].z);
     vec2 scale = finer(layer);
     return frame.ground_depth.w / min(scale.x, scale.y) * length(away) + 4e-7;
 }
 
-// What the map holds where no caster is.
+// Depth of a texel without a caster.
 const float EMPTY = 1.0;
 #endif
 
 #ifdef STANDARD
-// The standard shadow map: all or nothing, by the one texel that holds the point.
+// Standard shadow map: binary, from the single texel that contains the point.
 float arrives(vec3 at, int layer, vec3 normal) {
     vec2 place = at.xy * frame.shadow.w;
     float depth = texelFetch(shadow_map, ivec3(place, layer), 0).x;
@@ -71,8 +71,8 @@ float arrives(vec3 at, int layer, vec3 normal) {
 #endif
 
 #ifdef FILTERED
-// Percentage-closer filtering: the share of the texels around the point that hold no caster before it, weighed by the
-// Gaussian (TAPS: its half, centre first, and a zero) that moves with the point.
+// Percentage-closer filtering: share of the texels around the point without a caster in front of it, weighted by a
+// Gaussian centered at the point (TAPS: one half, center first, and a trailing zero).
 float arrives(vec3 at, int layer, vec3 normal) {
     vec2 place = at.xy * frame.shadow.w - 0.5;
     vec2 first = floor(place);
@@ -84,7 +84,7 @@ float arrives(vec3 at, int layer, vec3 normal) {
         for (int x = -REACH; x <= REACH; x += 2) {
             vec2 columns = mix(vec2(TAPS[abs(x)], TAPS[abs(x + 1)]), vec2(TAPS[abs(x - 1)], TAPS[abs(x)]), past.x);
             vec2 corner = vec2(x, y);
-            // Four texels around their common corner, in the order (0, 1), (1, 1), (1, 0), (0, 0).
+            // The four texels around their common corner, in textureGather order (0, 1), (1, 1), (1, 0), (0, 0).
             vec4 depth = textureGather(shadow_map, vec3((first + corner + 1.0) / frame.shadow.w, float(layer)), 0);
             float there = own + dot(steep, corner - past);
             vec4 plane = there + vec4(steep.y, steep.x + steep.y, steep.x, 0.0);
@@ -104,7 +104,7 @@ float lit(vec3 world, vec3 normal) {
     layer = layer_of(world);
     at.xy = in_layer(at.xy, layer);
 #endif
-    // The rim holds no caster; the outermost texels are left alone, where filtering repeats the edge.
+    // The rim has no caster. The outermost texels are not used, because filtering repeats them at the edge.
     vec2 inside = min(at.xy, 1.0 - at.xy) * frame.shadow.w;
     if (!(min(inside.x, inside.y) >= 1.0)) return 1.0;
     return arrives(at, layer, normal);

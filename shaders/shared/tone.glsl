@@ -1,19 +1,19 @@
-// The curve from light to what the screen shows, 0 to 1 in each channel: `Tone` in src/model/scene/post.rs says whose they are.
-// `untoned` is its inverse.
+// Tone curve from light to displayed values, 0 to 1 per channel; sources are given at `Tone` in
+// src/model/scene/post.rs. `untoned` is its inverse.
 #if defined(REINHARD)
-// So written, infinite light is white.
+// In this form, infinite light is white.
 vec3 toned(vec3 light) { return 1.0 - 1.0 / (1.0 + light); }
 
-// The curve comes near 1 and never there, but rounding does.
+// The curve never reaches 1 exactly, but rounding does.
 vec3 untoned(vec3 shown) { return shown / max(1.0 - shown, vec3(1.0 / MOST_LIGHT)); }
 #elif defined(ACES)
-// White from 7.3 on; the cap keeps squares finite.
+// White from 7.3 on; the clamp keeps the squares finite.
 vec3 toned(vec3 light) {
     light = min(light, vec3(MOST_LIGHT));
     return min(light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14), vec3(1.0));
 }
 
-// The root of (2.51 - 2.43 y) x x + (0.03 - 0.59 y) x - 0.14 y that is not negative.
+// The nonnegative root of (2.51 - 2.43 y) x x + (0.03 - 0.59 y) x - 0.14 y.
 vec3 untoned(vec3 shown) {
     vec3 a = 2.51 - 2.43 * shown, b = 0.03 - 0.59 * shown;
     return max((sqrt(b * b + 0.56 * a * shown) - b) / (2.0 * a), vec3(0.0));

@@ -1,4 +1,4 @@
-// The colour and alpha of a triangle at a place of the picture.
+// Color and alpha of a triangle at an image point.
 #ifdef UVS
 layout(binding = 19) uniform samplerBuffer uvs;
 #endif

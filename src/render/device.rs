@@ -1,11 +1,11 @@
-//! Which EGL device to draw on: all of them described for `doctor`, and the choice of one.
+//! EGL devices: describes all of them for `doctor`, and selects one.
 
 use super::Prefer;
 use super::egl::{Candidate, Context, candidates, none_fits};
 use super::gl::Gl;
 use modalcast_model::error::{Error, Result};
 
-/// One place where OpenGL may be had, as EGL describes it.
+/// A device that may offer OpenGL, as EGL describes it.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct EglDevice {
     /// Index among EGL's devices; none for Mesa's surfaceless platform, which needs no device.
@@ -14,23 +14,23 @@ pub struct EglDevice {
     pub vendor: String,
     /// Extensions of the device.
     pub extensions: Vec<String>,
-    /// The CUDA device that it is, by EGL_CUDA_DEVICE_NV.
+    /// Ordinal of the corresponding CUDA device, from EGL_CUDA_DEVICE_NV.
     pub cuda_device: Option<i32>,
-    /// Its DRM node, such as `/dev/dri/card0`.
+    /// DRM node, such as `/dev/dri/card0`.
     pub drm_node: Option<String>,
-    /// GL_RENDERER and GL_VERSION, when a context could be made.
+    /// GL_RENDERER and GL_VERSION; none when no context could be created.
     pub renderer: Option<String>,
     pub version: Option<String>,
-    /// Whether it draws on the CPU; as far as the device says when no context could be made.
+    /// Whether it draws on the CPU. Without a context, this is what the device itself reports.
     pub software: bool,
-    /// Why no context could be made.
+    /// Why no context could be created.
     pub problem: Option<String>,
 }
 
-/// All EGL devices, each tried with a context.
+/// All EGL devices; a context is tried on each.
 ///
 /// # Errors
-/// `Unavailable` naming the package when libEGL cannot be loaded.
+/// `Unavailable` with the package name when libEGL cannot be loaded.
 pub fn devices() -> Result<Vec<EglDevice>> {
     Ok(candidates()?.into_iter().map(describe).collect())
 }
@@ -54,7 +54,7 @@ fn describe(candidate: Candidate) -> EglDevice {
     }
 }
 
-/// Opens the preferred device. Gives the CUDA device that it is along.
+/// Opens the preferred device and returns it with the ordinal of its CUDA device.
 pub(super) fn open(prefer: Prefer) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
     let mut tried = Vec::new();
     for (candidate, software) in order(candidates()?, prefer) {
@@ -78,7 +78,8 @@ fn refusal(prefer: Prefer, tried: &[String]) -> Error {
     }
 }
 
-/// The candidates worth trying, best first, each with whether it must turn out to be software (or must not).
+/// The candidates to try, best first. The flag says whether the context must be a software one (`true`) or hardware
+/// (`false`).
 fn order(found: Vec<Candidate>, prefer: Prefer) -> Vec<(Candidate, Option<bool>)> {
     let hardware = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
         (Some(_), _) => 0,

@@ -1,7 +1,7 @@
-//! EGL without a window: the devices of this machine, and a surfaceless OpenGL 4.3 core context on one of them.
+//! EGL without a window: enumerates the devices of this machine and creates surfaceless OpenGL 4.3 core contexts.
 //!
-//! Displays are initialised once and never terminated: EGL hands every caller of a process the same display of a device,
-//! so that terminating one would pull it from under the other renderers.
+//! Displays are initialized once and never terminated: EGL returns the same display of a device to all callers in a
+//! process, so terminating it would invalidate the other renderers' contexts.
 
 use std::cell::Cell;
 use std::ffi::{CStr, c_char, c_void};
@@ -30,16 +30,16 @@ const DEBUG_BIT: i32 = 1;
 const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasteriser), or the NVIDIA \
                       driver's libEGL_nvidia.so.0 with its vendor file 10_nvidia.json in /usr/share/glvnd/egl_vendor.d";
 
-/// Guards the calls that make and destroy contexts: drivers are known to race there.
+/// Serializes display queries and the creation and destruction of contexts: drivers are known to race there.
 static DOOR: Mutex<()> = Mutex::new(());
 static NEXT: AtomicU64 = AtomicU64::new(1);
 
 thread_local! {
-    /// Number of the context that is current on this thread, 0 for none.
+    /// Number of the context that is current on this thread; 0 for none.
     static CURRENT: Cell<u64> = const { Cell::new(0) };
 }
 
-/// A place where a context may be made.
+/// A display on which a context can be created.
 #[derive(Debug, Clone)]
 pub(super) struct Candidate {
     /// Index among EGL's devices; `None` for Mesa's surfaceless platform.
@@ -48,17 +48,17 @@ pub(super) struct Candidate {
     pub(super) extensions: Vec<String>,
     pub(super) cuda_device: Option<i32>,
     pub(super) drm_node: Option<String>,
-    /// Whether the device itself says that it is software.
+    /// Whether the device reports that it is a software renderer.
     pub(super) software: bool,
     display: egl::Display,
 }
 
-/// A surfaceless context, made current where it is used.
+/// A surfaceless OpenGL context; its users make it current.
 pub(super) struct Context {
     number: u64,
     display: egl::Display,
     context: egl::Context,
-    /// Whether it was made to say what it thinks of its use.
+    /// Whether it is a debug context.
     pub(super) is_debug: bool,
 }
 
@@ -75,7 +75,7 @@ fn unavailable(reason: impl Into<String>) -> Error {
 }
 
 fn door() -> MutexGuard<'static, ()> {
-    // The lock guards no data, so one that a panicking thread left behind is as good as new.
+    // The lock guards no data, so a poisoned lock is safe to use.
     DOOR.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -86,12 +86,12 @@ fn api() -> Result<&'static Api> {
 
 impl Api {
     fn load() -> Result<Self> {
-        // SAFETY: loading libEGL runs its initialisers and those of the vendor libraries, which is what it is for.
+        // SAFETY: loading libEGL runs the initializers of libEGL and of its vendor libraries, which is their purpose.
         let instance = unsafe { Instance::load_required_from_filename("libEGL.so.1") }
             .map_err(|error| unavailable(format!("libEGL.so.1 cannot be loaded ({error})")))?;
         let find = |name: &str| instance.get_proc_address(name);
-        // SAFETY: the types are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base; an
-        // address that EGL gives out for an extension it lacks returns an error when called, and is called only then.
+        // SAFETY: the types are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base.
+        // EGL may return an address for an extension that it lacks; calling it then returns an error.
         let (query_devices, query_attribute, query_string, platform_display) = unsafe {
             (
                 find("eglQueryDevicesEXT")
@@ -111,7 +111,7 @@ impl Api {
         let Some(query) = self.query_devices else { return Vec::new() };
         let mut devices = [std::ptr::null_mut(); 64];
         let mut count = 0;
-        // SAFETY: the array has room for the 64 handles that the call may write, and the count is ours.
+        // SAFETY: the array has capacity for the 64 handles that the call may write, and the count outlives the call.
         let good = unsafe { query(devices.len() as i32, devices.as_mut_ptr(), &raw mut count) };
         let count = if good == 0 { 0 } else { usize::try_from(count).unwrap_or(0) };
         devices[..count.min(devices.len())].to_vec()
@@ -119,7 +119,7 @@ impl Api {
 
     fn text(&self, device: Raw, name: i32) -> Option<String> {
         let query = self.query_string?;
-        // SAFETY: the device came from eglQueryDevicesEXT; the answer is null or a string that lives as long as EGL.
+        // SAFETY: the device came from eglQueryDevicesEXT; the result is null or a string that lives as long as EGL.
         unsafe {
             let text = query(device, name);
             (!text.is_null()).then(|| CStr::from_ptr(text).to_string_lossy().into_owned())
@@ -135,9 +135,9 @@ impl Api {
 
     fn display(&self, platform: u32, native: Raw) -> Option<egl::Display> {
         let none = [egl::NONE];
-        // SAFETY: `native` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; the list is ended.
+        // SAFETY: `native` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; NONE ends the list.
         let display = unsafe { self.platform_display?(platform, native, none.as_ptr()) };
-        // SAFETY: a display that EGL made, and never terminated here.
+        // SAFETY: EGL created the display, and this process never terminates it.
         (!display.is_null()).then(|| unsafe { egl::Display::from_ptr(display) })
     }
 
@@ -165,7 +165,7 @@ impl Api {
     }
 }
 
-/// All places where a context may be made: EGL's devices in their order, then Mesa's surfaceless platform.
+/// All displays on which a context can be created: EGL's devices in their order, then Mesa's surfaceless platform.
 ///
 /// # Errors
 /// `Unavailable` when libEGL cannot be loaded.
@@ -187,18 +187,18 @@ pub(super) fn candidates() -> Result<Vec<Candidate>> {
     Ok(found)
 }
 
-/// The refusal when no candidate would do.
+/// Error when no candidate is suitable.
 pub(super) fn none_fits(wanted: &str, tried: &[String]) -> Error {
     let tried = if tried.is_empty() { "no EGL device is there".to_string() } else { tried.join("; ") };
     unavailable(format!("no context on {wanted}: {tried}"))
 }
 
 impl Context {
-    /// Makes a context on a candidate and makes it current on this thread.
+    /// Creates a context on a candidate and makes it current on this thread.
     pub(super) fn open(candidate: &Candidate) -> Result<Self> {
         let is_debug = super::gl::is_debug_wanted();
         let made = Self::make(candidate.display, is_debug)?;
-        // Not under the lock: a failure here drops the context, which takes the lock itself.
+        // Outside the lock: on failure the context is dropped, which takes the lock.
         made.make_current()?;
         Ok(made)
     }
@@ -229,7 +229,7 @@ impl Context {
         Ok(Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context, is_debug })
     }
 
-    /// Makes it current on this thread unless it is so already.
+    /// Makes the context current on this thread unless it already is.
     pub(super) fn make_current(&self) -> Result<()> {
         if CURRENT.get() == self.number {
             return Ok(());
@@ -251,17 +251,17 @@ impl Drop for Context {
     fn drop(&mut self) {
         let Ok(api) = api() else { return };
         let _door = door();
-        // A thread that ends may have lost its thread-locals already; then nothing is current on it either.
+        // A thread that exits may have lost its thread-locals already; then no context is current on it either.
         if CURRENT.try_with(Cell::get) == Ok(self.number) {
             api.instance.make_current(self.display, None, None, None).ok();
             CURRENT.set(0);
         }
-        // Destroying fails only for a context that is gone, which is what was asked for.
+        // Destroying fails only for a context that no longer exists, which is the wanted state.
         api.instance.destroy_context(self.display, self.context).ok();
     }
 }
 
-/// A config that asks for no window: the default surface type is WINDOW, which headless devices do not have.
+/// A config without window support: the default surface type is WINDOW, which headless devices do not offer.
 fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
     for surface in [egl::PBUFFER_BIT, 0] {
         let wanted = [egl::SURFACE_TYPE, surface, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];

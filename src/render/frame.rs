@@ -1,4 +1,4 @@
-//! A shot of a scene to the numbers that its shaders read, computed in f64 and rounded last.
+//! Per-frame uniforms, computed in f64 from a shot and rounded to f32 at the end.
 
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Matrix4, Vector3};
@@ -8,7 +8,7 @@ use super::light::{Fit, LightBox};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Bounds, LightBounds, Scene};
 
-/// Twin of `FrameBlock` in `shaders/shared/frame.glsl`; columns of matrices follow each other.
+/// Uniform block of a frame; matrices are column-major. Twin of `FrameBlock` in `shaders/shared/frame.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Frame {
@@ -30,19 +30,21 @@ pub(super) struct Frame {
 
 const _: () = assert!(size_of::<Frame>() == 368, "Frame differs from shaders/shared/frame.glsl");
 
-/// The ground fades by exp(-(d / D)^2) and is drawn to this many D: there it is the horizon to the last bit.
+/// The ground fades by exp(-(d / D)^2) and is drawn up to this multiple of D, where it equals the horizon color to the
+/// last bit.
 const EDGE: f64 = 6.0;
 
-/// Vertices may lie below the ground by so many roundings of a coordinate and still count as on it: positions are sums in
-/// f32. The ground that is drawn lies behind what it touches, by as many roundings of depth and the depth of a pixel on it.
+/// Tolerance for vertices that count as lying on the ground, in f32::EPSILON of the largest coordinate: positions are
+/// sums in f32. The rasterized ground is drawn behind surfaces in its plane by as many roundings of depth plus its
+/// depth slope per pixel (`Fixed::behind`).
 const ROUNDINGS: f64 = 4.0;
 
 impl Frame {
-    /// The numbers of one shot of positions that are relative to `origin`, a point in scene units from the scene's
-    /// origin. It is taken off the camera in f64.
+    /// Computes the uniforms of one shot. Positions are relative to `origin`, a point in scene units from the scene's
+    /// origin; it is subtracted from the camera in f64.
     ///
     /// # Errors
-    /// `Invalid` when the camera's numbers overflow.
+    /// `Invalid` when the camera's matrices overflow.
     pub(super) fn new(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Result<Self> {
         let bounds = sound(scene, shot);
         let home = home(scene, bounds, origin);
@@ -84,8 +86,8 @@ impl Frame {
         }
     }
 
-    /// Whether who sees nothing at (x, y) of normalised device coordinates sees ground that was not drawn. Twin of
-    /// `meets_ground` in `shaders/shared/meets.glsl`.
+    /// Whether the view ray through (x, y) in normalized device coordinates meets the ground. Used for samples without
+    /// an id, whose ground was not rasterized. Twin of `meets_ground` in `shaders/shared/meets.glsl`.
     pub(super) fn meets_ground(&self, image: [f64; 2]) -> bool {
         let vector = |four: [f32; 4]| Vector3::new(four[0], four[1], four[2]).cast::<f64>();
         let [x, y, one] = [0, 1, 2].map(|column| vector(self.world_from_image[column]));
@@ -98,37 +100,38 @@ impl Frame {
     }
 }
 
-/// The camera's projection of positions that are relative to `origin`. The depth range is for the deformed and the rest
-/// state: planes must not jump when a branch bends.
+/// The camera's projection matrix for positions relative to `origin`. The depth range covers both the deformed and the
+/// rest state, so that the clip planes do not jump when a branch bends.
 fn clip_from_camera(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Matrix4<f64> {
     let bounds = sound(scene, shot);
     let viewer = shot.camera.relative_to(origin);
     viewer.clip_from_camera(shot.width, shot.height, &bounds.union(home(scene, bounds, origin)))
 }
 
-/// Clip space of a shot from positions that are relative to `origin`.
+/// Clip space of a shot from positions relative to `origin`.
 pub(super) fn camera_clip(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Matrix4<f64> {
     clip_from_camera(scene, shot, origin) * shot.camera.relative_to(origin).camera_from_world()
 }
 
-/// Clip space of the shadow map from positions that are relative to `origin`: the sun looks along z, -1 is nearest to it.
+/// Clip space of the shadow map from positions relative to `origin`. The sun looks along z; z = -1 is nearest to it.
 pub(super) fn map_clip(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Matrix4<f64> {
     let map = LightBox::fit(&sun_fit(scene, shot, origin)).map_from_world;
     Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map
 }
 
-/// The bounds of a shot. Those that overflowed fit no shadow and no depth range; those at rest are always good.
+/// The bounds of a shot, or the rest bounds when those overflowed: overflowed bounds fit no shadow map and no depth
+/// range.
 fn sound(scene: &Scene, shot: &Shot) -> Bounds {
     let sound = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
     if sound { shot.bounds } else { scene.rest_bounds }
 }
 
-/// What the vertices of a shot take up in light space, unless that or their bounds overflowed.
+/// Light-space bounds of a shot; none when they or the world-space bounds overflowed.
 fn lit(shot: &Shot) -> Option<LightBounds> {
     shot.light.filter(|light| light.is_sound() && shot.bounds.is_finite())
 }
 
-/// What the sun's box is fitted to, relative to `origin` as the positions are.
+/// Inputs of the shadow map fit, relative to `origin` like the positions.
 pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
     let bounds = sound(scene, shot);
     let height = home(scene, bounds, origin).min[scene.up.index()];
@@ -144,8 +147,8 @@ pub(super) fn sun_fit(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> Fit {
     }
 }
 
-/// The size of a texel of the shadow map in the world: two vectors across the light, along the map's x and y, in scene
-/// units. None when the look has no shadow. For positions that are relative to the scene's origin.
+/// Texel of the shadow map in world space: two vectors perpendicular to the light, along x and y of the map, in scene
+/// units. None when the look has no shadow. Valid for positions relative to the scene's origin.
 pub fn shadow_texel(scene: &Scene, shot: &Shot) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
     let map = LightBox::fit(&sun_fit(scene, shot, [0.0; 3])).map_from_world;
@@ -156,20 +159,20 @@ pub fn shadow_texel(scene: &Scene, shot: &Shot) -> Option<[Vector3<f64>; 2]> {
     Some([texel(0), texel(1)])
 }
 
-/// The matrix from the world to the clip space of the shadow map: the sun looks along z, -1 is nearest to it. None when
-/// the look has no shadow. For positions that are relative to the scene's origin.
+/// Matrix from world space to the clip space of the shadow map. The sun looks along z; z = -1 is nearest to it. None
+/// when the look has no shadow. Valid for positions relative to the scene's origin.
 pub fn shadow_clip(scene: &Scene, shot: &Shot) -> Option<Matrix4<f64>> {
     scene.look.shadow.map(|_| map_clip(scene, shot, [0.0; 3]))
 }
 
-/// Whether the camera stands above the ground; from below it is not drawn.
+/// Whether the camera is above the ground; the ground is not visible from below.
 pub(super) fn above_ground(scene: &Scene, shot: &Shot) -> bool {
     let up = scene.up.index();
     shot.camera.eye()[up] > scene.rest_bounds.min[up]
 }
 
-/// Whether the ground lies behind all else: the camera stands above it, and nothing of the scene lies below. Who sees nothing
-/// and looks down then sees the ground, and it need not be drawn.
+/// Whether the ground is behind everything else: the camera is above it and no vertex is below it. Samples without an
+/// id that look down then see the ground, and it need not be rasterized.
 pub(super) fn ground_is_last(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> bool {
     let (up, bounds) = (scene.up.index(), shot.bounds);
     let height = home(scene, bounds, origin).min[up];
@@ -178,8 +181,8 @@ pub(super) fn ground_is_last(scene: &Scene, shot: &Shot, origin: [f64; 3]) -> bo
     scene.look.ground.is_some() && above_ground(scene, shot) && bounds.is_finite() && lowest >= height
 }
 
-/// The rest bounds in the frame of the positions. A scene that has left the scene's origin for good, so that positions
-/// have another one, is as if it rested where it is now; its ground stays at its height.
+/// The rest bounds in the coordinates of the positions. When positions have another origin than the scene, because the
+/// scene moved far from its origin, the rest bounds move along to the current center; the ground keeps its height.
 fn home(scene: &Scene, bounds: Bounds, origin: [f64; 3]) -> Bounds {
     let rest = scene.rest_bounds;
     if origin == [0.0; 3] {
@@ -191,7 +194,7 @@ fn home(scene: &Scene, bounds: Bounds, origin: [f64; 3]) -> Bounds {
     Bounds { min: moved(rest.min), max: moved(rest.max) }
 }
 
-/// Centre of the ground under the scene, and the distance D over which it fades.
+/// Center of the ground below the scene, and the distance D over which it fades.
 fn ground_disc(up: usize, home: Bounds, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
     let mut centre = home.centre().coords;
     centre[up] = home.min[up];
@@ -200,7 +203,7 @@ fn ground_disc(up: usize, home: Bounds, eye: Vector3<f64>) -> (Vector3<f64>, f64
     (centre, 3.5 * home.diagonal().max(aside.norm()).max(1e-6))
 }
 
-/// Normalised device coordinates (x, y, 1) to a direction in the world.
+/// Normalized device coordinates (x, y, 1) to a direction in world space.
 fn world_from_image(clip: &Matrix4<f64>, camera: &Matrix4<f64>) -> Matrix4<f64> {
     let world_from_camera = camera.fixed_view::<3, 3>(0, 0).try_inverse().unwrap_or_else(nalgebra::Matrix3::identity);
     let mut camera_from_image = nalgebra::Matrix3::zeros();

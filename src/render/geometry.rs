@@ -1,15 +1,14 @@
-//! A scene's domains to the arrays that never change: corner indices sorted into draw groups, the vertex and uv of each
-//! corner, and the material of each triangle.
+//! Converts a scene's domains to the static arrays: corner indices sorted into draw groups, vertex and texture
+//! coordinates of each corner, and the material of each triangle.
 //!
-//! Triangles are sorted by what the pipeline must be set to, so that the number of draw calls never grows with the
-//! number of domains.
+//! Triangles are grouped by pipeline state, so that the number of draw calls does not grow with the number of domains.
 
 use nalgebra::Vector3;
 
 use modalcast_model::domain::{AlphaMode, Domain, Material};
 use modalcast_model::scene::{Scene, Slot};
 
-/// Which pass a triangle belongs to, by its material.
+/// The pass that draws a triangle, from its material's alpha mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Kind {
     Opaque,
@@ -17,7 +16,7 @@ pub(super) enum Kind {
     Blend,
 }
 
-/// A contiguous run of triangles that one draw call draws.
+/// A contiguous range of triangles that one call draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Group {
     pub(super) kind: Kind,
@@ -26,49 +25,49 @@ pub(super) struct Group {
     pub(super) triangles: usize,
 }
 
-/// Triangles that follow each other in a mesh and in the groups alike.
+/// A range of triangles that is contiguous both in a mesh and in the draw order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Stretch {
-    /// Its first triangle in the order of the groups.
+    /// Its first triangle in the draw order.
     pub(super) first: usize,
     pub(super) domain: usize,
     /// The same triangle in the domain's mesh.
     pub(super) triangle: usize,
 }
 
-/// The domain of the triangle at a place in the order of the groups, and the same triangle in the domain's mesh.
+/// Domain of a triangle, and its index in the domain's mesh; `place` is the triangle's index in the draw order.
 pub(super) fn whose(stretches: &[Stretch], place: usize) -> Option<(usize, usize)> {
     let after = stretches.partition_point(|stretch| stretch.first <= place);
     let stretch = stretches.get(after.checked_sub(1)?)?;
     Some((stretch.domain, stretch.triangle + place - stretch.first))
 }
 
-/// The static arrays, packed as the scene's layout says; triangles in the order of the groups.
+/// The static arrays, packed as the scene's layout says; triangles are in draw order.
 #[derive(Debug, Default)]
 pub(super) struct Geometry {
-    /// Per corner, its vertex in the packed positions.
+    /// Per corner: its vertex in the packed positions.
     pub(super) vertices: Vec<u32>,
     /// Per corner; empty when nothing samples a texture.
     pub(super) uvs: Vec<[f32; 2]>,
-    /// Per triangle, three corners in the packed normals.
+    /// Per triangle: three corners in the packed normals.
     pub(super) triangles: Vec<[u32; 3]>,
-    /// Per triangle, the vertices of those.
+    /// Per triangle: the vertices of its corners.
     pub(super) triangle_vertices: Vec<[u32; 3]>,
-    /// Per triangle, its material's place among the used ones; empty when all triangles have one material.
+    /// Per triangle: index of its material among the used ones; empty when all triangles have the same material.
     pub(super) materials: Vec<u32>,
     pub(super) groups: Vec<Group>,
-    /// Ascending by the first triangle.
+    /// Sorted by the first triangle.
     pub(super) stretches: Vec<Stretch>,
     /// Group of each material.
     group_of: Vec<usize>,
 }
 
-/// Whether triangles look their materials up one by one.
+/// Whether the shaders look up the material of each triangle.
 pub(super) fn looks_up(scene: &Scene) -> bool {
     used_materials(scene).len() > 1
 }
 
-/// The groups of a scene: opaque, then mask, then blend, six at most; and the group of each material.
+/// The groups of a scene, opaque, then mask, then blend, six at most; and the group of each material.
 pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
     let mut groups: Vec<Group> = Vec::new();
     let mut of_material = vec![0; scene.materials.len()];
@@ -94,7 +93,7 @@ pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
     (groups, of_material)
 }
 
-/// What the pipeline must be set to for a material.
+/// Pipeline state of a material.
 fn state(material: &Material) -> (Kind, bool) {
     (kind(material), material.double_sided)
 }
@@ -107,7 +106,7 @@ pub(super) const fn kind(material: &Material) -> Kind {
     }
 }
 
-/// Indices of the materials that triangles have, ascending.
+/// Indices of the materials that triangles use, ascending.
 pub(super) fn used_materials(scene: &Scene) -> Vec<usize> {
     let used: std::collections::BTreeSet<usize> = scene.domains.iter().flat_map(Domain::materials).collect();
     used.into_iter().collect()
@@ -148,7 +147,7 @@ impl Geometry {
         self.vertices.extend(corners.vertices.iter().map(|vertex| vertex + slot.first_vertex as u32));
         if textured {
             self.uvs.extend_from_slice(&corners.uvs);
-            // A mesh without texture coordinates sees one texel everywhere.
+            // A mesh without texture coordinates samples one texel everywhere.
             self.uvs.resize(self.vertices.len(), [0.0; 2]);
         }
     }
@@ -156,7 +155,7 @@ impl Geometry {
     fn add_triangles(&mut self, scene: &Scene, index: usize, rank: &[u32], next: &mut [usize]) {
         let (domain, slot) = (&scene.domains[index], &scene.layout.slots[index]);
         let mesh = &scene.shapes[domain.shape].mesh;
-        // A placement that mirrors turns every winding around.
+        // A mirroring placement reverses the winding of all triangles.
         let mirrored = domain.placement.linear().determinant() < 0.0;
         for (material, range) in stretches(domain, slot) {
             let kind = &scene.materials[material];
@@ -175,7 +174,7 @@ impl Geometry {
     }
 }
 
-/// The runs of one material, as ranges of the domain's triangles.
+/// The material runs of a domain, as ranges of its triangles.
 fn stretches<'a>(domain: &'a Domain, slot: &Slot) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
     let count = slot.triangles;
     let whole = domain.runs.is_empty().then_some((domain.material, 0..count));
@@ -184,8 +183,8 @@ fn stretches<'a>(domain: &'a Domain, slot: &Slot) -> impl Iterator<Item = (usize
     whole.into_iter().chain(runs)
 }
 
-/// Whether a triangle's winding says the opposite of its normals. Which side of a double-sided triangle is seen is asked
-/// of the winding, so that must agree with the normals; files do not always see to it.
+/// Whether a triangle's winding contradicts its normals. The winding decides which side of a double-sided triangle is
+/// visible, so it must agree with the normals; not all files guarantee that.
 fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -> bool {
     let corners = mesh.corners();
     let at = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();

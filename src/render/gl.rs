@@ -1,7 +1,8 @@
-//! The only door to OpenGL: typed objects that free themselves (`gl/object.rs`), and the few commands of the passes.
+//! Thin layer over OpenGL: typed objects that free themselves (`gl/object.rs`), and the few commands that the passes
+//! need. No other module calls OpenGL.
 //!
-//! Every object keeps its context alive and makes it current before it is used or freed, so that several renderers may
-//! live on one thread. Names never leave these files except for [`Buffer::name`], which CUDA registers.
+//! Each object keeps its context alive and makes it current before each use and before it is freed, so that several
+//! renderers can share a thread. Object names stay private except for [`Buffer::name`], which CUDA registers.
 
 mod clear;
 mod culling;
@@ -29,7 +30,7 @@ pub(super) use self::timer::Stopwatch;
 use super::egl::Context;
 use modalcast_model::error::{Error, Result, during};
 
-/// The constants that other files name.
+/// OpenGL constants that other modules use.
 pub(super) use glow::{
     CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
     LINEAR_MIPMAP_NEAREST, NEAREST, R32F, R32UI, REPEAT, RG16F, RG32F, RGB32F, RGB32UI, RGBA8, RGBA16F, RGBA32F,
@@ -37,21 +38,21 @@ pub(super) use glow::{
     TEXTURE_MAG_FILTER, TEXTURE_MIN_FILTER, TEXTURE_WRAP_S, TEXTURE_WRAP_T, VERTEX_SHADER,
 };
 
-/// A current context and its functions.
+/// An OpenGL context and its functions.
 pub(super) struct Gl {
-    // Declared before the context, so that it is dropped while the context still is.
+    // Declared before the context, so that it is dropped while the context exists.
     glow: glow::Context,
     context: Context,
     pub(super) limits: Limits,
-    /// Timer queries that nobody waits for.
+    /// Pool of timer queries that are not in use.
     timers: RefCell<Vec<glow::Query>>,
-    /// Buffers that are to go once they were read.
+    /// Buffers that will be freed once their readers are done.
     retired: RefCell<Vec<staging::Retired>>,
 }
 
 impl Drop for Gl {
     fn drop(&mut self) {
-        // What is dropped with it takes its callback from the current context, which must be this one.
+        // Dropping `glow` removes the debug callback from the current context, which must be this one.
         self.context.make_current().ok();
     }
 }
@@ -62,7 +63,7 @@ impl std::fmt::Debug for Gl {
     }
 }
 
-/// One attribute of a corner: location, buffer, components of 32 bits, and whether it is an integer.
+/// A vertex attribute: location, buffer, number of 32-bit components, and whether it is an integer.
 pub(super) struct Attribute<'a> {
     pub(super) location: u32,
     pub(super) buffer: &'a Buffer,
@@ -74,12 +75,13 @@ pub(super) struct Attribute<'a> {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Fixed {
     pub(super) depth_write: bool,
-    /// Depth outside near and far is clamped rather than clipped.
+    /// Depth outside near and far is clamped instead of clipped.
     pub(super) depth_clamp: bool,
-    /// Drawn a little farther away than it is, so that what lies in the same plane is seen.
+    /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
     pub(super) behind: bool,
     pub(super) cull: bool,
-    /// Colours are blended over those that are there; alpha becomes the share of what was there before that is left.
+    /// Colors are blended over the existing ones; alpha becomes the transmittance: the share of the background that
+    /// remains visible.
     pub(super) blend: bool,
 }
 
@@ -87,7 +89,7 @@ impl Gl {
     pub(super) fn new(context: Context) -> Result<Rc<Self>> {
         context.make_current()?;
         let address = |name: &std::ffi::CStr| name.to_str().map_or(std::ptr::null(), |name| context.address(name));
-        // SAFETY: the context is current on this thread, and the addresses are those that its EGL gives.
+        // SAFETY: the context is current on this thread, and EGL returned the addresses for this context.
         let mut glow = unsafe { glow::Context::from_loader_function_cstr(address) };
         let limits = Limits::of(&glow);
         if context.is_debug {
@@ -96,16 +98,16 @@ impl Gl {
         Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default(), retired: RefCell::default() }))
     }
 
-    /// The functions, with the context current.
+    /// The OpenGL functions; makes the context current first.
     fn on(&self) -> &glow::Context {
-        // A context that cannot be made current leaves errors that `check` reports at the end of the pass.
+        // If the context cannot be made current, `check` reports the errors at the end of the pass.
         self.context.make_current().ok();
         &self.glow
     }
 
-    /// Fails when OpenGL reported an error since the last check.
+    /// Fails if OpenGL reported an error since the last check.
     pub(super) fn check(&self, stage: &'static str) -> Result<()> {
-        // SAFETY: only asks; the context is current.
+        // SAFETY: a query without side effects on memory; the context is current.
         match unsafe { self.on().get_error() } {
             glow::NO_ERROR => Ok(()),
             glow::OUT_OF_MEMORY => Err(during(stage)("OpenGL is out of memory")),
@@ -113,12 +115,14 @@ impl Gl {
         }
     }
 
-    /// A buffer of `bytes` (at least 4, since OpenGL has no empty buffers), filled from `data` when given.
+    /// Creates a buffer of `bytes`, at least 4 because OpenGL has no empty buffers. It is filled from `data` if that
+    /// has exactly `bytes` bytes.
     pub(super) fn buffer(self: &Rc<Self>, bytes: u64, usage: u32, data: Option<&[u8]>) -> Result<Buffer> {
         let size = i32::try_from(bytes.max(4))
             .map_err(|_| during("buffer")(format!("{bytes} bytes is over the 2 GiB that one buffer may have")))?;
         let gl = self.on();
-        // SAFETY: size and data agree, or the data is absent and the store stays unwritten until somebody writes it.
+        // SAFETY: the size is that of the data, or there is no data and the content stays undefined until the first
+        // write.
         let name = unsafe {
             let name = gl.create_buffer().map_err(during("buffer"))?;
             gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(name));
@@ -137,7 +141,7 @@ impl Gl {
     pub(super) fn texture(self: &Rc<Self>, kind: TextureKind) -> Result<Texture> {
         let gl = self.on();
         let [width, height, depth, levels] = [kind.width, kind.height, kind.depth, kind.levels].map(|side| side as i32);
-        // SAFETY: storage of a fresh texture; sizes above the limits are reported as errors.
+        // SAFETY: allocates storage for a new texture; OpenGL reports sizes above the limits as errors.
         let name = unsafe {
             let name = gl.create_texture().map_err(during("texture"))?;
             gl.bind_texture(kind.target, Some(name));
@@ -154,11 +158,11 @@ impl Gl {
         self.check("texture").map(|()| texture)
     }
 
-    /// A view of a whole buffer as a texture of one row. The buffer must outlive it.
+    /// Creates a buffer texture over a whole buffer. The buffer must outlive it.
     pub(super) fn view(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
         let gl = self.on();
         let target = glow::TEXTURE_BUFFER;
-        // SAFETY: fresh texture over a buffer of this context.
+        // SAFETY: a new texture over a buffer of this context.
         let name = unsafe {
             let name = gl.create_texture().map_err(during("texture"))?;
             gl.bind_texture(target, Some(name));
@@ -170,11 +174,11 @@ impl Gl {
         self.check("texture").map(|()| texture)
     }
 
-    /// Links shaders, each given as stage and source.
+    /// Compiles and links a program from pairs of stage and source.
     pub(super) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
         let gl = self.on();
         let fail = |log: String| during("shader")(format!("{label}: {log}"));
-        // SAFETY: fresh objects; the shaders are flagged for deletion once the program holds them.
+        // SAFETY: new objects; the shaders are flagged for deletion and live until the program is deleted.
         unsafe {
             let name = gl.create_program().map_err(during("shader"))?;
             let program = Program { gl: Rc::clone(self), name };
@@ -199,7 +203,7 @@ impl Gl {
 
     fn attached(self: &Rc<Self>, colour: Option<&Texture>, depth: Option<&Texture>) -> Result<Framebuffer> {
         let gl = self.on();
-        // SAFETY: attaches textures of this context; completeness is asked for at once.
+        // SAFETY: attaches textures of this context; completeness is checked right after.
         unsafe {
             let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
             let framebuffer = Framebuffer { gl: Rc::clone(self), name };
@@ -240,7 +244,7 @@ impl Gl {
         }
     }
 
-    /// Where the samples of a framebuffer's pixels lie in them, 0 to 1 from the lower left.
+    /// Sample positions within the pixels of a framebuffer, 0 to 1 from the lower left.
     pub(super) fn sample_places(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
         type GetMultisample = unsafe extern "system" fn(u32, u32, *mut f32);
         let gl = self.on();
@@ -248,7 +252,7 @@ impl Gl {
         if address.is_null() {
             return Err(during("samples")("glGetMultisamplefv is not there"));
         }
-        // SAFETY: the address is that of the function of this name, whose parameters are these; it writes two floats.
+        // SAFETY: the address is that of glGetMultisamplefv, which has this signature and writes two floats.
         unsafe {
             let ask = std::mem::transmute::<*const std::ffi::c_void, GetMultisample>(address);
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(of.name));
@@ -263,7 +267,7 @@ impl Gl {
     pub(super) fn set(&self, fixed: Fixed) {
         let gl = self.on();
         let flip = |flag: u32, on: bool| {
-            // SAFETY: flags that every 4.3 core context knows.
+            // SAFETY: flags that every 4.3 core context accepts.
             unsafe { if on { gl.enable(flag) } else { gl.disable(flag) } }
         };
         flip(glow::DEPTH_TEST, true);
@@ -271,7 +275,7 @@ impl Gl {
         flip(glow::POLYGON_OFFSET_FILL, fixed.behind);
         flip(glow::CULL_FACE, fixed.cull);
         flip(glow::BLEND, fixed.blend);
-        // SAFETY: plain state.
+        // SAFETY: sets state; no memory is accessed.
         unsafe {
             gl.depth_func(glow::LEQUAL);
             gl.polygon_offset(1.0, 8.0);
@@ -284,7 +288,7 @@ impl Gl {
     /// Draws `triangles` triangles of an array's index buffer from triangle `first` on.
     pub(super) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
         let gl = self.on();
-        // SAFETY: the indices were built from checked meshes and stay below the corners that the attributes hold.
+        // SAFETY: the indices come from validated meshes and stay below the number of elements of each attribute.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
             gl.draw_elements(glow::TRIANGLES, 3 * triangles as i32, glow::UNSIGNED_INT, 12 * first as i32);
@@ -292,7 +296,7 @@ impl Gl {
         }
     }
 
-    /// Draws vertices that the shader makes from their number.
+    /// Draws vertices that the vertex shader derives from their index.
     pub(super) fn draw_made(&self, array: &VertexArray, vertices: u32) {
         let gl = self.on();
         // SAFETY: no attribute is read.
@@ -303,7 +307,7 @@ impl Gl {
         }
     }
 
-    /// Runs the current compute program, then lets everything after it see what it wrote.
+    /// Runs the bound compute program, followed by a barrier that makes its writes visible to later commands.
     pub(super) fn dispatch(&self, groups_x: u32, groups_y: u32) {
         let gl = self.on();
         // SAFETY: the shaders check their own bounds.
@@ -313,7 +317,7 @@ impl Gl {
         }
     }
 
-    /// The same with as many groups as the first three words of a buffer say.
+    /// Like [`Self::dispatch`]; the first three words of a buffer give the number of workgroups.
     pub(super) fn dispatch_listed(&self, groups: &Buffer) {
         let gl = self.on();
         // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
@@ -328,11 +332,11 @@ impl Gl {
         self.copy_to(from, (to, 0), bytes);
     }
 
-    /// The same to a place that many bytes into the other buffer.
+    /// Copies the first `bytes` bytes to byte offset `place` of the other buffer.
     pub(super) fn copy_to(&self, from: &Buffer, (to, place): (&Buffer, u64), bytes: u64) {
         let gl = self.on();
         let (read, write) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
-        // SAFETY: OpenGL refuses ranges outside either buffer.
+        // SAFETY: OpenGL rejects ranges outside either buffer.
         unsafe {
             gl.bind_buffer(read, Some(from.name));
             gl.bind_buffer(write, Some(to.name));
@@ -341,7 +345,7 @@ impl Gl {
     }
 }
 
-/// A refusal by size that a caller can act on.
+/// Error for a size above a device limit, which the caller can act on.
 pub(super) fn too_large(what: &str, limit: u64, given: u64) -> Error {
     modalcast_model::error::invalid(what, format!("at most {limit} on this device"), given)
 }

@@ -1,32 +1,35 @@
-//! Headless OpenGL: a scene's buffers, the passes that draw it, and the pixels back.
+//! Headless OpenGL renderer: uploads a scene to the device, draws frames of it and reads their pixels back.
 //!
 //! | pass | what it does | runs when |
 //! |---|---|---|
-//! | raster | the shadow map's depth, what the camera sees, or both, by a rasteriser beside OpenGL ([`Path`]) | the look asks for it |
-//! | shadow cull | lists of the triangles that the shadow map may show (compute) | triangles are culled |
-//! | shadow | depth from the sun; cut-outs leave holes | the look has a shadow |
-//! | blur | depth to moments, blurred in x and in y (compute) | that shadow is a variance map |
-//! | occluders | depth of what the last frame saw, and its pyramid (compute) | hidden triangles are culled |
+//! | raster | shadow depth, visibility or both, drawn by the compute rasterizer ([`Path`]) | the look asks for it |
+//! | shadow cull | lists of the triangles that may appear in the shadow map (compute) | triangles are culled |
+//! | shadow | depth as seen from the sun; cut-outs leave holes | the look has a shadow |
+//! | blur | depth to moments, blurred in x and in y (compute) | the shadow is a variance map |
+//! | occluders | depth of the triangles that the last frame saw, and its pyramid (compute) | hidden triangles are culled |
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
-//! | visibility | which triangle each sample sees, and depth; mask discards | some triangle is not blended |
-//! | unpack | in its place: what a rasteriser beside OpenGL saw, and the ground, to ids (compute) | that drew it |
-//! | ground | the same of the ground | the look has a ground, the camera is above it, and something is below it |
-//! | blended | light of the blended triangles over each other, no depth written | two passes, and some triangle is blended |
-//! | count, scan, fill | lists of the blended fragments of each pixel | exact, and some triangle is blended |
-//! | resolve | lists sorted by depth, shaded and blended (compute) | the same |
-//! | backdrop | sky, ground (found here where it was not drawn) and blended layer to light, where no triangle is seen; lists the other tiles (compute) | always |
-//! | shade | Phong and images too, in the listed tiles; samples to pixels (compute) | some triangle is not blended |
-//! | bloom | bright light spreads, then the tone curve (compute) | the look has a bloom |
-//! | encode | light to sRGB bytes, top row first; smooths edges and mixes levels (compute) | always |
+//! | visibility | triangle id and depth of each sample; masked materials discard | some triangle is not blended |
+//! | unpack | keys of the compute rasterizer, and the ground, to ids (compute) | it drew the visibility |
+//! | ground | id and depth of the ground | the look has a ground, the camera is above it, and something is below it |
+//! | blended | light of translucent triangles over each other; no depth writes | two-pass transparency, some triangle is blended |
+//! | count, scan, fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
+//! | resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |
+//! | backdrop | shades tiles that see no opaque triangle; lists the other tiles (compute) | always |
+//! | shade | Phong shading in the listed tiles; samples to pixels (compute) | some triangle is not blended |
+//! | bloom | spreads bright light, then applies the tone curve (compute) | the look has a bloom |
+//! | encode | linear light to sRGB bytes, top row first; smooths edges and dithers (compute) | always |
 //!
-//! A frame is submitted and collected apart, so that others may be under way meanwhile ([`Ticket`]).
+//! Submitting a frame and collecting its pixels are separate calls, so that several frames can be in flight
+//! ([`Ticket`]).
 //!
-//! Two things are drawn only when asked for, with programs and buffers made then: what a few pixels see ([`Pick`]), and
-//! numbers in place of colours ([`Survey`]).
+//! Two outputs are drawn only on request, with programs and buffers that are created on first use: picking, which finds
+//! the triangles at a few pixels ([`Pick`]), and AOV (arbitrary output variable) readbacks, which deliver numbers
+//! instead of colors ([`Survey`]).
 //!
-//! A triangle is shaded once in each pixel where it is seen, whatever lies behind it; the rasteriser writes ids alone. Of
-//! several samples a pixel these are never cleared: depth says where there is one. Of a frame no more is drawn into than the
-//! bounds of the vertices can reach, and no more is cleared than earlier frames have.
+//! Shading is deferred: the rasterizer writes ids only, and each visible triangle is shaded once per pixel, whatever
+//! lies behind it. Multisampled id buffers are not cleared; the depth buffer says which samples hold an id. A frame
+//! draws only into the screen region that the bounds of the vertices can reach, and clears only the region that earlier
+//! frames wrote.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
@@ -81,123 +84,125 @@ use modalcast_model::deform::Surface;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Bounds, Camera, LightBounds, Scene};
 
-/// Which EGL device to draw on.
+/// Preference for the EGL device that draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Prefer {
-    /// The device that is this CUDA device.
+    /// The EGL device that corresponds to this CUDA device ordinal.
     Cuda(i32),
-    /// Any hardware device, else Mesa's software rasteriser.
+    /// Any hardware device; Mesa's software rasterizer when there is none.
     Any,
-    /// Mesa's software rasteriser.
+    /// Mesa's software rasterizer.
     Software,
 }
 
-/// What draws.
+/// Description of the OpenGL device and driver.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct Info {
-    /// GL_RENDERER.
+    /// The GL_RENDERER string.
     pub renderer: String,
-    /// GL_VERSION.
+    /// The GL_VERSION string.
     pub version: String,
-    /// Whether it runs on the CPU.
+    /// Whether OpenGL runs on the CPU.
     pub software: bool,
-    /// The CUDA device that it is, by EGL_CUDA_DEVICE_NV.
+    /// Ordinal of the corresponding CUDA device, from EGL_CUDA_DEVICE_NV.
     pub cuda_device: Option<i32>,
-    /// The largest side of a frame, in pixels.
+    /// Longest side of a frame, in pixels.
     pub max_side: u32,
 }
 
-/// One frame to be drawn of what the buffers hold.
+/// Parameters of one frame; the geometry is the current content of the scene's buffers.
 #[derive(Debug, Clone, Copy)]
 pub struct Shot {
     pub camera: Camera,
     pub width: u32,
     pub height: u32,
-    /// Bounds that hold every deformed vertex: a frame shows nothing outside of them, unless they are not finite.
+    /// Bounds of all deformed vertices, in scene units. The frame draws nothing outside them; bounds that are not
+    /// finite are ignored.
     pub bounds: Bounds,
-    /// What the same vertices take up in light space, to which the shadow map is fitted; without it, to the corners of
-    /// `bounds`.
+    /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
+    /// to the corners of `bounds`.
     pub light: Option<LightBounds>,
 }
 
-/// RGBA8 sRGB pixels, top row first.
+/// RGBA8 sRGB pixels of a frame, top row first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Image {
     pub width: u32,
     pub height: u32,
     pub rgba: Vec<u8>,
-    /// Milliseconds, by name: the stages "shadow", "draw" and "read", and the passes out of them: "raster" (of a rasteriser
-    /// beside OpenGL; what the camera sees too, where it draws both) and "blur" of the shadow, "ids" (by that one alone),
-    /// "cull" (of a culled scene, with the occluders), "visibility" (with the ground), "blended" (lists and all), "shade"
-    /// (with the backdrop), "bloom" and "encode" of drawing.
+    /// Milliseconds by name. The stages are "shadow", "draw" and "read". "raster" (the compute rasterizer, including
+    /// the visibility when it draws both) and "blur" are part of the shadow stage. "ids" (the compute rasterizer when
+    /// it draws visibility only), "cull" (with the occluders), "visibility" (with the ground), "blended" (with the
+    /// fragment lists), "shade" (with the backdrop), "bloom" and "encode" are part of the draw stage.
     pub passes: Vec<(&'static str, f64)>,
     pub paths: Paths,
 }
 
-/// Names of the OpenGL buffers that a deformer may write in place of an upload.
+/// Names of the OpenGL buffers that a deformer can write directly, instead of an upload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SharedBuffers {
     /// 3 f32 per vertex.
     pub positions: u32,
     /// 3 f32 per corner.
     pub normals: u32,
-    /// 4 f32 per corner, when the scene has normal maps.
+    /// 4 f32 per corner; present when the scene has normal maps.
     pub tangents: Option<u32>,
 }
 
-/// What the last frame really ran.
+/// Statistics of the last frame that was collected: the passes that ran and how many triangles they processed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Ran {
-    /// Passes, in order. Of several frames of one step the first alone has "shadow" and "blur", where they can be shared:
-    /// see [`SceneBuffers::hold_step`].
+    /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"
+    /// and "blur"; see [`SceneBuffers::hold_step`].
     pub passes: Vec<&'static str>,
-    /// Who drew the passes that turn triangles into samples.
+    /// The rasterizer that drew the shadow map and the visibility.
     pub paths: Paths,
-    /// Draw calls of the visibility and blended passes.
+    /// Number of draw calls of the visibility and blended passes.
     pub draws: usize,
-    /// Samples a pixel.
+    /// Samples per pixel.
     pub samples: u32,
-    /// Of exact transparency: how many fragments were blended, and whether all fitted.
+    /// Fragment list statistics; present with exact transparency.
     pub lists: Option<Lists>,
-    /// What was left out before it was drawn, where triangles are culled.
+    /// Culling statistics; present when triangles are culled.
     pub culled: Option<Culled>,
 }
 
-/// The largest side of a frame, whatever the device can do.
+/// Longest side of a frame in pixels, even on devices that support more.
 const MAX_SIDE: u32 = 8192;
-/// Forms of frames whose images are kept.
+/// Number of render targets that are cached, by frame form.
 const TARGETS: usize = 4;
-/// Programs that are kept for scenes to come.
+/// Number of programs that are cached across scenes.
 const PROGRAMS: usize = 128;
-/// How long a renderer that goes waits for those who still copy pixels.
+/// Maximum time that a dropped renderer waits for each thread that still copies pixels.
 const LAST_READERS: Duration = Duration::from_secs(1);
-/// How long the device may take for one frame.
+/// Time limit of the device for one frame.
 const WATCHDOG: Duration = Duration::from_secs(60);
 
-/// The EGL and OpenGL contexts. Lives and dies on the device thread.
+/// A headless OpenGL context with its cached programs and render targets. It is created, used and dropped on the device
+/// thread.
 #[derive(Debug)]
 pub struct Renderer {
     info: Info,
     gl: Rc<Gl>,
     programs: HashMap<Source, Rc<Program>>,
     sample_places: Vec<[f32; 2]>,
-    /// The most recently used last.
+    /// Least recently used first.
     targets: Vec<Target>,
     ran: Ran,
-    /// Of the last frame.
+    /// Uniforms of the last frame.
     last: Option<frame::Frame>,
     watchdog: Duration,
-    /// What picks are drawn into, once there was one.
+    /// Render target for picks; created by the first pick.
     picker: Option<pick::Picker>,
-    /// What the last survey was drawn into, once there was one.
+    /// Render target of the last AOV readback.
     surveyor: Option<survey::Surveyor>,
 }
 
 impl Renderer {
-    /// Opens a surfaceless context and makes it current on this thread.
+    /// Creates a surfaceless context and makes it current on this thread.
     ///
     /// # Errors
-    /// `Unavailable` naming the missing library or vendor file.
+    /// `Unavailable` with the name of the missing library or vendor file.
     pub fn open(prefer: Prefer) -> Result<Self> {
         let (gl, cuda_device) = device::open(prefer)?;
         let info = Info {
@@ -222,17 +227,17 @@ impl Renderer {
         })
     }
 
-    /// What draws.
+    /// The OpenGL device and driver.
     pub const fn info(&self) -> &Info {
         &self.info
     }
 
-    /// What the last frame really ran.
+    /// Statistics of the last frame that was collected.
     pub const fn ran(&self) -> &Ran {
         &self.ran
     }
 
-    /// Loads what never changes of a scene, and makes room for what does.
+    /// Uploads the static data of a scene and allocates the buffers of the deformed data.
     ///
     /// # Errors
     /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
@@ -248,15 +253,15 @@ impl Renderer {
 
     /// Frees a scene's buffers.
     pub fn unload(&mut self, buffers: SceneBuffers) {
-        // Makes this context current: a rasteriser beside it gives its buffers back to the current one.
+        // `check` makes this context current: the compute rasterizer unregisters its buffers from the current context.
         self.gl.check("unload").ok();
         drop(buffers);
     }
 
-    /// Fills the shared buffers from host memory.
+    /// Uploads a deformed surface from host memory into the shared buffers.
     ///
     /// # Errors
-    /// `Fault` when the surface is not the scene's, or OpenGL reports an error.
+    /// `Fault` when an array of the surface has another length than its buffer, or OpenGL reports an error.
     pub fn upload(&mut self, buffers: &SceneBuffers, surface: &Surface) -> Result<()> {
         buffers.shared_shadow.forget();
         for (name, list) in
@@ -275,11 +280,12 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// Fills positions that are drawn in place of the shared ones until [`SceneBuffers::relative_to`] says otherwise: for
-    /// domains in cells of their own, whose shared positions have no common origin. `origin` is theirs.
+    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::relative_to`]. For
+    /// scenes whose domains have separate local origins: the shared positions then have no common origin, and
+    /// `positions` are rebased to `origin` (scene units, from the scene's origin).
     ///
     /// # Errors
-    /// `Fault` when the positions are not the scene's, or OpenGL reports an error.
+    /// `Fault` when the number of positions differs from the scene's, or OpenGL reports an error.
     pub fn upload_apart(&mut self, buffers: &mut SceneBuffers, positions: &[f32], origin: [f64; 3]) -> Result<()> {
         let bytes = buffers.buffer("positions")?.bytes;
         if 4 * positions.len() as u64 != bytes {
@@ -297,17 +303,17 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// What the first sample of each pixel of the last frame sees, top row first.
+    /// Ids that the first sample of each pixel of the last frame sees, top row first.
     ///
     /// # Errors
-    /// `Fault` when no frame was drawn, or the device does not finish.
+    /// `Fault` when no frame was drawn, or the device does not finish in time.
     pub fn seen(&mut self) -> Result<Vec<Seen>> {
         let nothing = || during("seen")("no frame was drawn");
         let samples = self.targets.last().ok_or_else(nothing)?.form.samples;
         let program = self.program(shaders::seen(samples))?;
         let target = self.targets.last().ok_or_else(nothing)?;
         passes::seen(&self.gl, target, &program)?;
-        // Not by the ring, which may be full of frames under way.
+        // A temporary staging buffer, because the ring may be full of frames in flight.
         let bytes = target.form.bytes();
         let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
         self.gl.copy(&target.packed, &staging, bytes);
@@ -324,7 +330,7 @@ impl Renderer {
         Ok(seen.collect())
     }
 
-    /// Puts the images for frames of this form last in the list, made if need be.
+    /// Moves the target of this form to the end of the cache, and creates it if it is not cached.
     fn make_room(&mut self, form: Form) -> Result<()> {
         if let Some(at) = self.targets.iter().position(|target| target.form == form) {
             self.targets[at..].rotate_left(1);
@@ -348,8 +354,8 @@ impl Renderer {
     }
 }
 
-/// Normalised device coordinates of a place in a pixel, by the pixel's number from the top left on; the place is measured
-/// from the pixel's lower left, 0 to 1.
+/// Normalized device coordinates of a point in a pixel. `pixel` counts from the top left; `place` is measured from the
+/// pixel's lower left corner, 0 to 1.
 fn image_place(pixel: u32, [width, height]: [u32; 2], place: [f32; 2]) -> [f64; 2] {
     let (column, row) = (pixel % width, height - 1 - pixel / width);
     let across = |at: u32, place: f32, side: u32| 2.0 * (f64::from(at) + f64::from(place)) / f64::from(side) - 1.0;

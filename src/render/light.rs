@@ -1,49 +1,53 @@
-//! The sun's view of the deformed scene: a box in light space, and the matrix from the world into it (section 3.3.1).
+//! Fits the shadow map to the deformed scene: a box in light space, and the matrix from world space to the map (section
+//! 3.3.1).
 //!
-//! The z axis of light space is v_l, the direction to the sun, and its y axis points up in the world. The box is the
-//! axis-aligned box there of the vertices, as the deformer measured them, symmetric about its centre in x and y; or, as in
-//! the thesis, that of the corners of their world-space bounds, where a shot has no more. Its four side facets run
-//! along the light, so they are lengthened until they meet the ground: then the whole shadow on it lies inside. All sides
-//! keep to steps that are fixed in the world, so that shadows do not crawl while the scene sways.
+//! The z axis of light space is v_l, the direction to the sun; its y axis points up in the world. The box is
+//! axis-aligned in light space and symmetric about its center in x and y. It encloses the vertices as the deformer
+//! measured them; a shot without that measurement uses the corners of the world-space bounds, as in the thesis. The
+//! four side facets run along the light and are lengthened until they meet the ground, so that the whole shadow on the
+//! ground lies inside. All sides are quantized to steps that are fixed in the world, so that shadow edges do not crawl
+//! while the scene sways.
 
 use nalgebra::{Matrix4, Vector3};
 
 use modalcast_model::scene::{Bounds, LightBounds, UpAxis, light_axes};
 
-/// How far below the box the ground may pull the far plane, in diagonals: a grazing sun would pull it to infinity, and a
-/// receiver beyond the far plane is still shaded rightly.
+/// Maximum distance by which the ground may push the far plane below the box, in diagonals of the bounds. A grazing sun
+/// would push it to infinity. Receivers beyond the far plane are still shaded correctly.
 const REACH: f64 = 8.0;
 
 /// The fitted shadow map.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LightBox {
-    /// World to the map: x and y are 0 to 1 across it, z is 0 at the plane nearest to the sun and 1 at the farthest.
+    /// World space to the map: x and y are 0 to 1 across the map, z is 0 at the plane nearest to the sun and 1 at the
+    /// farthest.
     pub(super) map_from_world: Matrix4<f64>,
-    /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) when there is none.
+    /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
     pub(super) ground: [f64; 3],
-    /// x, y and z of light space.
+    /// Axes x, y and z of light space.
     pub(super) axes: [Vector3<f64>; 3],
-    /// The map along x and y of light space.
+    /// Extent of the map along x and y of light space.
     pub(super) sides: [Side; 2],
 }
 
-/// What the box is fitted to.
+/// Inputs of the fit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Fit {
     pub(super) to_sun: Vector3<f64>,
     pub(super) up: UpAxis,
     pub(super) bounds: Bounds,
-    /// Of the same vertices; without it, the corners of `bounds` take its place.
+    /// Light-space bounds of the same vertices; without them, the corners of `bounds` are used.
     pub(super) light: Option<LightBounds>,
-    /// Height of the ground along up.
+    /// Height of the ground along the up axis.
     pub(super) ground: Option<f64>,
     /// Side of the map and the empty rim that the blur needs, both in texels.
     pub(super) size: f64,
     pub(super) rim: f64,
 }
 
-/// A side of a map, on a grid of texels that is fixed in the world: where it begins and half its length. What it is fitted
-/// to may grow or move; its length keeps to a few rungs and it moves by whole texels, so that no shadow crawls.
+/// One side of a map on a texel grid that is fixed in the world: its lower end and half its length. When the fitted
+/// bounds grow or move, the length changes in few discrete steps and the side moves by whole texels, so that shadows do
+/// not crawl.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Side {
     pub(super) low: f64,
@@ -51,7 +55,7 @@ pub(super) struct Side {
 }
 
 impl Side {
-    /// Holds `reach` to each side of the centre, inside the rim.
+    /// Covers `reach` to each side of the center, inside the rim.
     pub(super) fn snapped(centre: f64, reach: f64, fit: &Fit) -> Self {
         let half = rung(reach) * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
         let texel = 2.0 * half / fit.size;
@@ -59,7 +63,7 @@ impl Side {
     }
 }
 
-/// The next length above: sixteenths of the power of two below.
+/// The next larger quantized length, in sixteenths of the next lower power of two.
 fn rung(length: f64) -> f64 {
     let step = length.log2().floor().exp2() / 16.0;
     ((length / step).floor() + 1.0) * step
@@ -100,12 +104,12 @@ impl LightBox {
     }
 }
 
-/// The yardstick of the box. Bounds of no size get some, that f32 still tells apart where they are.
+/// Reference length of the box. Bounds without extent get one that f32 can still resolve at their position.
 fn diagonal(fit: &Fit) -> f64 {
     fit.bounds.diagonal().max(1e-6).max(1e-6 * fit.bounds.centre().coords.amax())
 }
 
-/// z of light space at the planes nearest to the sun and farthest from it, in whole steps as the sides are.
+/// z of light space at the planes nearest to the sun and farthest from it, quantized like the sides.
 fn depths(fit: &Fit, [mut far, nearest]: [f64; 2], sides: &[Side; 2], plane: Option<[f64; 3]>) -> (f64, f64) {
     let diagonal = diagonal(fit);
     let near = nearest + 0.01 * diagonal;
@@ -118,7 +122,7 @@ fn depths(fit: &Fit, [mut far, nearest]: [f64; 2], sides: &[Side; 2], plane: Opt
     ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
 }
 
-/// The z of the ground in light space at (x, y): a x + b y + c; none when the sun is as good as on the horizon.
+/// The z of the ground in light space at (x, y): a x + b y + c; none when the sun is almost on the horizon.
 fn ground_plane(axes: &[Vector3<f64>; 3], up: UpAxis, height: f64) -> Option<[f64; 3]> {
     let [x, y, z] = axes.map(|axis| axis[up.index()]);
     (z.abs() > 0.02).then(|| [-x / z, -y / z, height / z])
@@ -154,7 +158,7 @@ mod tests {
         }
     }
 
-    /// A ball inside the bounds of [`fit`], each axis scaled.
+    /// Points of an ellipsoid inside the bounds of [`fit`]; each axis is scaled.
     fn ball(scale: [f64; 3]) -> Vec<Point3<f64>> {
         let point = |at: u32| {
             let (turn, height) = (2.4 * f64::from(at), f64::from(at) / 250.0 - 1.0);
@@ -208,8 +212,9 @@ mod tests {
         assert!(centre.iter().all(|number| (0.0..=1.0).contains(number)), "{centre}");
     }
 
-    /// Where a fixed point falls between the texels of the map, over bounds that sway and grow slowly: the most that it
-    /// moves from step to step, in texels, but for the steps at which the map takes another rung; and their number.
+    /// Tracks a fixed point in the texel grid of the map while the bounds sway and grow slowly. Returns its largest
+    /// movement between steps, in fractions of a texel, and the number of steps at which the map changed its quantized
+    /// size, which are excluded from the movement.
     fn crawl(is_lit: bool, place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
         let mut fit = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut last, mut most, mut jumps): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
@@ -217,7 +222,7 @@ mod tests {
             let sway = f64::from(step) * 0.3;
             fit.bounds.max = [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
             let [x, y, z] = fit.bounds.max;
-            // A size that does not sway about a rung.
+            // A size that does not oscillate around a quantization step.
             fit.light = held(&fit, &ball([x, 0.5 * y, z].map(|scale| 0.95 * scale))).filter(|_| is_lit);
             let at = place(&fit).map(|number| number * fit.size);
             let width = LightBox::fit(&fit).sides[0].half + LightBox::fit(&fit).sides[1].half;

@@ -1,9 +1,10 @@
-//! Exact transparency: a list of all blended fragments in each pixel, in bounded memory.
+//! Exact order-independent transparency: a list of all blended fragments of each pixel, in bounded memory.
 //!
-//! Fragments are counted, each pixel is given room, the lists are filled in whatever order fragments come, and sorted by
-//! depth and id before they are blended: the picture does not depend on that order. The budget is in fragments. Where a
-//! frame has more, all pixels keep the same number of their nearest at most, the largest for which all fit; what is left
-//! out is counted.
+//! One pass counts the fragments, a prefix sum allocates a list for each pixel, and another pass fills the lists in any
+//! order. The lists are sorted by depth and id before they are blended, so the picture does not depend on the order of
+//! the fragments. The memory budget is a number of fragments. When a frame has more, every pixel keeps at most the same
+//! number of its nearest fragments: the largest number for which all lists fit, up to 256. Dropped fragments are
+//! counted.
 
 use std::rc::Rc;
 
@@ -27,37 +28,37 @@ const LEDGER: u32 = 3;
 const COUNTS: u32 = 1;
 const ENDS: u32 = 2;
 const LAYERS: u32 = 3;
-/// Bytes of a fragment: depth, and id with coverage.
+/// Bytes of a fragment: depth, then id and coverage.
 const RECORD_BYTES: u64 = 8;
-/// Fragments a pixel for which there is room by default, on average; and in a frame however small.
+/// Default budget in fragments per pixel, and its minimum per frame.
 const USUAL: u64 = 8;
 const FEWEST: u64 = 1 << 20;
-/// Turns of the gathering program.
+/// Phases of the gather program: count, fill, and add ids to the kept depths.
 const COUNT: i32 = 0;
 const FILL: i32 = 1;
 const JOIN: i32 = 2;
 
-/// What a frame's lists held.
+/// Fragment statistics of a frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Lists {
-    /// Blended fragments that something opaque does not hide and that are not wholly transparent.
+    /// Blended fragments that are not wholly transparent and not hidden by something opaque.
     pub fragments: u64,
-    /// Those that fitted into the budget; the others, farthest in their pixels, are not in the picture.
+    /// Fragments within the budget. The others, the farthest of their pixels, are missing in the picture.
     pub kept: u64,
-    /// Fragments of the pixel with the most.
+    /// Largest number of fragments in a pixel.
     pub deepest: u32,
-    /// Fragments that a pixel could keep, where not all fitted.
+    /// Maximum number of fragments per pixel, when the budget was exceeded.
     pub bound: Option<u32>,
 }
 
 impl Lists {
-    /// Fragments that the picture lacks.
+    /// Fragments that are missing in the picture.
     pub const fn dropped(&self) -> u64 {
         self.fragments - self.kept
     }
 }
 
-/// Twin of `Ledger` in `shaders/shared/lists.glsl`, up to its bins.
+/// Counters and indirect draws of a frame. Twin of `Ledger` in `shaders/shared/lists.glsl`, up to its bins.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct Ledger {
@@ -66,7 +67,7 @@ struct Ledger {
     most: u32,
     used: u32,
     budget: u32,
-    /// Count, instances, first index, base vertex, base instance of a draw.
+    /// Indirect draws: index count, instances, first index, base vertex, base instance.
     commands: [[u32; 5]; 2],
 }
 
@@ -90,22 +91,22 @@ pub(super) struct ListTarget {
     /// Blended fragments of each pixel.
     pub(super) counts: Texture,
     ends: Texture,
-    /// One layer of the array a sample.
+    /// One array layer per sample.
     pub(super) layers: Texture,
-    /// Clears the counts.
+    /// Framebuffer that clears the counts.
     counted: Framebuffer,
     touched: Touched,
-    /// Depth alone, to test against.
+    /// Framebuffer with depth only, for the depth test.
     behind: Framebuffer,
     records: Buffer,
     pub(super) ledger: Buffer,
     tiles: Buffer,
 }
 
-/// The records that a frame may have.
+/// Number of fragment records that a frame may use.
 ///
 /// # Errors
-/// `Invalid` when the look asks for more than the device has in one buffer.
+/// `Invalid` when the look asks for more records than fit into one buffer of the device.
 pub(super) fn budget(limits: &Limits, look: &Look, [width, height]: [u32; 2]) -> Result<u32> {
     let most = u64::from(MAX_FRAGMENTS).min(limits.max_storage / RECORD_BYTES);
     if let Some(fragments) = look.fragments {
@@ -157,7 +158,7 @@ impl ListTarget {
         self.tiles.bind_storage(TILES);
     }
 
-    /// An empty ledger: nothing is counted yet, and no pixel has more than it may.
+    /// Resets the ledger: nothing is counted, and the number of records per pixel is unlimited.
     fn empty(&self, gl: &Gl, buffers: &SceneBuffers) {
         let mut commands = [[0; 5]; 2];
         let blended = buffers.groups.iter().filter(|group| group.kind == Kind::Blend);
@@ -171,7 +172,7 @@ impl ListTarget {
         self.ledger.write(&bytes);
         let blended = buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == Kind::Blend);
         for (index, (place, _)) in blended.enumerate() {
-            // Of a culled scene only as many indices as are listed.
+            // A culled scene draws only as many indices as are listed.
             if let Some((_, listed)) = buffers.listed(Kind::Blend) {
                 let to = COMMANDS + size_of::<[u32; 5]>() * index;
                 gl.copy_part((listed, command(place)), (&self.ledger, to), size_of::<u32>());
@@ -181,17 +182,17 @@ impl ListTarget {
     }
 }
 
-/// What a frame's lists held, from the head of its ledger.
+/// Fragment statistics of a frame, from the head of its ledger.
 pub(super) fn told(head: &[u8]) -> Lists {
     let mut ledger = Ledger::zeroed();
-    // Of as many bytes, because it is a copy of one.
+    // A byte copy, because `head` may be unaligned; it has the length of the ledger.
     bytemuck::bytes_of_mut(&mut ledger).iter_mut().zip(head).for_each(|(to, from)| *to = *from);
     let [low, high] = ledger.total.map(u64::from);
     let bound = (ledger.most != u32::MAX).then_some(ledger.most);
     Lists { fragments: high << 32 | low, kept: ledger.used.into(), deepest: ledger.deepest, bound }
 }
 
-/// The layers of the blended triangles, before what is opaque, whose depth is there.
+/// Draws the layers of the blended triangles in front of the opaque ones, against whose depth they are tested.
 pub(super) fn draw(
     gl: &Gl,
     buffers: &SceneBuffers,
@@ -224,7 +225,8 @@ pub(super) fn draw(
 /// The passes of exact transparency.
 pub(super) const PASSES: [&str; 4] = ["count", "scan", "fill", "resolve"];
 
-/// One turn of all blended triangles. The last is drawn as often as the ledger says: not at all where all fragments fit.
+/// Draws all blended triangles for one phase. In the last phase the ledger gives the number of instances: none when all
+/// fragments fit.
 fn gather(
     gl: &Gl,
     buffers: &SceneBuffers,
@@ -251,7 +253,7 @@ fn gather(
     gl.wait_for_stores();
 }
 
-/// What a look wants for the blended triangles of a frame.
+/// How a frame of this look draws blended triangles.
 pub(super) fn wanted(gl: &Gl, scene: &modalcast_model::scene::Scene, size: [u32; 2]) -> Result<Blended> {
     match scene.look.transparency {
         _ if !scene.needs.blend => Ok(Blended::None),
@@ -283,14 +285,15 @@ mod tests {
         assert_eq!(refusal, "look.fragments: expected at most 16777216 on this device, given 33554432");
     }
 
-    /// A square of glass before and behind an opaque one, in squares of 64 pixels; and the renderer that drew it.
+    /// Draws a glass square in front of an opaque square and another behind it, 64 pixels wide; returns the pixels and
+    /// the renderer.
     fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth: bool) -> (Vec<u8>, Renderer) {
         let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
         let mut parts =
             squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);
-        // Without a shadow: light that changes within a pixel would tell where in it a fragment is shaded.
+        // No shadow: light that varies within a pixel would reveal where in the pixel a fragment is shaded.
         (parts.look.transparency, parts.look.shadow) = (transparency, None);
-        // Turned a little, so that edges cross pixels.
+        // Slightly rotated, so that edges cross pixels.
         let corner = |z: f32, angle: f32, [x, y]: [f32; 2]| {
             let (sine, cosine) = angle.sin_cos();
             [cosine * x - sine * y, sine * x + cosine * y, z]

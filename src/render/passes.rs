@@ -1,4 +1,5 @@
-//! The passes of one frame, in order: shadow, blur, visibility, ground, blended, backdrop, shade; then those of `post.rs`.
+//! The passes of one frame, in execution order: shadow, blur, visibility, ground, blended, backdrop, shade. `post.rs`
+//! has the passes after them.
 
 use super::cull::{SHADOW_CULL, command};
 use super::frame::{Frame, above_ground};
@@ -19,22 +20,22 @@ use modalcast_model::error::Result;
 
 pub(super) const PIXELS: u32 = 0;
 pub(super) const TILES: u32 = 1;
-/// Groups of the dispatch over listed tiles: rows of TILE_ROW, none so far; and the tiles, none so far.
+/// Initial indirect dispatch over listed tiles: group counts (TILE_ROW, 0 rows, 1), then the tile count 0.
 pub(super) const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
 const SPLITS: u32 = 2;
-/// Nothing is blended yet: no light, and all that lies behind comes through.
+/// Cleared layer: no light, full transmittance.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 /// Which triangles of a kind a pass draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Drawn {
     All,
-    /// Those that culling has listed.
+    /// The triangles in the culled lists.
     Listed,
 }
 
-/// Binds what all passes read.
+/// Binds the buffers and textures that all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     buffers.drawn_positions().bind(POSITION_UNIT);
     for (unit, view) in &buffers.views.others {
@@ -53,7 +54,7 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
     Ok(())
 }
 
-/// Depth from the sun, unless a rasteriser beside OpenGL has drawn it.
+/// Draws the depth of the shadow map, unless the compute rasterizer has drawn it.
 pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
     let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_beside().is_none()) else { return Ok(()) };
     ran.paths.shadow = Some(Path::OpenGl);
@@ -63,7 +64,7 @@ pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<(
     Ok(())
 }
 
-/// What the map of a method that needs it has besides depth: blurred moments.
+/// Blurs the moments of a variance map. Other shadow methods need depth only.
 pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
     let Some(map) = &buffers.shadow else { return Ok(()) };
     if super::shadow::blur(gl, buffers, map)? {
@@ -72,7 +73,7 @@ pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()>
     Ok(())
 }
 
-/// What each sample sees: ids and depth.
+/// Draws the id and depth of each sample.
 pub(super) fn visibility(
     gl: &Gl,
     buffers: &SceneBuffers,
@@ -81,7 +82,7 @@ pub(super) fn visibility(
     ran: &mut Ran,
 ) -> Result<()> {
     let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
-    // Of several samples, depth says where there is an id.
+    // With several samples, depth says where an id is valid; the ids need no clear.
     let clear = match target.form.samples {
         1 => Clear::DepthAndIds(Some(&target.touched)),
         _ => Clear::Depth(Some(&target.touched.depth)),
@@ -91,8 +92,8 @@ pub(super) fn visibility(
     super::cull::remember(gl, buffers, target, sampled)
 }
 
-/// Ids and depth into a part of a framebuffer as large as its frame or larger: of what is opaque; of what is cut out, by
-/// the first program; and of the opaque parts of what is blended, by the second.
+/// Draws ids and depth into `part` of a framebuffer that is at least as large as the part's frame: of opaque triangles,
+/// of cut-outs with the first program, and of the opaque parts of blended triangles with the second.
 pub(super) fn identify(
     gl: &Gl,
     buffers: &SceneBuffers,
@@ -101,7 +102,8 @@ pub(super) fn identify(
     ran: &mut Ran,
 ) -> Result<()> {
     gl.begin(into, part, clear);
-    // What is cut out comes last: where something stands before it, nothing is sampled.
+    // Cut-outs come after opaque triangles: where something opaque is nearer, the depth test saves their texture
+    // lookups.
     let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out), (Kind::Blend, parts)];
     let written = Fixed { depth_write: true, ..Fixed::default() };
     let mut any = false;
@@ -118,8 +120,8 @@ pub(super) fn identify(
     gl.check("visibility")
 }
 
-/// The ground as one more thing that samples see. A picture's is drawn where something lies below it alone; else the
-/// shading finds it.
+/// Draws the ground into ids and depth. A picture draws it only when something lies below it; otherwise the shading
+/// finds the ground.
 pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
     let Some(program) = buffers.programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) else {
         return Ok(());
@@ -131,7 +133,7 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran
     gl.check("ground")
 }
 
-/// The layer of the blended triangles, before what is opaque.
+/// Draws the layer of the blended triangles in front of the opaque ones.
 pub(super) fn blended(
     gl: &Gl,
     buffers: &SceneBuffers,
@@ -151,7 +153,7 @@ pub(super) fn blended(
     gl.check("blended")
 }
 
-/// What is seen to linear light.
+/// Shades the visible surfaces to linear light.
 pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
     bind_shadow(buffers);
     bind_seen(target);
@@ -180,13 +182,14 @@ pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &
     gl.check("shade")
 }
 
-/// Binds what each sample sees. Depth says where that is something.
+/// Binds ids and depth. Depth says which samples hold a valid id.
 pub(super) fn bind_seen(target: &Target) {
     target.ids.bind(ID_UNIT);
     target.depth.bind(DEPTH_UNIT);
 }
 
-/// Words made from ids, where the host can read them; `program` has a number at location 0 when one is given.
+/// Converts ids to words in a buffer that can be copied to the host. `number` is the uniform at location 0 of programs
+/// that have one.
 pub(super) fn words(
     gl: &Gl,
     (ids, into): (&Texture, &Buffer),
@@ -200,7 +203,7 @@ pub(super) fn words(
     gl.check("words")
 }
 
-/// Ids of each pixel's first sample, where the host can read them.
+/// Packs the ids of each pixel's first sample into a buffer that can be copied to the host.
 pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
     program.bind(None);
     bind_seen(target);
@@ -209,7 +212,7 @@ pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
     gl.check("seen")
 }
 
-/// Draws the triangles of one kind: a call for those with one side, and one for those with two.
+/// Draws the triangles of one kind: one call for single-sided, one for double-sided ones.
 fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program, drawn): (Kind, &Program, Drawn), fixed: Fixed, ran: &mut Ran) {
     for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == kind) {
         gl.set(Fixed { cull: !group.double_sided, ..fixed });
@@ -219,7 +222,7 @@ fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program, drawn): (Kind, &Program
     }
 }
 
-/// Depth of the triangles of one kind into a framebuffer that is bound.
+/// Draws the depth of one kind of triangle into the bound framebuffer.
 pub(super) fn draw_depth(
     gl: &Gl,
     buffers: &SceneBuffers,
@@ -230,8 +233,8 @@ pub(super) fn draw_depth(
     draw(gl, buffers, (kind, program, drawn), Fixed { depth_write: true, ..Fixed::default() }, ran);
 }
 
-/// Draws the triangles of one kind, those with one side and those with two alike, with a program in use: in one call, or
-/// a call for each list.
+/// Draws the triangles of one kind, single- and double-sided alike, with the bound program: in one call, or in one call
+/// per culled list.
 pub(super) fn draw_kind(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), drawn: Drawn) {
     let has_fragments = kind != Kind::Opaque;
     if drawn == Drawn::All {
@@ -252,12 +255,13 @@ pub(super) fn draw_kind(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind,
     }
 }
 
-/// What a culled scene's passes draw, and any other's.
+/// The culled lists when the scene is culled, else all triangles.
 pub(super) fn listed(buffers: &SceneBuffers) -> Drawn {
     if buffers.culler.is_some() { Drawn::Listed } else { Drawn::All }
 }
 
-/// Where the triangles of a group, or its list, begin, as the shaders take it.
+/// Offset of a group for the shaders: its first triangle, or the complement of it for a list
+/// (`shaders/shared/drawn.glsl`).
 pub(super) const fn begins(group: &Group, drawn: Drawn) -> u32 {
     match drawn {
         Drawn::All => group.first_triangle as u32,
@@ -265,7 +269,7 @@ pub(super) const fn begins(group: &Group, drawn: Drawn) -> u32 {
     }
 }
 
-/// Draws a group, or its list.
+/// Draws a group, or the culled list of the group.
 pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: Drawn) {
     let group = buffers.groups[index];
     match drawn {

@@ -1,9 +1,10 @@
-//! Picking: what the pixels of a small rectangle see, on the deformed surface. Only the rectangle is drawn, as a picture of
-//! its own with one sample in the middle of each pixel, and only its triangles are read back. The host meets them in f64.
+//! Picking: finds the triangles and surface points that the pixels of a small rectangle see on the deformed surface.
+//! Only the rectangle is rendered, as an image of its own with one sample at the center of each pixel, and only the
+//! visible triangles are read back. The host computes the intersections in f64.
 //!
-//! A pick is begun and finished apart, so that other work can be given to the device in between. Holes of cut-out materials
-//! are holes. Blended triangles cannot be picked: what stands behind them is. The ground is not drawn: it is no hit and hides
-//! none.
+//! Beginning and finishing a pick are separate calls, so that the device gets other work in between. Holes of cut-out
+//! materials are holes. Blended triangles cannot be picked; the surface behind them is. The ground is not drawn: it is
+//! never hit and hides nothing.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -21,44 +22,44 @@ use super::{Ran, Renderer, Shot, frame, passes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Rectangle, Scene};
 
-/// Words per pixel as `shaders/pick.comp` writes them.
+/// 32-bit words per pixel that `shaders/pick.comp` writes.
 const WORDS: usize = 22;
 const LARGEST: u32 = Rectangle::LARGEST;
 const BYTES: u64 = 4 * WORDS as u64 * LARGEST as u64 * LARGEST as u64;
 
-/// The surface at the middle of a pixel.
+/// The surface point at the center of a pixel.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hit {
-    /// Column and row in the whole picture; (0, 0) is the top left.
+    /// Column and row in the full picture; (0, 0) is the top left.
     pub pixel: [u32; 2],
     pub domain: usize,
-    /// Triangle of the domain's mesh.
+    /// Index of the triangle in the domain's mesh.
     pub triangle: usize,
-    /// Vertices of the triangle in the domain's mesh (rows of U over three).
+    /// Vertices of the triangle in the domain's mesh (row of U divided by three).
     pub vertices: [u32; 3],
-    /// Barycentric coordinates of the point, in the order of `vertices`: 0 to 1, their sum is 1.
+    /// Barycentric coordinates of the point, in the order of `vertices`: 0 to 1, with sum 1.
     pub shares: [f64; 3],
     /// The point, in scene units from the scene's origin.
     pub position: [f64; 3],
-    /// The corners' normals at the point, unit, on the side that is seen; zeros when they cancel.
+    /// Interpolated unit normal on the visible side; zero when the corner normals cancel.
     pub normal: [f64; 3],
-    /// Along the view axis, in scene units.
+    /// Distance along the view axis, in scene units.
     pub depth: f64,
 }
 
-/// What picks are drawn into.
+/// Render target and buffers of picks.
 #[derive(Debug)]
 pub(super) struct Picker {
     ids: Texture,
     visible: Framebuffer,
     packed: Buffer,
-    /// Host-readable buffers of picks that are finished.
+    /// Staging buffers of finished picks, for reuse.
     free: Vec<Buffer>,
     // Attached to the framebuffer, which must not outlive it.
     _depth: Texture,
 }
 
-/// A pick on its way.
+/// A pick in flight.
 #[derive(Debug)]
 pub struct Pick {
     staging: Buffer,
@@ -66,7 +67,7 @@ pub struct Pick {
     scene: Arc<Scene>,
     stretches: Rc<[Stretch]>,
     rectangle: Rectangle,
-    /// The rectangle's camera, relative to `origin`.
+    /// Camera of the rectangle, relative to `origin`.
     camera: Camera,
     origin: [f64; 3],
 }
@@ -82,10 +83,10 @@ impl Picker {
 }
 
 impl Renderer {
-    /// Begins to pick in a rectangle of the picture that `shot` is, without waiting for the device.
+    /// Begins a pick in a rectangle of the picture that `shot` describes, without waiting for the device.
     ///
     /// # Errors
-    /// `Invalid` for a camera that overflows, `Fault` when OpenGL reports an error.
+    /// `Invalid` for a camera whose matrices overflow, `Fault` when OpenGL reports an error.
     pub fn begin_pick(&mut self, buffers: &SceneBuffers, shot: &Shot, rectangle: Rectangle) -> Result<Pick> {
         let [width, height] = rectangle.size();
         let camera = shot.camera.cropped([shot.width, shot.height], rectangle);
@@ -128,10 +129,10 @@ impl Renderer {
         })
     }
 
-    /// Waits for a pick and tells what its pixels see, row by row; a pixel that sees no triangle has no entry.
+    /// Waits for a pick and returns its hits row by row. Pixels without a triangle have no entry.
     ///
     /// # Errors
-    /// `Fault` when the device does not finish.
+    /// `Fault` when the device does not finish in time.
     pub fn finish_pick(&mut self, pick: Pick) -> Result<Vec<Hit>> {
         pick.fence.wait("pick", self.watchdog)?;
         let [width, height] = pick.rectangle.size();
@@ -148,13 +149,13 @@ impl Renderer {
 }
 
 impl Pick {
-    /// Whether [`Renderer::finish_pick`] would not wait.
+    /// Whether [`Renderer::finish_pick`] would return without waiting.
     pub fn is_ready(&self) -> bool {
         self.fence.is_over()
     }
 }
 
-/// The rays through the pixels of a picture.
+/// View rays through the pixels of the rectangle.
 struct Rays {
     camera_from_world: Matrix4<f64>,
     /// fx, fy, cx and cy.
@@ -167,21 +168,21 @@ impl Rays {
         Self { camera_from_world: pick.camera.camera_from_world(), lens }
     }
 
-    /// From the eye through the middle of a pixel, one unit of depth long, in the camera's frame.
+    /// Ray from the eye through the center of a pixel, in camera space, one unit of depth long.
     fn through(&self, [x, y]: [u32; 2]) -> Vector3<f64> {
         let [fx, fy, cx, cy] = self.lens;
         Vector3::new((f64::from(x) + 0.5 - cx) / fx, (cy - f64::from(y) - 0.5) / fy, -1.0)
     }
 }
 
-/// What one pixel of the rectangle sees, from the words that the device wrote.
+/// Hit of one pixel of the rectangle, from the words that the device wrote.
 fn hit(pick: &Pick, rays: &Rays, words: &[u32], at: [u32; 2]) -> Option<Hit> {
     let Seen::Triangle(place) = Seen::from_id(words[0]) else { return None };
     let (domain, triangle) = whose(&pick.stretches, place)?;
     let mesh = &pick.scene.shapes[pick.scene.domains[domain].shape].mesh;
     let corners = *mesh.triangles().get(triangle)?;
     let first = pick.scene.layout.slots[domain].first_corner as u32;
-    // The renderer turns the winding of some triangles around; the mesh's own order counts.
+    // The renderer reverses the winding of some triangles; the result uses the order of the mesh.
     let drawn: [u32; 3] = [words[1], words[2], words[3]];
     let order = corners.map(|corner| drawn.iter().position(|own| *own == corner + first).unwrap_or(0));
     let point = |from: usize, index: usize| {
@@ -206,9 +207,9 @@ fn hit(pick: &Pick, rays: &Rays, words: &[u32], at: [u32; 2]) -> Option<Hit> {
     })
 }
 
-/// Barycentric coordinates of the point where a ray from the origin meets a triangle, and whether its front is seen: corner
-/// i has the share d . (v_j x v_k) of their sum. The ray may pass the triangle by as much as the rasteriser rounds (1/256
-/// pixel): then the nearest shares that are none below 0 are taken. A triangle without area on the screen has equal shares.
+/// Barycentric coordinates of the intersection of a ray from the origin with a triangle, and whether its front side is
+/// visible. Corner i has the share d . (v_j x v_k) of their sum. The ray may miss the triangle by the rounding of the
+/// rasterizer (1/256 pixel); negative shares are then clamped to 0. A triangle without screen area gets equal shares.
 fn meet([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
     let volumes = [b.cross(c), c.cross(a), a.cross(b)].map(|normal| ray.dot(&normal));
     let sum: f64 = volumes.iter().sum();
@@ -216,7 +217,7 @@ fn meet([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
     let whole: f64 = inside.iter().sum();
     // NaN fails the comparison.
     let shares = if whole > 0.5 && whole.is_finite() { inside.map(|share| share / whole) } else { [1.0 / 3.0; 3] };
-    // Rays point away from the eye, so the front is seen where the sum is negative.
+    // Rays point away from the eye, so the front side is visible when the sum is negative.
     (shares, sum < 0.0)
 }
 

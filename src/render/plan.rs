@@ -1,7 +1,8 @@
-//! What a scene needs of the device, decided once from its [`modalcast_model::scene::Needs`]: buffers, textures, passes, shader
-//! branches; and what was left out, with what that saved against a scene that needs everything.
+//! Plan of the device resources of a scene, derived once from its [`modalcast_model::scene::Needs`]: buffers, textures,
+//! passes and shader branches. It also lists the features that were left out, and what each saves compared with a scene
+//! that uses every feature.
 //!
-//! The renderer allocates and compiles exactly this. Pure: runs without a device.
+//! The renderer allocates and compiles exactly what the plan lists. Planning is pure and needs no device.
 
 use super::cull::{self, allocations, chosen};
 use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
@@ -17,37 +18,39 @@ pub struct Allocation {
     pub bytes: u64,
 }
 
-/// A feature that the scene does not need, and what leaving it out saved.
+/// A feature that the scene does not need, and the savings from leaving it out.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Saving {
-    /// The feature.
+    /// Name of the feature.
     pub feature: &'static str,
     /// Device memory that is not allocated.
     pub bytes: u64,
     /// Passes that do not run.
     pub passes: Vec<&'static str>,
-    /// What the shaders do without, in words.
+    /// Description of the shader work that is saved.
     pub shaders: &'static str,
 }
 
-/// All that the renderer makes for a scene.
+/// All device resources and passes of a scene.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Plan {
     /// Buffers of the scene, by name.
     pub buffers: Vec<Allocation>,
     /// Textures of the scene, by name.
     pub textures: Vec<Allocation>,
-    /// Passes of a frame, in order; that of the ground runs where the camera is above it and something lies below.
+    /// Passes of a frame, in execution order. The ground pass runs only when the camera is above the ground and
+    /// something lies below it.
     pub passes: Vec<&'static str>,
-    /// Draw calls of the visibility and blended passes together, fourteen at most: domains and materials do not matter.
+    /// Draw calls of the occluders, visibility and blended passes, fourteen at most; independent of the number of
+    /// domains and materials.
     pub draws: usize,
-    /// Branches that the shaders are compiled with.
+    /// Defines that the shaders are compiled with.
     pub defines: Vec<&'static str>,
     pub left_out: Vec<Saving>,
 }
 
 impl Plan {
-    /// Whether the shaders are compiled with a branch.
+    /// Whether the shaders are compiled with a define.
     pub fn defines(&self, name: &str) -> bool {
         self.defines.contains(&name)
     }
@@ -58,12 +61,12 @@ impl Plan {
     }
 }
 
-/// What a scene needs of a GPU.
+/// Plans a scene for a GPU without limits.
 pub fn plan(scene: &Scene) -> Plan {
     planned(scene, &Limits { max_storage: u64::MAX, ..Limits::default() })
 }
 
-/// What a scene needs of a device, which may be a rasteriser in software.
+/// Plans a scene for a device, which may be a software rasterizer.
 pub(super) fn planned(scene: &Scene, limits: &Limits) -> Plan {
     let (groups, _) = groups(scene);
     let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
@@ -107,7 +110,7 @@ fn blended(scene: &Scene) -> Vec<&'static str> {
     }
 }
 
-/// Whether some blended triangle may reach the threshold from which two passes draw it as opaque.
+/// Whether some blended triangle may reach the alpha threshold above which two-pass transparency draws it as opaque.
 fn opaque_parts(scene: &Scene) -> bool {
     let (look, materials) = (scene.look, used_materials(scene));
     let dense = |material: usize| {
@@ -117,7 +120,7 @@ fn opaque_parts(scene: &Scene) -> bool {
     look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
 }
 
-/// What hides others is drawn twice.
+/// Draw calls of the occluder pass: culling by depth draws opaque and cut-out groups twice.
 fn occluders(groups: &[Group], culling: Culling) -> usize {
     let hiding = groups.iter().filter(|group| group.kind != Kind::Blend).count();
     if culling == Culling::Depth { hiding } else { 0 }
@@ -131,8 +134,8 @@ fn culled(culling: Culling) -> Vec<&'static str> {
     }
 }
 
-/// Blended triangles take three turns for their lists, the third as often as the device finds it needed; with two passes
-/// a second turn for their opaque parts.
+/// Draw calls without occluders. Exact transparency draws blended triangles in three phases, the third only on demand;
+/// two-pass transparency draws their opaque parts in a second phase.
 fn draws(scene: &Scene, groups: &[Group]) -> usize {
     let blended = groups.iter().filter(|group| group.kind == Kind::Blend).count();
     let turns = match scene.look.transparency {

@@ -1,5 +1,5 @@
-//! What happens to a picture between its shading and its bytes, as the look says: glow, tone curve, smoothed edges,
-//! mixed levels. What a look does not name is not in any program and has no image.
+//! Post-processing between shading and output bytes, as the look says: bloom, tone curve, anti-aliasing and dithering.
+//! Programs contain no code, and frames no images, for features that the look does not use.
 
 use std::fmt::Write as _;
 use std::rc::Rc;
@@ -16,16 +16,17 @@ const TONE: &str = include_str!("../../shaders/shared/tone.glsl");
 const RESOLVE: &str = include_str!("../../shaders/shared/resolve.glsl");
 const FXAA: &str = include_str!("../../shaders/shared/fxaa.glsl");
 const VERSION: &str = "#version 430 core\n";
-/// A sample's light, at most: far above white, and well within half precision.
+/// Maximum light of a sample: far above white, and well within half precision.
 const MOST_LIGHT: f32 = 1000.0;
 
-/// The programs of one look.
+/// The post-processing programs of one look.
 #[derive(Debug)]
 pub(super) struct Post {
     encode: Rc<Program>,
     glow: Option<Glow>,
 }
 
+/// The bloom programs: downsample, upsample, and the last upsample onto the picture.
 #[derive(Debug)]
 struct Glow {
     down: Rc<Program>,
@@ -46,7 +47,7 @@ impl Post {
         Ok(Self { encode: compile(encode(look))?, glow })
     }
 
-    /// Spreads the glow and goes through the tone curve, in place.
+    /// Spreads the bright light over the picture and applies the tone curve, in place.
     pub(super) fn bloom(&self, gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
         let (Some(glow), Some(coarsest)) = (&self.glow, target.glow.last()) else { return Ok(()) };
         glow.down.bind(None);
@@ -63,7 +64,7 @@ impl Post {
             tiles(gl, to);
             from = to;
         }
-        // The last program has no use for the number.
+        // The last program has no uniform for the number of levels.
         glow.last.bind(None);
         from.bind(0);
         target.picture.bind_image_both_ways(0);
@@ -72,7 +73,7 @@ impl Post {
         gl.check("bloom")
     }
 
-    /// Light to bytes, where the host can read them.
+    /// Encodes the picture to bytes in a buffer that can be copied to the host.
     pub(super) fn encode(&self, gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
         self.encode.bind(None);
         target.picture.bind(0);
@@ -87,7 +88,7 @@ fn tiles(gl: &Gl, of: &Texture) {
     gl.dispatch(of.kind.width.div_ceil(TILE), of.kind.height.div_ceil(TILE));
 }
 
-/// The images between which glow spreads: what glows of each pixel, and each half as large as the one before, rounded up.
+/// The bloom pyramid: the bright light of each pixel, then levels of half the size, rounded up.
 pub(super) fn glow(gl: &Rc<Gl>, form: Form) -> Result<Vec<Texture>> {
     if form.halvings == 0 {
         return Ok(Vec::new());
@@ -102,7 +103,7 @@ pub(super) fn glow(gl: &Rc<Gl>, form: Form) -> Result<Vec<Texture>> {
     (0..=form.halvings).map(half).collect()
 }
 
-/// What the shading makes of a sample's light, as text for its program.
+/// Shader source that the shading applies to the light of each sample.
 pub(super) fn resolve(look: &Look) -> String {
     let mut text = String::new();
     if look.exposure != 1.0 {
@@ -114,7 +115,7 @@ pub(super) fn resolve(look: &Look) -> String {
     [&text, &curve(look), RESOLVE].concat()
 }
 
-/// The tone curve and its inverse.
+/// Shader source of the tone curve and its inverse.
 fn curve(look: &Look) -> String {
     let name = match look.tone {
         Tone::None => "",
@@ -139,7 +140,7 @@ fn up(look: &Look, bloom: Bloom, last: bool) -> Source {
     compute(if last { "bloom, onto the picture" } else { "bloom, double" }, text)
 }
 
-/// Turns the picture into sRGB bytes.
+/// Converts the picture to sRGB bytes.
 fn encode(look: &Look) -> Source {
     let mut text = format!("{VERSION}#define LANES {LANES}\nlayout(binding = 0) uniform sampler2D picture;\n");
     if look.dither {

@@ -1,4 +1,4 @@
-//! The programs of a scene: those of its passes, with the branches that its materials need.
+//! Shader programs of a scene's passes, with the branches that its materials need.
 
 use std::rc::Rc;
 
@@ -10,35 +10,36 @@ use super::plan::Plan;
 use super::shaders::{Options, Source};
 use modalcast_model::error::Result;
 
-/// Gives the program of a source, compiled or shared.
+/// Returns the program of a source, compiled or from the cache.
 pub(super) type Compile<'a> = dyn FnMut(Source) -> Result<Rc<Program>> + 'a;
 
-/// Programs whatever the samples a pixel; absent where the scene has no such pass or triangles.
+/// Programs that do not depend on the samples per pixel; none where the scene has no such pass or triangles.
 #[derive(Debug)]
 pub(super) struct Programs {
-    /// In order; none where the map has no moments.
+    /// In execution order; empty when the shadow map has no moments.
     pub(super) blur: Vec<Rc<Program>>,
-    /// Casters of each kind.
+    /// Shadow casters of each kind.
     pub(super) shadow: [Option<Rc<Program>>; 3],
     pub(super) opaque: Option<Rc<Program>>,
     pub(super) ground: Option<Rc<Program>>,
-    /// Lists casters, where triangles are culled.
+    /// Culling of shadow casters.
     pub(super) sun: Option<SunPrograms>,
 }
 
-/// Programs for one number of samples a pixel.
+/// Programs for one number of samples per pixel.
 #[derive(Debug, Clone)]
 pub(super) struct Sampled {
     pub(super) samples: u32,
     pub(super) mask: Option<Rc<Program>>,
-    /// Of two passes: the opaque parts of blended triangles, where there are any; and the rest of them.
+    /// Two-pass transparency: the opaque parts of blended triangles, if there may be any. `blended` draws the rest of
+    /// them.
     pub(super) parts: Option<Rc<Program>>,
     pub(super) blended: Option<Rc<Program>>,
-    /// Of exact transparency.
+    /// Exact transparency.
     pub(super) lists: Option<ListPrograms>,
     pub(super) backdrop: Rc<Program>,
     pub(super) shade: Option<Rc<Program>>,
-    /// Where triangles are culled.
+    /// Triangle culling.
     pub(super) cull: Option<CullPrograms>,
 }
 

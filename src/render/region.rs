@@ -1,5 +1,5 @@
-//! The part of a frame that a scene can take up. What lies outside is neither drawn nor, next time, cleared: a sample of 32
-//! bits that is cleared takes a device as long as one that is drawn (an H200 14 a nanosecond, measured).
+//! Screen region that a scene can cover. Pixels outside it are neither drawn nor cleared for the next frame. Clearing a
+//! 32-bit sample costs a device as much time as drawing one (an H200 clears 14 samples per nanosecond, measured).
 
 use std::cell::Cell;
 
@@ -7,7 +7,7 @@ use nalgebra::{Matrix4, Vector4};
 
 use modalcast_model::scene::Bounds;
 
-/// A rectangle of a frame's pixels; (0, 0) is the bottom left one. It may be empty.
+/// A rectangle of a frame's pixels; (0, 0) is the bottom left pixel. It may be empty.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Region {
     frame: [u32; 2],
@@ -15,18 +15,18 @@ pub(super) struct Region {
     size: [u32; 2],
 }
 
-/// The pixels of an image that may hold something else than what it is cleared to: at first all of them.
+/// Dirty region of an image: the pixels that may differ from the clear value. Initially all of them.
 #[derive(Debug, Default)]
 pub(super) struct Touched(Cell<Option<Region>>);
 
-/// What f32 makes of a clip coordinate, relative to the sum of its products' magnitudes: each number of the matrix is
-/// rounded, each product, and three sums.
+/// Bound on the f32 rounding error of a clip coordinate, relative to the sum of the magnitudes of its products: each
+/// matrix element, each product and three sums are rounded.
 const ROUNDINGS: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
 
-/// Pixels around what the numbers say: a rasteriser moves corners by up to 1/256 pixel, and a sample may lie anywhere in one.
+/// Margin in pixels: a rasterizer moves vertices by up to 1/256 pixel, and a sample may lie anywhere in its pixel.
 const MARGIN: f64 = 1.0;
 
-/// Pixels beside a part of a frame that a draw into it may still reach: llvmpipe lets one through with several samples.
+/// Pixels outside the scissor that a draw may still touch: llvmpipe draws one with multisampling.
 const SLACK: u32 = 2;
 
 impl Region {
@@ -34,8 +34,8 @@ impl Region {
         Self { frame, corner: [0; 2], size: frame }
     }
 
-    /// Where a frame of so many pixels can show what lies in `bounds`, when `clip` takes positions to clip space in f32. All
-    /// of it when some of that lies behind the eye, or overflowed.
+    /// Region of the frame that can show points in `bounds` when `clip` transforms positions in f32. The whole frame if
+    /// the bounds reach behind the eye or overflow.
     pub(super) fn of(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
         let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip.abs() * corner.abs());
@@ -58,7 +58,7 @@ impl Region {
         Self { frame, corner: spans.map(|[low, _]| low), size: spans.map(|[low, high]| high - low) }
     }
 
-    /// With so many more pixels on each side, as far as the frame reaches.
+    /// Grows the region by this many pixels on each side, clamped to the frame.
     fn grown(self, by: u32) -> Self {
         let low = self.corner.map(|at| at.saturating_sub(by));
         let high = [0, 1].map(|axis| (self.corner[axis] + self.size[axis] + by).min(self.frame[axis]));
@@ -78,12 +78,12 @@ impl Region {
 }
 
 impl Touched {
-    /// What was touched, none for all; from now on this is.
+    /// Returns the dirty region, none for all pixels, and replaces it by `by`.
     pub(super) fn replace(&self, by: Region) -> Option<Region> {
         self.0.replace(Some(by.grown(SLACK)))
     }
 
-    /// Somebody writes to all of it.
+    /// Marks all pixels as dirty.
     pub(super) fn everywhere(&self) {
         self.0.set(None);
     }
@@ -102,14 +102,14 @@ mod tests {
         camera.clip_from_camera(FRAME[0], FRAME[1], bounds) * camera.camera_from_world()
     }
 
-    /// Where f32 puts a point, in pixels, as a vertex shader does.
+    /// Position of a point in pixels, transformed in f32 as in a vertex shader.
     fn pixel(clip: &Matrix4<f64>, point: [f32; 3]) -> [f32; 2] {
         let clip: Matrix4<f32> = clip.cast();
         let at = clip * Vector4::new(point[0], point[1], point[2], 1.0);
         [0, 1].map(|axis| (0.5 * at[axis] / at.w + 0.5) * FRAME[axis] as f32)
     }
 
-    /// A box of this half side, its middle, and every fifth of it on the way to its corners.
+    /// A cube with this half side, and points in steps of a fifth of it from the center to its corners.
     fn filled(centre: [f64; 3], half: f64) -> (Bounds, Vec<[f32; 3]>) {
         let (mut bounds, mut points) = (Bounds::EMPTY, Vec::new());
         for index in 0..216 {
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn what_lies_in_the_bounds_is_drawn_inside_the_region_however_far_from_the_origin() {
-        // Near the origin, and where f32 moves points by pixels.
+        // Near the origin, and where f32 rounding moves points by pixels.
         for (centre, away) in [([0.3, -0.2, 0.1], 5.0), ([2e5, -3e4, 1e5], 5.0), ([-9e6, 0.0, 9e6], 900.0)] {
             let (bounds, points) = filled(centre, 0.1 * away);
             for turn in 0..16 {
@@ -188,7 +188,7 @@ mod tests {
             assert_eq!(Region::of(&(seen * bad), &bounds, FRAME), whole);
         }
         assert_eq!(Region::of(&seen, &Bounds::EMPTY, FRAME), whole);
-        // So far along x that f32 may put it anywhere there.
+        // So far along x that f32 rounding may place it at any column.
         let (bounds, _) = filled([1e9, 0.0, 0.0], 0.5);
         let [_, y, width, height] = Region::of(&clip([1e9, 0.0, 6.0], [1e9, 0.0, 0.0], &bounds), &bounds, FRAME).part();
         assert!(width == FRAME[0] && y > 100 && height < 200, "{y}, {width} x {height}");

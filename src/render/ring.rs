@@ -1,4 +1,4 @@
-//! The buffers through which frames of one form come back: as many as were ever under way at once, three at most.
+//! Ring of staging buffers for the readback of frames of one form; it grows on demand to [`FRAMES_UNDER_WAY`] buffers.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -8,7 +8,7 @@ use std::time::Duration;
 use super::gl::{Gl, Staging};
 use modalcast_model::error::{Error, Result};
 
-/// Frames of one form that may be under way at once.
+/// Maximum number of frames of one form in flight.
 pub const FRAMES_UNDER_WAY: usize = 3;
 
 /// The staging buffers of one form.
@@ -17,11 +17,11 @@ pub(super) struct Ring {
     gl: Rc<Gl>,
     bytes: u64,
     made: Cell<usize>,
-    /// Of no frame under way, in the order in which they were given back. Some may still be read.
+    /// Buffers without a frame in flight, in the order in which they were returned. Readers may still copy from some.
     free: RefCell<VecDeque<Staging>>,
 }
 
-/// A staging buffer of one frame; it goes back when this is dropped.
+/// Staging buffer of one frame. Dropping the slot returns the buffer to the ring.
 #[derive(Debug)]
 pub(super) struct Slot {
     ring: Rc<Ring>,
@@ -33,11 +33,11 @@ impl Ring {
         Rc::new(Self { gl: Rc::clone(gl), bytes, made: Cell::new(0), free: RefCell::default() })
     }
 
-    /// A buffer for one more frame; made when all there are are in use. Where there can be no more, this waits for those
-    /// that are only being copied from, at most `limit`.
+    /// Takes a staging buffer for a frame; creates one when all existing ones are in use. When the ring is full, this
+    /// waits at most `limit` for the oldest buffer that is only being copied from.
     ///
     /// # Errors
-    /// `Busy` when so many frames are under way; `Fault` of OpenGL.
+    /// `Busy` when all buffers have frames in flight or the reader exceeds `limit`; `Fault` of OpenGL.
     pub(super) fn take(self: &Rc<Self>, limit: Duration) -> Result<Slot> {
         let slot = |staging: Staging| Slot { ring: Rc::clone(self), staging: Some(staging) };
         let free = self.free.borrow().iter().position(|staging| staging.is_read(Duration::ZERO));
@@ -54,7 +54,7 @@ impl Ring {
         read.map(slot).ok_or(Error::Busy { queue: "frames under way", limit: FRAMES_UNDER_WAY })
     }
 
-    /// Buffers that there are.
+    /// Number of buffers in the ring.
     #[cfg(test)]
     pub(super) fn count(&self) -> usize {
         self.made.get()
@@ -62,7 +62,7 @@ impl Ring {
 }
 
 impl Slot {
-    /// The buffer.
+    /// The staging buffer.
     pub(super) fn staging(&self) -> Option<&Staging> {
         self.staging.as_ref()
     }
@@ -70,7 +70,7 @@ impl Slot {
 
 impl Drop for Slot {
     fn drop(&mut self) {
-        // A frame that nobody waited for may still write it: so does the next one, after it in the order of commands.
+        // An abandoned frame may still write it; so will the next frame, which is later in the command stream.
         self.ring.free.borrow_mut().extend(self.staging.take());
     }
 }

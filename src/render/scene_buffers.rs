@@ -1,4 +1,4 @@
-//! What a scene owns on the device: buffers, texture arrays, shadow map and programs, exactly as its plan says.
+//! Device resources of one scene: buffers, texture arrays, shadow map and programs, exactly as its plan says.
 
 use std::collections::BTreeMap;
 use std::rc::Rc;
@@ -22,15 +22,17 @@ use modalcast_model::domain::AlphaMode;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::Scene;
 
-/// Twin of `material_of` in `shaders/shared/material.glsl`.
+/// GPU layout of a material. Twin of `material_of` in `shaders/shared/material.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct PackedMaterial {
-    /// With the array of the normal map, and its layer.
+    /// Ambient color, array of the normal map.
     ambient_array: [f32; 4],
+    /// Diffuse color, layer of the normal map.
     diffuse_layer: [f32; 4],
+    /// Specular color, exponent.
     specular_exponent: [f32; 4],
-    /// Array and layer of the colour texture, alpha, cutoff.
+    /// Array and layer of the color texture, alpha, cutoff.
     cut: [f32; 4],
 }
 
@@ -40,19 +42,20 @@ const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders
 /// A scene's buffers, textures and programs on the device; freed when dropped.
 #[derive(Debug)]
 pub struct SceneBuffers {
-    /// Names of the buffers that a deformer may write in place of an upload.
+    /// Names of the buffers that a deformer can write directly, instead of an upload.
     pub shared: SharedBuffers,
-    /// Draws passes in place of OpenGL, where the look asks for it and somebody gave one. Before the buffers that it knows.
+    /// Compute rasterizer that draws some passes instead of OpenGL; present when the look asks for it and one was
+    /// given. Declared before the buffers that it has registered, so that it is dropped first.
     pub(super) beside: Option<Beside>,
     pub(super) scene: Arc<Scene>,
     pub(super) buffers: BTreeMap<String, Buffer>,
     pub(super) views: Views,
     pub(super) groups: Vec<Group>,
-    /// What opaque triangles are made from.
+    /// Vertex array of opaque triangles.
     solids: VertexArray,
-    /// What the others are made from; absent when there are none.
+    /// Vertex array of cut-out and blended triangles; none without such triangles.
     corners: Option<VertexArray>,
-    /// No attributes: for triangles that shaders make themselves.
+    /// Vertex array without attributes, for triangles that a vertex shader generates.
     pub(super) nothing: VertexArray,
     pub(super) colours: Vec<Texture>,
     pub(super) normals: Vec<Texture>,
@@ -60,28 +63,28 @@ pub struct SceneBuffers {
     pub(super) shared_shadow: Shared,
     pub(super) programs: Programs,
     pub(super) post: Post,
-    /// Lists of triangles, where they are culled.
+    /// Lists of culled triangles; present when triangles are culled.
     pub(super) culler: Option<Culler>,
-    /// For the samples a pixel that the look asks for.
+    /// Programs for the number of samples per pixel that the look asks for.
     sampled: Sampled,
     options: Options,
     pub(super) stretches: Rc<[Stretch]>,
-    /// What positions are relative to, in scene units from the scene's origin.
+    /// Origin of the positions, in scene units from the scene's origin.
     pub(super) origin: [f64; 3],
-    /// Positions that are drawn in place of the shared ones.
+    /// Rebased positions that are drawn instead of the shared ones.
     pub(super) apart: Option<Apart>,
-    /// A number per vertex, once a picture of numbers was asked for.
+    /// A scalar per vertex for AOV readbacks; allocated by the first upload.
     pub(super) values: Option<Values>,
     plan: Plan,
 }
 
-/// Positions of a scene whose domains have no common origin, brought to one.
+/// Positions rebased to one origin, for scenes whose domains have separate local origins.
 #[derive(Debug)]
 pub(super) struct Apart {
     pub(super) buffer: Buffer,
     view: Texture,
     solids: VertexArray,
-    /// Of lists, where triangles are culled.
+    /// Vertex array of the culled lists, when triangles are culled.
     listed: Option<VertexArray>,
 }
 
@@ -95,23 +98,23 @@ impl Apart {
     }
 }
 
-/// A number per vertex, as a picture of numbers shows them.
+/// A scalar per vertex, which the shader of an AOV readback interpolates.
 #[derive(Debug)]
 pub(super) struct Values {
     pub(super) buffer: Buffer,
     pub(super) view: Texture,
 }
 
-/// Buffers that shaders read like textures.
+/// Buffer textures over the scene's buffers.
 #[derive(Debug)]
 pub(super) struct Views {
     positions: Texture,
-    /// Each with its unit.
+    /// Texture unit and view.
     pub(super) others: Vec<(u32, Texture)>,
 }
 
 impl SceneBuffers {
-    /// Allocates and fills what the plan of the scene says; `compile` gives programs that may be shared.
+    /// Allocates and fills the buffers that the scene's plan lists. `compile` returns programs, which scenes may share.
     pub(super) fn new(
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
@@ -172,7 +175,7 @@ impl SceneBuffers {
         &self.options
     }
 
-    /// The programs of frames of so many samples a pixel; compiled now unless the look asked for that many.
+    /// The programs for this number of samples per pixel; compiled now unless the look asked for the same number.
     pub(super) fn sampled(&self, samples: u32, compile: &mut Compile<'_>) -> Result<Sampled> {
         match self.sampled.samples == samples {
             true => Ok(self.sampled.clone()),
@@ -180,7 +183,8 @@ impl SceneBuffers {
         }
     }
 
-    /// The program that identifies cut-out triangles in frames of so many samples a pixel, where there are any.
+    /// The program that draws ids of cut-out triangles with this number of samples per pixel; none without such
+    /// triangles.
     pub(super) fn cut_out(&self, samples: u32, compile: &mut Compile<'_>) -> Result<Option<Rc<Program>>> {
         if self.sampled.samples == samples {
             return Ok(self.sampled.mask.clone());
@@ -189,36 +193,37 @@ impl SceneBuffers {
         if any { compile(self.options.visibility(Kind::Mask, samples)).map(Some) } else { Ok(None) }
     }
 
-    /// The program that reads a field off ids of so many samples a pixel.
+    /// The program that reads an AOV field from ids with this number of samples per pixel.
     pub(super) fn survey(&self, field: &'static str, samples: u32, compile: &mut Compile<'_>) -> Result<Rc<Program>> {
         compile(self.options.survey(field, samples))
     }
 
-    /// The triangles of one kind, which follow each other: the first, and how many.
+    /// First triangle and number of triangles of one kind; they are contiguous.
     pub(super) fn triangles(&self, kind: Kind) -> (usize, usize) {
         let mut of_kind = self.groups.iter().filter(|group| group.kind == kind);
         let first = of_kind.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
         of_kind.fold(first, |(first, count), group| (first, count + group.triangles))
     }
 
-    /// The domain of a triangle that a frame's ids name (the id less one), and its place in the domain's mesh.
+    /// Domain of a triangle that an id of a frame names (`place` is the id minus 1), and its index in the domain's
+    /// mesh.
     pub fn triangle(&self, place: usize) -> Option<(usize, usize)> {
         if place < self.scene.layout.triangles { whose(&self.stretches, place) } else { None }
     }
 
-    /// Says what the positions in the shared buffers are relative to, in scene units from the scene's origin (which they
-    /// are until this is called), and that these are to be drawn.
+    /// Sets the origin of the shared positions, in scene units from the scene's origin, and draws the shared positions
+    /// from now on. Before the first call, positions are relative to the scene's origin.
     pub fn relative_to(&mut self, origin: [f64; 3]) {
         self.origin = origin;
         self.apart = None;
     }
 
-    /// The positions that are drawn.
+    /// The positions that are drawn: the rebased ones if there are any, else the shared ones.
     pub(super) fn drawn_positions(&self) -> &Texture {
         self.apart.as_ref().map_or(&self.views.positions, |apart| &apart.view)
     }
 
-    /// What triangles of a kind are made from, for ids and depth; none without such triangles.
+    /// Vertex array of one kind of triangle, for ids and depth; none without such triangles.
     pub(super) fn array(&self, kind: Kind) -> Option<&VertexArray> {
         match kind {
             Kind::Opaque => Some(self.apart.as_ref().map_or(&self.solids, |apart| &apart.solids)),
@@ -226,19 +231,20 @@ impl SceneBuffers {
         }
     }
 
-    /// What listed triangles of a kind are made from, and where their draws lie; none where triangles are not culled.
+    /// Vertex array of the culled list of one kind, and the buffer with the indirect draw commands; none when triangles
+    /// are not culled.
     pub(super) fn listed(&self, kind: Kind) -> Option<(&VertexArray, &Buffer)> {
         let (culler, ledger) = (self.culler.as_ref()?, self.buffers.get("cull ledger")?);
         let apart = self.apart.as_ref().and_then(|apart| apart.listed.as_ref()).filter(|_| kind == Kind::Opaque);
         apart.or_else(|| culler.array(kind)).map(|array| (array, ledger))
     }
 
-    /// The plan that was followed.
+    /// The plan that the buffers follow.
     pub const fn plan(&self) -> &Plan {
         &self.plan
     }
 
-    /// The buffers that the device really holds for this scene, by name.
+    /// The buffers that the device holds for this scene, by name.
     pub fn allocated(&self) -> Vec<Allocation> {
         let buffers = self.buffers.iter().map(|(name, buffer)| Allocation { name: name.clone(), bytes: buffer.bytes });
         let apart = self.apart.iter().map(|apart| Allocation { name: "apart".into(), bytes: apart.buffer.bytes });
@@ -248,7 +254,7 @@ impl SceneBuffers {
         buffers.chain(apart).chain(values).chain(beside).collect()
     }
 
-    /// The textures that the device really holds for this scene: arrays of images, and the maps of the shadow.
+    /// Number of textures that the device holds for this scene: texture arrays and shadow map textures.
     pub fn texture_count(&self) -> usize {
         self.colours.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
     }
@@ -286,7 +292,7 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
     used_materials(scene).into_iter().map(|material| one(&scene.materials[material])).collect()
 }
 
-/// What the shaders must know of each material.
+/// The properties of each material that the shader sources depend on.
 fn used(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<Used> {
     let array = |arrays: &[Array], texture: Option<usize>| Some(place(arrays, texture?)?.0);
     let one = |material: usize| {
@@ -360,12 +366,12 @@ const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: boo
     Attribute { location, buffer, components, integer }
 }
 
-/// Vertices of triangles that are nothing but solid.
+/// Vertex array of opaque triangles, which need positions only.
 fn solids(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<VertexArray> {
     gl.vertex_array(Some(named(buffers, index)?), &[attribute(0, named(buffers, "positions")?, 3, false)])
 }
 
-/// The lists of a scene whose plan has room for them.
+/// Creates the culled lists if the plan has buffers for them.
 fn culler(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, groups: &[Group]) -> Result<Option<Culler>> {
     if !buffers.contains_key(LISTED) {
         return Ok(None);
@@ -373,7 +379,7 @@ fn culler(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, groups: &[Group]) -> 
     Culler::new(gl, buffers, groups, (solids(gl, buffers, LISTED)?, corners(gl, buffers, LISTED)?))
 }
 
-/// Corners of cut-out and blended triangles, where there are any.
+/// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
 fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<Option<VertexArray>> {
     let Some(vertices) = buffers.get("corner vertices") else { return Ok(None) };
     let mut from = vec![attribute(0, vertices, 1, true), attribute(1, named(buffers, "normals")?, 3, false)];
@@ -400,7 +406,8 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
         depth: layers,
         levels: array.levels(),
     })?;
-    // A few layers at a time: all chains of a large scene at once would take many times its textures in memory.
+    // Few layers at a time: the mipmap chains of all layers of a large scene would take many times the memory of its
+    // textures.
     for (chunk, part) in array.layers.chunks(8).enumerate() {
         let chain = |layer: &usize| {
             let cutoff = if purpose == Use::Colour { cutoff(scene, *layer) } else { None };
@@ -414,7 +421,7 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
             }
         }
     }
-    // On a CPU blending two levels costs a sixth of the frame and is hardly seen.
+    // On a CPU, blending two mipmap levels costs a sixth of the frame time and is hardly visible.
     let between = if gl.limits.software { gl::LINEAR_MIPMAP_NEAREST } else { gl::LINEAR_MIPMAP_LINEAR };
     let sampling = [
         (gl::TEXTURE_MIN_FILTER, between),

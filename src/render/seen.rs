@@ -1,13 +1,12 @@
-//! The ids of the visibility image as values.
+//! Decodes the ids of the visibility image.
 
 /// What a sample of a frame sees.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Seen {
-    /// The sky.
+    /// Neither triangle nor ground, that is, the sky.
     Nothing,
     Ground,
-    /// A triangle, by its place in the order in which the renderer keeps them; [`super::SceneBuffers::triangle`] tells
-    /// whose it is.
+    /// A triangle, by its index in the renderer's draw order; [`super::SceneBuffers::triangle`] maps it to its domain.
     Triangle(usize),
 }
 

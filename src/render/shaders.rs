@@ -1,4 +1,4 @@
-//! Shader sources to programs: the files under `shaders/`, with the branches that a scene needs and no others.
+//! Assembles the shader sources from the files under `shaders/`, with only the branches that a scene needs.
 
 mod asked;
 pub(super) mod lists;
@@ -32,7 +32,7 @@ const TRIANGLE: &str = include_str!("../../shaders/shared/triangle.glsl");
 pub(super) const SHADOW_UNIT: u32 = 0;
 pub(super) const COLOUR_UNIT: u32 = 1;
 pub(super) const NORMAL_UNIT: u32 = COLOUR_UNIT + super::textures::MAX_ARRAYS as u32;
-/// Units of the buffer textures and of the frame's images, as the shaders name them.
+/// Units of the buffer textures and of the frame's images, the same as in the shaders.
 pub(super) const POSITION_UNIT: u32 = 13;
 pub(super) const MATERIAL_UNIT: u32 = 14;
 pub(super) const TRIANGLE_MATERIAL_UNIT: u32 = 15;
@@ -47,7 +47,7 @@ pub(super) const DEPTH_UNIT: u32 = 26;
 pub(super) const LAYER_UNIT: u32 = 22;
 pub(super) const COUNT_UNIT: u32 = 23;
 pub(super) const VALUE_UNIT: u32 = 24;
-/// Textures that the shading reads beside the scene's images, at most.
+/// Maximum number of textures that the shading reads in addition to the scene's images.
 pub(super) const OTHER_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
@@ -58,23 +58,23 @@ pub(super) const TILE: u32 = 8;
 /// Workgroups in a row of the dispatch over listed tiles.
 pub(super) const TILE_ROW: u32 = 64;
 
-/// What the sources depend on.
+/// Parameters of the shader sources.
 #[derive(Debug, Clone)]
 pub(super) struct Options {
     pub(super) defines: Vec<&'static str>,
-    /// The materials that triangles have.
+    /// The materials that triangles use.
     pub(super) used: Vec<Used>,
-    /// The shadow map as the device is given it; what it says counts where the defines name shadows.
+    /// Shadow settings as resolved for the device; used only when the defines contain SHADOWS.
     pub(super) shadow: Shadow,
-    /// Where the samples of a multisampled pixel lie in it.
+    /// Sample positions within a multisampled pixel.
     pub(super) sample_places: Vec<[f32; 2]>,
-    /// What the shading makes of a sample's light.
+    /// Source that is applied to the light of each sample.
     pub(super) resolve: String,
-    /// Whether a fragment can know its samples that pass the depth test.
+    /// Whether a fragment can read its coverage after the depth test.
     pub(super) post_depth: bool,
 }
 
-/// A material that triangles have: what pipeline draws them, and the arrays that hold its images.
+/// A material that triangles use: the pipeline that draws them, and the arrays of its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Used {
     pub(super) kind: Kind,
@@ -82,7 +82,7 @@ pub(super) struct Used {
     pub(super) normal: Option<usize>,
 }
 
-/// The text of a program's stages.
+/// The source text of a program's stages.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Source {
     pub(super) label: String,
@@ -99,8 +99,8 @@ impl Options {
         text
     }
 
-    /// The branches that triangles of these kinds need: those of their images, and the lookup of a material where they
-    /// have more than one.
+    /// Defines for triangles of these kinds: for their images, and for the material lookup if they have several
+    /// materials.
     pub(super) fn branches(&self, kinds: &[Kind]) -> String {
         let mut own = (0..).zip(&self.used).filter(|(_, used)| kinds.contains(&used.kind));
         let mut text = match (own.next(), own.next()) {
@@ -120,14 +120,14 @@ impl Options {
         text
     }
 
-    /// The lookups of those branches.
+    /// Lookup functions for the images and materials of these kinds.
     pub(super) fn lookups(&self, kinds: &[Kind], slopes: Slopes) -> String {
         let colours = sampler("colour", COLOUR_UNIT, &self.arrays(kinds, Use::Colour), slopes);
         let normals = sampler("normal", NORMAL_UNIT, &self.arrays(kinds, Use::Normal), slopes);
         [MATERIAL, &colours, &normals].concat()
     }
 
-    /// The arrays that hold images of these kinds' materials.
+    /// Texture arrays that hold images of these kinds' materials.
     fn arrays(&self, kinds: &[Kind], purpose: Use) -> BTreeSet<usize> {
         let image = |used: &Used| match purpose {
             Use::Colour => used.colour,
@@ -136,12 +136,12 @@ impl Options {
         self.used.iter().filter(|used| kinds.contains(&used.kind)).filter_map(image).collect()
     }
 
-    /// Whether parts of blended triangles are drawn as opaque.
+    /// Whether two-pass transparency draws parts of blended triangles as opaque.
     pub(super) fn opaque_parts(&self) -> bool {
         self.defines.contains(&"OPAQUE_PARTS")
     }
 
-    /// What depends on the samples a pixel.
+    /// Defines that depend on the samples per pixel.
     pub(super) fn sampling(&self, samples: u32) -> String {
         let middle = vec![[0.5; 2]];
         let places = if samples > 1 { &self.sample_places } else { &middle };
@@ -150,7 +150,7 @@ impl Options {
         format!("#define SAMPLES {samples}\nconst vec2 SAMPLE_PLACES[{}] = vec2[]({list});\n", places.len())
     }
 
-    /// Ids and depth of the triangles of one kind.
+    /// Draws ids and depth of one kind of triangle.
     pub(super) fn visibility(&self, kind: Kind, samples: u32) -> Source {
         let label = format!("visibility, {kind:?}, {samples} samples");
         let (vertex, body) =
@@ -168,7 +168,7 @@ impl Options {
         Source { label, stages: drawn([&head, FRAME, CLIP, vertex].concat(), fragment) }
     }
 
-    /// The layer of the blended triangles, but for the parts that were drawn as opaque.
+    /// Draws the layer of the blended triangles, except the parts that were drawn as opaque.
     pub(super) fn blended(&self, samples: u32) -> Source {
         let head = self.head(&[]) + &self.branches(&[Kind::Blend]);
         let lookups = self.lookups(&[Kind::Blend], Slopes::OfTheQuad);
@@ -179,14 +179,14 @@ impl Options {
         Source { label: "blended".into(), stages: drawn(vertex, fragment) }
     }
 
-    /// Ids to light, in tiles where no triangle is seen.
+    /// Shades tiles in which no triangle is visible.
     pub(super) fn backdrop(&self, samples: u32) -> Source {
         let mut text = self.shading(samples, &["BACKDROP"]);
         text += include_str!("../../shaders/shade.comp");
         Source { label: format!("backdrop, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
-    /// Ids to light, in the other tiles.
+    /// Shades the other tiles.
     pub(super) fn shade(&self, samples: u32) -> Source {
         let all = [Kind::Opaque, Kind::Mask, Kind::Blend];
         let kinds = if self.opaque_parts() { &all } else { &all[..2] };
@@ -203,7 +203,7 @@ impl Options {
         [&head, &self.sampling(samples), FRAME, CLIP, IDS, MEETS, &self.sun(), SKY, ground, &self.resolve].concat()
     }
 
-    /// Keys of a rasteriser beside OpenGL to ids.
+    /// Converts the keys of the compute rasterizer to ids.
     pub(super) fn unpack(&self) -> Source {
         let mut head = self.head(&[]);
         writeln!(head, "#define TILE {TILE}").ok();
@@ -223,8 +223,8 @@ pub(super) fn drawn(vertex: String, fragment: String) -> Vec<(u32, String)> {
     vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
 }
 
-/// The lookup in texture arrays: sampling must not hang on a number that differs within a quad, so that with several
-/// arrays the slopes are taken first.
+/// Lookup in texture arrays. Implicit derivatives are undefined in divergent control flow, so with several arrays the
+/// derivatives are computed before the array is chosen.
 fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: Slopes) -> String {
     let mut text = String::new();
     let Some(first) = arrays.first() else { return text };
@@ -249,16 +249,16 @@ fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: Slopes) -> S
     text
 }
 
-/// Where the slopes of texture coordinates come from.
+/// Source of the derivatives of texture coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Slopes {
     /// Differences between the fragments of a quad.
     OfTheQuad,
-    /// The caller knows them.
+    /// Arguments of the lookup.
     Given,
 }
 
-/// What the first sample of each pixel sees.
+/// Packs the ids of each pixel's first sample.
 pub(super) fn seen(samples: u32) -> Source {
     let head = format!("#version 430 core\n#define LANES {LANES}\n#define SAMPLES {samples}\n");
     let body = [&head, IDS, include_str!("../../shaders/seen.comp")].concat();

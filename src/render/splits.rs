@@ -1,5 +1,5 @@
-//! Where the maps of a split shadow lie: the view is cut by distance, each part but the last gets a map of its own inside
-//! the whole box, and the last map is the whole box (parallel-split shadow maps, Zhang et al. 2006).
+//! Cascades of a split shadow map. The view is cut by distance; each part but the last has a map of its own within the
+//! box of the whole shadow map, and the last map is the whole box (parallel-split shadow maps, Zhang et al. 2006).
 
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Point3, Vector3};
@@ -8,12 +8,12 @@ use super::Shot;
 use super::light::{Fit, LightBox, Side};
 use modalcast_model::scene::{Camera, Scene};
 
-/// The share of the logarithmic scheme in where the view is cut; the rest is cut evenly.
+/// Weight of the logarithmic split scheme; the rest is the uniform scheme.
 const LOGARITHMIC: f64 = 0.5;
-/// The nearest part begins no nearer than this share of the farthest point.
+/// Smallest distance at which the first part begins, relative to the farthest point.
 const NEAREST: f64 = 1e-3;
 
-/// Twin of `SplitBlock` in `shaders/shared/splits.glsl`.
+/// Uniform block of the cascades. Twin of `SplitBlock` in `shaders/shared/splits.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(super) struct Splits {
@@ -24,7 +24,7 @@ pub(super) struct Splits {
 const _: () = assert!(size_of::<Splits>() == 80, "Splits differs from shaders/shared/splits.glsl");
 
 impl Splits {
-    /// The parts of one shot. `fit` is what the whole box was fitted to, relative to `origin` as the positions are.
+    /// Fits the cascades of one shot. `fit` is the input of the whole box, relative to `origin` like the positions.
     pub(super) fn new(scene: &Scene, shot: &Shot, fit: &Fit, origin: [f64; 3]) -> Self {
         let count = scene.look.shadow.unwrap_or_default().splits as usize;
         let whole = LightBox::fit(fit);
@@ -44,7 +44,7 @@ impl Splits {
     }
 }
 
-/// The nearest and the farthest distance at which the camera can see something of the bounds.
+/// Nearest and farthest distance at which the camera can see a point of the bounds.
 fn seen(camera: &Camera, fit: &Fit) -> (f64, f64) {
     let view = camera.camera_from_world();
     let depths = fit.bounds.corners().map(|corner| -view.transform_point(&corner).z);
@@ -56,7 +56,7 @@ fn seen(camera: &Camera, fit: &Fit) -> (f64, f64) {
     (near.clamp(NEAREST * far, far), far)
 }
 
-/// The practical scheme: the mean of cutting by equal ratios and by equal lengths. All cuts but the ends.
+/// Practical split scheme: the mean of logarithmic and uniform splits. Returns the cuts between the parts.
 fn cuts(near: f64, far: f64, count: usize) -> Vec<f64> {
     let cut = |part: usize| {
         let share = part as f64 / count as f64;
@@ -65,7 +65,7 @@ fn cuts(near: f64, far: f64, count: usize) -> Vec<f64> {
     (1..count).map(cut).collect()
 }
 
-/// A ball around what the camera sees between two distances: its size does not change when the camera turns.
+/// Bounding sphere of the view volume between two distances; its size does not change when the camera turns.
 fn ball(camera: &Camera, shot: &Shot, begin: f64, end: f64, fit: &Fit) -> (Point3<f64>, f64) {
     let clip = camera.clip_from_camera(shot.width, shot.height, &fit.bounds);
     let world = camera.camera_from_world().try_inverse().unwrap_or_default();
@@ -79,7 +79,7 @@ fn ball(camera: &Camera, shot: &Shot, begin: f64, end: f64, fit: &Fit) -> (Point
     (centre, corners.iter().map(|corner| (corner - centre).norm()).fold(0.0, f64::max))
 }
 
-/// The sides of a map around a ball; none when it would be no finer than the whole, or has no size.
+/// Sides of a cascade that encloses a sphere; none if it would not be finer than the whole map, or has no size.
 fn part_of(whole: &LightBox, fit: &Fit, (centre, radius): &(Point3<f64>, f64)) -> Option<[Side; 2]> {
     let sound = *radius > 0.0 && radius.is_finite() && centre.coords.iter().all(|number| number.is_finite());
     let sides =
@@ -87,7 +87,7 @@ fn part_of(whole: &LightBox, fit: &Fit, (centre, radius): &(Point3<f64>, f64)) -
     sides.filter(|sides| sides.iter().zip(&whole.sides).all(|(part, whole)| part.half < whole.half))
 }
 
-/// Scale and offset from the whole map to the part.
+/// Scale and offset from coordinates of the whole map to those of the cascade.
 fn within(whole: &[Side; 2], part: &[Side; 2]) -> [f32; 4] {
     let scale = [0, 1].map(|axis: usize| whole[axis].half / part[axis].half);
     let offset = [0, 1].map(|axis: usize| (whole[axis].low - part[axis].low) / (2.0 * part[axis].half));

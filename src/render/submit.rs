@@ -1,8 +1,8 @@
-//! A frame in two halves: its commands are given to the device ([`Renderer::submit`]), and its pixels are taken once they
-//! are there ([`Renderer::collect`]). In between the host may do something else, or submit another.
+//! Asynchronous frames: [`Renderer::submit`] records the commands of a frame, [`Renderer::collect`] takes its pixels
+//! when they are ready. In between, the host can do other work or submit more frames.
 //!
-//! The numbers of a frame (`frame`, `splits`, the empty ledgers) are written with commands of OpenGL, which take their turn
-//! in the stream: a frame under way keeps its own, and so do vertices that are uploaded.
+//! The uniforms of a frame (`frame`, `splits`, the initial values of the counters) are written with stream-ordered
+//! OpenGL commands. Frames in flight therefore keep their own values; the same holds for uploaded vertices.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -21,26 +21,26 @@ use super::target::{Form, Target};
 use super::{Image, Path, Paths, Ran, Renderer, Shot, cull, frame, passes};
 use modalcast_model::error::{Error, Result, during, invalid};
 
-/// Bytes that one thread copies at a time: enough that starting it costs little of that.
+/// Bytes that one thread copies at a time: large enough that the cost of starting a task is small in comparison.
 const STRETCH: usize = 1 << 20;
 
-/// A frame under way. Dropping it gives the frame up.
+/// A frame in flight. Dropping the ticket abandons the frame.
 #[derive(Debug)]
 pub struct Ticket {
     form: Form,
-    /// None of a frame that nobody reads.
+    /// None for a frame whose pixels are not read back.
     slot: Option<Slot>,
     fence: Fence,
-    /// In order, each with its time.
+    /// Passes in execution order, each with its timer.
     passes: Vec<(&'static str, Stopwatch)>,
     ran: Ran,
     limit: Duration,
-    /// When it was waited for first.
+    /// When the host first polled or waited for the frame.
     waited: Cell<Option<Instant>>,
 }
 
-/// The pixels of a frame that is done, where the device left them. Any thread may take them; it should at once, because the
-/// device has no other use for the memory until then.
+/// Pixels of a finished frame, still in the staging buffer that the device wrote. Any thread may copy them. The ring
+/// cannot reuse the staging buffer until then, so copy them soon.
 #[derive(Debug)]
 pub struct Pixels {
     width: u32,
@@ -51,7 +51,7 @@ pub struct Pixels {
 }
 
 impl Renderer {
-    /// Draws one frame of what the shared buffers hold, and waits for its pixels.
+    /// Draws one frame of the current buffers and waits for its pixels.
     ///
     /// # Errors
     /// Those of [`Self::submit`] and [`Self::retrieve`].
@@ -60,22 +60,22 @@ impl Renderer {
         self.collect(ticket)
     }
 
-    /// Gives the device one frame of what the shared buffers hold now, whatever they are made to hold next. At most
-    /// [`super::FRAMES_UNDER_WAY`] of one form may be under way: a further one is refused, and the oldest must be collected
-    /// first.
+    /// Submits one frame of the current buffers; later changes of the buffers do not affect it. At most
+    /// [`super::FRAMES_UNDER_WAY`] frames of one form may be in flight. A further one is refused until the oldest is
+    /// collected.
     ///
     /// # Errors
-    /// `Busy` when so many are under way, `Invalid` for a size above the limit or a camera that overflows, `Fault` naming
-    /// the pass when OpenGL reports an error.
+    /// `Busy` when too many frames are in flight, `Invalid` for a size above the limit or a camera whose matrices
+    /// overflow, `Fault` naming the pass when OpenGL reports an error.
     pub fn submit(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Ticket> {
         self.start(buffers, shot, true)
     }
 
-    /// The same of a frame whose pixels stay on the device, as of one that is shown on a screen: its image has none. Any
-    /// number of them may be under way.
+    /// Submits a frame whose pixels stay on the device, like a frame that is shown on a screen: its image is empty.
+    /// Such frames use no staging buffer, so their number in flight is not limited.
     ///
     /// # Errors
-    /// Those of [`Self::submit`] but for `Busy`.
+    /// Those of [`Self::submit`] except `Busy`.
     pub fn submit_unread(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Ticket> {
         self.start(buffers, shot, false)
     }
@@ -88,10 +88,10 @@ impl Renderer {
         self.retrieve(ticket).map(Pixels::into_image)
     }
 
-    /// Waits for a frame, and leaves its pixels to be copied by whatever thread has time for it.
+    /// Waits for a frame and returns its pixels uncopied, so that another thread can copy them.
     ///
     /// # Errors
-    /// `Fault` naming the pass that did not end within the limit, or of OpenGL.
+    /// `Fault` naming the pass that did not finish within the time limit, or the OpenGL error.
     pub fn retrieve(&mut self, ticket: Ticket) -> Result<Pixels> {
         ticket.wait()?;
         let Ticket { form, slot, passes, mut ran, .. } = ticket;
@@ -102,7 +102,7 @@ impl Renderer {
             (ran.lists, ran.culled) =
                 (told(listed)?.map(|head| lists::told(&head)), told(culled)?.map(|counts| cull::told(&counts)));
         }
-        // Nothing was sifted where somebody else saw.
+        // When the compute rasterizer drew the visibility there are no camera counts; the sun's are dropped with them.
         ran.culled = ran.culled.filter(|_| ran.paths.visibility != Some(Path::Cuda));
         let lent = staging.map(|staging| staging.lend(form.bytes() as usize)).transpose()?;
         self.gl.check("read")?;
@@ -141,7 +141,7 @@ impl Renderer {
             Ok(passes)
         });
         if passes.is_err() {
-            // Nobody knows what its images hold.
+            // A failed pass leaves the images of the target undefined.
             self.targets.pop();
         }
         let passes = passes?;
@@ -166,7 +166,7 @@ impl Renderer {
         Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given))
     }
 
-    /// The passes that make the picture.
+    /// Records the passes that make the picture.
     fn run(
         &self,
         buffers: &SceneBuffers,
@@ -216,7 +216,7 @@ impl Renderer {
         Ok(times)
     }
 
-    /// Brings the pixels, and behind them what is told of lists and of what was culled, to where the host can read them.
+    /// Copies the pixels, then the list and culling statistics, to the staging buffer.
     fn bring(
         &self,
         buffers: &SceneBuffers,
@@ -239,15 +239,15 @@ impl Renderer {
     }
 }
 
-/// Whether the ground is one more thing that samples see.
+/// Whether the ground must be rasterized.
 fn draws_ground(buffers: &SceneBuffers, shot: &Shot) -> bool {
     let scene = &buffers.scene;
-    // The bounds of a scene apart leave out what is far away.
+    // The bounds of a rebased scene leave out what is far away.
     let is_last = buffers.apart.is_none() && frame::ground_is_last(scene, shot, buffers.origin);
     scene.look.ground.is_some() && frame::above_ground(scene, shot) && !is_last
 }
 
-/// Where a frame may have triangles, or ground that is drawn.
+/// Region of the frame that may show triangles or rasterized ground.
 fn reach(buffers: &SceneBuffers, shot: &Shot, ground: bool) -> Region {
     let size = [shot.width, shot.height];
     if buffers.apart.is_some() || ground {
@@ -257,18 +257,18 @@ fn reach(buffers: &SceneBuffers, shot: &Shot, ground: bool) -> Region {
 }
 
 impl Ticket {
-    /// Whether [`Renderer::retrieve`] would not wait.
+    /// Whether [`Renderer::retrieve`] would return without waiting.
     pub fn is_ready(&self) -> bool {
         self.is_ready_within(Duration::ZERO)
     }
 
-    /// The same after waiting for the frame, at most so long. A frame that is late by more than the watchdog's limit is
-    /// ready to be given up.
+    /// Waits at most `limit` for the frame and returns whether it is ready. A frame that exceeds the watchdog's limit
+    /// counts as ready: retrieving it reports the timeout.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
         self.left().is_zero() || self.fence.is_over_within(limit)
     }
 
-    /// What is left of the watchdog's time, which begins with the first waiting.
+    /// Remaining watchdog time. The clock starts at the first poll or wait.
     fn left(&self) -> Duration {
         let begin = self.waited.get().unwrap_or_else(Instant::now);
         self.waited.set(Some(begin));
@@ -279,7 +279,7 @@ impl Ticket {
         self.fence.wait("read", self.left()).map_err(|error| self.blame(error))
     }
 
-    /// Names the pass at which the device stopped: the first that it has not done, behind the last one that it has.
+    /// Names the pass at which the device stopped: the one after the last pass that is known to be finished.
     fn blame(&self, error: Error) -> Error {
         let Error::Fault { stage, reason } = error else { return error };
         let over = self.passes.iter().take_while(|(_, stopwatch)| stopwatch.is_over()).count();
@@ -290,14 +290,14 @@ impl Ticket {
 }
 
 impl Pixels {
-    /// Notes a stage that came before the others, in milliseconds.
+    /// Adds the milliseconds of a stage that ran before the others.
     #[must_use]
     pub fn after(mut self, stage: &'static str, ms: f64) -> Self {
         self.passes.insert(0, (stage, ms));
         self
     }
 
-    /// Copies the pixels, on several threads when they are many.
+    /// Copies the pixels; several threads share the work when there are many.
     pub fn into_image(self) -> Image {
         let begin = Instant::now();
         let Self { width, height, lent, mut passes, paths } = self;
@@ -313,7 +313,7 @@ impl Pixels {
     }
 }
 
-/// Milliseconds of the stages and of the passes that they are made of.
+/// Milliseconds of the stages and of their passes.
 fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
     let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, stopwatch)| (*name, stopwatch.ms())).collect();
     let of_shadow = |name: &str| ["raster", "shadow", "blur"].contains(&name);
@@ -326,7 +326,7 @@ fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
     times
 }
 
-/// Says so when a frame lacks blended fragments and the one before did not.
+/// Warns when a frame drops blended fragments and the previous one did not.
 fn warn_of_lists(last: &Ran, ran: &Ran) {
     let lacks = |ran: &Ran| ran.lists.filter(|lists| lists.dropped() > 0);
     if let (Some(lists), None) = (lacks(ran), lacks(last)) {

@@ -1,5 +1,6 @@
-//! Numbers in place of colours: depth, domains, normals, or a number per vertex, for every pixel of a frame. Made only when
-//! somebody asks: the programs are compiled and the buffers allocated then, and the frames before and after do not change.
+//! AOV (arbitrary output variable) readback: numbers instead of colors for every pixel of a frame, namely depth,
+//! domains, normals or a scalar per vertex. Programs are compiled and buffers allocated on the first readback; frames
+//! before and after do not change.
 
 use std::time::Instant;
 
@@ -14,35 +15,36 @@ use super::target::{Form, image};
 use super::{Ran, Renderer, Shot, frame, passes};
 use modalcast_model::error::{Result, during};
 
-/// What is read off a frame. Blended triangles are not there: what stands behind them is. Only depth knows the ground:
-/// elsewhere it hides nothing that hangs below it.
+/// Attribute to read back. Blended triangles are ignored; the surface behind them is read. Only depth includes the
+/// ground: in the other fields, the ground hides nothing below it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Field {
-    /// f32, metres along the view axis, not along the ray; infinite where nothing is. The ground counts.
+    /// f32: meters along the view axis, not along the ray; infinite where nothing is visible. Includes the ground.
     Depth,
-    /// u32, the domain's index; `u32::MAX` where no triangle is.
+    /// u32: index of the domain; `u32::MAX` where no triangle is visible.
     Domains,
-    /// Three f32: the unit normal, on the side that is seen; zeros where no triangle is.
+    /// Three f32: unit normal on the visible side; zeros where no triangle is visible.
     Normals,
-    /// A word per sample: a number of every vertex ([`Renderer::upload_values`]) over `largest`, clamped to 0 to 1, in the
-    /// lower 16 bits; and in the upper ones the cosine between normal and eye. 0 where no triangle is.
+    /// One word per sample. Lower 16 bits: a scalar per vertex ([`Renderer::upload_values`]) divided by `largest`,
+    /// clamped to 0 to 1, as unorm. Upper 16 bits: the cosine between normal and eye, as unorm. 0 where no triangle is
+    /// visible.
     Values { largest: f32 },
 }
 
-/// Words of 32 bits, top row first.
+/// Result of a readback: 32-bit words, top row first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Survey {
     pub width: u32,
     pub height: u32,
-    /// Samples a pixel, which follow each other: 1 unless it is values.
+    /// Samples per pixel, stored next to each other; 1 for all fields but values.
     pub samples: u32,
-    /// Little-endian on every machine that this runs on.
+    /// Little-endian on all supported machines.
     pub bytes: Vec<u8>,
-    /// Milliseconds per pass, by the name of the stage.
+    /// Milliseconds by stage.
     pub passes: Vec<(&'static str, f64)>,
 }
 
-/// Ids and depth of a survey, and the words read off them.
+/// Render target of a readback, and the buffers of its words.
 #[derive(Debug)]
 pub(super) struct Surveyor {
     form: Form,
@@ -67,10 +69,10 @@ impl Field {
 }
 
 impl Renderer {
-    /// Takes a number per vertex, packed as the scene's layout says, for surveys of [`Field::Values`].
+    /// Uploads a scalar per vertex, in the vertex order of the scene's layout, for readbacks of [`Field::Values`].
     ///
     /// # Errors
-    /// `Fault` when the count is not the scene's, or OpenGL reports an error.
+    /// `Fault` when the count differs from the scene's number of vertices, or OpenGL reports an error.
     pub fn upload_values(&mut self, buffers: &mut SceneBuffers, values: &[f32]) -> Result<()> {
         let count = buffers.scene.layout.vertices;
         if values.len() != count {
@@ -88,11 +90,12 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// Reads a field off what the shared buffers hold. Depth, domains and normals are those of the middle of each pixel.
+    /// Reads a field for the current content of the shared buffers. Depth, domains and normals are sampled at pixel
+    /// centers.
     ///
     /// # Errors
-    /// `Invalid` for a size above the limit or a camera that overflows; `Fault` when no values were uploaded, OpenGL
-    /// reports an error or the device does not finish.
+    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` when no values were uploaded,
+    /// OpenGL reports an error or the device does not finish in time.
     pub fn survey(&mut self, buffers: &SceneBuffers, shot: &Shot, field: Field) -> Result<Survey> {
         self.check_size(shot)?;
         let samples = if matches!(field, Field::Values { .. }) { buffers.scene.look.samples_a_pixel() } else { 1 };
@@ -153,7 +156,7 @@ impl Renderer {
         Ok(Survey { width: form.width, height: form.height, samples: form.samples, bytes, passes })
     }
 
-    /// Keeps one surveyor: the last one, when it fits.
+    /// Keeps the last render target if its form and words per pixel match, else replaces it.
     fn make_surveyor(&mut self, form: Form, words: u64) -> Result<()> {
         if self.surveyor.as_ref().is_some_and(|last| (last.form, last.words) == (form, words)) {
             return Ok(());
@@ -175,7 +178,7 @@ impl Renderer {
     }
 }
 
-/// Ids to the domains of their triangles.
+/// Maps ids to the domains of their triangles.
 fn domains(buffers: &SceneBuffers, ids: Vec<u8>) -> Vec<u8> {
     let mut words: Vec<u32> = bytemuck::pod_collect_to_vec(&ids);
     let stretches = &buffers.stretches[..];
@@ -184,7 +187,7 @@ fn domains(buffers: &SceneBuffers, ids: Vec<u8>) -> Vec<u8> {
         Seen::Nothing | Seen::Ground => u32::MAX,
     };
     words.par_chunks_mut(4096).for_each(|words| {
-        // Neighbours mostly see the same triangle.
+        // Neighboring pixels mostly see the same triangle.
         let mut last = (0, u32::MAX);
         for word in words {
             if *word != last.0 {

@@ -1,5 +1,5 @@
-//! Where a frame is drawn: ids, depth and blended layer of every sample, the picture, and the buffers through which its
-//! pixels come back.
+//! Render target of a frame: ids, depth and blended layer of each sample, the picture, and the buffers for its
+//! readback.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -14,30 +14,30 @@ use super::shaders::TILE;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, Look};
 
-/// Pixels of a multisampled frame, at most: with depth, ids and a blended layer they take 704 MiB of device memory. A
-/// larger frame is drawn with one sample a pixel.
+/// Maximum number of pixels of a multisampled frame: with depth, ids and a blended layer they take 704 MiB of device
+/// memory. Larger frames are drawn with one sample per pixel.
 const MULTISAMPLED_PIXELS: u64 = 11 << 20;
 
-/// What a frame's images are made for.
+/// Properties of a frame that determine its images and buffers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Form {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) samples: u32,
     pub(super) blended: Blended,
-    /// Halvings of the picture through which light glows.
+    /// Levels of the bloom pyramid below the picture's size.
     pub(super) halvings: u32,
-    /// How triangles are culled; never what is to be chosen yet.
+    /// Culling method; never the automatic choice.
     pub(super) culling: Culling,
 }
 
-/// What a frame needs for blended triangles.
+/// Resources that a frame needs for blended triangles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Blended {
     None,
-    /// A layer that is drawn over.
+    /// A layer into which they are blended in draw order.
     Drawn,
-    /// Lists of so many fragments.
+    /// Lists with this budget of fragments.
     Listed(u32),
 }
 
@@ -45,31 +45,31 @@ pub(super) enum Blended {
 #[derive(Debug)]
 pub(super) struct Target {
     pub(super) form: Form,
-    /// Per sample what it sees; kept until the next frame, like depth.
+    /// Id of each sample; kept until the next frame, like depth.
     pub(super) ids: Texture,
     pub(super) visible: Framebuffer,
     pub(super) touched: Traces,
-    /// Where the frame that is drawn now may have triangles, or ground that is drawn.
+    /// Region of the current frame that may show triangles or rasterized ground.
     pub(super) reach: Cell<Region>,
     pub(super) layer: Option<Layer>,
     pub(super) lists: Option<ListTarget>,
-    /// The tiles that see triangles, after the numbers of the dispatch over them.
+    /// Indirect dispatch arguments, then the tiles that see triangles.
     pub(super) tiles: Buffer,
-    /// Linear light, one value a pixel.
+    /// Linear light, one value per pixel.
     pub(super) picture: Texture,
-    /// What glows of each pixel, then half as large each time; none without glow.
+    /// Bright light of each pixel, then levels of half the size; empty without bloom.
     pub(super) glow: Vec<Texture>,
     /// RGBA8, top row first, as the encoder writes it.
     pub(super) packed: Buffer,
-    /// What brings it to the host.
+    /// Staging buffers for the readback of `packed`.
     pub(super) ring: Rc<Ring>,
-    /// Of culling by depth.
+    /// Depth pyramid of occlusion culling.
     pub(super) pyramid: Option<Pyramid>,
     // Attached to framebuffers, which must not outlive it.
     pub(super) depth: Texture,
 }
 
-/// Light of the blended triangles of every sample, and the share of what lies behind that they let by.
+/// Blended light of the translucent triangles per sample, and their transmittance in alpha.
 #[derive(Debug)]
 pub(super) struct Layer {
     pub(super) framebuffer: Framebuffer,
@@ -78,7 +78,7 @@ pub(super) struct Layer {
 }
 
 impl Form {
-    /// No pixels and nothing but them.
+    /// No pixels and no optional features.
     pub(super) const EMPTY: Self =
         Self { width: 0, height: 0, samples: 1, blended: Blended::None, halvings: 0, culling: Culling::None };
 
@@ -88,18 +88,20 @@ impl Form {
         Self { blended, halvings, ..Self::plain(gl, [width, height], look.samples_a_pixel()) }
     }
 
-    /// The form of a frame of ids and depth alone, with as many samples a pixel as are wanted and fit.
+    /// The form of a frame with ids and depth only, with `wanted` samples per pixel if the device and the frame size
+    /// allow it, else one.
     pub(super) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
         Self { width, height, samples: if fits { wanted } else { 1 }, ..Self::EMPTY }
     }
 
-    /// Bytes of its picture.
+    /// Bytes of the encoded picture.
     pub(super) fn bytes(&self) -> u64 {
         4 * u64::from(self.width) * u64::from(self.height)
     }
 
-    /// Where behind the picture is told what its lists held, and what was culled; empty where there is no such thing.
+    /// Byte ranges of the list and culling statistics, which follow the picture in the staging buffer; empty without
+    /// lists or culling.
     pub(super) fn told(&self) -> [Range<u64>; 2] {
         let lists = if matches!(self.blended, Blended::Listed(_)) { HEAD as u64 } else { 0 };
         let culled = if self.culling == Culling::None { 0 } else { COUNT_BYTES as u64 };
@@ -144,7 +146,7 @@ impl Target {
     }
 }
 
-/// Where the samples of a pixel of four lie in it; empty on a device that has no four.
+/// Sample positions within a pixel with four samples; empty on a device without 4x multisampling.
 pub(super) fn sample_places(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
     let form = Form { width: 1, height: 1, samples: 4, ..Form::EMPTY };
     if gl.limits.max_samples < form.samples {

@@ -1,9 +1,9 @@
-//! A scene's images to texture arrays: one layer per distinct use, a bounded number of arrays.
+//! Packs a scene's images into a bounded number of texture arrays, one layer per distinct use.
 //!
 //! Images of one size share an array. When there are more sizes than [`MAX_ARRAYS`], the smallest array is merged into
-//! the one where that wastes the fewest texels, and its images are stretched to that size; texture coordinates run from
-//! 0 to 1 either way, so nothing else changes. Colours are stored sRGB, normal maps linear. Where alpha only cuts out, its levels
-//! keep the share of the image that is left (`coverage`).
+//! the one where that wastes the fewest texels, and its images are enlarged to that size. Texture coordinates run from
+//! 0 to 1 either way, so nothing else changes. Colors are stored as sRGB, normal maps as linear values. If alpha only
+//! cuts out, the mipmap levels preserve the covered share of the image (`coverage`).
 
 mod coverage;
 
@@ -15,21 +15,21 @@ use modalcast_model::scene::Scene;
 
 use super::geometry::used_materials;
 
-/// Arrays per use. Colours, normals and the shadow map together stay below the sixteen units that OpenGL guarantees to a
-/// fragment shader.
+/// Maximum number of arrays per use. The color arrays, the normal arrays and the shadow map together stay below the
+/// sixteen texture units that OpenGL guarantees to a fragment shader.
 pub(super) const MAX_ARRAYS: usize = 6;
 
-/// Bytes of all arrays with their levels. 512 images of 4096 x 4096 would be 46 GB.
+/// Maximum bytes of all arrays with their mipmap levels. 512 images of 4096 x 4096 would take 46 GB.
 const BUDGET: u64 = 8 << 30;
 
-/// What an image is read as.
+/// What an image contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Use {
     Colour,
     Normal,
 }
 
-/// One array: its size and the scene's textures in it, one per layer.
+/// One texture array: its size, and the scene's texture in each layer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Array {
     pub(super) width: u32,
@@ -37,7 +37,7 @@ pub(super) struct Array {
     pub(super) layers: Vec<usize>,
 }
 
-/// Where a material finds its image: array and layer.
+/// Location of a material's image: array and layer.
 pub(super) type Place = (usize, usize);
 
 impl Array {
@@ -53,7 +53,7 @@ impl Array {
     }
 }
 
-/// The arrays that a scene needs for one use; empty when no triangle's material has such an image.
+/// The arrays that a scene needs for one use; empty when no used material has such an image.
 pub(super) fn arrays(scene: &Scene, purpose: Use) -> Vec<Array> {
     let wanted = match purpose {
         Use::Colour => scene.needs.textures,
@@ -72,10 +72,10 @@ pub(super) fn arrays(scene: &Scene, purpose: Use) -> Vec<Array> {
     merge(by_size(sizes), MAX_ARRAYS)
 }
 
-/// Refuses arrays that would take more device memory than images may.
+/// Checks that the arrays stay within the device memory budget for images.
 ///
 /// # Errors
-/// `Invalid` with the bytes, the largest array first.
+/// `Invalid` with the number of bytes and a list of the arrays, largest first.
 pub(super) fn within_budget(images: &[Vec<Array>; 2]) -> Result<()> {
     let mut arrays: Vec<&Array> = images.iter().flatten().collect();
     let bytes: u64 = arrays.iter().map(|array| array.bytes()).sum();
@@ -88,7 +88,7 @@ pub(super) fn within_budget(images: &[Vec<Array>; 2]) -> Result<()> {
     Err(invalid("scene.textures", format!("at most {BUDGET} bytes with all levels"), format!("{bytes} bytes: {list}")))
 }
 
-/// Where a texture lies in its arrays.
+/// Location of a texture in its arrays.
 pub(super) fn place(arrays: &[Array], texture: usize) -> Option<Place> {
     arrays
         .iter()
@@ -126,7 +126,7 @@ fn merge(mut arrays: Vec<Array>, limit: usize) -> Vec<Array> {
     arrays
 }
 
-/// From which alpha on a texture's texels are left, when nothing but cut-outs of one cutoff reads them.
+/// Alpha threshold of a texture's texels, if only cut-outs with one cutoff use the texture.
 pub(super) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
     let materials = used_materials(scene).into_iter().map(|material| &scene.materials[material]);
     let of_material = |material: &modalcast_model::domain::Material| match material.alpha_mode {
@@ -138,7 +138,8 @@ pub(super) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
     (first > 0.0 && first < 1.0 && cutoffs.all(|cutoff| cutoff == Some(first))).then_some(first)
 }
 
-/// All levels of one image at the size of its array, level 0 first, RGBA8. With a cutoff, all leave the same share of it.
+/// All mipmap levels of an image at the size of its array, level 0 first, RGBA8. With a cutoff, all levels cover the
+/// same share.
 pub(super) fn levels(texture: &Texture, array: &Array, purpose: Use, cutoff: Option<f32>) -> Vec<Vec<u8>> {
     let mut image = Linear::new(texture, purpose);
     if (texture.width(), texture.height()) != (array.width, array.height) {
@@ -158,7 +159,7 @@ pub(super) fn levels(texture: &Texture, array: &Array, purpose: Use, cutoff: Opt
     chain.iter().map(|level| level.bytes(purpose)).collect()
 }
 
-/// RGBA as numbers: linear colour (or a normal), and alpha.
+/// RGBA as floats: linear color (or a normal), and alpha.
 struct Linear {
     width: u32,
     height: u32,
@@ -183,8 +184,8 @@ impl Linear {
         self.texels[(y.min(self.height - 1) * self.width + x.min(self.width - 1)) as usize]
     }
 
-    /// The next level: each texel averages what lies below it, four texels or, of odd sides, parts of up to nine; colours
-    /// weighed by alpha, so that what is cut away tints nothing.
+    /// The next mipmap level. Each texel averages the texels below it: four, or parts of up to nine for odd sides.
+    /// Colors are weighted by alpha, so that transparent texels do not tint the result.
     fn halved(&self) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
         let (across, down) = (shares(self.width), shares(self.height));
@@ -201,7 +202,7 @@ impl Linear {
         Self { width, height, texels }
     }
 
-    /// Bilinear enlargement (arrays never shrink an image), wrapping around as sampling does.
+    /// Bilinear enlargement (arrays never shrink an image), with repeat wrapping like the sampler.
     fn stretched(&self, width: u32, height: u32) -> Self {
         let along = |to: u32, count: u32, from: u32| {
             let position = (to as f32 + 0.5) * from as f32 / count as f32 - 0.5;
@@ -241,8 +242,8 @@ impl Linear {
     }
 }
 
-/// How much of each texel of half a side lies on the texels 2x, 2x + 1 and 2x + 2 of the side. An odd side's texels are
-/// wider than two: taking two of them would drop the last column and shift the rest.
+/// Weights of the texels 2x, 2x + 1 and 2x + 2 in texel x of the halved side. Texels of a halved odd side are wider
+/// than two: averaging pairs would drop the last column and shift the rest.
 fn shares(side: u32) -> Vec<[f32; 3]> {
     let half = (side / 2).max(1);
     let share = |x: u32| match side {
@@ -267,8 +268,8 @@ fn weighed(parts: &[([f32; 4], f32)]) -> [f32; 4] {
     mean
 }
 
-/// Gives every wholly transparent texel the colour of the level above it, from the coarsest level down: filtering at the
-/// edge of a cut-out then finds the colour of the leaf and no dark rim.
+/// Gives each fully transparent texel the color of the next coarser level, from the coarsest level down: filtering at
+/// the edge of a cut-out then finds the color of the leaf instead of a dark rim.
 fn bleed(chain: &mut [Linear]) {
     for level in (0..chain.len().saturating_sub(1)).rev() {
         let (fine, coarse) = chain.split_at_mut(level + 1);
@@ -285,7 +286,7 @@ fn bleed(chain: &mut [Linear]) {
     }
 }
 
-/// IEC 61966-2-1.
+/// sRGB transfer function, IEC 61966-2-1.
 pub(super) fn linear_from_srgb(encoded: f32) -> f32 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
@@ -350,7 +351,7 @@ mod tests {
     #[test]
     fn every_level_of_an_odd_side_keeps_the_mean_of_the_image_and_its_centre() {
         for (width, height) in [(25, 15), (3, 1), (1, 7), (24, 24), (75, 50), (2, 3)] {
-            // A ramp, and a last column and row that stand out: halving by pairs would drop them.
+            // A ramp with a distinct last column and row, which halving by pairs would drop.
             let level = |at: u32, side: u32| 100 * u32::from(at + 1 == side) + 3 * at % 100;
             let texel = |at: u32| [level(at % width, width) as f32, level(at / width, height) as f32, 1.0, 1.0];
             let texels: Vec<[f32; 4]> = (0..width * height).map(texel).collect();

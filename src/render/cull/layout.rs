@@ -1,39 +1,39 @@
-//! Groups of triangles cut into blocks, and the numbers that the shaders of culling share with the host.
+//! Partition of the triangle groups into blocks, and the data that the culling shaders share with the host.
 
 use bytemuck::{Pod, Zeroable};
 
 use super::super::geometry::{Group, Kind};
 
-/// Triangles of a block, which one workgroup looks at.
+/// Triangles per block; one workgroup tests a block.
 pub(crate) const LANES: u32 = 256;
-/// Blocks of a super block, whose listed triangles are counted together.
+/// Blocks per super block, whose listed triangles are counted together.
 pub(crate) const SUPER: u32 = 64;
-/// Groups that a scene has at most: three kinds, with one side and with two.
+/// Maximum number of groups: three kinds, single- and double-sided.
 pub(crate) const GROUPS: usize = 6;
 /// Workgroups in a row of the dispatch over blocks.
 const ROW: u32 = 1 << 15;
-/// Words of an indexed draw, and what follows all of them before the totals.
+/// Words of an indexed indirect draw, and words of the ledger before its totals.
 const COMMAND: usize = 5;
 const HEAD: usize = COMMAND * GROUPS + 2;
 
-/// Twin of `GroupBlock` in `shaders/shared/cull.glsl`.
+/// Uniform block of the groups. Twin of `GroupBlock` in `shaders/shared/cull.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct Groups {
-    /// First triangle, triangles, first workgroup, first block.
+    /// First triangle, number of triangles, first workgroup, first block.
     places: [[u32; 4]; GROUPS],
-    /// Whether it has one side, and whether it is made of vertices alone.
+    /// Whether the group is single-sided, and whether it uses vertices only.
     ways: [[u32; 4]; GROUPS],
-    /// Groups, workgroups.
+    /// Number of groups, workgroups and blocks.
     count: [u32; 4],
-    /// The part of a pixel to which places are rounded.
+    /// Step of the rasterizer's subpixel grid, in pixels.
     grid: [f32; 4],
 }
 
 const _: () = assert!(size_of::<Groups>() == 224, "Groups differs from shaders/shared/cull.glsl");
 
 impl Groups {
-    /// The groups of a scene, on a device that rounds places to this part of a pixel.
+    /// Lays out the groups of a scene for a device with this subpixel step.
     pub(crate) fn new(groups: &[Group], grid: f32) -> Self {
         let mut own = Self { grid: [grid, 0.0, 0.0, 0.0], ..Self::zeroed() };
         let (mut work, mut block) = (0, 0);
@@ -42,19 +42,19 @@ impl Groups {
             *way = [u32::from(!group.double_sided), u32::from(group.kind == Kind::Opaque), 0, 0];
             let blocks = (group.triangles as u32).div_ceil(LANES);
             work += blocks;
-            // A super block has blocks of one group alone.
+            // A super block contains blocks of one group only.
             block += blocks.next_multiple_of(SUPER);
         }
         own.count = [groups.len() as u32, work, block, 0];
         own
     }
 
-    /// The dispatch over all blocks.
+    /// Workgroups of the dispatch over all blocks.
     pub(crate) fn dispatch(&self) -> [u32; 2] {
         [self.count[1].min(ROW), self.count[1].div_ceil(ROW)]
     }
 
-    /// Bytes of a bit for every triangle of every block.
+    /// Bytes of a bitmap with one bit for every triangle of every block.
     pub(crate) const fn bit_bytes(&self) -> usize {
         self.count[2] as usize * LANES as usize / 8
     }
@@ -64,18 +64,18 @@ impl Groups {
         4 * (HEAD + (self.count[2] / SUPER) as usize)
     }
 
-    /// An empty ledger: a draw of nothing for each group, and no totals.
+    /// Initial ledger: an empty draw for each group, and zero totals.
     pub(crate) fn empty_ledger(&self) -> Vec<u8> {
         let mut words = vec![0_u32; self.ledger_bytes() / 4];
         for (command, place) in words.chunks_exact_mut(COMMAND).zip(&self.places) {
-            // Indices, instances, first index, base vertex, base instance.
+            // Index count, instances, first index, base vertex, base instance.
             command.copy_from_slice(&[0, 1, 3 * place[0], 0, 0]);
         }
         bytemuck::cast_slice(&words).to_vec()
     }
 }
 
-/// Where the draw of a group lies in the ledger, in bytes.
+/// Byte offset of a group's indirect draw in the ledger.
 pub(crate) const fn command(group: usize) -> usize {
     4 * COMMAND * group
 }

@@ -1,31 +1,33 @@
-//! Culling on the GPU: before the rasteriser sees a group of triangles, a compute pass looks at each of them and lists
-//! those that it may make something of; one indirect call a group draws the list. The rasteriser is scarce (about
-//! 0.4 G triangles/s on a data-centre GPU), compute is not.
+//! Triangle culling on the GPU. Before the rasterizer processes a group of triangles, a compute pass tests each
+//! triangle and lists those that may be visible; one indirect draw per group draws the list. Rasterizer throughput is
+//! scarce (about 0.4 G triangles/s on a data-center GPU), compute throughput is not.
 //!
-//! # What is left out
-//! Triangles outside one plane of the view volume; back faces of what has one side; triangles so small that no sample lies
-//! in their bounding box; and, where the look says so, triangles behind what is nearer. Each bound is widened by all that
-//! rounding may do, on the host's side of the rasteriser and on its own, so that no bit of the picture changes. The counts
-//! come back with the pixels.
+//! # Tests
+//! Culling removes triangles outside one plane of the view volume, back faces of single-sided materials, triangles so
+//! small that no sample lies in their bounding box and, if the look asks for it, triangles behind nearer ones. Each
+//! bound is widened by the rounding errors of the shaders and of the rasterizer, so that culling changes no bit of the
+//! picture. The counts are read back with the pixels.
 //!
-//! # Hidden triangles
-//! What the last frame saw is drawn first, depth alone, where it is now. A pyramid of the farthest depth of ever larger
-//! squares is made of that, all triangles are tested against it, and the survivors are drawn into a cleared image in their
-//! own order. The picture depends on no history: whatever was remembered, it was drawn from this frame's positions, so a
-//! triangle that is strictly behind its depth at every sample is behind the picture's too, and what is dropped never
-//! would have been seen. Which triangles are hidden does depend on it, and so does their count: a first frame hides none.
+//! # Occlusion culling
+//! The pass first draws the depth of the triangles that the last frame saw, at their current positions. A hierarchical
+//! depth pyramid holds the farthest depth of ever larger squares. All triangles are tested against the pyramid, and the
+//! survivors are drawn into a cleared image in their original order. The picture does not depend on the history. The
+//! occluders have this frame's positions, so a triangle strictly behind their depth at every sample is also behind the
+//! picture's depth and would not be visible. The set of hidden triangles, and so their count, does depend on the
+//! history: the first frame hides none.
 //!
-//! Drawing the remembered ones once, with ids, and only the rest after them would spare their second turn. It is not
-//! exact: of equal depths the later triangle is seen, and the rest may be both equal and earlier. Fragments cannot ask what
-//! is there, and comparing depths in the shader would run it once a sample. So they are drawn twice, the first time without
-//! ids. Depth is cleared in between because depths of the two turns would have to agree to the bit otherwise; now they
-//! only need to agree within the margin.
+//! Drawing the remembered triangles once, with ids, and then only the rest would avoid drawing them twice, but it is
+//! not exact: at equal depths the later triangle must win, and one of the rest may have equal depth and an earlier
+//! position. Fragment shaders cannot read the current id, and a depth comparison in the shader would force per-sample
+//! shading. The occluders are therefore drawn twice, the first time without ids. The depth is cleared in between
+//! because the depths of both draws would otherwise have to match to the bit; with the clear they only need to match
+//! within the margin.
 //!
 //! # Lists
-//! A list keeps its triangles' order, by a scan of counted bits and not by atomics, and begins where its group does. It
-//! holds indices rather than triangles alone, so that vertices are still shared between triangles: without an index buffer
-//! each would be transformed three times. Its fragments find their triangle's name by one fetch, the same for all
-//! fragments of a triangle.
+//! A list keeps the order of its triangles, because it is compacted with a prefix sum over bits instead of atomics, and
+//! begins at the offset of its group. It holds indices and not only triangles, so that triangles still share
+//! transformed vertices: without an index buffer, each vertex would be transformed three times. Fragments find the id
+//! of their triangle with one texel fetch, which is uniform over a triangle.
 
 mod layout;
 mod pyramid;
@@ -51,56 +53,59 @@ use modalcast_model::scene::{Culling, Scene};
 
 /// The buffer of listed triangles, three indices each.
 pub(super) const LISTED: &str = "listed triangles";
-/// The pass of the sun's lists.
+/// The pass that builds the lists of shadow casters.
 pub(super) const SHADOW_CULL: &str = "shadow cull";
-/// Words of the counts: five verdicts of the camera, five of the sun.
+/// Words of the counts: five verdicts for the camera, five for the sun.
 const COUNTS: usize = 10;
 pub(super) const COUNT_BYTES: usize = 4 * COUNTS;
 /// The buffer of the counts.
 pub(super) const COUNTED: &str = "cull counts";
-/// Triangles from which a scene is culled on hardware, where its look does not say: between those measured, see `chosen`.
+/// Number of triangles from which a scene is culled on hardware by default; lies between the measurements given at
+/// `chosen`.
 const MANY: usize = 1 << 20;
 
-/// What became of the triangles of one pass. Of a shadow with several maps, those of all maps; of one that frames share,
-/// nothing but in the frame that drew it.
+/// Culling result of one view. For the sun, the counts add up over all cascades; they are zero in frames that reuse a
+/// shadow map.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Sifted {
-    /// Left to the rasteriser.
+    /// Passed on to the rasterizer.
     pub listed: u32,
-    /// Outside the view volume, or the box of the shadow map.
+    /// Outside the view volume, or outside the box of the shadow map.
     pub outside: u32,
-    /// Back faces of what has one side.
+    /// Back faces of single-sided materials.
     pub facing: u32,
-    /// In no sample of a pixel, or without area.
+    /// Triangles that cover no sample or have no area.
     pub no_sample: u32,
-    /// Behind what the last frame saw.
+    /// Behind the depth of the triangles that the last frame saw.
     pub hidden: u32,
 }
 
-/// What became of a frame's triangles before they were drawn.
+/// Culling results of a frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Culled {
     pub camera: Sifted,
-    /// Of the shadow map.
+    /// Casters of the shadow map.
     pub sun: Sifted,
 }
 
 impl Sifted {
-    /// Triangles that the rasteriser does not see.
+    /// Triangles that the rasterizer does not process.
     pub const fn left_out(&self) -> u32 {
         self.outside + self.facing + self.no_sample + self.hidden
     }
 }
 
-/// How a scene is culled on a device: what its look says, or what suits both. Not at all where the device has no buffers
-/// so large as the lists.
+/// Culling method of a scene on a device: the look's choice, or the one that suits both. None if the lists exceed the
+/// largest buffer of the device.
 ///
-/// On hardware (H200, 1080p) a field of 3 M triangles takes 6.32 ms a frame without culling, 5.78 with what no sample hits
-/// left out, and more by depth. One of 262,144 takes 2.04 ms without, 2.08 and 2.76 with; the almond tree (37,560 triangles,
-/// leaves with two sides, four samples) 1.57 without, 1.59 and 2.09 with: there it does not pay.
+/// On hardware (H200, 1080p), a field of 3 M triangles takes 6.32 ms per frame without culling, 5.78 ms with the test
+/// for samples, and more with occlusion culling. A field of 262,144 triangles takes 2.04 ms without culling, 2.08 ms
+/// and 2.76 ms with the two methods; the almond tree (37,560 triangles, double-sided leaves, four samples) takes 1.57
+/// ms without, 1.59 ms and 2.09 ms with them. Culling does not pay for the two smaller scenes.
 ///
-/// Software gains too little: on two cores the visibility pass of the almond tree (37,560 triangles, 1080p, four samples)
-/// takes 83 ms in place of 80 where what no sample hits is left out (3 % of it), and by depth four times as long.
+/// In software it does not pay either: on two cores, the visibility pass of the almond tree (37,560 triangles, 1080p,
+/// four samples) takes 83 ms instead of 80 ms when the 3 % of triangles without a sample are culled, and four times as
+/// long with occlusion culling.
 pub(super) fn chosen(scene: &Scene, limits: &Limits) -> Culling {
     let software = limits.software;
     let wanted = match scene.look.culling {
@@ -113,14 +118,14 @@ pub(super) fn chosen(scene: &Scene, limits: &Limits) -> Culling {
     if fits { wanted } else { Culling::None }
 }
 
-/// Whether cut-outs read an image at the centroid of the samples that they cover. Mesa's rasteriser takes the centroid of
-/// those that also pass the depth test, so that what is hidden later moves it, and a pixel in a million differs without
-/// what is hidden.
+/// Whether cut-outs sample a texture at the centroid of their covered samples. Mesa's rasterizer takes the centroid of
+/// the samples that also pass the depth test. Hidden triangles drawn earlier thus move the centroid, and about one
+/// pixel in a million differs when they are culled.
 fn centroids(scene: &Scene) -> bool {
     scene.look.samples_a_pixel() > 1 && scene.needs.mask && scene.needs.textures
 }
 
-/// How a plan culls.
+/// Culling method of a plan.
 pub(super) fn of(plan: &Plan) -> Culling {
     match (plan.defines("CULLED"), plan.defines("REMEMBERS")) {
         (_, true) => Culling::Depth,
@@ -129,7 +134,7 @@ pub(super) fn of(plan: &Plan) -> Culling {
     }
 }
 
-/// The passes of the camera's lists, in order.
+/// The passes of the camera's lists, in execution order.
 pub(super) fn passes(culling: Culling) -> Vec<&'static str> {
     match culling {
         Culling::Depth => vec!["occluders", "cull"],
@@ -158,12 +163,12 @@ pub(super) fn allocations(scene: &Scene, culling: Culling) -> Vec<Allocation> {
     all.into_iter().chain(seen).map(named).collect()
 }
 
-/// Programs of the camera's lists, for one number of samples a pixel.
+/// Programs of the camera's lists, for one number of samples per pixel.
 #[derive(Debug, Clone)]
 pub(super) struct CullPrograms {
     sift: Rc<Program>,
     list: Rc<Program>,
-    /// Of culling by depth.
+    /// Programs of occlusion culling.
     remembered: Option<Rc<Program>>,
     remember: Option<Rc<Program>>,
     pyramid: Option<[Rc<Program>; 2]>,
@@ -190,7 +195,7 @@ impl CullPrograms {
     }
 }
 
-/// Programs of the sun's lists.
+/// Programs of the shadow casters' lists.
 #[derive(Debug)]
 pub(super) struct SunPrograms {
     sift: Rc<Program>,
@@ -203,7 +208,7 @@ impl SunPrograms {
     }
 }
 
-/// The lists of a culled scene, one for each group, and what is drawn from them.
+/// The lists of a culled scene, one per group, and the vertex arrays that draw them.
 #[derive(Debug)]
 pub(super) struct Culler {
     numbers: Groups,
@@ -213,7 +218,7 @@ pub(super) struct Culler {
 }
 
 impl Culler {
-    /// Of a scene whose plan has the buffers; none otherwise. The vertex arrays are those of lists.
+    /// Creates the lists of a scene whose plan has buffers for them; none otherwise. The vertex arrays index the lists.
     pub(super) fn new(
         gl: &Rc<Gl>,
         buffers: &BTreeMap<String, Buffer>,
@@ -232,7 +237,7 @@ impl Culler {
         Ok(Some(Self { numbers, names: gl.view(names, gl::R32UI)?, solids, corners }))
     }
 
-    /// What listed triangles of a kind are made from.
+    /// Vertex array of one kind of listed triangle.
     pub(super) const fn array(&self, kind: Kind) -> Option<&VertexArray> {
         match kind {
             Kind::Opaque => Some(&self.solids),
@@ -241,7 +246,7 @@ impl Culler {
     }
 }
 
-/// What became of a frame's triangles, from its counts.
+/// Culling results of a frame, from its counts.
 pub(super) fn told(counts: &[u8]) -> Culled {
     let words: Vec<u32> = bytemuck::pod_collect_to_vec(counts);
     let sifted = |first: usize| {

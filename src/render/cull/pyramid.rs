@@ -1,4 +1,4 @@
-//! The farthest depth of ever larger squares of a frame.
+//! Hierarchical depth pyramid: the farthest depth of ever larger squares of a frame.
 
 use std::rc::Rc;
 
@@ -10,15 +10,15 @@ use modalcast_model::error::Result;
 
 /// The coarsest level: squares of 2^8 pixels.
 pub(super) const TOP: u32 = 8;
-/// Levels that one turn makes besides the one that it begins with, and the side of what a workgroup takes.
+/// Levels that one dispatch adds to its first level, and the side of the square of texels that a workgroup reduces.
 const TURN: u32 = 4;
 const SIDE: u32 = 1 << TURN;
 const PYRAMID: u32 = 4;
 
-/// What occluders are drawn into, and the pyramid of it. For frames of one form.
+/// Framebuffer of the occluders and the pyramid of their depth, for frames of one form.
 #[derive(Debug)]
 pub(crate) struct Pyramid {
-    /// The frame's depth alone.
+    /// Framebuffer with the frame's depth only.
     pub(super) occluders: Framebuffer,
     depths: Buffer,
 }
@@ -39,7 +39,7 @@ impl Pyramid {
         Ok(Self { occluders: gl.framebuffer(None, depth)?, depths })
     }
 
-    /// Makes all levels of the depth that is there.
+    /// Builds all levels from the current depth.
     pub(super) fn build(&self, gl: &Gl, (depth, form): (&Texture, Form), sampled: &Sampled) {
         let Some([fine, coarse]) = sampled.cull.as_ref().and_then(|cull| cull.pyramid.as_ref()) else { return };
         let groups = [form.width, form.height].map(|side| side.div_ceil(SIDE));
@@ -56,7 +56,7 @@ impl Pyramid {
     }
 }
 
-/// Width and height in one number, as the shaders take them.
+/// Width and height in one word, as the shaders expect them.
 pub(super) const fn packed(form: Form) -> u32 {
     form.width | form.height << 16
 }

@@ -1,4 +1,4 @@
-//! The passes of culling within a frame.
+//! Runs the culling passes of a frame.
 
 use super::super::Ran;
 use super::super::geometry::Kind;
@@ -14,7 +14,7 @@ use modalcast_model::error::Result;
 
 const NAME_UNIT: u32 = 25;
 const GROUP_BLOCK: u32 = 3;
-/// Where buffers are bound, in the order of their names.
+/// Storage buffer bindings, by buffer name.
 const STORED: [(&str, u32); 6] = [
     ("cull ledger", 0),
     ("cull bits", 1),
@@ -23,10 +23,10 @@ const STORED: [(&str, u32); 6] = [
     ("listed names", 5),
     ("listed triangles", 6),
 ];
-/// Side of the square of pixels that a workgroup remembers.
+/// Side of the square of pixels whose ids one workgroup records.
 const REMEMBERED: u32 = 8;
 
-/// Nothing is counted yet.
+/// Resets the counts.
 pub(crate) fn begin(buffers: &SceneBuffers) {
     if let Some(counts) = buffers.buffers.get(COUNTED) {
         counts.write(&[0; COUNT_BYTES]);
@@ -44,7 +44,7 @@ fn bind(buffers: &SceneBuffers) {
     }
 }
 
-/// Lists of the triangles that a program in use finds, with what it reads bound.
+/// Runs the bound culling program and compacts its result to lists. The caller has bound their inputs.
 fn lists(gl: &Gl, culler: &Culler, list: &Program) {
     let [wide, tall] = culler.numbers.dispatch();
     gl.dispatch(wide, tall);
@@ -53,7 +53,7 @@ fn lists(gl: &Gl, culler: &Culler, list: &Program) {
     culler.names.bind(NAME_UNIT);
 }
 
-/// What all lists begin with: the draws before are done with theirs.
+/// Resets the ledger and binds the buffers, after the draws that use the previous lists.
 fn empty(gl: &Gl, buffers: &SceneBuffers, culler: &Culler) {
     gl.wait_for_stores();
     if let Some(ledger) = buffers.buffers.get("cull ledger") {
@@ -62,7 +62,8 @@ fn empty(gl: &Gl, buffers: &SceneBuffers, culler: &Culler) {
     bind(buffers);
 }
 
-/// Lists of what may cast a shadow into a layer of the map, whose side is `size`. `choose` tells a program in use the layer.
+/// Lists the triangles that may cast a shadow into one layer of the map, whose side is `size` texels. `choose` sets the
+/// layer of the bound program.
 pub(crate) fn sun(gl: &Gl, buffers: &SceneBuffers, size: u32, choose: impl Fn(&Program)) -> Result<()> {
     let (Some(culler), Some(programs)) = (&buffers.culler, &buffers.programs.sun) else { return Ok(()) };
     empty(gl, buffers, culler);
@@ -72,7 +73,7 @@ pub(crate) fn sun(gl: &Gl, buffers: &SceneBuffers, size: u32, choose: impl Fn(&P
     gl.check("shadow cull")
 }
 
-/// Lists of what the camera may see.
+/// Lists the triangles that the camera may see.
 pub(crate) fn camera(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
     let (Some(culler), Some(programs)) = (&buffers.culler, &sampled.cull) else { return Ok(()) };
     if let (Some(pyramid), Some(remembered)) = (&target.pyramid, &programs.remembered) {
@@ -100,7 +101,7 @@ pub(crate) fn camera(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: 
     gl.check("cull")
 }
 
-/// Keeps in mind which triangles the ids name.
+/// Records the triangles that the ids name, which are the occluders of the next frame.
 pub(crate) fn remember(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled) -> Result<()> {
     let Some(program) = sampled.cull.as_ref().and_then(|programs| programs.remember.as_ref()) else { return Ok(()) };
     gl.wait_for_stores();

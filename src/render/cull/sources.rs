@@ -1,4 +1,4 @@
-//! The shaders of culling.
+//! Shader sources of the culling passes.
 
 use std::fmt::Write as _;
 
@@ -9,12 +9,12 @@ use super::pyramid::TOP;
 
 const CULL: &str = include_str!("../../../shaders/shared/cull.glsl");
 
-/// Places among the counts at which those of a pass begin.
+/// First word of each view's counts.
 pub(super) const CAMERA_COUNTS: usize = 0;
 pub(super) const SUN_COUNTS: usize = 5;
 
 impl Options {
-    /// Which triangles the camera may see, besides those that remembered depth hides.
+    /// Tests which triangles the camera may see; with occlusion culling also against the depth pyramid.
     pub(super) fn sift(&self, samples: u32) -> Source {
         let more: &[&str] = if self.hides() { &["HIDDEN"] } else { &[] };
         let head = self.cull_head(more) + &format!("#define FIRST_COUNT {CAMERA_COUNTS}\n") + &self.sampling(samples);
@@ -22,44 +22,45 @@ impl Options {
         compute(format!("sift, {samples} samples"), [&head, FRAME, CULL, body].concat())
     }
 
-    /// Which triangles may cast a shadow.
+    /// Tests which triangles may cast a shadow.
     pub(super) fn sift_sun(&self) -> Source {
         let head = self.cull_head(&["SUN"]) + &format!("#define FIRST_COUNT {SUN_COUNTS}\n") + &self.sampling(1);
         let body = include_str!("../../../shaders/sift.comp");
         compute("sift, sun".into(), [&head, FRAME, self.splits(), CULL, body].concat())
     }
 
-    /// Which triangles the last frame saw.
+    /// Selects the triangles that the last frame saw.
     pub(super) fn sift_remembered(&self) -> Source {
         let head = self.cull_head(&["REMEMBERED"]);
         compute("sift, remembered".into(), [&head, CULL, include_str!("../../../shaders/sift.comp")].concat())
     }
 
-    /// Those triangles, for a draw.
+    /// Compacts the selected triangles to index lists.
     pub(super) fn list(&self) -> Source {
         let head = self.cull_head(&[]);
         compute("list".into(), [&head, CULL, include_str!("../../../shaders/list.comp")].concat())
     }
 
-    /// Which triangles a frame's ids name.
+    /// Records which triangles the ids of a frame name.
     pub(super) fn remember(&self, samples: u32) -> Source {
         let head = self.cull_head(&[]) + &self.sampling(samples);
         let body = include_str!("../../../shaders/remember.comp");
         compute(format!("remember, {samples} samples"), [&head, IDS, CULL, body].concat())
     }
 
-    /// Depth to the first levels of its pyramid, or those to the others.
+    /// Builds the first levels of the depth pyramid, or the remaining ones from them.
     pub(super) fn pyramid(&self, samples: u32, first: bool) -> Source {
         let head = self.cull_head(if first { &["FIRST"] } else { &[] }) + &self.sampling(samples);
         let label = format!("pyramid, {samples} samples, {}", if first { "fine" } else { "coarse" });
         compute(label, head + include_str!("../../../shaders/pyramid.comp"))
     }
 
-    /// Whether triangles are culled at all, and by depth.
+    /// Whether triangles are culled at all.
     pub(crate) fn culls(&self) -> bool {
         self.defines.contains(&"CULLED")
     }
 
+    /// Whether occlusion culling is on.
     pub(crate) fn hides(&self) -> bool {
         self.defines.contains(&"REMEMBERS")
     }

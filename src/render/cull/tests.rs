@@ -1,4 +1,4 @@
-//! Negative controls: a test that is a little too greedy changes the picture. And which scenes are culled at all.
+//! Negative controls: culling tests that remove too much change the picture. Also tests which scenes are culled at all.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use modalcast_model::deform::Surface;
 use modalcast_model::domain::{Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};
 
-/// A sheet of 24 x 24 squares in front of which a smaller sheet stands, both of one side.
+/// A sheet of 24 x 24 squares behind a smaller sheet; both are single-sided.
 fn sheets() -> Arc<Scene> {
     let mut rest = Vec::new();
     let mut indices = Vec::new();
@@ -34,7 +34,7 @@ fn sheets() -> Arc<Scene> {
     Scene::new(parts).expect("good")
 }
 
-/// The second frame of a scene whose sifting says `greedy` in place of `just`.
+/// The second frame of a scene whose culling shader has `greedy` in place of `just`.
 fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
     let mut renderer = Renderer::open(Prefer::Any).expect("EGL and OpenGL 4.3");
     let (gl, places) = (Rc::clone(&renderer.gl), renderer.sample_places.clone());

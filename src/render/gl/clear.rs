@@ -1,32 +1,32 @@
-//! How a pass begins: with a framebuffer, the part of it that is drawn into, and what it holds before.
+//! Begins a pass: binds its framebuffer, restricts drawing to a region and clears what earlier frames wrote.
 
 use glow::HasContext as _;
 
 use super::super::region::{Region, Touched};
 use super::{Framebuffer, Gl};
 
-/// What is known of ids and their depth.
+/// Dirty regions of an id image and its depth image.
 #[derive(Debug, Default)]
 pub(crate) struct Traces {
     pub(crate) ids: Touched,
     pub(crate) depth: Touched,
 }
 
-/// What a pass begins with. What is known of an image tells which pixels need it; without, all do.
+/// How a pass initializes its framebuffer. With a known dirty region only that is cleared, else the whole image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Clear<'a> {
-    /// Depth of 1.
+    /// Depth to 1.
     Depth(Option<&'a Touched>),
-    /// Depth of 1 and ids of 0.
+    /// Depth to 1 and ids to 0.
     DepthAndIds(Option<&'a Traces>),
     Colour([f32; 4], &'a Touched),
-    /// Words of 0, without depth.
+    /// Integer words to 0; there is no depth.
     Words(&'a Touched),
-    /// All stays.
+    /// The content is kept.
     Nothing,
 }
 
-/// What pixels are made to hold.
+/// The value that pixels are cleared to.
 #[derive(Debug, Clone, Copy)]
 enum Fill {
     /// Depth of 1.
@@ -37,11 +37,11 @@ enum Fill {
 }
 
 impl Gl {
-    /// Binds a framebuffer and clears; from then on draws reach this part of it alone.
+    /// Binds a framebuffer, clears it and sets the scissor: later draws reach only `part`.
     pub(crate) fn begin(&self, into: &Framebuffer, part: Region, clear: Clear<'_>) {
         let gl = self.on();
         let [width, height] = part.frame().map(|side| side as i32);
-        // SAFETY: state with a complete framebuffer.
+        // SAFETY: sets state with a complete framebuffer.
         unsafe {
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(into.name));
             gl.viewport(0, 0, width, height);
@@ -61,7 +61,7 @@ impl Gl {
         self.cut(part);
     }
 
-    /// Fills what was touched of an attachment, before `part` is.
+    /// Clears the dirty region of an attachment and marks `part` as dirty.
     fn fill(&self, part: Region, touched: Option<&Touched>, with: Fill) {
         let last = touched.and_then(|touched| touched.replace(part));
         self.cut(last.unwrap_or_else(|| Region::whole(part.frame())));
@@ -78,7 +78,7 @@ impl Gl {
 
     fn cut(&self, to: Region) {
         let [x, y, width, height] = to.part().map(|number| number as i32);
-        // SAFETY: plain state.
+        // SAFETY: sets state; no memory is accessed.
         unsafe { self.on().scissor(x, y, width, height) };
     }
 }

@@ -1,24 +1,24 @@
-//! The commands that lists of triangles need beside the others.
+//! OpenGL commands that only triangle culling uses.
 
 use glow::HasContext as _;
 
 use super::{Buffer, Gl};
 
-/// Bits of a place within a pixel; not among glow's constants.
+/// GL_SUBPIXEL_BITS, which glow does not define.
 const SUBPIXEL_BITS: u32 = 0x0D50;
 
 impl Gl {
-    /// The part of a pixel to which the rasteriser rounds places, at most.
+    /// Largest step of the rasterizer's subpixel grid, in pixels.
     pub(crate) fn grid(&self) -> f32 {
-        // SAFETY: a plain question that every context answers, with 4 or more.
+        // SAFETY: a query that every context answers, with at least 4.
         let bits = unsafe { self.on().get_parameter_i32(SUBPIXEL_BITS) };
         0.5_f32.powi(bits.clamp(0, 16))
     }
 
-    /// Copies `bytes` bytes, from and to a place in each buffer.
+    /// Copies `bytes` bytes between byte offsets of two buffers.
     pub(crate) fn copy_part(&self, (from, first): (&Buffer, usize), (to, place): (&Buffer, usize), bytes: usize) {
         let gl = self.on();
-        // SAFETY: OpenGL refuses ranges outside either buffer.
+        // SAFETY: OpenGL rejects ranges outside either buffer.
         unsafe {
             gl.bind_buffer(glow::COPY_READ_BUFFER, Some(from.name));
             gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(to.name));

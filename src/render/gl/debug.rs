@@ -1,5 +1,5 @@
-//! What the driver says, to the log: target `opengl`, at the level of OpenGL's severity. A context says little unless it
-//! was made to be debugged, which may cost, so that one is made only where somebody listens.
+//! Forwards the driver's debug messages to the log: target `opengl`, level by OpenGL's severity. Drivers report little
+//! outside debug contexts, which can be slower; a debug context is created only if the log level asks for it.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
@@ -7,29 +7,30 @@ use std::sync::{Mutex, PoisonError};
 use glow::HasContext as _;
 use tracing::{Level, dispatcher};
 
-/// Different messages that are counted apart; all beyond them are counted as one.
+/// Distinct messages that are counted separately; further ones share one counter.
 const KINDS: usize = 256;
 
 /// Source, type and id of a message.
 type Key = [u32; 3];
 
-/// Whether the log takes what a context that is debugged would say: `opengl` at `debug` or below (`RUST_LOG=opengl=debug`).
+/// Whether the log accepts the messages of a debug context: target `opengl` at `debug` or below
+/// (`RUST_LOG=opengl=debug`).
 pub(crate) fn is_wanted() -> bool {
     tracing::enabled!(target: "opengl", Level::DEBUG)
 }
 
-/// Sends the driver's messages to the log of this thread, whichever thread the driver speaks on. The callback lives as long
-/// as `gl`, which takes it back from the context before it goes.
+/// Sends the driver's messages to the log of this thread, on whatever thread the driver calls back. The callback lives
+/// as long as `gl`, which removes it from the context when dropped.
 pub(super) fn listen(gl: &mut glow::Context) {
     if !gl.supports_debug() {
         return;
     }
     let (log, heard) = (dispatcher::get_default(Clone::clone), Repeats::default());
-    // SAFETY: the callback owns all that it uses, may be called on any thread, and does not panic; if a subscriber does, glow
-    // stops it there.
+    // SAFETY: the callback owns all its data, may be called on any thread and does not panic; if a log subscriber
+    // panics, glow catches it at the callback.
     unsafe {
         gl.enable(glow::DEBUG_OUTPUT);
-        // The driver need not stop for its messages.
+        // Asynchronous output: the driver need not stop for its messages.
         gl.disable(glow::DEBUG_OUTPUT_SYNCHRONOUS);
         gl.debug_message_callback(move |source, kind, id, severity, text| {
             if let Some(times) = heard.again([source, kind, id]) {
@@ -39,13 +40,13 @@ pub(super) fn listen(gl: &mut glow::Context) {
     }
 }
 
-/// How often each message was heard.
+/// Number of occurrences of each message.
 #[derive(Debug, Default)]
 struct Repeats(Mutex<HashMap<Key, u64>>);
 
 impl Repeats {
-    /// Counts a message; how often it was heard by now when that is to be told: at 1, 2, 4, 8 and so on, so that a driver
-    /// that says the same in each frame is heard and fills no log.
+    /// Counts a message. Returns the count when it is to be logged, at 1, 2, 4, 8 and so on, so that a driver that
+    /// repeats a message in each frame does not flood the log.
     fn again(&self, key: Key) -> Option<u64> {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let key = if counts.len() < KINDS || counts.contains_key(&key) { key } else { [0; 3] };
@@ -112,16 +113,16 @@ mod tests {
         }
     }
 
-    /// While a process has one log alone, whether a place in the code is listened to is decided once, by the log of the thread
-    /// that comes there first: a test beside this one, without a log, would decide that nobody is. With two it is asked of
-    /// each thread. The place is passed before, so that it is known when the second comes.
+    /// With a single subscriber in the process, `tracing` caches whether a callsite is enabled, as decided by the
+    /// thread that reaches it first: another test without a log would disable the callsite. With two subscribers,
+    /// `tracing` asks each thread. The callsite is registered before the second subscriber is created.
     fn keep_a_second_log() {
         static SECOND: OnceLock<Dispatch> = OnceLock::new();
         is_wanted();
         SECOND.get_or_init(|| Dispatch::new(tracing_subscriber::registry()));
     }
 
-    /// What the log holds after a context was used wrongly so many times.
+    /// The log after a context was misused this many times.
     fn log_of(filter: &str, wrong: usize) -> String {
         keep_a_second_log();
         let lines = Lines::default();
@@ -134,11 +135,11 @@ mod tests {
         tracing::subscriber::with_default(log, || {
             let (gl, _) = device::open(Prefer::Any).expect("EGL");
             for _ in 0..wrong {
-                // SAFETY: no such flag, which OpenGL refuses.
+                // SAFETY: the flag does not exist, and OpenGL rejects it.
                 unsafe { gl.on().enable(0xFFFF) }
                 assert!(gl.check("test").is_err(), "the error is seen without the log too");
             }
-            // SAFETY: only waits, so that a driver that speaks late has spoken.
+            // SAFETY: waits for the commands, so that a driver with delayed messages has sent them.
             unsafe { gl.on().finish() }
         });
         String::from_utf8(lines.0.lock().expect("whole").clone()).expect("text")
@@ -159,7 +160,7 @@ mod tests {
     fn a_thread_without_a_log_does_not_decide_that_no_thread_has_one() {
         keep_a_second_log();
         let log = tracing_subscriber::fmt().with_max_level(Level::TRACE).with_writer(std::io::sink).finish();
-        // A place in the code that no thread has come to yet.
+        // A callsite that no thread has reached yet.
         let asks = || tracing::enabled!(target: "opengl", Level::WARN);
         tracing::subscriber::with_default(log, || {
             let other = std::thread::spawn(asks).join().expect("asks");

@@ -1,4 +1,4 @@
-//! A mark in the stream of commands that the host may ask for, or wait for, later.
+//! Fences: markers in the command stream that the host can poll or wait for.
 
 use std::rc::Rc;
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use glow::HasContext as _;
 use super::Gl;
 use modalcast_model::error::{Result, during};
 
-/// All commands that were given before it was made.
+/// Signaled once all commands before it are complete.
 #[derive(Debug)]
 pub(crate) struct Fence {
     gl: Rc<Gl>,
@@ -16,10 +16,10 @@ pub(crate) struct Fence {
 }
 
 impl Gl {
-    /// A fence behind all commands so far, which are sent on their way.
+    /// Inserts a fence after all commands so far and flushes them to the device.
     pub(crate) fn fence(self: &Rc<Self>, stage: &'static str) -> Result<Fence> {
         let gl = self.on();
-        // SAFETY: a fresh fence, owned by the value that is returned.
+        // SAFETY: a new fence, owned by the returned value.
         let name = unsafe {
             let name = gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0).map_err(during(stage))?;
             gl.flush();
@@ -30,20 +30,20 @@ impl Gl {
 }
 
 impl Fence {
-    /// Whether the commands are done, or will never be: then [`Self::wait`] says why.
+    /// Whether the commands are complete or will never be; in the second case [`Self::wait`] returns the reason.
     pub(crate) fn is_over(&self) -> bool {
         self.is_over_within(Duration::ZERO)
     }
 
-    /// The same after waiting for them, at most so long.
+    /// Like [`Self::is_over`], after waiting at most `limit`.
     pub(crate) fn is_over_within(&self, limit: Duration) -> bool {
         self.state(limit) != glow::TIMEOUT_EXPIRED
     }
 
-    /// Waits until the commands are done.
+    /// Waits until the commands are complete.
     ///
     /// # Errors
-    /// `Fault` of `stage` when the device did not finish within `limit` or was lost.
+    /// `Fault` of `stage` when the device does not finish within `limit` or is lost.
     pub(crate) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
         let begin = Instant::now();
         loop {
@@ -58,9 +58,9 @@ impl Fence {
         }
     }
 
-    /// What OpenGL says of it after at most this time, or a second.
+    /// Status of the fence after waiting at most `limit` or one second.
     fn state(&self, limit: Duration) -> u32 {
-        // A second fits glow's 32-bit nanoseconds.
+        // One second fits into glow's 32-bit nanoseconds.
         let slice = limit.min(Duration::from_secs(1)).as_nanos() as i32;
         // SAFETY: the fence lives as long as this value.
         unsafe { self.gl.on().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) }
@@ -69,7 +69,7 @@ impl Fence {
 
 impl Drop for Fence {
     fn drop(&mut self) {
-        // SAFETY: the name is ours alone and is not used after this.
+        // SAFETY: this value owns the name, which is not used afterwards.
         unsafe { self.gl.on().delete_sync(self.name) }
     }
 }
@@ -79,7 +79,7 @@ impl Gl {
     /// A fence that the device has lost.
     pub(crate) fn lost_fence(self: &Rc<Self>) -> Fence {
         let fence = self.fence("test").expect("a fence");
-        // SAFETY: a name that OpenGL does not know any more is an error wherever it is used.
+        // SAFETY: using a deleted name is an OpenGL error without other effects.
         unsafe { self.on().delete_sync(fence.name) }
         fence
     }
@@ -91,7 +91,7 @@ mod tests {
     use super::super::super::{Prefer, device};
     use super::*;
 
-    /// Draws a picture that takes long, on threads of the driver's own in software.
+    /// Draws a picture that takes long; in software, on threads of the driver.
     fn draw_for_long(gl: &Rc<Gl>, turns: u32) {
         let form = Form { width: 2048, height: 2048, samples: 1, ..Form::EMPTY };
         let colour = image(gl, form, glow::RGBA8).expect("an image");

@@ -1,4 +1,4 @@
-//! Images of several layers that passes write one by one: the maps of a shadow.
+//! Rendering to single layers of array textures: the cascades of a shadow map.
 
 use std::rc::Rc;
 
@@ -8,7 +8,7 @@ use super::{Framebuffer, Gl, Program, Texture};
 use modalcast_model::error::{Result, during};
 
 impl Gl {
-    /// A framebuffer of one layer of an image: of its depth, or of its one colour.
+    /// Creates a framebuffer of one layer of an array texture: of its depth, or of its only color attachment.
     pub(crate) fn layer_framebuffer(
         self: &Rc<Self>,
         image: &Texture,
@@ -17,7 +17,7 @@ impl Gl {
     ) -> Result<Framebuffer> {
         let gl = self.on();
         let point = if is_depth { glow::DEPTH_ATTACHMENT } else { glow::COLOR_ATTACHMENT0 };
-        // SAFETY: attaches a layer of a texture of this context; completeness is asked for at once.
+        // SAFETY: attaches a layer of a texture of this context; completeness is checked right after.
         unsafe {
             let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
             let framebuffer = Framebuffer { gl: Rc::clone(self), name };
@@ -31,7 +31,7 @@ impl Gl {
         }
     }
 
-    /// Draws a triangle over the whole of a framebuffer with the current program. Nothing is cleared.
+    /// Draws a triangle over the whole framebuffer with the bound program. Nothing is cleared.
     pub(crate) fn cover(&self, into: &Framebuffer, side: u32, nothing: &super::VertexArray) {
         let gl = self.on();
         // SAFETY: state and a draw without attributes into a complete framebuffer.
@@ -47,7 +47,7 @@ impl Gl {
 impl Texture {
     /// Binds one layer as an image that a compute shader writes.
     pub(crate) fn bind_image_layer(&self, unit: u32, layer: u32) {
-        // SAFETY: level 0 of a texture whose format the shader names.
+        // SAFETY: level 0 of a texture whose format the shader declares.
         unsafe {
             let gl = self.gl.on();
             gl.bind_image_texture(unit, Some(self.name), 0, false, layer as i32, glow::WRITE_ONLY, self.kind.format);
@@ -56,9 +56,9 @@ impl Texture {
 }
 
 impl Program {
-    /// Gives the program in use, which is this one, the layer that it writes: location 1.
+    /// Sets the layer (location 1) that this program writes. It must be the bound program.
     pub(crate) fn layer(&self, layer: u32) {
-        // SAFETY: location 1 is declared by the shaders that are given a layer.
+        // SAFETY: the shaders that write layers declare location 1.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), layer as i32) }
     }
 }

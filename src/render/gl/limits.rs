@@ -1,34 +1,34 @@
-//! What a context can do.
+//! Limits and features of an OpenGL context.
 
 use glow::HasContext as _;
 
-/// What the context can do.
+/// Limits and features of an OpenGL context.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Limits {
     pub(crate) renderer: String,
     pub(crate) version: String,
     pub(crate) software: bool,
     pub(crate) max_side: u32,
-    /// Samples that colour, depth and integer images may all have.
+    /// Samples per pixel that color, depth and integer images all support.
     pub(crate) max_samples: u32,
-    /// Textures that one compute shader may read.
+    /// Textures that one compute shader can read.
     pub(crate) max_reads: u32,
     pub(crate) max_layers: u32,
-    /// Largest buffer texture.
+    /// Texels of the largest buffer texture.
     pub(crate) max_texels: u64,
-    /// Largest buffer that shaders write.
+    /// Bytes of the largest buffer that shaders can write.
     pub(crate) max_storage: u64,
-    /// Whether fragments can know their samples that pass the depth test.
+    /// Whether fragments can read their coverage after the depth test.
     pub(crate) post_depth: bool,
-    /// Whether buffers can stay mapped while they are written (OpenGL 4.4).
+    /// Whether buffers can stay mapped while the device writes them (OpenGL 4.4).
     pub(crate) persistent: bool,
-    /// Largest anisotropy, 1 when there is none or it is computed by the CPU.
+    /// Largest anisotropy; 1 if it is not supported or runs on the CPU.
     pub(crate) anisotropy: f32,
 }
 
 impl Limits {
     pub(super) fn of(gl: &glow::Context) -> Self {
-        // SAFETY: plain questions that every 4.3 core context answers.
+        // SAFETY: queries that every 4.3 core context answers.
         unsafe {
             let number = |name: u32| gl.get_parameter_i32(name).max(0) as u32;
             let renderer = gl.get_parameter_string(glow::RENDERER);

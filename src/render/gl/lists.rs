@@ -1,4 +1,4 @@
-//! The commands that lists of fragments need beside the others.
+//! OpenGL commands for lists that shaders write: indirect draws and their barriers.
 
 use std::rc::Rc;
 
@@ -8,16 +8,16 @@ use super::{Buffer, Framebuffer, Gl, Texture, VertexArray};
 use modalcast_model::error::Result;
 
 impl Gl {
-    /// A framebuffer without depth.
+    /// Creates a framebuffer with a color attachment and no depth.
     pub(crate) fn colour_framebuffer(self: &Rc<Self>, colour: &Texture) -> Result<Framebuffer> {
         self.attached(Some(colour), None)
     }
 
-    /// Draws triangles of an array's index buffer as a command in a buffer says, which a shader may have written.
+    /// Draws triangles of an array's index buffer with an indirect command, which a shader may have written.
     pub(crate) fn draw_told(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
         let gl = self.on();
-        // SAFETY: the command names a checked range of the index buffer; of it shaders change the number of instances, or
-        // of indices, which they have written themselves from checked ones and never beyond the range.
+        // SAFETY: the command names a checked range of the index buffer. Shaders change only the number of instances or
+        // of indices; they write the indices themselves, from checked ones and never beyond the range.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
             gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name));
@@ -26,9 +26,9 @@ impl Gl {
         }
     }
 
-    /// Lets everything after this see what shaders wrote.
+    /// Memory barrier: later commands see what shaders wrote.
     pub(crate) fn wait_for_stores(&self) {
-        // SAFETY: only orders memory.
+        // SAFETY: only orders memory accesses.
         unsafe { self.on().memory_barrier(glow::ALL_BARRIER_BITS) }
     }
 }

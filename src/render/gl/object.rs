@@ -1,4 +1,4 @@
-//! Buffers, textures, programs, framebuffers and vertex arrays: each owns its name and frees it.
+//! Buffers, textures, programs, framebuffers and vertex arrays. Each owns its OpenGL name and deletes it when dropped.
 
 use std::rc::Rc;
 
@@ -15,7 +15,7 @@ pub(crate) struct Buffer {
     pub(crate) bytes: u64,
 }
 
-/// What a texture is made for.
+/// Storage parameters of a texture.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TextureKind {
     pub(crate) target: u32,
@@ -27,7 +27,7 @@ pub(crate) struct TextureKind {
     pub(crate) levels: u32,
 }
 
-/// A texture object of fixed storage.
+/// A texture object with immutable storage.
 #[derive(Debug)]
 pub(crate) struct Texture {
     pub(super) gl: Rc<Gl>,
@@ -54,26 +54,26 @@ pub(crate) struct VertexArray {
 }
 
 impl Buffer {
-    /// The name that other APIs register.
+    /// The name with which other APIs register the buffer.
     pub(crate) fn name(&self) -> u32 {
         self.name.0.get()
     }
 
-    /// Overwrites the first bytes.
+    /// Overwrites the first `data.len()` bytes.
     pub(crate) fn write(&self, data: &[u8]) {
         let gl = self.gl.on();
-        // SAFETY: OpenGL refuses more bytes than the buffer has.
+        // SAFETY: OpenGL rejects data that is larger than the buffer.
         unsafe {
             gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(self.name));
             gl.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, data);
         }
     }
 
-    /// Copies the first bytes out. Waits for whatever still writes them.
+    /// Copies the first bytes to the host. Waits for pending writes.
     pub(crate) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
         let gl = self.gl.on();
         let bytes = bytes.min(self.bytes as usize);
-        // SAFETY: the mapped range is inside the buffer, only read, and unmapped before anybody else may use it.
+        // SAFETY: the mapped range is inside the buffer, is only read, and is unmapped before any other use.
         unsafe {
             gl.bind_buffer(glow::COPY_READ_BUFFER, Some(self.name));
             let mapped = gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, bytes as i32, glow::MAP_READ_BIT);
@@ -91,16 +91,16 @@ impl Buffer {
         unsafe { self.gl.on().bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.name)) }
     }
 
-    /// Binds `bytes` bytes from `offset` on, a multiple of 256.
+    /// Binds `bytes` bytes from `offset`, a multiple of 256.
     pub(crate) fn bind_uniform(&self, binding: u32, offset: usize, bytes: usize) {
         let (offset, bytes) = (offset as i32, bytes as i32);
-        // SAFETY: as for storage; OpenGL refuses ranges outside the buffer.
+        // SAFETY: binding points below the 36 that every context has; OpenGL rejects ranges outside the buffer.
         unsafe { self.gl.on().bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.name), offset, bytes) }
     }
 }
 
 impl Texture {
-    /// Fills one layer of one level with RGBA8 pixels, first row first.
+    /// Uploads RGBA8 pixels to one layer of one mipmap level, first row first.
     pub(crate) fn fill(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
@@ -119,7 +119,7 @@ impl Texture {
         self.gl.check("texture")
     }
 
-    /// How it is sampled: OpenGL's parameters and values.
+    /// Sets sampler parameters: pairs of OpenGL parameter and value.
     pub(crate) fn sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
         let gl = self.gl.on();
         // SAFETY: plain parameters of a texture of this context.
@@ -143,18 +143,18 @@ impl Texture {
         }
     }
 
-    /// Binds it as an image that a compute shader writes.
+    /// Binds the texture as an image that a compute shader writes.
     pub(crate) fn bind_image(&self, unit: u32) {
         self.bind_image_for(unit, glow::WRITE_ONLY);
     }
 
-    /// The same for a shader that also reads what was there.
+    /// Binds the texture as an image that a compute shader reads and writes.
     pub(crate) fn bind_image_both_ways(&self, unit: u32) {
         self.bind_image_for(unit, glow::READ_WRITE);
     }
 
     fn bind_image_for(&self, unit: u32, access: u32) {
-        // SAFETY: level 0 of a texture whose format the shader names.
+        // SAFETY: level 0 of a texture whose format the shader declares.
         unsafe {
             let gl = self.gl.on();
             let layered = self.kind.target == glow::TEXTURE_2D_ARRAY;
@@ -164,10 +164,11 @@ impl Texture {
 }
 
 impl Program {
-    /// Uses it; a number, as the first triangle, goes to location 0 of those programs that have one.
+    /// Makes the program current. `number`, for example the first triangle, goes to location 0 of programs that declare
+    /// one.
     pub(crate) fn bind(&self, number: Option<u32>) {
         let gl = self.gl.on();
-        // SAFETY: a linked program; location 0 is declared by the shaders that are given a number.
+        // SAFETY: a linked program; shaders that get a number declare location 0.
         unsafe {
             gl.use_program(Some(self.name));
             if let Some(number) = number {
@@ -178,15 +179,15 @@ impl Program {
 }
 
 impl Program {
-    /// Gives the program in use, which is this one, where its triangles begin: location 0.
+    /// Sets the first triangle of the next draw (location 0). This must be the bound program.
     pub(crate) fn first(&self, number: u32) {
-        // SAFETY: location 0 is declared by the shaders that are given a number.
+        // SAFETY: shaders that get a number declare location 0.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
     }
 
-    /// Says which turn it takes: location 1 of those programs that take several, while it is in use.
+    /// Sets the phase of a program with several phases (location 1). This must be the bound program.
     pub(crate) fn turn(&self, turn: i32) {
-        // SAFETY: a linked program, in use; location 1 is declared by the shaders that are given a turn.
+        // SAFETY: a linked, bound program; shaders with several phases declare location 1.
         unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), turn) }
     }
 }
@@ -195,7 +196,7 @@ macro_rules! freed_by {
     ($($object:ty => $delete:ident),*) => {$(
         impl Drop for $object {
             fn drop(&mut self) {
-                // SAFETY: the name is ours alone and is not used after this.
+                // SAFETY: this value owns the name, which is not used afterwards.
                 unsafe { self.gl.on().$delete(self.name) }
             }
         }

@@ -1,5 +1,5 @@
-//! Buffers through which bytes come back to the host. Where OpenGL has it (4.4), one stays mapped for good, so that reading
-//! it is no command: any thread may copy out of it what a fence has passed.
+//! Staging buffers for readback. With OpenGL 4.4 they are persistently mapped: any thread can copy from them once a
+//! fence has passed, without an OpenGL call.
 
 use std::cell::RefCell;
 use std::mem::{self, ManuallyDrop};
@@ -16,20 +16,20 @@ use modalcast_model::error::{Result, during};
 #[derive(Debug)]
 pub(crate) struct Staging {
     pub(crate) buffer: ManuallyDrop<Buffer>,
-    /// Where it is mapped; none where it cannot stay so.
+    /// Address of the persistent mapping; none where the context does not support it.
     mapped: Option<*const u8>,
-    /// Hears when whoever reads it has done.
+    /// Disconnects when the current reader is done.
     reader: RefCell<Option<Receiver<()>>>,
 }
 
-/// A buffer whose reader has outlived its use.
+/// A dropped staging buffer that a reader still uses.
 pub(super) type Retired = (Buffer, Receiver<()>);
 
-/// Bytes of a staging buffer, to be copied by any thread. The device does not write them and they stay mapped while this
-/// lives, so it must not live long.
+/// Bytes of a staging buffer that any thread may copy. While this value exists, the bytes stay mapped and the device
+/// does not write them, so it must be short-lived.
 #[derive(Debug)]
 pub(crate) enum Lent {
-    /// Where they are mapped, and what tells the buffer that they were read when it is dropped.
+    /// Address and length of the mapped bytes. Dropping the sender tells the staging buffer that the reader is done.
     Mapped {
         first: *const u8,
         bytes: usize,
@@ -38,12 +38,12 @@ pub(crate) enum Lent {
     Copied(Vec<u8>),
 }
 
-// SAFETY: the memory is mapped for reading, nobody writes it before the lender hears that this was dropped, and it is
-// unmapped after that or never.
+// SAFETY: the memory is mapped for reading only. Nothing writes it before the staging buffer sees that this value was
+// dropped, and it is unmapped after that or never.
 unsafe impl Send for Lent {}
 
 impl Gl {
-    /// A buffer of so many bytes that the host may read.
+    /// Creates a staging buffer of `bytes` bytes, persistently mapped if possible.
     pub(crate) fn staging(self: &Rc<Self>, bytes: u64) -> Result<Staging> {
         self.bury(Duration::ZERO);
         let reader = RefCell::default();
@@ -54,7 +54,7 @@ impl Gl {
         let size = i32::try_from(bytes).map_err(during("readback"))?;
         let kept = glow::MAP_READ_BIT | glow::MAP_PERSISTENT_BIT | glow::MAP_COHERENT_BIT;
         let gl = self.on();
-        // SAFETY: a fresh buffer of fixed storage, mapped whole and only for reading, for as long as it lives.
+        // SAFETY: a new buffer with immutable storage, mapped as a whole for reading, for as long as it exists.
         let (buffer, mapped) = unsafe {
             let name = gl.create_buffer().map_err(during("readback"))?;
             let buffer = Buffer { gl: Rc::clone(self), name, bytes };
@@ -69,8 +69,8 @@ impl Gl {
         Ok(Staging { buffer: ManuallyDrop::new(buffer), mapped: Some(mapped.cast_const()), reader })
     }
 
-    /// Frees the buffers that were given up while somebody read them, after waiting for each reader at most so long. Those
-    /// that are read even then stay, and so does the context: better some memory is lost than read when it is gone.
+    /// Frees the retired buffers whose readers are done, after waiting for each reader at most `limit`. Buffers that
+    /// are still read survive, and with them the context: a leak is better than a read of unmapped memory.
     pub(crate) fn bury(&self, limit: Duration) {
         let mut retired = mem::take(&mut *self.retired.borrow_mut());
         retired.retain(|(_, reader)| !is_over(reader, limit));
@@ -79,20 +79,20 @@ impl Gl {
 }
 
 impl Staging {
-    /// The first bytes, once a fence behind the last command that writes them was passed. While they are lent, no command
-    /// may write the buffer.
+    /// The first bytes. Call it once a fence after the last command that writes them has passed; no command may write
+    /// the buffer while the bytes are lent.
     ///
     /// # Errors
-    /// `Fault` where the buffer cannot be mapped.
+    /// `Fault` when the buffer cannot be mapped.
     pub(crate) fn lend(&self, bytes: usize) -> Result<Lent> {
         let Some(first) = self.mapped else { return self.buffer.read(bytes).map(Lent::Copied) };
-        // Nothing is ever sent: its end is all it tells.
+        // No message is ever sent; the reader signals with the disconnect alone.
         let (done, reader) = mpsc::sync_channel(1);
         self.reader.replace(Some(reader));
         Ok(Lent::Mapped { first, bytes: bytes.min(self.buffer.bytes as usize), _done: done })
     }
 
-    /// Waits until nobody reads it any more, at most `limit`; whether that is so.
+    /// Waits at most `limit` for the reader and returns whether it is done.
     pub(crate) fn is_read(&self, limit: Duration) -> bool {
         let mut reader = self.reader.borrow_mut();
         let over = reader.as_ref().is_none_or(|reader| is_over(reader, limit));
@@ -102,7 +102,7 @@ impl Staging {
         over
     }
 
-    /// A copy of some bytes, as [`Self::lend`] has them.
+    /// Copies a range of bytes, under the same conditions as [`Self::lend`].
     pub(crate) fn read(&self, range: std::ops::Range<usize>) -> Result<Vec<u8>> {
         let lent = self.lend(range.end)?;
         Ok(lent.bytes().get(range).unwrap_or_default().to_vec())
@@ -110,9 +110,9 @@ impl Staging {
 }
 
 impl Drop for Staging {
-    /// Waits for nobody: the reader may be this very thread.
+    /// Does not wait for the reader, which may run on this thread.
     fn drop(&mut self) {
-        // SAFETY: taken once, here, and not used after this.
+        // SAFETY: taken once, here, and not used afterwards.
         let buffer = unsafe { ManuallyDrop::take(&mut self.buffer) };
         if let Some(reader) = self.reader.take().filter(|reader| !is_over(reader, Duration::ZERO)) {
             let gl = Rc::clone(&buffer.gl);
@@ -121,7 +121,7 @@ impl Drop for Staging {
     }
 }
 
-/// Whether the reader has done, after waiting for it at most so long. Its end is told as an error, as nothing is ever sent.
+/// Whether the reader is done, after waiting at most `limit`. The disconnect signals its end.
 fn is_over(reader: &Receiver<()>, limit: Duration) -> bool {
     match limit {
         Duration::ZERO => reader.try_recv() == Err(TryRecvError::Disconnected),
@@ -132,7 +132,7 @@ fn is_over(reader: &Receiver<()>, limit: Duration) -> bool {
 impl Lent {
     pub(crate) fn bytes(&self) -> &[u8] {
         match self {
-            // SAFETY: the range is inside the mapping, which stays, and nobody writes it while this lives.
+            // SAFETY: the range is inside the mapping, which stays mapped and unwritten while this value exists.
             Self::Mapped { first, bytes, .. } => unsafe { std::slice::from_raw_parts(*first, *bytes) },
             Self::Copied(bytes) => bytes,
         }
@@ -141,7 +141,7 @@ impl Lent {
 
 #[cfg(test)]
 impl Gl {
-    /// Buffers that wait for their readers.
+    /// Number of buffers that wait for their readers.
     pub(crate) fn retired(&self) -> usize {
         self.retired.borrow().len()
     }

@@ -1,4 +1,4 @@
-//! How long stretches of commands take, and waiting for all of them.
+//! Measures the device time of passes, and waits for the device.
 
 use std::rc::Rc;
 use std::time::{Duration, Instant};
@@ -8,8 +8,8 @@ use glow::HasContext as _;
 use super::Gl;
 use modalcast_model::error::{Result, during};
 
-/// Milliseconds of a stretch of commands: a timer query on hardware, the wall clock around waiting in software, where timer
-/// queries mean nothing.
+/// Milliseconds of a sequence of commands. Hardware uses a timer query. Software uses the wall clock and waits before
+/// and after, because its timer queries are meaningless.
 #[derive(Debug)]
 pub(crate) enum Stopwatch {
     Wall(f64),
@@ -17,19 +17,19 @@ pub(crate) enum Stopwatch {
 }
 
 impl Gl {
-    /// Waits until all commands are done.
+    /// Waits until all commands are complete.
     ///
     /// # Errors
-    /// `Fault` of `stage` when the device did not finish within `limit`.
+    /// `Fault` of `stage` when the device does not finish within `limit`.
     pub(crate) fn wait(self: &Rc<Self>, stage: &'static str, limit: Duration) -> Result<()> {
         self.fence(stage)?.wait(stage, limit)
     }
 
-    /// Runs the commands of a pass and tells how long they take; in software this waits for them, at most `limit`. Each
-    /// stretch has a query of its own until its stopwatch is dropped, so that several frames may be under way.
+    /// Runs the commands of a pass and measures their device time. In software this waits for them, at most `limit`.
+    /// Each pass owns a query until its stopwatch is dropped, so that several frames can be in flight.
     ///
     /// # Errors
-    /// Those of the commands; `Fault` of the pass when software did not finish.
+    /// Those of the commands; `Fault` of the pass when software does not finish in time.
     pub(crate) fn timed(
         self: &Rc<Self>,
         (pass, limit): (&'static str, Duration),
@@ -44,8 +44,8 @@ impl Gl {
         }
         let gl = self.on();
         let free = self.timers.borrow_mut().pop();
-        // SAFETY: one query at a time: it is ended before this returns, whatever the commands did. One that was used before is
-        // waited for by nobody.
+        // SAFETY: queries do not nest: this one is ended before the function returns, even if the commands fail. A
+        // query from the pool has no other user.
         let query = unsafe {
             let query = free.map_or_else(|| gl.create_query(), Ok).map_err(during("timer"))?;
             gl.begin_query(glow::TIME_ELAPSED, query);
@@ -60,22 +60,22 @@ impl Gl {
 }
 
 impl Stopwatch {
-    /// Milliseconds; for a stretch that was ended and waited for.
+    /// Milliseconds. Waits for the result if the device has not finished.
     pub(crate) fn ms(&self) -> f64 {
         match self {
             Self::Wall(ms) => *ms,
-            // SAFETY: the query was ended; its result is there or waited for.
+            // SAFETY: the query was ended; reading its result waits until it is available.
             Self::Query(gl, query) => unsafe {
                 gl.on().get_query_parameter_u64(*query, glow::QUERY_RESULT) as f64 * 1e-6
             },
         }
     }
 
-    /// Whether the device has done the stretch; nothing is waited for.
+    /// Whether the device has finished the commands; does not wait.
     pub(crate) fn is_over(&self) -> bool {
         match self {
             Self::Wall(_) => true,
-            // SAFETY: the query was ended; this only asks.
+            // SAFETY: the query was ended; this asks for availability only.
             Self::Query(gl, query) => unsafe {
                 gl.on().get_query_parameter_u32(*query, glow::QUERY_RESULT_AVAILABLE) != 0
             },
@@ -86,7 +86,7 @@ impl Stopwatch {
 impl Drop for Stopwatch {
     fn drop(&mut self) {
         if let Self::Query(gl, query) = self {
-            // There are as many as were ever under way at once.
+            // The pool grows to the largest number of queries that were in flight at once.
             gl.timers.borrow_mut().push(*query);
         }
     }
@@ -94,9 +94,9 @@ impl Drop for Stopwatch {
 
 #[cfg(test)]
 impl Gl {
-    /// A stopwatch of a stretch that the device never comes to.
+    /// A stopwatch for commands that the device never reaches.
     pub(crate) fn stopped_watch(self: &Rc<Self>) -> Stopwatch {
-        // SAFETY: a fresh name; asking for a query that was never begun is an error without a result.
+        // SAFETY: a new name; reading a query that was never begun is an OpenGL error without a result.
         let query = unsafe { self.on().create_query() }.expect("a query");
         Stopwatch::Query(Rc::clone(self), query)
     }

@@ -1,4 +1,4 @@
-//! What a rasteriser beside OpenGL is given of a scene: the triangles of the draw groups, and what cuts holes into them.
+//! Input of the compute rasterizer: the triangles of the draw groups and the alpha data of cut-outs.
 
 use super::super::geometry::{Geometry, Kind, kind, used_materials};
 use super::super::scene_buffers::SceneBuffers;
@@ -8,7 +8,7 @@ use modalcast_model::error::Result;
 use modalcast_model::raster::{AlphaImage, CutOuts, GlBuffer, Mesh, Surface};
 use modalcast_model::scene::{Faces, Group, Scene};
 
-/// The mesh of a scene, whose positions are those that its buffers share.
+/// The mesh of a scene, over the shared position buffer.
 pub(super) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<Mesh> {
     let (scene, positions) = (&buffers.scene, buffers.buffer("positions")?);
     let geometry = Geometry::new(scene);
@@ -25,7 +25,8 @@ pub(super) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<Mesh> {
     })
 }
 
-/// Cut-out triangles, and blended ones, which come after them and cast shadows from a threshold of alpha on.
+/// Alpha data of cut-out triangles and of the blended triangles after them, which cast shadows above a threshold of
+/// alpha.
 fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOuts> {
     let first = geometry.groups.iter().find(|group| group.kind != Kind::Opaque)?.first_triangle;
     let uv = |corner: u32| geometry.uvs.get(corner as usize).copied().unwrap_or_default();
@@ -45,7 +46,7 @@ fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOu
     })
 }
 
-/// What is left of a material; its image is put behind the others unless it is there.
+/// The alpha properties of a material. Appends its image to `images` if it is not in the list.
 fn surface(scene: &Scene, material: &Material, images: &mut Vec<usize>) -> Surface {
     let least = match material.alpha_mode {
         AlphaMode::Opaque => 0.0,
@@ -63,7 +64,7 @@ fn surface(scene: &Scene, material: &Material, images: &mut Vec<usize>) -> Surfa
     Surface { alpha: material.alpha, least, image: image.map(|image| image as u32) }
 }
 
-/// The alpha of all levels of an image, as OpenGL has them; an opaque texel where OpenGL has none.
+/// Alpha of all mipmap levels of an image, the same as in OpenGL; one opaque texel if the image has no texture array.
 fn alpha(scene: &Scene, arrays: &[Array], texture: usize) -> AlphaImage {
     let Some((array, _)) = place(arrays, texture) else {
         return AlphaImage { width: 1, height: 1, levels: vec![vec![u8::MAX]] };

@@ -1,7 +1,8 @@
-//! Who turns triangles into samples, pass by pass: OpenGL, or a rasteriser beside it that is given the same mesh.
+//! Selects the rasterizer of each pass: OpenGL, or a compute rasterizer that gets the same mesh.
 //!
-//! The rasteriser writes into buffers of OpenGL: depth for the blur, and keys that a compute pass makes ids of. All that
-//! follows is the same. A scene whose look does not ask for it has none of this.
+//! The compute rasterizer writes into OpenGL buffers: depth for the blur, and visibility keys that a compute pass
+//! converts to ids. All later passes are the same. A scene whose look does not ask for a compute rasterizer has none of
+//! these resources.
 
 mod mesh;
 mod trial;
@@ -19,7 +20,7 @@ use modalcast_model::error::{Error, Result, during};
 use modalcast_model::raster::{GlBuffer, Mesh, Rasteriser};
 use modalcast_model::scene::{Scene, Window};
 
-/// Who drew a pass.
+/// A rasterizer that can draw a pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Path {
@@ -27,36 +28,36 @@ pub enum Path {
     Cuda,
 }
 
-/// Who drew the passes of a frame; none where a frame has no such pass.
+/// The rasterizers of a frame's passes; none where the frame has no such pass.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Paths {
     pub shadow: Option<Path>,
     pub visibility: Option<Path>,
 }
 
-/// A rasteriser beside OpenGL, and what it writes into.
+/// A compute rasterizer and its output buffers.
 #[derive(Debug)]
 pub(super) struct Beside {
-    // Before the buffers that it has registered.
+    // Declared before the buffers that it has registered, so that it is dropped first.
     rasteriser: RefCell<Box<dyn Rasteriser>>,
     shadow: Option<Depths>,
     visibility: Option<Keys>,
-    /// Which of both it is to draw.
+    /// Whether it draws the shadow map and the visibility.
     draws: Cell<[bool; 2]>,
 }
 
-/// Depth of the shadow map.
+/// Depth output of the shadow map.
 #[derive(Debug)]
 struct Depths {
     buffer: Buffer,
-    /// The first pass of the blur, reading that.
+    /// The first pass of the blur, reading `buffer`.
     blur: Rc<Program>,
 }
 
-/// What the camera sees.
+/// Visibility output.
 #[derive(Debug)]
 struct Keys {
-    /// As large as the largest frame so far.
+    /// Sized for the largest frame so far.
     buffer: RefCell<Option<Buffer>>,
     unpack: Rc<Program>,
 }
@@ -65,7 +66,7 @@ struct Keys {
 const KEY: u64 = 8;
 
 impl Path {
-    /// Its name in looks and on the wire.
+    /// Name in looks and on the wire.
     pub const fn name(self) -> &'static str {
         match self {
             Self::OpenGl => "opengl",
@@ -74,8 +75,8 @@ impl Path {
     }
 }
 
-/// Which of shadow map and visibility may be drawn beside OpenGL. A map whose depth is looked up itself, or that is split,
-/// may not; nor may a frame of several samples a pixel, or one whose blended triangles are tested against depth.
+/// Whether a compute rasterizer may draw the shadow map and the visibility. The shadow map must have moments and only
+/// one cascade. Frames must have one sample per pixel and no blended triangles, which are tested against depth.
 fn allowed(scene: &Scene) -> [bool; 2] {
     let look = &scene.look;
     let shadow = look.shadow.is_some_and(|shadow| shadow.has_moments() && shadow.splits == 1);
@@ -84,11 +85,11 @@ fn allowed(scene: &Scene) -> [bool; 2] {
 }
 
 impl Renderer {
-    /// Gives a scene a rasteriser beside OpenGL, which `make` makes of its mesh; it draws what it may from now on. Not made
-    /// where it may draw nothing.
+    /// Attaches a compute rasterizer to a scene; `make` creates it from the scene's mesh. It draws the passes that it
+    /// supports from now on. Nothing is created for a scene without such passes.
     ///
     /// # Errors
-    /// Those of `make` and of [`Rasteriser::make_ready`], and `Fault` of OpenGL; the scene is then drawn by OpenGL as before.
+    /// Those of `make` and of [`Rasteriser::make_ready`], and `Fault` of OpenGL; OpenGL then still draws the scene.
     pub fn draw_beside(
         &mut self,
         buffers: &mut SceneBuffers,
@@ -119,22 +120,22 @@ impl Renderer {
 }
 
 impl SceneBuffers {
-    /// The rasteriser, and which of shadow map and visibility it draws: it knows the shared positions alone. None where OpenGL
-    /// draws both.
+    /// The compute rasterizer, and whether it draws the shadow map and the visibility. None where OpenGL draws both, as
+    /// in rebased scenes: the rasterizer has registered the shared positions only.
     pub(super) fn drawn_beside(&self) -> Option<(&Beside, [bool; 2])> {
         let beside = self.beside.as_ref().filter(|_| self.apart.is_none())?;
         let draws = beside.draws.get();
         draws.contains(&true).then_some((beside, draws))
     }
 
-    /// The rasteriser that draws the shadow map's depth; none where OpenGL does.
+    /// The compute rasterizer if it draws the depth of the shadow map.
     pub(super) fn shadow_beside(&self) -> Option<&Beside> {
         self.drawn_beside().filter(|(_, draws)| draws[0]).map(|(beside, _)| beside)
     }
 }
 
 impl Beside {
-    /// Draws into the buffers what of both is wanted of this frame.
+    /// Draws the requested outputs of this frame into the buffers.
     pub(super) fn draw(
         &self,
         gl: &Rc<Gl>,
@@ -161,18 +162,18 @@ impl Beside {
         Ok(())
     }
 
-    /// Leaves the scene to OpenGL from now on.
+    /// Disables the compute rasterizer after an error; OpenGL draws the scene from now on.
     pub(super) fn give_up(&self, error: &Error) {
         tracing::warn!(%error, "OpenGL draws from now on: the rasteriser beside it failed");
         self.draws.set([false; 2]);
     }
 
-    /// What the first pass of the blur is to read, and by which program.
+    /// Input buffer and program of the first blur pass.
     pub(super) fn blur(&self) -> Option<(&Buffer, &Program)> {
         self.shadow.as_ref().map(|depths| (&depths.buffer, depths.blur.as_ref()))
     }
 
-    /// Keys to the ids of what the camera sees, the ground too.
+    /// Converts the keys to the ids that the camera sees, including the ground.
     pub(super) fn unpack(&self, gl: &Gl, target: &Target, ran: &mut Ran) -> Result<()> {
         let missing = || during("unpack")("no keys were drawn");
         let keys = self.visibility.as_ref().ok_or_else(missing)?;
@@ -194,7 +195,7 @@ impl Beside {
 }
 
 impl Keys {
-    /// Makes a buffer of so many bytes, unless there is one at least as large; the one that it replaces.
+    /// Grows the buffer to at least `bytes` bytes and returns the buffer that was replaced, if any.
     fn make_room(&self, gl: &Rc<Gl>, bytes: u64) -> Result<Option<Buffer>> {
         let mut buffer = self.buffer.borrow_mut();
         if buffer.as_ref().is_some_and(|buffer| buffer.bytes >= bytes) {

@@ -1,16 +1,17 @@
-//! Which of two ways is the faster one, measured pass by pass on the scene itself.
+//! Chooses the faster rasterizer for each pass by timing them on the scene itself.
 
 use super::super::scene_buffers::SceneBuffers;
 use super::super::{Image, Renderer, Shot};
 use super::{Path, Paths};
 use modalcast_model::error::Result;
 
-/// Frames by each way; the first warms up, and of the others the median counts.
+/// Frames per combination; the first one warms up, and the median of the others counts.
 const FRAMES: usize = 6;
 
 impl Renderer {
-    /// Draws some frames by each way and keeps the fastest: each of both passes by OpenGL or beside it, because what one costs
-    /// hangs on who draws the other. What was chosen; OpenGL where there is nothing else. What draws nothing goes.
+    /// Times all combinations of OpenGL and the compute rasterizer for shadow map and visibility, and keeps the
+    /// fastest: the cost of one pass depends on who draws the other. Returns the choice, which is OpenGL without a
+    /// compute rasterizer. A compute rasterizer that draws nothing is dropped.
     ///
     /// # Errors
     /// Those of drawing.
@@ -22,7 +23,7 @@ impl Renderer {
             if ways.iter().zip(able).all(|(wanted, able)| able || !wanted) {
                 beside.draws.set(ways);
                 let ms = self.median_ms(buffers, shot)?;
-                // Where it failed it was given up, and OpenGL was measured.
+                // A combination that failed was given up, and the timing is that of OpenGL.
                 if beside.draws.get() == ways {
                     measured.push((ways, ms));
                 }
@@ -39,12 +40,12 @@ impl Renderer {
         Ok(Paths { shadow: path(ways[0]), visibility: path(ways[1]) })
     }
 
-    /// Milliseconds of a frame that draws its shadow, its pixels left where they are.
+    /// Median milliseconds of a frame including its shadow map, without readback.
     fn median_ms(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<f64> {
         let mut times = Vec::new();
         for _ in 0..FRAMES {
             buffers.shared_shadow.forget();
-            // Nobody reads it, so that those whose frames are under way are not in its way.
+            // Submitted unread, so that the trial does not compete for the staging buffers of frames in flight.
             let ticket = self.submit_unread(buffers, shot)?;
             times.push(of_frame(&self.collect(ticket)?));
         }

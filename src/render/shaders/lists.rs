@@ -1,4 +1,4 @@
-//! The programs of exact transparency: gather, tally, place and resolve.
+//! Shader sources of exact transparency: gather, tally, place and resolve.
 
 use std::fmt::Write as _;
 
@@ -6,15 +6,15 @@ use super::{CLIP, DRAWN, FRAME, LISTS, Options, PHONG, SHARES, Slopes, Source, T
 use crate::geometry::Kind;
 use crate::gl;
 
-/// Side of the square of pixels that a workgroup tallies.
+/// Side of the square of pixels whose fragments a workgroup counts.
 pub(crate) const TALLY: u32 = 16;
-/// Pixels are told apart by their fragments up to this many.
+/// Bins of the histogram over fragments per pixel; the last bin also counts pixels with more fragments.
 pub(crate) const BINS: usize = 256;
 
 impl Options {
-    /// Counts the blended fragments of pixels, and puts them in their lists.
+    /// Counts the blended fragments of each pixel, and adds them to the lists.
     pub(crate) fn gather(&self, samples: u32) -> Source {
-        // Extensions are named before anything else.
+        // Extension directives must precede all other code.
         let post_depth = samples > 1 && self.post_depth;
         let more: &[&str] = if post_depth { &["MASK", "POST_DEPTH"] } else { &["MASK"] };
         let extension = if post_depth { "#extension GL_ARB_post_depth_coverage : require\n" } else { "" };
@@ -27,7 +27,7 @@ impl Options {
         Source { label: format!("gather, {samples} samples"), stages: drawn(vertex.concat(), fragment) }
     }
 
-    /// Sorted lists to layers.
+    /// Sorts, shades and blends the lists to layers.
     pub(crate) fn resolve_lists(&self, samples: u32) -> Source {
         let mut text = self.head(&[]) + &bins() + &tiles() + &self.branches(&[Kind::Blend]);
         text += &[&self.sampling(samples), FRAME, CLIP, &self.sun(), LISTS].concat();
@@ -37,14 +37,14 @@ impl Options {
     }
 }
 
-/// How many pixels have how many blended fragments.
+/// Builds the histogram of fragments per pixel.
 pub(crate) fn tally() -> Source {
     let head = format!("#version 430 core\n#define SIDE {TALLY}\n{}", bins());
     let text = [&head, LISTS, include_str!("../../../shaders/tally.comp")].concat();
     Source { label: "tally".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
 }
 
-/// Where the list of each pixel begins.
+/// Allocates the list of each pixel.
 pub(crate) fn place() -> Source {
     let head = format!("#version 430 core\n{}{}", tiles(), bins());
     let text = [&head, LISTS, include_str!("../../../shaders/place.comp")].concat();

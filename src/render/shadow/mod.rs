@@ -1,5 +1,5 @@
-//! The shadow map of a scene and the passes that make it: depth from the sun and, for a variance map, its blurred
-//! moments. One layer for each split.
+//! Shadow map of a scene and the passes that draw it: depth from the sun and, for a variance map, its blurred moments.
+//! One array layer per cascade (split).
 
 mod shared;
 mod sources;
@@ -20,26 +20,27 @@ use super::shaders::LANES;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Blurring, Moments, Shadow};
 
+/// Textures and framebuffers of a shadow map.
 #[derive(Debug)]
 pub(super) struct ShadowMap {
     shadow: Shadow,
     depth: Texture,
-    /// One for each layer of the depth.
+    /// One per layer of the depth.
     framebuffers: Vec<Framebuffer>,
     blurred: Option<Blurred>,
 }
 
-/// The moments of a variance map.
+/// The blurred moments of a variance map.
 #[derive(Debug)]
 struct Blurred {
     moments: Texture,
-    /// One layer, blurred in x; none where tiles are blurred in one pass.
+    /// One layer of moments blurred in x; none when tiles are blurred in both directions at once.
     half: Option<Texture>,
-    /// Of `half`, then of each layer of the moments; none where compute shaders write.
+    /// For `half`, then for each layer of the moments; empty when compute shaders blur.
     framebuffers: Vec<Framebuffer>,
 }
 
-/// The map that a device is given: what fits a kind of device is chosen here.
+/// Resolves the settings that depend on the kind of device.
 pub(super) fn fitting(shadow: Shadow, software: bool) -> Shadow {
     let blurring = match shadow.blurring {
         Blurring::Fitting if software => Blurring::Rows,
@@ -49,7 +50,7 @@ pub(super) fn fitting(shadow: Shadow, software: bool) -> Shadow {
     Shadow { blurring, ..shadow }
 }
 
-/// Textures of a map: name, bytes of a texel, layers.
+/// Textures of a map: name, bytes per texel, layers.
 pub(super) fn textures(shadow: &Shadow) -> Vec<(&'static str, u32, u32)> {
     let pair = if shadow.moments == Moments::F16 { 4 } else { 8 };
     let mut textures = vec![("shadow depth", 4, shadow.splits)];
@@ -75,12 +76,12 @@ impl ShadowMap {
         Ok(Self { shadow, depth, framebuffers, blurred })
     }
 
-    /// What surfaces look up.
+    /// The texture that the shading samples: moments if there are any, else depth.
     pub(super) fn lookup(&self) -> &Texture {
         self.blurred.as_ref().map_or(&self.depth, |blurred| &blurred.moments)
     }
 
-    /// Textures that it holds.
+    /// Number of textures that the map holds.
     pub(super) fn texture_count(&self) -> usize {
         textures(&self.shadow).len()
     }
@@ -119,7 +120,7 @@ fn image(gl: &Rc<Gl>, shadow: &Shadow, format: u32, filter: u32, layers: u32) ->
     Ok(texture)
 }
 
-/// Depth from the sun, layer by layer.
+/// Draws the depth from the sun, layer by layer.
 pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<()> {
     let size = map.shadow.size;
     let drawn = listed(buffers);
@@ -137,7 +138,7 @@ pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<
     gl.check("shadow")
 }
 
-/// Blurred moments of the depth, layer by layer. Whether the map has any.
+/// Blurs the moments of the depth, layer by layer. Returns whether the map has moments.
 pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<bool> {
     let Some(blurred) = &map.blurred else { return Ok(false) };
     let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
@@ -184,7 +185,7 @@ fn begin(program: &Program, from: &Texture, map: &ShadowMap, layer: u32) {
     choose(program, map, layer);
 }
 
-/// Tells a program in use which layer it makes, where there are several.
+/// Sets the layer of the bound program, which has that uniform only when the map is split.
 fn choose(program: &Program, map: &ShadowMap, layer: u32) {
     if map.shadow.splits > 1 {
         program.layer(layer);

@@ -1,4 +1,5 @@
-//! The shaders of the shadow: casters, blur and lookup, with the branches that the scene's kind of map needs.
+//! Shader sources of the shadow passes: casters, blur and lookup, with the branches that the scene's shadow method
+//! needs.
 
 use std::fmt::Write as _;
 
@@ -12,14 +13,14 @@ const SUN: &str = include_str!("../../../shaders/shared/sun.glsl");
 const SPLITS: &str = include_str!("../../../shaders/shared/splits.glsl");
 const MOMENTS: &str = include_str!("../../../shaders/shared/moments.glsl");
 
-/// Texels that one invocation of the blur makes, along its direction.
+/// Consecutive texels that one invocation of the blur writes, along its direction.
 pub(crate) const RUN: u32 = 8;
 /// Lanes of a workgroup that blurs a tile.
 const TILE_LANES: u32 = 256;
-/// The shared memory that every device gives a workgroup.
+/// Bytes of shared memory that every device gives a workgroup.
 pub(super) const SHARED_BYTES: u32 = 32 << 10;
 
-/// The branches of a kind of map.
+/// Defines of a shadow method.
 pub(crate) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'static str> {
     let method = match shadow.method {
         ShadowMethod::Variance => "VARIANCE",
@@ -30,13 +31,13 @@ pub(crate) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'static str> {
     ["SHADOWS", method].into_iter().chain(splits)
 }
 
-/// Texels of the map that a workgroup of the blur in one pass makes: columns and rows.
+/// Columns and rows of the map that one workgroup writes when both directions are blurred in one pass.
 pub(crate) fn made_at_once(shadow: &Shadow) -> [u32; 2] {
     let tile = Tile::of(shadow);
     Strip::of(shadow).map_or([tile.wide, tile.tall], |strip| [strip.wide, strip.tall])
 }
 
-/// A workgroup's tile of the map: its sides, and how many rows of depth it holds at once.
+/// The tile of a workgroup: its width and height in texels, and the number of depth rows that it holds at once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Tile {
     wide: u32,
@@ -46,21 +47,21 @@ struct Tile {
 }
 
 impl Tile {
-    /// The first of these that fits into shared memory: a wider reach leaves room for fewer texels at once.
+    /// The first of these sizes that fits into shared memory; a wider blur kernel needs smaller tiles.
     fn of(shadow: &Shadow) -> Self {
         let reach = shadow.reach();
         let sizes = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
-        // All rows at once where they fit: a second band would leave most lanes idle.
+        // All rows at once if they fit: a second band would leave most lanes idle.
         let tiles = sizes.map(|(wide, tall, band)| Self { wide, tall, band: (tall + 2 * reach).min(band), reach });
         tiles.into_iter().find(|tile| tile.bytes() <= SHARED_BYTES).unwrap_or(tiles[sizes.len() - 1])
     }
 
-    /// Numbers from one row of depths to the next.
+    /// Floats from one row of depths to the next; odd, which avoids bank conflicts.
     const fn depth_pitch(&self) -> u32 {
         (self.wide + 2 * self.reach) | 1
     }
 
-    /// Pairs from one blurred row to the next.
+    /// Moment pairs from one blurred row to the next.
     const fn pitch(&self) -> u32 {
         self.wide + 1
     }
@@ -71,7 +72,7 @@ impl Tile {
 }
 
 impl Options {
-    /// The function `lit`, for every shader that asks how much of the sun arrives.
+    /// Source of `lit`, the share of the sun's light that reaches a point.
     pub(crate) fn sun(&self) -> String {
         let mut text = String::new();
         if self.has("VARIANCE") {
@@ -94,7 +95,7 @@ impl Options {
         self.defines.contains(&define)
     }
 
-    /// Draws triangles of one kind into the shadow map; opaque ones need no fragment shader.
+    /// Draws one kind of triangle into the shadow map; opaque ones need no fragment shader.
     pub(crate) fn shadow(&self, kind: Kind) -> Source {
         let label = format!("shadow, {kind:?}");
         let vertex = |head: &str| [head, FRAME, self.splits(), include_str!("../../../shaders/shadow.vert")].concat();
@@ -108,7 +109,7 @@ impl Options {
         Source { label, stages: drawn(vertex(&head), fragment) }
     }
 
-    /// The programs that make blurred moments of depth, in order.
+    /// The programs that blur the moments of depth, in execution order.
     pub(crate) fn blur(&self) -> Vec<Source> {
         match self.shadow.blurring {
             Blurring::Fitting | Blurring::Tiles => vec![self.blur_at_once()],
@@ -116,7 +117,7 @@ impl Options {
         }
     }
 
-    /// The first of them, for depth that lies in a buffer; none where there are none.
+    /// The first blur program, for depth in a storage buffer; none without a blur.
     pub(crate) fn blur_of_buffer(&self) -> Option<Source> {
         let Source { label, stages } = self.blur().into_iter().next().filter(|_| self.has("VARIANCE"))?;
         let version = |text: String| text.replacen('\n', "\n#define OF_BUFFER\n", 1);
@@ -131,7 +132,7 @@ impl Options {
         [&head, FRAME, self.splits(), MOMENTS].concat()
     }
 
-    /// One direction of the blur; the first also turns depth into moments.
+    /// One direction of the blur; the first direction also converts depth to moments.
     fn blur_along(&self, first: bool) -> Source {
         let more: &[&str] = if first { &["FIRST"] } else { &[] };
         let fragments = self.shadow.blurring == Blurring::Fragments;
@@ -151,7 +152,7 @@ impl Options {
         Source { label, stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
     }
 
-    /// Both directions of the blur, strip by strip where the reach allows it.
+    /// Both directions of the blur in one pass: by strips if the kernel is small enough, else by tiles.
     fn blur_at_once(&self) -> Source {
         let weights = weights(self.shadow.blur);
         let Some(strip) = Strip::of(&self.shadow) else { return self.blur_tiles(&weights) };
@@ -159,7 +160,7 @@ impl Options {
         Source { label: "blur, strips".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
-    /// The same tile by tile.
+    /// Both directions of the blur, tile by tile.
     fn blur_tiles(&self, weights: &[f32]) -> Source {
         let tile = Tile::of(&self.shadow);
         let Tile { wide, tall, band, reach } = tile;
@@ -176,8 +177,8 @@ impl Options {
     }
 }
 
-/// A function of this name with the weighted sums of one invocation of the blur, written out: each pair of moments is
-/// fetched once for all the sums it is part of.
+/// GLSL function with the unrolled weighted sums of one blur invocation. Each pair of moments is fetched once for all
+/// sums that use it.
 fn taps(name: &str, arguments: &str, weights: &[f32], run: u32, fetch: impl Fn(i32) -> String) -> String {
     let reach = weights.len() as i32 - 1;
     let mut text = format!("void {name}({arguments}, out vec2 sums[RUN]) {{\n    vec2 texel;\n");
@@ -195,7 +196,8 @@ fn taps(name: &str, arguments: &str, weights: &[f32], run: u32, fetch: impl Fn(i
     text + "}\n"
 }
 
-/// Half a normalised Gaussian (equation 3.11 in one dimension), centre first, cut off at three deviations.
+/// One half of a normalized Gaussian (equation 3.11 in one dimension), center first, cut off at three standard
+/// deviations.
 pub(crate) fn weights(deviation: f32) -> Vec<f32> {
     let deviation = f64::from(deviation);
     let reach = (3.0 * deviation).ceil() as i32;

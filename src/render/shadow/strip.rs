@@ -1,32 +1,33 @@
-//! The blur of a variance map by strips: the text of its shader, with every sum in a variable of its own. Arrays would do
-//! where compilers keep them in registers, and not all do.
+//! Generates the shader that blurs a variance map by strips, with every sum in a variable of its own: not all compilers
+//! keep arrays in registers.
 
 use std::fmt::Write as _;
 
 use modalcast_model::scene::Shadow;
 
-/// Lanes of a workgroup and rows of a turn: for a reach up to so far, and beyond. More sums leave registers for fewer lanes,
-/// which wait less often when a turn is long. Of 4096^2 on an H200: 15 taps took 135 us with the first and 154 with the
-/// other, 25 taps 200 and 166.
+/// Lanes per workgroup and rows per iteration, for kernels with a reach up to `NEAR` and beyond. A longer kernel needs
+/// more sums, which leaves registers for fewer lanes; lanes wait at fewer barriers when an iteration has more rows.
+/// Measured on an H200 with a 4096^2 map: 15 taps take 135 us with the first and 154 us with the second setting, 25
+/// taps take 200 us and 166 us.
 const NEAR: u32 = 9;
 const WALKS: [(u32, u32); 2] = [(64, 4), (128, 8)];
-/// The widest reach of which the sums stay in the registers of a lane.
+/// The widest reach whose sums still fit into the registers of a lane.
 const WIDEST: u32 = 24;
 
-/// A workgroup's strip of the map: a column for each lane, and the rows that it makes.
+/// The strip of a workgroup: one column per lane, and the number of rows that it writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Strip {
-    /// Lanes: columns.
+    /// Columns, one per lane.
     pub(crate) wide: u32,
     pub(crate) tall: u32,
-    /// Rows that are read at once.
+    /// Rows per iteration, which are loaded together.
     turn: u32,
     reach: u32,
 }
 
 impl Strip {
-    /// None where the blur reaches too far. A tall strip begins seldom, which costs 2 `reach` rows; a small map needs many
-    /// strips, so that all of a device has work.
+    /// None if the kernel is too wide. Each strip also processes 2 `reach` rows that it does not store, so tall strips
+    /// cost less; a small map needs many strips to occupy the device.
     pub(crate) fn of(shadow: &Shadow) -> Option<Self> {
         let reach = shadow.reach();
         let (wide, turn) = WALKS[usize::from(reach > NEAR)];
@@ -41,7 +42,7 @@ impl Strip {
         4 * 2 * self.turn * (self.wide + 2 * self.reach)
     }
 
-    /// The shader behind its head, which tells LANES, for half a bell of these weights.
+    /// The shader source after its head, which defines LANES, for one half of a Gaussian with these weights.
     pub(crate) fn text(self, weights: &[f32]) -> String {
         let Self { tall, turn, reach, .. } = self;
         let text = format!("#define TALL {tall}\n#define TURN {turn}\n#define REACH {reach}\n");
@@ -50,13 +51,13 @@ impl Strip {
         text + &parts.into_iter().fold(String::from(body), |body, (place, part)| body.replace(place, &part))
     }
 
-    /// What a turn hands to the next: the sums that are begun.
+    /// Partial sums that an iteration carries over to the next.
     fn sums(self) -> String {
         (0..2 * self.reach).map(|sum| format!("vec2 sum{sum} = vec2(0.0);\n")).collect()
     }
 
-    /// Depths of a turn's rows to shared memory: first a lane's own column, then what lies to both sides. All are on their
-    /// way before one is waited for.
+    /// Loads the depths of an iteration's rows into shared memory: each lane's own column, then the margins. All loads
+    /// are issued before the first one is waited for.
     fn load(self) -> String {
         let Self { wide, turn, reach, .. } = self;
         let pitch = wide + 2 * reach;
@@ -80,7 +81,7 @@ impl Strip {
         read + &write
     }
 
-    /// A turn's rows, blurred, to the sums that they are part of; sums that are whole are stored.
+    /// Adds the blurred rows of an iteration to the sums that use them, and stores the sums that are complete.
     fn add(self, weights: &[f32]) -> String {
         let Self { wide, turn, reach, .. } = self;
         let weight = |from: u32, to: u32| format!("{:?}", weights[from.abs_diff(to) as usize]);

@@ -1,4 +1,4 @@
-//! Frames under way: by a renderer that waits for nothing, as one on hardware does.
+//! Tests of frames in flight, with a renderer that does not wait between passes, like one on hardware.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, Scene, Transparency};
 
-/// A renderer whose passes are timed by queries, whatever it draws on, so that its frames are under way when they were
+/// A renderer that times its passes with queries on any device, so that its frames are in flight after they were
 /// submitted.
 fn open() -> Renderer {
     let mut renderer = Renderer::open(Prefer::Any).expect("EGL");
@@ -21,7 +21,7 @@ fn open() -> Renderer {
     renderer
 }
 
-/// An opaque square, and one of glass before it.
+/// An opaque square, and a glass square in front of it.
 fn scene() -> Arc<Scene> {
     let glass = Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, double_sided: true, ..Material::default() };
     let red = Material { diffuse: [0.9, 0.2, 0.1], double_sided: true, ..Material::default() };
@@ -30,7 +30,7 @@ fn scene() -> Arc<Scene> {
     Scene::new(parts).expect("good")
 }
 
-/// Both squares, the glass wider by so much.
+/// Both squares; the glass is wider by `by`.
 fn surface(by: f32) -> Surface {
     let square = |z: f32, wide: f32| [[0.0, 0.0, z], [wide, 0.0, z], [wide, 1.0, z], [0.0, 1.0, z]];
     let positions = [square(0.0, 1.0), square(0.3, 0.25 + by)].concat();
@@ -43,7 +43,7 @@ fn shot(scene: &Scene, side: u32) -> Shot {
     Shot { camera, width: side, height: side, bounds: scene.rest_bounds, light: None }
 }
 
-/// A picture of one surface by itself, and how many blended fragments it has.
+/// The picture of one surface drawn alone, and its number of blended fragments.
 fn alone(by: f32) -> (Vec<u8>, u64) {
     let (mut renderer, scene) = (open(), scene());
     let buffers = renderer.load(&scene).expect("loads");
@@ -68,7 +68,7 @@ fn each_frame_under_way_keeps_its_vertices_camera_and_counts_whatever_comes_afte
         renderer.upload(&buffers, &surface(by)).expect("uploads");
         tickets.push(renderer.submit(&buffers, &shot(&scene, 64)).expect("submits"));
     }
-    // The last first: the order of waiting is the host's.
+    // Last frame first: the host chooses the order of waiting.
     let mut seen = Vec::new();
     for by in moved.into_iter().rev() {
         let ticket = tickets.pop().expect("as many");
@@ -134,7 +134,7 @@ fn a_frame_that_does_not_end_is_an_error_with_the_name_of_the_pass_and_the_next_
         assert_eq!(stage, passes[stuck]);
         let last = if stuck == 0 { "none".to_owned() } else { format!("'{}'", passes[stuck - 1]) };
         assert!(reason.ends_with(&format!("the last pass that it finished: {last}")), "{reason}");
-        // Errors of asking for what is not there.
+        // Discards the errors of querying objects that do not exist.
         renderer.gl.check("test").ok();
         renderer.draw(&buffers, &shot).expect("the next one is drawn");
     }
@@ -201,7 +201,7 @@ fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_go
             pixels.into_image()
         })
     };
-    // The fourth waits until the first was copied.
+    // The fourth frame waits until the first was copied.
     let readers: Vec<_> = (0..4).map(|_| slow(&mut renderer, &buffers)).collect();
     renderer.unload(buffers);
     drop(renderer);

@@ -1,17 +1,17 @@
-//! Mipmap levels of cut-outs that leave as much of the image as level 0 does (after Castano, "Computing alpha mipmaps",
-//! 2010).
+//! Coverage-preserving mipmap levels of cut-outs (after Castano, "Computing alpha mipmaps", 2010).
 //!
-//! Averaged alpha forgets shapes: of an image more than half of which is left, the coarse levels leave all, so that small
-//! leaves grow into the polygons that carry them; of one less than half of which is, nothing. Alpha of each level is scaled
-//! until the share of it at or above the cutoff, sampled bilinearly as the shaders do, is that of level 0. Alpha ends at 1,
-//! so that a level whose alpha is raised falls short by what that clips, and a single texel has no shape to keep.
+//! Averaging alpha destroys shapes. If more than half of an image is covered, the coarse levels are covered completely,
+//! and small leaves grow into the polygons that carry them; if less than half is covered, they vanish. The alpha of
+//! each level is therefore scaled until the share at or above the cutoff, sampled bilinearly as in the shaders, equals
+//! that of level 0. Alpha is clamped to 1, so a level with raised alpha falls short by what the clamp removes, and a
+//! level of one texel cannot keep a shape.
 
 use super::Linear;
 
-/// Samples of a level lie at most this far apart, in sides of the image.
+/// Minimum number of samples along each side of a level.
 const APART: u32 = 256;
 
-/// Scales the alpha of every level but the first.
+/// Scales the alpha of all levels but the first.
 pub(super) fn keep(chain: &mut [Linear], cutoff: f32) {
     let Some((first, rest)) = chain.split_first_mut() else { return };
     let share = coverage(first, cutoff);
@@ -24,26 +24,26 @@ pub(super) fn keep(chain: &mut [Linear], cutoff: f32) {
     }
 }
 
-/// The share of an image whose alpha is not below the cutoff.
+/// Share of an image whose alpha is at or above the cutoff.
 pub(super) fn coverage(image: &Linear, cutoff: f32) -> f32 {
     let samples = samples(image);
     samples.iter().filter(|alpha| **alpha >= cutoff).count() as f32 / samples.len() as f32
 }
 
-/// The alpha that this share of an image reaches and the rest does not: half way between the two, so that what lies on a
-/// plateau stays clear of the cutoff.
+/// The alpha that exactly this share of an image reaches: the middle between the lowest alpha that counts and the
+/// highest that does not, so that plateaus stay clear of the cutoff.
 fn threshold(image: &Linear, share: f32) -> f32 {
     let mut samples = samples(image);
     let rank = (share * samples.len() as f32).round() as usize;
     let Some(last) = rank.checked_sub(1) else {
-        // Nothing is left at level 0, and nothing shall be.
+        // Nothing is covered at level 0, so nothing may be covered here.
         return f32::INFINITY;
     };
     let (_, reached, rest) = samples.select_nth_unstable_by(last, |a, b| b.total_cmp(a));
     0.5 * (*reached + rest.iter().copied().fold(0.0, f32::max))
 }
 
-/// Alpha between the texels, on an even grid of one sample a texel or more.
+/// Alpha interpolated on an even grid with at least one sample per texel.
 fn samples(image: &Linear) -> Vec<f32> {
     let (width, height) = (image.width, image.height);
     let fine = APART.div_ceil(width.min(height)).max(1);
@@ -72,7 +72,7 @@ mod tests {
     use modalcast_model::domain::Texture;
     use modalcast_model::scene::Parts;
 
-    /// The share that each level leaves, read back from its bytes.
+    /// Covered share of each level, computed from its bytes.
     fn shares(texture: &Texture, cutoff: f32, kept: bool) -> Vec<f32> {
         let array = Array { width: texture.width(), height: texture.height(), layers: vec![0] };
         let chain = levels(texture, &array, Use::Colour, kept.then_some(cutoff));
