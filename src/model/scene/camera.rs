@@ -49,7 +49,7 @@ impl Bounds {
         nalgebra::center(&Point3::from(self.min), &Point3::from(self.max))
     }
 
-    /// Length of the diagonal: all error bounds of this project are relative to it.
+    /// Length of the diagonal, the reference length of relative errors in this project.
     pub fn diagonal(&self) -> f64 {
         (Point3::from(self.max) - Point3::from(self.min)).norm()
     }

@@ -9,7 +9,7 @@ use crate::error::{Result, invalid};
 /// larger deviation is an error of the sender.
 const NORM_SLACK: f64 = 1e-3;
 
-/// The largest f64 translation per axis, in scene units. The resolution of f64 at this distance is about 1e-4 units.
+/// The largest f64 translation per axis, in scene units. At this distance, f64 rounds by up to 1.2e-4 units.
 pub(super) const FARTHEST: f64 = (1_u64 << 40) as f64;
 
 /// The encoding of the transforms of a step.

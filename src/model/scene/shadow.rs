@@ -15,8 +15,8 @@ pub enum ShadowMethod {
     /// the map. An occluder closer than one texel side to the surface behind it casts no shadow.
     Standard,
     /// Percentage-closer filtering: the fraction of surrounding depths behind the receiver, weighted by the Gaussian of
-    /// `blur`. Soft edges, half dark within half a texel of the true edge, no light bleeding, at the cost of (6 blur +
-    /// 2)^2 depths per pixel. As with `Standard`, an occluder closer than one texel side casts no shadow.
+    /// `blur`. Soft edges, half dark within half a texel of the true edge, no light bleeding, at the cost of
+    /// (6 blur + 2)^2 depths per pixel. As with `Standard`, an occluder closer than one texel side casts no shadow.
     Filtered,
 }
 
@@ -51,7 +51,7 @@ pub enum Blurring {
     /// `Tiles` on hardware, `Rows` on software implementations.
     #[default]
     Fitting,
-    /// One compute pass. It works on strips with running sums in registers; for a blur above 8, whose radius is too
+    /// One compute pass. It works on strips with sums in registers; for a blur above 8, whose radius is too
     /// large for this, on tiles in shared memory.
     Tiles,
     /// Two compute passes without shared memory.
@@ -130,8 +130,8 @@ impl Shadow {
 
     /// Upper bound of the variance that f32 rounding produces from equal depths m, |m| <= 1/2, blurred by N taps in x
     /// and in y. With u = 2^-24, the products, sums and weights of two passes and the bilinear lookup change M2 <= 1/4
-    /// by at most (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, hence M1^2 by (N + 3) u. The total is below (1.5 N
-    /// + 5) u.
+    /// by at most (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, hence M1^2 by (N + 3) u. In total, the
+    /// variance is below (1.5 N + 5) u.
     pub fn floor(&self) -> f32 {
         let taps = 2 * self.reach() + 1;
         (1.5 * taps as f32 + 5.0) * (0.5 * f32::EPSILON)

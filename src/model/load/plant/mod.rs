@@ -1,6 +1,6 @@
 //! Loader of plants (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`): each shoot and each leaf becomes a rigid
-//! domain. Lengths are in meters, Z is up. Every domain can be moved independently; a `scene.toml` with `follows =
-//! "leaf"` keeps leaves attached to their shoots.
+//! domain. Lengths are in meters, Z is up. Every domain can be moved independently; a `scene.toml` with
+//! `follows = "leaf"` keeps leaves attached to their shoots.
 
 mod assign;
 mod structure;
