@@ -22,7 +22,8 @@ impl From<Transform> for Composed {
 impl Composed {
     /// `world_from_domain` in f32, as deformers apply it to positions. With row t of the root's transform and column f
     /// of the frame, an entry is `fma(t0, f0, fma(t1, f1, t2 f2))` and a translation is
-    /// `fma(t0, f0, fma(t1, f1, fma(t2, f2, t3)))`: three roundings each. Bit-identical to `place_of` in `kernels/follow.cuh`.
+    /// `fma(t0, f0, fma(t1, f1, fma(t2, f2, t3)))`: three roundings each. Bit-identical to `place_of` in
+    /// `kernels/follow.cuh`.
     pub fn rounded(&self) -> Transform {
         let Some(Transform(f)) = self.frame else { return self.mover };
         let mut product = [0.0; 12];

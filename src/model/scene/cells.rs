@@ -38,8 +38,8 @@ pub struct Cells {
     shared: [f64; 3],
     /// Number of roots that have a cell of their own.
     away: usize,
-    /// Number of translations set since the last search for a shared cell. A search costs a pass over all domains, so
-    /// there is at most one per this many translations.
+    /// Number of translations set since the last search for a shared cell. A search is a pass over all domains; it is
+    /// repeated only after as many translations as there are domains, so that its cost per translation is constant.
     set: usize,
 }
 
@@ -115,7 +115,8 @@ impl Cells {
         self.set = self.set.saturating_add(1);
     }
 
-    /// Moves the shared cell if more than half of the domains are outside its reach. If this returns true, the caller
+    /// Moves the shared cell if more than half of the domains are outside its reach, as many translations were set since
+    /// the last attempt as there are domains, and the move leaves fewer domains outside. If this returns true, the caller
     /// must rebase every transform by [`Self::express`]. The new cell is the one nearest to the per-axis median, which,
     /// unlike the centroid, is robust to a few very distant domains.
     pub(super) fn follow(&mut self) -> bool {

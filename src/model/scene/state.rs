@@ -65,8 +65,8 @@ impl State {
     }
 
     /// Applies a whole step. Domains that the step does not name keep their values. The cost is proportional to the
-    /// number of named domains, their followers, and the domains that share their q; only a step that moves the shared
-    /// cell costs a pass over all domains.
+    /// number of named domains, their followers, and the domains that share their q. Exceptions are the first step with
+    /// f64 translations and the rare steps that search a new shared cell: they make a pass over all transform roots.
     pub fn apply(&mut self, scene: &Scene, update: &Update) {
         self.step = update.number;
         self.time = update.time;
