@@ -115,10 +115,10 @@ impl Cells {
         self.set = self.set.saturating_add(1);
     }
 
-    /// Moves the shared cell if more than half of the domains are outside its reach, as many translations were set since
-    /// the last attempt as there are domains, and the move leaves fewer domains outside. If this returns true, the caller
-    /// must rebase every transform by [`Self::express`]. The new cell is the one nearest to the per-axis median, which,
-    /// unlike the centroid, is robust to a few very distant domains.
+    /// Moves the shared cell if more than half of the domains are outside its reach, as many translations were set
+    /// since the last attempt as there are domains, and the move leaves fewer domains outside. If this returns true,
+    /// the caller must rebase every transform by [`Self::express`]. The new cell is the one nearest to the per-axis
+    /// median, which, unlike the centroid, is robust to a few very distant domains.
     pub(super) fn follow(&mut self) -> bool {
         let count = self.translations.len();
         if 2 * self.away <= count || self.set < count {
