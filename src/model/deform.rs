@@ -1,35 +1,37 @@
-//! What every deformer does: x = T (x0 + U q) for all vertices of a scene, and the normals that go with it.
+//! The trait of all deformers. A deformer computes x = T (x0 + U q) for every vertex of a scene, and the normals and
+//! tangents of the deformed surface.
 //!
-//! Vertices are asked for: by [`Deformer::surface`], which waits for them, or by [`Deformer::fetch`], after which the
-//! next step can be deformed while they are on their way.
+//! Vertices are read back only on request. [`Deformer::surface`] blocks until they are in host memory;
+//! [`Deformer::fetch`] starts a readback that can overlap the next step.
 //!
-//! Three deformers implement it: `reference` (f64, the definition), `cpu` (f32, rayon and SIMD) and `gpu` (CUDA).
+//! Three backends implement [`Deformer`]: `reference` (f64, the definition), `cpu` (f32, rayon and SIMD) and `gpu`
+//! (CUDA).
 
 use std::sync::Arc;
 
 use crate::error::{Result, during};
 use crate::scene::{Bounds, LightBounds, State};
 
-/// Deformed vertices of a whole scene, packed as the scene's layout says.
+/// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Surface {
-    /// World positions, three numbers per vertex, relative to their domain's cell ([`State::cell_of`]): the scene's origin
-    /// unless steps took the domain far from it.
+    /// World positions, three numbers per vertex, relative to the cell of their domain ([`State::cell_of`]). The cell
+    /// is the scene's origin unless a step with f64 translations moved the domain far from it.
     pub positions: Vec<f32>,
-    /// World unit normals, three numbers per corner.
+    /// World-space unit normals, three numbers per corner.
     pub normals: Vec<f32>,
-    /// World unit tangents and bitangent signs, four numbers per corner; empty when the scene has no normal map.
+    /// World-space unit tangents and bitangent signs, four numbers per corner. Empty if the scene has no normal map.
     pub tangents: Vec<f32>,
-    /// u = U q, three numbers per vertex in the frame of its domain, scene units; empty unless the scene keeps them
-    /// (`deform.displacements`).
+    /// Displacements u = U q in the domain's own frame, three numbers per vertex, in scene units. Empty unless the
+    /// scene enables `deform.displacements`.
     pub displacements: Vec<f32>,
-    /// Per domain the smallest box that holds its `positions`, relative to the same cell; empty unless the scene keeps
-    /// them (`deform.boxes`).
+    /// The axis-aligned bounding box of each domain's `positions`, relative to the same cell. Empty unless the scene
+    /// enables `deform.boxes`.
     pub boxes: Vec<Bounds>,
 }
 
 impl Surface {
-    /// A copy of what is wanted, without tangents, which are for the renderer alone.
+    /// Copies the requested attributes. Tangents are never copied: only the renderer uses them.
     fn only(&self, wanted: Wanted) -> Self {
         let list = |wanted: bool, list: &Vec<f32>| if wanted { list.clone() } else { Vec::new() };
         Self {
@@ -42,23 +44,23 @@ impl Surface {
     }
 }
 
-/// What of a [`Surface`] a reader wants; nothing by default.
+/// Attributes of a [`Surface`] to read back. The default is none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Wanted {
     pub positions: bool,
-    /// And tangents.
+    /// Normals, and tangents where a deformer reads them in place. A [`Fetch`] never contains tangents.
     pub normals: bool,
     pub displacements: bool,
     pub boxes: bool,
 }
 
 impl Wanted {
-    /// What there is to draw.
+    /// The attributes that are needed for drawing.
     pub const VERTICES: Self = Self { positions: true, normals: true, displacements: false, boxes: false };
-    /// Everything.
+    /// Every attribute.
     pub const ALL: Self = Self { positions: true, normals: true, displacements: true, boxes: true };
 
-    /// What either of two wants.
+    /// The union of both sets.
     #[must_use]
     pub const fn or(self, other: Self) -> Self {
         Self {
@@ -69,18 +71,18 @@ impl Wanted {
         }
     }
 
-    /// Whether all that `other` wants is wanted.
+    /// Whether `other` is a subset of this set.
     pub fn covers(self, other: Self) -> bool {
         self.or(other) == self
     }
 }
 
-/// Vertices on their way to host memory, or there already. Each is of one step, whatever is deformed later; it can be
-/// waited for late, more than once, or not at all. Its memory is kept while this or what [`Deformer::fetched`] returned
-/// is held.
+/// A readback of one step's vertices, in flight or complete. Deforming later steps does not change its contents. It can
+/// be awaited at any time, more than once, or never. Its memory stays allocated while this handle or the result of
+/// [`Deformer::fetched`] is alive.
 ///
-/// The vertices of a pending fetch cannot be reached through this type: a device may still be writing them. Only the deformer
-/// that began it can resolve it.
+/// A pending readback does not expose its vertices, because the device may still write them. Only the deformer that
+/// started it can complete it.
 #[derive(Debug, Clone)]
 pub struct Fetch {
     surface: Arc<Surface>,
@@ -88,33 +90,33 @@ pub struct Fetch {
 }
 
 impl Fetch {
-    /// Vertices that are still being written; the deformer finds them again by [`Self::is_of`].
+    /// A readback in flight. The deformer identifies it by [`Self::is_of`].
     pub const fn pending(surface: Arc<Surface>) -> Self {
         Self { surface, is_ready: false }
     }
 
-    /// Vertices that are complete.
+    /// A completed readback.
     pub const fn ready(surface: Arc<Surface>) -> Self {
         Self { surface, is_ready: true }
     }
 
-    /// Whether the vertices were complete from the beginning, so that [`Deformer::fetched`] does not wait.
+    /// Whether the readback was complete when it was created, so that [`Deformer::fetched`] does not block.
     pub const fn is_ready(&self) -> bool {
         self.is_ready
     }
 
-    /// Whether this is a fetch into `surface`.
+    /// Whether this readback writes to `surface`.
     pub fn is_of(&self, surface: &Arc<Surface>) -> bool {
         Arc::ptr_eq(&self.surface, surface)
     }
 
-    /// The vertices, unless they are still being written.
+    /// The vertices, or `None` if they may still be in flight.
     fn complete(&self) -> Option<&Arc<Surface>> {
         self.is_ready.then_some(&self.surface)
     }
 }
 
-/// The backends by name.
+/// The deformer implementations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {
@@ -124,7 +126,7 @@ pub enum Backend {
 }
 
 impl Backend {
-    /// The name used on the command line, on the wire and in records.
+    /// The name on the command line, in the protocol and in benchmark records.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Reference => "reference",
@@ -134,67 +136,68 @@ impl Backend {
     }
 }
 
-/// What a deformation tells besides the vertices.
+/// The result of [`Deformer::deform`] apart from the vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Deformed {
-    /// Bounds of all deformed positions as they are in [`Surface`]. Not finite when f32 overflowed somewhere, in a
-    /// displacement that is kept too.
+    /// Bounds of all deformed positions in the coordinates of [`Surface::positions`]. Not finite if f32 overflowed in a
+    /// position or in a stored displacement.
     pub bounds: Bounds,
-    /// What the same positions take up along the axes of light space ([`Scene::light_axes`](crate::scene::Scene)), relative
-    /// to the same origin; none where the look has no shadow that is fitted to them. It holds every vertex. `reference` is
-    /// as tight as the vertices are; the others put boxes around up to 128 vertices each and reach beyond by less than the
-    /// diagonal of such a box, and never beyond the corners of `bounds` by more than rounding.
+    /// Bounds of the same positions along the axes of light space ([`Scene::light_axes`](crate::scene::Scene)),
+    /// relative to the same origin. `None` if the look has no shadow map that is fitted to the vertices. The bounds
+    /// contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
+    /// each: they exceed the tight bounds by less than the diagonal of such a box, and never extend beyond the corners
+    /// of `bounds` by more than rounding.
     pub light: Option<LightBounds>,
-    /// Milliseconds from the call until the vertices were there; with vertices in the renderer's own buffers, without the
-    /// wait for frames that are still drawn from them.
+    /// Milliseconds from the call until the vertices were complete. If they are written to the renderer's own buffers,
+    /// the wait for frames that still read these buffers is not included.
     pub ms: f64,
 }
 
-/// A deformer that was built for one scene and holds all it needs of it.
+/// A deformer for one scene. It owns all data that it needs from the scene.
 pub trait Deformer {
-    /// Which one this is.
+    /// The implementation behind this trait object.
     fn backend(&self) -> Backend;
 
     /// Computes the vertices of `state` into the deformer's output.
     ///
     /// # Errors
-    /// `Fault` when the device failed.
+    /// `Fault` if the device fails.
     fn deform(&mut self, state: &State) -> Result<Deformed>;
 
-    /// Whether the output lies in the renderer's own buffers already, so that nothing need be uploaded.
+    /// Whether the output is written to the renderer's own buffers, so that no upload is needed.
     fn shares_buffers(&self) -> bool {
         false
     }
 
-    /// The vertices of the last [`Self::deform`], in host memory.
+    /// The vertices of the last [`Self::deform`], in host memory. Blocks until they are complete.
     ///
     /// # Errors
-    /// `Fault` when copying from the device failed.
+    /// `Fault` if the copy from the device fails.
     fn surface(&mut self) -> Result<&Surface>;
 
-    /// The same, of which only what is wanted need be there: the rest may be missing or that of an earlier step. Output
-    /// that lies in host memory is there anyway.
+    /// Like [`Self::surface`], but only the attributes in `wanted` are guaranteed. The others may be empty or belong to
+    /// an earlier step. A deformer whose output is in host memory returns all of them.
     ///
     /// # Errors
-    /// As [`Self::surface`].
+    /// As for [`Self::surface`].
     fn read(&mut self, _wanted: Wanted) -> Result<&Surface> {
         self.surface()
     }
 
-    /// Begins to bring what is wanted of the last [`Self::deform`] to the host, and nothing else: the other lists of the
-    /// [`Surface`] are empty. Tangents are for the renderer alone and stay. Positions and normals may be on their way
-    /// while the next step is deformed; displacements and boxes are there when this returns.
+    /// Starts a readback of the attributes in `wanted` of the last [`Self::deform`]. All other arrays of the resulting
+    /// [`Surface`] are empty; tangents are never read back. Positions and normals may still be in flight while the next
+    /// step is deformed. Displacements and boxes are complete when this returns.
     ///
     /// # Errors
-    /// `Fault` when nothing was deformed or copying from the device failed.
+    /// `Fault` if no step was deformed yet, or if the copy from the device fails.
     fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
         Ok(Fetch::ready(Arc::new(self.read(wanted)?.only(wanted))))
     }
 
-    /// Waits until all of it is there.
+    /// Blocks until the readback is complete.
     ///
     /// # Errors
-    /// `Fault` when copying from the device failed, or when it is another deformer's.
+    /// `Fault` if the copy from the device fails, or if another deformer started the readback.
     fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
         fetch.complete().cloned().ok_or_else(|| during("fetch")("it was begun by another deformer"))
     }
@@ -212,7 +215,7 @@ mod tests {
         assert!(boxes.covers(Wanted::default()) && !Wanted::default().covers(boxes));
     }
 
-    /// A deformer that keeps its output in host memory.
+    /// A deformer whose output is in host memory.
     struct OnHost(Surface);
 
     impl Deformer for OnHost {

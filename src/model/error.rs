@@ -1,49 +1,51 @@
-//! What can go wrong, sorted by who can act on it. Every variant carries the numbers that the actor needs.
+//! The error type of all crates. Variants are grouped by who can act on the error, and carry the values that this party
+//! needs.
 
-/// The one error of the server.
+/// The error type of the server.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// The caller sent something that can never be accepted.
+    /// The caller sent a value that is never acceptable.
     #[error("{field}: expected {expected}, given {given}")]
     Invalid { field: String, expected: String, given: String },
-    /// The caller named something that is not there.
+    /// The caller named an object that does not exist.
     #[error("{what} not found: {given}")]
     NotFound { what: &'static str, given: String },
-    /// The caller wants what somebody else holds; it may be free later.
+    /// Another client holds the resource; it may become free.
     #[error("{what} is taken: {holder}")]
     Taken { what: &'static str, holder: String },
-    /// The caller asked for what has passed.
+    /// The requested step has already been superseded.
     #[error("{what}: expected {expected}, given {given}")]
     Gone { what: &'static str, expected: String, given: String },
-    /// The caller came too fast; a later try may pass.
+    /// A queue is full; a later attempt may succeed.
     #[error("{queue} is full ({limit})")]
     Busy { queue: &'static str, limit: usize },
-    /// The caller's deadline passed first.
+    /// The caller's deadline expired first.
     #[error("{what} did not come within {ms} ms")]
     Deadline { what: String, ms: u64 },
-    /// The operator must install, mount or free something.
+    /// A resource or program is missing; the operator must install, mount or free it.
     #[error("{what} is not available: {reason}. {remedy}")]
     Unavailable { what: &'static str, reason: String, remedy: String },
-    /// A fault of ours or of the device.
+    /// An internal error, or a failure of the device or a library.
     #[error("{stage} failed: {reason}")]
     Fault { stage: &'static str, reason: String },
 }
 
-/// Shorthand of every fallible function in the crate.
+/// `Result` with [`Error`] as its default error type.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// A refusal that names the field, what was expected and what was given.
+/// An [`Error::Invalid`] that names the field, the expected and the given value.
 pub fn invalid(field: impl Into<String>, expected: impl Into<String>, given: impl ToString) -> Error {
     Error::Invalid { field: field.into(), expected: expected.into(), given: given.to_string() }
 }
 
-/// Makes a fault of `stage` out of any library error; to be used with `map_err`.
+/// Converts any library error to an [`Error::Fault`] of `stage`, for use with `map_err`.
 pub fn during<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Error {
     move |error| Error::Fault { stage, reason: error.to_string() }
 }
 
 impl Error {
-    /// The same error with `place` put before its field, so that a nested parser's refusal names the whole path.
+    /// Prefixes the field of an [`Error::Invalid`] with `place`, so that the message contains the whole path. Other
+    /// variants remain unchanged.
     pub fn within(self, place: &str) -> Self {
         match self {
             Self::Invalid { field, expected, given } => {

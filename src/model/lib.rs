@@ -1,5 +1,5 @@
-//! What a scene is, and the contract of those who deform and draw it: meshes, modes U and materials, scenes and steps as
-//! values, and the files that they are read from. Neither CUDA nor OpenGL is known here.
+//! The scene model: meshes, modes U, materials, scenes and steps as plain values, the loaders that read them from
+//! files, and the traits that deformers and rasterizers implement. This crate uses neither CUDA nor OpenGL.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

@@ -1,87 +1,92 @@
-//! What draws triangles into samples beside OpenGL, as a trait: the renderer asks, `gpu` answers.
+//! The trait of the compute rasterizer, the alternative to OpenGL's rasterizer for some passes. The renderer calls it;
+//! `gpu` implements it in CUDA.
 //!
-//! One sample a pixel, rows from the top. Which samples a triangle covers and how deep it is there is defined by
-//! `reference::raster`; so is what is left of a cut-out, but for the last bits of how an image is filtered.
+//! Images have one sample per pixel and rows from top to bottom. `reference::raster` defines which samples a triangle
+//! covers, their depths, and which samples of cut-outs survive the alpha test. Implementations may differ from it in
+//! the last bits of filtered images.
 
 use crate::error::Result;
 use crate::scene::{Group, Window};
 
-/// An OpenGL buffer of the context that is current on the thread.
+/// A buffer of the OpenGL context that is current on the calling thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GlBuffer {
     pub name: u32,
     pub bytes: u64,
 }
 
-/// What is drawn.
+/// The geometry to draw.
 #[derive(Debug, Clone)]
 pub struct Mesh {
-    /// 3 f32 a vertex, written anew for every step.
+    /// Three f32 per vertex, rewritten by every step.
     pub positions: GlBuffer,
-    /// Vertices; a triangle's id is its place here.
+    /// Vertex indices. The id of a triangle is its index in this list.
     pub triangles: Vec<[u32; 3]>,
-    /// One after the other, all triangles.
+    /// Consecutive ranges that together cover all triangles.
     pub groups: Vec<Group>,
-    /// None where no triangle has holes.
+    /// Alpha-tested triangles; `None` if the mesh has none.
     pub cut_outs: Option<CutOuts>,
 }
 
-/// The triangles that are left where alpha is large enough alone.
+/// The alpha-tested triangles: a sample survives only where alpha reaches a cutoff.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CutOuts {
-    /// The first of them; all behind it are too.
+    /// Index of the first alpha-tested triangle. All triangles from it on are alpha-tested.
     pub first: u32,
-    /// Of each from the first on: texture coordinates of its corners.
+    /// Per alpha-tested triangle, the texture coordinates of its corners.
     pub uvs: Vec<[[f32; 2]; 3]>,
-    /// Of each from the first on: its place among the surfaces.
+    /// Per alpha-tested triangle, its index in `table`.
     pub surfaces: Vec<u32>,
     pub table: Vec<Surface>,
     pub images: Vec<AlphaImage>,
-    /// The most samples along the longer side of a pixel's footprint, 1 or more.
+    /// Maximum anisotropy: the largest number of samples along the major axis of a pixel's footprint, at least 1.
     pub anisotropy: f32,
 }
 
-/// How a surface is cut out: where its own alpha times that of its image is `least` or more, it is there.
+/// Alpha-test parameters of a material. A sample survives if `alpha` times the image's alpha is at least `least`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
     pub alpha: f32,
     pub least: f32,
-    /// Place among the images.
+    /// Index in [`CutOuts::images`].
     pub image: Option<u32>,
 }
 
-/// The alpha of an image that repeats: texels of 8 bits for 0 to 1, row by row as texture coordinates grow.
+/// The alpha channel of an image with wrap mode "repeat". Texels have 8 bits for 0 to 1; rows are in the order of
+/// increasing v.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AlphaImage {
     pub width: u32,
     pub height: u32,
-    /// The image, then each halving down to one texel.
+    /// The mipmap chain, from the full image down to one texel.
     pub levels: Vec<Vec<u8>>,
 }
 
-/// A window and the buffer that its samples go to.
+/// A window and the buffer that receives its samples.
 pub type Order<'a> = (&'a Window, GlBuffer);
 
-/// Draws one mesh. Buffers are ordered with OpenGL's commands before and after a call without a wait of the host. It may
-/// keep hold of the positions and of what it drew into: OpenGL deletes the first after it, the others after
+/// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
+/// host. The implementation may keep the position buffer and the target buffers registered. The caller must therefore
+/// delete the position buffer only after it drops the rasterizer, and a target only after
 /// [`forget`](Rasteriser::forget).
 pub trait Rasteriser: std::fmt::Debug {
-    /// Draws depth, ids, or both in one turn, because changing over from OpenGL and back takes longer than either.
+    /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
+    /// longer than either pass.
     ///
-    /// Depth of every sample: f32 from 0 to 1, 1 where nothing is; all triangles are drawn from both sides. Ids, what every
-    /// sample sees: u64, the bits of its depth, then in the lower half the triangle; all ones where nothing is; triangles
-    /// are drawn from the sides that their groups say.
+    /// Depths are one f32 per sample from 0 to 1, and 1 where no triangle is; triangles are drawn two-sided. Ids are
+    /// one u64 per sample: the bits of the nearest depth in the upper half and the triangle in the lower half, and all
+    /// ones where no triangle is. Each group says which of its faces are drawn.
     ///
     /// # Errors
-    /// `Fault` when the device fails, or a buffer is unknown or smaller than its window.
+    /// `Fault` if the device fails, or if a buffer is unknown or smaller than its window.
     fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()>;
 
-    /// Compiles what passes of depth, of ids, or of both need, so that no frame waits for that.
+    /// Compiles the kernels for depth, id, or both passes ahead of the first frame.
     ///
     /// # Errors
-    /// `Unavailable` when there is no compiler; `Fault` when compiling fails.
+    /// `Unavailable` if there is no compiler; `Fault` if compilation fails.
     fn make_ready(&mut self, depth: bool, ids: bool) -> Result<()>;
 
-    /// Lets go of a buffer that was drawn into, before OpenGL deletes it: its name may be given to another.
+    /// Releases a target buffer. Call it before OpenGL deletes the buffer, because OpenGL may reuse the name.
     fn forget(&mut self, _name: u32) {}
 }

@@ -1,15 +1,15 @@
-//! T = T_mover F: the transform of a domain that follows another one by a constant frame.
+//! T = T_root F: the transform of a domain that follows a transform root by a constant frame.
 
 use nalgebra::Matrix3;
 
 use super::Transform;
 
-/// A domain's transform as what it is made of.
+/// The factors of a domain's transform.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Composed {
-    /// The domain's own transform, or that of the domain that it follows.
+    /// The domain's own transform or, for a follower, that of its root.
     pub mover: Transform,
-    /// `mover_from_domain`; `None` for a domain with a transform of its own.
+    /// F, `root_from_domain`; `None` for a domain with a transform of its own.
     pub frame: Option<Transform>,
 }
 
@@ -20,9 +20,10 @@ impl From<Transform> for Composed {
 }
 
 impl Composed {
-    /// `world_from_domain` in f32, as deformers multiply positions with it. With row t of the mover and column f of the
-    /// frame an entry is `fma(t0, f0, fma(t1, f1, t2 f2))`, a translation `fma(t0, f0, fma(t1, f1, fma(t2, f2, t3)))`:
-    /// three roundings each. Twin of `place_of` in `kernels/follow.cuh`, bit by bit.
+    /// `world_from_domain` in f32, as deformers apply it to positions. With row t of the root's transform and column f
+    /// of the frame, an entry is `fma(t0, f0, fma(t1, f1, t2 f2))` and a translation is
+    /// `fma(t0, f0, fma(t1, f1, fma(t2, f2, t3)))`: three roundings each. Bit-identical to `place_of` in
+    /// `kernels/follow.cuh`.
     pub fn rounded(&self) -> Transform {
         let Some(Transform(f)) = self.frame else { return self.mover };
         let mut product = [0.0; 12];
@@ -35,8 +36,8 @@ impl Composed {
         Transform(product)
     }
 
-    /// The same in f64, 3x4 row-major. Products of two f32 are exact there and cannot overflow; sums go from left to
-    /// right, so that an entry that vanishes here vanishes on the device.
+    /// The product in f64, 3x4 row-major. Products of two f32 are exact in f64 and cannot overflow. Sums are evaluated
+    /// from left to right as on the device, so that an entry that cancels to 0 here also does so there.
     pub fn exact(&self) -> [f64; 12] {
         let t = self.mover.0.map(f64::from);
         let Some(frame) = self.frame else { return t };
@@ -48,7 +49,7 @@ impl Composed {
         })
     }
 
-    /// The linear part A of [`Self::exact`], which turns normals and tangents.
+    /// The linear part A of [`Self::exact`], which transforms normals and tangents.
     pub fn linear(&self) -> Matrix3<f64> {
         let entries = self.exact();
         Matrix3::from_fn(|row, column| entries[4 * row + column])

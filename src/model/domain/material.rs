@@ -1,20 +1,20 @@
-//! Phong materials: equation 3.12 of the thesis with clamped dots, extended by alpha, textures and normal maps.
+//! Phong materials: equation 3.12 of the thesis with clamped dot products, extended by alpha, textures and normal maps.
 
 use crate::error::{Result, invalid};
 
-/// What happens to the alpha of a material (glTF's words).
+/// How a material's alpha is used (as in glTF).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum AlphaMode {
     /// Alpha is ignored.
     #[default]
     Opaque,
-    /// A fragment below the cutoff is left out, in the shadow pass too.
+    /// Fragments below the cutoff are discarded, also in the shadow pass.
     Mask { cutoff: f32 },
-    /// Drawn after all else and blended by alpha.
+    /// Drawn after opaque triangles and blended by alpha.
     Blend,
 }
 
-/// Colours are linear, 0 to 1.
+/// A Phong material. Colors are linear, 0 to 1.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Material {
     pub name: String,
@@ -23,14 +23,14 @@ pub struct Material {
     pub specular: [f32; 3],
     /// Phong exponent, 0 to 1e6.
     pub shininess: f32,
-    /// 0 (nothing to be seen) to 1.
+    /// 0 (invisible) to 1 (opaque).
     pub alpha: f32,
-    /// Index into the scene's textures; multiplies diffuse, ambient and alpha. Stored sRGB.
+    /// Index into the scene's textures. The texture multiplies diffuse, ambient and alpha; its colors are sRGB.
     pub colour_texture: Option<usize>,
-    /// Index into the scene's textures; tangent space, +Y up (OpenGL's convention). Stored linear.
+    /// Index into the scene's textures. A tangent-space normal map with +Y up (OpenGL's convention) and linear values.
     pub normal_texture: Option<usize>,
     pub alpha_mode: AlphaMode,
-    /// Back faces are drawn too, with their normal turned to the viewer.
+    /// Draws back faces too, with their normal flipped towards the viewer.
     pub double_sided: bool,
 }
 
@@ -52,10 +52,10 @@ impl Default for Material {
 }
 
 impl Material {
-    /// The material itself if all of its numbers are in range.
+    /// Validates all numbers.
     ///
     /// # Errors
-    /// `Invalid` naming the material and the field.
+    /// `Invalid` with the material and the field.
     pub fn checked(self) -> Result<Self> {
         let unit = |field: &str, value: f32| match value {
             0.0..=1.0 => Ok(()),

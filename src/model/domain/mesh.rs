@@ -1,15 +1,16 @@
-//! A triangle mesh in two levels: vertices, one per three rows of U, and corners, one per rendered (v, vt, vn).
+//! A triangle mesh on two levels: vertices, each with three rows of U, and corners, one per rendered combination of
+//! OBJ's v, vt and vn.
 
 use crate::error::{Result, invalid};
 
-/// The rendered corners, all columns of one length.
+/// The rendered corners as arrays of equal length.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Corners {
     /// The vertex of each corner.
     pub vertices: Vec<u32>,
     /// Unit normals at rest.
     pub normals: Vec<[f32; 3]>,
-    /// Texture coordinates, (0, 0) at the top left of the image; empty when the mesh has none.
+    /// Texture coordinates with (0, 0) at the top left of the image; empty if the mesh has none.
     pub uvs: Vec<[f32; 2]>,
 }
 
@@ -22,12 +23,12 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// A mesh whose triangles index `corners` and whose corners index `rest`.
+    /// A mesh whose triangles index `corners` and whose corners index `rest`. Normals are normalized.
     ///
-    /// Vertices that no corner names are kept: the rows of U count them.
+    /// Unreferenced vertices are kept, because the rows of U include them.
     ///
     /// # Errors
-    /// `Invalid` when a list is empty, an index is out of range, lengths differ or a number is not finite.
+    /// `Invalid` if a list is empty, an index is out of range, lengths differ or a number is not finite.
     pub fn new(rest: Vec<[f32; 3]>, mut corners: Corners, triangles: Vec<[u32; 3]>) -> Result<Self> {
         let count = corners.vertices.len();
         if rest.is_empty() || triangles.is_empty() {
@@ -57,7 +58,7 @@ impl Mesh {
     /// A mesh with one corner per vertex.
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// As for [`Self::new`].
     pub fn indexed(
         rest: Vec<[f32; 3]>,
         normals: Vec<[f32; 3]>,
@@ -84,8 +85,8 @@ impl Mesh {
     }
 }
 
-/// Area-weighted vertex normals for corners that came without any. Triangles index corners; corners of one vertex share
-/// a normal. A vertex of zero area gets +Z.
+/// Area-weighted vertex normals, one per corner, for corners without normals. Triangles index corners, and all corners
+/// of a vertex share its normal. A vertex without adjacent area gets +Z.
 pub fn smooth_normals(rest: &[[f32; 3]], corner_vertices: &[u32], triangles: &[[u32; 3]]) -> Vec<[f32; 3]> {
     let mut sums = vec![nalgebra::Vector3::<f64>::zeros(); rest.len()];
     let position = |vertex: u32| nalgebra::Vector3::from(rest[vertex as usize]).cast::<f64>();

@@ -1,13 +1,14 @@
-//! The modal matrix U of one shape: 3n x r, column-major f32, so that one mode is one contiguous run.
+//! The modal matrix U of one shape: 3n x r, column-major f32, so that each mode is contiguous.
 
 use std::sync::Arc;
 
 use crate::error::{Result, invalid};
 
-/// The largest number of modes of one domain.
+/// The largest number of modes of a domain.
 pub const MAX_RANK: usize = 512;
 
-/// U, 3n rows and r columns. Row 3i + c is component c of vertex i; every entry is finite. Copies share the entries.
+/// U with 3n rows and r columns. Row 3i + c is component c of vertex i; every entry is finite. Clones share the
+/// entries.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Modes {
     vertices: usize,
@@ -16,7 +17,7 @@ pub struct Modes {
 }
 
 impl Modes {
-    /// No modes: the domain is rigid.
+    /// No modes, for a rigid domain.
     pub fn rigid() -> Self {
         Self { vertices: 0, rank: 0, columns: Arc::default() }
     }
@@ -24,8 +25,8 @@ impl Modes {
     /// U from its entries in column-major order (Vega's order).
     ///
     /// # Errors
-    /// `Invalid` when rows are not a multiple of three, columns exceed 512, the count differs from rows x columns, or
-    /// an entry is not finite.
+    /// `Invalid` if the number of rows is not a positive multiple of three, there are more than 512 columns, the number
+    /// of entries differs from rows x columns, or an entry is not finite.
     pub fn from_columns(rows: usize, rank: usize, columns: Vec<f32>) -> Result<Self> {
         if !rows.is_multiple_of(3) || rows == 0 {
             return Err(invalid("modes.rows", "a positive multiple of 3", rows));
@@ -49,7 +50,7 @@ impl Modes {
     /// U from its entries in row-major order (NumPy's default order).
     ///
     /// # Errors
-    /// As [`Self::from_columns`].
+    /// As for [`Self::from_columns`].
     pub fn from_rows(rows: usize, rank: usize, entries: &[f32]) -> Result<Self> {
         if rows.checked_mul(rank) != Some(entries.len()) {
             return Err(invalid("modes.entries", format!("{rows} x {rank}"), entries.len()));
@@ -58,12 +59,12 @@ impl Modes {
         Self::from_columns(rows, rank, columns)
     }
 
-    /// r.
+    /// The number r of modes.
     pub const fn rank(&self) -> usize {
         self.rank
     }
 
-    /// n, or 0 when there are no modes.
+    /// The number n of vertices, or 0 if there are no modes.
     pub const fn vertices(&self) -> usize {
         self.vertices
     }
@@ -78,13 +79,13 @@ impl Modes {
         &self.columns[3 * self.vertices * mode..][..3 * self.vertices]
     }
 
-    /// Entry of vertex `vertex`, component `component`, mode `mode`.
+    /// The entry of vertex `vertex`, component `component`, mode `mode`.
     pub fn at(&self, vertex: usize, component: usize, mode: usize) -> f32 {
         self.columns[3 * self.vertices * mode + 3 * vertex + component]
     }
 
-    /// The 3 x r block of U at a point of a triangle, row-major: the rows of three vertices, weighted by barycentric
-    /// coordinates in f64 and rounded once.
+    /// The 3 x r block of U at a point of a triangle, row-major: the rows of the three vertices, weighted by the
+    /// barycentric coordinates `shares` in f64 and rounded once.
     pub fn at_point(&self, vertices: [u32; 3], shares: [f64; 3]) -> Vec<f32> {
         let entry = |component: usize, mode: usize| {
             let of_vertex =
@@ -97,7 +98,7 @@ impl Modes {
             .collect()
     }
 
-    /// The same without modes if every entry is zero.
+    /// Replaces a matrix whose entries are all zero by no modes.
     pub fn without_zero_matrix(self) -> Self {
         if self.columns.iter().all(|entry| *entry == 0.0) { Self::rigid() } else { self }
     }

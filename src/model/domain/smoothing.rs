@@ -1,32 +1,34 @@
-//! Smoothing groups of a mesh, and the triangles around each: what normals of a deformed surface are gathered from.
+//! Smoothing groups of a mesh and the triangles around each group, from which normals of a deformed surface are
+//! computed.
 //!
-//! Corners of one vertex whose rest normals agree within 0.1 degrees form a group: a seam of texture coordinates splits
-//! corners but not groups, a hard edge splits both. The triangles that a group's corners belong to are kept as a ring:
-//! the group's own vertex first, then the vertices around it. Two neighbours in a ring are, in this order, the other
-//! two vertices of one triangle, unless the second of them carries [`RING_START`]. A closed fan of k triangles takes
-//! k + 2 entries instead of the 2 k of a list of pairs, and each vertex is read once where it would be read twice.
+//! Corners of one vertex whose rest normals agree within 0.1 degrees form a group: a texture seam splits corners but
+//! not groups, a hard edge splits both. The triangles adjacent to a group are stored as a ring: the group's own vertex
+//! first, then the vertices around it. Two consecutive vertices of a ring are, in this order, the other two vertices of
+//! one triangle, unless the second has the flag [`RING_START`]. A closed fan of k triangles takes k + 2 entries instead
+//! of the 2 k of a list of pairs, and each vertex is read once instead of twice.
 //!
-//! Memory: 4 bytes per corner, 20 per group (its ring's begin, own vertex and geometric normal), and 4 (k + 1) per group
-//! of k triangles that form one fan; at the most 24 per triangle, when no two of a group share an edge.
+//! Memory: 4 bytes per corner; 20 bytes per group (start of its ring, own vertex and geometric normal); and 4 (k + 1)
+//! bytes per group of k triangles that form one fan, or at most 24 bytes per triangle, if no two triangles of a group
+//! share an edge.
 
 use nalgebra::Vector3;
 
 use super::Mesh;
 
-/// Marks the first vertex of each fan of a ring.
+/// Flag of the first vertex of each fan of a ring.
 pub const RING_START: u32 = 1 << 31;
 
-/// The most triangles of all shapes together whose rings an index of 32 bits can address.
+/// The largest number of triangles, over all shapes, whose rings a 32-bit index can address.
 pub const MAX_RING_TRIANGLES: usize = 1 << 28;
 
-/// Rest normals of a group differ by at most this: the length of the chord of 0.1 degrees.
+/// The largest distance between rest normals of a group: the chord of 0.1 degrees.
 const SAME_NORMAL: f64 = 1.745_329e-3;
 
-/// A group whose area vectors cancel to less than this part of their lengths has no geometric normal: a leaf whose two
-/// sides share corners, for example.
+/// A group whose area vectors cancel to less than this fraction of their total length has no geometric normal, for
+/// example a leaf whose two sides share corners.
 const CANCELLED: f64 = 1.0 / 1024.0;
 
-/// The groups of one mesh.
+/// The smoothing groups of one mesh.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Smoothing {
     members: Vec<u32>,
@@ -35,11 +37,11 @@ pub struct Smoothing {
     normals: Vec<[f32; 3]>,
 }
 
-/// The two other vertices of a triangle around some vertex, in its winding.
+/// The two other vertices of a triangle at some vertex, in winding order.
 type Pair = (u32, u32);
 
 impl Smoothing {
-    /// The groups of a mesh with at most [`MAX_RING_TRIANGLES`] triangles. O(c log c) for c corners.
+    /// Computes the groups of a mesh with at most [`MAX_RING_TRIANGLES`] triangles, in O(c log c) for c corners.
     pub(super) fn of(mesh: &Mesh) -> Self {
         let members = number(&leaders(mesh));
         let groups = members.iter().max().map_or(0, |last| *last as usize + 1);
@@ -70,34 +72,34 @@ impl Smoothing {
         &self.members
     }
 
-    /// Where each group's ring begins in [`Self::rings`], and one more: where the last ends.
+    /// Start of each group's ring in [`Self::rings`], and the end of the last one.
     pub fn begins(&self) -> &[u32] {
         &self.begins
     }
 
-    /// All rings, one behind the other.
+    /// All rings, concatenated.
     pub fn rings(&self) -> &[u32] {
         &self.rings
     }
 
-    /// The ring of one group: its vertex, then fans of vertices around it.
+    /// The ring of one group: its vertex, then the fans of vertices around it.
     pub fn ring(&self, group: usize) -> &[u32] {
         &self.rings[self.begins[group] as usize..self.begins[group + 1] as usize]
     }
 
-    /// Per group: the unit normal at rest that its triangles have by their windings, weighted by area; zeros where
-    /// they have none (no triangle, no area, or areas that cancel).
+    /// Per group, the area-weighted unit normal of its triangles at rest, oriented by their winding. Zero if it is
+    /// undefined: no triangles, no area, or areas that cancel.
     pub fn normals(&self) -> &[[f32; 3]] {
         &self.normals
     }
 
-    /// Host bytes of all lists.
+    /// Host memory of all lists in bytes.
     pub fn bytes(&self) -> u64 {
         (4 * (self.members.len() + self.begins.len() + self.rings.len()) + 12 * self.normals.len()) as u64
     }
 }
 
-/// For each corner the corner that stands for its group.
+/// For each corner, the corner that represents its group.
 fn leaders(mesh: &Mesh) -> Vec<u32> {
     let corners = mesh.corners();
     let vertex = |corner: u32| corners.vertices[corner as usize];
@@ -107,7 +109,7 @@ fn leaders(mesh: &Mesh) -> Vec<u32> {
         axes.fold(std::cmp::Ordering::Equal, std::cmp::Ordering::then)
     };
     let mut order: Vec<u32> = (0..corners.vertices.len() as u32).collect();
-    // In this order the groups do not depend on the order of corners in a file.
+    // This order makes the groups independent of the order of corners in a file.
     order.sort_unstable_by(|a, b| vertex(*a).cmp(&vertex(*b)).then(by_normal(*a, *b)).then(a.cmp(b)));
     let mut leader_of = vec![0; order.len()];
     let mut leaders: Vec<u32> = Vec::new();
@@ -115,7 +117,7 @@ fn leaders(mesh: &Mesh) -> Vec<u32> {
         if leaders.last().is_some_and(|leader| vertex(*leader) != vertex(corner)) {
             leaders.clear();
         }
-        // Leaders ascend in x, so only those of a narrow band need a look, however many corners a vertex has.
+        // Leaders ascend in x, so only a narrow band must be searched, however many corners a vertex has.
         let mut band =
             leaders.iter().rev().take_while(|leader| apart(normal(corner), normal(**leader), 1) <= SAME_NORMAL);
         let found = band.find(|leader| apart(normal(corner), normal(**leader), 3) <= SAME_NORMAL).copied();
@@ -127,12 +129,12 @@ fn leaders(mesh: &Mesh) -> Vec<u32> {
     leader_of
 }
 
-/// The distance of two points in their first axes.
+/// The distance of two points within their first `axes` coordinates.
 fn apart(a: [f32; 3], b: [f32; 3], axes: usize) -> f64 {
     (0..axes).map(|axis| (f64::from(a[axis]) - f64::from(b[axis])).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Leaders to group numbers, in the order of the groups' first corners.
+/// Maps leaders to group numbers, in the order of the groups' first corners.
 fn number(leader_of: &[u32]) -> Vec<u32> {
     const NEW: u32 = u32::MAX;
     let mut numbers = vec![NEW; leader_of.len()];
@@ -148,8 +150,8 @@ fn number(leader_of: &[u32]) -> Vec<u32> {
     leader_of.iter().map(group).collect()
 }
 
-/// The pairs around each group, and where each group's begin. A triangle that names a vertex twice has no area whatever
-/// the positions and is left out.
+/// The pairs around each group, and the start of each group's pairs. A triangle that contains a vertex twice never has
+/// any area and is omitted.
 fn pairs_of_groups(mesh: &Mesh, members: &[u32], groups: usize) -> (Vec<usize>, Vec<Pair>) {
     let spokes = || {
         mesh.triangles().iter().flat_map(|triangle| {
@@ -185,16 +187,16 @@ fn geometric_normal(mesh: &Mesh, own: u32, pairs: &[Pair]) -> [f32; 3] {
     sum.try_normalize(0.0).filter(|_| resolved).map_or([0.0; 3], |unit| unit.cast::<f32>().into())
 }
 
-/// Puts pairs behind each other where one ends as the next begins. Keeps its memory from group to group.
+/// Chains pairs where the end of one is the beginning of the next. Reuses its buffers for all groups.
 #[derive(Default)]
 struct Chain {
-    /// At the first pair of each beginning: how many pairs with it are in a ring already.
+    /// At the first pair of each beginning vertex: the number of pairs with this beginning that are in a ring already.
     taken: Vec<usize>,
     ends: Vec<u32>,
 }
 
 impl Chain {
-    /// Appends the fans of a group: first those with a free border, from it, then the closed ones, each in the order of
+    /// Appends the fans of a group: first open fans, starting at their border, then closed ones, each in the order of
     /// vertex indices. O(k log k) for k pairs.
     fn add(&mut self, pairs: &mut [Pair], ring: &mut Vec<u32>) {
         pairs.sort_unstable();
@@ -221,7 +223,7 @@ impl Chain {
         }
     }
 
-    /// The end of a pair that begins so and was not taken yet.
+    /// Takes an unused pair that begins at `from` and returns its end.
     fn take(&mut self, pairs: &[Pair], from: u32) -> Option<u32> {
         let first = pairs.partition_point(|pair| pair.0 < from);
         let taken = self.taken.get_mut(first)?;
@@ -236,7 +238,7 @@ mod tests {
     use super::super::Corners;
     use super::*;
 
-    /// The pairs that a ring stands for, sorted.
+    /// The pairs that a ring encodes, sorted.
     fn unrolled(ring: &[u32]) -> Vec<Pair> {
         let steps = ring[1..].windows(2).filter(|step| step[1] & RING_START == 0);
         let mut pairs: Vec<Pair> = steps.map(|step| (step[0] & !RING_START, step[1])).collect();
@@ -244,7 +246,7 @@ mod tests {
         pairs
     }
 
-    /// A mesh of given corners (vertex, normal) and triangles over scattered positions.
+    /// A mesh with the given corners (vertex, normal) and triangles over scattered positions.
     fn mesh(corners: &[(u32, [f32; 3])], triangles: Vec<[u32; 3]>) -> Mesh {
         let rest = (0..60_u32).map(|at| [at as f32, (at * at % 17) as f32, (at * 5 % 7) as f32]).collect();
         let (vertices, normals) = corners.iter().copied().unzip();

@@ -1,13 +1,14 @@
-//! Tangents of a mesh at rest after E. Lengyel, "Mathematics for 3D Game Programming and Computer Graphics".
+//! Tangents of a mesh at rest, after E. Lengyel, "Mathematics for 3D Game Programming and Computer Graphics".
 
 use nalgebra::Vector3;
 
 use super::Mesh;
 
-/// Per corner: unit tangent orthogonal to the normal, and the sign of the bitangent.
+/// Per corner, the unit tangent, orthogonal to the normal, and the sign of the bitangent.
 ///
-/// Each triangle adds its uv gradients to its three corners; the sum is orthogonalised against the normal. A corner
-/// without a usable gradient (no uv, zero area) gets any unit vector orthogonal to its normal and a positive sign.
+/// Each triangle adds its uv gradients to its three corners; the sum is orthogonalized against the normal. A corner
+/// without a usable gradient (no uv, zero area) gets an arbitrary unit vector orthogonal to its normal and a positive
+/// sign.
 pub(super) fn lengyel(mesh: &Mesh) -> Vec<[f32; 4]> {
     let corners = mesh.corners();
     let mut along_u = vec![Vector3::<f64>::zeros(); corners.vertices.len()];
@@ -28,14 +29,14 @@ pub(super) fn lengyel(mesh: &Mesh) -> Vec<[f32; 4]> {
     corners.normals.iter().zip(&along_u).zip(&along_v).map(frame).collect()
 }
 
-/// Derivatives of the position along u and along v (v counted upwards, as normal maps do) over one triangle.
+/// Derivatives of the position along u and along v over one triangle. v points up here, as in normal maps.
 fn gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector3<f64>)> {
     let corners = mesh.corners();
     let position = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let uv = |corner: u32| corners.uvs[corner as usize].map(f64::from);
     let [a, b, c] = triangle;
     let (edge1, edge2) = (position(b) - position(a), position(c) - position(a));
-    // Our v counts downwards from the top of the image; the tangent frame of a normal map has it upwards.
+    // Corners store v downwards from the top of the image; the tangent frame of a normal map has v upwards.
     let (s1, t1) = (uv(b)[0] - uv(a)[0], uv(a)[1] - uv(b)[1]);
     let (s2, t2) = (uv(c)[0] - uv(a)[0], uv(a)[1] - uv(c)[1]);
     let area = s1 * t2 - s2 * t1;

@@ -2,7 +2,7 @@
 
 use crate::error::{Result, invalid};
 
-/// The largest width or height of a texture, in pixels.
+/// The largest width or height of a texture in pixels.
 pub(super) const MAX_SIDE: u32 = 8192;
 
 /// An image of `width` x `height` RGBA8 pixels, top row first.
@@ -15,10 +15,10 @@ pub struct Texture {
 }
 
 impl Texture {
-    /// An image from its pixels.
+    /// A texture from its pixels.
     ///
     /// # Errors
-    /// `Invalid` when a side is 0 or above 8192, or the pixels do not fill it.
+    /// `Invalid` if a side is 0 or above 8192, or the number of bytes is not 4 x width x height.
     pub fn new(name: impl Into<String>, width: u32, height: u32, rgba: Vec<u8>) -> Result<Self> {
         let name = name.into();
         if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
@@ -34,7 +34,7 @@ impl Texture {
     /// Decodes PNG or JPEG bytes.
     ///
     /// # Errors
-    /// `Invalid` when the bytes are no such image, or the image is over the limits.
+    /// `Invalid` if the bytes are not such an image, or the image exceeds the limits.
     pub fn decode(name: impl Into<String>, bytes: &[u8]) -> Result<Self> {
         let name = name.into();
         let refuse = |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
@@ -64,7 +64,7 @@ impl Texture {
         &self.rgba
     }
 
-    /// Whether a pixel is less than opaque.
+    /// Whether any pixel is not opaque.
     pub fn has_alpha(&self) -> bool {
         self.rgba.chunks_exact(4).any(|pixel| pixel[3] < 255)
     }

@@ -1,10 +1,10 @@
-//! Affine transforms between frames, 3x4 row-major, named by their ends: `world_from_domain`.
+//! Affine transforms between frames, 3x4 row-major. Names state target and source: `world_from_domain`.
 
 use nalgebra::{Matrix3, Matrix4, Vector3};
 
 use crate::error::{Result, invalid};
 
-/// A 3x4 row-major affine transform; the left 3x3 block is the linear part A, the last column the translation.
+/// A 3x4 row-major affine transform. The left 3x3 block is the linear part A, the last column the translation.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Transform(pub [f32; 12]);
@@ -21,10 +21,10 @@ impl Default for Transform {
 impl Transform {
     pub const IDENTITY: Self = Self([1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
 
-    /// The twelve numbers, refused when one is not finite.
+    /// A transform from its twelve entries.
     ///
     /// # Errors
-    /// `Invalid` naming the entry.
+    /// `Invalid` with the entry that is not finite.
     pub fn new(entries: [f32; 12]) -> Result<Self> {
         match entries.iter().position(|entry| !entry.is_finite()) {
             None => Ok(Self(entries)),
@@ -32,7 +32,7 @@ impl Transform {
         }
     }
 
-    /// Rounds a transform computed in f64.
+    /// Rounds a transform from f64.
     pub fn from_parts(linear: &Matrix3<f64>, translation: &Vector3<f64>) -> Self {
         let mut entries = [0.0; 12];
         for row in 0..3 {
@@ -44,12 +44,12 @@ impl Transform {
         Self(entries)
     }
 
-    /// The upper three rows of a homogeneous matrix.
+    /// Rounds the upper three rows of a homogeneous matrix.
     pub fn from_matrix(matrix: &Matrix4<f64>) -> Self {
         Self::from_parts(&matrix.fixed_view::<3, 3>(0, 0).into_owned(), &matrix.fixed_view::<3, 1>(0, 3).into_owned())
     }
 
-    /// The same as a homogeneous 4x4 matrix.
+    /// Converts to a homogeneous 4x4 matrix.
     pub fn to_matrix(self) -> Matrix4<f64> {
         let mut matrix = Matrix4::identity();
         for row in 0..3 {
@@ -75,12 +75,13 @@ impl Transform {
         Self::from_matrix(&(self.to_matrix() * b_from_c.to_matrix()))
     }
 
-    /// The inverse, or `None` when the linear part is singular.
+    /// The inverse, or `None` if the linear part is singular.
     pub fn inverse(self) -> Option<Self> {
         self.to_matrix().try_inverse().map(|matrix| Self::from_matrix(&matrix))
     }
 
-    /// Whether A is a rotation or reflection times one scale, within `1e-4`: then normals turn like positions do.
+    /// Whether A is a rotation or reflection times a uniform scale, within `1e-4`. Normals then transform like
+    /// directions.
     pub fn is_similarity(self) -> bool {
         let linear = self.linear();
         let gram = linear.transpose() * linear;

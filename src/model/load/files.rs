@@ -1,4 +1,4 @@
-//! Relative paths to bytes: where a loader may read, and how much.
+//! File access of the loaders: which paths they may read, and how many bytes.
 
 use std::fs::File;
 use std::io::Read;
@@ -6,25 +6,25 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::error::{Result, invalid};
 
-/// The most bytes of a file that holds a mesh or a matrix.
+/// The largest mesh or matrix file in bytes.
 pub(super) const MODEL_BYTES: u64 = 2 << 30;
-/// The most bytes of an image.
+/// The largest image file in bytes.
 pub(super) const IMAGE_BYTES: u64 = 256 << 20;
-/// The most bytes of a description in text.
+/// The largest text description in bytes.
 pub(super) const TEXT_BYTES: u64 = 64 << 20;
 
-/// The most entries of a folder that are looked at.
+/// The largest number of directory entries that are read.
 const MOST_ENTRIES: usize = 10_000;
 
-/// A folder whose files a loader may read. With `confine` every path must stay inside that root, symbolic links
-/// resolved; without, paths are taken as they are.
+/// A folder whose files a loader may read. With `confine`, every path must stay inside that root after symbolic links
+/// are resolved. Without, any path is allowed.
 #[derive(Debug, Clone)]
 pub(super) struct Files {
     base: PathBuf,
     confine: Option<PathBuf>,
 }
 
-/// A resolved path that is there.
+/// The kind of an existing path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     File,
@@ -32,40 +32,40 @@ pub(super) enum Kind {
 }
 
 impl Files {
-    /// Paths relative to `base`, and absolute ones, without a bound.
+    /// Allows paths relative to `base` and absolute ones, without confinement.
     pub(super) fn anywhere(base: &Path) -> Self {
         Self { base: base.to_path_buf(), confine: None }
     }
 
-    /// Paths relative to `root` that stay inside it. `root` is canonical.
+    /// Allows only paths relative to `root` that stay inside it. `root` must be canonical.
     pub(super) fn confined(root: &Path) -> Self {
         Self { base: root.to_path_buf(), confine: Some(root.to_path_buf()) }
     }
 
-    /// The same bound around the sub-folder `relative`.
+    /// The folder `relative`, with the same confinement.
     ///
     /// # Errors
-    /// As [`Self::resolve`].
+    /// As for [`Self::resolve`].
     pub(super) fn within(&self, relative: &str) -> Result<Self> {
         Ok(Self { base: self.resolve(relative)?, confine: self.confine.clone() })
     }
 
-    /// The last part of the path of `relative`, links resolved; `scene` when it has none.
+    /// The last component of the resolved path, or `scene` if there is none.
     pub(super) fn own_name(&self, relative: &str) -> String {
         let path = self.resolve(relative).ok();
         let name = path.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
         name.unwrap_or("scene").to_owned()
     }
 
-    /// The bytes of a regular file of at most `limit` bytes.
+    /// Reads a regular file of at most `limit` bytes.
     ///
     /// # Errors
-    /// `Invalid` naming the path as it was given, never the place on disk: outside the root, not there, no regular
-    /// file, over the limit or unreadable.
+    /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable.
+    /// The error names the path as it was given, never the resolved path.
     pub(super) fn read(&self, relative: &str, limit: u64) -> Result<Vec<u8>> {
         let path = self.resolve(relative)?;
         let refuse = |given: &dyn std::fmt::Display| invalid(field(relative), "a readable file", given);
-        // A pipe or device would block or never end, so its kind is looked at before it is opened.
+        // Check the type before opening, because opening a pipe or a device may block, and reading it may never end.
         let about = path.metadata().map_err(|error| refuse(&error.kind()))?;
         if !about.is_file() {
             return Err(refuse(&"something that is no regular file"));
@@ -77,14 +77,14 @@ impl Files {
         let mut bytes = Vec::new();
         let file = File::open(&path).map_err(|error| refuse(&error.kind()))?;
         file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| refuse(&error.kind()))?;
-        // It may have grown since its size was read.
+        // The file may have grown after its size was read.
         if bytes.len() as u64 > limit {
             return Err(too_large(bytes.len() as u64));
         }
         Ok(bytes)
     }
 
-    /// What lies at `relative`, or `None` when nothing does.
+    /// The kind of the path, or `None` if it does not exist.
     ///
     /// # Errors
     /// `Invalid` for a path that leaves the root.
@@ -101,7 +101,7 @@ impl Files {
         })
     }
 
-    /// Names and kinds of what lies directly in the folder, sorted; of a huge folder the first ten thousand.
+    /// Names and kinds of the folder's direct entries, sorted. Reads at most [`MOST_ENTRIES`] entries.
     pub(super) fn entries(&self) -> Vec<(String, Kind)> {
         let Ok(listing) = std::fs::read_dir(&self.base) else { return Vec::new() };
         let names = listing.take(MOST_ENTRIES).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
@@ -114,7 +114,7 @@ impl Files {
     /// The canonical path of `relative`.
     ///
     /// # Errors
-    /// `Invalid` when it leaves the root or nothing is there.
+    /// `Invalid` if the path leaves the root or does not exist.
     pub(super) fn resolve(&self, relative: &str) -> Result<PathBuf> {
         let path = self.join(relative)?;
         let missing = |error: std::io::Error| invalid(field(relative), "a file that is there", error.kind());
@@ -125,7 +125,7 @@ impl Files {
         }
     }
 
-    /// Joins by the letters of the path alone, so that a refusal tells nothing about what is outside.
+    /// Joins the path lexically, so that an error reveals nothing about files outside the root.
     fn join(&self, relative: &str) -> Result<PathBuf> {
         if relative.is_empty() || relative.contains('\0') {
             return Err(invalid(field(relative), "a path", format!("{relative:?}")));
@@ -149,7 +149,7 @@ impl Files {
     }
 }
 
-/// The folder of a relative path; `.` when it has none.
+/// The folder of a relative path; `.` if it has none.
 pub(super) fn parent_of(path: &str) -> &str {
     match path.rsplit_once('/') {
         Some(("", _)) => "/",
@@ -158,7 +158,7 @@ pub(super) fn parent_of(path: &str) -> &str {
     }
 }
 
-/// The last part of a relative path.
+/// The last component of a relative path.
 pub(super) fn name_of(path: &str) -> &str {
     path.rsplit_once('/').map_or(path, |(_, name)| name)
 }

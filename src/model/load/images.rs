@@ -1,4 +1,4 @@
-//! Image files to the textures of a scene, each file once.
+//! Cache of a scene's image files, each decoded once.
 
 use std::collections::HashMap;
 
@@ -14,18 +14,18 @@ pub(super) struct Images {
 }
 
 impl Images {
-    /// Index of the texture in `path`, read at the first call.
+    /// The index of the texture in `path`, which is decoded on the first call.
     ///
     /// # Errors
-    /// `Invalid` when the file is not there or no PNG or JPEG image.
+    /// `Invalid` if the file does not exist or is not a PNG or JPEG image.
     pub(super) fn load(&mut self, files: &Files, path: &str) -> Result<usize> {
         self.made(path, || decode(files, path))
     }
 
-    /// Index of the texture called `name`, made at the first call.
+    /// The index of the texture called `name`, which `make` creates on the first call.
     ///
     /// # Errors
-    /// As `make`.
+    /// Those of `make`.
     pub(super) fn made(&mut self, name: &str, make: impl FnOnce() -> Result<Texture>) -> Result<usize> {
         if let Some(index) = self.by_name.get(name) {
             return Ok(*index);
@@ -35,21 +35,21 @@ impl Images {
         Ok(self.list.len() - 1)
     }
 
-    /// The textures so far.
+    /// The textures loaded so far.
     pub(super) fn list(&self) -> &[Texture] {
         &self.list
     }
 
-    /// All textures.
+    /// Converts to the list of all textures.
     pub(super) fn into_list(self) -> Vec<Texture> {
         self.list
     }
 }
 
-/// The image in `path`.
+/// Decodes the image in `path`.
 ///
 /// # Errors
-/// As [`Images::load`].
+/// As for [`Images::load`].
 pub(super) fn decode(files: &Files, path: &str) -> Result<Texture> {
     Texture::decode(path, &files.read(path, IMAGE_BYTES)?)
 }

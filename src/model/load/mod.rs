@@ -1,15 +1,16 @@
-//! Files to scenes.
+//! Loaders: from files to scenes.
 //!
-//! # What a scene is called
-//! A built-in name (`tree`); a folder with `scene.toml` (its keys stand in `manifest`); a `.glb`, `.gltf` or `.obj` file;
-//! or a folder with one such file. Several are refused, with their names. Beside an OBJ file its modes are found by their
-//! names (`modes::beside`), and a plant's structure makes a plant of it.
+//! # Scene names
+//! A scene is a built-in name (`tree`), a folder with `scene.toml` (its keys are documented in `manifest`), a `.glb`,
+//! `.gltf` or `.obj` file, or a folder with exactly one such file. A folder with several is rejected with an error that
+//! lists them. The modes of an OBJ file are found by their file names next to it (`modes::beside`), and an OBJ file
+//! with a plant's structure next to it is loaded as a plant.
 //!
 //! # Conventions
-//! - Rows of U follow the `v` lines of an OBJ file, unreferenced and coincident ones included.
-//! - Texture coordinates have (0, 0) at the top left of the image; OBJ's v is turned over.
-//! - Colours in files are linear factors; images of colour are sRGB, normal maps are linear with +Y up.
-//! - OBJ and glTF have Y up unless `scene.toml` says otherwise; plants have Z up. Units are metres unless it says otherwise.
+//! - Rows of U follow the `v` lines of an OBJ file, including unreferenced and coincident vertices.
+//! - Texture coordinates have (0, 0) at the top left of the image; OBJ's v is flipped.
+//! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
+//! - OBJ and glTF have Y up and plants Z up, and units are meters, unless `scene.toml` says otherwise.
 
 mod files;
 mod gltf;
@@ -34,10 +35,10 @@ use crate::error::Result;
 use crate::scene::Scene;
 
 /// Opens `SCENE` of the command line: a built-in name, a folder with `scene.toml`, a `.glb`, `.gltf` or `.obj` file, or
-/// a folder with one recognisable model. Paths are taken as they are.
+/// a folder with exactly one recognized model. Paths are not confined to a root.
 ///
 /// # Errors
-/// `NotFound` when nothing of that name is there; `Invalid` naming file, field, expected and given otherwise.
+/// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub fn open(source: &str) -> Result<Arc<Scene>> {
     Scene::new(source::read(&files::Files::anywhere(Path::new(".")), source)?)
 }

@@ -1,4 +1,4 @@
-//! Promises about the real inputs: what the loaders make of files that others wrote.
+//! Tests of the loaders with real input files from other tools.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ fn open(path: &str) -> Arc<Scene> {
     super::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}"))
 }
 
-/// A folder with a scene.toml, opened.
+/// Opens a folder that contains this scene.toml.
 fn manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::write(folder.path().join("scene.toml"), text).expect("written");
@@ -36,7 +36,7 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
     assert_eq!((slot.vertices, slot.corners, slot.triangles, slot.rank), (16085, 61612, 32014, 20));
     assert_eq!(fixed_rows(&scene), 59);
     assert_eq!(scene.domains.len(), 1);
-    // The wrong numbering, by first use, would differ in nearly every row.
+    // Numbering by first use, which would be wrong, would differ in nearly every row.
     let mut seen = vec![false; slot.vertices];
     let corners = &scene.shapes[0].mesh.corners().vertices;
     let by_first_use: Vec<u32> =
@@ -139,7 +139,7 @@ fn real_plants_lie_where_their_file_says_and_petioles_reach_their_leaves() {
             assert!((bounds.min[axis] - scene.rest_bounds.min[axis]).abs() < 1e-6, "{name}");
             assert!((bounds.max[axis] - scene.rest_bounds.max[axis]).abs() < 1e-6, "{name}");
         }
-        // A petiole that joined another leaf would lie far from the frame of its domain.
+        // A petiole that was assigned to another leaf would lie far from the frame of its domain.
         let reach = if name == "almond" { 0.2 } else { 0.4 };
         for (index, domain) in scene.domains.iter().enumerate().filter(|(_, domain)| domain.name.starts_with("leaf ")) {
             let far = |rest: &[f32; 3]| nalgebra::Vector3::from(*rest).norm();

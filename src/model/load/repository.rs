@@ -1,4 +1,4 @@
-//! The server's folder of scenes: names to scenes, and the list of names.
+//! The server's folder of scenes: opens scenes by name and lists their names.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -8,22 +8,22 @@ use super::{manifest, source};
 use crate::error::{Error, Result};
 use crate::scene::Scene;
 
-/// How deep below the root scenes are listed; deeper ones can be opened by their path.
+/// Depth of folders, below the root, up to which scenes are listed. Deeper scenes can still be opened by their path.
 const DEPTH: usize = 4;
-/// The most names of a list.
+/// The largest number of listed names.
 const MOST: usize = 4096;
 
-/// The server's folder of scenes; every path stays inside it, symbolic links resolved.
+/// The server's folder of scenes. Every path stays inside it, after symbolic links are resolved.
 #[derive(Debug, Clone)]
 pub struct Repository {
     root: Option<PathBuf>,
 }
 
 impl Repository {
-    /// A repository of the built-in scenes and of what lies in `root`.
+    /// A repository with the built-in scenes and those in `root`.
     ///
     /// # Errors
-    /// `Unavailable` when the folder is not there.
+    /// `Unavailable` if the folder does not exist.
     pub fn new(root: Option<&Path>) -> Result<Self> {
         let Some(root) = root else { return Ok(Self { root: None }) };
         let unavailable = |reason: String| Error::Unavailable {
@@ -38,10 +38,10 @@ impl Repository {
         Ok(Self { root: Some(canonical) })
     }
 
-    /// Opens a built-in name or a path inside the repository; `.` is the repository's folder itself.
+    /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder.
     ///
     /// # Errors
-    /// As [`super::open`], and `Invalid` for a path that leaves the repository.
+    /// As for [`super::open`], and `Invalid` for a path that leaves the repository.
     pub fn open(&self, source: &str) -> Result<Arc<Scene>> {
         match &self.root {
             Some(root) => Scene::new(source::read(&Files::confined(root), source)?),
@@ -50,7 +50,8 @@ impl Repository {
         }
     }
 
-    /// Names that [`Self::open`] takes, sorted: built-in ones, then folders and model files down to a small depth.
+    /// Names that [`Self::open`] accepts: built-in scenes, then folders and model files down to a limited depth,
+    /// sorted.
     pub fn list(&self) -> Vec<String> {
         let mut names: Vec<String> = source::BUILT_IN.map(str::to_owned).to_vec();
         if let Some(root) = &self.root {
@@ -70,7 +71,7 @@ fn collect(folder: &Files, prefix: &str, depth: usize, found: &mut Vec<String>) 
         found.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
     }
     for (name, kind) in entries {
-        // Names with a dot in front are not for readers: uploads on their way, version control.
+        // Skip hidden entries: uploads in progress, version control.
         if found.len() >= MOST || name.starts_with('.') {
             continue;
         }

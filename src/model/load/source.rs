@@ -1,4 +1,4 @@
-//! The grammar of SCENE: a built-in name, a folder with `scene.toml`, a model file, or a folder with one model.
+//! Resolves a SCENE argument: a built-in name, a folder with `scene.toml`, a model file, or a folder with one model.
 
 use super::files::{Files, Kind, name_of, parent_of};
 use super::obj::Source;
@@ -6,10 +6,10 @@ use super::{gltf, manifest, obj, plant};
 use crate::error::{Error, Result, invalid};
 use crate::scene::Parts;
 
-/// Names of scenes that are made in code. A folder of such a name is reached as `./NAME`.
+/// Names of procedural scenes. A folder with such a name can be opened as `./NAME`.
 pub(super) const BUILT_IN: [&str; 1] = ["tree"];
 
-/// A model that lies in a folder, by the name of its main file, or of its stem for a plant.
+/// A model in a folder, by the name of its main file or, for a plant, its stem.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Model {
     Gltf(String),
@@ -18,10 +18,10 @@ pub(super) enum Model {
     Plant(String),
 }
 
-/// The parts of any SCENE.
+/// The parts of any scene.
 ///
 /// # Errors
-/// `NotFound` when nothing of that name is there; `Invalid` naming file, field, expected and given otherwise.
+/// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn read(files: &Files, source: &str) -> Result<Parts> {
     if BUILT_IN.contains(&source) {
         return crate::tree::grow(&crate::tree::Recipe::default());
@@ -43,10 +43,10 @@ pub(super) fn read(files: &Files, source: &str) -> Result<Parts> {
     }
 }
 
-/// The parts of one model: a file, or a folder with one recognisable model.
+/// The parts of one model: a file, or a folder with exactly one recognized model.
 ///
 /// # Errors
-/// `Invalid` naming file, field, expected and given.
+/// `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn model(files: &Files, path: &str, modes: Source) -> Result<Parts> {
     match files.kind(path)? {
         Some(Kind::Folder) => {
@@ -74,7 +74,7 @@ fn read_model(folder: &Files, model: &Model, modes: Source) -> Result<Parts> {
     }
 }
 
-/// The model of which this is the main file, told by its name.
+/// The model whose main file has this name, by its extension.
 pub(super) fn recognised(name: &str) -> Option<Model> {
     match name.rsplit_once('.')?.1.to_ascii_lowercase().as_str() {
         "glb" | "gltf" => Some(Model::Gltf(name.into())),
@@ -83,13 +83,13 @@ pub(super) fn recognised(name: &str) -> Option<Model> {
     }
 }
 
-/// All models of a folder.
+/// All models in a folder.
 pub(super) fn models(folder: &Files) -> Vec<Model> {
     let names = names_of(folder);
     names.iter().filter_map(|name| recognised(name)).map(|model| in_company(model, &names)).collect()
 }
 
-/// An OBJ file is a plant when the structure of one lies beside it.
+/// Turns an OBJ file into a plant if the files of a plant's structure are next to it.
 fn in_company(model: Model, names: &[String]) -> Model {
     let stem = match &model {
         Model::Obj(name) => name.strip_suffix(".obj"),
@@ -102,7 +102,7 @@ fn in_company(model: Model, names: &[String]) -> Model {
     stem.filter(is_plant).map(|stem| Model::Plant(stem.into())).unwrap_or(model)
 }
 
-/// Names of the files of a folder.
+/// Names of the files in a folder.
 fn names_of(folder: &Files) -> Vec<String> {
     folder.entries().into_iter().filter(|(_, kind)| *kind == Kind::File).map(|(name, _)| name).collect()
 }

@@ -1,17 +1,18 @@
-//! What Vega keeps beside a model (`NAME.config`, `NAME.cub`) to notes that are handed on to physics processes.
+//! Converts Vega's files next to a model (`NAME.config`, `NAME.cub`) to notes for simulations.
 
 use std::collections::BTreeMap;
 
 use super::files::{Files, Kind, TEXT_BYTES};
 use crate::error::{Result, invalid};
 
-/// Entries of a configuration that describe the dynamics; each is a number.
+/// Numeric entries of a configuration that describe the dynamics.
 const KEYS: [&str; 4] = ["baseFrequency", "deformableObjectCompliance", "dampingMassCoef", "dampingStiffnessCoef"];
 
-/// Notes on the OBJ file `name`: `vega.baseFrequency` and the like, and `vega.cubic`, the name of the file of cubic forces.
+/// Notes on the OBJ file `name`: entries such as `vega.baseFrequency`, and `vega.cubic`, the name of the file with the
+/// cubic force polynomials.
 ///
 /// # Errors
-/// `Invalid` naming file and entry when one of them is no number.
+/// `Invalid` with the file and the entry that is not a finite number.
 pub(super) fn notes(files: &Files, name: &str) -> Result<BTreeMap<String, String>> {
     let stem = name.strip_suffix(".obj").unwrap_or(name);
     let mut notes = BTreeMap::new();
@@ -35,7 +36,7 @@ pub(super) fn notes(files: &Files, name: &str) -> Result<BTreeMap<String, String
     Ok(notes)
 }
 
-/// A line `*key`, then a line with its value.
+/// Pairs of a line `*key` and the line after it, which is its value.
 fn entries(text: &str) -> impl Iterator<Item = (&str, &str)> {
     let lines: Vec<&str> =
         text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#')).collect();

@@ -1,11 +1,11 @@
-//! Cameras and bounds, in f64 until the last matrix.
+//! Cameras and bounding boxes. All computations are in f64; matrices are rounded to f32 last, by their users.
 
 use nalgebra::{Matrix3x4, Matrix4, Point3, Vector3};
 
 use super::{Rectangle, Scene};
 use crate::error::{Result, invalid};
 
-/// An axis-aligned box in scene units; empty when `min > max`.
+/// An axis-aligned bounding box in scene units. Empty if `min > max`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
     pub min: [f64; 3],
@@ -15,7 +15,7 @@ pub struct Bounds {
 impl Bounds {
     pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
 
-    /// The smallest bounds of packed positions, three numbers each.
+    /// The bounding box of packed positions, three numbers each.
     pub fn of(positions: &[f32]) -> Self {
         let mut bounds = Self::EMPTY;
         let points = positions.chunks_exact(3);
@@ -23,12 +23,12 @@ impl Bounds {
         bounds
     }
 
-    /// Grows to hold a point. A NaN stays, so that nobody mistakes the bounds for finite ones.
+    /// Extends the box to contain a point. NaN coordinates propagate, so that the bounds do not appear finite.
     pub fn include(&mut self, point: [f64; 3]) {
         *self = self.union(Self { min: point, max: point });
     }
 
-    /// The smallest bounds that hold both; NaN in either stays NaN.
+    /// The smallest box that contains both. NaN in either propagates.
     pub fn union(self, other: Self) -> Self {
         let pick = |a: f64, b: f64, least: bool| match (a.is_nan() || b.is_nan(), least) {
             (true, _) => f64::NAN,
@@ -49,7 +49,7 @@ impl Bounds {
         nalgebra::center(&Point3::from(self.min), &Point3::from(self.max))
     }
 
-    /// Length of the diagonal: the yardstick of every error in this project.
+    /// Length of the diagonal, the reference length of relative errors in this project.
     pub fn diagonal(&self) -> f64 {
         (Point3::from(self.max) - Point3::from(self.min)).norm()
     }
@@ -66,7 +66,7 @@ impl Bounds {
     }
 }
 
-/// Where the camera is.
+/// The camera's pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum View {
     LookAt {
@@ -74,11 +74,11 @@ pub enum View {
         target: [f64; 3],
         up: [f64; 3],
     },
-    /// `world_from_camera`, 3x4 row-major, OpenGL's axes: x right, y up, looking along -z.
+    /// `world_from_camera`, 3x4 row-major, with OpenGL's camera axes: x right, y up, looking along -z.
     Pose([f64; 12]),
 }
 
-/// How the camera projects.
+/// The camera's projection.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lens {
     /// Vertical field of view in degrees.
@@ -87,10 +87,10 @@ pub enum Lens {
     Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
 }
 
-/// The part of the image's half that a framed scene may take.
+/// The fraction of the half image that a framed scene may fill.
 const MARGIN: f64 = 0.94;
 
-/// A camera. Near and far are distances in scene units; both 0 means: fit them to the scene.
+/// A camera. `near` and `far` are distances in scene units; if both are 0, they are fitted to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     pub view: View,
@@ -100,8 +100,8 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A camera that frames the rest bounds of a scene from the front, a little above and aside, in an image of this
-    /// size: the bounds fill it but for a margin.
+    /// A camera that views the scene's rest bounds from the front, slightly from above and from the side. The bounds
+    /// fill an image of this size up to a margin.
     pub fn framing(scene: &Scene, width: u32, height: u32) -> Self {
         let up = scene.up.vector();
         let aside = scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
@@ -110,7 +110,7 @@ impl Camera {
         let aspect = f64::from(width.max(1)) / f64::from(height.max(1));
         let right = up.cross(&aside).normalize();
         let above = aside.cross(&right);
-        // A corner that is nearer by `depth` must stay inside the image's cone, so it needs that much more distance.
+        // A corner that is nearer by `depth` must stay inside the view frustum, so it requires that much more distance.
         let distance = |corner: &Point3<f64>| {
             let offset = corner - bounds.centre();
             let wide = offset.dot(&right).abs() / (slope * aspect);
@@ -123,10 +123,10 @@ impl Camera {
         Self { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
     }
 
-    /// The camera itself if all of its numbers make sense.
+    /// Validates all fields.
     ///
     /// # Errors
-    /// `Invalid` naming the field.
+    /// `Invalid` with the field.
     pub fn checked(self) -> Result<Self> {
         if let View::LookAt { eye, target, up } = self.view {
             let ahead = Vector3::from(target) - Vector3::from(eye);
@@ -168,7 +168,7 @@ impl Camera {
         Ok(self)
     }
 
-    /// `camera_from_world`, OpenGL's axes.
+    /// `camera_from_world` with OpenGL's camera axes.
     pub fn camera_from_world(&self) -> Matrix4<f64> {
         match self.view {
             View::LookAt { eye, target, up } => {
@@ -186,8 +186,8 @@ impl Camera {
         }
     }
 
-    /// The same camera in a frame whose origin is at `origin`. All in f64: a camera beside a domain that is far from the
-    /// scene's origin sees it from beside it, to the last bit of f32.
+    /// The same camera relative to the point `origin`. Computed in f64, so that a camera close to a domain far from the
+    /// scene's origin keeps its relative pose with f32 accuracy.
     #[must_use]
     pub fn relative_to(self, origin: [f64; 3]) -> Self {
         let moved = |point: [f64; 3]| std::array::from_fn(|axis| point[axis] - origin[axis]);
@@ -212,7 +212,7 @@ impl Camera {
         }
     }
 
-    /// The camera whose image is one rectangle of this camera's image of a width and height, pixel for pixel.
+    /// The camera whose image is, pixel for pixel, the rectangle `rectangle` of this camera's image of size `picture`.
     #[must_use]
     pub fn cropped(self, picture: [u32; 2], rectangle: Rectangle) -> Self {
         let [fx, fy, cx, cy] = self.intrinsics(picture);
@@ -220,7 +220,7 @@ impl Camera {
         Self { lens: Lens::Intrinsics { fx, fy, cx, cy }, ..self }
     }
 
-    /// `clip_from_camera` for an image of `width` x `height` pixels that shows `bounds`.
+    /// `clip_from_camera` for an image of `width` x `height` pixels. Fitted near and far planes enclose `bounds`.
     pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &Bounds) -> Matrix4<f64> {
         let (near, far) = self.range(bounds);
         let [fx, fy, cx, cy] = self.intrinsics([width, height]);
@@ -236,7 +236,7 @@ impl Camera {
         clip
     }
 
-    /// Near and far: as given, or fitted so that `bounds` and the ground around them are inside.
+    /// Near and far distances: as given, or fitted to `bounds` and the ground around them.
     fn range(&self, bounds: &Bounds) -> (f64, f64) {
         if self.far > 0.0 {
             return (self.near, self.far);
@@ -251,7 +251,7 @@ impl Camera {
     }
 }
 
-/// The inverse of a 3x4 row-major transform, when it has a finite one.
+/// The inverse of a 3x4 row-major transform, if it exists and is finite.
 fn inverse(pose: [f64; 12]) -> Option<Matrix4<f64>> {
     let mut matrix = Matrix4::identity();
     matrix.fixed_view_mut::<3, 4>(0, 0).copy_from(&Matrix3x4::from_row_slice(&pose));

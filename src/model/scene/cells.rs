@@ -1,47 +1,49 @@
-//! Origins of domains in f64, so that millimetres last ten thousand kilometres away from the scene's origin.
+//! Floating origins: f64 reference points that keep f32 coordinates accurate to a millimeter, ten thousand kilometers
+//! away from the scene's origin.
 //!
-//! A domain's f32 transform, and with it every f32 position that a deformer writes, is relative to the domain's *cell*:
-//! a point at whole multiples of [`GRID`] from the scene's origin. All domains within [`REACH`] of the shared cell have
-//! it, so that one frame holds for all that is drawn; a domain beyond has a cell of its own. When more than half of the
-//! domains are beyond, the shared cell follows them, and all transforms are expressed anew from their kept f64
-//! translations.
+//! A domain's f32 transform, and every f32 position that a deformer computes with it, is relative to the domain's
+//! *cell*: a point at whole multiples of [`GRID`] from the scene's origin. All domains within [`REACH`] of the shared
+//! cell use the shared cell, so that one coordinate frame suffices to draw them. A domain outside has a cell of its
+//! own. When more than half of the domains are outside, the shared cell moves to them, and all transforms are rebased
+//! from the stored f64 translations.
 //!
-//! The bound, per axis: a translation is rounded once, by at most 2^-13 units at `REACH`, and the three fused
-//! multiply-adds of x = A p + t by at most 2^-12 units each as long as the vertex is within 8192 units of its cell. That
-//! is 0.86 mm in a scene of metres. In a cell of its own a translation is at most 512 units long, and a vertex within
-//! 1024 units of it is off by at most 0.11 mm. What f32 costs A and p themselves comes on top, wherever the domain is.
+//! Error bound per axis: rounding a translation contributes at most 2^-13 units at `REACH`, and each of the three fused
+//! multiply-adds of x = A p + t at most 2^-12 units while the vertex is within 8192 units of its cell. In a scene of
+//! meters that is 0.86 mm. In a cell of its own, a translation is at most 512 units long, and the error of a vertex
+//! within 1024 units is at most 0.11 mm. The f32 rounding of A and p adds to this bound, independent of the domain's
+//! position.
 //!
-//! A domain that follows another one by a constant frame has no translation of its own: it is in the cell of that mover,
-//! and what is said of domains here holds of movers, in the order of their transforms.
+//! A follower has no translation of its own: it uses the cell of its transform root. Where this module says "domain",
+//! it means a transform root; translations have the order of the roots' transforms.
 //!
-//! Cells exist once a step with f64 translations has come. A scene that never sees one has none, and its origin is the
-//! cell of all.
+//! Cells exist only after the first step with f64 translations. Until then, the scene's origin is the cell of all
+//! domains.
 
 use super::{Bounds, Scene};
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
-/// Cells lie at whole multiples of this, in scene units: a power of two, so that f64 and often f32 hold them exactly.
+/// Spacing of cells in scene units. A power of two, so that their coordinates are exact in f64 and often in f32.
 pub const GRID: f64 = 1024.0;
 
-/// How far from the shared cell a domain's translation may be on each axis, in scene units, before the domain gets a cell
-/// of its own.
+/// The largest distance, per axis and in scene units, between the shared cell and the translation of a domain that uses
+/// it. Beyond, the domain has a cell of its own.
 pub const REACH: f64 = 4096.0;
 
-/// The cells of all movers of one state.
+/// The cells of all transform roots of one state.
 #[derive(Debug, Clone)]
 pub struct Cells {
-    /// Translation of each mover in scene units from the scene's origin.
+    /// Translation of each root in scene units from the scene's origin.
     translations: Vec<[f64; 3]>,
     shared: [f64; 3],
-    /// How many movers have a cell of their own.
+    /// Number of roots that have a cell of their own.
     away: usize,
-    /// How many translations were set since a shared cell was last looked for: looking costs a pass over all domains,
-    /// so it is done at most once per that many.
+    /// Number of translations set since the last search for a shared cell. A search is a pass over all domains; it is
+    /// repeated only after as many translations as there are domains, so that its cost per translation is constant.
     set: usize,
 }
 
-/// How cells came about does not matter, only what they say.
+/// Equality ignores the counters: equal cells and translations are enough.
 impl PartialEq for Cells {
     fn eq(&self, other: &Self) -> bool {
         self.shared == other.shared && self.translations == other.translations
@@ -49,7 +51,8 @@ impl PartialEq for Cells {
 }
 
 impl Cells {
-    /// Cells of transforms that are relative to the scene's origin. [`Self::express`] tells what becomes of them.
+    /// Cells of transforms that are relative to the scene's origin. [`Self::express`] converts the transforms to their
+    /// cells.
     pub(super) fn of(transforms: &[Transform]) -> Self {
         Self::with([0.0; 3], transforms.iter().map(|transform| transform.translation().into()).collect())
     }
@@ -59,10 +62,10 @@ impl Cells {
         Self { shared, away, set: translations.len(), translations }
     }
 
-    /// Cells as [`Self::shared`] and [`Self::translations`] of others told, from where they were kept.
+    /// Restores cells from the stored values of [`Self::shared`] and [`Self::translations`].
     ///
     /// # Errors
-    /// `Invalid` when the shared cell is not on the grid or a translation is not finite.
+    /// `Invalid` if the shared cell is not on the grid or a translation is not finite.
     pub fn restore(shared: [f64; 3], translations: Vec<[f64; 3]>) -> Result<Self> {
         if shared != nearest_cell(shared) || !shared.iter().all(|number| number.is_finite()) {
             return Err(invalid("cells.shared", format!("multiples of {GRID}"), format!("{shared:?}")));
@@ -73,28 +76,28 @@ impl Cells {
         }
     }
 
-    /// The cell of every domain that has none of its own, in scene units from the scene's origin.
+    /// The cell of all domains without a cell of their own, in scene units from the scene's origin.
     pub const fn shared(&self) -> [f64; 3] {
         self.shared
     }
 
-    /// Translation of each mover in scene units from the scene's origin.
+    /// Translation of each root in scene units from the scene's origin.
     pub fn translations(&self) -> &[[f64; 3]] {
         &self.translations
     }
 
-    /// Whether all domains have the shared cell.
+    /// Whether all domains use the shared cell.
     pub const fn is_one(&self) -> bool {
         self.away == 0
     }
 
-    /// The cell of a mover and its followers, in scene units from the scene's origin.
+    /// The cell of a root and its followers, in scene units from the scene's origin.
     pub fn cell_of(&self, mover: usize) -> [f64; 3] {
         let translation = self.translations[mover];
         if is_beyond(self.shared, translation) { nearest_cell(translation) } else { self.shared }
     }
 
-    /// A transform with the translation that the mover has in its cell, rounded once.
+    /// Replaces the translation of `transform` by the root's translation relative to its cell, rounded once.
     pub(super) fn express(&self, mover: usize, mut transform: Transform) -> Transform {
         let own = difference(self.translations[mover], self.cell_of(mover));
         for (row, along) in transform.0.chunks_exact_mut(4).zip(own) {
@@ -103,7 +106,7 @@ impl Cells {
         transform
     }
 
-    /// Moves a mover.
+    /// Sets the translation of a root, in scene units from the scene's origin.
     pub(super) fn set(&mut self, mover: usize, translation: [f64; 3]) {
         let (shared, kept) = (self.shared, &mut self.translations[mover]);
         self.away -= usize::from(is_beyond(shared, *kept));
@@ -112,9 +115,10 @@ impl Cells {
         self.set = self.set.saturating_add(1);
     }
 
-    /// Lets the shared cell follow the domains when most of them have left it. When true, every transform is to be
-    /// expressed anew. The cell nearest to the median on each axis: unlike the centroid, it does not mind a few domains
-    /// that are very far from all others.
+    /// Moves the shared cell if more than half of the domains are outside its reach, as many translations were set
+    /// since the last attempt as there are domains, and the move leaves fewer domains outside. If this returns true,
+    /// the caller must rebase every transform by [`Self::express`]. The new cell is the one nearest to the per-axis
+    /// median, which, unlike the centroid, is robust to a few very distant domains.
     pub(super) fn follow(&mut self) -> bool {
         let count = self.translations.len();
         if 2 * self.away <= count || self.set < count {
@@ -134,10 +138,10 @@ impl Cells {
         nearer
     }
 
-    /// Positions relative to their domains' cells as positions relative to `view`, a point in scene units from the
-    /// scene's origin: f64 in between, f32 in the end. Three numbers per vertex, packed as the layout says. Also the bounds
-    /// of the domains that are near `view` when measured by the nearest one; those of a domain that is a thousand times
-    /// as far would tell nothing about what can be seen.
+    /// Rebases positions from their domains' cells to `view`, a point in scene units from the scene's origin: computed
+    /// in f64, rounded to f32 once. `positions` has three numbers per vertex in layout order. Also returns the bounds
+    /// of the domains that are near `view` compared with the nearest one; bounds of much more distant domains would say
+    /// nothing about the visible ones.
     pub fn seen_from(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, Bounds) {
         let slots = &scene.layout.slots;
         let offset = |domain| difference(self.cell_of(scene.movers.of(domain)), view);

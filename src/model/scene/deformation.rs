@@ -1,27 +1,28 @@
-//! How a scene's deformation is stored and computed: exactly by default, cheaper where the scene says so.
+//! How a scene's modes are stored and its deformation computed: exact by default, with cheaper approximations on
+//! request.
 
 use crate::error::{Result, invalid};
 
-/// The type that entries of U are stored in. Sums are f32 whatever it is.
+/// The storage type of the entries of U. Sums are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Storage {
     /// 4 bytes, exact.
     #[default]
     F32,
-    /// 2 bytes, 11 significant bits, and a power of two per mode.
+    /// 2 bytes with 11 significant bits, and a power-of-two scale per mode.
     F16,
-    /// 2 bytes, 8 significant bits, and a power of two per mode.
+    /// 2 bytes with 8 significant bits, and a power-of-two scale per mode.
     Bf16,
-    /// 1 byte, -127 to 127, and a scale per tile of vertices and mode.
+    /// 1 byte, -127 to 127, and a scale per mode and tile of vertices.
     Int8,
 }
 
 impl Storage {
-    /// All of them.
+    /// All storage types.
     pub const ALL: [Self; 4] = [Self::F32, Self::F16, Self::Bf16, Self::Int8];
 
-    /// The name used in scenes, on the command line and in records.
+    /// The name in scene files, on the command line and in benchmark records.
     pub const fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
@@ -32,46 +33,46 @@ impl Storage {
     }
 }
 
-/// Which normals and tangents a deformed surface gets.
+/// How normals and tangents of a deformed surface are computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Normals {
-    /// Those of the rest state, turned by T alone (equation 3.8 of the thesis).
+    /// Normals of the rest state, transformed by T alone (equation 3.8 of the thesis).
     #[default]
     Rigid,
-    /// Those that follow the deformed triangles, weighted by area (`reference/normals.rs` defines them).
+    /// Area-weighted normals of the deformed triangles (defined in `reference/normals.rs`).
     Exact,
 }
 
-/// Whether domains that share a shape are deformed together, so that its U is read once for all of them: the same numbers,
-/// bit by bit.
+/// Whether domains that share a shape are deformed in a batch, so that U is read once for all of them. The results are
+/// bit-identical.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Batches {
-    /// Where it is known to be faster.
+    /// Batches where they are known to be faster.
     #[default]
     Auto,
-    /// Each for itself.
+    /// No batches.
     Never,
-    /// Wherever several domains share a shape that has modes.
+    /// Batches of all domains that share a shape with modes.
     Always,
 }
 
-/// Choices between error and time. The default leaves nothing out.
+/// Options that trade accuracy for time, and additional outputs. The default is exact.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Deformation {
     pub storage: Storage,
     pub normals: Normals,
-    /// Leave out the modes that together move no vertex by more than this many metres.
+    /// Error bound in meters: modes that together move no vertex by more than this distance are skipped.
     pub truncation: Option<f64>,
-    /// Sum the modes with compensation, for modes that nearly cancel.
+    /// Sum modes with error compensation. Useful for modes that nearly cancel.
     pub compensated: bool,
-    /// Keep u = U q of every vertex beside its position, in the domain's own frame, for a reader such as a collision test.
+    /// Store the displacement u = U q of every vertex in the domain's own frame, for example for collision tests.
     pub displacements: bool,
-    /// Keep an axis-aligned box of each domain's deformed positions.
+    /// Store an axis-aligned bounding box of each domain's deformed positions.
     pub boxes: bool,
-    /// Of the CUDA deformer. Truncated and compensated sums, and kept displacements, have no batches.
+    /// Batching in the CUDA deformer. Not available with truncation, compensated sums or stored displacements.
     pub batches: Batches,
 }
 

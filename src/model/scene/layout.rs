@@ -1,4 +1,4 @@
-//! Where each domain's vertices, corners, triangles and coordinates lie in the packed buffers of a scene.
+//! The layout of a scene's packed buffers: where the vertices, corners, triangles and coordinates of each domain begin.
 
 use std::collections::BTreeMap;
 
@@ -8,21 +8,21 @@ use crate::error::{Result, invalid};
 /// The packed ranges of one domain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Slot {
-    /// First vertex in the packed positions, and their count n.
+    /// First vertex in the packed positions, and the number n of vertices.
     pub first_vertex: usize,
     pub vertices: usize,
-    /// First corner in the packed normals, and their count.
+    /// First corner in the packed normals, and the number of corners.
     pub first_corner: usize,
     pub corners: usize,
-    /// First triangle in the packed index buffer, and their count.
+    /// First triangle in the packed index buffer, and the number of triangles.
     pub first_triangle: usize,
     pub triangles: usize,
-    /// First coordinate in the packed q, and the rank r. Domains that share coordinates share `first_q`.
+    /// First coordinate in the packed q, and the rank r. Domains that share coordinates have the same `first_q`.
     pub first_q: usize,
     pub rank: usize,
 }
 
-/// Slots of all domains and the totals.
+/// The packed ranges of all domains and the totals.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
     pub slots: Vec<Slot>,
@@ -31,7 +31,7 @@ pub struct Layout {
     pub triangles: usize,
     /// Length of the packed q.
     pub coordinates: usize,
-    /// By `first_q`: all domains of rank above 0 that share coordinates, ascending. Empty where nobody shares.
+    /// Domains of rank above 0 that share coordinates, ascending, by `first_q`. Empty if no domain shares coordinates.
     pub sharers: BTreeMap<usize, Vec<u32>>,
 }
 
@@ -64,12 +64,12 @@ impl Layout {
             layout.triangles += slot.triangles;
             layout.coordinates += if shared.is_some() { 0 } else { rank };
             if let Some(twin) = domain.shares_q_with.filter(|_| rank > 0) {
-                // The first to share is whoever owns the coordinates: a twin of a twin finds the list there already.
+                // Only the owner of the coordinates inserts itself: a twin of a twin finds an existing list.
                 layout.sharers.entry(slot.first_q).or_insert_with(|| vec![twin as u32]).push(index as u32);
             }
             layout.slots.push(slot);
         }
-        // Device indices are 32 bit and address three numbers per vertex and corner.
+        // Device indices have 32 bits and address three numbers per vertex and corner.
         let largest = layout.vertices.max(layout.corners).max(layout.triangles);
         if largest > (u32::MAX / 4) as usize {
             return Err(invalid(

@@ -1,16 +1,16 @@
-//! Light space: the constant axes along which the map of the sun's shadow lies (section 3.3.1 of the thesis), and boxes in
-//! it.
+//! Light space: the coordinate axes of the sun's shadow map (section 3.3.1 of the thesis), and bounding boxes in it.
 //!
-//! The thesis takes an axis-aligned box of the vertices in the world and that of its eight corners in light space. The
-//! second is fitted closer here: to the corners of the boxes of small parts of the surface, or to the vertices.
+//! The thesis takes the axis-aligned bounding box of all vertices in the world, and in light space the bounding box of
+//! its eight corners. Here, the light-space box is tighter: it bounds the corners of the boxes of small parts of the
+//! surface, or the vertices themselves.
 
 use nalgebra::Vector3;
 
 use super::shadow::Fit;
 use super::{Bounds, Scene, UpAxis};
 
-/// x, y and z of light space, unit vectors in the world: z is v_l, the direction to the sun, and y points up in the world.
-/// With the sun straight up, "up in the world" says nothing, and any y will do.
+/// The x, y and z axes of light space as unit vectors in the world. z is v_l, the direction to the sun, and y points
+/// up. If the sun is at the zenith, "up" does not determine y, and y is chosen arbitrarily.
 pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
     let across = up.vector().cross(&to_sun);
     let x = across.try_normalize(1e-6).unwrap_or_else(|| {
@@ -21,23 +21,24 @@ pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
 }
 
 impl Scene {
-    /// The axes along which deformers measure the vertices for the sun's shadow; none where the look has no map that is fitted to
-    /// them.
+    /// The axes along which deformers compute [`LightBounds`]. `None` if the look has no shadow map that is fitted to
+    /// the vertices.
     pub fn light_axes(&self) -> Option<[Vector3<f64>; 3]> {
         let fitted = self.look.shadow.filter(|shadow| shadow.fit == Fit::Vertices);
         fitted.map(|_| light_axes(self.look.to_sun(self.up), self.up))
     }
 }
 
-/// A box along the axes of light space, in scene units from the same origin as what it holds; empty when `min > max`.
+/// A bounding box along the axes of light space, in scene units and relative to the same origin as the bounded
+/// positions. Empty if `min > max`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LightBounds(pub Bounds);
 
 impl LightBounds {
     pub const EMPTY: Self = Self(Bounds::EMPTY);
 
-    /// The smallest that holds a box of the world: a corner of the box is the farthest along each axis. A NaN in the box
-    /// gives one here, so does what is infinite, and an empty box an empty one.
+    /// The smallest light-space box that contains a world-space box: along each axis, a corner of the box is the
+    /// farthest point. NaN and infinite coordinates yield NaN or infinite bounds; an empty box yields an empty one.
     pub fn of_box(axes: &[Vector3<f64>; 3], world: &Bounds) -> Self {
         if world.min[0] > world.max[0] {
             return Self::EMPTY;
@@ -55,19 +56,19 @@ impl LightBounds {
         })
     }
 
-    /// The smallest that holds both; NaN in either stays NaN.
+    /// The smallest box that contains both. NaN in either propagates.
     #[must_use]
     pub fn union(self, other: Self) -> Self {
         Self(self.0.union(other.0))
     }
 
-    /// The same, longer by `margin` at every end.
+    /// The box, extended by `margin` at all sides.
     #[must_use]
     pub fn widened(self, margin: f64) -> Self {
         Self(Bounds { min: self.0.min.map(|end| end - margin), max: self.0.max.map(|end| end + margin) })
     }
 
-    /// Whether a map can be fitted to it: it holds something, and all of it is finite.
+    /// Whether a shadow map can be fitted to the box: it is finite and not empty.
     pub fn is_sound(&self) -> bool {
         self.0.is_finite() && self.0.min[0] <= self.0.max[0]
     }

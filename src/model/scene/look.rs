@@ -1,4 +1,5 @@
-//! How a scene is lit: one directional light (the sun), its shadow, the ground and the sky.
+//! The look of a scene: one directional light (the sun) and its shadow, ground, sky, and how triangles are rasterized
+//! and blended.
 
 use nalgebra::Vector3;
 
@@ -17,24 +18,24 @@ pub enum UpAxis {
 }
 
 impl UpAxis {
-    /// Index of the axis.
+    /// Index of the axis: 0 to 2.
     pub const fn index(self) -> usize {
         self as usize
     }
 
-    /// The unit vector up.
+    /// The up direction as a unit vector.
     pub fn vector(self) -> Vector3<f64> {
         Vector3::ith(self.index(), 1.0)
     }
 
-    /// A rotation that takes Y-up coordinates to this axis up.
+    /// The rotation from Y-up coordinates to this up axis.
     pub fn from_y_up(self) -> nalgebra::Rotation3<f64> {
         let identity = nalgebra::Rotation3::identity();
         nalgebra::Rotation3::rotation_between(&Vector3::y(), &self.vector()).unwrap_or(identity)
     }
 }
 
-/// A plane at the lowest rest position along up; it receives the shadow and casts none.
+/// A plane at the lowest rest position along the up axis. It receives shadows and casts none.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Ground {
@@ -47,92 +48,96 @@ impl Default for Ground {
     }
 }
 
-/// Blended fragments that one frame may keep: they lie in one buffer, 8 bytes each, and one buffer has less than 2 GiB.
+/// The largest number of blended fragments per frame. They share one buffer, 8 bytes per fragment, and a buffer must
+/// stay below 2 GiB.
 pub const MAX_FRAGMENTS: u32 = (1 << 28) - 1;
 
-/// How blended triangles are drawn over what is opaque, and over each other.
+/// How blended triangles are composited over opaque ones and over each other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Transparency {
-    /// The thesis's two passes (chapter 3.3): what reaches [`Look::opaque_alpha`] first, with depth; then the rest, blended
-    /// over that without writing depth. Blended triangles lie over each other in the order of the index buffer: those with
-    /// one side before those with two, then by domain, then by triangle.
+    /// The two-pass method of the thesis (chapter 3.3). The first pass draws fragments whose alpha reaches
+    /// [`Look::opaque_alpha`], with depth writes; the second blends the others over them without depth writes. Blended
+    /// triangles are drawn in index-buffer order: one-sided before two-sided, then by domain, then by triangle.
     TwoPass,
-    /// A list of all blended fragments in each pixel, sorted by depth: order does not matter. Depths are compared in the
-    /// middle of the pixel; of equal ones the later triangle of the index buffer lies in front.
+    /// Order-independent transparency: per pixel, a list of all blended fragments, sorted by depth. Depths are compared
+    /// at the pixel center; of equal depths, the later triangle in the index buffer is in front.
     #[default]
     Exact,
 }
 
-/// Which triangles are left out before the rasteriser sees them. The picture is the same to the bit, whichever it is.
+/// Which triangles are culled before rasterization. The image is bit-identical in all modes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Culling {
-    /// Chosen by the number of triangles and by the device.
+    /// Selected by the number of triangles and by the device.
     #[default]
     Fitting,
-    /// None: nothing is compiled, allocated or run for it.
+    /// No culling: no culling pass is compiled, allocated or run.
     None,
-    /// Those outside the view, back faces of what has one side, and those in which no sample lies; for shadow maps too.
+    /// Triangles outside the view, back faces of one-sided materials, and triangles that cover no sample. Applies to
+    /// shadow maps too.
     Triangles,
-    /// Those, and what is hidden behind the triangles that the last frame saw. A rasteriser in software leaves hidden
-    /// triangles in where cut-outs have images and several samples a pixel: there they change where images are read.
+    /// As `Triangles`, plus triangles that are occluded by the triangles visible in the last frame. On software OpenGL
+    /// implementations, hidden triangles are kept if cut-outs have textures and the frame is multisampled, because
+    /// there their absence would change where textures are sampled.
     Depth,
 }
 
-/// What turns triangles into samples, pass by pass: the depth of the shadow map, and what the camera sees.
+/// Which rasterizer draws the shadow map's depth pass and the camera's pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Rastering {
-    /// OpenGL's rasteriser: the reference.
+    /// OpenGL's rasterizer, the reference.
     #[default]
     OpenGl,
-    /// A rasteriser in CUDA, where it can: on the CUDA device that also draws, for variance maps that are not split, and for
-    /// frames with one sample a pixel in which nothing is blended. Elsewhere OpenGL draws; a frame says who drew it. Samples
-    /// may see another triangle only where depths tie, within 1/256 pixel of an edge, and at the rim of what an image cuts
-    /// out.
+    /// The compute rasterizer in CUDA, where it is supported: on a CUDA device that also draws, for variance shadow
+    /// maps without splits, and for frames with one sample per pixel and no blended triangles. OpenGL draws everything
+    /// else, and each frame reports which rasterizer drew it. The visible triangle of a sample may differ only where
+    /// depths tie, within 1/256 pixel of an edge, and at the border of textured cut-outs.
     Cuda,
     /// For each pass the faster of both, measured when the scene is loaded.
     Fastest,
 }
 
-/// Light, shadow, ground and sky. Colours are linear.
+/// Light, shadow, ground, sky and rasterization settings. Colors are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Look {
-    /// Direction towards the sun for a scene with Y up; other up axes turn it along.
+    /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
     pub sun: [f32; 3],
-    /// Colour times intensity of the sun.
+    /// Color times intensity of the sun.
     pub sunlight: [f32; 3],
-    /// Colour times intensity of the ambient light.
+    /// Color times intensity of the ambient light.
     pub skylight: [f32; 3],
-    /// Sky at the zenith and at the horizon.
+    /// Sky colors at the zenith and at the horizon.
     pub zenith: [f32; 3],
     pub horizon: [f32; 3],
     pub shadow: Option<Shadow>,
     pub ground: Option<Ground>,
-    /// Samples a pixel, 1 or 4: how smooth the edges of triangles and cut-outs are.
+    /// Samples per pixel for multisampling, 1 or 4.
     pub samples: u32,
-    /// What smooths edges: these samples, or something that needs but one.
+    /// The antialiasing method: multisampling with `samples`, or a method with one sample per pixel.
     pub antialias: Antialias,
     pub bloom: Option<Bloom>,
     pub tone: Tone,
-    /// All light is multiplied by this before glow and tone curve, above 0.
+    /// Multiplier of all light before bloom and tone mapping, above 0.
     pub exposure: f32,
-    /// Whether levels of 8 bits are mixed in a fixed pattern of 8 x 8 pixels, so that slow gradients show no bands. A pixel
-    /// changes by one level at most, and one that lies on a level stays.
+    /// Whether 8-bit output is dithered with a fixed pattern of 8 x 8 pixels against banding in slow gradients. A pixel
+    /// changes by at most one level, and a value exactly on a level does not change.
     pub dither: bool,
-    /// How blended triangles are drawn.
+    /// How blended triangles are composited.
     pub transparency: Transparency,
-    /// Two passes only: alpha from which a blended triangle counts as opaque, above 0; above 1 none does.
+    /// [`Transparency::TwoPass`] only: the alpha from which a blended fragment counts as opaque, above 0. Above 1, none
+    /// does.
     pub opaque_alpha: f32,
-    /// Exact only: blended fragments of a frame that are kept, 1 to 2^28 - 1; by default eight a pixel (2^20 at
-    /// least), as far as the device has buffers so large. Where a frame has more, every pixel keeps as many of its
-    /// nearest as all pixels can.
+    /// [`Transparency::Exact`] only: capacity of the fragment buffer, 1 to 2^28 - 1. By default eight fragments per
+    /// pixel and at least 2^20, limited by the largest buffer of the device. If a frame has more fragments, every pixel
+    /// keeps the same number of nearest ones, the largest that fits.
     pub fragments: Option<u32>,
-    /// What is left out before it is drawn.
+    /// Which triangles are culled.
     pub culling: Culling,
-    /// What draws.
+    /// Which rasterizer draws.
     pub raster: Rastering,
 }
 

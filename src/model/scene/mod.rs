@@ -1,7 +1,7 @@
-//! A scene: the immutable set of domains that one physics process drives, and the values of one step.
+//! A scene: an immutable set of domains that one simulation drives, and the state that its steps change.
 //!
-//! All domains are packed: each knows where its vertices, corners, triangles and coordinates begin. Every deformer and
-//! the renderer use the same packing ([`Layout`]).
+//! All domains share packed buffers. [`Layout`] stores where the vertices, corners, triangles and coordinates of each
+//! domain begin; every deformer and the renderer use it.
 
 mod camera;
 mod cells;
@@ -41,17 +41,18 @@ use std::sync::Arc;
 use crate::domain::{AlphaMode, Domain, MAX_RING_TRIANGLES, Material, Shape, Texture};
 use crate::error::{Result, invalid};
 
-/// The largest number of domains of one scene.
+/// The largest number of domains in a scene.
 pub const MAX_DOMAINS: usize = 1 << 20;
 
-/// The most bytes of one domain's name, and of all its notes; a description of the domain travels in one message.
+/// The most bytes of a domain's name, and of all its notes together. The limits keep the description of a domain within
+/// one message.
 const MAX_NAME: usize = 4 << 10;
 const MAX_NOTES: usize = 64 << 10;
 
-/// The most vertices of a parent that carry one frame.
+/// The largest number of parent vertices that define an attachment frame.
 const MAX_ATTACHMENT_ROWS: usize = 4096;
 
-/// What a loader hands to [`Scene::new`].
+/// The input of [`Scene::new`], as a loader produces it.
 #[derive(Debug, Clone, Default)]
 pub struct Parts {
     pub name: String,
@@ -60,19 +61,19 @@ pub struct Parts {
     pub textures: Vec<Texture>,
     pub domains: Vec<Domain>,
     pub up: UpAxis,
-    /// Metres per unit of length.
+    /// Meters per scene unit.
     pub unit: f64,
-    /// World position of the frame in which all transforms are given, metres.
+    /// World position, in meters, of the frame in which all transforms are given.
     pub origin: [f64; 3],
     pub look: Look,
     pub deformation: Deformation,
-    /// The scene's promise that no step will shear or scale a domain unevenly; a step that does is refused.
+    /// Declares that no step will shear or non-uniformly scale a domain; a step that does is rejected.
     pub rigid_transforms: bool,
-    /// What the loader could not use, in words, for `inspect` and the log.
+    /// Warnings of the loader about input that it could not use, for `inspect` and the log.
     pub remarks: Vec<String>,
 }
 
-/// A checked scene. Immutable; shared by reference count.
+/// A validated scene. Immutable, and shared through `Arc`.
 #[derive(Debug)]
 pub struct Scene {
     pub name: String,
@@ -90,12 +91,12 @@ pub struct Scene {
     pub layout: Layout,
     pub movers: Movers,
     pub needs: Needs,
-    /// Bounds of the rest state, in scene units.
+    /// Bounds of the rest state in scene units.
     pub rest_bounds: Bounds,
 }
 
 impl Scene {
-    /// The parts that the scene would be built of again, to change some of them.
+    /// The parts of which this scene was built, for building a modified scene.
     pub fn parts(&self) -> Parts {
         Parts {
             name: self.name.clone(),
@@ -113,10 +114,10 @@ impl Scene {
         }
     }
 
-    /// Checks all that is between the parts and computes packing, needs, tangents and rest bounds, once.
+    /// Validates all references between the parts, and computes the layout, feature flags, tangents and rest bounds.
     ///
     /// # Errors
-    /// `Invalid` naming the domain and the field.
+    /// `Invalid` with the domain and the field.
     pub fn new(mut parts: Parts) -> Result<Arc<Self>> {
         if parts.domains.is_empty() || parts.domains.len() > MAX_DOMAINS {
             return Err(invalid("scene.domains", format!("1 to {MAX_DOMAINS}"), parts.domains.len()));
@@ -164,7 +165,7 @@ impl Scene {
         Ok(Arc::new(scene))
     }
 
-    /// The packed vertices of each triangle, in the order of the packing.
+    /// The packed vertex indices of each triangle, in layout order.
     pub fn triangle_vertices(&self) -> Vec<[u32; 3]> {
         let of_domain = |domain: usize| {
             let (mesh, first) = (&self.shape_of(domain).mesh, self.layout.slots[domain].first_vertex as u32);
@@ -184,7 +185,7 @@ impl Scene {
         self.shape_of(domain).modes.rank()
     }
 
-    /// Index of the domain called `name`.
+    /// The index of the domain with this name.
     pub fn find(&self, name: &str) -> Option<usize> {
         self.domains.iter().position(|domain| domain.name == name)
     }
@@ -244,7 +245,7 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
         }
     }
     if let Some(attachment) = &domain.attachment {
-        // Parents come first, so the hierarchy has no cycle and one pass in order composes it.
+        // A parent must precede its children: the hierarchy then has no cycle, and one pass in order composes it.
         below("parent", attachment.parent, index)?;
         let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest().len();
         if attachment.rows.len() > MAX_ATTACHMENT_ROWS {
@@ -286,8 +287,8 @@ fn check_runs(parts: &Parts, domain: &Domain) -> Result<()> {
     Ok(())
 }
 
-/// A texture on a shape without texture coordinates would show one texel everywhere: such domains get a copy of their
-/// material without textures, and a remark says so.
+/// Removes textures from shapes without texture coordinates, where they would show one texel everywhere. Affected
+/// domains get an untextured copy of their material, and a remark is recorded.
 fn leave_out_unplaced_textures(parts: &mut Parts) {
     let mut copies: BTreeMap<usize, usize> = BTreeMap::new();
     let Parts { shapes, materials, domains, remarks, .. } = parts;
@@ -314,7 +315,7 @@ fn leave_out_unplaced_textures(parts: &mut Parts) {
     }
 }
 
-/// Tangents only where a normal map will read them.
+/// Computes tangents of shapes that are used with a normal map.
 fn add_tangents(parts: &mut Parts) {
     for domain in &parts.domains {
         let shape = &mut parts.shapes[domain.shape];
@@ -325,7 +326,7 @@ fn add_tangents(parts: &mut Parts) {
     }
 }
 
-/// Smoothing groups of the shapes that bend; normals of the others turn with their domain.
+/// Computes smoothing groups of shapes with modes. Normals of rigid shapes only rotate with their domain.
 fn add_smoothing(parts: &mut Parts) -> Result<()> {
     let mut triangles = 0;
     for domain in &parts.domains {
@@ -343,12 +344,12 @@ fn add_smoothing(parts: &mut Parts) -> Result<()> {
 }
 
 impl Parts {
-    /// Parts of a scene with the usual conventions: metres, no origin, default look.
+    /// Empty parts with default conventions: meters, origin at zero, default look.
     pub fn named(name: impl Into<String>) -> Self {
         Self { name: name.into(), unit: 1.0, ..Self::default() }
     }
 
-    /// Whether any domain's material has this property.
+    /// Whether `has` holds for a material of any domain.
     pub(crate) fn any_material(&self, has: impl Fn(&Material) -> bool) -> bool {
         self.domains.iter().flat_map(Domain::materials).any(|material| has(&self.materials[material]))
     }
@@ -363,7 +364,7 @@ mod tests {
     use super::*;
     use crate::domain::{Attachment, Mesh, Modes, Run, Transform};
 
-    /// One domain of two triangles, with a plain and a blended material.
+    /// One domain of two triangles, with an opaque and a blended material.
     fn square(runs: Vec<Run>) -> Parts {
         let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
         let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");

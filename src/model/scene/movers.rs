@@ -1,46 +1,48 @@
-//! Which domains have a transform of their own in a step, and how the others follow them.
+//! Transform roots (domains with a transform of their own in each step) and followers (domains that move with a root by
+//! a constant frame).
 
 use nalgebra::Matrix4;
 
 use crate::domain::{Composed, Domain, Transform};
 use crate::error::{Result, invalid};
 
-/// Transforms of a state lie in the order of the movers, the domains that follow no other.
+/// The transform roots of a scene, and the root and frame of every follower. [`super::State::transforms`] has one
+/// transform per root, in this order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Movers {
     count: usize,
-    /// `None` where nobody follows: every domain then is its own mover.
+    /// `None` if the scene has no followers; every domain is then its own root.
     table: Option<Table>,
 }
 
 #[derive(Debug, Clone, PartialEq, Default)]
 struct Table {
-    /// Per mover, its domain.
+    /// Per root, its domain.
     domains: Vec<u32>,
-    /// Per domain, its mover, and its frame or [`Movers::NO_FRAME`].
+    /// Per domain, the index of its root, and the index of its frame or [`Movers::NO_FRAME`].
     following: Vec<[u32; 2]>,
-    /// `mover_from_domain` of each follower.
+    /// `root_from_domain` of each follower.
     frames: Vec<Transform>,
-    /// Per domain, where its followers begin in `followers`, and where the last ones end. None of a follower.
+    /// Start offsets into `followers`, one per domain and one for the end. The range of a follower is empty.
     begins: Vec<u32>,
     followers: Vec<u32>,
 }
 
 impl Movers {
-    /// In place of the frame of a domain that follows no other.
+    /// Frame index of a domain that follows no other.
     pub const NO_FRAME: u32 = u32::MAX;
 
-    /// Looks at checked domains, whose parents come first, and puts followers where they follow to. Frames of frames are
-    /// multiplied in f64 and rounded once.
+    /// Flattens chains of followers to their roots, and sets the placement of each follower accordingly. The domains
+    /// are validated, and parents precede their children. Products of frames are computed in f64 and rounded once.
     ///
     /// # Errors
-    /// `Invalid` naming the domain whose frame or place leaves f32.
+    /// `Invalid` with the domain whose frame or placement exceeds the range of f32.
     pub(super) fn new(domains: &mut [Domain]) -> Result<Self> {
         if domains.iter().all(|domain| domain.follows.is_none()) {
             return Ok(Self { count: domains.len(), table: None });
         }
         let mut table = Table::default();
-        // Of followers alone: many domains need no memory here.
+        // Has entries for followers only, so that many independent domains need no memory here.
         let mut exact: Vec<Matrix4<f64>> = Vec::new();
         for index in 0..domains.len() {
             let Some(follow) = domains[index].follows else {
@@ -66,51 +68,53 @@ impl Movers {
         Ok(Self { count: table.domains.len(), table: Some(table) })
     }
 
-    /// How many there are: the length of [`super::State::transforms`].
+    /// The number of transform roots, which is the length of [`super::State::transforms`].
     pub const fn count(&self) -> usize {
         self.count
     }
 
-    /// Index in [`super::State::transforms`] of a domain's own transform, or of that which it follows.
+    /// The index in [`super::State::transforms`] of the transform of a domain's root. A domain that follows no other is
+    /// its own root.
     pub fn of(&self, domain: usize) -> usize {
         self.table.as_ref().map_or(domain, |table| table.following[domain][0] as usize)
     }
 
-    /// `mover_from_domain` of a follower; `None` of a mover.
+    /// `root_from_domain` of a follower; `None` for a root.
     pub fn frame_of(&self, domain: usize) -> Option<Transform> {
         self.table.as_ref().and_then(|table| table.frames.get(table.following[domain][1] as usize).copied())
     }
 
-    /// The domain of each mover, in the order of [`super::State::transforms`].
+    /// The domain of each root, in the order of [`super::State::transforms`].
     pub fn domains(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
         (0..self.count).map(|mover| self.domain(mover))
     }
 
-    /// The domain of a mover.
+    /// The domain of a root.
     pub fn domain(&self, mover: usize) -> u32 {
         self.table.as_ref().map_or(mover as u32, |table| table.domains[mover])
     }
 
-    /// The domains that move with a domain, ascending; itself is not among them, and none are of a follower.
+    /// The followers of a domain, ascending, without the domain itself. Empty for a follower.
     pub fn followers_of(&self, domain: usize) -> &[u32] {
         self.table
             .as_ref()
             .map_or(&[], |table| &table.followers[table.begins[domain] as usize..table.begins[domain + 1] as usize])
     }
 
-    /// Per domain its mover and the index of its frame, or [`Self::NO_FRAME`]; empty where nobody follows.
+    /// Per domain, the index of its root and the index of its frame or [`Self::NO_FRAME`]. Empty if the scene has no
+    /// followers.
     pub fn following(&self) -> &[[u32; 2]] {
         self.table.as_ref().map_or(&[], |table| &table.following)
     }
 
-    /// `mover_from_domain` of every follower; empty where nobody follows.
+    /// `root_from_domain` of every follower. Empty if the scene has no followers.
     pub fn frames(&self) -> &[Transform] {
         self.table.as_ref().map_or(&[], |table| &table.frames)
     }
 }
 
 impl Table {
-    /// Sorts followers by their movers; those of one stay ascending.
+    /// Groups followers by their root, ascending within a group (counting sort).
     fn list_followers(&mut self) {
         let mut begins = vec![0_u32; self.following.len() + 1];
         let followers = || self.following.iter().enumerate().filter(|(_, [_, frame])| *frame != Movers::NO_FRAME);
@@ -131,7 +135,7 @@ impl Table {
     }
 }
 
-/// Refuses a step that moves a follower.
+/// Rejects a step that sets the transform of a follower.
 pub(super) fn check_moves(movers: &Movers, domains: &[Domain], (field, list): (&str, &[u32])) -> Result<()> {
     if movers.table.is_none() {
         return Ok(());
@@ -174,7 +178,7 @@ mod tests {
         }
     }
 
-    /// Five domains of one vertex; the pairs say who follows whom, at x = 1, 2, 3, ...
+    /// Five domains of one vertex. Each pair (child, parent) adds a follower with a frame at x = 1, 2, 3, ...
     fn following(pairs: &[(usize, usize)]) -> Parts {
         let mut parts = Parts::named("points");
         let mesh = Mesh::indexed(vec![[0.5, 0.25, 1.0]], vec![[0.0, 0.0, 1.0]], vec![], vec![[0; 3]]).expect("a point");

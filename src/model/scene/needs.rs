@@ -1,42 +1,43 @@
-//! What a scene needs, computed once at load; kernels, shaders, passes and buffers follow it and nothing else.
+//! The features that a scene uses, computed once at load time. Kernels, shaders, passes and buffers are selected by
+//! these flags alone.
 
 use super::{Normals, Parts};
 use crate::domain::Domain;
 
-/// A feature is compiled, allocated and run only when its flag is set.
+/// Feature flags of a scene. A feature is compiled, allocated and run only if its flag is set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 pub struct Needs {
-    /// Some domain has modes: u = U q is computed at all.
+    /// Some domain has modes; without, u = U q is not computed.
     pub modes: bool,
-    /// Some material has a colour texture.
+    /// Some material has a color texture.
     pub textures: bool,
-    /// Some material has a normal map on a shape with uvs: tangents exist.
+    /// Some material has a normal map on a shape with texture coordinates; requires tangents.
     pub normal_maps: bool,
-    /// Some material discards by cutoff.
+    /// Some material is alpha-tested (cut-outs).
     pub mask: bool,
-    /// Some material blends: the blended pass exists.
+    /// Some material is blended; requires the blended pass.
     pub blend: bool,
-    /// The look asks for shadows: map, moments and blur exist.
+    /// The look has shadows; requires the shadow map and, for variance maps, moments and blur.
     pub shadows: bool,
-    /// Steps may shear or scale unevenly: normals need the inverse transpose.
+    /// Steps may shear or scale non-uniformly; normals require the inverse transpose.
     pub shear: bool,
-    /// Normals follow the deformed triangles: their adjacency exists.
+    /// Normals are computed from the deformed triangles; requires their adjacency.
     pub exact_normals: bool,
-    /// Modes that cannot matter at a step's q are left out: lists of modes exist.
+    /// Modes that are negligible at a step's q are skipped; requires lists of modes.
     pub truncation: bool,
-    /// Sums carry their rounding errors along.
+    /// Sums of modes are compensated (their rounding errors are accumulated).
     pub compensated: bool,
-    /// Some domain follows another one by a constant frame: products of transforms exist.
+    /// Some domain follows another one by a constant frame; requires products of transforms.
     pub followers: bool,
-    /// Displacements are kept, those of domains without modes too: they are 0.
+    /// Displacements are stored for every domain. Those of domains without modes are 0.
     pub displacements: bool,
-    /// A box of each domain is kept.
+    /// A bounding box of each domain is stored.
     pub boxes: bool,
 }
 
 impl Needs {
     pub(super) fn of(parts: &Parts) -> Self {
-        // What is done about modes costs nothing where there are none.
+        // Options for modes cost nothing in a scene without modes.
         let modes = parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0);
         Self {
             modes,
@@ -78,7 +79,7 @@ impl Needs {
     }
 }
 
-/// Whether neither the placement of a domain nor the frame that it has in another one shears.
+/// Whether the placement of a domain and, for a follower, its frame are similarities (without shear).
 fn is_similar(domain: &Domain) -> bool {
     domain.placement.is_similarity() && domain.follows.is_none_or(|follow| follow.frame.is_similarity())
 }

@@ -1,45 +1,47 @@
-//! What happens to a picture after it is shaded: smoothed edges, glow, and the curve from light to what a screen shows.
+//! Post-processing of a shaded image: antialiasing, bloom and tone mapping.
 
 use crate::error::{Result, invalid};
 
-/// How the edges of a picture are smoothed.
+/// The antialiasing method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Antialias {
-    /// By the samples of a pixel, as many as the look says.
+    /// Multisampling with the look's number of samples per pixel.
     #[default]
     Samples,
-    /// One sample a pixel; edges are found in the picture and smoothed along their length (FXAA, Lottes 2009).
+    /// Fast approximate antialiasing (FXAA, Lottes 2009): one sample per pixel; edges are detected in the image and
+    /// smoothed along their length.
     Fxaa,
-    /// One sample a pixel, and nothing after it.
+    /// One sample per pixel and no antialiasing.
     None,
 }
 
-/// The curve from light to what the screen shows, for each colour channel.
+/// The tone-mapping curve, applied to each color channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Tone {
-    /// Light is shown as it is; what is above 1 is white.
+    /// Linear; values above 1 are clipped to white.
     #[default]
     None,
-    /// x / (1 + x): Reinhard et al. 2002, "Photographic tone reproduction for digital images", equation 3. Never white.
+    /// x / (1 + x): Reinhard et al. 2002, "Photographic tone reproduction for digital images", equation 3. Never
+    /// reaches white.
     Reinhard,
-    /// The film curve of the Academy Color Encoding System, in Narkowicz's fit of 2015:
-    /// x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14).
+    /// The film curve of the Academy Color Encoding System in Narkowicz's fit of 2015: x (2.51 x + 0.03) / (x (2.43 x +
+    /// 0.59) + 0.14).
     Aces,
 }
 
-/// Light above a threshold glows: a share of it leaves its pixel and spreads over the surroundings, as in a lens. None is
-/// made and none is lost.
+/// Bloom: a fraction of the light above a threshold is spread over the neighborhood of its pixel, as in a lens. Energy
+/// is conserved.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Bloom {
-    /// Light that does not glow, in the brightest channel of a pixel after exposure, 0 to 1000.
+    /// Threshold of the brightest channel of a pixel, after exposure, 0 to 1000.
     pub threshold: f32,
-    /// The share that spreads, 0 to 1.
+    /// The fraction of the light above the threshold that is spread, 0 to 1.
     pub strength: f32,
-    /// Halvings of the picture, 1 to 8: the widest glow is about 2 to this power pixels to each side, the others each half
-    /// as wide, and all have the same light.
+    /// Number of successive halvings of the image, 1 to 8. With n levels, the widest glow extends about 2^n pixels to
+    /// each side, and every other one half as far as the next. All levels have equal energy.
     pub levels: u32,
 }
 
@@ -49,7 +51,7 @@ impl Default for Bloom {
     }
 }
 
-/// The most exposure, so that no light overflows.
+/// The largest exposure; the limit keeps light from overflowing.
 const MOST_EXPOSURE: f32 = 1024.0;
 
 impl Bloom {
@@ -68,7 +70,7 @@ impl Bloom {
 }
 
 impl super::Look {
-    /// Samples of a pixel that this look asks for.
+    /// Number of samples per pixel of the image.
     pub fn samples_a_pixel(&self) -> u32 {
         if self.antialias == Antialias::Samples { self.samples } else { 1 }
     }

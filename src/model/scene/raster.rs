@@ -1,13 +1,13 @@
-//! What a rasteriser is told besides a mesh: the window, and groups of triangles.
+//! Inputs of a rasterizer besides the mesh: the window and groups of triangles.
 
 use nalgebra::Matrix4;
 
 use crate::error::{Result, invalid};
 
-/// The most pixels along a side of a window.
+/// The largest width and height of a window in pixels.
 pub const MAX_SIDE: u32 = 16384;
 
-/// A rectangle of pixels, and how positions come into it. Rows are counted from the top.
+/// An image size and the projection of positions into it. Rows are counted from the top.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Window {
     clip: [f32; 16],
@@ -16,11 +16,11 @@ pub struct Window {
 }
 
 impl Window {
-    /// A window of `width` x `height` pixels that shows what `clip_from_positions` takes into OpenGL's clip volume.
-    /// Rounded to f32 here. What is not finite drops every triangle that it reaches.
+    /// A window of `width` x `height` pixels. `clip_from_positions` maps positions to OpenGL's clip space and is
+    /// rounded to f32. A triangle with a vertex that is not finite in clip space is dropped.
     ///
     /// # Errors
-    /// `Invalid` when a side is not 1 to [`MAX_SIDE`] pixels.
+    /// `Invalid` if a side is not 1 to [`MAX_SIDE`] pixels.
     pub fn new(clip_from_positions: &Matrix4<f64>, width: u32, height: u32) -> Result<Self> {
         for (name, side) in [("width", width), ("height", height)] {
             if !(1..=MAX_SIDE).contains(&side) {
@@ -31,7 +31,7 @@ impl Window {
         Ok(Self { clip, width, height })
     }
 
-    /// Clip from positions, row-major.
+    /// `clip_from_positions`, row-major.
     pub const fn clip(&self) -> &[f32; 16] {
         &self.clip
     }
@@ -41,7 +41,7 @@ impl Window {
         [self.width, self.height]
     }
 
-    /// Pixels.
+    /// Number of pixels.
     pub const fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }
@@ -51,23 +51,23 @@ impl Window {
         self.size().map(|side| 0.5 * side as f32)
     }
 
-    /// The |x| and |y| in normalised device coordinates beyond which triangles are clipped: 16384 pixels from the middle,
-    /// where an f32 still tells more than 1/256 pixel.
+    /// The guard band: |x| and |y| in normalized device coordinates beyond which triangles are clipped. It ends 16384
+    /// pixels from the center, where f32 still resolves more than 1/256 pixel.
     pub fn guard(&self) -> [f32; 2] {
         self.half().map(|half| MAX_SIDE as f32 / half)
     }
 }
 
-/// Which sides of triangles are drawn.
+/// Which faces of triangles are drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Faces {
     #[default]
     Both,
-    /// Those whose corners are seen anticlockwise.
+    /// Front faces: triangles whose corners appear counterclockwise.
     Fronts,
 }
 
-/// Triangles that are drawn alike, next to each other in the list.
+/// A contiguous range of triangles that are drawn alike.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Group {
     pub first: u32,

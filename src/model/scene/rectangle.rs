@@ -1,8 +1,8 @@
-//! A small rectangle of a picture's pixels.
+//! A small rectangle of an image's pixels.
 
 use crate::error::{Result, invalid};
 
-/// A rectangle that lies inside its picture, at most [`Self::LARGEST`] pixels a side. (0, 0) is the top left pixel.
+/// A rectangle inside an image, at most [`Self::LARGEST`] pixels per side. (0, 0) is the top left pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rectangle {
     x: u32,
@@ -12,13 +12,13 @@ pub struct Rectangle {
 }
 
 impl Rectangle {
-    /// The most pixels of a side.
+    /// The largest width and height in pixels.
     pub const LARGEST: u32 = 64;
 
-    /// The rectangle whose top left pixel is `corner`, in a picture of this width and height.
+    /// The rectangle with the top left pixel `corner` in an image of the size `picture` (width, height).
     ///
     /// # Errors
-    /// `Invalid` when a side is 0 or above [`Self::LARGEST`], or when a part lies outside of the picture.
+    /// `Invalid` if a side is 0 or above [`Self::LARGEST`], or if the rectangle exceeds the image.
     pub fn within(picture: [u32; 2], corner: [u32; 2], size: [u32; 2]) -> Result<Self> {
         let ([x, y], [width, height]) = (corner, size);
         if !size.iter().all(|side| (1..=Self::LARGEST).contains(side)) {
@@ -33,12 +33,12 @@ impl Rectangle {
         Ok(Self { x, y, width, height })
     }
 
-    /// Column of the left pixels.
+    /// Column of the leftmost pixels.
     pub const fn x(&self) -> u32 {
         self.x
     }
 
-    /// Row of the top pixels.
+    /// Row of the topmost pixels.
     pub const fn y(&self) -> u32 {
         self.y
     }

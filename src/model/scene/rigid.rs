@@ -1,30 +1,31 @@
-//! Transforms off the wire: affine as they are, or a quaternion and a translation in f32 or f64.
+//! Parsers of received transforms: affine matrices, or a quaternion and a translation in f32 or f64.
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
-/// How far a quaternion's norm may be from 1. Rounding to f32 is a ten-thousandth of this; more is a sender's mistake.
+/// The largest accepted deviation of a quaternion's norm from 1. Rounding to f32 causes a ten-thousandth of it; a
+/// larger deviation is an error of the sender.
 const NORM_SLACK: f64 = 1e-3;
 
-/// The largest f64 translation on an axis, in scene units: f64 itself keeps a tenth of a thousandth of a unit there.
+/// The largest f64 translation per axis, in scene units. At this distance, f64 rounds by up to 1.2e-4 units.
 pub(super) const FARTHEST: f64 = (1_u64 << 40) as f64;
 
-/// How the transforms of a step are packed.
+/// The encoding of the transforms of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum TransformFormat {
-    /// 12 f32, row-major 3x4, relative to the scene's origin.
+    /// A 3x4 matrix relative to the scene's origin: 12 f32, row-major.
     #[default]
     Affine,
-    /// x, y, z, w of a quaternion and a translation relative to the scene's origin, 7 f32.
+    /// A quaternion x, y, z, w and a translation relative to the scene's origin: 7 f32.
     RigidF32,
-    /// x, y, z, w of a quaternion, 4 f32, and a translation from the world's origin in scene units, 3 f64.
+    /// A quaternion x, y, z, w (4 f32) and a translation from the world's origin in scene units (3 f64).
     RigidF64,
 }
 
 impl TransformFormat {
-    /// Bytes of one transform.
+    /// Size of one transform in bytes.
     pub const fn bytes(self) -> usize {
         match self {
             Self::Affine => 48,
@@ -34,15 +35,15 @@ impl TransformFormat {
     }
 }
 
-/// A parsed transform relative to the scene's origin, and its translation before it was rounded to f32, if it was.
+/// A parsed transform relative to the scene's origin and, if it was given in f64, the unrounded translation.
 pub(super) type Parsed = (Transform, Option<[f64; 3]>);
 
-/// Twelve f32.
+/// Parses [`TransformFormat::Affine`].
 pub(super) fn affine(bytes: &[u8]) -> Result<Parsed> {
     Ok((Transform::new(floats(bytes))?, None))
 }
 
-/// A quaternion and a translation, 7 f32.
+/// Parses [`TransformFormat::RigidF32`].
 pub(super) fn rigid_f32(bytes: &[u8]) -> Result<Parsed> {
     let (rotation, translation) = bytes.split_at(16);
     let translation: [f32; 3] = floats(translation);
@@ -51,7 +52,7 @@ pub(super) fn rigid_f32(bytes: &[u8]) -> Result<Parsed> {
     Ok((Transform::from_parts(&linear, &Vector3::from(translation).cast()), None))
 }
 
-/// A quaternion, 4 f32, and a translation from the world's origin, 3 f64. `origin` is the scene's, in scene units.
+/// Parses [`TransformFormat::RigidF64`]. `origin` is the scene's origin in scene units.
 pub(super) fn rigid_f64(bytes: &[u8], origin: [f64; 3]) -> Result<Parsed> {
     let (rotation, translation) = bytes.split_at(16);
     let given: [f64; 3] = numbers(translation, f64::from_le_bytes);
@@ -89,7 +90,7 @@ fn floats<const N: usize>(bytes: &[u8]) -> [f32; N] {
     numbers(bytes, f32::from_le_bytes)
 }
 
-/// N little-endian numbers of S bytes each, at any alignment. `bytes` holds at least so many.
+/// Decodes N little-endian numbers of S bytes each, at any alignment. `bytes` has at least N * S bytes.
 fn numbers<T, const N: usize, const S: usize>(bytes: &[u8], read: fn([u8; S]) -> T) -> [T; N] {
     std::array::from_fn(|at| {
         let mut word = [0; S];
@@ -102,7 +103,7 @@ fn numbers<T, const N: usize, const S: usize>(bytes: &[u8], read: fn([u8; S]) ->
 mod tests {
     use super::*;
 
-    /// Bytes of numbers, one byte off every alignment.
+    /// Encodes a transform with an offset of one byte, so that no number is aligned.
     fn pack(rotation: [f32; 4], translation: impl IntoIterator<Item = Vec<u8>>) -> Vec<u8> {
         let mut bytes = vec![0xff];
         bytes.extend(rotation.into_iter().flat_map(f32::to_le_bytes));
@@ -147,7 +148,7 @@ mod tests {
         let (transform, kept) = rigid_f64(&bytes[1..], [1e7, -1e7, 0.0]).expect("good");
         assert!((transform.0[3] - 0.001).abs() < 2e-9, "{}", transform.0[3]);
         assert_eq!((transform.0[7], transform.0[11], kept.map(|kept| kept[2])), (0.0, 12.5, Some(12.5)));
-        // The control: rounded first, the millimetre is gone.
+        // Counterexample: rounding before the subtraction loses the millimeter.
         assert_eq!(at[0] as f32 - 1e7_f32, 0.0);
     }
 

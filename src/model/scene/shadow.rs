@@ -1,86 +1,89 @@
-//! Which shadow map a scene asks for.
+//! Settings of a scene's shadow map.
 
 use crate::error::{Result, invalid};
 
-/// How the map answers whether the sun is seen.
+/// How a lookup in the shadow map is filtered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ShadowMethod {
-    /// Chebyshev's bound on blurred moments of depth (variance shadow map, equation 3.10): soft, one lookup a pixel. On a
-    /// receiver with one caster before it the bound is exact, and half dark within half a texel of the true edge but for
-    /// `bleeding`; where casters overlap it lets light through.
+    /// Variance shadow map (equation 3.10): Chebyshev's bound on blurred moments of depth. Soft edges, one lookup per
+    /// pixel. For a receiver with a single occluder the bound is exact, and, apart from `bleeding`, the half-dark
+    /// contour is within half a texel of the true edge. Where occluders overlap, light bleeds through.
     #[default]
     Variance,
-    /// One depth a pixel (standard shadow map): hard, its edge within half a texel of the true one in the plane of the
-    /// map. A caster nearer than the side of a texel to the surface behind it casts none.
+    /// Standard shadow map with one depth per texel. Hard edges, within half a texel of the true edge in the plane of
+    /// the map. An occluder closer than one texel side to the surface behind it casts no shadow.
     Standard,
-    /// The share of depths around the pixel that lie behind it, weighed by the Gaussian of `blur` (percentage-closer
-    /// filtering): soft, half dark within half a texel of the true edge, no light through where casters overlap, and
-    /// (6 blur + 2)^2 depths a pixel. Nearer than the side of a texel it casts none either.
+    /// Percentage-closer filtering: the fraction of surrounding depths behind the receiver, weighted by the Gaussian of
+    /// `blur`. Soft edges, half dark within half a texel of the true edge, no light bleeding, at the cost of
+    /// (6 blur + 2)^2 depths per pixel. As with `Standard`, an occluder closer than one texel side casts no shadow.
     Filtered,
 }
 
-/// How the moments of a variance map are stored.
+/// The storage type of a variance map's moments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Moments {
     #[default]
     F32,
-    /// Half the memory, and wrong: the second moment is rounded by up to 2^-14, thirty times the default least variance,
-    /// so that the shadow near its caster is spotted with light. It is there to be measured.
+    /// Half the memory, but insufficient precision: the second moment is rounded by up to 2^-14, thirty times the
+    /// default `least_variance`, so that shadows near their occluder are speckled with light. Intended for measurements
+    /// only.
     F16,
 }
 
-/// What a map is fitted to.
+/// What the light's view volume is fitted to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fit {
-    /// What the vertices take up as the sun sees them: the texels of a tree have a third of the area, and its leaves fill three
-    /// times as many of them.
+    /// Bounds of the vertices in light space. Compared with `Corners`, the texels of a tree have a third of the area,
+    /// and its leaves cover three times as many of them.
     #[default]
     Vertices,
-    /// The corners of the vertices' box in the world, as the thesis has it (section 3.3.1): deformers measure nothing more.
+    /// The corners of the vertices' bounding box in the world, as in the thesis (section 3.3.1). Needs no extra
+    /// measurement by the deformers.
     Corners,
 }
 
-/// What blurs the moments of a variance map; all three give the same map up to rounding.
+/// The implementation of the moments' blur. All of them yield the same map up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Blurring {
-    /// Tiles on hardware, rows in software.
+    /// `Tiles` on hardware, `Rows` on software implementations.
     #[default]
     Fitting,
-    /// One compute pass: over strips, with sums in registers; over tiles in shared memory where a blur above 8 reaches too
-    /// far for that.
+    /// One compute pass. It works on strips with sums in registers; for a blur above 8, whose radius is too
+    /// large for this, on tiles in shared memory.
     Tiles,
     /// Two compute passes without shared memory.
     Rows,
-    /// Two passes of fragments, as the thesis draws them: a baseline for the report.
+    /// Two fragment passes, as in the thesis; a baseline for the benchmark report.
     Fragments,
 }
 
-/// The shadow map.
+/// Settings of the shadow map.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Shadow {
     pub method: ShadowMethod,
     /// Side of the square map in texels, 16 to 16384.
     pub size: u32,
-    /// Standard deviation of the Gaussian in texels, 0 (none) to 16. A standard map has none.
+    /// Standard deviation of the Gaussian in texels, 0 (no blur) to 16. [`ShadowMethod::Standard`] ignores it.
     pub blur: f32,
-    /// Smallest variance, as a fraction of the squared depth range. Not less than what rounding alone makes of no
-    /// variance is ever taken: [`Self::floor`].
+    /// Lower bound of the variance, as a fraction of the squared depth range. The effective bound is at least
+    /// [`Self::floor`], the variance that rounding alone produces.
     pub least_variance: f32,
-    /// Chebyshev values below this count as full shadow, 0 to 0.99 (light-bleeding reduction). It moves the edge of a
-    /// shadow outwards: at 0.2 by a quarter of the deviation.
+    /// Light-bleeding reduction: Chebyshev values below this count as full shadow, 0 to 0.99. It moves the edge of a
+    /// shadow outwards, at 0.2 by a quarter of the standard deviation.
     pub bleeding: f32,
-    /// Blended materials cast a shadow from this alpha on (the thesis's t_alpha).
+    /// The alpha from which blended materials cast a shadow (t_alpha of the thesis).
     pub alpha_threshold: f32,
     pub moments: Moments,
-    /// Maps of this size, 1 to 4, split by distance from the camera: the nearer finer, the last over the whole scene.
-    /// `blur` is in texels of each, so that shadows are sharper nearby.
+    /// Number of cascades, 1 to 4, each with a map of `size`, split by distance from the camera. Nearer cascades have
+    /// finer texels; the last one covers the whole scene. `blur` is in texels of each cascade, so that shadows are
+    /// sharper nearby.
     pub splits: u32,
     pub fit: Fit,
-    /// For measurements; no file names it.
+    /// For benchmarks only; not part of the file format.
     #[serde(skip)]
     pub blurring: Blurring,
 }
@@ -102,16 +105,16 @@ impl Default for Shadow {
     }
 }
 
-/// The most texels of all maps together.
+/// The largest number of texels of all cascades together.
 const MOST_TEXELS: u64 = 16384 * 16384;
 
 impl Shadow {
-    /// Whether moments are made of the depth, and blurred.
+    /// Whether the map stores moments of depth, which are blurred.
     pub const fn has_moments(&self) -> bool {
         matches!(self.method, ShadowMethod::Variance)
     }
 
-    /// Texels to each side of the middle one that the Gaussian reaches: three deviations.
+    /// Radius of the blur kernel in texels: three standard deviations.
     pub fn reach(&self) -> u32 {
         match self.method {
             ShadowMethod::Standard => 0,
@@ -119,15 +122,16 @@ impl Shadow {
         }
     }
 
-    /// Standard deviation of what a soft map weighs depths with, in texels: that of the blur, and of reading between
-    /// texels, which is a tent of variance 1/6.
+    /// Standard deviation, in texels, of the filter that a soft map applies to depths: the blur and the bilinear
+    /// lookup, a tent of variance 1/6.
     pub fn deviation(&self) -> f64 {
         (f64::from(self.blur).powi(2) + 1.0 / 6.0).sqrt()
     }
 
-    /// The variance that rounding to f32 can make of equal depths m, |m| <= 1/2, blurred by N taps in x and in y. With
-    /// u = 2^-24: the products, sums and weights of two passes and the bilinear lookup leave M2 <= 1/4 wrong by at most
-    /// (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, so M1^2 by (N + 3) u; in all below (1.5 N + 5) u.
+    /// Upper bound of the variance that f32 rounding produces from equal depths m, |m| <= 1/2, blurred by N taps in x
+    /// and in y. With u = 2^-24, the products, sums and weights of two passes and the bilinear lookup change M2 <= 1/4
+    /// by at most (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, hence M1^2 by (N + 3) u. In total, the
+    /// variance is below (1.5 N + 5) u.
     pub fn floor(&self) -> f32 {
         let taps = 2 * self.reach() + 1;
         (1.5 * taps as f32 + 5.0) * (0.5 * f32::EPSILON)
@@ -177,7 +181,7 @@ mod tests {
         }
     }
 
-    /// Moments of equal depths m, blurred twice in f32 as the shaders do it; the largest |M2 - M1^2|.
+    /// Blurs moments of equal depths m twice in f32, as the shaders do. Returns the largest |M2 - M1^2|.
     fn spurious(shadow: &Shadow) -> f32 {
         let reach = shadow.reach() as i32;
         let bell = |step: i32| (-0.5 * (f64::from(step) / f64::from(shadow.blur)).powi(2)).exp();

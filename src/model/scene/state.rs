@@ -1,4 +1,5 @@
-//! The values of one step: packed coordinates q, and one transform per domain that follows no other.
+//! The state of a scene after a step: packed coordinates q, and the transform of each transform root (a domain that
+//! follows no other domain).
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -6,42 +7,43 @@ use std::sync::Arc;
 use super::{Cells, Movers, Scene, Update};
 use crate::domain::{Composed, Transform};
 
-/// Which domains differ from the state one serial number before.
+/// The domains that differ from the state with the previous serial number.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Changed {
-    /// Possibly all.
+    /// Possibly all domains.
     #[default]
     All,
-    /// These at most, ascending, each once: those whose q or T the last update named, those that share a named q, and
-    /// those that follow a named T.
+    /// At most these domains, ascending and without duplicates: domains whose q or T the last update set, domains that
+    /// share a q that was set, and followers of a domain whose T was set.
     Some(Vec<u32>),
 }
 
-/// The whole state that a step leaves behind.
+/// The complete state after a step.
 #[derive(Debug, Clone)]
 pub struct State {
-    /// Counts the writers of this scene; step numbers belong to one writer. 0 before the first.
+    /// Number of the run: each new writer starts a run, and step numbers belong to one run. 0 before the first.
     pub run: u64,
-    /// The number that the writer gave the last step.
+    /// The step number that the writer assigned.
     pub step: u64,
-    /// Simulation time in seconds, as the writer said.
+    /// Simulation time in seconds, as given by the writer.
     pub time: f64,
-    /// All coordinates, packed as [`super::Layout`] says.
+    /// All coordinates, packed as in [`super::Layout`].
     pub q: Vec<f32>,
-    /// `world_from_domain` of each mover ([`super::Movers`]), which is each domain where nobody follows; relative to its
-    /// cell ([`Self::cell_of`]): the scene's origin unless a step with f64 translations took it far from it.
+    /// `world_from_domain` of each transform root ([`super::Movers`]); without followers, every domain is one. Relative
+    /// to the domain's cell ([`Self::cell_of`]), which is the scene's origin unless a step with f64 translations moved
+    /// the domain far from it.
     pub transforms: Vec<Transform>,
-    /// Where movers are in f64, once a step with f64 translations has come.
+    /// f64 translations and cells; present after the first step with f64 translations.
     pub cells: Option<Arc<Cells>>,
-    /// Counts the updates of this state; 0 at rest. A deformer that has computed serial s and is given s + 1 need compute
-    /// only the domains in `changed`. Any other pair of numbers, equal ones included, means all, and so does a deformer's
-    /// own failure.
+    /// Number of updates of this state; 0 at rest. A deformer that computed serial s and receives s + 1 needs to
+    /// compute only the domains in `changed`. For any other pair of serials, including equal ones, and after an error
+    /// of its own, it must compute all domains.
     pub serial: u64,
-    /// What the last update changed.
+    /// The domains that the last update changed.
     pub changed: Changed,
 }
 
-/// Equal when they show the same: how they came about (`serial`, `changed`) does not count.
+/// Equality ignores how the state came about (`serial`, `changed`).
 impl PartialEq for State {
     fn eq(&self, other: &Self) -> bool {
         (self.run, self.step, self.time) == (other.run, other.step, other.time)
@@ -62,8 +64,9 @@ impl State {
         Self { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
     }
 
-    /// Applies a whole step. What it does not name keeps its value. The work is that of the named domains and of the
-    /// lists of those that share their q or follow them, but for the rare step after which the shared cell follows its domains.
+    /// Applies a whole step. Domains that the step does not name keep their values. The cost is proportional to the
+    /// number of named domains, their followers, and the domains that share their q. Exceptions are the first step with
+    /// f64 translations and the rare steps that search a new shared cell: they make a pass over all transform roots.
     pub fn apply(&mut self, scene: &Scene, update: &Update) {
         self.step = update.number;
         self.time = update.time;
@@ -87,7 +90,7 @@ impl State {
         self.changed = if anew { Changed::All } else { Changed::Some(changed) };
     }
 
-    /// Sets the named transforms. True when others were expressed anew.
+    /// Sets the named transforms. Returns true if transforms of other domains were rebased to a new cell.
     fn place(&mut self, movers: &Movers, update: &Update) -> bool {
         let begins = self.cells.is_none() && update.has_f64();
         if begins {
@@ -117,23 +120,23 @@ impl State {
         anew
     }
 
-    /// The f64 point that the transform of a mover, its vertices and those of its followers are relative to, in scene
-    /// units from the scene's origin. `mover` is an index in `transforms`.
+    /// The f64 reference point of a transform root: its transform, its vertices and those of its followers are relative
+    /// to this point, which is in scene units from the scene's origin. `mover` is an index into `transforms`.
     pub fn cell_of(&self, mover: usize) -> [f64; 3] {
         self.cells.as_ref().map_or([0.0; 3], |cells| cells.cell_of(mover))
     }
 
-    /// The transform of a domain and, of a follower, its frame; relative to the cell of its mover.
+    /// The transform of a domain's root and, for a follower, its constant frame; relative to the cell of the root.
     pub fn composed(&self, scene: &Scene, domain: usize) -> Composed {
         Composed { mover: self.transforms[scene.movers.of(domain)], frame: scene.movers.frame_of(domain) }
     }
 
-    /// `world_from_domain` of a domain in f32, as deformers have it ([`Composed::rounded`]).
+    /// `world_from_domain` of a domain in f32, as deformers use it ([`Composed::rounded`]).
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> Transform {
         self.composed(scene, domain).rounded()
     }
 
-    /// That of every domain; `transforms` itself where nobody follows.
+    /// `world_from_domain` of every domain. Borrows `transforms` if the scene has no followers.
     pub fn world_transforms(&self, scene: &Scene) -> Cow<'_, [Transform]> {
         match scene.needs.followers {
             false => Cow::Borrowed(&self.transforms),
@@ -141,13 +144,14 @@ impl State {
         }
     }
 
-    /// To be called after `q` or `transforms` were written by hand, so that no deformer takes the change list for whole.
+    /// Marks the whole state as changed. Call it after writing `q` or `transforms` directly, because `changed` does not
+    /// list such writes.
     pub fn touch(&mut self) {
         self.serial += 1;
         self.changed = Changed::All;
     }
 
-    /// Coordinates of one domain.
+    /// The coordinates of one domain.
     pub fn q_of<'a>(&'a self, scene: &Scene, domain: usize) -> &'a [f32] {
         let slot = scene.layout.slots[domain];
         &self.q[slot.first_q..][..slot.rank]

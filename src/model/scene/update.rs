@@ -1,4 +1,4 @@
-//! One step as a client sends it: parsed once against the scene, then trusted.
+//! One step of a writer. It is validated once against its scene, so that later code can rely on it.
 
 use std::collections::BTreeMap;
 
@@ -8,45 +8,45 @@ use super::{Scene, TransformFormat};
 use crate::domain::Transform;
 use crate::error::{Error, Result, invalid};
 
-/// The bytes of a step off the wire, not yet believed.
+/// A step as received, not yet validated.
 #[derive(Debug, Clone, Default)]
 pub struct RawUpdate {
     pub number: u64,
     pub time: f64,
-    /// Domains whose coordinates follow in `q`; empty with bytes in `q` means all domains in order.
+    /// Domains whose coordinates are in `q`. If empty while `q` is not, all domains in order.
     pub q_domains: Vec<u32>,
-    /// r little-endian f32 per named domain, concatenated. Any alignment.
+    /// r little-endian f32 per named domain, concatenated, at any alignment.
     pub q: bytes::Bytes,
-    /// Domains whose transforms follow; empty with bytes in `transforms` means all domains in order, but for those that
-    /// follow another one.
+    /// Domains whose transforms are in `transforms`. If empty while `transforms` is not, all transform roots in order
+    /// (domains that follow no other).
     pub transform_domains: Vec<u32>,
-    /// One transform per named domain in `transform_format`, little-endian, concatenated. Any alignment.
+    /// One transform per named domain in `transform_format`, little-endian, concatenated, at any alignment.
     pub transforms: bytes::Bytes,
     pub transform_format: TransformFormat,
 }
 
-/// A domain, and the first number and the count of its coordinates among the values of a step.
+/// A domain, and the offset and number of its coordinates in `Update::values`.
 type Part = (u32, usize, usize);
 
-/// A step that fits its scene: every index in range, every length right, every number finite.
+/// A validated step: every index is in range, every length matches, every number is finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Update {
     pub number: u64,
     pub time: f64,
     q: Vec<Part>,
     values: Vec<f32>,
-    /// Each named domain's transform relative to the scene's origin, rounded to f32.
+    /// The transform of each named domain relative to the scene's origin, rounded to f32.
     pub transforms: Vec<(u32, Transform)>,
-    /// Those domains of `transforms`, in the same order, whose translation was given in f64: relative to the scene's
-    /// origin, not rounded.
+    /// For the domains of `transforms` with an f64 translation, in the same order: the unrounded translation relative
+    /// to the scene's origin.
     translations: Vec<(u32, [f64; 3])>,
 }
 
 impl Update {
-    /// Parses a step against its scene.
+    /// Validates a step against its scene.
     ///
     /// # Errors
-    /// `Invalid` with the field, what was expected and what was given.
+    /// `Invalid` with the field, the expected and the given value.
     pub fn parse(scene: &Scene, raw: &RawUpdate) -> Result<Self> {
         if !raw.time.is_finite() {
             return Err(invalid("step.time", "a finite number", raw.time));
@@ -56,12 +56,13 @@ impl Update {
         Ok(Self { number: raw.number, time: raw.time, q, values, transforms, translations })
     }
 
-    /// Whether a translation was given in f64.
+    /// Whether any translation was given in f64.
     pub const fn has_f64(&self) -> bool {
         !self.translations.is_empty()
     }
 
-    /// Each domain whose transform changes, with its translation relative to the scene's origin as exact as it was given.
+    /// Each domain with a new transform, and its translation relative to the scene's origin in the precision in which
+    /// it was given.
     pub fn placements(&self) -> impl Iterator<Item = (usize, Transform, [f64; 3])> {
         let mut exact = self.translations.iter().peekable();
         self.transforms.iter().map(move |(domain, transform)| {
@@ -71,16 +72,16 @@ impl Update {
         })
     }
 
-    /// Each domain whose coordinates change, with its r numbers.
+    /// Each domain with new coordinates, and its r numbers.
     pub fn coordinates(&self) -> impl Iterator<Item = (usize, &[f32])> {
         self.q.iter().map(|(domain, first, count)| (*domain as usize, &self.values[*first..][..*count]))
     }
 
-    /// This step after an older one, so that applying the result equals applying both in order.
+    /// Merges this step with an older one. Applying the result equals applying both in order.
     pub fn over(self, older: &Self) -> Self {
         let mut q: BTreeMap<u32, &[f32]> = BTreeMap::new();
         let mut transforms = BTreeMap::new();
-        // Only what was given in f64 stays so: a newer f32 translation of the same domain replaces it.
+        // A newer f32 translation of a domain replaces an older f64 translation.
         let mut translations = BTreeMap::new();
         for step in [older, &self] {
             q.extend(step.coordinates().map(|(domain, values)| (domain as u32, values)));
@@ -139,7 +140,7 @@ fn parse_q(scene: &Scene, raw: &RawUpdate) -> Result<(Vec<Part>, Vec<f32>)> {
     Ok((places, values))
 }
 
-/// Transforms of the named domains, and which of their translations were given in f64.
+/// Transforms of the named domains, and the f64 translations among them.
 type Transforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
 
 fn parse_transforms(scene: &Scene, raw: &RawUpdate) -> Result<Transforms> {
@@ -170,7 +171,7 @@ fn parse_transforms(scene: &Scene, raw: &RawUpdate) -> Result<Transforms> {
     Ok((transforms, translations))
 }
 
-/// The only format that can shear.
+/// Parses the only format that can contain shear.
 fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<Parsed> {
     let (transform, kept) = rigid::affine(bytes)?;
     if !scene.needs.shear && !transform.is_similarity() {
@@ -180,13 +181,13 @@ fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<Parsed> {
     Ok((transform, kept))
 }
 
-/// The domains that a list names, each once.
+/// Validates a list of domain indices: in range and without duplicates.
 fn named(scene: &Scene, field: &str, list: &[u32]) -> Result<Vec<u32>, Error> {
     let count = scene.domains.len();
     if list.len() > count {
         return Err(invalid(field, format!("at most {count} indices"), list.len()));
     }
-    // One bit per domain: a list of a million costs as much per index as one of ten.
+    // A bit set keeps the cost per index independent of the length of the list.
     let mut seen = vec![0_u64; count.div_ceil(64)];
     for (at, domain) in list.iter().enumerate() {
         let index = *domain as usize;
@@ -202,7 +203,7 @@ fn named(scene: &Scene, field: &str, list: &[u32]) -> Result<Vec<u32>, Error> {
     Ok(list.to_vec())
 }
 
-/// Little-endian numbers at any alignment.
+/// Decodes little-endian numbers at any alignment.
 fn floats(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(4).map(|word| f32::from_le_bytes([word[0], word[1], word[2], word[3]])).collect()
 }

@@ -1,4 +1,4 @@
-//! The bark, made from a seed: a tiling sRGB colour image and its tangent-space normal map (+Y up), 512 x 512 each.
+//! Procedural bark from a seed: a tiling sRGB color image and its tangent-space normal map (+Y up), 512 x 512 each.
 
 use rayon::prelude::*;
 
@@ -10,19 +10,19 @@ use crate::error::Result;
 /// Side of both images in pixels.
 const SIDE: usize = 512;
 
-/// Height of the ridges above the furrows, in widths of the tile.
+/// Height of the ridges above the furrows, in tile widths.
 const RELIEF: f32 = 0.020;
 
-/// sRGB, 0 to 255: bottoms of the furrows, ridges, weathered crests, a breath of lichen.
+/// sRGB colors, 0 to 255: furrow bottoms, ridges, weathered crests, and lichen.
 const FURROW: [f32; 3] = [70.0, 57.0, 47.0];
 const RIDGE: [f32; 3] = [126.0, 109.0, 92.0];
 const CREST: [f32; 3] = [166.0, 152.0, 135.0];
 const LICHEN: [f32; 3] = [126.0, 126.0, 92.0];
 
-/// Colour image and normal map.
+/// The color image and the normal map.
 ///
 /// # Errors
-/// None in practice: the sizes are constants.
+/// None in practice, because the sizes are constants.
 pub(super) fn textures(random: &mut Random) -> Result<[Texture; 2]> {
     let layers = Layers::new(random);
     let rows = |row: usize| (0..SIDE).map(move |column| (column, row));
@@ -68,7 +68,7 @@ impl Layers {
     /// 0 in the furrows to about 1 on the crests.
     fn height(&self, u: f32, v: f32) -> f32 {
         let bent = u + 0.035 * self.warps[0].at(u, v) + 0.012 * self.warps[1].at(u, v);
-        // Zero lines of the noise are long wavering furrows; the finer ones are shallow.
+        // The zero crossings of the noise form long, wavering furrows; the finer ones are shallow.
         let deep = smooth_step(0.0, 0.34, self.furrows[0].at(bent, v).abs());
         let fine = smooth_step(0.0, 0.36, self.furrows[1].at(bent, v).abs());
         let crack = smooth_step(0.0, 0.16, self.cracks.at(bent, v + 0.02 * self.warps[1].at(v, u)).abs());
@@ -77,7 +77,7 @@ impl Layers {
         plate * (0.93 + 0.07 * grain) + 0.045 * grain
     }
 
-    /// sRGB of a place and its height.
+    /// sRGB color at a position of the given height.
     fn colour(&self, u: f32, v: f32, height: f32) -> [f32; 3] {
         let grain = self.grain[0].at(u, v);
         let tint = self.tint.at(u, v);
@@ -89,7 +89,7 @@ impl Layers {
     }
 }
 
-/// The unit normal by central differences over the tile's edges; x to the right, y up in the image.
+/// The unit normal by central differences, periodic at the tile's edges; x points right and y up in the image.
 fn normal(heights: &[f32], column: usize, row: usize) -> [f32; 3] {
     let at = |column: usize, row: usize| heights[row % SIDE * SIDE + column % SIDE];
     let right = at(column + 1, row) - at(column + SIDE - 1, row);
@@ -116,7 +116,7 @@ mod tests {
         assert!((x - 127.5).abs() < 2.0 && (y - 127.5).abs() < 2.0 && z > 215.0, "{x} {y} {z}");
         let [red, green, blue] = mean(&colour);
         assert!(red > green && green > blue && (70.0..160.0).contains(&red), "{red} {green} {blue}");
-        // The control: it is no flat map.
+        // The map is not flat.
         let tilted = normals.rgba().chunks_exact(4).filter(|pixel| pixel[2] < 240).count();
         assert!(tilted > SIDE * SIDE / 10, "{tilted} tilted pixels");
     }
@@ -138,7 +138,7 @@ mod tests {
         heights[100 * SIDE + 100] = 0.2;
         assert!(normal(&heights, 101, 100)[0] > 0.1);
         assert!(normal(&heights, 99, 100)[0] < -0.1);
-        // The pixel above the bump in the image looks up.
+        // The normal of the pixel above the bump in the image points up.
         assert!(normal(&heights, 100, 99)[1] > 0.1);
     }
 }

@@ -1,4 +1,4 @@
-//! A clamped chain of beam elements to its lowest modes: K phi = lambda M phi, lambda in (rad/s)^2, phi^T M phi = 1.
+//! The lowest modes of a clamped chain of beam elements: K phi = lambda M phi, lambda in (rad/s)^2, phi^T M phi = 1.
 
 use nalgebra::{Cholesky, DMatrix, SymmetricEigen, Vector3};
 
@@ -9,26 +9,26 @@ use crate::error::{Result, during};
 /// A cantilever along a polyline, clamped at its first node.
 #[derive(Debug, Clone)]
 pub(super) struct Beam {
-    /// N + 1 places, metres.
+    /// N + 1 node positions in meters.
     pub(super) nodes: Vec<Vector3<f64>>,
-    /// N sections.
+    /// N sections, one per element.
     pub(super) sections: Vec<Section>,
     pub(super) wood: Wood,
-    /// Masses (kg) of what hangs on the beam, and where.
+    /// Carried masses (kg) and their stations.
     pub(super) loads: Vec<(Station, f64)>,
 }
 
 /// The lowest modes of a beam.
 #[derive(Debug, Clone)]
 pub(super) struct BeamModes {
-    /// (rad/s)^2, ascending.
+    /// Eigenvalues in (rad/s)^2, ascending.
     pub(super) eigenvalues: Vec<f64>,
-    /// 6 (N + 1) rows (the first six, of the clamp, are zero), one column per mode.
+    /// 6 (N + 1) rows and one column per mode. The first six rows, those of the clamped node, are zero.
     pub(super) shapes: DMatrix<f64>,
 }
 
 impl Beam {
-    /// Mass of the wood alone, kg.
+    /// Mass of the wood alone in kg.
     pub(super) fn own_mass(&self) -> f64 {
         let lengths = self.nodes.windows(2).map(|ends| (ends[1] - ends[0]).norm());
         lengths.zip(&self.sections).map(|(length, section)| self.wood.density * section.area * length).sum()
@@ -40,7 +40,7 @@ impl Beam {
         let (mut stiffness, mut mass) = (DMatrix::zeros(free, free), DMatrix::zeros(free, free));
         for (element, section) in self.sections.iter().enumerate() {
             let (k, m) = matrices(&self.nodes[element], &self.nodes[element + 1], section, &self.wood);
-            // The first node is clamped: of the first element only the second node's block is free.
+            // The first node is clamped: of the first element, only the second node's block is free.
             let (first, count) = if element == 0 { (6, 6) } else { (0, 12) };
             let to = 6 * element + first - 6;
             let mut block = stiffness.view_mut((to, to), (count, count));
@@ -60,12 +60,13 @@ impl Beam {
 
     /// The `count` lowest modes.
     ///
-    /// K is factored rather than M: stretching is up to 10^10 times stiffer than the first bending, so the lowest
-    /// eigenvalues of L^-1 K L^-T with M = L L^T would drown in the rounding of the highest. With K = L L^T they are
-    /// the largest ones of L^-1 M L^-T, mu = 1 / lambda, and come out to full precision; phi = L^-T y / sqrt(mu).
+    /// K is factored instead of M. Axial stiffness is up to 10^10 times the lowest bending stiffness, so that in L^-1 K
+    /// L^-T with M = L L^T the lowest eigenvalues would be lost in the rounding errors of the highest. With K = L L^T
+    /// they are the largest ones of L^-1 M L^-T, mu = 1 / lambda, and accurate to full precision; phi = L^-T y /
+    /// sqrt(mu).
     ///
     /// # Errors
-    /// `Fault` when K is not positive definite (a node without stiffness) or the iteration does not converge.
+    /// `Fault` if K is not positive definite (a node without stiffness) or the iteration does not converge.
     pub(super) fn modes(&self, count: usize) -> Result<BeamModes> {
         let fault = during::<&str>("tree.beam");
         let (stiffness, mass) = self.assemble();
@@ -84,7 +85,7 @@ impl Beam {
         for (column, index) in order.into_iter().enumerate() {
             let mu = eigen.eigenvalues[index];
             let shape = factor.tr_solve_lower_triangular(&eigen.eigenvectors.column(index)).ok_or_else(singular)?;
-            // The largest entry is positive: a sign that does not hang on the solver's path.
+            // The largest entry is positive, so that the sign does not depend on the solver.
             let scale = shape[shape.icamax()].signum() / mu.sqrt();
             shapes.view_mut((6, column), (shape.len(), 1)).copy_from(&(shape * scale));
             eigenvalues.push(1.0 / mu);
@@ -99,7 +100,8 @@ pub(super) mod tests {
 
     pub(in super::super) const WOOD: Wood = Wood { youngs_modulus: 8e9, shear_modulus: 5e8, density: 800.0 };
 
-    /// A beam of length 1 with ends of two radii, bent by `bend` radians over its length, lying obliquely.
+    /// A beam of length 1 with different radii at its ends, bent by `bend` radians over its length, in an oblique
+    /// direction.
     pub(in super::super) fn bent(elements: usize, radii: [f64; 2], bend: f64) -> Beam {
         let oblique = nalgebra::Rotation3::from_euler_angles(0.4, 0.9, -1.3);
         let place = |index: usize| {
@@ -119,7 +121,7 @@ pub(super) mod tests {
         }
     }
 
-    /// The largest ||K phi - lambda M phi|| / ||K phi||, and the largest departure of phi^T M phi from the identity.
+    /// The largest ||K phi - lambda M phi|| / ||K phi||, and the largest deviation of phi^T M phi from the identity.
     pub(in super::super) fn faults(beam: &Beam, modes: &BeamModes) -> (f64, f64) {
         let (stiffness, mass) = beam.assemble();
         let shapes = modes.shapes.rows(6, stiffness.nrows()).into_owned();
@@ -163,13 +165,13 @@ pub(super) mod tests {
     #[test]
     fn a_uniform_cantilever_has_the_frequencies_of_euler_and_bernoulli() {
         for radius in [0.02, 0.00025] {
-            // A shear modulus beyond any wood keeps torsion above the bending modes looked at.
+            // An unrealistically high shear modulus keeps torsion above the first bending modes.
             let wood = Wood { shear_modulus: 1e12, ..WOOD };
             let beam = Beam { wood, ..bent(14, [radius; 2], 0.0) };
             let modes = beam.modes(6).expect("converges");
             let Section { area, moment } = beam.sections[0];
             let base = (wood.youngs_modulus * moment / (wood.density * area)).sqrt();
-            // Roots of cos x cosh x = -1; each bending comes twice, once per plane.
+            // Roots of cos x cosh x = -1. Each bending mode occurs twice, once per plane.
             let roots = [1.875_104, 1.875_104, 4.694_091, 4.694_091, 7.854_757, 7.854_757];
             for (value, root) in modes.eigenvalues.iter().zip(roots) {
                 let want = root * root * base;

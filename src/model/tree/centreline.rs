@@ -1,4 +1,5 @@
-//! The curve that a branch grows along: a start direction and its bends to points, tangents and arc lengths in metres.
+//! The centerline of a branch: generated from a start direction and bends, sampled as points, tangents and arc lengths
+//! in meters.
 
 use nalgebra::{Rotation3, Vector3};
 
@@ -7,23 +8,23 @@ use super::random::Random;
 /// Integration steps between two rings.
 const STEPS: usize = 8;
 
-/// How a branch grows. Angles are radians, lengths metres.
+/// Growth parameters of a branch. Angles are in radians, lengths in meters.
 #[derive(Debug, Clone)]
 pub(super) struct Growth {
     pub(super) length: f64,
-    /// Beam elements along the branch.
+    /// Number of beam elements along the branch.
     pub(super) elements: usize,
-    /// Rings of skin per beam element.
+    /// Number of skin rings per beam element.
     pub(super) rings: usize,
-    /// Node i of N lies at `length (i / N)^grading`: above 1 the nodes are denser near the root.
+    /// Node i of N is at arc length `length (i / N)^grading`: above 1, nodes are denser near the root.
     pub(super) grading: f64,
     /// Unit direction at the root.
     pub(super) start: Vector3<f64>,
-    /// Unit direction of the light, which is against gravity.
+    /// Unit direction of the light, opposite to gravity.
     pub(super) up: Vector3<f64>,
-    /// How far the weight bends the inner half down.
+    /// Downward bend of the inner half by weight.
     pub(super) sag: f64,
-    /// How far the light bends the outer half up.
+    /// Upward bend of the outer half towards the light.
     pub(super) rise: f64,
     /// Amplitude of the random bends.
     pub(super) wander: f64,
@@ -35,7 +36,7 @@ pub(super) struct Centreline {
     pub(super) points: Vec<Vector3<f64>>,
     /// Unit tangents.
     pub(super) tangents: Vec<Vector3<f64>>,
-    /// Unit vectors across, carried along the curve without twist.
+    /// Unit vectors perpendicular to the tangents, transported along the curve without twist.
     pub(super) sides: Vec<Vector3<f64>>,
     /// Arc length from the root.
     pub(super) arcs: Vec<f64>,
@@ -44,7 +45,7 @@ pub(super) struct Centreline {
 }
 
 impl Centreline {
-    /// Grows a curve from the origin.
+    /// Generates a curve from the origin.
     pub(super) fn grow(growth: &Growth, random: &mut Random) -> Self {
         let wander = Wander::new(growth, random);
         let arcs = ring_arcs(growth);
@@ -77,7 +78,7 @@ impl Centreline {
         if arc - self.arcs[after - 1] < self.arcs[after] - arc { after - 1 } else { after }
     }
 
-    /// A fraction of the length for each ring.
+    /// The arc length of a ring as a fraction of the length.
     pub(super) fn fraction(&self, ring: usize) -> f64 {
         self.arcs[ring] / self.length()
     }
@@ -87,7 +88,7 @@ impl Centreline {
         self.points.iter().copied().step_by(self.rings).collect()
     }
 
-    /// A unit vector that leaves ring `ring` at `angle` from the tangent, towards `azimuth` around it.
+    /// A unit vector at ring `ring`, at `angle` from the tangent towards the direction `across`.
     pub(super) fn leaving(&self, ring: usize, angle: f64, across: &Vector3<f64>) -> Vector3<f64> {
         let tangent = self.tangents[ring];
         let flat = (across - tangent * tangent.dot(across)).try_normalize(1e-9).unwrap_or(self.sides[ring]);
@@ -95,7 +96,7 @@ impl Centreline {
     }
 }
 
-/// The frame of a part: +Y along `along`, +Z as near to `up` as that allows.
+/// The frame of a part: +Y along `along`, +Z as close to `up` as possible.
 pub(super) fn frame(along: &Vector3<f64>, up: &Vector3<f64>) -> Rotation3<f64> {
     let flat = up - along * along.dot(up);
     let z = flat.try_normalize(1e-6).unwrap_or_else(|| {
@@ -117,16 +118,16 @@ fn ring_arcs(growth: &Growth) -> Vec<f64> {
     arcs
 }
 
-/// Change of the tangent per length of the branch by weight and light.
+/// Change of the tangent, per unit of relative length, by weight and light.
 fn bend(growth: &Growth, tangent: &Vector3<f64>, along: f64) -> Vector3<f64> {
     let across = growth.up - tangent * tangent.dot(&growth.up);
     across * (2.0 * growth.rise * along - 2.0 * growth.sag * (1.0 - along))
 }
 
-/// Smooth random bends: three waves about two axes across the start.
+/// Smooth random bends: three waves about each of two axes perpendicular to the start.
 struct Wander {
     axes: [Vector3<f64>; 2],
-    /// Amplitude, waves along the branch, phase.
+    /// Amplitude, number of waves along the branch, and phase of each wave.
     waves: [[(f64, f64, f64); 3]; 2],
 }
 

@@ -1,4 +1,4 @@
-//! Leaf clusters: a green shoot with leaf blades, as molds. Sprays bend with two modes, rosettes are rigid.
+//! Templates of leaf clusters: a green shoot with leaf blades. Sprays bend with two modes, rosettes are rigid.
 
 use nalgebra::{Rotation3, Unit, Vector3};
 
@@ -12,16 +12,16 @@ use super::sheet::{Blade, Sheet, Wrap, between};
 /// Green shoots are softer than wood.
 const SHOOT: Wood = Wood { youngs_modulus: 3.0e9, shear_modulus: 2.0e8, density: 850.0 };
 
-/// Fresh mass of a leaf, kg per m^2 of one side.
+/// Fresh mass of a leaf in kg per m^2 of one side.
 const LEAF_MASS: f64 = 0.17;
 
-/// The part of a card that the outline covers.
+/// The fraction of a card's area that the leaf outline covers.
 const COVER: f64 = 0.55;
 
-/// Width of a leaf's card over its length.
+/// Ratio of width to length of a leaf's card.
 const SLIMNESS: f64 = 0.62;
 
-/// Which clusters there are: bending or not, length of the shoot (m), leaves, length of a leaf (m).
+/// The clusters: whether it bends, length of the shoot (m), number of leaves, length of a leaf (m).
 const CLUSTERS: [(bool, f64, usize, f64); 8] = [
     (true, 0.50, 13, 0.235),
     (true, 0.46, 12, 0.240),
@@ -33,7 +33,7 @@ const CLUSTERS: [(bool, f64, usize, f64); 8] = [
     (false, 0.26, 10, 0.225),
 ];
 
-/// All kinds of clusters.
+/// The templates of all clusters.
 pub(super) fn clusters(random: &mut Random) -> Vec<Mold> {
     CLUSTERS.iter().map(|cluster| grow(*cluster, &mut random.fork())).collect()
 }
@@ -77,17 +77,17 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Ran
     mold
 }
 
-/// Adds a leaf at a fraction of the shoot. Azimuth 0 is to the right of the shoot, the light comes from +Z.
+/// Adds a leaf at a fraction of the shoot. Azimuth 0 is to the right of the shoot; light comes from +Z.
 fn add_leaf(mold: &mut Mold, along: f64, azimuth: f64, length: f64, random: &mut Random) {
     let (station, base, tangent) = between(&mold.line, along);
     let right = tangent.cross(&Vector3::z()).normalize();
     let over = right.cross(&tangent);
-    // Leaves stand off to the sides rather than up or down, the last one goes on where the shoot ends.
+    // Leaves point sideways rather than up or down; the last leaf continues the shoot.
     let across = right * azimuth.cos() + over * (0.60 * azimuth.sin() + 0.15);
     let angle = if along >= 1.0 { random.between(0.05, 0.25) } else { random.between(0.70, 1.20) };
     let droop = random.between(0.05, 0.50);
     let forward = (tangent * angle.cos() + across * angle.sin() - Vector3::z() * droop).normalize();
-    // The blade turns its face to the light, but never wholly.
+    // The blade turns its face towards the light, but not completely.
     let face = (over + Vector3::z() + forward.cross(&Vector3::z()) * random.spread(0.55)).normalize();
     let normal = (face - forward * forward.dot(&face)).normalize();
     let twist = Rotation3::from_axis_angle(&Unit::new_unchecked(forward), random.spread(0.35));

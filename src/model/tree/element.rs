@@ -1,14 +1,14 @@
-//! One Euler-Bernoulli frame element: section, length and direction to 12 x 12 stiffness and consistent mass.
+//! The 12 x 12 stiffness and consistent mass matrices of one Euler-Bernoulli frame element.
 //!
-//! Degrees of freedom per node: displacement x, y, z (m), rotation about x, y, z (rad). Local x runs along the element.
-//! Bending is cubic, stretch and twist are linear in the element (Przemieniecki, "Theory of Matrix Structural
-//! Analysis", sections 5.6 and 11.3; rotary inertia of the bending is left out, as Euler and Bernoulli did).
+//! Degrees of freedom per node: displacement x, y, z (m), rotation about x, y, z (rad). Local x points along the
+//! element. Bending is cubic, stretch and twist are linear in the element (Przemieniecki, "Theory of Matrix Structural
+//! Analysis", sections 5.6 and 11.3). Rotary inertia of bending is neglected, as in Euler-Bernoulli theory.
 
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3};
 
 pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
 
-/// Elastic constants of the wood: pascals and kg/m^3.
+/// Elastic constants (Pa) and density (kg/m^3) of the wood.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Wood {
     pub(super) youngs_modulus: f64,
@@ -16,7 +16,7 @@ pub(super) struct Wood {
     pub(super) density: f64,
 }
 
-/// A round section: area (m^2) and second moment of area about a diameter (m^4).
+/// A circular section: area (m^2) and second moment of area about a diameter (m^4).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Section {
     pub(super) area: f64,
@@ -24,7 +24,7 @@ pub(super) struct Section {
 }
 
 impl Section {
-    /// Means over a cone between two radii.
+    /// Mean area and second moment over a truncated cone between two radii.
     pub(super) fn of_cone(a: f64, b: f64) -> Self {
         use std::f64::consts::{FRAC_PI_4, PI};
         let squares = (a * a + a * b + b * b) / 3.0;
@@ -33,7 +33,7 @@ impl Section {
     }
 }
 
-/// Rows: the local axes of an element between two nodes.
+/// The local axes of an element between two nodes, as rows.
 pub(super) fn axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f64> {
     let x = (to - from).normalize();
     let helper = if x.x.abs() < 0.7 { Vector3::x() } else { Vector3::z() };
@@ -84,14 +84,14 @@ fn local_mass(l: f64, section: &Section, wood: &Wood) -> Matrix12 {
     matrix
 }
 
-/// Adds a 2 x 2 block that couples degree `dof` of both nodes.
+/// Adds a 2 x 2 block that couples degree of freedom `dof` of both nodes.
 fn add_linear(matrix: &mut Matrix12, dof: usize, block: [f64; 4]) {
     for (at, value) in block.into_iter().enumerate() {
         matrix[(dof + 6 * (at / 2), dof + 6 * (at % 2))] += value;
     }
 }
 
-/// Adds the bending in both planes. A rotation about y lowers the slope dw/dx, hence the sign.
+/// Adds bending in both planes. The sign accounts for rotations about y, which decrease the slope dw/dx.
 fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
     for (places, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
         for row in 0..4 {
@@ -131,7 +131,7 @@ mod tests {
             assert!((stiffness * shift).norm() <= 1e-9 * stiffness.norm());
             assert!((stiffness * spin).norm() <= 1e-9 * stiffness.norm());
             assert!((shift.dot(&(mass * shift)) / weight - 1.0).abs() < 1e-12);
-            // The control: shifting one end only does cost energy.
+            // Counterexample: moving only one end requires energy.
             shift.fixed_rows_mut::<3>(0).fill(0.0);
             assert!((stiffness * shift).norm() > 1e-6 * stiffness.norm());
         }

@@ -1,5 +1,5 @@
-//! The leaf, made from a seed: a 256 x 256 sRGB image whose alpha is the outline, tip at the top, and at its right
-//! edge an opaque strip for stems.
+//! Procedural leaf texture from a seed: a 256 x 256 sRGB image. Alpha is the outline of the leaf with its tip at the
+//! top; at the right edge is an opaque strip for stems.
 
 use super::noise::{Noise, blend, smooth_step};
 use super::random::Random;
@@ -8,24 +8,25 @@ use crate::error::Result;
 
 const SIDE: usize = 256;
 
-/// The leaf's part of the image. It keeps off the left edge, where a repeating image lets the strip of the right one in.
+/// The horizontal range of the leaf. It keeps a margin on the left, where filtering with wrap mode "repeat" would blend
+/// in the strip at the right edge.
 pub(super) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
 
-/// The middle of the strip for stems.
+/// The center of the strip for stems.
 pub(super) const STEM_U: f32 = 0.965;
 
-/// Where the strip begins.
+/// Left edge of the strip.
 const STRIP: f32 = 0.93;
 
-/// The petiole's part of the height, at the bottom.
+/// The fraction of the height that the petiole takes, at the bottom.
 const PETIOLE: f32 = 0.13;
 
-/// Widest half of the blade, in widths of its part of the image.
+/// Largest half-width of the blade, as a fraction of the leaf's range.
 const HALF_WIDTH: f32 = 0.46;
 
 const TEETH: f32 = 19.0;
 
-/// sRGB colours, 0 to 255.
+/// sRGB colors, 0 to 255.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Palette {
     pub(super) blade: [f32; 3],
@@ -34,10 +35,10 @@ pub(super) struct Palette {
     pub(super) stem: [f32; 3],
 }
 
-/// The image of a leaf.
+/// The texture of a leaf.
 ///
 /// # Errors
-/// None in practice: the sizes are constants.
+/// None in practice, because the sizes are constants.
 pub(super) fn texture(name: &str, palette: &Palette, random: &mut Random) -> Result<Texture> {
     let mottle = [Noise { cells: [7, 9], seed: random.bits() }, Noise { cells: [31, 37], seed: random.bits() }];
     let mut rgba = Vec::with_capacity(4 * SIDE * SIDE);
@@ -53,7 +54,7 @@ pub(super) fn texture(name: &str, palette: &Palette, random: &mut Random) -> Res
     Texture::new(name, SIDE as u32, SIDE as u32, rgba)
 }
 
-/// Colour and cover at `x` from the midrib and `y` above the foot of the petiole.
+/// Color and coverage at distance `x` from the midrib and `y` above the base of the petiole.
 fn leaf(palette: &Palette, x: f32, y: f32) -> ([f32; 3], f32) {
     let along = (y - PETIOLE) / (0.985 - PETIOLE);
     let off = x.abs();
@@ -67,14 +68,14 @@ fn leaf(palette: &Palette, x: f32, y: f32) -> ([f32; 3], f32) {
     let cover = ((half - off) / (1.6 * pixel) + 0.5).clamp(0.0, 1.0).max(on_stalk);
     let across = (off / half.max(1e-3)).min(1.2);
     let body = blend(palette.blade, palette.edge, smooth_step(0.35, 1.1, across));
-    // Between two side veins the blade bulges, so it is lighter half way.
+    // Between two side veins the blade bulges and appears lighter.
     let (vein, bulge) = side_vein(along, off, across);
     let bulged = body.map(|channel| channel * (0.93 + 0.14 * bulge));
     let veined = blend(bulged, palette.vein, 0.75 * vein);
     (blend(veined, palette.vein, smooth_step(1.9 * stalk, 0.6 * stalk, off)), cover)
 }
 
-/// Half of the blade's width: egg-shaped with a drawn-out tip, and teeth that point forwards.
+/// Half-width of the blade: egg-shaped with an elongated tip and forward-pointing teeth.
 fn half_width(along: f32) -> f32 {
     let t = along.clamp(0.0, 1.0);
     let egg = (std::f32::consts::PI * t.powf(0.74)).sin().max(0.0).powf(0.72);
@@ -83,9 +84,9 @@ fn half_width(along: f32) -> f32 {
     HALF_WIDTH * egg * tip * (0.93 + 0.07 * tooth * tooth.sqrt())
 }
 
-/// How much of a side vein is here, and how far between two of them.
+/// Intensity of the side veins, and relative distance from the nearest one (1 halfway between two).
 fn side_vein(along: f32, off: f32, across: f32) -> (f32, f32) {
-    // Veins leave the midrib at equal steps and bend towards the tip.
+    // Veins leave the midrib at equal intervals and bend towards the tip.
     let phase = (along - 0.62 * off - 0.35 * off * off) * 8.5;
     let from_vein = (phase - phase.round()).abs();
     let width = 0.10 * (1.0 - 0.75 * across.min(1.0));

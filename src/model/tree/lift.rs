@@ -1,4 +1,4 @@
-//! Modes of a beam to modes of its skin: u = w(s) + theta(s) x d at each vertex, with 3n x r entries in f32.
+//! Lifts the modes of a beam to its skin: u = w(s) + theta(s) x d at each vertex, as 3n x r entries in f32.
 
 use nalgebra::{DMatrix, Vector3};
 
@@ -6,14 +6,14 @@ use super::element::axes;
 use crate::domain::Modes;
 use crate::error::Result;
 
-/// A place along a beam: the element, and the fraction of its length, 0 to 1.
+/// A position along a beam: the element, and the fraction of its length, 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Station {
     pub(super) element: usize,
     pub(super) fraction: f64,
 }
 
-/// A section's place at rest and its small motion.
+/// Rest position and infinitesimal motion of a section.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Motion {
     pub(super) centre: Vector3<f64>,
@@ -28,8 +28,8 @@ impl Motion {
     }
 }
 
-/// Motion of a section under nodal displacements `dofs` (six per node), interpolated as the element does it: cubic
-/// Hermite across, linear along and in twist; the section turns with the slope of its centreline.
+/// Motion of a section under the nodal displacements `dofs` (six per node), with the element's shape functions: cubic
+/// Hermite for bending, linear for stretch and twist. The section rotates with the slope of its centerline.
 pub(super) fn motion(nodes: &[Vector3<f64>], dofs: &[f64], station: Station) -> Motion {
     let Station { element, fraction: x } = station;
     let (from, to) = (nodes[element], nodes[element + 1]);
@@ -54,7 +54,7 @@ pub(super) fn motion(nodes: &[Vector3<f64>], dofs: &[f64], station: Station) -> 
 /// U of a skin whose vertex i is fixed to the section at `stations[i]`.
 ///
 /// # Errors
-/// `Invalid` when a mode overflows f32.
+/// `Invalid` if a mode overflows f32.
 pub(super) fn lift(
     nodes: &[Vector3<f64>],
     shapes: &DMatrix<f64>,
@@ -66,7 +66,7 @@ pub(super) fn lift(
         let dofs: Vec<f64> = shape.iter().copied().collect();
         for (position, station) in rest.iter().zip(stations) {
             let moved = motion(nodes, &dofs, *station).of(&Vector3::from(*position).cast());
-            // Adding zero turns -0 into 0, so that the rows of the clamp are plain zeros.
+            // Adding zero converts -0 to 0, so that the rows of the clamp are plain zeros.
             columns.extend(moved.iter().map(|entry| (entry + 0.0) as f32));
         }
     }
@@ -78,7 +78,7 @@ mod tests {
     use super::super::beam::tests::bent;
     use super::*;
 
-    /// Nodal displacements of a rigid motion: a shift and a small rotation about the origin.
+    /// Nodal displacements of a rigid motion: a translation and a small rotation about the origin.
     fn rigid(nodes: &[Vector3<f64>], shift: Vector3<f64>, turn: Vector3<f64>) -> Vec<f64> {
         let dofs = |node: &Vector3<f64>| {
             let moved = shift + turn.cross(node);
@@ -115,7 +115,7 @@ mod tests {
                 assert!((before.shift - after.shift).norm() <= 1e-9 * size);
                 assert!((before.turn - after.turn).norm() <= 1e-9 * size);
             }
-            // The turn is the derivative of the shift across the beam.
+            // The rotation is the derivative of the transverse displacement.
             let (a, b, h) = (at(3, 0.4 - 1e-5), at(3, 0.4 + 1e-5), 2e-5 * (beam.nodes[4] - beam.nodes[3]).norm());
             let along = (beam.nodes[4] - beam.nodes[3]).normalize();
             let across = |v: Vector3<f64>| v - along * along.dot(&v);
@@ -143,7 +143,7 @@ mod tests {
                 let got = f64::from(skin.at(1, axis, mode));
                 assert!((got - want[axis]).abs() <= 1e-6 * want.norm(), "mode {mode}: {got} is not {}", want[axis]);
             }
-            // The control: without the rotation's part the skin would be elsewhere.
+            // Counterexample: without the rotational part, the skin's displacement would differ.
             assert!(part(3).cross(&arm).norm() > 1e-4 * want.norm());
         }
     }

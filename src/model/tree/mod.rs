@@ -1,10 +1,12 @@
-//! The built-in scene `tree`, made in code from a seed: beams to modes, modes to skin.
+//! The built-in scene `tree`, generated from a seed: beams, their modes, and the modes of the skin.
 //!
-//! A trunk of 7 m carries boughs, boughs carry twigs, all carry leaf clusters. Every wooden part is a clamped
-//! Euler-Bernoulli beam along its centreline that carries the masses of its children where they hang; its modes are
-//! lifted to the skin. Modes are mass-orthonormal in kg, so that modal forces are U^T f in newtons.
+//! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every
+//! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children at their
+//! joints; its modes are lifted to the skin. Modes are mass-orthonormal in kg, so that modal forces are U^T f with f in
+//! newtons.
 //!
-//! The frame of a part: its origin is the centre of its base, +Y runs along its start, +Z looks up as far as that allows.
+//! The frame of a part has its origin at the center of the base, +Y along the start of the centerline, and +Z as close
+//! to up as possible.
 
 mod bark;
 mod beam;
@@ -28,7 +30,7 @@ use crate::scene::{Look, Parts};
 use mold::{Bud, Kind, Mold};
 use random::Random;
 
-/// What the tree is made from.
+/// Parameters of the tree.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Recipe {
     pub seed: u64,
@@ -40,10 +42,10 @@ impl Default for Recipe {
     }
 }
 
-/// Index of the bark among the materials; the leaves follow.
+/// Index of the bark material; the leaf materials follow.
 const BARK: usize = 0;
 
-/// Two kinds of leaves: those in the shade and those in the light.
+/// The two leaf materials: shaded and sunlit leaves.
 const LEAVES: [(&str, leaf_image::Palette); 2] = [
     (
         "leaf",
@@ -65,15 +67,15 @@ const LEAVES: [(&str, leaf_image::Palette); 2] = [
     ),
 ];
 
-/// Grows the tree.
+/// Generates the tree.
 ///
 /// # Errors
-/// `Fault` when the eigenproblem of a beam does not converge.
+/// `Fault` if the eigenproblem of a beam does not converge.
 pub fn grow(recipe: &Recipe) -> Result<Parts> {
     let mut random = Random::new(recipe.seed);
     let mut parts = Parts::named("tree");
     parts.rigid_transforms = true;
-    // Leaves and bark are dark, so a noon sun does not wash them out.
+    // Leaves and bark are dark, so strong sunlight does not overexpose them.
     parts.look =
         Look { sun: [0.52, 0.74, 0.62], sunlight: [1.15, 1.06, 0.92], skylight: [0.30, 0.34, 0.39], ..Look::default() };
     add_materials(&mut parts, &mut random.fork())?;
@@ -112,7 +114,7 @@ fn add_materials(parts: &mut Parts, random: &mut Random) -> Result<()> {
     Ok(())
 }
 
-/// Places molds, parents before children.
+/// Places instances of the templates ([`Mold`]), parents before children.
 struct Planter<'a> {
     molds: &'a [Mold],
     metadata: &'a [Metadata],
@@ -121,14 +123,14 @@ struct Planter<'a> {
 }
 
 impl Planter<'_> {
-    /// Places the trunk, which is the last mold, and all that hangs on it.
+    /// Places the trunk, which is the last template, and everything attached to it.
     fn plant(&mut self) {
         let trunk = self.molds.len() - 1;
         self.domains.push(self.domain("trunk".into(), trunk, BARK, Transform::IDENTITY));
         self.dress(0, trunk, &Isometry3::identity());
     }
 
-    /// Places the children of a domain.
+    /// Places the children of a domain, recursively.
     fn dress(&mut self, parent: usize, mold: usize, world_from_parent: &Isometry3<f64>) {
         let molds = self.molds;
         for (number, bud) in molds[mold].buds.iter().enumerate() {
@@ -168,7 +170,7 @@ impl Planter<'_> {
     }
 }
 
-/// `parent_from_child`: at the ring's centre, along the bud, with +Z towards the sky.
+/// `parent_from_child`: the origin is the ring's center, +Y the bud's direction, and +Z points towards the sky.
 fn joint(parent: &Mold, bud: &Bud, world_from_parent: &Isometry3<f64>) -> Isometry3<f64> {
     let turn = world_from_parent.rotation;
     let child = centreline::frame(&(turn * bud.direction), &Vector3::y());
@@ -251,7 +253,7 @@ mod tests {
                 (centre.coords - domain.placement.translation()).norm()
             };
             assert!(mean(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, mean(&attachment.rows));
-            // The control: the ring below is elsewhere.
+            // Counterexample: the center of the ring below differs.
             let count = attachment.rows.len() as u32;
             let below: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(count)).collect();
             assert!(mean(&below) > 1e-3, "{}", domain.name);

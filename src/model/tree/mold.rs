@@ -1,5 +1,5 @@
-//! A part of the tree before it is placed: centreline, radii and skin, what it carries, and the shape with modes that
-//! comes of it. Parts that look alike are instances of one mold.
+//! Templates of tree parts. A template has a centerline, radii, a skin, carried masses and joints, and is converted to
+//! a shape with modes. Parts that look alike are instances of one template.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ use super::sheet::{Sheet, Tube, Wrap, station};
 use crate::domain::{Metadata, Modes, Shape};
 use crate::error::Result;
 
-/// What a part is.
+/// The kind of a part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Trunk,
@@ -21,67 +21,67 @@ pub(super) enum Kind {
     Leaf,
 }
 
-/// Where another part hangs on this one.
+/// A joint where a child part is attached.
 #[derive(Debug, Clone)]
 pub(super) struct Bud {
-    /// The ring whose centre is the joint.
+    /// The ring whose center is the joint.
     pub(super) ring: usize,
-    /// Unit direction of the other part in this part's frame.
+    /// Unit direction of the child in this part's frame.
     pub(super) direction: Vector3<f64>,
-    /// Index of the other part's mold.
+    /// Index of the child's template.
     pub(super) mold: usize,
 }
 
-/// A part that can be placed any number of times.
+/// A template: a part that can be placed any number of times.
 #[derive(Debug, Clone)]
 pub(super) struct Mold {
     pub(super) kind: Kind,
-    /// 0 for the trunk, 1 for what grows on it, and so on.
+    /// 0 for the trunk, 1 for boughs, 2 for twigs; 0 for leaf clusters.
     pub(super) level: usize,
     pub(super) line: Centreline,
-    /// One radius per ring, metres.
+    /// One radius per ring, meters.
     pub(super) radii: Vec<f64>,
     pub(super) sides: usize,
     pub(super) sheet: Sheet,
     pub(super) wood: Wood,
-    /// Fraction of the critical damping that such a part has.
+    /// Damping ratio (fraction of critical damping), for clients.
     pub(super) damping: f64,
-    /// Carried masses, kg.
+    /// Carried masses in kg and their stations.
     pub(super) loads: Vec<(Station, f64)>,
     pub(super) buds: Vec<Bud>,
-    /// Modes to keep; 0 makes a rigid part.
+    /// Number of modes; 0 for a rigid part.
     pub(super) rank: usize,
-    /// One side of all blades, m^2.
+    /// Total one-sided area of all blades in m^2.
     pub(super) leaf_area: f64,
 }
 
 impl Mold {
-    /// Hangs a part of `mass` kg at a ring.
+    /// Attaches a part of `mass` kg at a ring.
     pub(super) fn hang(&mut self, bud: Bud, mass: f64) {
         self.loads.push((station(&self.line, bud.ring), mass));
         self.buds.push(bud);
     }
 
-    /// Own and carried mass, kg.
+    /// Own and carried mass in kg.
     pub(super) fn mass(&self) -> f64 {
         self.beam().own_mass() + self.carried()
     }
 
-    /// The vertices of a ring of its tube, which is the first thing on its sheet.
+    /// The vertices of a ring of the tube. The tube must be the first geometry of its sheet.
     pub(super) fn ring_rows(&self, ring: usize) -> Vec<u32> {
         (ring * self.sides..(ring + 1) * self.sides).map(|row| row as u32).collect()
     }
 
-    /// Covers the line with a tube.
+    /// Adds a tube around the centerline.
     pub(super) fn add_skin(&mut self, wrap: Wrap, swell: impl Fn(f64, f64) -> f64) {
         let tube = Tube { line: &self.line, radii: &self.radii, sides: self.sides, wrap };
         self.sheet.add_tube(&tube, swell);
     }
 
-    /// The shape with its modes, and what a client should know of it.
+    /// Converts to a shape with modes and metadata for clients.
     ///
     /// # Errors
-    /// `Fault` when the beam's eigenproblem fails.
+    /// `Fault` if the beam's eigenproblem fails.
     pub(super) fn cast(&self) -> Result<(Shape, Metadata)> {
         let beam = self.beam();
         let mut metadata = Metadata { notes: self.notes(&beam), eigenvalues: vec![] };
@@ -180,7 +180,7 @@ mod tests {
                     let want = section.of(&mold.line.points[ring]);
                     assert!((mean(ring, mode) - want).norm() <= 1e-6 * largest, "ring {ring}");
                 }
-                // The control: neighbouring rings move differently.
+                // Counterexample: neighboring rings move differently.
                 let last = mold.line.points.len() - 1;
                 assert!((mean(last, mode) - mean(last - 1, mode)).norm() > 1e-4 * largest);
             }

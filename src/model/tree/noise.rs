@@ -1,4 +1,4 @@
-//! Periodic gradient noise on the unit square, so that an image made of it tiles without a seam.
+//! Periodic gradient noise on the unit square, so that images made of it tile seamlessly.
 
 use super::random::mix;
 
@@ -10,7 +10,7 @@ pub(super) struct Noise {
 }
 
 impl Noise {
-    /// About -1 to 1, with period 1 in both `u` and `v`, mean about 0.
+    /// Noise of about -1 to 1, with period 1 in both `u` and `v` and a mean of about 0.
     pub(super) fn at(&self, u: f32, v: f32) -> f32 {
         let (x, y) = (u * self.cells[0] as f32, v * self.cells[1] as f32);
         let (column, row) = (x.floor(), y.floor());
@@ -28,7 +28,7 @@ impl Noise {
     fn gradient(&self, column: i32, row: i32) -> (f32, f32) {
         let place = column.rem_euclid(self.cells[0]) as u64 | (row.rem_euclid(self.cells[1]) as u64) << 32;
         let turn = (mix(place ^ self.seed) >> 40) as f32 / (1_u32 << 24) as f32;
-        // Turns are spread over the circle by a pair of parabolas: as even as sine and cosine, and cheap.
+        // Approximate cosine and sine of the gradient's angle by parabolas, which is cheaper.
         let wave = |turn: f32| {
             let x = 2.0 * turn.fract() - 1.0;
             4.0 * x * (1.0 - x.abs())
@@ -41,13 +41,13 @@ fn fade(t: f32) -> f32 {
     t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 }
 
-/// 0 below `low`, 1 above `high`, smooth between.
+/// 0 below `low`, 1 above `high`, smooth in between.
 pub(super) fn smooth_step(low: f32, high: f32, x: f32) -> f32 {
     let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
-/// `a` at 0, `b` at 1, colour by colour.
+/// Linear interpolation per channel: `a` at 0, `b` at 1.
 pub(super) fn blend(a: [f32; 3], b: [f32; 3], t: f32) -> [f32; 3] {
     std::array::from_fn(|channel| a[channel] + (b[channel] - a[channel]) * t)
 }

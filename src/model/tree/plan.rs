@@ -1,4 +1,5 @@
-//! The species: a seed to the molds of all parts, children before parents, the trunk last. Lengths in metres.
+//! The species: the templates of all parts, generated from a seed; children before parents, the trunk last. Lengths are
+//! in meters.
 
 use std::f64::consts::TAU;
 
@@ -14,17 +15,17 @@ use super::sheet::{Sheet, Wrap};
 /// Green wood.
 const WOOD: Wood = Wood { youngs_modulus: 4.5e9, shear_modulus: 3.5e8, density: 900.0 };
 
-/// The turn from one branch to the next around the trunk.
+/// Angle in radians between successive boughs around the trunk.
 const GOLDEN_ANGLE: f64 = 2.399_963;
 
-/// Boughs on the trunk, and where the crown begins and ends on it.
+/// Number of boughs on the trunk, and the fractions of the trunk where the crown begins and ends.
 const BOUGHS: usize = 24;
 const CROWN: [f64; 2] = [0.24, 0.96];
 
-/// Lengths of the twigs, three molds of each.
+/// Lengths of the twigs, one template each.
 const TWIGS: [f64; 12] = [0.45, 0.50, 0.56, 0.66, 0.72, 0.78, 0.90, 0.97, 1.04, 1.18, 1.26, 1.34];
 
-/// The molds of a tree.
+/// The templates of a tree.
 pub(super) fn plan(random: &mut Random) -> Vec<Mold> {
     let mut molds = clusters(&mut random.fork());
     let leaves = 0..molds.len();
@@ -75,7 +76,7 @@ fn trunk(random: &mut Random) -> Mold {
     mold.damping = 0.05;
     let phases = [random.between(0.0, TAU), random.between(0.0, TAU), random.between(0.0, TAU)];
     mold.add_skin(Wrap::Bark { repeats: 2 }, |arc, angle| {
-        // Roots run out into the ground; further up the stem is only a little uneven.
+        // Roots extend outwards at the ground; further up, the trunk is slightly uneven.
         let root = 0.20 * (5.0 * angle + phases[0]).cos() + 0.10 * (3.0 * angle + phases[1]).cos();
         let uneven = 0.025 * (2.0 * angle + phases[2] + 1.7 * arc).cos() + 0.018 * (4.0 * angle - 2.3 * arc).cos();
         1.0 + root * (-arc / 0.30).exp() + uneven
@@ -83,7 +84,7 @@ fn trunk(random: &mut Random) -> Mold {
     mold
 }
 
-/// Ring, direction and length of a bough: long and level below, short and steep above.
+/// Ring, direction and length of a bough: long and level at the bottom, short and steep at the top.
 fn place_bough(trunk: &Mold, number: usize, random: &mut Random) -> (usize, Vector3<f64>, f64) {
     let height = (number as f64 + random.spread(0.25)) / (BOUGHS - 1) as f64;
     let ring = trunk.line.ring_at(CROWN[0] + (CROWN[1] - CROWN[0]) * height.clamp(0.0, 1.0).powf(1.06));
@@ -93,7 +94,8 @@ fn place_bough(trunk: &Mold, number: usize, random: &mut Random) -> (usize, Vect
     (ring, trunk.line.leaving(ring, angle, &across), (0.40 + 2.32 * crown) * random.between(0.92, 1.08))
 }
 
-/// A bough that starts along `direction` (in the world), with its twigs and leaves. `size`: length, largest radius.
+/// A bough that starts along `direction` (in the world), with its twigs and leaves. `size` is length and largest
+/// radius.
 fn bough(
     direction: &Vector3<f64>,
     size: [f64; 2],
@@ -159,7 +161,7 @@ fn twig(length: f64, leaves: &[Mold], random: &mut Random) -> Mold {
     mold
 }
 
-/// Hangs leaf clusters at fractions of the length; one at the very end goes straight on.
+/// Attaches leaf clusters at fractions of the length. A cluster at the very end continues the branch.
 fn hang_leaves(mold: &mut Mold, along: &[f64], leaves: &[Mold], up: &Vector3<f64>, random: &mut Random) {
     for (number, along) in along.iter().enumerate() {
         let ring = mold.line.ring_at(*along);
@@ -189,7 +191,7 @@ fn wooden(kind: Kind, line: Centreline, radii: Vec<f64>, [sides, rank]: [usize; 
     }
 }
 
-/// Radii from the base to the tip, with a collar where the branch leaves its parent.
+/// Radii from the base to the tip, with a branch collar at the base.
 fn tapering(line: &Centreline, base: f64, tip: f64) -> Vec<f64> {
     let radius = |ring: usize| {
         let along = line.fraction(ring);
@@ -198,12 +200,12 @@ fn tapering(line: &Centreline, base: f64, tip: f64) -> Vec<f64> {
     (0..line.points.len()).map(radius).collect()
 }
 
-/// A unit vector across the line at `azimuth` around it.
+/// A unit vector perpendicular to the line, at `azimuth` around it.
 fn around(line: &Centreline, ring: usize, azimuth: f64) -> Vector3<f64> {
     Rotation3::from_axis_angle(&Unit::new_unchecked(line.tangents[ring]), azimuth) * line.sides[ring]
 }
 
-/// A vector across the line, left and right by turns, somewhat above the level more often than below.
+/// A unit vector perpendicular to the line, alternately left and right, more often tilted up than down.
 fn beside(line: &Centreline, ring: usize, up: &Vector3<f64>, number: usize, random: &mut Random) -> Vector3<f64> {
     let basis = frame(&line.tangents[ring], up);
     let tilt = random.between(-0.6, 0.8);
@@ -211,7 +213,7 @@ fn beside(line: &Centreline, ring: usize, up: &Vector3<f64>, number: usize, rand
     basis * Vector3::new(side * tilt.cos(), 0.0, tilt.sin())
 }
 
-/// A twig of about the wanted length.
+/// The twig template nearest to the wanted length, which is varied randomly by up to 7 %.
 fn nearest(wanted: f64, twigs: &std::ops::Range<usize>, random: &mut Random) -> usize {
     let wanted = wanted * random.between(0.93, 1.07);
     let gap = |twig: &usize| (TWIGS[twig - twigs.start] - wanted).abs();

@@ -1,4 +1,4 @@
-//! Seeded pseudo-random numbers: a 64-bit seed to a stream of f64, the same on every machine.
+//! Seeded pseudo-random numbers, identical on every machine.
 
 /// `SplitMix64` (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
 #[derive(Debug, Clone)]
@@ -30,13 +30,13 @@ impl Random {
         self.between(-spread, spread)
     }
 
-    /// A stream of its own, so that a part which draws more numbers does not change its siblings.
+    /// An independent stream, so that a part that draws more numbers does not change its siblings.
     pub(super) const fn fork(&mut self) -> Self {
         Self(self.bits())
     }
 }
 
-/// The finaliser of `SplitMix64`: every bit of the input changes about half of the output.
+/// The finalizer of `SplitMix64`: every input bit affects about half of the output bits.
 pub(super) const fn mix(mut bits: u64) -> u64 {
     bits = (bits ^ (bits >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     bits = (bits ^ (bits >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);

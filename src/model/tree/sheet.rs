@@ -1,4 +1,4 @@
-//! A mesh in the making, with the beam station of every vertex: tubes around centrelines, and leaf blades.
+//! Skin geometry under construction, with the beam station of every vertex: tubes around centerlines, and leaf blades.
 
 use nalgebra::Vector3;
 
@@ -7,7 +7,7 @@ use super::lift::Station;
 use crate::domain::{Corners, Mesh, smooth_normals};
 use crate::error::Result;
 
-/// Positions in the part's own frame, metres; one station per vertex.
+/// A mesh under construction. Positions are in the part's own frame, in meters; every vertex has a station.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Sheet {
     pub(super) rest: Vec<[f32; 3]>,
@@ -21,58 +21,58 @@ pub(super) struct Sheet {
 #[derive(Debug)]
 pub(super) struct Tube<'a> {
     pub(super) line: &'a Centreline,
-    /// One radius per ring.
+    /// One radius per ring, meters.
     pub(super) radii: &'a [f64],
     pub(super) sides: usize,
     pub(super) wrap: Wrap,
 }
 
-/// How the image lies on a tube.
+/// How a texture is mapped to a tube.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Wrap {
-    /// A whole number of repeats around, and as many along as keep the texels square.
+    /// A whole number of repeats around the tube, and as many along it as keep the texels square.
     Bark { repeats: u32 },
-    /// One column of the image, top to bottom.
+    /// One column of the image, from top to bottom.
     Strip { u: f32 },
 }
 
-/// A leaf blade: a card folded along its midrib and curled along its length.
+/// A leaf blade: a card that is folded along its midrib and curled along its length.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Blade {
     pub(super) base: Vector3<f64>,
     /// Unit vector from the base along the midrib.
     pub(super) forward: Vector3<f64>,
-    /// Unit vector out of the upper face.
+    /// Unit normal of the upper face.
     pub(super) normal: Vector3<f64>,
     pub(super) length: f64,
     pub(super) width: f64,
-    /// Radians by which the tip points below the base.
+    /// Angle in radians by which the tip points below the base.
     pub(super) curl: f64,
-    /// Radians by which each half is raised.
+    /// Angle in radians by which each half is raised.
     pub(super) fold: f64,
-    /// The image's part: left, right.
+    /// Left and right texture coordinate of the leaf in the image.
     pub(super) span: [f32; 2],
 }
 
-/// Quads along a blade; across it has two.
+/// Number of quads along a blade; there are two across.
 const BLADE_ROWS: usize = 2;
 
-/// The bark's image shrinks with the branch down to this radius, metres.
+/// The bark texture scales with the radius of a branch, but not below this radius (meters).
 const LEAST_RADIUS: f64 = 0.012;
 
 impl Sheet {
     /// The finished mesh with smooth normals.
     ///
     /// # Errors
-    /// `Invalid` when a position is not finite.
+    /// `Invalid` if a position is not finite.
     pub(super) fn mesh(&self) -> Result<Mesh> {
         let normals = smooth_normals(&self.rest, &self.corners, &self.triangles);
         let corners = Corners { vertices: self.corners.clone(), normals, uvs: self.uvs.clone() };
         Mesh::new(self.rest.clone(), corners, self.triangles.clone())
     }
 
-    /// Adds a tube with one ring per sample of its centreline and a closed tip. `swell` gives a factor on the radius
-    /// for an arc length and an angle; rings are centred on the line whatever it does.
+    /// Adds a tube with one ring per sample of its centerline and a closed tip. `swell` returns a radius factor for an
+    /// arc length and an angle; the rings remain centered on the line for any `swell`.
     pub(super) fn add_tube(&mut self, tube: &Tube, swell: impl Fn(f64, f64) -> f64) {
         let (line, sides) = (tube.line, tube.sides);
         let last = line.points.len() - 1;
@@ -110,7 +110,7 @@ impl Sheet {
         }
     }
 
-    /// Adds a leaf blade that is fixed to one section of its stem.
+    /// Adds a leaf blade whose vertices are all fixed to one section of the stem.
     pub(super) fn add_blade(&mut self, blade: &Blade, station: Station) {
         let side = blade.forward.cross(&blade.normal);
         let step = blade.length / BLADE_ROWS as f64;
@@ -147,7 +147,7 @@ impl Sheet {
             (across * angle.cos() + over * angle.sin()) * (tube.radii[ring] * swell(line.arcs[ring], angle))
         };
         let offsets: Vec<_> = (0..sides).map(offset).collect();
-        // A joint finds the section's centre as the mean of its ring, so the mean is made to lie there.
+        // A joint computes the section's center as the mean of its ring, so the mean must be on the centerline.
         let mean = offsets.iter().sum::<Vector3<f64>>() / sides as f64;
         for offset in offsets {
             self.add_vertex(&(line.points[ring] + offset - mean), station(line, ring));
@@ -168,7 +168,7 @@ pub(super) fn station(line: &Centreline, ring: usize) -> Station {
     Station { element: ring / line.rings, fraction: (ring % line.rings) as f64 / line.rings as f64 }
 }
 
-/// The beam station, the place and the unit tangent at a fraction of the length.
+/// The beam station, position and unit tangent at a fraction of the length.
 pub(super) fn between(line: &Centreline, along: f64) -> (Station, Vector3<f64>, Vector3<f64>) {
     let arc = along * line.length();
     let after = line.arcs.partition_point(|at| *at < arc).clamp(1, line.arcs.len() - 1);
@@ -180,7 +180,8 @@ pub(super) fn between(line: &Centreline, along: f64) -> (Station, Vector3<f64>, 
 }
 
 impl Wrap {
-    /// Texture coordinates for a fraction around, an arc length in circumferences, and a fraction of the length.
+    /// Texture coordinates at a fraction of the circumference, an arc length in circumferences, and a fraction of the
+    /// length.
     fn at(self, around: f64, along: f64, fraction: f64) -> [f32; 2] {
         match self {
             Self::Bark { repeats } => {

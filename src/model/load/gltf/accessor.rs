@@ -1,7 +1,7 @@
-//! Accessors to lists of numbers: what a document declares is what is delivered, or it is refused.
+//! Decodes glTF accessors to lists of numbers, and rejects accessors whose data does not match their declaration.
 //!
-//! An accessor is first packed (its `count` elements, tightly, sparse values laid over), then its components are
-//! decoded. Every offset is computed with checked arithmetic.
+//! An accessor is first packed (its `count` elements without gaps, with sparse values applied), then its components are
+//! decoded. All offsets are computed with checked arithmetic.
 
 use super::at;
 use super::bytes::Bytes;
@@ -13,17 +13,17 @@ const U16: u64 = 5123;
 const U32: u64 = 5125;
 const F32: u64 = 5126;
 
-/// What an attribute may look like.
+/// The accepted formats of an attribute.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Form {
-    /// Unsigned integers are taken too if they are normalised.
+    /// Whether normalized unsigned integers are accepted too.
     pub(super) integers: bool,
-    /// The number of elements when another accessor has set it already. Only then may the bytes be left out (all
-    /// zeros, or zeros under sparse values): a count that nothing backs could ask for any amount of memory.
+    /// The number of elements, if another accessor already determines it. Only then may the data be omitted (all zeros,
+    /// or zeros with sparse values): otherwise a count without data could request any amount of memory.
     pub(super) count: Option<usize>,
 }
 
-/// The accessors of one document.
+/// Decodes the accessors of one document.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reader<'a> {
     pub(super) document: &'a Document,
@@ -34,7 +34,7 @@ impl Reader<'_> {
     /// Elements of `N` floats.
     ///
     /// # Errors
-    /// `Invalid` naming accessor and field.
+    /// `Invalid` with the accessor and the field.
     pub(super) fn vectors<const N: usize>(&self, index: usize, form: Form) -> Result<Vec<[f32; N]>> {
         let accessor = at(&self.document.accessors, index, "accessor")?;
         self.vectors_of(accessor, form).map_err(|error| error.within(&format!("accessors[{index}]")))
@@ -68,7 +68,7 @@ impl Reader<'_> {
     /// Indices, each below `vertices`.
     ///
     /// # Errors
-    /// `Invalid` naming accessor and field.
+    /// `Invalid` with the accessor and the field.
     pub(super) fn indices(&self, index: usize, vertices: usize) -> Result<Vec<u32>> {
         let accessor = at(&self.document.accessors, index, "accessor")?;
         self.indices_of(accessor, vertices).map_err(|error| error.within(&format!("accessors[{index}]")))
@@ -89,7 +89,7 @@ impl Reader<'_> {
         }
     }
 
-    /// The accessor's elements, `components` each, without gaps.
+    /// The accessor's elements of `components` components each, without gaps.
     fn packed(&self, accessor: &Accessor, components: usize) -> Result<Vec<u8>> {
         let size = components * component_size(accessor.component_type);
         let total = accessor.count.checked_mul(size).filter(|_| accessor.count > 0);
@@ -118,7 +118,7 @@ impl Reader<'_> {
         Ok(packed)
     }
 
-    /// Lays the sparse values over the elements.
+    /// Replaces elements by the sparse values.
     fn overlay(&self, packed: &mut [u8], sparse: &Sparse, size: usize) -> Result<()> {
         let count = packed.len() / size;
         if sparse.count == 0 || sparse.count > count {
@@ -146,7 +146,7 @@ impl Reader<'_> {
     }
 }
 
-/// `count` (at least one) elements of `size` bytes, `stride` apart.
+/// `count` (at least one) elements of `size` bytes at intervals of `stride` bytes.
 fn elements(
     view: &[u8],
     offset: usize,
@@ -171,7 +171,7 @@ fn expect_kind(accessor: &Accessor, kind: &str) -> Result<()> {
     }
 }
 
-/// Bytes of a component; the type has been checked.
+/// Size of a component in bytes. The type must have been checked.
 const fn component_size(component: u64) -> usize {
     match component {
         U8 => 1,

@@ -1,4 +1,4 @@
-//! Placed nodes and their meshes to the domains of a scene, parents before children.
+//! Builds the domains of a scene, parents before children, from placed nodes and their meshes.
 
 use std::collections::{HashMap, HashSet};
 
@@ -17,14 +17,14 @@ use crate::domain::{Attachment, Domain, Metadata, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::{MAX_DOMAINS, Parts};
 
-/// The nearest domain at or above a node.
+/// The nearest domain at or above a node, which becomes the parent of domains below.
 #[derive(Debug, Clone, Copy)]
 struct Carrier {
     domain: usize,
     carrier_from_node: Matrix4<f64>,
 }
 
-/// What one primitive of one mesh became; instances of the mesh share it.
+/// The converted primitive of a mesh, shared by all instances of the mesh.
 #[derive(Debug, Clone, Copy)]
 struct Made {
     shape: usize,
@@ -42,10 +42,10 @@ struct Assembly<'a> {
     remarks: Remarks,
 }
 
-/// All domains of the scene that the document shows.
+/// Builds all domains of the document's default scene.
 ///
 /// # Errors
-/// `Invalid` naming the place in the document.
+/// `Invalid` with the place in the document.
 pub(super) fn assemble(name: &str, document: &Document, bytes: &Bytes<'_>, mut remarks: Remarks) -> Result<Parts> {
     let nodes = hierarchy::place(document, &mut remarks)?;
     let mut assembly = Assembly {
@@ -73,7 +73,7 @@ pub(super) fn assemble(name: &str, document: &Document, bytes: &Bytes<'_>, mut r
 }
 
 impl Assembly<'_> {
-    /// Adds a domain for each primitive of the node's mesh and gives the first one's index.
+    /// Adds a domain for each primitive of the node's mesh and returns the index of the first.
     fn add_node(&mut self, placed: &Placed, above: Option<Carrier>) -> Result<Option<usize>> {
         let document = self.reader.document;
         let node = &document.nodes[placed.node];
@@ -83,7 +83,7 @@ impl Assembly<'_> {
         let placement = transform(&placed.world)?;
         let attachment = above.map(|above| attach(&above)).transpose()?;
         let first = self.domains.len();
-        // The node's first domain of each rank: its coordinates are those of the others.
+        // The node's first domain of each rank. The node's other domains of this rank share its coordinates.
         let mut twins: HashMap<usize, usize> = HashMap::new();
         let name = self.name(node.name.as_ref().or(mesh.name.as_ref()), placed.node);
         for (place, primitive) in mesh.primitives.iter().enumerate() {
@@ -117,7 +117,7 @@ impl Assembly<'_> {
         Ok((self.domains.len() > first).then_some(first))
     }
 
-    /// The shape and material of a primitive, read when it is first used; `None` for points and lines.
+    /// The shape and material of a primitive, converted on first use; `None` for points and lines.
     fn make(&mut self, mesh: usize, place: usize) -> Result<Option<Made>> {
         if let Some(made) = self.made.get(&(mesh, place)) {
             return Ok(*made);
@@ -137,7 +137,7 @@ impl Assembly<'_> {
         Ok(made)
     }
 
-    /// The name of the node, else of its mesh, made unique by the node's index.
+    /// The name of the node or else of its mesh, made unique by the node's index.
     fn name(&mut self, given: Option<&String>, index: usize) -> String {
         let given = given.map(|name| tidy(name, 120)).filter(|name| !name.is_empty());
         let mut name = given.unwrap_or_else(|| format!("node {index}"));
@@ -164,7 +164,7 @@ impl Assembly<'_> {
 
 fn attach(above: &Carrier) -> Result<Attachment> {
     let frame = transform(&above.carrier_from_node)?;
-    // A node hangs on its parent's frame, which morph targets do not move.
+    // A node is attached to its parent's frame, which morph targets do not move.
     Ok(Attachment { parent: above.domain, frame, rows: vec![] })
 }
 

@@ -1,4 +1,4 @@
-//! Buffers, buffer views and URIs to bytes, with a budget on everything that is held or decoded.
+//! Resolves buffers, buffer views and URIs to bytes, within a budget for all data that is stored or decoded.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -12,11 +12,11 @@ use super::{MAX_FILE, at};
 use crate::error::{Result, invalid};
 use crate::load::files::Files;
 
-/// The most bytes that one model may hold in buffers, decoded accessors and pixels together. Without it a small file
-/// that names one large buffer or image many times would fill the memory.
+/// The most bytes that one model may use in buffers, decoded accessors and pixels together. Otherwise a small file that
+/// refers to one large buffer or image many times could exhaust the memory.
 pub(super) const BUDGET: u64 = 1 << 31;
 
-/// All buffers of a document.
+/// The buffers of a document.
 #[derive(Debug)]
 pub(super) struct Bytes<'a> {
     document: &'a Document,
@@ -26,10 +26,10 @@ pub(super) struct Bytes<'a> {
 }
 
 impl<'a> Bytes<'a> {
-    /// Fetches every buffer: from its URI or, without one, from the GLB's binary chunk.
+    /// Reads every buffer from its URI or, without a URI, from the GLB's binary chunk.
     ///
     /// # Errors
-    /// `Invalid` naming the buffer when it is not there, shorter than it says or out of bounds.
+    /// `Invalid` with the buffer if its data is missing, shorter than declared or outside the folder.
     pub(super) fn load(document: &'a Document, folder: &'a Files, bin: Option<&'a [u8]>) -> Result<Self> {
         let mut bytes = Self { document, folder, buffers: Vec::new(), left: Cell::new(BUDGET) };
         for index in 0..document.buffers.len() {
@@ -56,10 +56,10 @@ impl<'a> Bytes<'a> {
         Ok(content)
     }
 
-    /// The view's bytes and its stride.
+    /// The bytes of a buffer view and its stride.
     ///
     /// # Errors
-    /// `Invalid` when it reaches beyond its buffer.
+    /// `Invalid` if the view exceeds its buffer.
     pub(super) fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
         let view = at(&self.document.buffer_views, index, "bufferView")?;
         let bytes = self.cut(view).map_err(|error| error.within(&format!("bufferViews[{index}]")))?;
@@ -80,7 +80,7 @@ impl<'a> Bytes<'a> {
     /// The encoded bytes of an image.
     ///
     /// # Errors
-    /// `Invalid` when it has no source or its source is not there.
+    /// `Invalid` if the image has no source or the source does not exist.
     pub(super) fn image(&self, index: usize) -> Result<Cow<'_, [u8]>> {
         let image = &self.document.images[index];
         match (&image.uri, image.buffer_view) {
@@ -90,10 +90,10 @@ impl<'a> Bytes<'a> {
         }
     }
 
-    /// Takes `bytes` from the budget before they are allocated.
+    /// Subtracts `bytes` from the budget; call it before allocating them.
     ///
     /// # Errors
-    /// `Invalid` when the model as a whole is too large.
+    /// `Invalid` if the budget of the model is exceeded.
     pub(super) fn spend(&self, bytes: u64) -> Result<()> {
         let left = self.left.get().checked_sub(bytes);
         let left = left.ok_or_else(|| invalid("decoded size", format!("at most {BUDGET} bytes in all"), "more"))?;
@@ -111,7 +111,7 @@ impl<'a> Bytes<'a> {
     }
 }
 
-/// What follows `data:` of a data URI, which has to be Base64.
+/// Decodes the part of a data URI after `data:`, which must be Base64.
 fn decode_data(data: &str) -> Result<Vec<u8>> {
     let Some((kind, payload)) = data.split_once(',').filter(|(kind, _)| kind.ends_with(";base64")) else {
         return Err(invalid("uri", "data:...;base64,...", format!("data:{}", tidy(data, 40))));
@@ -120,7 +120,7 @@ fn decode_data(data: &str) -> Result<Vec<u8>> {
     STANDARD_PAD_INDIFFERENT.decode(payload).map_err(refuse)
 }
 
-/// The path that a relative URI names. A model may read only in and below its own folder, wherever that is.
+/// The path of a relative URI. A model may read files only in and below its own folder.
 fn relative(uri: &str) -> Result<String> {
     let path = percent_decoded(uri);
     let scheme = path.split('/').next().is_some_and(|first| first.contains(':'));
@@ -131,7 +131,7 @@ fn relative(uri: &str) -> Result<String> {
     Ok(path)
 }
 
-/// Resolves `%20` and the like; a text that does not decode is taken as it is.
+/// Decodes escapes such as `%20`. If the result is not UTF-8, the text is returned unchanged.
 fn percent_decoded(uri: &str) -> String {
     let mut bytes = Vec::with_capacity(uri.len());
     let mut rest = uri.as_bytes();

@@ -1,4 +1,4 @@
-//! The bytes of a `.gltf` or `.glb` file to its JSON document and its binary chunk.
+//! Splits a `.gltf` or `.glb` file into its JSON document and its binary chunk.
 
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -6,11 +6,12 @@ use serde_json::Value;
 use super::document::Document;
 use crate::error::{Result, invalid};
 
-/// The most JSON objects of one document. Each takes at least two bytes of text but some 300 bytes of memory.
+/// The largest number of JSON objects in a document. Each object takes at least two bytes of text but about 300 bytes
+/// of memory.
 const MAX_OBJECTS: usize = 1 << 21;
-/// The most commas, which bound the elements of all lists in the same way.
+/// The largest number of commas, which limits the elements of all lists in the same way.
 const MAX_COMMAS: usize = 1 << 24;
-/// The longest text that is parsed a second time to find the place of an error.
+/// The longest text that is parsed a second time to locate an error.
 const MAX_SEARCHED: usize = 1 << 22;
 const MAGIC: &[u8] = b"glTF";
 const JSON: u32 = 0x4E4F_534A;
@@ -24,10 +25,10 @@ pub(super) struct Container<'a> {
     pub(super) bin: Option<&'a [u8]>,
 }
 
-/// Splits a GLB into its chunks; anything else is taken for JSON.
+/// Splits a GLB into its chunks. Any other content is assumed to be JSON.
 ///
 /// # Errors
-/// `Invalid` naming the field of the header or the chunk.
+/// `Invalid` with the field of the header or the chunk.
 pub(super) fn split(content: &[u8]) -> Result<Container<'_>> {
     if !content.starts_with(MAGIC) {
         return Ok(Container { json: content, bin: None });
@@ -48,11 +49,11 @@ pub(super) fn split(content: &[u8]) -> Result<Container<'_>> {
         return Ok(Container { json, bin: None });
     }
     let (kind, bin, _) = chunk(content, rest)?;
-    // A chunk of an unknown kind has to be passed over; all that may follow the JSON and is known is BIN.
+    // Chunks of unknown types must be ignored; the only known type after JSON is BIN.
     Ok(Container { json, bin: (kind == BIN).then_some(bin) })
 }
 
-/// Kind and content of the chunk that begins at `start`, and where the next one begins.
+/// Type and content of the chunk at `start`, and the start of the next one.
 fn chunk(content: &[u8], start: usize) -> Result<(u32, &[u8], usize)> {
     let length = word(content, start, "glb.chunk.length")? as usize;
     let kind = word(content, start + 4, "glb.chunk.type")?;
@@ -72,7 +73,7 @@ fn word(content: &[u8], start: usize, field: &str) -> Result<u32> {
 /// Parses the JSON text.
 ///
 /// # Errors
-/// `Invalid` naming the list and the element that are not as glTF has them.
+/// `Invalid` with the list and the element that do not conform to glTF.
 pub(super) fn parse(json: &[u8]) -> Result<Document> {
     for (sign, what, most) in [(b'{', "objects", MAX_OBJECTS), (b',', "commas", MAX_COMMAS)] {
         let count = json.iter().filter(|byte| **byte == sign).count();
@@ -86,8 +87,8 @@ pub(super) fn parse(json: &[u8]) -> Result<Document> {
     })
 }
 
-/// The first element of a top-level list that does not parse on its own. The parser itself tells only line and column,
-/// which is of little use in a file of one line.
+/// The first element of a top-level list that does not parse on its own, with the reason. The parser itself reports
+/// only line and column, which do not help in a file of one line.
 fn locate(json: &[u8]) -> Option<(String, String)> {
     use super::document as doc;
     let root: Value = serde_json::from_slice(Some(json).filter(|json| json.len() <= MAX_SEARCHED)?).ok()?;

@@ -1,5 +1,5 @@
-//! The JSON of glTF 2.0, as far as it is used here, into plain structures. Nothing is checked yet: indices may point
-//! anywhere and counts may be any 64-bit number. Names follow the specification.
+//! The supported part of glTF 2.0's JSON as plain structures. Values are not validated: indices may be out of range and
+//! counts may be any 64-bit number. Names follow the specification.
 
 use std::collections::BTreeMap;
 
@@ -48,10 +48,10 @@ pub(super) struct Node {
     pub(super) name: Option<String>,
     pub(super) children: Vec<usize>,
     pub(super) mesh: Option<usize>,
-    /// Column-major 4x4; excludes the three below.
+    /// Column-major 4x4; mutually exclusive with translation, rotation and scale.
     pub(super) matrix: Option<[f64; 16]>,
     pub(super) translation: Option<[f64; 3]>,
-    /// x, y, z, w.
+    /// Quaternion x, y, z, w.
     pub(super) rotation: Option<[f64; 4]>,
     pub(super) scale: Option<[f64; 3]>,
     pub(super) weights: Option<Vec<f32>>,
@@ -73,7 +73,7 @@ pub(super) struct Primitive {
     pub(super) indices: Option<usize>,
     #[serde(default)]
     pub(super) material: Option<usize>,
-    /// 4: triangles, 5: strip, 6: fan; below: points and lines.
+    /// 4: triangles, 5: strip, 6: fan; 0 to 3: points and lines.
     #[serde(default = "triangles")]
     pub(super) mode: u64,
     #[serde(default)]
@@ -200,14 +200,14 @@ impl Default for Pbr {
     }
 }
 
-/// A texture as a material uses it.
+/// A material's reference to a texture.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct TextureUse {
     pub(super) index: usize,
     #[serde(default)]
     pub(super) tex_coord: u32,
-    /// Of normal textures only.
+    /// For normal textures only.
     #[serde(default)]
     pub(super) scale: Option<f32>,
     #[serde(default)]
@@ -224,10 +224,10 @@ const fn triangles() -> u64 {
     4
 }
 
-/// The number of OpenGL's `GL_REPEAT`.
+/// The value of OpenGL's `GL_REPEAT`.
 const fn repeat() -> u64 {
     REPEAT
 }
 
-/// The only way of wrapping that the renderer has.
+/// The only wrap mode that the renderer supports.
 pub(super) const REPEAT: u64 = 10497;

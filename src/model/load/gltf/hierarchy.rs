@@ -1,5 +1,5 @@
-//! Nodes to placed nodes: parents before children, with f64 matrices. The node graph has to be a forest; it is walked
-//! with a stack of its own, so that its depth is bounded by its size alone.
+//! Flattens the node hierarchy: nodes with f64 matrices, parents before children. The node graph must be a forest. The
+//! traversal uses an explicit stack, so that deep hierarchies cannot overflow the call stack.
 
 use nalgebra::{Matrix4, Quaternion, Rotation3, Scale3, Translation3, UnitQuaternion};
 
@@ -8,12 +8,12 @@ use super::document::{Document, Node};
 use super::remarks::Remarks;
 use crate::error::{Result, invalid};
 
-/// A node of the scene that is shown.
+/// A node of the loaded scene.
 #[derive(Debug)]
 pub(super) struct Placed {
-    /// Its index in the document.
+    /// Index in the document.
     pub(super) node: usize,
-    /// Where its parent is in the list of placed nodes.
+    /// Index of the parent in the list of placed nodes.
     pub(super) parent: Option<usize>,
     /// `parent_from_node`.
     pub(super) local: Matrix4<f64>,
@@ -21,10 +21,10 @@ pub(super) struct Placed {
     pub(super) world: Matrix4<f64>,
 }
 
-/// All nodes of the default scene, of the first scene without one, or of the document without any.
+/// All nodes of the default scene; without a default, of the first scene; without scenes, of the document.
 ///
 /// # Errors
-/// `Invalid` naming the node that has two parents, is its own ancestor or has no valid transform.
+/// `Invalid` with the node that has two parents, is its own ancestor or has an invalid transform.
 pub(super) fn place(document: &Document, remarks: &mut Remarks) -> Result<Vec<Placed>> {
     let parents = parents(document)?;
     let roots: Vec<usize> = (0..parents.len()).filter(|node| parents[*node].is_none()).collect();
@@ -82,7 +82,8 @@ fn check_roots(nodes: &[usize], parents: &[Option<usize>]) -> Result<()> {
     Ok(())
 }
 
-/// Nodes with the place of their parent in the result. Children lead nowhere twice: that was checked.
+/// Nodes with the position of their parent in the result. No node is visited twice, because each has at most one
+/// parent.
 fn preorder(nodes: &[Node], roots: &[usize]) -> Vec<(usize, Option<usize>)> {
     let mut order = Vec::new();
     let mut stack: Vec<(usize, Option<usize>)> = roots.iter().rev().map(|root| (*root, None)).collect();

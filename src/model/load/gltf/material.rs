@@ -1,17 +1,19 @@
-//! glTF's metallic-roughness materials to Phong materials (equation 3.12 of the thesis).
+//! Converts glTF's metallic-roughness materials to Phong materials (equation 3.12 of the thesis).
 //!
-//! With base colour c, metalness m and roughness p (each factor times the mean of its texture's channel, since Phong's
-//! numbers are constant over a surface), alpha = p^2 and f = 0.04 (1 - m) + c m, the reflectance head on:
+//! With base color factor c, metalness m and roughness p (each of m and p is its factor times the mean of its texture
+//! channel, because Phong's parameters are constant over a surface), alpha = p^2 and the reflectance at normal
+//! incidence f = 0.04 (1 - m) + c m:
 //!
 //! ```text
-//! diffuse   = c (1 - m / 2)            a metal mirrors its surroundings, which are not there; half stays diffuse
+//! diffuse   = c (1 - m / 2)            a metal mirrors its surroundings, which are not rendered; half remains diffuse
 //! ambient   = c
 //! specular  = min(1, f / (4 alpha^2))  the peak of a GGX lobe relative to a white diffuse surface
-//! shininess = (2 / alpha^2 - 2) / 4    a half-vector lobe's exponent; a reflected vector's is a quarter of it
+//! shininess = (2 / alpha^2 - 2) / 4    exponent of a half-vector lobe; that of a reflected vector is a quarter of it
 //! ```
 //!
-//! `shininess` is kept in 1 to 10,000. The base colour texture multiplies diffuse, ambient and alpha. Normal textures
-//! have +Y up, as ours. Without a base colour alpha channel a mask stays a mask: a scene file may bring the alpha.
+//! `shininess` is clamped to 1 to 10,000. The base color texture multiplies diffuse, ambient and alpha. Normal textures
+//! have +Y up, as in [`Material`]. A mask material remains one even if its base color texture has no alpha, because a
+//! scene file may replace the texture.
 
 use std::collections::HashMap;
 
@@ -22,14 +24,14 @@ use super::texture::Gallery;
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
 
-/// The materials that primitives use so far.
+/// Converts materials when primitives first use them.
 #[derive(Debug)]
 pub(super) struct Palette<'a> {
     document: &'a Document,
     pub(super) gallery: Gallery<'a>,
-    /// What the scene gets.
+    /// The converted materials.
     pub(super) materials: Vec<Material>,
-    /// By index in the document (`None` is the default material) and whether its textures can be used.
+    /// Indices in `materials`, by index in the document (`None` is the default material) and usability of textures.
     known: HashMap<(Option<usize>, bool), usize>,
 }
 
@@ -38,10 +40,10 @@ impl<'a> Palette<'a> {
         Self { document, gallery, materials: Vec::new(), known: HashMap::new() }
     }
 
-    /// The set of texture coordinates that a material wants: the base colour's, else the normal map's, else 0.
+    /// The set of texture coordinates of a material: that of the base color, else of the normal map, else 0.
     ///
     /// # Errors
-    /// `Invalid` when there is no such material.
+    /// `Invalid` if the material does not exist.
     pub(super) fn uv_set(&self, material: Option<usize>) -> Result<u32> {
         let Some(index) = material else { return Ok(0) };
         let material = at(&self.document.materials, index, "material")?;
@@ -49,10 +51,10 @@ impl<'a> Palette<'a> {
         Ok(base.or(material.normal_texture.as_ref()).map_or(0, |wanted| wanted.tex_coord))
     }
 
-    /// The scene's index of a material; without its textures when the primitive lacks the coordinates.
+    /// The index of a converted material. It has no textures if the primitive lacks the texture coordinates.
     ///
     /// # Errors
-    /// `Invalid` naming material and field.
+    /// `Invalid` with the material and the field.
     pub(super) fn mix(&mut self, wanted: Option<usize>, has_uvs: bool, remarks: &mut Remarks) -> Result<usize> {
         if let Some(known) = self.known.get(&(wanted, has_uvs)) {
             return Ok(*known);
@@ -146,7 +148,7 @@ impl<'a> Palette<'a> {
         self.gallery.hang(wanted, remarks).map(Some).map_err(within("normalTexture"))
     }
 
-    /// Metalness and roughness, 0 to 1; the texture has them in blue and green.
+    /// Metalness and roughness, 0 to 1. Their texture stores them in blue and green.
     fn metal_and_roughness(&mut self, pbr: &document::Pbr, name: &str, remarks: &mut Remarks) -> Result<(f32, f32)> {
         let factors = (pbr.metallic_factor, pbr.roughness_factor);
         let Some(wanted) = &pbr.metallic_roughness_texture else { return Ok(factors) };

@@ -1,9 +1,9 @@
-//! glTF 2.0 (`.gltf` and `.glb`) to the parts of a scene: each primitive of each node with a mesh is a domain, morph
-//! POSITION targets are the columns of its U (3n x r), weights are q, nodes are transforms. Metres, Y up.
+//! Loader of glTF 2.0 (`.gltf` and `.glb`). Each primitive of each node with a mesh becomes a domain; morph POSITION
+//! targets become the columns of U (3n x r), weights become q, and nodes become transforms. Units are meters, Y is up.
 //!
-//! The JSON is parsed into our own structures and every byte is fetched with checked arithmetic. The `gltf` crate
-//! (1.4.1) is not used: its validation panics on some inputs, counts that overflow give zero elements in silence, and
-//! extensions that it was not built for cannot be seen, so nothing of what it checks could be relied on.
+//! The JSON is parsed into our own structures, and all data is read with checked arithmetic. The `gltf` crate (1.4.1)
+//! is not used: its validation panics on some inputs, overflowing counts silently yield zero elements, and extensions
+//! that it was not built with are invisible, so that none of its checks could be relied on.
 
 mod accessor;
 mod assemble;
@@ -27,16 +27,16 @@ use super::files::Files;
 use bytes::Bytes;
 use remarks::Remarks;
 
-/// The largest file: the model itself, a buffer or an image beside it.
+/// The largest file in bytes: the model itself, or a buffer or image next to it.
 const MAX_FILE: u64 = 1 << 29;
 
-/// Extensions that change only how a surface or a light looks; without them the geometry is still right.
+/// Extensions that affect only the appearance of surfaces and lights; the geometry is correct without them.
 const LOOK_ONLY: [&str; 4] = ["KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual", "KHR_xmp"];
 
-/// Reads the glTF or GLB file `path`; its buffers and images lie in the file itself or in or below its folder.
+/// Reads the glTF or GLB file `path`. Its buffers and images must be in the file itself or in or below its folder.
 ///
 /// # Errors
-/// `Invalid` naming file, field, expected and given.
+/// `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn read(files: &Files, path: &str) -> Result<Parts> {
     let content = files.read(path, MAX_FILE)?;
     let folder = match Path::new(path).parent().and_then(Path::to_str) {
@@ -47,7 +47,7 @@ pub(super) fn read(files: &Files, path: &str) -> Result<Parts> {
     parse(&folder, &name, &content).map_err(|error| error.within(&format!("file '{path}'")))
 }
 
-/// The same for bytes that are read already; `folder` is where relative URIs begin.
+/// Parses the bytes of a file. Relative URIs start at `folder`.
 fn parse(folder: &Files, name: &str, content: &[u8]) -> Result<Parts> {
     let container = container::split(content)?;
     let document = container::parse(container.json)?;
@@ -61,7 +61,7 @@ fn parse(folder: &Files, name: &str, content: &[u8]) -> Result<Parts> {
 
 fn check_version(document: &document::Document) -> Result<()> {
     let asset = &document.asset;
-    // A later minor version is compatible unless the file says that it is not.
+    // A later minor version is compatible unless the file requires it as minimum.
     if asset.version.starts_with("2.") && asset.min_version.as_ref().is_none_or(|least| least == "2.0") {
         return Ok(());
     }
@@ -95,7 +95,7 @@ fn remark_on_what_is_left_out(document: &document::Document, remarks: &mut Remar
     }
 }
 
-/// The element `index` of a list, refused with the list's name.
+/// The element `index` of a list; an error names the list.
 fn at<'a, T>(list: &'a [T], index: usize, field: &str) -> Result<&'a T> {
     list.get(index).ok_or_else(|| invalid(field, format!("an index below {}", list.len()), index))
 }

@@ -1,5 +1,5 @@
-//! A primitive to a shape: one vertex and one corner per element of POSITION, triangles from its topology, and U
-//! (3n x r) from the POSITION targets.
+//! Converts a primitive to a shape: one vertex and one corner per element of POSITION, triangles from its topology, and
+//! U (3n x r) from the POSITION targets.
 
 use super::accessor::{Form, Reader};
 use super::document::Primitive;
@@ -10,10 +10,10 @@ use crate::error::{Result, invalid};
 const STRIP: u64 = 5;
 const FAN: u64 = 6;
 
-/// The shape of a primitive, with the texture coordinates of set `uv_set` if it has them; `None` for points and lines.
+/// The shape of a primitive, with the texture coordinates of set `uv_set` if it has them. `None` for points and lines.
 ///
 /// # Errors
-/// `Invalid` naming attribute, accessor and field.
+/// `Invalid` with the attribute, the accessor and the field.
 pub(super) fn shape(
     reader: Reader<'_>,
     primitive: &Primitive,
@@ -64,7 +64,7 @@ fn mesh(reader: Reader<'_>, primitive: &Primitive, rest: Vec<[f32; 3]>, uv_set: 
     Mesh::indexed(rest, normals, uvs, triangles)
 }
 
-/// Triangles of a list, strip or fan. The triangles without area that stitch strips together are left out.
+/// The triangles of a list, strip or fan. Degenerate triangles that join strips are omitted.
 fn triangles(indices: &[u32], mode: u64) -> Result<Vec<[u32; 3]>> {
     let wanted = match mode {
         STRIP | FAN => indices.len() >= 3,
@@ -88,7 +88,7 @@ fn triangles(indices: &[u32], mode: u64) -> Result<Vec<[u32; 3]>> {
     })
 }
 
-/// Column k of U is the POSITION of target k, zero if it has none.
+/// Column k of U is the POSITION of target k, or zero if the target has none.
 fn modes(reader: Reader<'_>, primitive: &Primitive, vertices: usize, remarks: &mut Remarks) -> Result<Modes> {
     let targets = &primitive.targets;
     if targets.len() > MAX_RANK {

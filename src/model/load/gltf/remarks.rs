@@ -1,9 +1,9 @@
-//! What a model asks for and this loader leaves out, in words, each said once.
+//! Messages about features of a model that the loader does not support, without duplicates.
 
-/// The most remarks kept; a hostile file must not fill the log.
+/// The largest number of stored remarks, so that a hostile file cannot flood the log.
 const MOST: usize = 64;
 
-/// Remarks in the order in which they came up.
+/// Remarks in order of occurrence.
 #[derive(Debug, Default)]
 pub(super) struct Remarks {
     said: Vec<String>,
@@ -11,7 +11,7 @@ pub(super) struct Remarks {
 }
 
 impl Remarks {
-    /// Adds a remark unless it was made before.
+    /// Adds a remark unless it already exists.
     pub(super) fn add(&mut self, remark: String) {
         let remark = tidy(&remark, 240);
         match self.said.contains(&remark) {
@@ -21,7 +21,7 @@ impl Remarks {
         }
     }
 
-    /// All remarks, and how many more there were.
+    /// All remarks, and the number of remarks that exceeded the limit.
     pub(super) fn into_list(mut self) -> Vec<String> {
         if self.unsaid > 0 {
             self.said.push(format!("and {} more remarks", self.unsaid));
@@ -30,7 +30,7 @@ impl Remarks {
     }
 }
 
-/// A text of the file as it may be shown: no control characters, at most `most` characters.
+/// Sanitizes text from a file for display: no control characters, at most `most` characters.
 pub(super) fn tidy(text: &str, most: usize) -> String {
     text.chars().filter(|letter| !letter.is_control()).take(most).collect()
 }

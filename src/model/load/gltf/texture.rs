@@ -1,4 +1,4 @@
-//! glTF textures to decoded images, each image once whatever the number of textures and roles that it has.
+//! Decodes the images of glTF textures. An image that several textures or materials use becomes one texture.
 
 use std::collections::HashMap;
 
@@ -9,12 +9,12 @@ use super::{at, bytes};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 
-/// The images that materials use so far.
+/// Decodes images when materials first use them.
 #[derive(Debug)]
 pub(super) struct Gallery<'a> {
     document: &'a Document,
     bytes: &'a bytes::Bytes<'a>,
-    /// What the scene gets.
+    /// The decoded textures.
     pub(super) textures: Vec<Texture>,
     by_image: HashMap<usize, usize>,
     means: HashMap<usize, [f32; 4]>,
@@ -25,10 +25,10 @@ impl<'a> Gallery<'a> {
         Self { document, bytes, textures: Vec::new(), by_image: HashMap::new(), means: HashMap::new() }
     }
 
-    /// The scene's index of a texture.
+    /// The index of a decoded texture.
     ///
     /// # Errors
-    /// `Invalid` when it is not there or no PNG or JPEG image.
+    /// `Invalid` if the texture does not exist or is not a PNG or JPEG image.
     pub(super) fn hang(&mut self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<usize> {
         let image = self.image_of(wanted, remarks)?;
         if let Some(known) = self.by_image.get(&image) {
@@ -40,10 +40,10 @@ impl<'a> Gallery<'a> {
         Ok(self.textures.len() - 1)
     }
 
-    /// The means of the four channels, 0 to 1, of a texture that is not kept.
+    /// The mean of each of the four channels, 0 to 1. The texture itself is not kept.
     ///
     /// # Errors
-    /// As [`Self::hang`].
+    /// As for [`Self::hang`].
     pub(super) fn mean(&mut self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<[f32; 4]> {
         let image = self.image_of(wanted, remarks)?;
         if let Some(known) = self.means.get(&image) {
@@ -60,7 +60,7 @@ impl<'a> Gallery<'a> {
         Ok(means)
     }
 
-    /// The image behind a texture; what its sampler asks for and is not done is remarked on.
+    /// The image of a texture. Unsupported sampler settings are recorded as remarks.
     fn image_of(&self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<usize> {
         let texture = at(&self.document.textures, wanted.index, "index")?;
         let place = format!("textures[{}]", wanted.index);

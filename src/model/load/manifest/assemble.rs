@@ -1,4 +1,5 @@
-//! Entries of a manifest to the parts of one scene: models read once, placed, joined and painted.
+//! Builds one scene from the entries of a manifest: reads each model once, places and attaches its domains, and applies
+//! material overrides.
 
 use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
@@ -12,13 +13,13 @@ use crate::load::obj::Source;
 use crate::load::{images, modes, source};
 use crate::scene::{MAX_DOMAINS, Parts, UpAxis};
 
-/// Vertices of a deformable parent that carry a child whose entry names none.
+/// Number of carrying vertices of a deformable parent for an entry without `rows`.
 const CARRIERS: usize = 8;
 
-/// The scene of all entries.
+/// The parts of the scene of all entries.
 ///
 /// # Errors
-/// `Invalid` naming the entry.
+/// `Invalid` with the entry.
 pub(super) fn assemble(files: &Files, manifest: &Manifest, entries: &[Entry], own_name: &str) -> Result<Parts> {
     let name = manifest.name.clone().unwrap_or_else(|| own_name.to_owned());
     let mut assembly = Assembly {
@@ -55,7 +56,8 @@ pub(super) fn assemble(files: &Files, manifest: &Manifest, entries: &[Entry], ow
     Ok(parts)
 }
 
-/// A model that was read: its domains, indices already those of the whole scene, but domains counted from 0.
+/// A model that was read. The indices in its domains refer to the lists of the whole scene, except indices of other
+/// domains, which are relative to the model.
 struct Loaded {
     domains: Vec<Domain>,
 }
@@ -67,7 +69,7 @@ struct Assembly<'a> {
     pictures: HashMap<String, usize>,
     models: HashMap<(PathBuf, Option<String>), Loaded>,
     by_name: HashMap<String, usize>,
-    /// Names of materials that a patch was looked up for.
+    /// Names of all materials that were looked up in the overrides.
     patched: HashSet<String>,
 }
 
@@ -112,7 +114,7 @@ impl Assembly<'_> {
         Ok(())
     }
 
-    /// Reads a model and puts what is not a domain of it behind what is there.
+    /// Reads a model and appends its shapes, materials and textures to those of the scene.
     fn load(&mut self, index: usize, entry: &Entry) -> Result<Loaded> {
         let source = if entry.modes.is_some() { Source::None } else { Source::Beside };
         let mut model = source::model(self.files, &entry.model, source)?;
@@ -163,7 +165,7 @@ impl Assembly<'_> {
         Err(invalid("material", format!("* or one of {}", names.join(", ")), stray))
     }
 
-    /// Moves the domains to their place and hangs those without a parent on the entry's.
+    /// Places the domains, and attaches those without a parent to the entry's parent.
     fn place(&self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
         let first = self.parts.domains.len();
         let said = |placement: &Option<super::Placement>, key: &str| match placement {
@@ -218,7 +220,7 @@ impl Assembly<'_> {
         Ok(Attachment { parent, frame, rows })
     }
 
-    /// Gives the entry its own copies of the materials that it changes.
+    /// Gives the entry its own copies of the materials that it overrides.
     fn paint(&mut self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
         let Some(patch) = &entry.material else { return Ok(()) };
         let mut copies = HashMap::new();
@@ -254,7 +256,7 @@ impl Assembly<'_> {
         Ok(())
     }
 
-    /// Names every domain apart: the entry's name, in front of the model's own where that has several domains.
+    /// Gives every domain a unique name: the entry's name, as a prefix if the model has several domains.
     fn name(&mut self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
         let single = domains.len() == 1;
         for (offset, domain) in domains.iter_mut().enumerate() {
@@ -276,14 +278,14 @@ impl Assembly<'_> {
             self.by_name.insert(domain.name.clone(), index);
         }
         if let (Some(name), false) = (&entry.name, single) {
-            // The entry's name stands for its first domain when a later one wants it as its parent.
+            // As a parent of later entries, the entry's name denotes its first domain.
             self.by_name.entry(name.clone()).or_insert(self.parts.domains.len());
         }
         Ok(())
     }
 }
 
-/// Lets the domains that the entry says follow what they hang on, from where they are at rest.
+/// Makes the domains with the entry's name prefix followers of their parents, with their rest poses as frames.
 fn follow(entry: &Entry, domains: &mut [Domain]) -> Result<()> {
     let Some(start) = &entry.follows else { return Ok(()) };
     let mut any = false;
@@ -298,7 +300,7 @@ fn follow(entry: &Entry, domains: &mut [Domain]) -> Result<()> {
     }
 }
 
-/// Exchanges U of a model of one shape; coordinates at rest go with it.
+/// Replaces U of a model with one shape, and clears the rest coordinates, which belong to the old modes.
 fn replace_modes(files: &Files, file: &str, model: &mut Parts) -> Result<()> {
     let [shape] = &mut model.shapes[..] else {
         return Err(invalid("modes", "a model of one domain", format!("one of {}", model.shapes.len())));
@@ -309,14 +311,14 @@ fn replace_modes(files: &Files, file: &str, model: &mut Parts) -> Result<()> {
     Ok(())
 }
 
-/// Turns `from` up to `to` up; the identity when `from` is not said.
+/// The rotation from up axis `from` to `to`; the identity if `from` is `None`.
 fn turned(from: Option<UpAxis>, to: UpAxis) -> Transform {
     let Some(from) = from.filter(|from| *from != to) else { return Transform::IDENTITY };
     let turn = to.from_y_up() * from.from_y_up().inverse();
     Transform::from_parts(turn.matrix(), &nalgebra::Vector3::zeros())
 }
 
-/// The vertices of a deformable shape that are nearest to the origin of `frame`, ascending.
+/// The vertices of a deformable shape that are nearest to the origin of `frame`, ascending. Empty for a rigid shape.
 fn nearest(shape: &Shape, frame: Transform) -> Vec<u32> {
     if shape.modes.rank() == 0 {
         return Vec::new();
@@ -331,7 +333,7 @@ fn nearest(shape: &Shape, frame: Transform) -> Vec<u32> {
     vertices
 }
 
-/// Drops materials that no triangle has and textures that no material has, such as one that was replaced.
+/// Removes unused materials and textures, for example replaced textures.
 fn drop_unused(parts: &mut Parts) {
     let mut used = vec![false; parts.materials.len()];
     for domain in &parts.domains {
@@ -353,7 +355,7 @@ fn drop_unused(parts: &mut Parts) {
     }
 }
 
-/// Keeps what is used and tells where each kept one lies now.
+/// Keeps the used elements, and returns the new index of each of them.
 fn keep<T>(list: &mut Vec<T>, used: &[bool]) -> Vec<usize> {
     let before: Vec<usize> =
         used.iter().scan(0, |kept, used| Some(std::mem::replace(kept, *kept + usize::from(*used)))).collect();

@@ -1,50 +1,61 @@
-//! `scene.toml` to the parts of a scene: which models, where, on what, and what is changed about them.
+//! Loader of `scene.toml`: which models a scene consists of, where they are placed and attached, and how their
+//! materials and the scene's settings are overridden.
 //!
 //! ```toml
-//! name = "fern"              # else the folder's name
-//! up = "y"                   # x, y or z; else the first model's
-//! unit = 1.0                 # metres per unit of length; else the first model's
-//! origin = [0.0, 0.0, 0.0]   # world position of the frame of all transforms, metres
-//! transforms = "rigid"       # a promise that no step shears or scales; else "affine"
+//! name = "fern"              # default: the name of the folder
+//! up = "y"                   # x, y or z; default: up axis of the first model
+//! unit = 1.0                 # meters per scene unit; default: unit of the first model
+//! origin = [0.0, 0.0, 0.0]   # world position of the frame of all transforms, meters
+//! transforms = "rigid"       # declares that no step shears or scales; default: "affine"
 //! shadows = true             # false: no shadow map
-//! ground = true              # false: no ground plane
-//! look.sunlight = [1.0, 0.9, 0.8]       # and sun (direction), skylight, zenith, horizon
-//! look.samples = 4           # or 1: samples a pixel
-//! look.antialias = "samples" # or "fxaa", "none": one sample a pixel
-//! look.transparency = "exact" # or "two-pass", with opaque_alpha; exact keeps as many fragments as look.fragments says
-//! look.culling = "depth"     # or "none", "triangles": what is left out before it is drawn; the picture stays the same
-//! look.raster = "opengl"      # or "cuda", "fastest": what turns triangles into samples
-//! look.bloom = { threshold = 1.0, strength = 0.5, levels = 5 }   # light above the threshold glows
-//! look.tone = "aces"         # or "reinhard", "none"; look.exposure = 1.2 multiplies all light before it
-//! look.dither = true         # slow gradients show no bands
-//! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }   # variance, standard, filtered; maps, 1 to 4
-//!                            # and bleeding, least_variance, alpha_threshold, moments (f32, f16), fit (vertices,
-//!                            # corners)
-//! deform = { storage = "f16", normals = "exact", truncation = 1e-4 }   # f32, f16, bf16, int8; rigid, exact; metres
-//! deform.batches = "never"   # or "always": whether domains that share a U are deformed together; else where it pays
-//! deform.boxes = true        # keep a box of each domain for readers, and with displacements u = U q of each vertex
+//! ground = true              # false: no ground plane; look.ground.colour is its color
+//! look.sunlight = [1.0, 0.9, 0.8]   # also sun (direction), skylight, zenith, horizon; linear colors
+//! look.samples = 4           # samples per pixel, 1 or 4
+//! look.antialias = "samples" # or "fxaa", "none", both with one sample per pixel
+//! look.transparency = "exact"   # order-independent, with up to look.fragments blended fragments per frame;
+//!                            # or "two-pass", with look.opaque_alpha
+//! look.culling = "depth"     # or "none", "triangles", "fitting" (default); does not change the image
+//! look.raster = "opengl"     # the rasterizer; or "cuda", "fastest"
+//! look.bloom = { threshold = 1.0, strength = 0.5, levels = 5 }
+//! look.tone = "aces"         # tone mapping; or "reinhard", "none"
+//! look.exposure = 1.2        # multiplies all light before bloom and tone mapping
+//! look.dither = true         # avoids banding in slow gradients
+//! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }
+//!                            # method: variance, standard, filtered; splits: number of cascades, 1 to 4;
+//!                            # also bleeding, least_variance, alpha_threshold, moments (f32, f16),
+//!                            # fit (vertices, corners)
+//! deform.storage = "f16"     # type of the entries of U: f32 (default), f16, bf16, int8
+//! deform.normals = "exact"   # or "rigid" (default)
+//! deform.truncation = 1e-4   # skip modes that together move no vertex by more than this many meters
+//! deform.compensated = true  # compensated summation of modes
+//! deform.batches = "never"   # or "always", "auto" (default): whether domains that share U are deformed together
+//! deform.boxes = true        # store a bounding box per domain for clients
+//! deform.displacements = true   # store u = U q of every vertex for clients
 //!
-//! model = "fern_02.glb"      # a scene of one model, or a [[domain]] for each of several
-//! modes = "fern.npy"         # U of a model of one domain; "" for none
-//! follows = "leaf"           # domains of the model called so, or "leaf ...", keep their place on what they hang on: no
-//!                            # step names a transform of theirs; "" for all that hang on something
+//! model = "fern_02.glb"      # a scene of one model; or several [[domain]] entries
+//! modes = "fern.npy"         # U of a model with one shape; "" for none
+//! follows = "leaf"           # domains whose name in the model starts with "leaf" and that have a parent move rigidly
+//!                            # with it, and steps cannot set their transforms; "" for all domains with a parent
 //! placement = { translation = [0, 0, 0], axis = [0, 1, 0], degrees = 90, scale = 2.0 }
 //!
-//! [material."*"]             # a material's name, or * for all; what is missing stays as the model has it
-//! diffuse = [0.8, 0.1, 0.1]  # linear, 0 to 1; ambient follows unless it is given
-//! specular = [0.2, 0.2, 0.2] # and shininess, alpha
-//! colour_texture = "leaf.png"   # "" takes it away; normal_texture likewise
+//! [material."*"]             # overrides by material name, or * for all; missing keys keep the model's values
+//! diffuse = [0.8, 0.1, 0.1]  # linear, 0 to 1; also sets ambient unless that is given
+//! specular = [0.2, 0.2, 0.2] # also shininess, alpha
+//! colour_texture = "leaf.png"   # "" removes it; also normal_texture
 //! alpha_mode = "mask"        # opaque, mask or blend
 //! cutoff = 0.5
 //! double_sided = true
 //!
-//! [[domain]]                 # models that are named twice are instances: they share mesh and U
+//! [[domain]]                 # entries with the same model are instances: they share mesh and U
 //! name = "branch"
-//! model = "../branch.obj"
+//! model = "../branch.obj"    # also modes, follows and placement, as above
+//! up = "z"                   # up axis of the model, which is rotated to that of the scene
 //! parent = "trunk"           # a domain of an earlier entry
 //! frame = { translation = [0, 1, 0] }   # parent_from_model, instead of a placement
-//! rows = [3, 4, 5]           # vertices of the parent that carry it; else the nearest eight of a deformable parent
-//! material = { diffuse = [1, 0, 0] }    # for this entry only
+//! rows = [3, 4, 5]           # vertices of the parent that carry it; default: the nearest eight of a deformable parent
+//! material = { diffuse = [1, 0, 0] }    # overrides for this entry only
+//! eigenvalues = [39.5]       # (rad/s)^2, one per mode of a single domain; stored for clients
+//! notes = { source = "scan" }   # strings, stored for clients
 //! ```
 
 mod assemble;
@@ -60,9 +71,9 @@ use super::files::Files;
 use crate::error::{Result, invalid};
 use crate::scene::{Deformation, Look, Parts, UpAxis};
 
-/// The name that makes a folder a scene.
+/// The file name that makes a folder a scene.
 pub(super) const FILE: &str = "scene.toml";
-/// The most bytes of a `scene.toml`.
+/// The largest size of a `scene.toml` in bytes.
 const MOST_BYTES: u64 = 1 << 20;
 
 #[derive(Debug, serde::Deserialize)]
@@ -98,33 +109,33 @@ enum Transforms {
     Affine,
 }
 
-/// One model in its place.
+/// One model and its placement.
 #[derive(Debug, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Entry {
     model: String,
     name: Option<String>,
     modes: Option<String>,
-    /// The model's up axis, turned to the scene's.
+    /// Up axis of the model, which is rotated to that of the scene.
     up: Option<UpAxis>,
     placement: Option<Placement>,
     parent: Option<String>,
     frame: Option<Placement>,
     rows: Option<Vec<u32>>,
-    /// How the names begin of those domains that keep their place on what they hang on.
+    /// Name prefix of the domains that move rigidly with their parent.
     follows: Option<String>,
     material: Option<Patch>,
-    /// (rad/s)^2, one per mode; kept for clients.
+    /// Eigenvalues in (rad/s)^2, one per mode; stored for clients.
     eigenvalues: Option<Vec<f64>>,
-    /// Kept for clients.
+    /// Stored for clients.
     #[serde(default)]
     notes: BTreeMap<String, String>,
 }
 
-/// Reads the manifest `file` of the folder `files`; `own_name` is the scene's name unless it says another.
+/// Reads the manifest `file` in the folder `files`. `own_name` is the default name of the scene.
 ///
 /// # Errors
-/// `Invalid` naming the manifest and the line, or the entry, what was expected and what was given.
+/// `Invalid` with the manifest, the line or entry, and the expected and given value.
 pub(super) fn read(files: &Files, file: &str, own_name: &str) -> Result<Parts> {
     let place = format!("file '{file}'");
     let bytes = files.read(file, MOST_BYTES)?;
@@ -141,7 +152,7 @@ fn parse(bytes: &[u8]) -> Result<Manifest> {
     })
 }
 
-/// The entries; a `model` at the top is the only one.
+/// The entries. A top-level `model` is the only entry.
 fn entries(manifest: &mut Manifest) -> Result<Vec<Entry>> {
     let entries = std::mem::take(&mut manifest.domain);
     match (manifest.model.take(), entries.is_empty()) {

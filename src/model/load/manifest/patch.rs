@@ -1,10 +1,10 @@
-//! What `scene.toml` says about a material, laid over what the model's file says.
+//! Material overrides of `scene.toml`.
 
 use crate::domain::{AlphaMode, Material, Texture};
 use crate::error::{Result, invalid};
 use crate::load::obj::CUTOFF;
 
-/// Overrides; what is missing stays. A texture of no name takes the texture away.
+/// Overrides of a material. Missing keys keep the model's values; an empty texture name removes the texture.
 #[derive(Debug, Clone, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Patch {
@@ -28,22 +28,22 @@ enum Mode {
     Blend,
 }
 
-/// Where the patched scene keeps its textures.
+/// The textures of the scene whose materials are overridden.
 pub(super) trait Gallery {
-    /// Index of the texture in a file.
+    /// The index of the texture in a file, which is read on the first call.
     fn index(&mut self, path: &str) -> Result<usize>;
     /// The texture at an index.
     fn at(&self, index: usize) -> Option<&Texture>;
 }
 
 impl Patch {
-    /// Changes `material`.
+    /// Applies the overrides to `material`.
     ///
-    /// Without an `alpha_mode`, an opaque material whose new colour texture has alpha becomes a mask, and one whose new
-    /// alpha is below 1 blends.
+    /// Without an `alpha_mode`, an opaque material becomes blended if its new alpha is below 1, or masked if its new
+    /// color texture has alpha.
     ///
     /// # Errors
-    /// `Invalid` naming the material and the key: a texture that cannot be read, a cutoff for what is no mask.
+    /// `Invalid` with the material and the key, for a texture that cannot be read or a cutoff without alpha mode mask.
     pub(super) fn apply(&self, material: &mut Material, gallery: &mut impl Gallery) -> Result<()> {
         let place = |key: &str| format!("material '{}': {key}", material.name);
         let mut texture = |path: &str, key: &str| match path {
@@ -67,7 +67,7 @@ impl Patch {
             (AlphaMode::Mask { .. }, Some(cutoff)) => AlphaMode::Mask { cutoff },
             (_, Some(cutoff)) => return Err(invalid(place("cutoff"), "the alpha_mode mask with it", cutoff)),
         };
-        // A colour that is meant to be seen is meant in the shade too.
+        // An override of the diffuse color also applies in the shade.
         material.ambient = self.ambient.or(self.diffuse).unwrap_or(material.ambient);
         material.diffuse = self.diffuse.unwrap_or(material.diffuse);
         material.specular = self.specular.unwrap_or(material.specular);

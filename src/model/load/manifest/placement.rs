@@ -1,19 +1,19 @@
-//! A placement in words (translation, turn, scale; or twelve numbers) to a transform.
+//! Placements in `scene.toml`: translation, rotation and scale, or a matrix.
 
 use nalgebra::{Matrix3, Quaternion, Rotation3, Unit, UnitQuaternion, Vector3};
 
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
-/// Scale, then turn, then translation; or the twelve numbers of a row-major 3x4 matrix.
+/// Scale, then rotation, then translation; or the twelve entries of a row-major 3x4 matrix.
 #[derive(Debug, Clone, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Placement {
     translation: Option<[f64; 3]>,
-    /// With `degrees`: the turn about an axis through the origin.
+    /// Rotation axis through the origin; requires `degrees`.
     axis: Option<[f64; 3]>,
     degrees: Option<f64>,
-    /// The turn as x, y, z, w (glTF's order).
+    /// Rotation as x, y, z, w (glTF's order).
     quaternion: Option<[f64; 4]>,
     scale: Option<Scale>,
     matrix: Option<[f64; 12]>,
@@ -27,10 +27,10 @@ enum Scale {
 }
 
 impl Placement {
-    /// The transform.
+    /// Converts to a transform.
     ///
     /// # Errors
-    /// `Invalid` naming the key when two say the same thing, one needs another, or a number is not finite.
+    /// `Invalid` with the key if two keys conflict, one requires another, or a number is not finite.
     pub(super) fn transform(&self) -> Result<Transform> {
         let parts = [self.translation.is_some(), self.axis.is_some(), self.quaternion.is_some(), self.scale.is_some()];
         let transform = match self.matrix {

@@ -1,4 +1,4 @@
-//! Promises of the manifest, on small models written for them.
+//! Tests of the manifest with small models.
 
 use std::path::Path;
 

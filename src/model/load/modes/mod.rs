@@ -1,4 +1,4 @@
-//! Files to the modal matrix U: 3n rows, r columns, f32.
+//! Loaders of the modal matrix U: 3n rows, r columns, f32.
 
 mod numpy;
 mod sofa;
@@ -11,13 +11,13 @@ use super::files::{Files, Kind, MODEL_BYTES};
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
-/// Endings of files with modes, in the order in which they are preferred: binary ones hold all digits, text does not.
+/// Endings of mode files in order of preference: binary files before text, which has fewer digits.
 const ENDINGS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
 
-/// The modes in `name`; its ending tells the format.
+/// Reads the modes in `name`. The extension determines the format.
 ///
 /// # Errors
-/// `Invalid` naming the file, what was expected and what was given.
+/// `Invalid` with the file, and the expected and given value.
 pub(super) fn read(files: &Files, name: &str) -> Result<Modes> {
     let parse = match name.rsplit_once('.').map(|(_, ending)| ending) {
         Some("float" | "double" | "U") => vega::parse,
@@ -40,13 +40,14 @@ fn matrix(bytes: &[u8]) -> Result<Modes> {
     }
 }
 
-/// The modes that belong to the OBJ file `name` in its folder, if any.
+/// Finds the modes of the OBJ file `name` in its folder, if any.
 ///
-/// They have its name (without `.obj` and `.derived`) before one of [`ENDINGS`], in that order; `.U` may stand between.
-/// When no other OBJ file lies there, any file with such an ending is taken, in that order too.
+/// The candidates have its name (without `.obj` and `.derived`), optionally `.U`, and one of the first four
+/// [`ENDINGS`], in that order. If the folder has no other OBJ file, any file with one of the [`ENDINGS`] is accepted,
+/// in that order too.
 ///
 /// # Errors
-/// `Invalid` naming the candidates when two files have the same ending.
+/// `Invalid` with the candidates if two files have the same ending.
 pub(super) fn beside(files: &Files, name: &str) -> Result<Option<String>> {
     let stem = name.strip_suffix(".obj").unwrap_or(name);
     let stem = stem.strip_suffix(".derived").unwrap_or(stem);
@@ -64,7 +65,7 @@ pub(super) fn beside(files: &Files, name: &str) -> Result<Option<String>> {
         return Ok(None);
     }
     for ending in ENDINGS {
-        // `q.npy` and the like hold coordinates, not modes.
+        // `q.npy` and `*.q.npy` contain coordinates, not modes.
         let fits = |name: &&String| name.ends_with(ending) && *name != "q.npy" && !name.ends_with(".q.npy");
         let found: Vec<&String> = names.iter().filter(fits).collect();
         match found[..] {

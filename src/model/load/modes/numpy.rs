@@ -1,26 +1,26 @@
-//! NumPy's `.npy` files to arrays of f32.
+//! Parser of NumPy's `.npy` files to arrays of f32.
 //!
-//! The header is read here: it may be anything up to 4 GiB of a Python literal, and a general parser of literals follows
-//! its brackets as deep as the stack goes.
+//! It does not use a general parser of Python literals: a header may have up to 4 GiB, and such a parser would recurse
+//! as deep as the header's brackets nest and could overflow the stack.
 
 use crate::error::{Error, Result, invalid};
 
-/// The longest header that is read, in bytes.
+/// The longest accepted header in bytes.
 const MOST_HEADER: usize = 4096;
 
-/// Numbers with their shape.
+/// Array entries with their shape.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Array {
     pub shape: Vec<usize>,
-    /// The first index runs fastest, not the last.
+    /// Whether the first index varies fastest (column-major) instead of the last.
     pub fortran: bool,
     pub entries: Vec<f32>,
 }
 
-/// An array of f32 or f64 (rounded), of either byte order.
+/// Parses an array of f32 or f64 (rounded to f32) in either byte order.
 ///
 /// # Errors
-/// `Invalid` when the bytes are no such file, or more or fewer than its shape says.
+/// `Invalid` if the bytes are not such a file, or their number does not match the shape.
 pub fn parse(bytes: &[u8]) -> Result<Array> {
     let (header, body) = split(bytes)?;
     let description = value(header, "descr")?.trim_matches(['\'', '"']);
@@ -48,7 +48,7 @@ pub fn parse(bytes: &[u8]) -> Result<Array> {
     Ok(Array { shape, fortran, entries })
 }
 
-/// The text of the header and the bytes after it.
+/// Splits the file into the text of the header and the data after it.
 fn split(bytes: &[u8]) -> Result<(&str, &[u8])> {
     let cut = || invalid("header", "a whole .npy header", format!("{} bytes", bytes.len()));
     let start = bytes.get(..8).ok_or_else(cut)?;
@@ -70,7 +70,7 @@ fn split(bytes: &[u8]) -> Result<(&str, &[u8])> {
     Ok((text, body))
 }
 
-/// What stands after a key: up to the closing bracket of a tuple, or the next comma or brace.
+/// The value of a key: up to the closing parenthesis of a tuple, or the next comma or brace.
 fn value<'a>(header: &'a str, key: &str) -> Result<&'a str> {
     let missing = || -> Error { invalid("header", format!("the key '{key}'"), header.trim()) };
     let after = [format!("'{key}'"), format!("\"{key}\"")]

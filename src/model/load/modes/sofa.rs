@@ -1,12 +1,12 @@
-//! SOFA's text modes: rows and columns in the first line, then the values, one line per row of U.
+//! Parser of SOFA's text modes: rows and columns in the first line, then the values, one line per row of U.
 
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
-/// U from a whole file. What the header declares is compared with what the lines deliver.
+/// Parses U and compares the declared with the actual number of values.
 ///
 /// # Errors
-/// `Invalid` naming declared and delivered sizes, or the line of a value that is no number.
+/// `Invalid` with the declared and actual sizes, or with the line of a value that is not a number.
 pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     let text = std::str::from_utf8(bytes).map_err(|error| invalid("text", "ASCII numbers", error))?;
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
@@ -26,7 +26,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     Modes::from_rows(rows, rank, &entries)
 }
 
-/// The two whole numbers of the header; some writers give them as `684. 32.`.
+/// Parses the two whole numbers of the header; some tools write them as `684. 32.`.
 fn sizes(header: &str) -> Result<(usize, usize)> {
     let words: Vec<&str> = header.split_ascii_whitespace().collect();
     let whole = |word: &str| word.strip_suffix('.').unwrap_or(word).parse::<usize>().ok();
@@ -43,7 +43,7 @@ fn compare(rows: usize, rank: usize, widths: &[usize]) -> Result<()> {
     let delivered: usize = widths.iter().sum();
     let declared = rows.checked_mul(rank);
     let one_line_each = widths.len() == rows && widths.iter().all(|width| *width == rank);
-    // Values may be wrapped in other ways, but then the lines tell nothing and the total must fit.
+    // Values may be wrapped at other places; then only their total number can be checked.
     if declared == Some(delivered) && (one_line_each || widths.len() != rows) {
         return Ok(());
     }

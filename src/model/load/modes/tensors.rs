@@ -1,14 +1,14 @@
-//! safetensors files to U: the tensor named `U`, or the only one; f64, f32, f16 or bf16, row by row.
+//! Parser of safetensors files: the tensor `U`, or the only one, as row-major f64, f32, f16 or bf16.
 
 use safetensors::{Dtype, SafeTensors};
 
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
-/// U from a whole file.
+/// Parses U.
 ///
 /// # Errors
-/// `Invalid` when the bytes are no such file, hold no such tensor, or it is of another type or shape.
+/// `Invalid` if the bytes are not such a file, contain no such tensor, or it has an unsupported type or shape.
 pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|error| invalid("header", "a safetensors file", error))?;
     let names = tensors.names();

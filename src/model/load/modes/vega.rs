@@ -1,12 +1,13 @@
-//! Vega's matrix files: int32 rows, int32 columns (little-endian), then f32 or f64 entries, column by column.
+//! Parser of Vega's matrix files: int32 rows, int32 columns (little-endian), then f32 or f64 entries, column-major.
 
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
-/// U from a whole file; its size tells f32 from f64.
+/// Parses U. The file size distinguishes f32 from f64.
 ///
 /// # Errors
-/// `Invalid` when the header is cut off or negative, or the size fits neither; as [`Modes::from_columns`] else.
+/// `Invalid` if the header is truncated or negative, or the size matches neither type; otherwise as for
+/// [`Modes::from_columns`].
 pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     let Some((header, body)) = bytes.split_first_chunk::<8>() else {
         return Err(invalid("header", "8 bytes", bytes.len()));
@@ -17,7 +18,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
         usize::try_from(value).map_err(|_| invalid(field, "no negative number", value))
     };
     let (rows, rank) = (dimension("rows", [a, b, c, d])?, dimension("columns", [e, f, g, h])?);
-    // Two 31-bit numbers and a factor of eight may pass 64 bits.
+    // The product of two 31-bit numbers and eight can exceed 64 bits.
     let entries = rows as u128 * rank as u128;
     let columns = match body.len() as u128 {
         size if size == 4 * entries => four_bytes(body),
@@ -30,12 +31,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     Modes::from_columns(rows, rank, columns)
 }
 
-/// Little-endian f32 entries.
+/// Decodes little-endian f32 entries.
 pub(super) fn four_bytes(body: &[u8]) -> Vec<f32> {
     body.as_chunks().0.iter().map(|entry| f32::from_le_bytes(*entry)).collect()
 }
 
-/// Little-endian f64 entries, rounded.
+/// Decodes little-endian f64 entries, rounded to f32.
 pub(super) fn eight_bytes(body: &[u8]) -> Vec<f32> {
     body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry) as f32).collect()
 }

@@ -1,4 +1,4 @@
-//! Polygons to a mesh of triangles in runs of one material.
+//! Builds a triangle mesh, grouped into runs of one material, from the polygons of an OBJ file.
 
 use std::collections::HashMap;
 
@@ -7,19 +7,19 @@ use super::triangulate::triangulate;
 use crate::domain::{Corners, Mesh, Run, smooth_normals};
 use crate::error::Result;
 
-/// A mesh and where its materials (indices into [`Obj::materials`]) begin.
+/// A mesh and its runs of materials (indices into [`Obj::materials`]).
 #[derive(Debug)]
 pub(in crate::load) struct Piece {
     pub(in crate::load) mesh: Mesh,
     pub(in crate::load) material: usize,
-    /// Empty when there is one material only.
+    /// Empty if there is only one material.
     pub(in crate::load) runs: Vec<Run>,
 }
 
-/// All faces. The vertices are the file's `v` lines, all of them and in their order, whether a face names them or not.
+/// Builds a mesh from all faces. Its vertices are all `v` lines in file order, whether referenced or not.
 ///
 /// # Errors
-/// `Invalid` as [`Mesh::new`].
+/// `Invalid` as for [`Mesh::new`].
 pub(in crate::load) fn whole(obj: &Obj) -> Result<Piece> {
     let faces: Vec<usize> = (0..obj.faces.len()).collect();
     let mut builder = Builder { rest: obj.positions.clone(), ..Builder::new(obj) };
@@ -27,10 +27,10 @@ pub(in crate::load) fn whole(obj: &Obj) -> Result<Piece> {
     builder.finish()
 }
 
-/// Chosen faces with the vertices that they use, relative to `base`.
+/// Builds a mesh from some faces and only the vertices that they use, with positions relative to `base`.
 ///
 /// # Errors
-/// `Invalid` as [`Mesh::new`].
+/// `Invalid` as for [`Mesh::new`].
 pub(in crate::load) fn part(obj: &Obj, faces: &[usize], base: [f64; 3]) -> Result<Piece> {
     let mut builder = Builder { local: Some((HashMap::new(), base)), ..Builder::new(obj) };
     builder.add(faces);
@@ -39,7 +39,7 @@ pub(in crate::load) fn part(obj: &Obj, faces: &[usize], base: [f64; 3]) -> Resul
 
 struct Builder<'a> {
     obj: &'a Obj,
-    /// With a part: its own number of each of the file's vertices, and its base.
+    /// For [`part`]: the new index of each used vertex, by its index in the file, and the base.
     local: Option<(HashMap<u32, u32>, [f64; 3])>,
     rest: Vec<[f32; 3]>,
     corner_of: HashMap<Corner, u32>,
@@ -64,7 +64,7 @@ impl<'a> Builder<'a> {
     }
 
     fn add(&mut self, faces: &[usize]) {
-        // Sorted by material, so that there are no more runs than materials; stable, so that nothing else moves.
+        // Sort by material, so that there are no more runs than materials. The sort is stable: file order within a run.
         let mut faces = faces.to_vec();
         faces.sort_by_key(|face| self.obj.faces[*face].material);
         for face in faces {
@@ -83,7 +83,7 @@ impl<'a> Builder<'a> {
         self.triangles.extend(triangulate(&points).into_iter().map(|triangle| triangle.map(|index| numbers[index])));
     }
 
-    /// The rendered corner of a (v, vt, vn), made at its first use.
+    /// The index of the rendered corner of a (v, vt, vn), which is created on first use.
     fn corner(&mut self, corner: Corner) -> u32 {
         if let Some(known) = self.corner_of.get(&corner) {
             return *known;
@@ -114,7 +114,7 @@ impl<'a> Builder<'a> {
         Ok(Piece { mesh, material, runs })
     }
 
-    /// The file's normals; where it has none, or a zero, the smooth normal of the vertex.
+    /// The file's normals. Corners with none or a zero normal get the smooth normal of their vertex.
     fn normals(&self) -> Vec<[f32; 3]> {
         let given = |corner: &Corner| self.obj.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
         if let Some(all) = self.corners.iter().map(|corner| given(corner).copied()).collect() {
@@ -134,7 +134,7 @@ impl<'a> Builder<'a> {
 mod tests {
     use super::*;
 
-    /// Two squares in one plane; the middle edge is doubled, one vertex is unused, materials alternate.
+    /// Two squares in one plane. The middle edge is duplicated, one vertex is unused, and materials alternate.
     const SQUARES: &str = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\n\
         vt 0 0\nvt 1 1\nusemtl b\nf 2/1 3/1 4/1 5/1\nusemtl a\nf 6 7 8 9\nusemtl b\nf 2/2 3/2 4/2\n";
 

@@ -1,4 +1,4 @@
-//! MTL statements to Phong materials: a missing Kd is white, a missing Ka follows Kd, a missing Ks is black.
+//! Converts MTL statements to Phong materials. Default colors: white for Kd, the value of Kd for Ka, black for Ks.
 
 use super::mtl::Statements;
 use crate::domain::{AlphaMode, Material, Texture};
@@ -6,16 +6,16 @@ use crate::error::Result;
 use crate::load::files::Files;
 use crate::load::images::Images;
 
-/// The cutoff of materials whose alpha comes from an image.
+/// The alpha-test cutoff of materials whose alpha comes from an image.
 pub(in crate::load) const CUTOFF: f32 = 0.5;
 
-/// The material of `statements`, its images read from `files`.
+/// The material of `statements`, with images read from `files`.
 ///
-/// Alpha from an image makes a mask; an opacity below 1 blends. Faces are seen from both sides, because OBJ has no word
-/// for that and leaves are single sheets.
+/// Alpha in an image selects the alpha test; an opacity below 1 selects blending. Materials are double-sided, because
+/// OBJ cannot express this property and leaves are usually single sheets.
 ///
 /// # Errors
-/// `Invalid` naming the material and the statement: an image that is not there or not readable, a number out of range.
+/// `Invalid` with the material and the statement: a missing or unreadable image, or a number out of range.
 pub(super) fn material(
     name: &str,
     statements: &Statements,
@@ -47,7 +47,7 @@ pub(super) fn material(
         ambient: statements.ambient.unwrap_or(diffuse),
         diffuse,
         specular: statements.specular.unwrap_or([0.0; 3]),
-        // Below 1 the highlight would reach past the horizon of the light; files say 0 and mean "none chosen".
+        // Below 1, the highlight would extend past the light's horizon; files use 0 for "not specified".
         shininess: statements.exponent.unwrap_or(1.0).clamp(1.0, 1e6),
         alpha,
         colour_texture,
@@ -58,7 +58,7 @@ pub(super) fn material(
     material.checked()
 }
 
-/// The colour image with the alpha of `map_d`, whichever of the two there are.
+/// The color image with the alpha of `map_d`, as far as they are given.
 fn colour_texture(statements: &Statements, files: &Files, images: &mut Images) -> Result<Option<usize>> {
     match (&statements.colour_map, &statements.alpha_map) {
         (Some(colour), Some(alpha)) if colour != alpha => {
@@ -78,7 +78,8 @@ fn decode(files: &Files, path: &str) -> Result<Texture> {
     crate::load::images::decode(files, path)
 }
 
-/// `alpha`'s alpha channel, or its red one when it is opaque, at the texels of `colour` (nearest).
+/// Copies the alpha channel of `alpha`, or its red channel if it is opaque, to the texels of `colour` (nearest
+/// neighbor).
 fn with_alpha(name: &str, colour: Option<&Texture>, alpha: &Texture) -> Result<Texture> {
     let (width, height) = colour.map_or((alpha.width(), alpha.height()), |image| (image.width(), image.height()));
     let channel = if alpha.has_alpha() { 3 } else { 0 };
@@ -96,7 +97,7 @@ fn with_alpha(name: &str, colour: Option<&Texture>, alpha: &Texture) -> Result<T
     Texture::new(name, width, height, rgba)
 }
 
-/// `bump` names normal maps and grey height maps alike; only the former are of use.
+/// Loads a normal map. `bump` may also name a gray height map, which is not supported and yields `None`.
 fn normal_texture(path: &str, files: &Files, images: &mut Images) -> Result<Option<usize>> {
     let index = images.load(files, path)?;
     let grey = images.list()[index].rgba().chunks_exact(4).all(|texel| texel[0] == texel[1] && texel[1] == texel[2]);

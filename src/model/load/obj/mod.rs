@@ -1,4 +1,4 @@
-//! An OBJ file with its MTL libraries, images, modes and Vega configuration to a scene of one domain.
+//! Loader of OBJ files, with their MTL libraries, images, modes and Vega configuration, as scenes of one domain.
 
 mod build;
 mod material;
@@ -19,19 +19,19 @@ use crate::domain::{Domain, Material, Metadata, Modes, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::Parts;
 
-/// Which modes an OBJ file gets.
+/// Where the modes of an OBJ file come from.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Source {
-    /// Those that lie beside it, if any (see [`modes::beside`]).
+    /// Files next to it, if any (see [`modes::beside`]).
     Beside,
-    /// None: the caller has others.
+    /// No modes: the caller provides them.
     None,
 }
 
-/// Reads the OBJ file `name` of the folder `files` as one domain, with several materials as runs.
+/// Reads the OBJ file `name` in the folder `files` as one domain. Several materials become runs.
 ///
 /// # Errors
-/// `Invalid` naming the file, the line or material, what was expected and what was given.
+/// `Invalid` with the file, the line or material, and the expected and given value.
 pub(super) fn read(files: &Files, name: &str, source: Source) -> Result<Parts> {
     let obj = parse_file(files, name)?;
     let mut parts = Parts::named(name.strip_suffix(".obj").unwrap_or(name));
@@ -63,15 +63,15 @@ pub(super) fn read(files: &Files, name: &str, source: Source) -> Result<Parts> {
 /// Parses the OBJ file `name`.
 ///
 /// # Errors
-/// `Invalid` naming the file, the line and the statement.
+/// `Invalid` with the file, the line and the statement.
 pub(super) fn parse_file(files: &Files, name: &str) -> Result<Obj> {
     Obj::parse(&files.read(name, MODEL_BYTES)?).map_err(|error| error.within(&format!("file '{name}'")))
 }
 
-/// Adds the materials that the faces use, in the order of [`Obj::materials`], with their textures.
+/// Adds the materials that the faces use, in the order of [`Obj::materials`], and their textures.
 ///
 /// # Errors
-/// `Invalid` naming the material and the statement.
+/// `Invalid` with the material and the statement.
 pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Result<()> {
     let mut images = Images::default();
     let mut known = BTreeMap::new();
@@ -79,7 +79,7 @@ pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Resu
         for path in library_paths(files, library)? {
             let parsed = mtl::parse(&files.read(&path, TEXT_BYTES)?);
             let parsed = parsed.map_err(|error| error.within(&format!("file '{path}'")))?;
-            // Its images are named relative to the library.
+            // Image names are relative to the library.
             let folder = files.within(parent_of(&path))?;
             known.extend(parsed.into_iter().map(|(name, statements)| (name, (statements, folder.clone()))));
         }
@@ -115,7 +115,7 @@ fn white(name: &str) -> Material {
     Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
 }
 
-/// `mtllib` may name several files, and a file's name may hold blanks.
+/// The files of an `mtllib` statement. It may list several files, and a file name may contain spaces.
 fn library_paths(files: &Files, statement: &str) -> Result<Vec<String>> {
     let whole = statement.replace('\\', "/");
     if files.kind(&whole)?.is_some() || !whole.contains(' ') {

@@ -1,13 +1,13 @@
-//! Bytes of an MTL file to its statements, by material name.
+//! Parser of MTL files: statements by material name.
 //!
-//! Colours are linear factors, like glTF's; images are sRGB where they hold colour.
+//! Colors are linear factors, as in glTF; images of colors are sRGB.
 
 use std::collections::BTreeMap;
 
 use super::parse::{number, rest_of, words};
 use crate::error::{Result, invalid};
 
-/// One `newmtl` as it is written; what is missing is `None`.
+/// The statements of one `newmtl`; `None` for missing ones.
 #[derive(Debug, Default, Clone, PartialEq)]
 pub(super) struct Statements {
     pub(super) ambient: Option<[f32; 3]>,
@@ -18,16 +18,16 @@ pub(super) struct Statements {
     pub(super) opacity: Option<f32>,
     pub(super) colour_map: Option<String>,
     pub(super) alpha_map: Option<String>,
-    /// From `norm`, `map_Bump`, `map_bump` or `bump`.
+    /// The image of `norm`, `map_Bump`, `map_bump` or `bump`.
     pub(super) normal_map: Option<String>,
-    /// What was left out, in words.
+    /// Messages about statements that are not supported.
     pub(super) remarks: Vec<String>,
 }
 
-/// Parses a whole file; a name that comes twice holds its last definition.
+/// Parses a whole file. Of several definitions of a name, the last is used.
 ///
 /// # Errors
-/// `Invalid` naming the line and the statement.
+/// `Invalid` with the line and the statement.
 pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, Statements>> {
     let mut all = BTreeMap::new();
     let mut current: Option<(String, Statements)> = None;
@@ -56,7 +56,7 @@ impl Statements {
             b"map_kd" => self.colour_map = self.image(line, name)?,
             b"map_d" => self.alpha_map = self.image(line, name)?,
             b"norm" | b"map_bump" | b"bump" => self.normal_map = self.image(line, name)?,
-            // Ambient maps repeat the colour map; illumination models and the rest have no counterpart here.
+            // Ambient maps repeat the color map. Illumination models and the other statements have no equivalent here.
             _ => {}
         }
         Ok(())
@@ -80,7 +80,7 @@ impl Statements {
             rest = after;
             for argument in 0..most {
                 let (word, after) = next_word(rest);
-                // -s, -o and -t take one to three numbers.
+                // -s, -o and -t have one to three arguments.
                 if argument > 0 && word.parse::<f32>().is_err() {
                     break;
                 }
@@ -99,7 +99,7 @@ fn next_word(text: &str) -> (&str, &str) {
         .map_or((text, ""), |(word, rest)| (word, rest.trim_start()))
 }
 
-/// Three numbers, or one for all three.
+/// Three numbers, or one for all three channels.
 fn colour(line: &[u8]) -> Result<[f32; 3]> {
     let found: Option<Vec<f32>> = words(line).skip(1).map(number).collect();
     match found.as_deref() {
@@ -109,7 +109,7 @@ fn colour(line: &[u8]) -> Result<[f32; 3]> {
     }
 }
 
-/// The last word, so that `d -halo 0.5` is read too.
+/// The last word as a number, which also handles `d -halo 0.5`.
 fn last_number(line: &[u8]) -> Result<f32> {
     let value = words(line).skip(1).last().and_then(number);
     value.ok_or_else(|| invalid("value", "a finite number", rest_of(line)))

@@ -1,16 +1,16 @@
-//! Bytes of an OBJ file to its lists and polygons, indices counted from 0 and checked.
+//! Parser of OBJ files: lists and polygons with validated indices from 0.
 //!
-//! Written here rather than taken from tobj, because that renumbers vertices by first use: the rows of U follow the `v`
-//! lines of the file, and with other numbers they would be silently wrong while their count still fits.
+//! The `tobj` crate is not used because it renumbers vertices by first use. The rows of U follow the `v` lines of the
+//! file: after renumbering they would be wrong without any error, as their number would still match.
 
 use std::collections::{BTreeMap, HashMap};
 
 use crate::error::{Error, Result, invalid};
 
-/// The index of a corner's missing texture coordinate or normal.
+/// Marks a missing texture coordinate or normal of a corner.
 pub(in crate::load) const NONE: u32 = u32::MAX;
 
-/// One corner of a polygon: indices into the lists of the file.
+/// One corner of a polygon, as indices into the lists of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(in crate::load) struct Corner {
     pub(in crate::load) v: u32,
@@ -18,7 +18,7 @@ pub(in crate::load) struct Corner {
     pub(in crate::load) vn: u32,
 }
 
-/// One polygon: its corners and its material, and the line it stands in.
+/// One polygon: its corners, its material and its line in the file.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::load) struct Face {
     first: usize,
@@ -28,7 +28,7 @@ pub(in crate::load) struct Face {
     line: usize,
 }
 
-/// An OBJ file as it is written; texture coordinates have (0, 0) at the top left.
+/// The contents of an OBJ file. Texture coordinates have (0, 0) at the top left.
 #[derive(Debug, Default)]
 pub(in crate::load) struct Obj {
     pub(in crate::load) positions: Vec<[f32; 3]>,
@@ -36,11 +36,11 @@ pub(in crate::load) struct Obj {
     pub(in crate::load) normals: Vec<[f32; 3]>,
     pub(in crate::load) faces: Vec<Face>,
     corners: Vec<Corner>,
-    /// Names after `usemtl`, by first use; empty for faces before any.
+    /// Material names of `usemtl` in order of first use. Faces before any `usemtl` have an empty name.
     pub(in crate::load) materials: Vec<String>,
-    /// What stands after each `mtllib`.
+    /// The arguments of each `mtllib`.
     pub(in crate::load) libraries: Vec<String>,
-    /// Statements that were left out, in words.
+    /// Messages about statements that are not supported.
     pub(in crate::load) remarks: Vec<String>,
 }
 
@@ -48,13 +48,13 @@ impl Obj {
     /// Parses a whole file.
     ///
     /// # Errors
-    /// `Invalid` naming the line and the statement.
+    /// `Invalid` with the line and the statement.
     pub(in crate::load) fn parse(bytes: &[u8]) -> Result<Self> {
         let mut parser = Parser::default();
         let mut joined = Vec::new();
         for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
             let line = line.strip_suffix(b"\r").unwrap_or(line);
-            // A backslash at the end joins the next line to this one.
+            // A backslash at the end of a line continues it on the next one.
             if let Some(head) = line.strip_suffix(b"\\") {
                 joined.extend_from_slice(head);
                 joined.push(b' ');
@@ -106,7 +106,7 @@ fn below(line: usize, list: &str, index: u32, count: usize) -> Result<()> {
 #[derive(Default)]
 struct Parser {
     obj: Obj,
-    /// What the last `usemtl` chose, and its number once a face has it.
+    /// The name of the last `usemtl`, and its index in [`Obj::materials`] once a face uses it.
     wanted: String,
     material: Option<usize>,
     by_name: HashMap<String, usize>,
@@ -122,20 +122,20 @@ impl Parser {
             b"vn" => self.obj.normals.push(numbers(words, "vn", number)?),
             b"vt" => {
                 let [u, v] = texture_coordinates(words, number)?;
-                // The file counts v from the bottom of the image, this program from its top.
+                // The file measures v from the bottom of the image, meshes from the top.
                 self.obj.uvs.push([u, 1.0 - v]);
             }
             b"f" => self.face(words, number)?,
             b"usemtl" => (self.wanted, self.material) = (rest_of(line), None),
             b"mtllib" => self.obj.libraries.push(rest_of(line)),
-            // Groups and smoothing say nothing about geometry; the file's normals are used, or smooth ones.
+            // Groups and smoothing groups do not affect geometry: normals come from the file or are computed.
             b"o" | b"g" | b"s" => {}
             other => *self.ignored.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1,
         }
         Ok(())
     }
 
-    /// The number of the wanted material, given at the first face that has it.
+    /// The index of the current material, assigned at the first face that uses it.
     fn number(&mut self) -> usize {
         let list = &mut self.obj.materials;
         let made = || {
@@ -184,19 +184,19 @@ impl Parser {
     }
 }
 
-/// Words of a line up to its comment.
+/// Words of a line up to a comment.
 pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
     let words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
     words.take_while(|word| !word.starts_with(b"#"))
 }
 
-/// What follows the first word: a name, which may hold blanks.
+/// The text after the first word: a name that may contain spaces.
 pub(super) fn rest_of(line: &[u8]) -> String {
     let text = String::from_utf8_lossy(line);
     text.trim().split_once(|letter: char| letter.is_ascii_whitespace()).map_or("", |(_, rest)| rest.trim()).to_owned()
 }
 
-/// A finite number.
+/// Parses a finite number.
 pub(super) fn number(word: &[u8]) -> Option<f32> {
     std::str::from_utf8(word).ok()?.parse().ok().filter(|number: &f32| number.is_finite())
 }
@@ -223,7 +223,7 @@ fn unreadable(key: &str, expected: &str, word: Option<&[u8]>, line: usize) -> Er
     invalid(format!("line {line}: {key}"), expected, given)
 }
 
-/// An index counted from 1, or backwards from the last when negative, to one counted from 0.
+/// Converts an index that counts from 1, or backwards from the end if negative, to an index from 0.
 fn resolve(digits: &[u8], count: usize) -> Result<u32> {
     let text = String::from_utf8_lossy(digits);
     let refuse = |expected: String| invalid("index", expected, &text);

@@ -1,14 +1,15 @@
-//! One polygon in space to triangles with its winding.
+//! Triangulation of a polygon in space.
 
 use nalgebra::{Vector2, Vector3};
 
-/// Above this a polygon is cut as a fan: looking for ears takes the cube of its corners.
+/// The largest polygon that is triangulated by ear clipping, which takes cubic time. Larger ones are split into a fan.
 const MOST_EARS: usize = 256;
 
-/// Triangles as indices of `points`, corners in the polygon's order; always two fewer than points.
+/// Splits a polygon into triangles, as indices of `points`, with its winding; always two fewer than points.
 ///
-/// A polygon whose fan from its first corner turns one way only is cut so. Else a quad is cut along its other diagonal,
-/// and a larger polygon by its ears in the plane of its normal (Newell's sum).
+/// If all triangles of the fan from the first corner have the polygon's orientation, the fan is used. Otherwise a quad
+/// is split along its other diagonal, and a larger polygon by ear clipping in the plane of its normal (Newell's
+/// method).
 pub(super) fn triangulate(points: &[[f32; 3]]) -> Vec<[usize; 3]> {
     let fan = |count: usize| (2..count).map(|index| [0, index - 1, index]).collect::<Vec<_>>();
     if points.len() <= 3 {
@@ -33,12 +34,12 @@ pub(super) fn triangulate(points: &[[f32; 3]]) -> Vec<[usize; 3]> {
 
 /// Twice the area vector; zero for a polygon without area.
 fn newell(points: &[Vector3<f64>]) -> Vector3<f64> {
-    // About the first point, so that a small polygon far from the origin keeps its digits.
+    // Relative to the first point, so that a small polygon far from the origin loses no precision.
     let from_first = |index: usize| points[index % points.len()] - points[0];
     (0..points.len()).map(|index| from_first(index).cross(&from_first(index + 1))).sum()
 }
 
-/// The polygon in the two axes that its normal is least along, counter-clockwise.
+/// Projects the polygon along the dominant axis of its normal, counterclockwise.
 fn flattened(points: &[Vector3<f64>], normal: Vector3<f64>) -> Vec<Vector2<f64>> {
     let drop = normal.iamax();
     let (first, second) = ((drop + 1) % 3, (drop + 2) % 3);
@@ -57,7 +58,7 @@ fn ears(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
             let corners = ear.map(|index| points[index]);
             turn(corners) > 0.0 && !left.iter().any(|index| !ear.contains(index) && inside(points[*index], corners))
         };
-        // A polygon that crosses itself may have no ear; any corner will do then, and no face is lost.
+        // A self-intersecting polygon may have no ear; then any corner is cut, so that no face is lost.
         let at = (0..count).find(is_ear).unwrap_or(1);
         triangles.push(around(at));
         left.remove(at);
@@ -101,7 +102,7 @@ mod tests {
                 assert!((signed - whole).abs() < 1e-9 && (covered - whole).abs() < 1e-9, "{first}: {signed} {covered}");
             }
         }
-        // The control: a plain fan of the arrow from its second corner covers too much.
+        // Counterexample: a plain fan of the arrow from its second corner covers too much area.
         let mut turned = arrow.to_vec();
         turned.rotate_left(1);
         let (_, fan) = area(&turned, &[[0, 1, 2], [0, 2, 3]]);

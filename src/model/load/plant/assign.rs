@@ -1,4 +1,4 @@
-//! Objects of a plant to its members: each shoot and each leaf is one; everything else joins one of them.
+//! Assigns each object of a plant to a member: every shoot and every leaf is a member, and each other object joins one.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 use super::structure::Structure;
 use crate::error::{Result, invalid};
 
-/// A part of the plant that moves by itself: index of a shoot or of a leaf.
+/// A part of the plant that moves independently: the index of a shoot or of a leaf.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) enum Member {
     Shoot(usize),
@@ -17,13 +17,13 @@ pub(super) enum Member {
 /// Points per object that are compared with the shoots.
 const MOST_POINTS: usize = 32;
 
-/// The member that each object belongs to. `points` holds the corners of each object that has faces.
+/// The member of each object. `points` contains the corners of each object that has faces.
 ///
-/// Shoots have no object of their own in the structure: sorted ids of internodes are in shoot order. A petiole joins the
-/// leaf whose petiole line has its centre nearest to its own; anything else joins the nearest shoot.
+/// The structure does not assign object ids to shoots; internode ids, sorted, are in the order of the shoots. A petiole
+/// joins the leaf whose petiole line has the nearest center. Any other object joins the nearest shoot.
 ///
 /// # Errors
-/// `Invalid` when internodes and shoots differ in number, or an object is unknown.
+/// `Invalid` if the numbers of internodes and shoots differ, or an object is unknown.
 pub(super) fn members(structure: &Structure, points: &BTreeMap<u64, Vec<[f32; 3]>>) -> Result<HashMap<u64, Member>> {
     let mut members = HashMap::new();
     let internodes = structure.objects.iter().filter(|(_, kind)| *kind == "internode");
@@ -50,7 +50,7 @@ pub(super) fn members(structure: &Structure, points: &BTreeMap<u64, Vec<[f32; 3]
     Ok(members)
 }
 
-/// Centre of the petiole line, or else the base, of each leaf that may carry a petiole.
+/// Centers of the petiole lines of all leaves that have one. If none has, the bases of all leaves.
 fn petiole_centres(structure: &Structure) -> Vec<(usize, Vector3<f64>)> {
     let with_line: Vec<_> = structure
         .leaves
@@ -76,7 +76,7 @@ fn nearest_leaf(centres: &[(usize, Vector3<f64>)], petiole: Vector3<f64>) -> Opt
     centres.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).map(|(leaf, _)| Member::Leaf(*leaf))
 }
 
-/// The shoot whose line comes nearest to any of the points.
+/// The shoot whose line is nearest to any of the points.
 fn nearest_shoot(structure: &Structure, points: &[[f32; 3]]) -> Option<Member> {
     let step = points.len().div_ceil(MOST_POINTS).max(1);
     let points: Vec<Vector3<f64>> = points.iter().step_by(step).map(|point| Vector3::from(*point).cast()).collect();
@@ -88,7 +88,7 @@ fn nearest_shoot(structure: &Structure, points: &[[f32; 3]]) -> Option<Member> {
     by_distance.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, shoot)| Member::Shoot(shoot))
 }
 
-/// Squared distance of a point to a line of segments.
+/// Squared distance of a point to a polyline.
 fn to_line(line: &[[f64; 3]], point: &Vector3<f64>) -> f64 {
     let to_segment = |ends: &[[f64; 3]]| {
         let start = Vector3::from(ends[0]);

@@ -1,6 +1,6 @@
-//! A plant folder (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`) to a scene: each shoot and each leaf is a
-//! rigid domain. Lengths are metres, Z is up. Every domain may be moved by itself; a `scene.toml` with `follows = "leaf"`
-//! keeps leaves on their shoots.
+//! Loader of plants (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`): each shoot and each leaf becomes a rigid
+//! domain. Lengths are in meters, Z is up. Every domain can be moved independently; a `scene.toml` with
+//! `follows = "leaf"` keeps leaves attached to their shoots.
 
 mod assign;
 mod structure;
@@ -16,13 +16,13 @@ use crate::domain::{Attachment, Domain, Metadata, Modes, Shape, Transform};
 use crate::error::Result;
 use crate::scene::{Parts, UpAxis};
 
-/// Reads the plant `stem` of the folder `files`.
+/// Reads the plant `stem` in the folder `files`.
 ///
-/// The frame of a domain has the axes of the scene and its origin where the member grows from: a shoot's first point,
-/// the start of a leaf's petiole, or the leaf's base when another leaf of the same petiole carries that.
+/// The frame of a domain has the axes of the scene. Its origin is the point from which the member grows: the first
+/// point of a shoot, the start of a leaf's petiole, or the base of a leaf whose petiole belongs to another leaf.
 ///
 /// # Errors
-/// `Invalid` naming the file, what was expected and what was given.
+/// `Invalid` with the file, and the expected and given value.
 pub(super) fn read(files: &Files, stem: &str) -> Result<Parts> {
     let (json, ids) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
     let in_file = |name: &str| format!("file '{name}'");
@@ -35,7 +35,7 @@ pub(super) fn read(files: &Files, stem: &str) -> Result<Parts> {
     obj::add_materials(&obj, files, &mut parts)?;
     let mut faces: HashMap<Member, Vec<usize>> = HashMap::new();
     for (face, object) in objects.iter().enumerate() {
-        // Every object of a face has a member: `members` was asked about each of them.
+        // Always `Some`: `members` received every object that has faces.
         if let Some(member) = members.get(object) {
             faces.entry(*member).or_default().push(face);
         }
@@ -62,7 +62,7 @@ struct Plant<'a> {
 }
 
 impl Plant<'_> {
-    /// Adds shoots parents first, then leaves with a petiole, then the other leaflets, which hang on those.
+    /// Adds the shoots, parents first, then the leaves with a petiole, then the other leaflets, whose parents they are.
     fn grow(mut self) -> Result<Parts> {
         let structure = self.structure;
         for index in &structure.order {

@@ -1,19 +1,19 @@
-//! `STEM.structure.json` and `STEM_object_id.dat` to checked values: shoots parents first, leaves, kinds of objects.
+//! Parser of a plant's structure (`STEM.structure.json`) and of its object ids (`STEM_object_id.dat`).
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
 use crate::error::{Result, invalid};
 
-/// A shoot: a line from its base, in scene units, and its place in the hierarchy.
+/// A shoot: a polyline from its base, in scene units, and its parent shoot.
 #[derive(Debug, Clone, serde::Deserialize)]
 pub(super) struct Shoot {
     pub(super) id: i64,
-    /// Negative for none.
+    /// Id of the parent shoot, negative for none.
     pub(super) parent: i64,
     pub(super) vertices: Vec<[f64; 3]>,
 }
 
-/// A leaf, and the line of its petiole if it is the one that carries it; other leaflets of that petiole have none.
+/// A leaf. One leaf per petiole has the petiole's polyline; the other leaflets of that petiole have none.
 #[derive(Debug, Clone, serde::Deserialize)]
 pub(super) struct Leaf {
     pub(super) object_id: u64,
@@ -32,25 +32,25 @@ struct Raw {
     leaves: Vec<Leaf>,
 }
 
-/// A plant's structure, checked.
+/// A validated structure of a plant.
 #[derive(Debug)]
 pub(super) struct Structure {
     /// Kind of each object.
     pub(super) objects: BTreeMap<u64, String>,
-    /// Shoots in the order of the file.
+    /// Shoots in file order.
     pub(super) shoots: Vec<Shoot>,
     pub(super) leaves: Vec<Leaf>,
-    /// Indices of shoots, every parent before its children.
+    /// Indices of the shoots, every parent before its children.
     pub(super) order: Vec<usize>,
     index_of: HashMap<i64, usize>,
 }
 
 impl Structure {
-    /// Parses and checks the JSON text.
+    /// Parses and validates the JSON text.
     ///
     /// # Errors
-    /// `Invalid` naming the entry: not JSON, an unknown parent, a cycle, a number beyond f32, an empty line, a leaf
-    /// that is no object or comes twice.
+    /// `Invalid` with the entry: invalid JSON, an unknown parent, a cycle, a number that exceeds f32, an empty line, or
+    /// a leaf that is not an object or is duplicated.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let raw: Raw =
             serde_json::from_slice(bytes).map_err(|error| invalid("json", "objects, shoots and leaves", error))?;
@@ -67,7 +67,7 @@ impl Structure {
         Ok(structure)
     }
 
-    /// Index of the shoot `id`, or `None` for none.
+    /// The index of the shoot `id`, or `None` if there is no such shoot.
     pub(super) fn shoot(&self, id: i64) -> Option<usize> {
         self.index_of.get(&id).copied()
     }
@@ -106,11 +106,11 @@ impl Structure {
     }
 }
 
-/// Indices of shoots by depth, else in their order.
+/// Indices of shoots by depth in the hierarchy, in file order within a depth.
 fn parents_first(shoots: &[Shoot], index_of: &HashMap<i64, usize>) -> Result<Vec<usize>> {
     let mut depths: Vec<Option<usize>> = vec![None; shoots.len()];
     for start in 0..shoots.len() {
-        // Up to an ancestor of known depth, then down again: each shoot is walked over once.
+        // Walk up to an ancestor of known depth and back, so that each shoot is visited once.
         let (mut path, mut at, mut depth) = (Vec::new(), Some(start), 0);
         while let Some(index) = at {
             if let Some(known) = depths[index] {
@@ -137,10 +137,10 @@ fn parents_first(shoots: &[Shoot], index_of: &HashMap<i64, usize>) -> Result<Vec
     Ok(order)
 }
 
-/// The object of each face: one number per line.
+/// Parses the object of each face, one number per line.
 ///
 /// # Errors
-/// `Invalid` naming the line, or when there is not one line per face.
+/// `Invalid` with the line, or if the number of lines is not the number of faces.
 pub(super) fn objects_of_faces(bytes: &[u8], faces: usize) -> Result<Vec<u64>> {
     let lines = bytes.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).enumerate();
     let ids: Vec<u64> = lines

@@ -1,10 +1,10 @@
-//! What a step changes, by list; far translations; merged steps.
+//! Change lists of steps, distant translations, and merged steps.
 
 use super::*;
 use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape};
 use crate::scene::{GRID, Parts, RawUpdate, TransformFormat};
 
-/// Domains of one vertex and two modes; domains 2 and 4 share the coordinates of 1, domain 5 has no modes.
+/// Domains of one vertex and two modes. Domains 2 and 4 share the coordinates of domain 1; domain 5 has no modes.
 fn scene(count: usize) -> Arc<Scene> {
     let mesh =
         || Mesh::indexed(vec![[0.5, 0.25, 1.0]], vec![[0.0, 0.0, 1.0]], vec![], vec![[0, 0, 0]]).expect("a point");
@@ -33,7 +33,7 @@ fn q(domains: &[u32], values: &[f32]) -> RawUpdate {
     RawUpdate { q_domains: domains.to_vec(), q, ..RawUpdate::default() }
 }
 
-/// Translations without rotation, in f64.
+/// A step with f64 translations without rotation.
 fn far(domains: &[u32], translations: &[[f64; 3]]) -> RawUpdate {
     let one = |translation: &[f64; 3]| {
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
@@ -47,7 +47,7 @@ fn far(domains: &[u32], translations: &[[f64; 3]]) -> RawUpdate {
     }
 }
 
-/// A translation without rotation, in f32.
+/// A step with an f32 translation without rotation.
 fn near(domain: u32, [x, y, z]: [f32; 3]) -> RawUpdate {
     let entries = [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z];
     let transforms = entries.iter().flat_map(|number: &f32| number.to_le_bytes()).collect();
@@ -64,7 +64,7 @@ fn after(scene: &Scene, steps: &[RawUpdate]) -> State {
     state
 }
 
-/// Where a domain is, to the last bit of what the state keeps.
+/// The f64 position of a domain as stored in the state.
 fn place(state: &State, domain: usize) -> [f64; 3] {
     let (cell, own) = (state.cell_of(domain), state.transforms[domain].translation());
     std::array::from_fn(|axis| cell[axis] + own[axis])
@@ -81,7 +81,7 @@ fn a_step_lists_the_domains_that_it_names_and_those_that_share_their_coordinates
         (q(&[1], &[1.0, 2.0]), vec![1, 2, 4]),
         (q(&[4], &[1.0, 2.0]), vec![1, 2, 4]),
         (q(&[2, 6], &[0.0; 4]), vec![1, 2, 4, 6]),
-        // A domain without modes begins where the next one does, and shares nothing with it.
+        // A domain without modes has the same `first_q` as the next one but shares no coordinates with it.
         (q(&[5], &[]), vec![5]),
         (near(6, [1.0; 3]), vec![6]),
         (RawUpdate { q_domains: vec![4], q: vec![0; 8].into(), ..near(2, [1.0; 3]) }, vec![1, 2, 4]),
@@ -154,7 +154,7 @@ fn a_domain_ten_thousand_kilometres_away_has_a_cell_of_its_own_and_the_others_st
     let error = (0..3).map(|axis| (place(&state, 2)[axis] - at[axis]).abs()).fold(0.0, f64::max);
     assert!(error <= 2e-5, "{error} units");
     assert!((f64::from(at[0] as f32) - at[0]).abs() > 5e-4, "the control: f32 alone loses the millimetre");
-    // A translation in f32 moves the domain too, exactly, and it may come back.
+    // An f32 translation also moves the domain, exactly, and it may return.
     state.apply(&scene, &parse(&scene, &near(2, [1e6 + 1.0, 0.0, 0.0])));
     assert_eq!((place(&state, 2), state.cell_of(2)), ([1e6 + 1.0, 0.0, 0.0], [977.0 * GRID, 0.0, 0.0]));
     state.apply(&scene, &parse(&scene, &near(2, [5.0, 6.0, 7.0])));
@@ -165,7 +165,7 @@ fn a_domain_ten_thousand_kilometres_away_has_a_cell_of_its_own_and_the_others_st
 fn a_scene_that_leaves_as_a_whole_takes_its_origin_along_but_for_those_who_stay_behind() {
     let scene = scene(5);
     let off = |shift: f64| [0.0, 1.0, 2.0, 3.0].map(|at| [shift + at, 0.25, -shift]);
-    // The first two of five leave alone; with the third most have left.
+    // The first two of five domains leave alone; after the third, most have left.
     let steps = [far(&[0, 1], &off(1e7)[..2]), far(&[2, 3], &off(1e7)[2..])];
     let state = after(&scene, &steps[..1]);
     assert_eq!((state.cell_of(1), state.cell_of(4)), ([9766.0 * GRID, 0.0, -9766.0 * GRID], [0.0; 3]));
@@ -178,7 +178,7 @@ fn a_scene_that_leaves_as_a_whole_takes_its_origin_along_but_for_those_who_stay_
         assert_eq!(state.cell_of(domain), [9766.0 * GRID, 0.0, -9766.0 * GRID]);
         assert_eq!(place(&state, domain), *want);
     }
-    // Within reach the origin stays, beyond it follows.
+    // Within reach of the origin, the shared cell stays; beyond, it moves.
     state.apply(&scene, &parse(&scene, &far(&[0, 1, 2, 3], &off(1e7 + 4000.0))));
     assert_eq!(
         (state.cell_of(0), &state.changed),
@@ -230,6 +230,6 @@ fn merged_steps_leave_the_state_of_all_in_whatever_formats_they_came() {
     assert_eq!((at_once.serial, one_by_one.serial), (1, 4));
     assert_eq!(at_once.changed, Changed::Some(vec![0, 1, 2, 3]));
     assert_eq!(place(&at_once, 3), [-1e7 - 0.125, 0.0, 0.0]);
-    // Left out, the newer f32 translation of domain 0 would be missed.
+    // An implementation that ignores the newer f32 translation of domain 0 would fail here.
     assert_ne!(after(&scene, &[steps[0].clone(), steps[2].clone(), steps[3].clone()]), one_by_one);
 }

@@ -1,4 +1,4 @@
-//! Models that are broken on purpose: each is refused by the name of its field, and nothing panics.
+//! Malformed models: each is rejected with the name of its field, and none causes a panic.
 
 use serde_json::json;
 
@@ -10,7 +10,7 @@ use crate::load::gltf::remarks::Remarks;
 use crate::load::gltf::{assemble, container};
 use crate::scene::Scene;
 
-/// A textured, morphed, indexed model: it passes through every part of the reader.
+/// A textured, morphed, indexed model that covers every part of the reader.
 fn full() -> Model {
     let mut model = textured(json!({
         "alphaMode": "MASK", "normalTexture": {"index": 1},
@@ -170,7 +170,7 @@ fn an_index_beyond_the_vertices_numbers_that_are_not_finite_and_unsorted_sparse_
 fn more_modes_or_memory_than_the_limits_are_refused_before_they_are_allocated() {
     let targets: Vec<_> = (0..513).map(|_| json!({"POSITION": 0})).collect();
     refused(&Model::triangle().with("/meshes/0/primitives/0/targets", targets.into()), "targets");
-    // A small model that comes after so much else that little of the budget is left.
+    // A small model that follows so much other data that little of the budget is left.
     let model = full();
     let document = container::parse(model.json.to_string().as_bytes()).expect("parses");
     let folder = Files::anywhere(&std::env::temp_dir());
@@ -191,7 +191,7 @@ fn a_glb_cut_short_or_with_false_lengths_is_refused_at_every_length() {
     for length in 0..glb.len() {
         let refusal = parse(&glb[..length]).expect_err("cut short").to_string();
         assert!(refusal.contains("expected"), "{refusal}");
-        // With the header's length mended the chunks are what is too long.
+        // With a corrected header length, the chunks are too long.
         if length >= 12 {
             let mut mended = glb[..length].to_vec();
             mended[8..12].copy_from_slice(&(length as u32).to_le_bytes());
@@ -227,7 +227,7 @@ fn deep_or_huge_json_is_refused() {
     }
 }
 
-/// A small generator of equally distributed words (xorshift), so that each failure can be run again.
+/// A small generator of uniformly distributed words (xorshift), so that each failure is reproducible.
 struct Dice(u64);
 
 impl Dice {
@@ -259,7 +259,7 @@ fn no_mutation_of_a_sound_glb_makes_the_reader_panic() {
         match super::super::parse(&files, "mutant", &bytes) {
             Ok(parts) => {
                 accepted += 1;
-                // Whether it makes a scene or not: behind the reader nothing may panic either.
+                // Whether or not a scene results: code after the reader must not panic either.
                 let _ = Scene::new(parts);
             }
             Err(_) => refused += 1,
@@ -271,7 +271,7 @@ fn no_mutation_of_a_sound_glb_makes_the_reader_panic() {
 #[test]
 fn an_image_over_the_limits_is_refused() {
     let mut wide = png([1, 2, 3, 4]);
-    // Width in the header of a PNG; the checksum no longer fits either, which the decoder may see first.
+    // The width in the header of a PNG. Its checksum no longer matches, which the decoder may detect first.
     wide[16..20].copy_from_slice(&100_000_u32.to_be_bytes());
     let mut model = full();
     let view = model.view(&wide);

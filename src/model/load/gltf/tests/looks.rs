@@ -1,4 +1,4 @@
-//! Materials and textures of small models.
+//! Tests of materials and textures with small models.
 
 use std::io::Cursor;
 
@@ -8,7 +8,7 @@ use super::{Model, push};
 use crate::domain::{AlphaMode, Material};
 use crate::scene::Scene;
 
-/// A 2 x 2 PNG of one colour.
+/// A 2 x 2 PNG of one color.
 pub(super) fn png(pixel: [u8; 4]) -> Vec<u8> {
     let image = image::RgbaImage::from_pixel(2, 2, image::Rgba(pixel));
     let mut bytes = Cursor::new(Vec::new());
@@ -16,7 +16,7 @@ pub(super) fn png(pixel: [u8; 4]) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// A triangle with two sets of coordinates, one image as textures 0 and 1, and one material.
+/// A triangle with two sets of texture coordinates, one image as textures 0 and 1, and one material.
 pub(super) fn textured(material: Value) -> Model {
     let mut model = Model::triangle();
     let near = model.floats("VEC2", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);

@@ -1,4 +1,4 @@
-//! Small models made in code, and what becomes of them.
+//! Tests of the glTF reader with small generated models.
 
 mod hostile;
 mod looks;
@@ -62,7 +62,7 @@ impl Model {
         &mut self.json["meshes"][0]["primitives"][0]
     }
 
-    /// The same with a value put at a JSON pointer.
+    /// The model with a value set at a JSON pointer.
     fn with(mut self, pointer: &str, value: Value) -> Self {
         let (parent, key) = pointer.rsplit_once('/').expect("a pointer");
         let parent = self.json.pointer_mut(parent).expect("there");
@@ -102,7 +102,7 @@ fn push(list: &mut Value, value: Value) -> usize {
     list.len() - 1
 }
 
-/// A triangle with two targets, the second sparse over nothing: it moves vertex 2 alone.
+/// A triangle with two targets. The second is sparse without base data and moves only vertex 2.
 fn morphed() -> Model {
     let mut model = Model::triangle();
     let dense = model.floats("VEC3", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
@@ -251,7 +251,7 @@ fn points_and_lines_are_left_out_and_said_so() {
 fn interleaved_vertices_and_normalised_coordinates_are_read_and_missing_normals_computed() {
     let mut model = Model::triangle();
     assert_eq!(model.parts().shapes[0].mesh.corners().normals, [[0.0, 0.0, 1.0]; 3]);
-    // Twelve bytes of position, four of coordinates, and the last stride is cut short, as it may be.
+    // Twelve bytes of position, four of coordinates; the last stride may be shorter than the others.
     let mut bytes = Vec::new();
     for (x, u) in [(0.0_f32, 0_u16), (4.0, 65535), (8.0, 13107)] {
         bytes.extend(bytemuck::cast_slice::<f32, u8>(&[x, x * x, 0.0]));

@@ -1,4 +1,4 @@
-//! The real models among the inputs.
+//! Tests with the real models among the inputs.
 
 use std::path::PathBuf;
 
@@ -24,7 +24,7 @@ fn real_morph_stress_test_has_a_rigid_plate_and_a_block_of_eight_modes() {
     assert_eq!(parts.shapes[1].mesh.triangles().len(), 2400);
     assert_eq!(parts.domains[1].rest_q, [0.0; 8]);
     assert!(parts.domains.iter().all(|domain| domain.shares_q_with.is_none()));
-    // The accessors state these extremes of the eight targets.
+    // The accessors declare these extrema of the eight targets.
     for mode in 0..8 {
         let column = parts.shapes[1].modes.column(mode);
         let most = |axis: usize| column.iter().skip(axis).step_by(3).fold(0.0_f32, |most, entry| most.max(entry.abs()));
