@@ -1,11 +1,11 @@
-//! Shapes and scenes of noise for tests.
+//! Random shapes and scenes for tests.
 
 use std::sync::Arc;
 
 use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast_model::scene::{Deformation, Parts, Scene};
 
-/// Deterministic numbers in -1 to 1.
+/// Deterministic pseudorandom numbers in -1 to 1.
 pub(crate) struct Noise(pub(crate) u64);
 
 impl Noise {
@@ -15,13 +15,13 @@ impl Noise {
     }
 }
 
-/// Vertices in the unit cube with modes of noise.
+/// Vertices in the cube [-1, 1]^3 with random modes.
 pub(crate) fn shape(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
     let columns = (0..3 * vertices * rank).map(|_| noise.next()).collect();
     with_columns(vertices, rank, columns, noise)
 }
 
-/// Vertices in the unit cube with these columns.
+/// Vertices in the cube [-1, 1]^3 with these columns.
 pub(crate) fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, noise: &mut Noise) -> Shape {
     let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; vertices];
@@ -31,7 +31,7 @@ pub(crate) fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, nois
     Shape::new(mesh, modes).expect("a shape")
 }
 
-/// A scene of shapes of noise, one domain each per (n, r).
+/// A scene of random shapes, one domain each per (n, r).
 pub(crate) fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &mut Noise) -> Arc<Scene> {
     let mut parts = Parts::named("noise");
     parts.deformation = deformation;
