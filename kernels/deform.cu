@@ -276,7 +276,7 @@ __device__ __noinline__ float3 summed_exactly(const DeformArgs& args, unsigned t
 
 #if defined(DISPLACEMENTS) && defined(MODES)
 // Recomputes u of one vertex in f64, in the output where the warp stored it before its last barrier. A component that
-// is still not finite sets the box to NaN, because x may be finite all the same.
+// is still not finite sets the box to NaN, because x itself may be finite.
 __device__ __noinline__ void mend_displacement(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex,
                                                unsigned (&keys)[6]) {
     const Part part = part_of(args, tile, share);

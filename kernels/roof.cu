@@ -1,8 +1,8 @@
 // Benchmark kernels that measure the memory bandwidth of the device, and helpers of the timer. They deform nothing.
 //   fill     fills a buffer with pseudorandom numbers                                        `to`: [words] u32   (out)
 //   copy     copies `from` to `to`; one copy reads and writes the bytes of the buffer
-//   read     reads all of `from`; writes to `to` only if the bits of every word that a thread read combine to ones. That
-//            never happens here, but the compiler cannot know it
+//   read     reads all of `from`; writes to `to` only if the bits of every word that a thread read combine to ones.
+//            That never happens here, but the compiler cannot know it
 //   hold     blocks the stream for a time
 //   nothing  empty
 // Launch of copy and read: BLOCK threads per block, LOADS words of 16 bytes per thread, a block per tile of BLOCK *

@@ -268,7 +268,7 @@ unsafe impl DeviceRepr for NormalsArgs {}
 /// A size, offset or constant that must be the same on host and device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Agreement {
-    /// The C++ expression, e.g. `OFFSET(VertexSlot, rank)`.
+    /// The C++ expression, e.g. `OFFSET(Tile, rest)`.
     pub expression: String,
     /// Its value on the host.
     pub host: u32,
