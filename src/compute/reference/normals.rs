@@ -18,12 +18,12 @@
 //!
 //! # Fallback
 //! A corner keeps its rigid normal and tangent where no rotation can be determined: its shape has no modes; its group
-//! has no area at rest, or areas that cancel; or its area in this step is not above [`RESOLUTION`] times B. Here
-//! B = sum of l (l + w) over both edges of each triangle, with l the sum of an edge's absolute components and w that of
-//! the group's own position. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area
-//! vectors by at most 2^-23 B. For positions that were rounded once, the direction of the sum is therefore off by at most
-//! asin(2^-23 B / |sum|) < 1.8 degrees, and no rotation that rounding alone could cause is applied. A domain of one meter
-//! at 10^7 meters thus shows rigid normals; put the scene's origin near it.
+//! has no area at rest, or areas that cancel; or its area in this step is not above [`RESOLUTION`] times B. Here B =
+//! sum of l (l + w) over both edges of each triangle, with l the sum of an edge's absolute components and w that of the
+//! group's own position. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area
+//! vectors by at most 2^-23 B. For positions that were rounded once, the direction of the sum is therefore off by at
+//! most asin(2^-23 B / |sum|) < 1.8 degrees, and no rotation that rounding alone could cause is applied. A domain of
+//! one meter at 10^7 meters thus shows rigid normals; put the scene's origin near it.
 //!
 //! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the
 //! geometric ones by an angle d may be off by 2 d there, and in the limit the component perpendicular to the normal is
