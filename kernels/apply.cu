@@ -1,14 +1,15 @@
-// Puts the transforms and coordinates of the changed domains into their places and stamps them with the step.
-//   header          how many changed, and the step                       (in)
+// Writes the transforms and coordinates of the changed domains into the device state and stamps the domains with the
+// step.
+//   header          number of changes, and the step                      (in)
 //   changes         [changed]                                            (in)
 //   new_transforms  [changed][3] float4                                  (in)
 //   new_q           the coordinates of the changed domains, packed       (in)
-//   following       with FOLLOWERS: per domain its mover, and whether it has a frame in it  (in)
-//   transforms, q   of all movers, and of all domains                    (out)
-//   stale           [stale] u32: the tiles that hold a changed domain    (in)
+//   following       with FOLLOWERS: per domain its transform root, and its frame, if any    (in)
+//   transforms, q   of all transform roots, and of all domains           (out)
+//   stale           [stale] u32: the tiles that contain a changed domain (in)
 //   stamps          [domains] u32: the step that last changed a domain   (out)
-//   list            [stale] u32, on the device                           (out)
-// Launch: BLOCK threads a block, a warp a changed domain at a time, any number of blocks. CPU twin: State::apply.
+//   list            [stale] u32: copy of `stale` in device memory        (out)
+// Launch: BLOCK threads per block, a warp per changed domain, any number of blocks. CPU twin: State::apply.
 #include "layout.cuh"
 
 extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant__ ApplyArgs args) {
@@ -17,7 +18,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
     for (unsigned index = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; index < changed; index += warps) {
         const Change change = args.changes[index];
 #ifdef FOLLOWERS
-        // A follower is in the list for its coordinates, or for its stamp.
+        // A follower is in the list only for its coordinates or its stamp.
         const Following own = args.following[change.domain];
         const unsigned mover = own.mover;
         const bool moves = own.frame == NO_FRAME;

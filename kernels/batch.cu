@@ -1,41 +1,42 @@
-// x = T_b (x0 + U q_b) for domains b that share a shape, up to VECTORS at once: their U is read once for all of them.
-//   blocks     the work of each block: a group of domains, and some tiles of their shape (layout.cuh)   (in)
-//   groups     domains of one shape, and where its U and x0 lie                                         (in)
+// x = T_b (x0 + U q_b) for a group of up to VECTORS domains b that share a shape. The group reads its U once.
+//   blocks     the work of each block: a group, and a run of tiles of its shape (layout.cuh)            (in)
+//   groups     domains of one shape, and the offsets of its U and x0                                    (in)
 //   members    the domains of all groups                                                                (in)
 //   words      U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                             (in)
 //   rest       x0, per tile [3][width][4] f32                                                           (in)
 //   scales     with STORE_INT8: per tile of U and mode                                                  (in)
-//   transforms, following, frames, q   as `deform` has them                                             (in)
-//   positions  [vertices][3] f32, in the header                                                         (out)
-//   boxes      [tiles of deform][4][6] u32, as `deform` writes them; those of a half of a tile that has no
-//              vertices stay zeros, as they were made                                                   (out)
+//   transforms, following, frames, q   as for `deform`                                                  (in)
+//   positions  [vertices][3] f32, address in the header                                                 (out)
+//   boxes      [tiles of deform][4][6] u32, as `deform` writes them; the boxes of half a tile without
+//              vertices keep the zeros of their allocation                                              (out)
 // Launch: a block of WARPS warps for each run of tiles of a group, with shared memory for WARPS Own, Common and q.
 // CPU twin: the tests of src/compute/gpu/batch.rs.
 //
-// The modes are summed in their order, from +0, by fused multiply-adds, as `deform` does: the same bits. What is not
-// finite in f32 is computed again in f64.
+// Each vertex sums its modes in order, from +0, by fused multiply-adds, as `deform` does: the same bits. A result that
+// is not finite in f32 is computed again in f64.
 //
-// Why it looks like this, for 16 vectors, n vertices, r modes, per warp and mode. The product needs 48 multiply-adds a
-// vertex. Loads from shared memory bring 128 bytes a cycle to a multiprocessor, and it issues 4 instructions a cycle. A
-// lane of one vertex would load 16 + 3 numbers for 48 multiply-adds: 19 cycles of loads against 12 of arithmetic. A lane
-// of two loads 16 + 6 for 96: 22 cycles (no more with 2 byte entries, whose 16 bytes of a quad are half used) against
-// 24 of arithmetic, so both fit. It has 96 sums and about 128 registers: 16 warps a multiprocessor. So few warps keep
-// the memory busy only if loads in flight need no registers: U goes to shared memory by asynchronous copies,
-// STAGES * 3 KB a warp ahead, 144 KB a multiprocessor, where a latency of 1 us at 5 TB/s needs 38 KB.
+// Design, for 16 vectors, n vertices, r modes, per warp and mode. The product needs 48 multiply-adds per vertex. Shared
+// memory delivers 128 bytes per cycle to a multiprocessor, which issues 4 instructions per cycle. A lane with one
+// vertex would load 16 + 3 numbers for 48 multiply-adds: 19 cycles of loads against 12 of arithmetic. A lane with two
+// vertices loads 16 + 6 for 96: 22 cycles (no more with 2 byte entries, of which half of the 16 bytes of a quad are
+// used) against 24 of arithmetic, so both are balanced. It has 96 sums and about 128 registers: 16 warps per
+// multiprocessor. So few warps saturate the memory only if loads in flight need no registers: U is copied to shared
+// memory asynchronously, STAGES * 3 KB per warp ahead, 144 KB per multiprocessor, where a latency of 1 us at 5 TB/s
+// needs 38 KB.
 #include "batch_load.cuh"
 #include "ordered.cuh"
 
-// Blocks that a multiprocessor is to hold: as many as registers allow, where shared memory is as large as that.
+// Target number of resident blocks per multiprocessor: the register limit where shared memory is large enough.
 #if __CUDA_ARCH__ == 900
 constexpr unsigned RESIDENT = VECTORS == 16 ? 8 : 10;
 #elif __CUDA_ARCH__ == 800 || __CUDA_ARCH__ == 1000
-// Three warps a scheduler: its compiler needs more registers.
+// Three warps per scheduler: the compiler needs more registers for these architectures.
 constexpr unsigned RESIDENT = 6;
 #else
 constexpr unsigned RESIDENT = 4;
 #endif
 
-// Chunks whose loads and sums are interleaved: two modes at least.
+// Chunks whose loads and sums are interleaved: at least two modes.
 constexpr unsigned TOGETHER = CHUNK_MODES < 2 ? 2 : 1;
 
 // One axis of a lane's two vertices.
@@ -43,7 +44,7 @@ struct Pair {
     float of[2];
 };
 
-// Those of group `group` (mode * 3 + axis) of a chunk. `chunk` is the lane's first byte there.
+// The pair of group `group` (mode * 3 + axis) of a chunk. `chunk` is the lane's first byte in the chunk.
 __device__ __forceinline__ Pair pair_at(const char* chunk, unsigned group) {
     const unsigned byte = 4 * ENTRY_BYTES * group;
     const char* at = chunk + byte / 16 * (16 * QUADS) + byte % 16;
@@ -60,7 +61,7 @@ __device__ __forceinline__ Pair pair_at(const char* chunk, unsigned group) {
     Pair pair;
     pair.of[0] = entry_of(words, 0);
 #if defined(STORE_F16)
-    // Straight from the upper half, without a shift.
+    // Convert the upper half directly, without a shift.
     asm("{ .reg .b16 low, high; mov.b32 {low, high}, %1; cvt.f32.f16 %0, high; }" : "=f"(pair.of[1]) : "r"(words[0]));
 #else
     pair.of[1] = entry_of(words, 1);
@@ -93,8 +94,8 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const f
     }
 }
 
-// All modes, stage by stage; the ring is full when this begins. With 16 bits a number all registers are taken, and the
-// count of stages goes to local memory: a few bytes, once a stage.
+// Sums all modes, stage by stage; the ring is full at the start. With 16-bit entries all registers are in use and the
+// stage counter spills to local memory: a few bytes, once per stage.
 __device__ __forceinline__ void sum_modes(const Part& part, Own& own, const float4* q, Sums& sums) {
     const unsigned offset = 16 * (lane_of() / 2) + 2 * ENTRY_BYTES * (lane_of() % 2);
 #pragma unroll 1
@@ -127,17 +128,17 @@ struct Base {
     }
 };
 
-// Of a lane's two vertices, those that are there.
+// Number of existing vertices among a lane's two.
 __device__ __forceinline__ unsigned count_of(const Part& part) {
     return part.vertices > 2 * lane_of() ? min(2u, part.vertices - 2 * lane_of()) : 0;
 }
 
-// Where `deform` puts the two boxes of a half of a tile.
+// Address of the two boxes of half a tile in the boxes of `deform`.
 __device__ __forceinline__ unsigned* boxes_of(const BatchArgs& args, const Part& part, const Member& member) {
     return args.boxes + 24 * (size_t)(member.first_tile + part.tile) + 12 * (threadIdx.x / 32);
 }
 
-// Puts x of a lane's two vertices at its place of a stage, [vertex][3].
+// Writes x of a lane's two vertices to the stage, [vertex][3].
 __device__ __forceinline__ void stage_domain(const Base& base, const Common& common, const Sums& sums, unsigned domain,
                                              float* staged) {
     const Affine& t = common.transforms[domain];
@@ -157,8 +158,9 @@ __device__ __forceinline__ void stage_domain(const Base& base, const Common& com
     }
 }
 
-// The boxes of two domains that the warp staged. A half of the warp has a domain, a lane of it four vertices; then a lane
-// has either the lower or the upper sides, so that three numbers are left to be exchanged. A NaN is left to `mend`.
+// Computes the boxes of the two staged domains. Each half warp reduces one domain, with four vertices per lane. After
+// the first exchange a lane has either the lower or the upper sides, so later exchanges move three numbers. NaNs are
+// handled by `mend`.
 __device__ __forceinline__ void box_both(const BatchArgs& args, Part& part, const Common& common, unsigned domain,
                                          const float4* staged) {
     const float LEAST = __uint_as_float(0xff800000u); // minus infinity
@@ -174,7 +176,7 @@ __device__ __forceinline__ void box_both(const BatchArgs& args, Part& part, cons
             low[i % 3] = fmaxf(low[i % 3], -numbers[i]);
             high[i % 3] = fmaxf(high[i % 3], numbers[i]);
         }
-        // Zero, unless one of them is not finite.
+        // Remains zero unless a number is not finite.
         total = fmaf(0.0f, numbers[i], total);
     }
     if (__any_sync(0xffffffffu, total != 0.0f) && lane_of() == 0) {
@@ -202,12 +204,12 @@ __device__ __forceinline__ void box_both(const BatchArgs& args, Part& part, cons
     }
 }
 
-// No load moves across: side by side, what they bring would take more registers than there are.
+// Keeps the compiler from moving loads across: loads in parallel would need more registers than there are.
 __device__ __forceinline__ void part_loads() {
     __syncwarp();
 }
 
-// Writes what two domains staged, 48 words of 16 bytes each.
+// Writes two staged domains, 48 words of 16 bytes each.
 __device__ __forceinline__ void store_both(float* first, float* second, const float4* staged) {
     const unsigned lane = lane_of();
     float4 *low = (float4*)first, *high = (float4*)second;
@@ -222,7 +224,7 @@ __device__ __forceinline__ float* home_of(const Part& part, const Member& member
     return part.positions + 3 * (size_t)member.first;
 }
 
-// The same, number by number.
+// Writes the staged domains number by number, for part tiles and unaligned domains.
 __device__ __forceinline__ void store_numbers(const Part& part, const Common& common, unsigned domain,
                                               const float* staged) {
     const unsigned numbers = 3 * part.vertices;
@@ -236,7 +238,8 @@ __device__ __forceinline__ void store_numbers(const Part& part, const Common& co
     }
 }
 
-// Two domains at a time, by turns through two halves of the ring: lanes write when all have read what was there.
+// Writes two domains at a time, alternating between two halves of the ring. The barrier separates the reads of one pair
+// from the writes to the same half.
 __device__ __forceinline__ void put(const BatchArgs& args, Part& part, Own& own, const Common& common,
                                     const Sums& sums) {
 #pragma unroll
@@ -247,7 +250,7 @@ __device__ __forceinline__ void put(const BatchArgs& args, Part& part, Own& own,
             Base base;
             base.load(own);
             stage_domain(base, common, sums, domain, staged);
-            // Zeros, if it is not there.
+            // Zeros if the domain does not exist.
             stage_domain(base, common, sums, domain + 1, staged + 3 * VERTICES);
             const Member &low = common.members[domain], &high = common.members[domain + 1];
             __syncwarp();
@@ -280,7 +283,7 @@ __device__ __forceinline__ float3 summed_exactly(const BatchArgs& args, const Pa
     return placed_exactly(transforms_of(args), member.domain, bent);
 }
 
-// Of `mend`: the box of one domain's vertices of this warp, where `deform` puts those of the same half of the tile.
+// Writes the box of one domain's vertices of this warp, for `mend`, to the same half of the tile as in `deform`.
 __device__ __forceinline__ void store_box(const BatchArgs& args, const Part& part, const Member& member,
                                           const unsigned (&keys)[6]) {
     const unsigned key = warp_box(keys);
@@ -289,7 +292,7 @@ __device__ __forceinline__ void store_box(const BatchArgs& args, const Part& par
     }
 }
 
-// Computes anew what a warp has that is not finite, over what it wrote, and the boxes of all its domains: a NaN wins.
+// Recomputes the positions of a warp that are not finite, in the output, and the boxes of all its domains: a NaN wins.
 __device__ __noinline__ void mend(const BatchArgs& args, const Common& common, const float* q) {
     const Part& part = common.parts[threadIdx.x / 32];
     const unsigned count = count_of(part);
@@ -313,7 +316,7 @@ __device__ __noinline__ void mend(const BatchArgs& args, const Common& common, c
     }
 }
 
-// A warp's part of a tile, whose copies are under way.
+// Computes a warp's part of a tile, whose copies are in flight.
 __device__ __forceinline__ void compute(const BatchArgs& args, uint4* shared) {
     Own& own = own_of(shared);
     Common& common = common_of(shared);
@@ -329,7 +332,7 @@ __device__ __forceinline__ void compute(const BatchArgs& args, uint4* shared) {
     sum_modes(part, own, q_of(shared), sums);
     wait_for_all_but<0>();
     put(args, part, own, common, sums);
-    // Others wrote some of what a lane now reads, and read what the next tile overwrites.
+    // Lanes read what other lanes wrote, and the next tile overwrites what other lanes read.
     __syncwarp();
     if (part.is_lost) {
         mend(args, common, (const float*)q_of(shared));

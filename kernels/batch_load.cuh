@@ -1,4 +1,4 @@
-// What a block of `batch` has in shared memory, and how U, x0, T and q get there. Twin: the tests of src/compute/gpu/batch.rs.
+// Shared memory of a block of `batch`, and the loads of U, x0, T and q. Twin: the tests of src/compute/gpu/batch.rs.
 #pragma once
 #include "chunk.cuh"
 #include "follow.cuh"
@@ -10,16 +10,16 @@ constexpr unsigned VECTORS = 8;
 #else
 constexpr unsigned VECTORS = 16;
 #endif
-// A warp has half a tile: 16 quads, two vertices a lane.
+// A warp processes half a tile: 16 quads, two vertices per lane.
 constexpr unsigned WARPS = 2;
 constexpr unsigned QUADS = TILE_QUADS / WARPS;
 constexpr unsigned VERTICES = 4 * QUADS;
-// Chunks that are copied together, and such stages that are on their way at once.
+// Chunks per stage, and stages in flight.
 constexpr unsigned STAGE_CHUNKS = 4;
 constexpr unsigned STAGES = 3;
 constexpr unsigned ROWS = 3 * STAGE_CHUNKS;
 constexpr unsigned STAGE_WORDS = ROWS * QUADS;
-// What a warp has of shared memory: a ring of stages, which leaves when x comes, and x0.
+// Shared memory of a warp: a ring of stages, which is reused to stage x, and x0.
 struct Own {
     uint4 ring[STAGES * STAGE_WORDS];
     float4 rest[3 * QUADS];
@@ -30,7 +30,7 @@ __device__ __forceinline__ unsigned lane_of() {
     return threadIdx.x % 32;
 }
 
-// 16 bytes to shared memory, if they are there; the lane waits for them in `wait_for_all_but`.
+// Asynchronous copy of 16 bytes to shared memory if `is_there`; completed by `wait_for_all_but`.
 __device__ __forceinline__ void copy(void* to, const void* from, bool is_there) {
 #if __CUDA_ARCH__ >= 800
     const unsigned shared = (unsigned)__cvta_generic_to_shared(to);
@@ -45,14 +45,14 @@ __device__ __forceinline__ void copy(void* to, const void* from, bool is_there) 
 #endif
 }
 
-// Ends a group of copies.
+// Commits a group of copies.
 __device__ __forceinline__ void end_group() {
 #if __CUDA_ARCH__ >= 800
     asm volatile("cp.async.commit_group;" ::: "memory");
 #endif
 }
 
-// Until the warp sees all groups but the last `GROUPS`.
+// Waits until all groups but the last `GROUPS` are visible to the warp.
 template <unsigned GROUPS>
 __device__ __forceinline__ void wait_for_all_but() {
 #if __CUDA_ARCH__ >= 800
@@ -61,12 +61,12 @@ __device__ __forceinline__ void wait_for_all_but() {
     __syncwarp();
 }
 
-// A warp's part of a tile. It lies in shared memory and is read anew between barriers: summing takes all registers.
+// A warp's part of a tile. In shared memory and read again between barriers, because the sums use all registers.
 struct Part {
     const uint4* words; // of its first quad
-    const float4* rest; // likewise
+    const float4* rest; // of its first quad
     unsigned width;     // quads of the tile
-    unsigned quads;     // of the part; 0 without any
+    unsigned quads;     // of the part; 0 if it is empty
     unsigned first;     // its first vertex in the shape
     unsigned vertices;
     unsigned chunks;
@@ -74,14 +74,14 @@ struct Part {
     unsigned first_member;
     unsigned first_scale; // of the tile
     unsigned tile;
-    unsigned end;     // of the block's tiles
-    unsigned is_lost; // something is not finite
+    unsigned end;     // after the block's last tile
+    unsigned is_lost; // a result is not finite
     unsigned group;
-    float* positions; // of the domain that begins at packed vertex 0
+    float* positions; // of a domain that begins at packed vertex 0
 };
 
-// What the warps of a block share: T and the members themselves, zeros where there is no domain; q follows,
-// [modes][VECTORS] numbers times the tile's scales.
+// Data shared by the warps of a block: T and the members, zeros for missing domains. q follows, [modes][VECTORS]
+// numbers multiplied by the tile's scales.
 struct Common {
     Affine transforms[VECTORS];
     Member members[VECTORS];
@@ -124,13 +124,13 @@ __device__ __forceinline__ Part part_of(const BatchArgs& args, unsigned group, u
     return part;
 }
 
-// Starts the copies of a stage, [row][quad]. Lanes beyond the last quad copy that one again.
+// Starts the copies of a stage, [row][quad]. Lanes beyond the last quad copy that quad again.
 __device__ __forceinline__ void copy_stage(const Part& part, Own& own, unsigned stage) {
     constexpr unsigned STEP = 32 / QUADS, COPIES = STAGE_WORDS / 32;
     const unsigned row = ROWS * stage + lane_of() / QUADS;
     uint4* to = own.ring + stage % STAGES * STAGE_WORDS + lane_of();
     if (part.width == TILE_QUADS && ROWS * (stage + 1) <= 3 * part.chunks) {
-        // Nearly always, and with distances that are known when this is compiled.
+        // The common case, with strides that are compile-time constants.
         const uint4* from = part.words + row * TILE_QUADS + lane_of() % QUADS;
 #pragma unroll
         for (unsigned i = 0; i < COPIES; ++i) {
@@ -145,7 +145,7 @@ __device__ __forceinline__ void copy_stage(const Part& part, Own& own, unsigned 
     }
 }
 
-// x0, [axis][quad].
+// Starts the copies of x0, [axis][quad].
 __device__ __forceinline__ void copy_rest(const Part& part, Own& own) {
 #pragma unroll
     for (unsigned i = lane_of(); i < lane_of() + 3 * QUADS; i += 32) {
@@ -154,10 +154,10 @@ __device__ __forceinline__ void copy_rest(const Part& part, Own& own) {
     }
 }
 
-// Of the threads of a block, so many read the values of one domain, in runs.
+// Threads of a block that read the values of one domain, in contiguous runs.
 constexpr unsigned READERS = 32 * WARPS / VECTORS;
 
-// T and members, the same for all of a block. Returns where this thread's q begins.
+// Loads T and members, which all warps of a block share. Returns the first q of this thread's member.
 __device__ __forceinline__ unsigned load_members(const BatchArgs& args, const Part& part, Common& common) {
     const unsigned own = threadIdx.x / READERS;
     Member member = {};
@@ -174,7 +174,7 @@ __device__ __forceinline__ unsigned load_members(const BatchArgs& args, const Pa
     return member.first_q;
 }
 
-// q of the member of this thread, all modes.
+// Loads all modes of q of this thread's member.
 __device__ __forceinline__ void load_q(const BatchArgs& args, const Part& part, unsigned first_q, float* q) {
     const unsigned own = threadIdx.x / READERS, modes = part.chunks * CHUNK_MODES;
 #pragma unroll 8
@@ -187,15 +187,15 @@ __device__ __forceinline__ void load_q(const BatchArgs& args, const Part& part, 
     }
 }
 
-// What a warp needs before it can sum a tile: copies of U and x0 under way and, in shared memory, where they go; T and
-// members with the block's first tile, and q, whose scales may be the tile's.
+// Prepares a tile: starts the copies of U and x0, and writes the part to shared memory. With the block's first tile,
+// also loads T, the members and q; with STORE_INT8, q again for each tile, because its scales belong to the tile.
 __device__ __forceinline__ void prepare(const BatchArgs& args, const Part& part, uint4* shared, bool is_first) {
     Common& common = common_of(shared);
     if (lane_of() == 0) {
         common.parts[threadIdx.x / 32] = part;
     }
     if (part.quads > 0) {
-        // x0 belongs to the first group of copies, and groups of stages that are not there are empty.
+        // x0 belongs to the first group of copies. Groups of stages beyond the last chunk are empty.
         copy_rest(part, own_of(shared));
 #pragma unroll
         for (unsigned stage = 0; stage < STAGES; ++stage) {

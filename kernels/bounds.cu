@@ -1,28 +1,28 @@
-// The bounds of all positions, from the boxes that `deform` left of its tiles, those of passed-over tiles included; with
-// LIGHT along the axes of light space too, from the same boxes; with BOXES those of each domain, from its boxes, or from
-// its positions where it shares a tile with others.
-//   boxes      [count][6] u32: `ordered` maxima of -x, -y, -z, x, y, z; four of each tile         (in)
+// Reduces the boxes that `deform` stored per tile to the bounds of all positions, including the tiles that this step
+// did not compute. With LIGHT, also the bounds along the axes of light space, from the same boxes. With BOXES, also a
+// box of each domain, from its boxes, or from its positions if it shares a tile with other domains.
+//   boxes      [count][6] u32: `ordered` maxima of -x, -y, -z, x, y, z; four per tile             (in)
 //   light      with LIGHT: the axes of light space                                            (in)
 //   bounds     in the header: the maxima of all; zeros before the launch                      (in, out)
-//   pieces     with BOXES: the parts of domains of which a box is made                        (in)
+//   pieces     with BOXES: the parts of domains that are reduced to one box each              (in)
 //   stamps     with BOXES: per domain, the step that last changed it                          (in)
-//   positions  with BOXES: in the header                                                      (in)
-//   piece_boxes  with BOXES: [pieces][6] u32, like `boxes`; those of stale domains are written (out)
-// Launch: BLOCK threads a block, any number of blocks. CPU twin: Bounds::union.
+//   positions  with BOXES: address in the header                                              (in)
+//   piece_boxes  with BOXES: [pieces][6] u32, like `boxes`; only those of stale domains are written (out)
+// Launch: BLOCK threads per block, any number of blocks. CPU twin: Bounds::union.
 //
-// Light space: the farthest corner of a tile's box along an axis is found without looking at the others, so it takes three
-// multiply-adds an end. They round up, so that what the f32 axes say holds every vertex. The box of a tile of 128 vertices
-// reaches beyond them, by less than its diagonal; six dot products of each vertex in `deform` would not, but `deform` has
-// no registers left.
+// Light space: the farthest corner of a tile's box along an axis follows from the signs of the axis, so an end takes
+// three multiply-adds. They round outward, so that the bounds along the f32 axes contain every vertex. The box of a
+// tile of 128 vertices exceeds its vertices by less than its diagonal. Six dot products per vertex in `deform` would be
+// tight, but `deform` has no registers left.
 #include "chain.cuh"
 #include "layout.cuh"
 #include "ordered.cuh"
 
 #ifdef BOXES
-// Threads that make a box together.
+// Threads that reduce one piece together.
 constexpr unsigned TEAM = 8;
 
-// The keys of one box or vertex of a piece.
+// Adds one box or vertex of a piece to the keys.
 __device__ __forceinline__ void add_item(const BoundsArgs& args, const Piece& piece, unsigned item, unsigned (&keys)[6]) {
     if (piece.of_vertices) {
         const float* at = args.header->positions + 3 * (size_t)(piece.first + item);
@@ -41,7 +41,7 @@ __device__ __forceinline__ void add_item(const BoundsArgs& args, const Piece& pi
     }
 }
 
-// All of a team's threads agree on the piece, so they take each turn of the loop together.
+// All threads of a team have the same piece, so they stay converged in the loop.
 __device__ __forceinline__ void make_boxes(const BoundsArgs& args) {
     const unsigned member = threadIdx.x % TEAM;
     const unsigned team = 0xffu << threadIdx.x % 32 / TEAM * TEAM;
@@ -75,8 +75,8 @@ constexpr unsigned SIDES = 6;
 #endif
 
 #ifdef LIGHT
-// What one of four lanes that have a tile's boxes keeps: the maxima along an axis a of -a x and of a x. The last of the four
-// has the same axis as the one before it.
+// The maxima of -a x and of a x along an axis a, for one of the four lanes that hold a tile's boxes. Lane 3 duplicates
+// the axis of lane 2.
 struct Along {
     float axis[3];
     unsigned ends[2];
@@ -89,8 +89,9 @@ struct Along {
         ends[0] = ends[1] = 0;
     }
 
-    // Whether the four boxes are of the whole tile or of parts of it is up to the kernel that made them, but their union is
-    // always the same: so is what comes of it, whichever domains a step changed. The four lanes come here together.
+    // The kernel that wrote the four boxes decides whether each covers the whole tile or a part of it, but their union
+    // is always the same. The result therefore does not depend on which domains a step changed. All four lanes must
+    // call this.
     __device__ __forceinline__ void add(unsigned (&box)[6]) {
         const unsigned four = 0xfu << threadIdx.x % 32 / 4 * 4;
 #pragma unroll
@@ -114,7 +115,7 @@ struct Along {
         ends[1] = max(ends[1], ordered(upper));
     }
 
-    // All lanes of the warp.
+    // Reduces over the warp; all lanes must call this.
     __device__ __forceinline__ void report(unsigned* most) {
 #pragma unroll
         for (unsigned end = 0; end < 2; ++end) {
@@ -175,8 +176,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
     along.report(most + 6);
 #endif
     __syncthreads();
-    // Few blocks go beyond what others have reported: looking first keeps them from queueing at the same addresses. The
-    // value read may be old, but it only grows, so no maximum is lost.
+    // Read before the atomic: few blocks exceed what others have reported, so most atomics to the same addresses are
+    // avoided. The value read may be stale, but it only grows, so no maximum is lost.
     if (threadIdx.x < SIDES && most[threadIdx.x] > *(volatile unsigned*)(args.header->bounds + threadIdx.x)) {
         atomicMax(args.header->bounds + threadIdx.x, most[threadIdx.x]);
     }

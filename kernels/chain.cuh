@@ -1,16 +1,17 @@
-// A kernel behind another on its stream may be put onto the device while the last blocks of the other still run
-// (programmatic dependent launch, compute capability 9.0 and later; src/compute/gpu/chain.rs). It touches nothing before it has
-// waited, and the next one is let in only after that: whoever comes third finds the first complete.
+// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/chain.rs): a kernel may be scheduled
+// while the last blocks of the previous kernel on its stream still run. It accesses no memory before `await_previous`,
+// and calls `admit_next` only after that. The third kernel of a chain therefore finds the results of the first
+// complete.
 #pragma once
 
-// Returns when all that the kernel before wrote is there.
+// Returns when all writes of the previous kernel are visible.
 __device__ __forceinline__ void await_previous() {
 #if __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-// Lets the next kernel in once every block has come here or has ended.
+// Allows the next kernel to start once every block has called this or has ended.
 __device__ __forceinline__ void admit_next() {
 #if __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.launch_dependents;" ::: "memory");

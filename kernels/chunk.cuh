@@ -1,5 +1,5 @@
-// U as it is stored: 48 bytes hold the entries of one quad (4 vertices) for as many modes as fit, as three words of 16
-// bytes. Entry e = (mode * 3 + axis) * 4 + vertex. Twin: src/compute/storage.
+// Storage format of U: a chunk of 48 bytes, three words of 16 bytes, holds the entries of one quad (4 vertices) for as
+// many modes as fit. Entry e = (mode * 3 + axis) * 4 + vertex. Twin: src/compute/storage.
 #pragma once
 
 #if defined(STORE_F16) || defined(STORE_BF16)
@@ -11,7 +11,7 @@ constexpr unsigned CHUNK_MODES = 1;
 #endif
 constexpr unsigned ENTRY_BYTES = 4 / CHUNK_MODES;
 
-// The number that the lowest bits of `bits` stand for, before its mode's factor or scale.
+// Decodes the lowest bits of `bits`, without the factor or scale of the mode.
 __device__ __forceinline__ float number_of(unsigned bits) {
 #if defined(STORE_F16)
     float number;
@@ -20,14 +20,14 @@ __device__ __forceinline__ float number_of(unsigned bits) {
 #elif defined(STORE_BF16)
     return __uint_as_float(bits << 16);
 #elif defined(STORE_INT8)
-    // A byte put below the exponent of 2^23 is that many units above it; the code is the byte less 128. Both are exact.
+    // A byte in the mantissa of 2^23 adds its value; the code is the byte minus 128. Both steps are exact.
     return __uint_as_float(__byte_perm(bits, 0x4b000000u, 0x7650u)) - 8388736.0f;
 #else
     return __uint_as_float(bits);
 #endif
 }
 
-// Entry `entry` of a chunk whose twelve words are in registers; `entry` is known when this is compiled.
+// Entry `entry` of a chunk whose twelve words are in registers; `entry` is a compile-time constant.
 __device__ __forceinline__ float entry_of(const unsigned (&words)[12], unsigned entry) {
     const unsigned word = words[entry / CHUNK_MODES];
 #if defined(STORE_INT8)
@@ -37,8 +37,8 @@ __device__ __forceinline__ float entry_of(const unsigned (&words)[12], unsigned 
 #endif
 }
 
-// What entry (mode, axis) of vertex `vertex` of a chunk is, read by itself. `words` is the quad's first word of 16 bytes
-// and `stride` leads from one word of the quad to the next.
+// Loads the single entry (mode, axis) of vertex `vertex` of a chunk. `words` is the quad's first word of 16 bytes, and
+// `stride` leads from one word of the quad to the next.
 __device__ __forceinline__ float entry_at(const uint4* words, unsigned stride, unsigned mode, unsigned axis,
                                           unsigned vertex) {
     const unsigned byte = ((mode * 3 + axis) * 4) * ENTRY_BYTES;

@@ -1,15 +1,16 @@
-// What is left of a triangle at its samples: all of it, or where the alpha of its surface is large enough.
+// Alpha test of cut-out triangles at their samples.
 //
-// Texture coordinates at a sample are shares of those of the corners, by the edge functions of the corners in homogeneous
-// coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997): right in perspective,
-// and for corners behind the eye, without clipping. Corners are taken relative to the sample first, so that a small
-// triangle far from the middle keeps its digits. Their products hold as long as w is between 2^-50 and 2^50.
-// Twin: src/compute/reference/raster/cut_out.rs; the bits up to the texture's filter are its.
+// The texture coordinates of a sample are weighted sums of those of the corners. The weights are the edge functions of
+// the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates",
+// 1997): perspective-correct without clipping, also for corners behind the eye. The corners are first taken relative to
+// the sample, so that a small triangle far from the center keeps its precision. The products neither over- nor
+// underflow as long as w is between 2^-50 and 2^50. Twin: src/compute/reference/raster/cut_out.rs, with the same bits
+// up to the texture filter.
 #pragma once
 
 #include "raster.cuh"
 
-// Nothing to ask.
+// A triangle without a cut-out: every sample is kept.
 struct Whole {
     __device__ Whole(const RasterArgs&, unsigned) {}
 
@@ -78,13 +79,14 @@ struct CutOut {
             edge[i] = cross_of(px[j], py[j], px[k], py[k]);
         }
         const float inverse = __frcp_rn(sum_of(edge[0], edge[1], edge[2]));
-        // Snapping may put a sample outside of the corners as they were: no share is below zero.
+        // Snapping may put a sample outside the unsnapped corners, so clamp the weights to zero.
         const float a = fmaxf(times(edge[0], inverse), 0.0f), b = fmaxf(times(edge[1], inverse), 0.0f),
                     c = fmaxf(times(edge[2], inverse), 0.0f);
         const float whole = __frcp_rn(sum_of(a, b, c));
         float2 uv = {times(sum_of(times(a, u[0]), times(b, u[1]), times(c, u[2])), whole),
                      times(sum_of(times(a, v[0]), times(b, v[1]), times(c, v[2])), whole)};
-        // By how much the shares change to the next pixel across and down, times what the corners differ by from here.
+        // Derivatives of the weights by the pixel in x and y, times the differences of the corners' texture coordinates
+        // from this sample's.
         float2 across = {0.0f, 0.0f}, down = {0.0f, 0.0f};
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {

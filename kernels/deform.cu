@@ -1,43 +1,46 @@
-// x = T (x0 + U q) for every vertex of every domain of a scene, with ORIENT rigid normals and tangents of every corner
-// too, in one launch over a flat list of tiles; and a box of each warp's x.
+// The main kernel of a step: x = T (x0 + U q) for every vertex of every domain of a scene, and with ORIENT also the
+// rigid normals and tangents of every corner. One launch covers all domains by a flat list of tiles. Also computes a
+// bounding box of each warp's x.
 //   tiles, lanes  the work of each warp (layout.cuh)                                                        (in)
 //   words         U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                              (in)
-//   rest          x0, per tile of one domain [3][width][4] f32, of quads in mixed tiles [3][4]              (in)
-//   rest_normals  likewise; with ORIENT                                                                     (in)
-//   rest_tangents likewise, x, y, z and the sign of the bitangent; with ORIENT and NORMAL_MAPS              (in)
-//   corner_shifts with SHIFTED: per domain, from a vertex to its corner                                     (in)
+//   rest          x0, per tile of one domain [3][width][4] f32, per quad of a mixed tile [3][4]             (in)
+//   rest_normals  rest normals in the same layout; with ORIENT                                              (in)
+//   rest_tangents rest tangents likewise: x, y, z and the sign of the bitangent; with ORIENT, NORMAL_MAPS   (in)
+//   corner_shifts with SHIFTED: per domain, offset from a vertex to its corner                              (in)
 //   transforms    [movers][3] float4: the rows of world_from_domain, relative to the state's origin         (in)
-//   following     with FOLLOWERS: per domain its mover, and its frame among                                 (in)
-//   frames        [followers][3] float4: the rows of mover_from_domain; else every domain is a mover        (in)
-//   q             packed coordinates, times the factor of their mode with STORE_F16 and STORE_BF16          (in)
+//   following     with FOLLOWERS: per domain its transform root, and the index of its frame                 (in)
+//   frames        [followers][3] float4: the rows of mover_from_domain, with FOLLOWERS; without, every domain is a
+//                 transform root                                                                            (in)
+//   q             packed coordinates; with STORE_F16 and STORE_BF16 multiplied by the factor of their mode  (in)
 //   scales        with STORE_INT8: per tile of U and mode                                                   (in)
-//   kept          with TRUNCATED: per domain the chunks that are summed, ascending                          (in)
-//   list          with LISTED: the tiles to be computed, as many as the header says; else all are           (in)
-//   positions     [vertices][3] f32, in the header                                                          (out)
-//   normals       [corners][3] f32, in the header                                                           (out)
-//   tangents      [corners] float4, in the header                                                           (out)
-//   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, in the header; and nothing else with
-//                 WITHOUT_POSITIONS, for measuring, where u is not mended                                   (out)
+//   kept          with TRUNCATED: per domain the chunks to sum, ascending                                   (in)
+//   list          with LISTED: the tiles to compute, their number is in the header; without, all tiles      (in)
+//   positions     [vertices][3] f32, address in the header                                                  (out)
+//   normals       [corners][3] f32, address in the header                                                   (out)
+//   tangents      [corners] float4, address in the header                                                   (out)
+//   displacements with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, address in the header. With
+//                 WITHOUT_POSITIONS, for benchmarks, the only output, and u is not recomputed in f64        (out)
 //   boxes         [tiles][4][6] u32: `ordered` maxima of -x, -y, -z, x, y, z                                (out)
-// Launch: WARPS warps a block; 4 / SPAN warps for each of `count` tiles, or any number of blocks with LISTED.
+// Launch: WARPS warps per block; 4 / SPAN warps for each of `count` tiles, or any number of blocks with LISTED.
 // CPU twin: src/compute/reference/deform.rs.
 //
-// The modes of a vertex are summed in their order, from +0, by fused multiply-adds, whatever the tile and the lane: runs
-// agree bit by bit. What is not finite in f32 is computed again in f64, so that only what f32 cannot hold is lost; a u
-// that is lost counts in the boxes like an x.
+// Determinism: each vertex sums its modes in order, from +0, by fused multiply-adds, independent of the tile and the
+// lane, so runs agree bit by bit. A result that is not finite in f32 is computed again in f64, so only values that f32
+// cannot hold are lost. A displacement that is lost makes the box NaN, as a lost x does.
 #include "chain.cuh"
 #include "chunk.cuh"
 #include "ordered.cuh"
 #include "orient.cuh"
 
-// The chunks that a lane reads before it sums the first.
+// Number of chunks that a lane loads before it sums the first.
 #ifdef NARROW
 #define AHEAD (16 / CHUNK_MODES)
 #else
 #define AHEAD 4
 #endif
-// Warps of a block, and blocks that a multiprocessor is to hold: fewer would not keep the memory busy, more would spill
-// registers, so that what takes more registers has fewer. Tiles of modes read long runs and do best in blocks of one warp.
+// Warps per block, and target number of resident blocks per multiprocessor. Fewer blocks would not saturate the memory,
+// more would spill registers, so variants that need more registers have fewer blocks. Tiles with modes read long runs
+// and are fastest in blocks of one warp.
 #if defined(NARROW) && defined(MODES)
 constexpr unsigned WARPS = 1;
 #if defined(TRUNCATED) && defined(LISTED)
@@ -76,7 +79,7 @@ constexpr unsigned RESIDENT = 16;
 #endif
 
 #ifdef MODES
-// What entry (mode, axis) of the chunks is multiplied with.
+// Factors of the entries of a chunk, one per mode.
 struct Amounts {
     float of[CHUNK_MODES];
 };
@@ -100,8 +103,8 @@ __device__ __forceinline__ Amounts amounts_of(const DeformArgs& args, const Part
     return amounts;
 }
 
-// Sums of products, three to a vertex. COMPENSATED carries what rounding took away (Ogita, Rump and Oishi, "Accurate sum
-// and dot product", algorithm Dot2) and costs as many registers again.
+// Sums of products, three per vertex. COMPENSATED also accumulates the rounding errors (Ogita, Rump and Oishi,
+// "Accurate sum and dot product", algorithm Dot2), which doubles the registers of the sums.
 struct Sums {
     float of[FLOATS];
 #ifdef COMPENSATED
@@ -200,7 +203,7 @@ struct Chosen {
     }
 };
 
-// Adds `COUNT` chunks from the i-th chosen on, all of them loaded before the first is summed.
+// Adds `COUNT` chunks, from the i-th chosen chunk on. All are loaded before the first is summed.
 template <unsigned COUNT>
 __device__ __forceinline__ void sum_chunks(const DeformArgs& args, const Part& part, const Chosen& chosen, unsigned& i,
                                            Sums& sums) {
@@ -240,7 +243,7 @@ __device__ __forceinline__ void sum_modes(const DeformArgs& args, const Part& pa
 }
 #endif
 
-// The u of one vertex of this lane in f64.
+// u of one vertex of this lane in f64.
 __device__ __forceinline__ void sum_exactly(const DeformArgs& args, const Part& part, unsigned vertex, double (&u)[3]) {
     for (unsigned axis = 0; axis < 3; ++axis) {
         u[axis] = 0.0;
@@ -258,7 +261,8 @@ __device__ __forceinline__ void sum_exactly(const DeformArgs& args, const Part& 
     }
 }
 
-// The x of one vertex of this lane in f64, rounded once: for what overflowed on its way in f32 although it need not.
+// x of one vertex of this lane in f64, rounded once: recovers a result that is finite although an f32 intermediate
+// overflowed.
 __device__ __noinline__ float3 summed_exactly(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex) {
     const Part part = part_of(args, tile, share);
     const float* rest = first_of(args.rest, part, 3);
@@ -271,8 +275,8 @@ __device__ __noinline__ float3 summed_exactly(const DeformArgs& args, unsigned t
 }
 
 #if defined(DISPLACEMENTS) && defined(MODES)
-// The u of one vertex likewise, in its place, where the warp stored it before its last barrier. One that is lost counts
-// in the box as a NaN: x may be finite all the same.
+// Recomputes u of one vertex in f64, in the output where the warp stored it before its last barrier. A component that
+// is still not finite sets the box to NaN, because x itself may be finite.
 __device__ __noinline__ void mend_displacement(const DeformArgs& args, unsigned tile, unsigned share, unsigned vertex,
                                                unsigned (&keys)[6]) {
     const Part part = part_of(args, tile, share);
@@ -291,7 +295,7 @@ __device__ __noinline__ void mend_displacement(const DeformArgs& args, unsigned 
 }
 #endif
 
-// The six sides of what a lane staged, as keys. Vertices that are not there count as the first.
+// The six sides of the box of a lane's staged vertices, as keys. Vertices beyond `count` are replaced by the first one.
 __device__ __forceinline__ void box_of(const float (&world)[FLOATS], unsigned count, unsigned (&keys)[6]) {
 #pragma unroll
     for (unsigned axis = 0; axis < 3; ++axis) {
@@ -307,7 +311,7 @@ __device__ __forceinline__ void box_of(const float (&world)[FLOATS], unsigned co
     }
 }
 
-// Computes anew what is not finite of `count` staged vertices, and says what the box is then: a NaN wins.
+// Recomputes those of `count` staged vertices that are not finite, and the keys of their box: a NaN wins.
 __device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigned share, float* numbers, unsigned count,
                                   unsigned (&keys)[6]) {
     for (unsigned side = 0; side < 6; ++side) {
@@ -318,7 +322,7 @@ __device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigne
         if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
             const float3 exact = summed_exactly(args, tile, share, vertex);
 #if defined(DISPLACEMENTS) && defined(MODES)
-            // A u that is not finite makes no x that is.
+            // If u is not finite in f32, neither is x, so u needs this check only here.
             mend_displacement(args, tile, share, vertex, keys);
 #endif
             at[0] = exact.x;
@@ -332,13 +336,13 @@ __device__ __noinline__ void mend(const DeformArgs& args, unsigned tile, unsigne
     }
 }
 
-// The way out of a warp, and of the boxes of lanes that had to mend theirs.
+// Shared memory of a warp: the stage of its outputs, and the boxes of lanes that recomputed vertices in f64.
 struct Shared {
     Stage stage;
     unsigned mended[32][6];
 };
 
-// What a vertex has besides its modes: x0 and T.
+// x0 and T of a lane's vertices.
 struct Base {
     Items x, y, z;
     Affine t;
@@ -350,7 +354,7 @@ struct Base {
     }
 };
 
-// World positions from `bent`, [axis][vertex] sums.
+// World positions from the sums `bent`, [axis][vertex].
 __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, const Part& part, unsigned tile,
                                       unsigned share, const Base& base, const float (&bent)[FLOATS]) {
     float world[FLOATS], total = 0.0f;
@@ -361,7 +365,7 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
         world[3 * i] = placed(base.t.a, px, py, pz);
         world[3 * i + 1] = placed(base.t.b, px, py, pz);
         world[3 * i + 2] = placed(base.t.c, px, py, pz);
-        // Zero, unless one of them is not finite.
+        // Remains zero unless a component is not finite.
         total = fmaf(0.0f, world[3 * i] + world[3 * i + 1] + world[3 * i + 2], total);
     }
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
@@ -378,7 +382,7 @@ __device__ __forceinline__ void place(const DeformArgs& args, Shared& shared, co
         }
     }
     store(args.header->positions, shared.stage, part);
-    // Four boxes a tile: one of each warp, or four times that of the only one.
+    // A tile has four boxes. With four warps, each writes one; with one warp, it writes the same box four times.
     const unsigned key = warp_box(keys);
     if (lane_of() < 6 * SPAN) {
         args.boxes[24 * (size_t)tile + 6 * share + lane_of()] = key;
@@ -425,7 +429,7 @@ __device__ __forceinline__ void compute(const DeformArgs& args, Shared& shared, 
         base.load(args, part);
 #endif
 #ifdef ORIENT
-        // Before the positions leave, so that both are on their way at once.
+        // Load before the positions are stored, so that both transfers are in flight together.
         if (part.kind & TILE_CORNERS) {
             normals.load(args, part);
         }

@@ -1,5 +1,5 @@
-// T of a domain: its own or, with FOLLOWERS, that of the domain that it follows times a constant frame. CPU twin:
-// src/model/domain/composed.rs, bit by bit: the order of operations is stated there.
+// T of a domain: its own or, with FOLLOWERS, that of its transform root times a constant frame. CPU twin:
+// src/model/domain/composed.rs, bit by bit: it defines the order of operations.
 #pragma once
 #include "layout.cuh"
 
@@ -8,7 +8,7 @@ struct Affine {
     float4 a, b, c;
 };
 
-// Where transforms are found.
+// Tables from which T is composed.
 struct Transforms {
     const float4* rows; // [movers][3]
 #ifdef FOLLOWERS
@@ -78,7 +78,7 @@ __device__ __forceinline__ void place_exactly(const float4* rows, const double (
 __device__ __forceinline__ float3 placed_exactly(const Transforms& transforms, unsigned domain, double (&point)[3]) {
     double world[3];
 #ifdef FOLLOWERS
-    // One after the other: the product of both may overflow f32.
+    // Apply both transforms in sequence: their product may overflow f32.
     const Following own = following_of(transforms, domain);
     if (own.frame != NO_FRAME) {
         place_exactly(transforms.frames + 3 * (size_t)own.frame, point, world);

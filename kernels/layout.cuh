@@ -1,38 +1,40 @@
-// What the host hands to the kernels. Twin: src/compute/gpu/layout.rs; tests compare the size and the offset of every field.
+// Structs and constants that host and kernels share. Twin: src/compute/gpu/layout.rs; tests compare the size and the
+// offset of every field.
 #pragma once
 
-// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
+// Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
 constexpr unsigned BLOCK = 256;
-// The most quads (4 vertices of one domain) of a tile, which is the work of one warp.
+// Maximum number of quads (4 vertices of one domain) of a tile, which is the work of one warp.
 constexpr unsigned TILE_QUADS = 32;
 // `first_tangent` of a shape without tangents.
 constexpr unsigned NO_TANGENTS = 0xffffffffu;
 // `first_member` of a shape without smoothing groups.
 constexpr unsigned NO_GROUPS = 0xffffffffu;
-// Marks the first vertex of each fan of a ring.
+// Flag of the first vertex of each fan of a ring.
 constexpr unsigned RING_START = 0x80000000u;
 
-// In place of the frame of a domain that follows no other.
+// `frame` of a domain that follows no other domain.
 constexpr unsigned NO_FRAME = 0xffffffffu;
 
-// The start of a step's inputs, copied with them: where to write, and what is to be computed anew.
+// The start of a step's inputs, uploaded with them: output addresses, and which domains to compute again.
 struct Header {
     float* positions;
     float* normals;
     float4* tangents;
     float* displacements;
-    unsigned since;      // this output holds all that changed up to this step
+    unsigned since;      // this output contains all changes up to this step
     unsigned everything; // the last step that changed all domains
     unsigned step;       // this step; counts from 1
-    unsigned changed;    // domains in the list of `apply`
-    unsigned stale;      // tiles in its other list
+    unsigned changed;    // number of entries in the list of `apply`
+    unsigned stale;      // number of tiles in the tile list
     unsigned reserved[3];
-    unsigned bounds[12]; // `ordered` maxima of -x, -y, -z, x, y, z; with LIGHT of the same in light space; sent as zeros
+    unsigned bounds[12]; // `ordered` maxima of -x, -y, -z, x, y, z; with LIGHT also in light space; sent as zeros
 };
 static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/layout.rs");
 
-// `kind` of a tile: how many items its last quad has, 0 in a mixed tile; whether positions are computed of its items,
-// and whether normals and tangents are. A tile of both computes corner i of a shape with vertex i.
+// Bit fields of a tile's `kind`: the number of items of its last quad (0 in a mixed tile); whether it computes
+// positions; whether it computes normals and tangents. A tile of both computes corner i of a shape together with vertex
+// i.
 constexpr unsigned TILE_LAST = 7;
 constexpr unsigned TILE_VERTICES = 8;
 constexpr unsigned TILE_CORNERS = 16;
@@ -55,12 +57,12 @@ static_assert(sizeof(Tile) == 32, "Tile differs from src/compute/gpu/layout.rs")
 struct Lane {
     unsigned item;   // first packed vertex or corner
     unsigned rest;   // quad of x0, normals and tangents
-    unsigned domain; // four times its index, plus its items less one
+    unsigned domain; // 4 * index of the domain + items of the quad - 1
     unsigned first_q;
 };
 static_assert(sizeof(Lane) == 16, "Lane differs from src/compute/gpu/layout.rs");
 
-// The same for `normals`. Instances share all but `first` and `first_vertex`.
+// Offsets of a domain for `normals`. Instances share all but `first` and `first_vertex`.
 struct NormalSlot {
     unsigned first; // packed corner
     unsigned first_normal;
@@ -70,18 +72,18 @@ struct NormalSlot {
 };
 static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/layout.rs");
 
-// A changed domain in the list of `apply`.
+// An entry of the list of changed domains that `apply` reads.
 struct Change {
     unsigned domain;
     unsigned first_q; // in the packed coordinates
-    unsigned count;   // of coordinates
-    unsigned source;  // of its coordinates in the list's values
+    unsigned count;   // number of coordinates
+    unsigned source;  // offset of its coordinates in `new_q`
 };
 static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/layout.rs");
 
-// Whose transform a domain has, and which frame it has in it; with FOLLOWERS.
+// The transform root of a domain, and its frame relative to that root; with FOLLOWERS.
 struct Following {
-    unsigned mover; // in the transforms
+    unsigned mover; // index in the transforms
     unsigned frame;
 };
 static_assert(sizeof(Following) == 8, "Following differs from src/compute/gpu/layout.rs");
@@ -110,7 +112,7 @@ struct DeformArgs {
 };
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/layout.rs");
 
-// Domains of one shape whose U `batch` reads once.
+// Domains of one shape, for which `batch` reads U once.
 struct Group {
     unsigned long long first_word;
     unsigned rest; // first quad of x0
@@ -122,20 +124,20 @@ struct Group {
 };
 static_assert(sizeof(Group) == 32, "Group differs from src/compute/gpu/layout.rs");
 
-// One of them.
+// A domain of a group.
 struct Member {
     unsigned first; // packed vertex
     unsigned first_q;
     unsigned domain;
-    unsigned first_tile; // of `deform`: its boxes
+    unsigned first_tile; // first tile of the domain in `deform`, for its boxes
 };
 static_assert(sizeof(Member) == 16, "Member differs from src/compute/gpu/layout.rs");
 
 // The work of one block of `batch`.
 struct Block {
     unsigned group;
-    unsigned tile; // of its shape, the first
-    unsigned end;  // the one after the last
+    unsigned tile; // first tile of the block, in its shape
+    unsigned end;  // tile after the last one
     unsigned reserved;
 };
 static_assert(sizeof(Block) == 16, "Block differs from src/compute/gpu/layout.rs");
@@ -156,12 +158,12 @@ struct BatchArgs {
 };
 static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/layout.rs");
 
-// A part of a domain of which `bounds` makes a box.
+// A part of a domain that `bounds` reduces to one box.
 struct Piece {
-    unsigned first; // packed vertex, or box of `deform`
+    unsigned first; // first packed vertex, or first box of `deform`
     unsigned count;
     unsigned domain;
-    unsigned of_vertices; // not of boxes
+    unsigned of_vertices; // 1: a range of vertices, 0: a range of boxes
 };
 static_assert(sizeof(Piece) == 16, "Piece differs from src/compute/gpu/layout.rs");
 
@@ -173,7 +175,7 @@ struct BoundsArgs {
     unsigned* piece_boxes;
     unsigned count;
     unsigned piece_count;
-    float light[9]; // with LIGHT: the axes of light space, one after the other
+    float light[9]; // with LIGHT: the three axes of light space
     unsigned reserved;
 };
 static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/layout.rs");
@@ -219,7 +221,7 @@ __device__ inline bool is_stale(const Header* header, const unsigned* stamps, un
 }
 
 // The domain of a packed corner: the last slot that begins at or before it. `first_domains[b]` is the domain of the
-// first item of block b, and one more entry names the last domain; inside one domain nothing is searched.
+// first item of block b, followed by the last domain. A block inside one domain needs no search.
 template <typename Slot>
 __device__ inline unsigned domain_of(const Slot* slots, const unsigned* first_domains, unsigned item) {
     unsigned low = first_domains[blockIdx.x];
@@ -235,8 +237,8 @@ __device__ inline unsigned domain_of(const Slot* slots, const unsigned* first_do
     return low;
 }
 
-// Writes a block's three numbers per item as one run, so that a warp fills whole sectors. `staged` is complete when
-// the caller's last barrier was.
+// Writes three floats per item as one contiguous run of the block, so that a warp fills whole sectors. The caller has a
+// barrier between writing `staged` and this call.
 __device__ inline void store_triples(float* packed, const float* staged, unsigned items) {
     const unsigned begin = blockIdx.x * BLOCK;
     const unsigned floats = 3 * min(BLOCK, items - begin);

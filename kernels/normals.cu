@@ -2,33 +2,34 @@
 //   rest_normals   [3][rest_corners] f32, one plane per axis                                            (in)
 //   rest_tangents  [..] float4: unit tangent, sign of the bitangent; read only with NORMAL_MAPS         (in)
 //   transforms     [movers][3] float4: the rows of world_from_domain; A is their first three columns   (in)
-//   following, frames  with FOLLOWERS, as `deform` has them                                             (in)
-//   members        [..] u32: the smoothing group of each corner of a shape that has any                 (in)
-//   begins, rings  [groups + 1] u32 and what they point into: src/model/domain/smoothing.rs                   (in)
+//   following, frames  with FOLLOWERS, as for `deform`                                                  (in)
+//   members        [..] u32: the smoothing group of each corner of a shape that has groups              (in)
+//   begins, rings  [groups + 1] u32 offsets into the rings: src/model/domain/smoothing.rs               (in)
 //   group_normals  [3][groups] f32: geometric unit normals at rest, zeros where there is none           (in)
-//   positions      [vertices][3] f32, world, of this step; in the header                                (in)
-//   normals        [corners][3] f32, world; in the header                                               (out)
+//   positions      [vertices][3] f32, world, of this step; address in the header                        (in)
+//   normals        [corners][3] f32, world; address in the header                                       (out)
 //   tangents       [corners] float4, world; zeros where a shape has none; only with NORMAL_MAPS         (out)
-// Launch: BLOCK threads a block, a thread a packed corner, ceil(corners / BLOCK) blocks, whichever domains they meet.
-// A block whose domains have not changed since this output was written is passed over.
-// CPU twin: src/compute/reference/normals.rs, which defines what is computed.
+// Launch: BLOCK threads per block, a thread per packed corner, ceil(corners / BLOCK) blocks over all domains. A block
+// is skipped if none of its domains has changed since this output was written. CPU twin:
+// src/compute/reference/normals.rs, which defines the result.
 //
-// A thread per corner, not per group: corners of one group repeat its sum, from cache. A pass over groups would write and
-// read 12 bytes for each of them and cost a launch, which pays only where groups have two corners and more on average.
-// For groups of k triangles and one corner each, DRAM moves 4 bytes of members, 4 of begins, 4 (k + 2) of rings, 12 of
-// geometric normals and 12 of positions per corner, besides 24 for the rest normal and the new one: 88 in all at k = 6.
+// A thread per corner, not per group: corners of one group repeat its sum from the cache. A pass over groups would
+// write and read 12 bytes per group and cost a launch, which pays off only with two or more corners per group on
+// average. For groups of k triangles and one corner each, DRAM traffic per corner is 4 bytes of members, 4 of begins, 4
+// (k + 2) of rings, 12 of geometric normals and 12 of positions, plus 24 for the rest normal and the new one: 88 bytes
+// at k = 6.
 //
-// Each thread gathers for itself, without atomics, in the order of the ring: runs agree bit by bit. Sums are f64:
-// differences and products of two f32 are exact there or nearly so, and neither over- nor underflow, so that nothing
-// needs scaling, however large, small or far away a domain is.
+// Each thread gathers for itself, without atomics, in the order of the ring, so runs agree bit by bit. Sums are f64:
+// differences and products of two f32 are exact or nearly exact, and neither over- nor underflow, so no scaling is
+// needed for large, small or distant domains.
 #include "chain.cuh"
 #include "turn.cuh"
 
-// The part of B that an area must exceed, and the squared length of the sum of two opposite unit vectors; as the twin's.
+// Part of B that an area must exceed, and minimum squared length of the sum of two unit vectors; as in the twin.
 constexpr double RESOLUTION = 1.0 / 262144.0;
 constexpr float OPPOSITE = 1e-10f;
 
-// The unit directions between which the surface around a corner turned, where that can be told.
+// The rotation of the surface around a corner, as its unit normals before and after, if it could be determined.
 struct Turn {
     float3 from, to;
     bool is_told;
@@ -56,13 +57,13 @@ __device__ double sum_of(const double3& v) {
     return fabs(v.x) + fabs(v.y) + fabs(v.z);
 }
 
-// The area vectors around a group, and what the twin calls B.
+// The sum of the area vectors around a group, and its rounding scale B as the twin defines it.
 struct Area {
     double3 sum;
     double rounding;
 };
 
-// Of a ring of two entries or more.
+// The ring must have at least two entries.
 __device__ Area area_of(const unsigned* ring, const unsigned* end, const float* positions) {
     const double3 own = position_of(positions, __ldg(ring));
     const double height = sum_of(own);
@@ -108,15 +109,16 @@ __device__ Turn turn_of(const NormalsArgs& args, const NormalSlot& slot, const R
     if (!turn.is_told) {
         return turn;
     }
-    // As the rest normal is turned by the inverse transpose, the sum is by the cofactors; a mirror is between them.
+    // The sum transforms by the cofactors and the rest normal by the inverse transpose; they differ by the sign of the
+    // determinant.
     const double hand = hand_of(linear);
     turn.to = unit(make_double3(hand * sum.x, hand * sum.y, hand * sum.z));
     turn.from = turn_normal(linear, normal);
     return turn;
 }
 
-// The least rotation from one direction to the other: the part along `from` goes along `to`, the part across is
-// reflected at the plane across their middle.
+// Applies the smallest rotation that takes `from` to `to`: the component along `from` is moved to `to`, the rest is
+// reflected at the plane perpendicular to their bisector.
 __device__ float3 carry(const Turn& turn, const float3& v) {
     const float along = dot(turn.from, v);
     const float3 across = add(v, turn.from, -along);
@@ -130,7 +132,7 @@ __device__ float3 unit_of(const float3& v) {
     return scaled(v, 1.0f / sqrtf(dot(v, v)));
 }
 
-// A tangent without its part along the normal; where nothing else is left, any unit vector across.
+// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
 __device__ float3 beside(const float3& tangent, const float3& normal) {
     const float3 flat = add(tangent, normal, -dot(normal, tangent));
     if (dot(flat, flat) > 1e-12f) {

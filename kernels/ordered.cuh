@@ -1,18 +1,18 @@
-// Maxima of floats as maxima of integers. Twin: src/compute/gpu/bounds.rs.
+// Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin: src/compute/gpu/bounds.rs.
 #pragma once
 
-// An integer that grows with x and is never 0, of what is a number.
+// The key of a number: increases with x and is never 0. x must not be NaN.
 __device__ inline unsigned ordered_number(float x) {
     const unsigned bits = __float_as_uint(x);
     return bits ^ (unsigned)((int)bits >> 31 | (int)0x80000000u);
 }
 
-// The same of any x; of a NaN it is the largest, so that a NaN wins every maximum.
+// The key of any x. A NaN has the largest key, so it wins every maximum.
 __device__ inline unsigned ordered(float x) {
     return x != x ? 0xffffffffu : ordered_number(x);
 }
 
-// The number that a key stands for; of 0, which no number has, and of the NaN's key a NaN.
+// The number of a key. The key 0, which no number has, and the key of NaN give a NaN.
 __device__ inline float unordered(unsigned key) {
     return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
 }
@@ -28,7 +28,7 @@ __device__ inline unsigned warp_max(unsigned key) {
 #endif
 }
 
-// The maxima over a warp of six keys each: lane i has that of key i % 6.
+// The maxima of six keys each over a warp; lane i returns that of key i % 6.
 __device__ inline unsigned warp_box(const unsigned (&keys)[6]) {
     const unsigned side = threadIdx.x % 32 % 6;
     unsigned own = 0;

@@ -1,21 +1,21 @@
-// Rigid normals and tangents of a tile: those of the rest state, turned by T alone (equation 3.8 of the thesis; normals
-// by the inverse transpose of A, tangents by A, a mirror flips the sign of the bitangent). CPU twin:
+// Rigid normals and tangents of a tile: those at rest, rotated by T alone (equation 3.8 of the thesis; normals by the
+// inverse transpose of A, tangents by A; a reflection flips the sign of the bitangent). CPU twin:
 // src/compute/reference/orient.rs.
 //
-// The matrix of a lane is brought to entries of about 1 by a power of two; a direction that it leaves shorter than a
-// tenth has lost digits in f32 and is turned again in f64.
+// A lane's matrix is scaled by a power of two so that its entries are about 1. If a transformed direction is shorter
+// than a tenth, it has lost precision in f32 and is computed again in f64.
 #pragma once
 #include "tile.cuh"
 #include "turn.cuh"
 
-// A direction whose squared length is at most this was turned with too much cancellation.
+// A direction whose squared length is at most this was transformed with too much cancellation.
 constexpr float SHORT = 0.01f;
 
 struct Matrix {
     float3 a, b, c;
 };
 
-// A power of two that brings a number to [1, 2), or as near as f32 has one.
+// A power of two that scales a number to [1, 2), or as near as f32 allows.
 __device__ __forceinline__ float scale_of(float largest) {
     const unsigned exponent = __float_as_uint(largest) >> 23;
     return __uint_as_float(max(254 - (int)exponent, 1) << 23);
@@ -25,7 +25,7 @@ __device__ __forceinline__ float largest_of(float a, float b, float c) {
     return fmaxf(fmaxf(fabsf(a), fabsf(b)), fabsf(c));
 }
 
-// The linear part of a transform, its largest entry about 1: a power of two changes no digit.
+// The linear part of a transform, scaled so that its largest entry is about 1; a power of two rounds nothing.
 __device__ __forceinline__ Matrix scaled(const Affine& t) {
     const float4 a = t.a, b = t.b, c = t.c;
     const float largest = fmaxf(fmaxf(largest_of(a.x, a.y, a.z), largest_of(b.x, b.y, b.z)), largest_of(c.x, c.y, c.z));
@@ -41,7 +41,7 @@ __device__ __forceinline__ float4 linear_row_of(const float3& t, const Matrix& f
 }
 #endif
 
-// That of a domain. Both parts of a follower's are scaled before they are multiplied, so that nothing overflows.
+// The scaled matrix of a domain. Both factors of a follower's matrix are scaled before the product, to avoid overflow.
 __device__ __forceinline__ Matrix matrix_of(const Transforms& transforms, unsigned domain) {
 #ifdef FOLLOWERS
     const Following own = following_of(transforms, domain);
@@ -57,7 +57,7 @@ __device__ __forceinline__ Matrix matrix_of(const Transforms& transforms, unsign
 }
 
 #ifdef SHEAR
-// Times a power of two that brings the largest entry to [1, 2), rounded once.
+// The matrix scaled by a power of two so that its largest entry is in [1, 2), rounded once.
 __device__ __forceinline__ Matrix rounded(const Rows& m) {
     const double row_a = fmax(fmax(fabs(m.a.x), fabs(m.a.y)), fabs(m.a.z));
     const double row_b = fmax(fmax(fabs(m.b.x), fabs(m.b.y)), fabs(m.b.z));
@@ -77,9 +77,9 @@ __device__ __forceinline__ Rows normal_rows(const Rows& m) {
 #endif
 
 
-// Turns the directions whose bits are set again, in f64: normals of three numbers, tangents of four. Only those, so that
-// a corner has the same bits whichever corners share its lane. `from` is the first number of the first, `row` leads from
-// its x to its y; `to` is staged.
+// Transforms the directions whose bits are set again in f64: normals of three components, tangents of four. Only those,
+// so that the bits of a corner do not depend on the other corners of its lane. `from` is the first component of the
+// first direction, `row` leads from its x to its y; `to` is staged.
 __device__ __noinline__ void turn_again(Transforms transforms, unsigned domain, const float* from, unsigned row,
                                         float* to, unsigned set, unsigned numbers) {
     const Rows m = linear_of(transforms, domain);
@@ -94,14 +94,14 @@ __device__ __noinline__ void turn_again(Transforms transforms, unsigned domain, 
     }
 }
 
-// A direction turned and of unit length; `bit` is set in `set` when it counts and was turned with too much cancellation.
+// A direction, transformed and normalized. Sets `bit` in `set` when the transformation cancelled too much.
 __device__ __forceinline__ float3 turned(const Matrix& m, float x, float y, float z, unsigned bit, unsigned& set) {
     const float3 v = make_float3(fmaf(m.a.x, x, fmaf(m.a.y, y, m.a.z * z)), fmaf(m.b.x, x, fmaf(m.b.y, y, m.b.z * z)),
                                  fmaf(m.c.x, x, fmaf(m.c.y, y, m.c.z * z)));
     const float square = fmaf(v.x, v.x, fmaf(v.y, v.y, v.z * v.z));
     // A NaN counts as short.
     set |= square > SHORT ? 0 : bit;
-    // Within two units in the last place.
+    // Accurate to two units in the last place.
     const float inverse = rsqrtf(square);
     return make_float3(v.x * inverse, v.y * inverse, v.z * inverse);
 }
@@ -144,7 +144,7 @@ __device__ __forceinline__ void orient_tangents(const DeformArgs& args, Stage& s
     unsigned set = 0;
 #pragma unroll
     for (unsigned i = 0; i < SPAN; ++i) {
-        // A shape without tangents has zeros, which stay zeros.
+        // A shape without tangents has zeros, which remain zeros.
         const bool is_there = sign.of[i] != 0.0f;
         const unsigned bit = is_there ? 1u << i : 0;
         const float3 tangent = turned(matrix, x.of[i], y.of[i], z.of[i], bit, set);

@@ -1,18 +1,18 @@
-// Triangles to samples, one a pixel: the least depth of each and whose it is, by one atomic minimum of both. The result
-// does not depend on the order of anything.
-//   raster        a thread a triangle of a group: drops it, draws it if few samples are near, or hands it on
-//   raster_cut    the same of triangles that are cut out
-//   raster_warps  a warp a triangle of the medium queue
-//   raster_tiles  a warp a tile of a triangle of the large queue, or a strip of it where tiles are few; clipped ones come
-//                 here too
+// Compute rasterizer: one sample per pixel. For each sample it finds the least depth and the id of its triangle, by one
+// atomic minimum of both. The result does not depend on the order of execution.
+//   raster        a thread per triangle of a group: culls it, draws it if few samples are near, or queues it
+//   raster_cut    the same for cut-out triangles
+//   raster_warps  a warp per triangle of the medium queue
+//   raster_tiles  a warp per tile of a triangle of the large queue, or per strip of a tile if there are few tiles; also
+//                 draws clipped triangles
 // Macros: DEPTH   depth alone, f32, no ids: a shadow map
-//         CUT     there are triangles of which alpha leaves a part: all from args.cut on. Asked before the atomic
-//         COUNT   how many triangles took each path, and why others were dropped
-//         FEW     samples near a triangle that a thread draws, at most
-//         NARROW  1/256 pixels of a triangle that a warp draws, at most 16384: its edges fit 32 bits
-// Launch: BLOCK threads a block; of raster and raster_cut as many as triangles need, of the others any number: they take
-// turns.
-// CPU twin: Raster::draw.
+//         CUT     the mesh has cut-outs: triangles from args.cut on, tested for alpha before the atomic
+//         COUNT   count the triangles by path, including the reasons for culling
+//         FEW     maximum number of samples near a triangle that a thread draws
+//         NARROW  maximum extent, in 1/256 pixel, of a triangle that a warp draws; at most 16384, so that its edge
+//                 functions fit 32 bits
+// Launch: BLOCK threads per block. raster and raster_cut need a thread per triangle; the others loop over their queue,
+// with any number of blocks. CPU twin: Raster::draw.
 #include "cut_out.cuh"
 
 #ifndef FEW
@@ -24,10 +24,10 @@
 
 constexpr unsigned BLOCK = 128, WARPS = BLOCK / 32;
 constexpr int TILE = 64;
-constexpr unsigned HALVINGS = 3;          // of a tile into strips, at most
+constexpr unsigned HALVINGS = 3;          // maximum number of times that a tile is halved into strips
 constexpr unsigned TILES_BITS = 40;
 
-// Where a triangle goes, and what drawing it there needs.
+// The path of a triangle, and its setup.
 struct Aim {
     Path path;
     Box box;
@@ -40,7 +40,7 @@ __device__ inline bool is_empty(const Box& box) {
     return box.x0 > box.x1 || box.y0 > box.y1;
 }
 
-// What sign the area says of a triangle.
+// The path of a triangle by the sign of its area and its samples.
 __device__ inline Path judge(const RasterArgs& args, long long area, const Box& box) {
     return area == 0                     ? FLAT
            : args.faces == 1 && area > 0 ? BACK
@@ -48,8 +48,8 @@ __device__ inline Path judge(const RasterArgs& args, long long area, const Box& 
                                          : LARGE;
 }
 
-// What becomes of a clipped triangle. Apart, and with its own memory: few triangles come here, and the others keep theirs
-// in registers.
+// The path of a clipped triangle. A separate function with a struct in local memory: clipped triangles are rare, and
+// the others keep their setup in registers.
 struct Clipped {
     Path path;
     Box box;
@@ -115,7 +115,7 @@ __device__ inline void draw_small(const RasterArgs& args, const Aim& aim, unsign
     }
 }
 
-// One atomic a warp. All its lanes come here.
+// One atomic per warp; all lanes of the warp take part.
 __device__ inline void push_medium(const RasterArgs& args, bool wanted, unsigned triangle) {
     const unsigned lanes = __ballot_sync(0xffffffffu, wanted), lane = threadIdx.x % 32;
     if (lanes == 0) {
@@ -131,7 +131,7 @@ __device__ inline void push_medium(const RasterArgs& args, bool wanted, unsigned
     }
 }
 
-// One atomic gives both the place and the first tile, so that first tiles ascend with places.
+// One atomic returns both the queue entry and its first tile, so first tiles ascend with the entries.
 __device__ inline void push_large(const RasterArgs& args, const Box& box, unsigned triangle) {
     const unsigned x = box.x0 / TILE, y = box.y0 / TILE;
     const unsigned across = box.x1 / TILE - x + 1, down = box.y1 / TILE - y + 1;
@@ -223,7 +223,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid
     }
 }
 
-// The last entry whose first tile is not behind this one. A warp asks 32 entries at a time.
+// The last entry whose first tile is at or before `tile`. The warp tests 32 entries at a time.
 __device__ inline Large find(const RasterArgs& args, unsigned entries, unsigned long long tile) {
     const Large* list = (const Large*)args.large;
     unsigned low = 0, high = entries;
@@ -253,7 +253,8 @@ __device__ inline Box common(const Box& one, const Box& other) {
     return {max(one.x0, other.x0), max(one.y0, other.y0), min(one.x1, other.x1), min(one.y1, other.y1)};
 }
 
-// Whether all samples between two corners of a tile lie outside one edge: its largest value there is at one of the four.
+// Whether all samples of a box lie outside one edge: the edge function has its largest value at one of the four
+// corners.
 __device__ inline bool is_beyond(const Corner& from, const Corner& to, int least, const Box& box) {
     const int x = CELL * (to.y > from.y ? box.x0 : box.x1) + CELL / 2;
     const int y = CELL * (to.x > from.x ? box.y1 : box.y0) + CELL / 2;
@@ -278,21 +279,22 @@ __device__ inline void draw_tile(const RasterArgs& args, const Kind& surface, co
     }
 }
 
-// What a block has to do. Kept where it takes no registers, like what follows.
+// The work of all warps. In shared memory, to save registers, like `Turn`.
 struct Turns {
     unsigned long long count;
     unsigned entries;
-    unsigned halvings;                    // of every tile into strips
+    unsigned halvings;                    // of each tile into strips
 };
 
-// What a warp draws in one turn.
+// What a warp draws in one iteration.
 struct Turn {
     Polygon polygon;
     Box box;
     unsigned triangle;
 };
 
-// A tile is 128 rounds of a warp: where there are fewer tiles than warps, that is what all would wait for.
+// A tile takes 128 iterations of a warp. If there are fewer tiles than warps, one tile would determine the run time, so
+// tiles are split into strips.
 __device__ inline void plan_turns(const RasterArgs& args, Turns& turns) {
     const unsigned long long large = ((const Tally*)args.tally)->large, tiles = large & ((1ull << TILES_BITS) - 1);
     turns.entries = (unsigned)(large >> TILES_BITS);
@@ -314,7 +316,8 @@ __device__ inline void take_turn(const RasterArgs& args, const Turns& turns, con
     turn.triangle = entry.triangle;
 }
 
-// All pieces of a polygon turn the way that the whole does; what rounding turned the other way has no samples of its own.
+// All pieces of a polygon have the orientation of the whole. A piece that rounding turned around has no samples of its
+// own.
 template <typename Kind>
 __device__ inline void draw_pieces(const RasterArgs& args, const Turn& turn) {
     const Polygon& polygon = turn.polygon;

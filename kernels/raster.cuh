@@ -1,33 +1,34 @@
-// One triangle on its way to samples: corners in clip space, clipped, in 1/256 pixel, its three edges and its depth. Every
-// sum and product of floats is rounded by itself, so that the same bits come out wherever it is computed.
-// Windows have y down, the first sample of the first row at (1/2, 1/2). Twin: src/compute/reference/raster.rs.
+// Triangle setup of the compute rasterizer: corners in clip space, clipping, snapping to 1/256 pixel, edge functions
+// and depth. Every float sum and product is rounded separately (no fused multiply-add), so that host and device give
+// the same bits. Windows have y down; the first sample of the first row is at (1/2, 1/2). Twin:
+// src/compute/reference/raster.rs.
 #pragma once
 
-constexpr int CELL = 256;                 // steps of a pixel
+constexpr int CELL = 256;                 // subpixel steps per pixel
 constexpr unsigned MOST_CORNERS = 8;      // three, and one more for each of five planes
-constexpr float LEAST_W = 0x1p-100f;      // below, 1 / w is no number to go on with
+constexpr float LEAST_W = 0x1p-100f;      // below this, 1 / w is not usable
 
 struct RasterArgs {
     unsigned long long positions;         // [vertices][3] f32
     unsigned long long triangles;         // [triangles][3] u32: vertices
     unsigned long long target;            // [height][width] u64: depth, id; or f32: depth                 (in, out)
     unsigned long long medium;            // [triangles] u32: triangles that warps draw                    (out, in)
-    unsigned long long large;             // [triangles] Large: those that are drawn by tiles               (out, in)
+    unsigned long long large;             // [triangles] Large: triangles that are drawn by tiles          (out, in)
     unsigned long long tally;             // Tally                                                         (in, out)
     unsigned long long uvs;               // [triangles - cut][3][2] f32
-    unsigned long long surfaces;          // [triangles - cut] u32: places in the table
+    unsigned long long surfaces;          // [triangles - cut] u32: indices into the table
     unsigned long long table;             // [surfaces] Surface
     float clip[16];                       // clip from positions, row-major
     float half_width, half_height;        // pixels
     float guard_x, guard_y;               // |x| and |y| up to which nothing is clipped, in units of w
     unsigned width, height;
     unsigned first, count;                // the triangles of this launch
-    unsigned faces;                       // 0: both, 1: fronts (anticlockwise with y up)
-    unsigned cut;                         // the first triangle that is cut out; with the three above, of CUT
+    unsigned faces;                       // 0: both, 1: front faces (counterclockwise with y up)
+    unsigned cut;                         // first cut-out triangle; with CUT, as uvs, surfaces and table
 };
 
 struct Large {
-    unsigned long long first;             // tiles of those before it
+    unsigned long long first;             // number of tiles of the entries before
     unsigned triangle;
     unsigned box;                         // first tile: x, y; tiles across - 1: 8 bits each
 };
@@ -50,7 +51,7 @@ struct Polygon {
     Corner corners[MOST_CORNERS];
 };
 
-// Samples, both ends included.
+// A range of samples, both ends included.
 struct Box {
     int x0, y0, x1, y1;
 };
@@ -88,7 +89,7 @@ __device__ inline bool is_finite(float4 v) {
     return fabsf(v.x) <= LARGEST && fabsf(v.y) <= LARGEST && fabsf(v.z) <= LARGEST && fabsf(v.w) <= LARGEST;
 }
 
-// Whether all three lie beyond one plane of the view.
+// Whether all three corners lie outside one plane of the view frustum.
 __device__ inline bool is_outside(const float4 (&v)[3]) {
     return (v[0].x > v[0].w && v[1].x > v[1].w && v[2].x > v[2].w) ||
            (v[0].x < -v[0].w && v[1].x < -v[1].w && v[2].x < -v[2].w) ||
@@ -98,7 +99,7 @@ __device__ inline bool is_outside(const float4 (&v)[3]) {
            (v[0].z < -v[0].w && v[1].z < -v[1].w && v[2].z < -v[2].w);
 }
 
-// Not negative on the inner side of a plane: the near one, then the sides of the guard.
+// Signed distance to a plane, not negative on the inner side: the near plane, then the sides of the guard band.
 __device__ inline float inside(const RasterArgs& args, float4 v, unsigned plane) {
     const float x = times(args.guard_x, v.w), y = times(args.guard_y, v.w);
     return plane == 0 ? plus(v.z, v.w) : plane == 1 ? plus(x, -v.x) : plane == 2 ? plus(x, v.x)
@@ -122,7 +123,8 @@ __device__ inline Corner snap(const RasterArgs& args, float4 v) {
     return corner;
 }
 
-// From the inner end of an edge towards its outer one, whichever triangle of the edge asks.
+// Intersection of an edge with a plane, always computed from the inner end, so that both triangles of an edge get the
+// same bits.
 __device__ inline float4 cut(float4 in, float4 out, float d_in, float d_out) {
     const float t = __fdiv_rn(d_in, plus(d_in, -d_out));
     float4 v;
@@ -133,7 +135,7 @@ __device__ inline float4 cut(float4 in, float4 out, float d_in, float d_out) {
     return v;
 }
 
-// Sutherland and Hodgman's clipping by the near plane and the guard; no corners if nothing is left. Rarely called.
+// Sutherland-Hodgman clipping by the near plane and the guard band; no corners if nothing remains. Rarely called.
 __device__ __noinline__ void clip_triangle(const RasterArgs& args, float4 a, float4 b, float4 c, Polygon& polygon) {
     float4 lists[2][MOST_CORNERS];
     unsigned count = 3, from = 0;
@@ -165,12 +167,12 @@ __device__ __noinline__ void clip_triangle(const RasterArgs& args, float4 a, flo
     }
 }
 
-// Twice the area between two sides that begin at a, positive where b, c follow clockwise on the screen.
+// Twice the signed area; positive when a, b, c are clockwise on the screen.
 __device__ inline long long area_of(const Corner& a, const Corner& b, const Corner& c) {
     return (long long)(b.x - a.x) * (c.y - a.y) - (long long)(b.y - a.y) * (c.x - a.x);
 }
 
-// The samples between two ends, cut by the window.
+// The samples between two corners in 1/256 pixel, clipped to the window.
 __device__ inline Box box_of(const RasterArgs& args, int x0, int y0, int x1, int y1) {
     constexpr int MIDDLE = CELL / 2;
     return {max(0, (x0 + MIDDLE - 1) >> 8), max(0, (y0 + MIDDLE - 1) >> 8), min((int)args.width - 1, (x1 - MIDDLE) >> 8),
@@ -198,12 +200,12 @@ __device__ inline Box box_of(const RasterArgs& args, const Polygon& polygon) {
     return box_of(args, x0, y0, x1, y1);
 }
 
-// A triangle with its corners clockwise on the screen. Wide holds its edges at all samples that are asked about.
+// A triangle with its corners clockwise on the screen. `Wide` must hold its edge functions at all samples tested.
 template <typename Wide>
 struct Piece {
     Corner a, b, c;
     float inverse, rise_b, rise_c;        // 1 / area; depth from a to b and to c
-    int least_a, least_b, least_c;        // an edge opposite to a corner takes samples from here on: top-left rule
+    int least_a, least_b, least_c;        // least covered value of the edge opposite each corner: top-left rule
 
     __device__ static int least(const Corner& from, const Corner& to) {
         return to.y < from.y || (to.y == from.y && to.x > from.x) ? 0 : 1;
@@ -225,7 +227,7 @@ struct Piece {
         return (Wide)(to.x - from.x) * (y - from.y) - (Wide)(to.y - from.y) * (x - from.x);
     }
 
-    // Whether the sample of a pixel lies inside and before the far plane; its depth if so, not below 0.
+    // Whether a pixel's sample lies inside the triangle and in front of the far plane. `depth` is then at least 0.
     __device__ bool covers(int column, int row, float& depth) const {
         const int x = CELL * column + CELL / 2, y = CELL * row + CELL / 2;
         const Wide at_b = edge(c, a, x, y), at_c = edge(a, b, x, y);
@@ -239,8 +241,8 @@ struct Piece {
     }
 };
 
-// Depths are not negative, so that their bits are ordered as they are. What was read before is never below what is there
-// now: an atomic that it makes needless would have changed nothing, and what would not be seen need not be looked at.
+// Depths are not negative, so their bits order like the numbers. The plain read may be stale, but the target only
+// decreases: if the test fails, the atomic would change nothing, and the alpha of a hidden sample need not be read.
 template <typename Kind>
 __device__ inline void put(const RasterArgs& args, const Kind& surface, int column, int row, float depth, unsigned triangle) {
     const size_t at = (size_t)row * args.width + column;

@@ -1,15 +1,15 @@
-// A warp's tile: which vertices and corners its lanes have, and the way out for what they compute.
+// The tile of a warp: which vertices and corners its lanes compute, and coalesced stores of the results.
 #pragma once
 #include "layout.cuh"
 
-// Vertices or corners of a lane. With NARROW a lane has one, and four warps share a tile: small scenes then fill the
+// Vertices or corners per lane. With NARROW a lane has one, and four warps share a tile, so that small scenes fill the
 // device too.
 #ifdef NARROW
 constexpr unsigned SPAN = 1;
 #else
 constexpr unsigned SPAN = 4;
 #endif
-constexpr unsigned SHARE = 4 / SPAN; // warps of a tile
+constexpr unsigned SHARE = 4 / SPAN; // warps per tile
 constexpr unsigned FLOATS = 3 * SPAN;
 
 __device__ __forceinline__ unsigned lane_of() {
@@ -23,18 +23,18 @@ struct Part {
     unsigned width;
     unsigned chunks;
     unsigned long long first_word;
-    unsigned within; // the lane's first item in its quad
-    unsigned item;   // the same, packed: a vertex, or a corner of a tile of corners alone
-    unsigned count;  // items to be written
+    unsigned within; // first item of the lane in its quad
+    unsigned item;   // its packed index: a vertex, or a corner in a tile of corners alone
+    unsigned count;  // number of items to write
     unsigned domain;
-    unsigned run;    // items of the whole warp in a tile of one domain, from lane 0's on; else 0
-    unsigned rest;   // quad of x0, normals and tangents: the tile's first, or in a mixed tile the lane's own
-    unsigned stride; // from one number of the quad to the next, in fours
+    unsigned run;    // items of the whole warp in a tile of one domain, from lane 0 on; else 0
+    unsigned rest;   // quad of x0, normals and tangents: the tile's first, or the lane's own in a mixed tile
+    unsigned stride; // float4 from one component of the quad to the next
     unsigned first_q;
     unsigned first_scale;
 };
 
-// A lane without an item has a count of 0 and looks at those of quad 0.
+// A lane without an item has a count of 0 and reads the items of quad 0.
 __device__ __forceinline__ Part part_of(const DeformArgs& args, unsigned tile, unsigned share) {
     const uint4 head = __ldg((const uint4*)(args.tiles + tile));
     const uint4 tail = __ldg((const uint4*)(args.tiles + tile) + 1);
@@ -80,17 +80,17 @@ __device__ __forceinline__ Part part_of(const DeformArgs& args, unsigned tile, u
     return part;
 }
 
-// A warp's numbers on their way out, [lane][item][number], and where each lane's items belong.
+// Shared memory for coalesced stores of a warp, [lane][item][component], and the destination of each lane's items.
 struct Stage {
-    float4 numbers[32 * SPAN]; // room for four numbers an item
-    uint2 places[32];          // first item, and how many
+    float4 numbers[32 * SPAN]; // capacity for four components per item
+    uint2 places[32];          // first item and number of items
 };
 
 __device__ __forceinline__ float* staged(Stage& stage) {
     return (float*)stage.numbers;
 }
 
-// Three numbers an item, whose first of this lane is `first`.
+// Stages three components per item; `first` is the lane's first item.
 __device__ __forceinline__ void put(Stage& stage, const Part& part, unsigned first, const float (&numbers)[FLOATS]) {
 #ifdef NARROW
     float* to = staged(stage) + 3 * lane_of();
@@ -106,8 +106,8 @@ __device__ __forceinline__ void put(Stage& stage, const Part& part, unsigned fir
     stage.places[lane_of()] = make_uint2(first, part.count);
 }
 
-// Writes what was put, so that sectors are written whole. A warp of one domain writes one run, 16 bytes a lane where it
-// begins at such.
+// Writes the staged numbers so that whole sectors are written. A warp of one domain writes one run, with 16 bytes per
+// lane if the run is aligned.
 __device__ __forceinline__ void store(float* packed, Stage& stage, const Part& part) {
     __syncwarp();
     if (part.kind & TILE_LAST) {
@@ -124,8 +124,8 @@ __device__ __forceinline__ void store(float* packed, Stage& stage, const Part& p
             __stcs(run + i, staged(stage)[i]);
         }
     } else {
-        // Number 32 k + lane of the stage belongs to lane (32 k + lane) / FLOATS, which repeats every three k but for a
-        // whole number of lanes.
+        // Number 32 k + lane of the stage belongs to lane (32 k + lane) / FLOATS. The pattern repeats every three k,
+        // shifted by a whole number of lanes.
         unsigned owner[3], within[3];
 #pragma unroll
         for (unsigned k = 0; k < 3; ++k) {
@@ -143,7 +143,7 @@ __device__ __forceinline__ void store(float* packed, Stage& stage, const Part& p
     __syncwarp();
 }
 
-// Four numbers an item, which lie in the stage already; places are those of the last `put`.
+// Writes four components per item, which are already staged; the destinations are those of the last `put`.
 __device__ __forceinline__ void store_quadruples(float4* packed, Stage& stage) {
     __syncwarp();
 #pragma unroll
@@ -157,19 +157,19 @@ __device__ __forceinline__ void store_quadruples(float4* packed, Stage& stage) {
     __syncwarp();
 }
 
-// One number of each of a lane's items.
+// One component of each of a lane's items.
 struct Items {
     float of[SPAN];
 };
 
-// The first number of a lane's first item in a table of `numbers` for each item: [tile][numbers][width] fours, or of
-// quads in mixed tiles [quad][numbers] fours.
+// The first component of a lane's first item in a table with `numbers` components per item: [tile][numbers][width]
+// float4, or [quad][numbers] float4 for quads of mixed tiles.
 __device__ __forceinline__ const float* first_of(const float4* table, const Part& part, unsigned numbers) {
     const unsigned quad = part.kind & TILE_LAST ? part.quad : 0;
     return (const float*)(table + numbers * (size_t)part.rest + quad) + part.within;
 }
 
-// Number `number` of a lane's items.
+// Component `number` of a lane's items.
 __device__ __forceinline__ Items items_of(const float4* table, const Part& part, unsigned numbers, unsigned number) {
     const float* from = first_of(table, part, numbers) + 4 * number * part.stride;
     Items items;

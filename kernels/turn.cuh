@@ -1,10 +1,10 @@
-// Directions under the linear part A of a transform: normals by the inverse transpose, tangents by A. Without SHEAR
-// every A is a rotation or reflection times one scale, which turns normals as it turns tangents.
+// Transformation of directions by the linear part A of a transform: normals by the inverse transpose, tangents by A.
+// Without SHEAR every A is a rotation or reflection times a uniform scale, which transforms normals like tangents.
 //
-// A is handled in f64: cofactors and determinant of a nearly singular A cancel, and the sign of the determinant decides
-// which way a surface faces. Products of two f32 are exact in f64, and every other step is rounded as the twin rounds
-// it (no fused multiply-add), so that what vanishes there vanishes here. Nothing over- or underflows. A of a follower is
-// the product of two, in f64 too.
+// A is computed in f64: cofactors and determinant of a nearly singular A cancel, and the sign of the determinant
+// decides which way a surface faces. Products of two f32 are exact in f64, and every other step is rounded as in the
+// twin (no fused multiply-add), so both get zero for the same inputs. Nothing over- or underflows. A of a follower is a
+// product of two matrices, also in f64.
 #pragma once
 #include "follow.cuh"
 
@@ -46,7 +46,7 @@ __device__ inline Rows linear_of(const Transforms& transforms, unsigned domain) 
     return {linear_row(t.a), linear_row(t.b), linear_row(t.c)};
 }
 
-// +1 or -1; of a zero determinant its sign bit decides, as in the twin.
+// Sign of the determinant, +1 or -1. For a zero determinant its sign bit decides, as in the twin.
 __device__ inline double hand_of(const Rows& m) {
     const double first = __dmul_rn(m.a.x, minor_of(m.b.y, m.b.z, m.c.y, m.c.z));
     const double second = __dmul_rn(m.a.y, minor_of(m.b.x, m.b.z, m.c.x, m.c.z));
@@ -54,7 +54,8 @@ __device__ inline double hand_of(const Rows& m) {
     return copysign(1.0, __dadd_rn(__dsub_rn(first, second), third));
 }
 
-// v over its length, +Z when v is zero. A power of two brings the largest component to [1, 2) first, without rounding.
+// v / |v|, or +Z when v is zero. First scaled by a power of two, without rounding, so that the largest component is in
+// [1, 2).
 __device__ inline float3 unit(const double3& v) {
     const double largest = fmax(fmax(fabs(v.x), fabs(v.y)), fabs(v.z));
     if (!(largest > 0.0)) {
@@ -77,7 +78,8 @@ __device__ inline double3 cross(const double3& v, const double3& w, double hand)
                         hand * minor_of(v.x, v.y, w.x, w.y));
 }
 
-// The inverse transpose is the cofactor matrix over the determinant; only its sign survives normalising.
+// The inverse transpose is the cofactor matrix over the determinant; only the determinant's sign survives
+// normalization.
 __device__ inline float3 turn_normal(const Rows& m, const double3& normal) {
     const double hand = hand_of(m);
     return turn({cross(m.b, m.c, hand), cross(m.c, m.a, hand), cross(m.a, m.b, hand)}, normal);

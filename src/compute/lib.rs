@@ -1,4 +1,5 @@
-//! The deformers x = T (x0 + U q): CUDA, all cores of the CPU, and the plain f64 reference that both are tested against.
+//! Deformers: three implementations of x = T (x0 + U q), the deformation of every vertex of a scene. They run on CUDA,
+//! on all cores of the CPU, and as a plain f64 reference against which the tests compare the other two.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

@@ -1,5 +1,5 @@
-//! How much of the memory's read rate the deformer reaches. Run with
-//! `cargo test --release --lib cpu::bench -- --ignored --nocapture`.
+//! Benchmark: the fraction of the memory's read bandwidth that the deformer reaches. Run with
+//! `cargo test --release -p modalcast-compute cpu::bench -- --ignored --nocapture`.
 
 use std::time::Instant;
 
@@ -7,7 +7,7 @@ use super::*;
 use crate::testing::{Noise, scene};
 use modalcast_model::scene::{Deformation, Storage};
 
-/// The median time of a step, of at least 15 with other coordinates each, in seconds.
+/// The median time of a step in seconds, over 15 steps with different coordinates.
 fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
     let mut noise = Noise(3);
     let mut state = State::rest(scene);
@@ -28,7 +28,7 @@ fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
 #[test]
 #[ignore = "a measurement"]
 fn part_of_the_read_rate() {
-    // The first one stays in the caches: it shows what computing alone takes.
+    // The first size fits the caches: it shows the time of the computation alone.
     for (vertices, rank) in [(1 << 11, 32), (1 << 20, 10), (1 << 20, 32)] {
         for storage in Storage::ALL {
             for compensated in [false, true] {

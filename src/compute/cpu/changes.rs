@@ -1,17 +1,17 @@
-//! Which domains changed since the last step: their q or T differs in some bit.
+//! Finds the domains that changed since the last step: those with any changed bit in q or T.
 //!
-//! The values are compared, whatever the state's list of changes says: a list would miss numbers that were written by
-//! hand, and a state of another history with the same serial number.
+//! The values themselves are compared, because the state's list of changes is not sufficient: it misses values that
+//! were written directly, and states of another history with the same serial number.
 
 use rayon::prelude::*;
 
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{Scene, State};
 
-/// Remembers the values of the last step.
+/// The values of the last step, and the domains that changed since.
 #[derive(Debug, Default)]
 pub(super) struct Changes {
-    /// Values of the last step; none before the first.
+    /// Values of the last step; `None` before the first.
     last: Option<(Vec<f32>, Vec<Transform>)>,
     flags: Vec<bool>,
     domains: Vec<u32>,
@@ -19,7 +19,7 @@ pub(super) struct Changes {
 }
 
 impl Changes {
-    /// Compares a step with the one before and remembers it.
+    /// Compares a step with the previous one and stores its values.
     pub(super) fn follow(&mut self, scene: &Scene, state: &State) {
         let count = scene.domains.len();
         let Some((q, transforms)) = &mut self.last else {
@@ -54,7 +54,7 @@ impl Changes {
     }
 }
 
-/// Zeros of both signs differ: they may give sums of zero different signs.
+/// Compares bits, because zeros of different sign may give sums with zeros of different sign.
 fn bits(numbers: &[f32]) -> &[u8] {
     bytemuck::cast_slice(numbers)
 }

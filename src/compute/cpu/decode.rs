@@ -1,12 +1,12 @@
-//! A chunk of stored planes to columns of f32, `[mode][axis][vertex of the tile]`: the order that f32 tiles have as they
-//! are. The planes of a tile are read from their first byte to their last.
+//! Decodes a chunk of stored planes to columns of f32, `[mode][axis][vertex of the tile]`, which is the stored order of
+//! f32 tiles. The planes of a tile are read sequentially.
 
 use crate::storage::{Plane, TILE_QUADS};
 
-/// Room for the four modes that are added at once.
+/// Capacity for the four modes that are added together.
 pub(super) type Columns = [f32; 4 * 12 * TILE_QUADS];
 
-/// Two modes of f16, without their factors. Exact.
+/// Decodes two modes of f16, without their factors. Exact.
 #[inline(always)]
 pub(super) fn halves(planes: &[Plane], columns: &mut [f32]) {
     let mut room = [0_u64; 6 * TILE_QUADS];
@@ -16,11 +16,11 @@ pub(super) fn halves(planes: &[Plane], columns: &mut [f32]) {
     }
 }
 
-/// A finite f16, with no branch and no subnormal operand, which would be slow.
+/// Decodes a finite f16 without a branch and without subnormal operands, which would be slow.
 #[inline(always)]
 fn half(bits: u16) -> f32 {
-    // The exponent moves from a bias of 15 to one of 127. A subnormal m 2^-24 becomes x = 2^-15 + m 2^-25, which
-    // 2 x - 2^-14 sets right; of all others that is not below x.
+    // Change the exponent's bias from 15 to 127. A subnormal m 2^-24 becomes x = 2^-15 + m 2^-25, which 2 x - 2^-14
+    // corrects; for all other numbers that expression is at least x.
     let bits = u32::from(bits);
     let x = f32::from_bits((bits << 13 & 0x0fff_e000) + (112 << 23));
     let fixed = x.mul_add(2.0, -SMALLEST_NORMAL_HALF);
@@ -31,7 +31,7 @@ fn half(bits: u16) -> f32 {
 /// 2^-14.
 pub(super) const SMALLEST_NORMAL_HALF: f32 = 1.0 / (1 << 14) as f32;
 
-/// Two modes of bf16, without their factors. Exact.
+/// Decodes two modes of bf16, without their factors. Exact.
 #[inline(always)]
 pub(super) fn brains(planes: &[Plane], columns: &mut [f32]) {
     let mut room = [0_u64; 6 * TILE_QUADS];
@@ -41,7 +41,7 @@ pub(super) fn brains(planes: &[Plane], columns: &mut [f32]) {
     }
 }
 
-/// Four modes of codes, -127 to 127, without their scales.
+/// Decodes four modes of codes, -127 to 127, without their scales.
 #[inline(always)]
 pub(super) fn codes(planes: &[Plane], columns: &mut [f32]) {
     let quads = planes.len() / 3;
@@ -61,7 +61,8 @@ pub(super) fn codes(planes: &[Plane], columns: &mut [f32]) {
     }
 }
 
-/// Each plane of a chunk holds two groups of four halves per quad: the first ones of all quads, then the second ones.
+/// Separates the two groups of four halves that each plane of a chunk has per quad: the first groups of all quads, then
+/// the second.
 #[inline(always)]
 fn pairs_apart<'a>(planes: &[Plane], room: &'a mut [u64; 6 * TILE_QUADS]) -> &'a [u64] {
     let quads = planes.len() / 3;

@@ -11,10 +11,10 @@ use crate::storage::{QUAD, TILE_QUADS, Tiles};
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{Scene, State};
 
-/// The most vertices of a tile.
+/// Maximum number of vertices of a tile.
 pub(super) const TILE: usize = QUAD * TILE_QUADS;
 
-/// All that a step reads.
+/// The inputs of a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Inputs<'a> {
     pub(super) scene: &'a Scene,
@@ -22,15 +22,15 @@ pub(super) struct Inputs<'a> {
     /// Per shape.
     pub(super) shapes: &'a [Tiles],
     pub(super) kept: Option<&'a Kept>,
-    /// 0, 1, 2 and so on: the chunks of a domain that leaves nothing out.
+    /// 0, 1, 2 and so on: the chunks of a domain without truncated modes.
     pub(super) every_chunk: &'a [u16],
 }
 
-/// Three f32 per vertex, the extent of each tile, and three more f32 per vertex where displacements are kept.
+/// Three f32 per vertex; the extent of each tile; and three more f32 per vertex if the scene keeps displacements.
 pub(super) type Outputs<'a> = (Packed<'a>, PerTile<'a, Extent>, Option<Packed<'a>>);
 
-/// Writes positions, extents and displacements of these tiles. A tile's extent is not finite when one of its positions
-/// or of the displacements that are kept is not.
+/// Writes positions, extents and displacements of these tiles. A tile's extent is not finite if one of its positions,
+/// or one of the displacements that the scene keeps, is not.
 pub(super) fn deform(inputs: Inputs, tiles: &[Tile], outputs: Outputs) {
     if inputs.scene.needs.compensated {
         tile::spread(tiles, outputs, &|tiles, outputs| vectorized(Run::<true> { inputs, tiles, outputs }));
@@ -39,7 +39,7 @@ pub(super) fn deform(inputs: Inputs, tiles: &[Tile], outputs: Outputs) {
     }
 }
 
-/// Neighbouring tiles on one core.
+/// A run of neighboring tiles on one core.
 struct Run<'a, const COMPENSATED: bool> {
     inputs: Inputs<'a>,
     tiles: &'a [Tile],
@@ -84,8 +84,8 @@ fn deform_tile<const COMPENSATED: bool>(inputs: &Inputs, tile: &Tile, scratch: &
     extent.spoilt_by(spoil)
 }
 
-/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices. What is not finite is summed once
-/// more in f64, so that only what f32 cannot hold is lost; then the answer is not finite.
+/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices. Displacements that are not finite
+/// are summed again in f64, so that only values that f32 cannot hold are lost. Returns 0, or NaN if any is lost.
 #[inline(always)]
 fn keep(inputs: &Inputs, tile: &Tile, sums: &Coordinates, out: &mut [f32]) -> f32 {
     let width = tile.count().next_multiple_of(QUAD);
@@ -145,7 +145,7 @@ fn add_rest(rest: &[[f32; 12]], sums: &mut Coordinates) {
     }
 }
 
-/// World positions of a tile from `[axis][vertex]`, `width` vertices an axis, which are overwritten.
+/// World positions of a tile from `[axis][vertex]`, `width` vertices per axis. Overwrites `bent`.
 #[inline(always)]
 fn put(transform: &Transform, bent: &mut Coordinates, width: usize, out: &mut [f32]) -> Extent {
     let t = transform.0;
@@ -165,7 +165,7 @@ fn put(transform: &Transform, bent: &mut Coordinates, width: usize, out: &mut [f
     Extent::of([&x[..count], &y[..count], &z[..count]])
 }
 
-/// Vertices that are not finite, once more in f64: a finite sum may have had terms or partial sums that are none in f32.
+/// Recomputes in f64 the vertices that are not finite: an f32 intermediate of a finite result may have overflowed.
 #[cold]
 #[inline(never)]
 fn rescue(inputs: &Inputs, tile: &Tile, out: &mut [f32]) -> Extent {

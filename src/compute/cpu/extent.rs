@@ -1,11 +1,11 @@
-//! The bounds of one tile, kept so that what did not change still counts.
+//! The bounds of one tile, cached so that tiles that did not change still count in the bounds of the scene.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use modalcast_model::scene::{Bounds, LightBounds};
 
-/// Bounds of f32 positions: all NaN as soon as one of them is not finite, `min > max` for none.
+/// Bounds of f32 positions: all NaN if a position is not finite, `min > max` if there are none.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Extent {
     min: [f32; 3],
@@ -30,7 +30,7 @@ impl Extent {
                     let number = eight[lane];
                     min[lane] = if number < min[lane] { number } else { min[lane] };
                     max[lane] = if number > max[lane] { number } else { max[lane] };
-                    // Infinity times zero is NaN, and NaN stays: one number tells whether all were finite.
+                    // Infinity times zero is NaN, and NaN propagates: the sum shows whether all numbers are finite.
                     sums[lane] += number * 0.0;
                 }
             }
@@ -44,10 +44,10 @@ impl Extent {
         extent.poisoned(poison)
     }
 
-    /// The smallest extent that holds both.
+    /// The smallest extent that contains both.
     #[inline(always)]
     pub(super) fn union(self, other: Self) -> Self {
-        // Of an empty extent nothing is finite, but nothing is NaN either.
+        // An empty extent is infinite but not NaN, and must not make the union NaN.
         let poison = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
         Self {
             min: std::array::from_fn(|axis| self.min[axis].min(other.min[axis])),
@@ -56,7 +56,7 @@ impl Extent {
         .poisoned(poison)
     }
 
-    /// Whether all positions were finite.
+    /// Whether all positions are finite, and there is at least one.
     #[inline(always)]
     pub(super) const fn is_finite(&self) -> bool {
         self.min[0].is_finite()
@@ -67,7 +67,7 @@ impl Extent {
         extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
     }
 
-    /// What all tiles take up along these axes of light space, from the corners of their boxes.
+    /// Bounds of all tiles along these axes of light space, from the corners of their boxes.
     pub(super) fn along(extents: &[Self], axes: &[Vector3<f64>; 3]) -> LightBounds {
         let one = |extent: &Self| LightBounds::of_box(axes, &extent.to_bounds());
         extents.par_iter().with_min_len(4096).map(one).reduce(|| LightBounds::EMPTY, LightBounds::union)
@@ -82,13 +82,13 @@ impl Extent {
         Bounds { min: self.min.map(f64::from), max: self.max.map(f64::from) }
     }
 
-    /// The same, not finite when `number` is not.
+    /// The extent, made NaN if `number` is not finite.
     #[inline(always)]
     pub(super) fn spoilt_by(self, number: f32) -> Self {
         self.poisoned(number * 0.0)
     }
 
-    /// Unchanged by 0, all NaN by NaN.
+    /// The extent, unchanged if `poison` is 0, all NaN if it is NaN.
     #[inline(always)]
     fn poisoned(self, poison: f32) -> Self {
         Self { min: self.min.map(|number| number + poison), max: self.max.map(|number| number + poison) }

@@ -1,5 +1,5 @@
-//! Sums of packed entries that never leave the vector registers: two quads at a time, decoded and added at once. Bit by
-//! bit what [`super::sum`] computes by way of columns, in a fraction of the time; plain sums on x86 alone.
+//! Fused decoding and summation of packed entries in vector registers, two quads at a time. The results are
+//! bit-identical to those of [`super::sum`] by decoded columns, and much faster. Only for uncompensated sums on x86.
 
 use std::arch::x86_64::{__m256, __m256i};
 
@@ -9,8 +9,8 @@ use pulp::x86::V3;
 use super::decode::SMALLEST_NORMAL_HALF;
 use crate::storage::{Plane, QUAD};
 
-/// A storage type whose entries of two neighbouring quads, the 32 bytes of two planes, are `GROUPS` vectors of one mode
-/// and axis each.
+/// Decoder of a storage type. The entries of two neighboring quads, the 32 bytes of two planes, decode to `GROUPS`
+/// vectors of one mode and axis each.
 pub(super) trait Decode<const GROUPS: usize> {
     fn decode(simd: V3, planes: __m256i) -> [__m256; GROUPS];
 }
@@ -22,7 +22,7 @@ pub(super) struct Brains;
 /// int8.
 pub(super) struct Codes;
 
-// No closure calls an intrinsic here: it would be compiled without the features that intrinsics need to be inlined.
+// No closure may call an intrinsic here: it would be compiled without the features that intrinsics need to be inlined.
 
 impl Decode<2> for Halves {
     #[inline(always)]
@@ -30,7 +30,7 @@ impl Decode<2> for Halves {
         let mut groups = [simd.avx._mm256_set1_ps(0.0); 2];
         for (group, target) in groups.iter_mut().enumerate() {
             let bits = simd.avx2._mm256_shuffle_epi8(planes, cast(UPPER_HALVES[group]));
-            // As `decode::half` does it.
+            // The algorithm of `decode::half`.
             let kept = simd.avx._mm256_set1_epi32(0x0fff_e000);
             let magnitude = simd.avx2._mm256_and_si256(simd.avx2._mm256_srli_epi32::<3>(bits), kept);
             let x = cast(simd.avx2._mm256_add_epi32(magnitude, simd.avx._mm256_set1_epi32(112 << 23)));
@@ -56,7 +56,7 @@ impl Decode<2> for Brains {
 impl Decode<4> for Codes {
     #[inline(always)]
     fn decode(simd: V3, planes: __m256i) -> [__m256; 4] {
-        // A byte below the exponent of 2^23 is 2^23 + byte: subtracting takes the bias of 128 off as well, exactly.
+        // A byte in the mantissa of 2^23 is 2^23 + byte: the subtraction also removes the bias of 128, exactly.
         let above = simd.avx._mm256_set1_epi32(0x4b00_0000);
         let zero = simd.avx._mm256_set1_ps(8_388_608.0 + 128.0);
         let mut groups = [zero; 4];
@@ -68,10 +68,11 @@ impl Decode<4> for Codes {
     }
 }
 
-/// Puts each half of a group into the upper bits of a word: places among the 16 bytes of a quad, 0x80 for zero.
+/// Shuffle masks that move each half of a group to the upper bits of a word: indices into the 16 bytes of a quad, 0x80
+/// for zero.
 const UPPER_HALVES: [[u8; 32]; 2] = [places(2, 0), places(2, 1)];
 
-/// Puts each byte of a group into the lower bits of a word.
+/// Shuffle masks that move each byte of a group to the lower bits of a word.
 const BYTES: [[u8; 32]; 4] = [places(1, 0), places(1, 1), places(1, 2), places(1, 3)];
 
 const fn places(size: u8, group: u8) -> [u8; 32] {
@@ -80,7 +81,7 @@ const fn places(size: u8, group: u8) -> [u8; 32] {
     while vertex < 4 {
         let mut byte = 0;
         while byte < size {
-            // Halves go to bytes 2 and 3 of a word, a code to byte 0.
+            // Halves go to bytes 2 and 3 of a word, codes to byte 0.
             let target = (4 * vertex + if size == 2 { 2 } else { 0 } + byte) as usize;
             places[target] = size * (4 * group + vertex) + byte;
             places[target + 16] = places[target];
@@ -91,8 +92,8 @@ const fn places(size: u8, group: u8) -> [u8; 32] {
     places
 }
 
-/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk is three planes per quad and `MODES` amounts; a group of
-/// a plane holds four vertices.
+/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk is three planes per quad and `MODES` amounts; a group
+/// of a plane has four vertices.
 #[inline(always)]
 pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
@@ -107,7 +108,7 @@ pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, co
         add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [2 * pair, 2 * pair + 1], [x, y, z]);
     }
     if quads % 2 == 1 {
-        // The last quad twice; its double is dropped.
+        // Process the last quad twice and drop the second result.
         let mut room = [[0.0; 2 * QUAD]; 3];
         let [a, b, c] = &mut room;
         a[..QUAD].copy_from_slice(x_rest);
@@ -131,7 +132,7 @@ fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CH
     let mut axes: [__m256; 3] = [cast(*x), cast(*y), cast(*z)];
     for (planes, amounts) in chunks {
         let count = planes.len() / 3;
-        // Group by group is axis by axis, mode by mode: the order of the sum.
+        // Groups are ordered by mode, then axis, so this is the order of the sum.
         for plane in 0..3 {
             let two = [planes[plane * count + quads[0]], planes[plane * count + quads[1]]];
             let groups = D::decode(simd, cast(two));

@@ -1,4 +1,4 @@
-//! The modes of each domain that a step sums, where a scene has a budget for leaving some out.
+//! The modes that each domain sums in a step, in scenes with a truncation budget.
 
 use rayon::prelude::*;
 
@@ -7,10 +7,10 @@ use super::sum::Summed;
 use crate::storage::{Amounts, Truncation, bound, modes_per_chunk, reaches};
 use modalcast_model::scene::{Scene, State};
 
-/// The lists of all domains.
+/// The kept modes of all domains.
 #[derive(Debug)]
 pub(super) struct Kept {
-    /// Scene units.
+    /// Error budget, scene units.
     budget: f64,
     /// Per shape.
     reaches: Vec<Vec<f64>>,
@@ -25,7 +25,7 @@ struct List {
 }
 
 impl Kept {
-    /// Nothing left out yet. `None` for a scene without a budget.
+    /// Starts without truncated modes. `None` for a scene without a budget.
     pub(super) fn new(scene: &Scene) -> Option<Self> {
         let metres = scene.deformation.truncation.filter(|_| scene.needs.truncation)?;
         let list = |domain| {
@@ -39,7 +39,7 @@ impl Kept {
         })
     }
 
-    /// Decides for the domains that changed.
+    /// Updates the domains that changed.
     pub(super) fn follow(&mut self, scene: &Scene, state: &State, changes: &Changes) {
         let per_chunk = modes_per_chunk(scene.deformation.storage) as u16;
         let Self { budget, reaches, domains } = self;
@@ -62,13 +62,13 @@ impl Kept {
         domains.par_iter_mut().enumerate().with_min_len(64).for_each(decide);
     }
 
-    /// What a domain sums.
+    /// The modes that a domain sums.
     pub(super) fn of(&self, domain: usize) -> Summed<'_> {
         let list = &self.domains[domain];
         Summed { q: &list.q, chunks: &list.chunks }
     }
 
-    /// What a domain leaves out.
+    /// The truncation of a domain.
     pub(super) fn truncation(&self, domain: usize) -> &Truncation {
         &self.domains[domain].truncation
     }

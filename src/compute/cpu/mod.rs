@@ -1,9 +1,10 @@
-//! The f32 deformer of machines without a GPU: rayon over a flat list of tiles of all domains, SIMD inside a tile.
+//! The CPU deformer in f32, for machines without a GPU: rayon over a flat list of tiles of all domains, SIMD inside a
+//! tile.
 //!
-//! A vertex sums its modes in their order by fused multiply-adds, whatever tile it falls in and whichever domains
-//! changed, so equal inputs give bit-identical outputs on any number of cores. Domains whose q and T are those of the
-//! step before keep their vertices and normals. Where modes are left out within a budget, which ones depends on earlier
-//! steps too.
+//! Each vertex sums its modes in order by fused multiply-adds, independent of its tile and of the domains that changed,
+//! so equal inputs give bit-identical outputs on any number of cores. Domains whose q and T equal those of the previous
+//! step keep their vertices and normals. With a truncation budget, the result also depends on earlier steps, because
+//! the choice of truncated modes has hysteresis.
 
 #[cfg(test)]
 mod bench;
@@ -38,10 +39,10 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Bounds, Scene, State};
 use tile::{Packed, PerTile, Work};
 
-/// The most corners of a tile.
+/// Maximum number of corners of a tile.
 const CORNER_TILE: usize = 256;
 
-/// The deformer `cpu` of one scene.
+/// The deformer of the `cpu` backend, of one scene.
 #[derive(Debug)]
 pub struct CpuDeformer {
     scene: Arc<Scene>,
@@ -58,7 +59,7 @@ pub struct CpuDeformer {
 }
 
 impl CpuDeformer {
-    /// Stores U as the scene says and prepares its work lists and room for its vertices.
+    /// Encodes U in the scene's storage type and allocates work lists and outputs.
     pub fn new(scene: &Arc<Scene>) -> Self {
         let layout = &scene.layout;
         let tangents = if scene.needs.normal_maps { 4 * layout.corners } else { 0 };
@@ -85,12 +86,12 @@ impl CpuDeformer {
         }
     }
 
-    /// Bytes of U and x0 as they are stored: what a step of all domains without instances reads.
+    /// Bytes of stored U and x0: what a step of all domains reads if no two domains share a shape.
     pub fn stored_bytes(&self) -> usize {
         self.shapes.iter().map(|tiles| tiles.bytes().len() + size_of_val(tiles.rest())).sum()
     }
 
-    /// What a domain left out in the last step; `None` for a scene without a budget for it.
+    /// The truncated modes of a domain in the last step; `None` for a scene without a truncation budget.
     pub fn truncation(&self, domain: usize) -> Option<&Truncation> {
         self.kept.as_ref().map(|kept| kept.truncation(domain))
     }
@@ -109,7 +110,8 @@ impl CpuDeformer {
         deform::deform(inputs, self.vertex_work.of(&self.changes), outputs);
     }
 
-    /// Boxes of the domains that changed, from those of their tiles; none where the scene keeps none.
+    /// Updates the boxes of the domains that changed, from those of their tiles; does nothing if the scene keeps no
+    /// boxes.
     fn keep_boxes(&mut self) {
         let (changes, work, extents) = (&self.changes, &self.vertex_work, &self.extents);
         self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, all)| {
@@ -133,7 +135,7 @@ impl Deformer for CpuDeformer {
         }
         self.deform_positions(state);
         self.keep_boxes();
-        // Either kind of normals depends on the domain's own positions and T alone.
+        // Both kinds of normals depend only on the domain's own positions and T.
         let corners = self.corner_work.of(&self.changes);
         if self.scene.needs.exact_normals {
             normals::normals(&self.scene, state, corners, &mut self.surface);

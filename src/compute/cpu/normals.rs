@@ -1,8 +1,8 @@
 //! Normals and tangents that follow the deformed triangles. Twin: `reference/normals.rs`, which defines them.
 //!
-//! Each corner gathers its group's ring: nothing is shared between threads, and the order of a sum is that of its ring.
-//! Positions and results are f32. Sums are f64: differences and products of two f32 neither over- nor underflow there,
-//! so that no input needs scaling, and gathering costs more than adding.
+//! Each corner gathers its group's ring: threads share nothing, and a sum has the order of its ring. Positions and
+//! results are f32. Sums are f64: differences and products of two f32 neither over- nor underflow there, so no input
+//! needs scaling, and the gather costs more than the arithmetic.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -18,12 +18,12 @@ const RESOLUTION: f64 = 1.0 / 262_144.0;
 /// As in the twin: squared length of the sum of two opposite unit vectors.
 const OPPOSITE: f64 = 1e-10;
 
-/// Writes three f32 per corner of these tiles into the normals and, where the scene has normal maps, four into the
-/// tangents, from the surface's positions.
+/// Writes the normals of these tiles, three f32 per corner, and the tangents, four f32 per corner, if the scene has
+/// normal maps. Reads the surface's positions.
 pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
     let Surface { positions, normals, tangents, .. } = surface;
     let positions = positions.as_slice();
-    // A tile of a scene without tangents has 0 numbers of them.
+    // In a scene without tangents, a tile has zero numbers of them.
     let tangents = Packed::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);
     tile::spread(tiles, (Packed::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
         for tile in tiles {
@@ -37,7 +37,7 @@ pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mu
     });
 }
 
-/// Carries the rigid normals and tangents of a domain's corners from `first` on to where its surface turned.
+/// Rotates the rigid normals and tangents of a domain's corners, from `first` on, with the surface.
 fn follow(bent: &Bent, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
     let Some(smoothing) = bent.smoothing else { return };
     let mut tangents = tangents.chunks_exact_mut(4);
@@ -53,12 +53,12 @@ fn follow(bent: &Bent, first: usize, normals: &mut [f32], tangents: &mut [f32]) 
     }
 }
 
-/// What a domain's surface is told by.
+/// The deformed surface of a domain.
 struct Bent<'a> {
     smoothing: Option<&'a Smoothing>,
     /// Three f32 per vertex of the domain.
     positions: &'a [f32],
-    /// Turns area vectors from rest to world.
+    /// Transforms area vectors from rest to world.
     area_turn: Matrix3<f64>,
 }
 
@@ -72,17 +72,17 @@ impl<'a> Bent<'a> {
         }
     }
 
-    /// How the surface around a group turned; nothing where that cannot be told.
+    /// The rotation of the surface around a group; `None` where it cannot be determined.
     fn turn(&self, smoothing: &Smoothing, group: usize) -> Option<Turn> {
         let (sum, rounding) = self.area(smoothing.ring(group));
         let resolved = sum.norm() > RESOLUTION * rounding;
         let from = self.area_turn * Vector3::from(smoothing.normals()[group]).cast();
-        // Scaled, because the square of cofactors of tiny entries may underflow.
+        // Scaled first, because the square of cofactors of tiny entries may underflow.
         let largest = from.amax();
         (resolved && largest > 0.0).then(|| Turn { from: (from / largest).normalize(), to: sum.normalize() })
     }
 
-    /// The area vectors around a ring, and what the twin calls B.
+    /// The sum of the area vectors around a ring, and its rounding scale B as the twin defines it.
     fn area(&self, ring: &[u32]) -> (Vector3<f64>, f64) {
         let at = |entry: u32| vector(&self.positions[3 * (entry & !RING_START) as usize..]);
         let own = at(ring[0]);
@@ -103,14 +103,14 @@ impl<'a> Bent<'a> {
     }
 }
 
-/// The unit directions between which a surface turned.
+/// The rotation of a surface, as its unit directions before and after.
 struct Turn {
     from: Vector3<f64>,
     to: Vector3<f64>,
 }
 
 impl Turn {
-    /// The least rotation from one to the other.
+    /// Applies the smallest rotation that takes `from` to `to`.
     fn carry(&self, rigid: Vector3<f64>) -> Vector3<f64> {
         let along = self.from.dot(&rigid);
         let across = rigid - self.from * along;
@@ -121,7 +121,7 @@ impl Turn {
     }
 }
 
-/// A tangent without its part along the normal; where nothing else is left, any unit vector across.
+/// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
 fn beside(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
     let flat = tangent - normal * normal.dot(&tangent);
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };

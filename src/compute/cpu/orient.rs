@@ -1,4 +1,4 @@
-//! Normals by the inverse transpose of A, tangents by A, in f32. Twin: `reference/orient.rs`.
+//! Rigid normals by the inverse transpose of A, tangents by A, in f32. Twin: `reference/orient.rs`.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -6,7 +6,7 @@ use super::tile::{self, Packed, Tile};
 use modalcast_model::deform::Surface;
 use modalcast_model::scene::{Scene, State};
 
-/// Writes three f32 per corner into the normals and, where the scene has normal maps, four into the tangents.
+/// Writes the normals, three f32 per corner, and the tangents, four f32 per corner, if the scene has normal maps.
 pub(super) fn orient(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
     tile::spread(tiles, Packed::new(3, &mut surface.normals), &|tiles, mut out| {
         tiles.iter().for_each(|tile| orient_normals(scene, state, tile, out.of(tile)));
@@ -21,7 +21,7 @@ pub(super) fn orient(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut
 /// World normals of a tile.
 pub(super) fn orient_normals(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
     let linear = state.composed(scene, tile.domain()).linear();
-    // Without shear A itself turns normals, up to a mirror's sign, which the cofactors carry.
+    // Without shear A itself transforms normals, up to the sign of a reflection, which the cofactors include.
     let turn = if scene.needs.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
     let turn = scaled(turn);
     let normals = &scene.shape_of(tile.domain()).mesh.corners().normals[tile.first()..][..tile.count()];
@@ -30,7 +30,7 @@ pub(super) fn orient_normals(scene: &Scene, state: &State, tile: &Tile, out: &mu
     }
 }
 
-/// World tangents of a tile; left as they are where the shape has none.
+/// World tangents of a tile; not written if the shape has none.
 pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: &Tile, out: &mut [f32]) {
     let tangents = scene.shape_of(tile.domain()).tangents();
     if tangents.is_empty() {
@@ -45,7 +45,7 @@ pub(super) fn orient_tangents(scene: &Scene, state: &State, tile: &Tile, out: &m
     }
 }
 
-/// Scaled to entries of at most 1, so that squares of very large or small transforms stay inside f32.
+/// Scales entries to at most 1, so that squares of very large or small transforms do not over- or underflow f32.
 fn scaled(matrix: Matrix3<f64>) -> Matrix3<f32> {
     let largest = matrix.abs().max();
     if largest > 0.0 { (matrix / largest).cast() } else { matrix.cast() }
@@ -59,7 +59,7 @@ pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::from_fn(adjugate)
 }
 
-/// A vector over its length, +Z when it has none.
+/// A vector divided by its length; +Z if its length is about zero.
 pub(super) fn unit(vector: Vector3<f32>) -> Vector3<f32> {
     let square = vector.norm_squared();
     if square > 1e-30 { vector / square.sqrt() } else { Vector3::z() }

@@ -1,4 +1,4 @@
-//! How fast all cores together read memory: the roof of a deformer that reads every entry of U once.
+//! Read bandwidth of the memory by all cores: the upper limit of a deformer that reads every entry of U once.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -8,10 +8,10 @@ use rayon::prelude::*;
 
 use super::simd::vectorized;
 
-/// The best of `runs` reads of `bytes` bytes by all of rayon's threads, in GB/s (10^9 bytes). A buffer that is smaller
-/// than the last-level cache measures the cache; compare it with as many bytes of U.
+/// The best of `runs` reads of `bytes` bytes by all rayon threads, in GB/s (10^9 bytes). A buffer that fits the
+/// last-level cache measures the cache, so compare with a U of the same size.
 pub fn read_rate(bytes: usize, runs: usize) -> f64 {
-    // Written once, because untouched pages are all one page of zeros.
+    // Written once, because untouched pages all map to one page of zeros.
     let mut words = vec![0_u64; bytes.div_ceil(8).max(1)];
     words.par_chunks_mut(PART).enumerate().for_each(|(part, words)| words.fill(part as u64));
     let bytes = 8.0 * words.len() as f64;
@@ -25,7 +25,7 @@ pub fn read_rate(bytes: usize, runs: usize) -> f64 {
 
 /// Words that one task reads: 1 MiB.
 const PART: usize = 1 << 17;
-/// Independent sums, so that reading does not wait for adding.
+/// Independent sums, so that loads do not wait for additions.
 const LANES: usize = 32;
 
 struct Read<'a>(&'a [u64]);

@@ -1,10 +1,10 @@
-//! Run-time dispatch: the same Rust, compiled once more for what most x86 machines have.
+//! Run-time dispatch: compiles the same Rust code a second time for AVX2 with FMA, which most x86 machines have.
 
 use pulp::NullaryFnOnce;
 
-/// Runs work on 256-bit vectors with fused multiply-add where the machine has them. Results do not depend on that:
-/// `mul_add` rounds once everywhere. What the work calls must be `#[inline(always)]`, or it stays compiled for any
-/// machine.
+/// Runs work on 256-bit vectors with fused multiply-add if the machine supports them. The results do not depend on it:
+/// `mul_add` rounds once on every machine. Functions that the work calls must be `#[inline(always)]`; otherwise they
+/// remain compiled for the baseline target.
 #[inline(always)]
 pub(super) fn vectorized<W: NullaryFnOnce>(work: W) -> W::Output {
     #[cfg(target_arch = "x86_64")]

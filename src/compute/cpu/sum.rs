@@ -1,4 +1,4 @@
-//! u = U q of one tile: a chain of fused multiply-adds per coordinate of a vertex, over the modes in ascending order.
+//! u = U q of one tile: per vertex coordinate, a chain of fused multiply-adds over the modes in ascending order.
 
 use super::decode::{self, Columns};
 #[cfg(target_arch = "x86_64")]
@@ -10,11 +10,11 @@ use modalcast_model::scene::Storage;
 /// Coordinates of a tile's vertices, `[axis][vertex]`.
 pub(super) type Coordinates = [f32; 12 * TILE_QUADS];
 
-/// What sums of a tile need besides U: it stays in the first-level cache.
+/// Working memory of a tile's sums, small enough for the L1 cache.
 #[derive(Debug)]
 pub(super) struct Scratch {
     pub(super) sums: Coordinates,
-    /// What the sums lost by rounding; used by compensated sums alone.
+    /// Accumulated rounding errors; only for compensated sums.
     lost: Coordinates,
     columns: Columns,
     amounts: [f32; MAX_RANK],
@@ -27,16 +27,16 @@ impl Scratch {
     }
 }
 
-/// The modes of a domain that are summed.
+/// The modes of a domain to sum.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Summed<'a> {
-    /// Coordinates, zero where a mode is left out.
+    /// Coordinates, zero for truncated modes.
     pub(super) q: &'a [f32],
-    /// Chunks with a mode that is not left out, ascending.
+    /// Chunks with at least one kept mode, ascending.
     pub(super) chunks: &'a [u16],
 }
 
-/// Writes u into the sums. `COMPENSATED` carries the rounding errors along (Ogita, Rump, Oishi, Accurate Sum and Dot
+/// Writes u to the sums. `COMPENSATED` also accumulates the rounding errors (Ogita, Rump, Oishi, Accurate Sum and Dot
 /// Product, 2005, algorithm Dot2 with a fused multiply-add): as if summed in twice the precision, then rounded.
 #[inline(always)]
 pub(super) fn sum<const COMPENSATED: bool>(tiles: &Tiles, tile: &Tile, summed: Summed, scratch: &mut Scratch) {
@@ -87,7 +87,7 @@ fn sum_fused(simd: pulp::x86::V3, tiles: &Tiles, tile: &Tile, summed: Summed, sc
     }
 }
 
-/// q times the factors or scales that stored entries are short of, rounded once.
+/// Multiplies q by the factors or scales of the stored entries, rounded once.
 #[inline(always)]
 fn weigh(tiles: &Tiles, tile: &Tile, q: &[f32], amounts: &mut [f32; MAX_RANK]) {
     let rank = q.len();
@@ -98,11 +98,11 @@ fn weigh(tiles: &Tiles, tile: &Tile, q: &[f32], amounts: &mut [f32; MAX_RANK]) {
     };
     amounts[..rank].copy_from_slice(q);
     amounts[..rank].iter_mut().zip(factors).for_each(|(amount, factor)| *amount *= factor);
-    // Modes that fill up the last chunk.
+    // Padding modes of the last chunk.
     amounts[rank..MAX_RANK.min(rank + 3)].fill(0.0);
 }
 
-/// A tile's chunks and what they are multiplied by.
+/// A tile's chunks and their amounts.
 #[derive(Clone, Copy)]
 struct Parts<'a> {
     planes: &'a [Plane],
@@ -158,7 +158,7 @@ struct Sums<'a, const COMPENSATED: bool> {
 }
 
 impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
-    // Four modes at a time keep the sums in registers four times as long; the order of the sum stays that of the modes.
+    // Four modes at a time quarter the loads and stores of the sums; the modes are still added in order.
     #[inline(always)]
     fn add_floats(&mut self, parts: Parts) {
         let column = |chunk: u16| bytemuck::cast_slice(parts.chunk(chunk));
@@ -223,7 +223,7 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
     }
 }
 
-/// The next sum, and all that was lost so far: TwoProduct by fused multiply-add, TwoSum of Knuth.
+/// The next sum, and the accumulated rounding error: TwoProduct by fused multiply-add, TwoSum of Knuth.
 #[inline(always)]
 fn add_exactly((sum, lost): (f32, f32), entry: f32, amount: f32) -> (f32, f32) {
     let product = entry * amount;
@@ -234,7 +234,7 @@ fn add_exactly((sum, lost): (f32, f32), entry: f32, amount: f32) -> (f32, f32) {
     (next, lost + (product_lost + sum_lost))
 }
 
-/// The first N columns of decoded ones.
+/// The first N decoded columns.
 #[inline(always)]
 fn split<const N: usize>(columns: &Columns, length: usize) -> [&[f32]; N] {
     std::array::from_fn(|mode| &columns[mode * length..][..length])
@@ -246,7 +246,7 @@ mod tests {
     use crate::testing::{Noise, with_columns};
     use modalcast_model::domain::Shape;
 
-    /// The chains of one tile of f32.
+    /// The expected sums of one tile of f32.
     fn plain(shape: &Shape, tile: &Tile, q: &[f32]) -> Vec<f32> {
         let chain = |vertex: usize, axis: usize| {
             (0..q.len()).fold(0.0_f32, |sum, mode| shape.modes.at(vertex, axis, mode).mul_add(q[mode], sum))
@@ -259,7 +259,7 @@ mod tests {
     fn vectors_columns_and_plain_chains_agree_bit_by_bit_for_whole_and_chosen_chunks() {
         let mut noise = Noise(1);
         for (vertices, rank) in [(128, 32), (4, 1), (12, 5), (128, 7), (140, 33), (52, 512)] {
-            // Every fifth entry is so small that f16 holds it as a subnormal.
+            // Every fifth entry is subnormal in f16.
             let entry = |at: usize, value: f32| if at.is_multiple_of(5) { value * 1e-8 } else { value };
             let columns = (0..3 * vertices * rank).map(|at| entry(at, noise.next())).collect();
             let shape = with_columns(vertices, rank, columns, &mut noise);

@@ -1,17 +1,17 @@
-//! Cuts the packed vertices or corners of a scene into tiles, so that one huge domain and many small ones share cores
-//! alike, and hands each tile its part of the output.
+//! Cuts the packed vertices or corners of a scene into tiles, and gives each tile its part of the outputs. The tiles
+//! balance the load between cores for one huge domain as well as for many small ones.
 
 use super::changes::Changes;
 
-/// `count` items of one domain from its item `first`.
+/// `count` consecutive items of one domain, from item `first` on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Tile {
     pub(super) domain: u32,
     first: u32,
     count: u32,
-    /// The place of the first item among the packed ones of all domains.
+    /// Index of the first item among the packed items of all domains.
     packed: u32,
-    /// The place of the tile among all tiles.
+    /// Index of the tile among all tiles.
     index: u32,
 }
 
@@ -34,13 +34,13 @@ impl Tile {
 #[derive(Debug)]
 pub(super) struct Work {
     all: Vec<Tile>,
-    /// The first tile of each domain, and the count of all.
+    /// The first tile of each domain, followed by the number of tiles.
     first_tiles: Vec<usize>,
     active: Vec<Tile>,
 }
 
 impl Work {
-    /// Tiles of at most `size` items of domains with these counts, in packed order: they cover every item once.
+    /// Tiles of at most `size` items for domains with these item counts, in packed order; they cover every item once.
     pub(super) fn new(counts: impl Iterator<Item = usize>, size: usize) -> Self {
         let (mut all, mut first_tiles, mut packed) = (Vec::new(), vec![0], 0);
         for (domain, count) in counts.enumerate() {
@@ -54,12 +54,12 @@ impl Work {
         Self { active: Vec::with_capacity(all.len()), all, first_tiles }
     }
 
-    /// How many there are.
+    /// Number of all tiles.
     pub(super) const fn len(&self) -> usize {
         self.all.len()
     }
 
-    /// The places of a domain's tiles among all.
+    /// The range of a domain's tiles among all tiles.
     pub(super) fn tiles_of(&self, domain: usize) -> std::ops::Range<usize> {
         self.first_tiles[domain]..self.first_tiles[domain + 1]
     }
@@ -76,9 +76,9 @@ impl Work {
     }
 }
 
-/// An output that can be cut where a tile begins.
+/// An output that can be split at the begin of a tile.
 pub(super) trait Output: Sized + Send {
-    /// What lies before the tile, and the rest.
+    /// The part before the tile, and the rest.
     fn cut(self, at: &Tile) -> (Self, Self);
 }
 
@@ -138,7 +138,7 @@ impl<T: Send> Output for PerTile<'_, T> {
     }
 }
 
-/// An output that a scene may do without.
+/// An output that not every scene has.
 impl<O: Output> Output for Option<O> {
     fn cut(self, at: &Tile) -> (Self, Self) {
         self.map(|output| output.cut(at)).map_or((None, None), |(left, right)| (Some(left), Some(right)))
@@ -159,9 +159,9 @@ impl<A: Output, B: Output> Output for (A, B) {
     }
 }
 
-/// Runs `op` on all cores, on runs of neighbouring tiles with their outputs.
+/// Runs `op` in parallel on runs of neighboring tiles with their outputs.
 pub(super) fn spread<O: Output>(tiles: &[Tile], output: O, op: &(impl Fn(&[Tile], O) + Sync)) {
-    // A few runs per core even out their loads; a run of many tiles reads memory in one long stream.
+    // Several runs per core balance the load; a run of many tiles reads memory sequentially.
     let run = (tiles.len() / (16 * rayon::current_num_threads())).clamp(4, 1024);
     halve(tiles, output, run, op);
 }

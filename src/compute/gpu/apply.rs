@@ -1,4 +1,5 @@
-//! Launches `kernels/apply.cu`: new transforms and coordinates of the domains that changed, straight from pinned memory.
+//! Launches `kernels/apply.cu`, which reads new transforms and coordinates of changed domains directly from pinned
+//! memory.
 
 use cudarc::driver::{CudaFunction, LaunchConfig, PinnedHostSlice, PushKernelArg as _, sys};
 
@@ -10,18 +11,18 @@ use super::plan::Kernel;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Scene, State};
 
-/// A list pays while it has at most this part of the domains; else the whole state is copied.
+/// A partial step pays off up to 1 / `MOST` of the domains; beyond that the whole state is copied.
 const MOST: usize = 4;
 
-/// The kernel, and what writes the lists that it reads over the bus.
+/// The kernel, and the writer of the lists that it reads over the bus.
 #[derive(Debug)]
 pub struct Apply {
     function: CudaFunction,
     config: LaunchConfig,
-    /// Entries.
+    /// Maximum number of entries.
     most: usize,
     coordinates: usize,
-    /// Per tile, the list that named it last, and how many lists there were.
+    /// Per tile, the number of the last list that contains it; and the number of lists written.
     named: Vec<u32>,
     lists: u32,
 }
@@ -29,7 +30,7 @@ pub struct Apply {
 /// Pinned memory for the lists of one step: `[changes][transforms][q][tiles]`.
 pub(super) type List = PinnedHostSlice<u32>;
 
-/// How long the lists of a step are.
+/// Lengths of the lists of a step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Lengths {
     pub changed: u32,
@@ -40,20 +41,22 @@ pub struct Lengths {
 const CHANGE: usize = size_of::<Change>() / 4;
 const TRANSFORM: usize = 12;
 
-/// The most domains that a list may be about; 0 where steps are always whole: the scene has too few domains, or leaves
-/// modes out. Which ones depends on q, and goes to the device with the whole state alone.
+/// Maximum number of changed domains in a partial step; 0 where steps are always full: when the scene has too few
+/// domains, or when it truncates modes. The set of truncated modes depends on q and is uploaded only with the whole
+/// state.
 pub(super) const fn most_domains(scene: &Scene) -> usize {
     if scene.needs.truncation { 0 } else { scene.domains.len() / MOST }
 }
 
-/// The most entries that it has then: silent domains have none.
+/// Maximum number of entries of such a list: silent domains have none.
 pub(super) fn most_changes(scene: &Scene) -> usize {
     let silent = (0..scene.domains.len()).filter(|domain| is_silent(scene, *domain)).count();
     most_domains(scene).min(scene.domains.len() - silent)
 }
 
-/// Whether all that a step changes of a domain is known from its mover: it has neither a transform nor coordinates, and
-/// nobody asks for its stamp, as normals that follow the surface and boxes do. Its tiles are computed anew all the same.
+/// Whether a step never has to send a change of this domain. Such a domain follows another domain's transform, has no
+/// coordinates, and nobody reads its stamp, as exact normals and boxes would. Its tiles are computed again all the
+/// same.
 fn is_silent(scene: &Scene, domain: usize) -> bool {
     let needs = scene.needs;
     needs.followers
@@ -75,16 +78,17 @@ impl Apply {
         })
     }
 
-    /// Room for the lists of a step.
+    /// Allocates pinned memory for the lists of a step.
     pub fn list(&self, device: &Device) -> Result<List> {
         let words = (CHANGE + TRANSFORM) * self.most + self.coordinates + self.named.len();
         let flags = sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP;
-        // SAFETY: the kernel reads only what `write` wrote.
+        // SAFETY: the memory is uninitialized; the kernel reads only what `write` wrote.
         unsafe { device.context().alloc_pinned_with_flags(words, flags) }.map_err(during("allocate"))
     }
 
-    /// Writes the lists of a step that changes some domains, into an output that lacks others besides; the caller has
-    /// waited for the last launch with `list`. None when there are too many changes for it, or a whole step is less work.
+    /// Writes the lists of a partial step. `changed`: domains that the step changes. `behind`: further domains that the
+    /// output lacks. The caller has waited for the last launch with `list`. Returns `None` when the lists have no
+    /// capacity for the changes, or when a full step is less work.
     pub fn write(
         &mut self,
         list: &mut List,
@@ -104,12 +108,12 @@ impl Apply {
         let told = changed.iter().filter(|domain| !is_silent(scene, **domain as usize));
         for (index, domain) in told.enumerate() {
             let (at, first) = (*domain as usize, source);
-            // Of a follower it is not read.
+            // The kernel does not read the transform of a follower.
             let transform: [u32; TRANSFORM] = bytemuck::cast(state.transforms[scene.movers.of(at)].0);
             transforms[TRANSFORM * index..][..TRANSFORM].copy_from_slice(&transform);
             let own = state.q_of(scene, at);
             if source + own.len().next_multiple_of(4) > self.coordinates {
-                // Domains that share coordinates may name them more often than there is room.
+                // Domains can share coordinates, so the entries may need more coordinates than the scene has.
                 return Ok(None);
             }
             packing.put_q(at, own, |number| {
@@ -130,7 +134,7 @@ impl Apply {
             self.lists = 0;
         }
         self.lists += 1;
-        // What the output lacks has its values and stamps on the device already.
+        // The values and stamps of the domains in `behind` are already on the device.
         let lacking = changed.iter().chain(behind);
         let stale = list_tiles(packing, lacking, (&mut self.named, self.lists), tiles);
         if stale as usize > packing.listing.whole {
@@ -139,7 +143,8 @@ impl Apply {
         Ok(Some(Lengths { changed: count, stale }))
     }
 
-    /// Starts the kernel; the header among the values says how long the lists are. That of tiles goes to `tiles`.
+    /// Starts the kernel. The header among `values` has the lengths of the lists. The kernel copies the tile list to
+    /// `tiles`.
     pub fn launch(&self, device: &Device, list: &mut List, values: Values, tiles: u64) -> Result<()> {
         let fail = during("apply");
         let list = list.as_mut_ptr().map_err(&fail)? as u64;
@@ -158,14 +163,15 @@ impl Apply {
             list: tiles,
         };
         let mut launch = device.stream().launch_builder(&self.function);
-        // SAFETY: `ApplyArgs` is the kernel's only argument. Pinned memory has one address on host and device (unified
-        // addressing), and the list names domains and coordinates of the scene that the buffers were made for.
+        // SAFETY: `ApplyArgs` is the kernel's only argument. Pinned memory has the same address on host and device
+        // (unified addressing), and the list refers to domains and coordinates of the scene that the buffers were made
+        // for.
         unsafe { launch.arg(&args).launch(self.config) }.map_err(fail)?;
         Ok(())
     }
 }
 
-/// Lists the tiles of these domains, each once, and returns how many there are.
+/// Lists the tiles of these domains, each once. Returns their number.
 fn list_tiles<'a>(
     packing: &Packing,
     domains: impl Iterator<Item = &'a u32>,
@@ -201,10 +207,10 @@ mod tests {
         let boxes = Deformation { boxes: true, ..plain };
         let displacements = Deformation { displacements: true, ..plain };
         let mut sizes = [(7, 0); 8];
-        // Without modes no normals would follow the surface.
+        // Without modes, normals would not follow the surface.
         sizes[7].1 = 1;
         let entries = |deformation| most_changes(&followed(&sizes, deformation));
-        // Of sixteen domains a quarter may change; one is the mover, and two have coordinates.
+        // A quarter of sixteen domains may change; one is the transform root, and two have coordinates.
         assert_eq!([plain, exact, boxes, displacements].map(entries), [3, 4, 4, 3]);
         assert_eq!(most_changes(&deformed(&sizes, plain)), 4, "nobody follows");
         assert_eq!(most_domains(&followed(&sizes, plain)), 4, "followers count among what changes");

@@ -1,5 +1,5 @@
-//! Launches `kernels/batch.cu`: x = T_b (x0 + U q_b) of groups of domains b that share a shape, whose U is read once for
-//! each group, and a box of each warp's vertices.
+//! Launches `kernels/batch.cu`: x = T_b (x0 + U q_b) for groups of domains b that share a shape. The kernel reads U
+//! once per group, and also computes a box of each warp's vertices.
 
 use cudarc::driver::sys::CUfunction_attribute;
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
@@ -14,15 +14,16 @@ use crate::storage::modes_per_chunk;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::Scene;
 
-/// The other numbers of vectors that the kernel is compiled for, with their macros.
+/// Smaller maximum group sizes (vectors q_b) that the kernel can be compiled for, with their macros; the default is
+/// [`MOST`].
 const FEWER: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
 
-/// Warps of a block; bytes of shared memory of each, and for each vector besides q.
+/// Warps per block, and bytes of shared memory: per warp, and per vector without its q.
 const WARPS: usize = 2;
 const OWN: usize = 9984 + 72;
 const VECTOR: usize = 64;
 
-/// The kernel and its work.
+/// The kernel and its work list.
 #[derive(Debug)]
 pub(super) struct Batch {
     pub function: CudaFunction,
@@ -32,7 +33,7 @@ pub(super) struct Batch {
     members: CudaSlice<u8>,
 }
 
-/// Device addresses of what `deform` has too.
+/// Device addresses of buffers that belong to `deform`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Shared {
     pub words: u64,
@@ -42,11 +43,11 @@ pub(super) struct Shared {
 }
 
 impl Batch {
-    /// Puts the work onto the device.
+    /// Compiles the kernel and uploads its work list.
     pub(super) fn new(device: &Device, kernel: &Kernel, batched: &Batched) -> Result<Self> {
         let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
         let shared = shared_bytes(batched, &kernel.defines);
-        // As many blocks as registers allow, so nothing is left to the L1 cache.
+        // Give all of the L1 cache to shared memory, so that registers alone limit the number of resident blocks.
         let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
         let most = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
         for (attribute, value) in [(carveout, 100), (most, shared as i32)] {
@@ -65,7 +66,7 @@ impl Batch {
         })
     }
 
-    /// Starts the kernel; the header among the values says where everything goes.
+    /// Starts the kernel; the header among `values` has the output addresses.
     pub(super) fn launch(&self, device: &Device, values: Values, shared: Shared) -> Result<()> {
         let Shared { words, rest, scales, boxes } = shared;
         let at = |buffer: &CudaSlice<u8>| address(device, buffer);
@@ -84,16 +85,16 @@ impl Batch {
             boxes,
         };
         let mut launch = device.stream().launch_builder(&self.function);
-        // SAFETY: `BatchArgs` is the kernel's only argument. Blocks name groups, groups members, and both the words, x0,
-        // scales, transforms, q and boxes of `Work`, from which the buffers were made; a group has no more members than
-        // the kernel was compiled for; shared memory has room for the longest; and the header's positions have the size
-        // that `Output` checked.
+        // SAFETY: `BatchArgs` is the kernel's only argument. Blocks refer to groups and groups to members. Groups and
+        // members refer to the words, x0, scales, transforms, q and boxes of `Work`, from which the buffers were made.
+        // A group has no more members than the kernel was compiled for, shared memory has capacity for the longest
+        // group, and the header's positions have the size that `Output` checked.
         unsafe { launch.arg(&args).launch(self.config) }.map_err(during("batch"))?;
         Ok(())
     }
 }
 
-/// What a scene compiles and launches.
+/// The kernel of a scene with batches.
 pub(super) fn kernel(scene: &Scene, batched: &Batched, source: KernelSource) -> Kernel {
     let vectors = FEWER.iter().find(|(vectors, _)| batched.most <= *vectors).map(|(_, name)| *name);
     let follows = scene.needs.followers.then_some("FOLLOWERS");
@@ -107,19 +108,19 @@ pub(super) fn kernel(scene: &Scene, batched: &Batched, source: KernelSource) -> 
     }
 }
 
-/// Device bytes of the work.
+/// Device bytes of the work list.
 pub(super) fn bytes(batched: &Batched) -> u64 {
     let Batched { groups, members, blocks, .. } = batched;
     let sizes = [size_of_val(groups.as_slice()), size_of_val(members.as_slice()), size_of_val(blocks.as_slice())];
     sizes.iter().sum::<usize>() as u64
 }
 
-/// Domains of a group as the kernel was compiled with these macros.
+/// Maximum group size of the kernel compiled with these macros.
 fn vectors_of(defines: &[&str]) -> usize {
     FEWER.iter().find(|(_, name)| defines.contains(name)).map_or(MOST, |(vectors, _)| *vectors)
 }
 
-/// Shared memory of a block: what each warp has, T and members of all vectors, and q.
+/// Shared memory of a block: the part of each warp, T and the members of all vectors, and q.
 fn shared_bytes(batched: &Batched, defines: &[&str]) -> usize {
     let storages = modalcast_model::scene::Storage::ALL.into_iter();
     let storage =
@@ -143,7 +144,7 @@ mod tests {
     use crate::testing::{Noise, scene_and_state, transformed_axis};
     use modalcast_model::scene::{Batches, Deformation, Parts, State, Storage};
 
-    /// Shapes of so many vertices and modes, each used by `instances` domains, and a state of them.
+    /// A scene with shapes of so many vertices and modes, each used by `instances` domains, and a random state of it.
     fn ensemble(storage: Storage, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, State) {
         let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
         let mut parts = Parts::named("ensemble");
@@ -157,7 +158,7 @@ mod tests {
         (scene, state)
     }
 
-    /// `batch` block by block, with its rings, stages and ways out.
+    /// Emulates `batch` block by block, with its ring of stages and its coalesced stores.
     fn twin_of_batch(tables: &Tables) -> Vec<f32> {
         let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
         let tiles =
@@ -174,7 +175,7 @@ mod tests {
         positions
     }
 
-    /// x of a vertex by the same arithmetic on U as it is given.
+    /// x of a vertex by the same arithmetic, directly from the U of the shape.
     fn x_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f32; 3] {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
         let rest = shape.mesh.rest()[vertex];
@@ -185,7 +186,7 @@ mod tests {
         [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], bent))
     }
 
-    /// Shapes, and how many domains each has.
+    /// Shapes, and the number of domains of each.
     const LOADS: [(&[(usize, usize)], usize); 6] = [
         (&[(1, 3), (63, 13)], 2),
         (&[(64, 4), (300, 0)], 16),
@@ -277,7 +278,7 @@ mod tests {
     #[test]
     fn shared_memory_holds_all_modes_of_every_batch() {
         let longest = Batched { chunks: modalcast_model::domain::MAX_RANK, ..Batched::default() };
-        // 64 KiB is what the smallest device has.
+        // 64 KiB is the shared memory of the smallest supported device.
         assert!(shared_bytes(&longest, &[]) <= 64 << 10);
         assert_eq!(shared_bytes(&Batched::default(), &["BATCH_4"]), 2 * OWN + 64 * 4);
         let chunks = Batched { chunks: 3, ..Batched::default() };

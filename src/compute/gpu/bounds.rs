@@ -1,5 +1,5 @@
-//! Launches `kernels/bounds.cu`: the bounds of all positions from the boxes of `deform`, those in light space where the
-//! look has a shadow, and those of each domain where the scene keeps boxes.
+//! Launches `kernels/bounds.cu`, which reduces the boxes of `deform` to the bounds of all positions. It also computes
+//! the bounds in light space if the scene has a shadow, and the box of each domain if the scene keeps boxes.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 use nalgebra::Vector3;
@@ -14,19 +14,19 @@ use super::plan::Kernel;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{LightBounds, Scene};
 
-/// The kernel.
+/// The kernel and its buffers.
 #[derive(Debug)]
 pub struct Bounds {
     pub function: CudaFunction,
     config: LaunchConfig,
-    /// The axes of light space, of a scene with a shadow.
+    /// The axes of light space, if the scene has a shadow.
     light: Option<[Vector3<f64>; 3]>,
-    /// Of a scene that keeps them.
+    /// Only in a scene that keeps boxes.
     pub(super) boxes: Option<Boxes>,
 }
 
 impl Bounds {
-    /// With `pieces`, a box of each domain is made too.
+    /// With `pieces`, the kernel also computes a box of each domain.
     pub fn new(device: &Device, scene: &Scene, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
         Ok(Self {
             function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
@@ -36,12 +36,12 @@ impl Bounds {
         })
     }
 
-    /// Words of its result.
+    /// Words of the result: keys of one box, or of two in a scene with a shadow.
     pub(super) const fn words(&self) -> usize {
         if self.light.is_some() { 12 } else { 6 }
     }
 
-    /// Starts the kernel on `count` boxes; the result goes into the header among the values.
+    /// Starts the kernel on `count` boxes; it writes its result into the header among `values`.
     pub fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
         let (pieces, piece_boxes, piece_count) = self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
         let Values { header, stamps, .. } = values;
@@ -57,22 +57,23 @@ impl Bounds {
             reserved: 0,
         };
         // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
-        // allocated them, and `piece_boxes` for each piece. Pieces name boxes, vertices and domains of the same scene.
-        // The kernel waits first.
+        // allocated them, and `piece_boxes` has six for each piece. Pieces refer to boxes, vertices and domains of the
+        // same scene. The kernel calls `await_previous` before it accesses memory.
         unsafe { chain::launch(device, &self.function, self.config, &args) }
     }
 }
 
-/// Axes as the kernel takes them.
+/// The axes as arguments of the kernel.
 fn narrow(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
     let axes = axes.unwrap_or_default();
     std::array::from_fn(|at| axes[at / 3][at % 3] as f32)
 }
 
-/// The bounds in light space that the last six of twelve keys stand for; none where there are but six.
+/// The bounds in light space, from the last six of twelve keys; `None` when there are only six keys.
 ///
-/// The kernel's sums round up, but its axes are f32: a component of a unit vector is off by 2^-25 at most, so an end by as
-/// much of the sum of the largest coordinates. Twice that is added.
+/// The kernel rounds its sums outward, but its axes are f32. A component of a unit vector in f32 has an error of at
+/// most 2^-25, so an end of the bounds has an error of at most 2^-25 times the sum of the largest coordinates. This
+/// function widens the bounds by twice that.
 pub(super) fn light_of(keys: &[u32]) -> Option<LightBounds> {
     let (world, light) = keys.split_at_checked(6).filter(|(_, light)| light.len() == 6)?;
     let world = bounds_of(world);
@@ -80,7 +81,7 @@ pub(super) fn light_of(keys: &[u32]) -> Option<LightBounds> {
     Some(LightBounds(bounds_of(light)).widened(farthest * f64::from(f32::EPSILON) / 2.0))
 }
 
-/// The bounds that the six keys stand for.
+/// The bounds that six keys encode.
 pub(super) fn bounds_of(keys: &[u32]) -> modalcast_model::scene::Bounds {
     let mut bounds = modalcast_model::scene::Bounds::EMPTY;
     for axis in 0..3 {
@@ -90,7 +91,8 @@ pub(super) fn bounds_of(keys: &[u32]) -> modalcast_model::scene::Bounds {
     bounds
 }
 
-/// `unordered` of `kernels/ordered.cuh`, the inverse of `ordered`. Zero, which no number has, gives a NaN like the NaN's own key.
+/// `unordered` of `kernels/ordered.cuh`, the inverse of `ordered`. The key 0, which encodes no number, gives a NaN like
+/// the key of NaN.
 fn number_of(key: u32) -> f32 {
     f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
 }
@@ -99,7 +101,7 @@ fn number_of(key: u32) -> f32 {
 mod tests {
     use super::*;
 
-    /// `ordered` of the kernel, word by word.
+    /// `ordered` of the kernel, branch by branch.
     fn ordered(x: f32) -> u32 {
         match x {
             x if x.is_nan() => u32::MAX,

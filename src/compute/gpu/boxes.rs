@@ -1,8 +1,8 @@
-//! A box of each domain: the pieces that `bounds` makes boxes of, and what comes back from it.
+//! Bounding boxes per domain: the pieces that `bounds` reduces to boxes, and the readback of the result.
 //!
-//! A domain with tiles of its own is cut into pieces of tiles, whose boxes `deform` left; one that shares a tile is a
-//! piece of its positions. So a domain of millions of vertices keeps as many threads busy as 200,000 leaves do. The few
-//! boxes of a large domain are united here.
+//! A domain with tiles of its own is cut into pieces of tiles, whose boxes `deform` computed. A domain that shares a
+//! tile is one piece, a range of its positions. This keeps as many threads busy for a domain of millions of vertices as
+//! for 200,000 leaves. The host unites the few boxes of a large domain.
 
 use cudarc::driver::{CudaSlice, PinnedHostSlice};
 
@@ -14,13 +14,13 @@ use super::work::Work;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Bounds, Scene};
 
-/// The most tiles of a piece, of four boxes each.
+/// Maximum number of tiles of a piece; each tile has four boxes.
 const PIECE_TILES: u32 = 32;
 
 /// Keys of a box.
 const SIDES: usize = 6;
 
-/// The pieces of all domains, in their order.
+/// The pieces of all domains, in the order of the domains.
 pub(super) fn pieces(scene: &Scene, work: &Work) -> Vec<Piece> {
     let mut pieces = Vec::with_capacity(scene.domains.len());
     for (index, ([(first, count), _], slot)) in work.spans.iter().zip(&scene.layout.slots).enumerate() {
@@ -51,7 +51,7 @@ pub(super) struct Boxes {
     boxes: CudaSlice<u8>,
     /// The domain of each piece.
     domains: Vec<u32>,
-    /// What comes back, page-locked; made when somebody asks.
+    /// Page-locked memory for the readback, allocated on the first read.
     keys: Option<PinnedHostSlice<u32>>,
 }
 
@@ -62,24 +62,24 @@ impl Boxes {
         Ok(Self { pieces: upload(device, list)?, boxes: room(device, boxes)?, domains, keys: None })
     }
 
-    /// Where the pieces and their boxes lie, and how many there are.
+    /// Addresses of the pieces and their boxes, and the number of pieces.
     pub(super) fn addresses(&self, device: &Device) -> (u64, u64, u32) {
         (address(device, &self.pieces), address(device, &self.boxes), self.domains.len() as u32)
     }
 
-    /// Copies the boxes of all domains, and waits for them.
+    /// Copies the boxes of all domains, and waits for the copy.
     pub(super) fn read(&mut self, device: &Device, to: &mut Vec<Bounds>) -> Result<()> {
         let from = address(device, &self.boxes);
         let keys = match &mut self.keys {
             Some(keys) => keys,
             none => {
-                // SAFETY: the copy below writes all of it before it is read.
+                // SAFETY: the memory is uninitialized; the copy below writes all of it before it is read.
                 let pinned = unsafe { device.context().alloc_pinned_with_flags(SIDES * self.domains.len(), 0) };
                 none.insert(pinned.map_err(during("allocate"))?)
             }
         };
         let keys = keys.as_mut_slice().map_err(during("download"))?;
-        // SAFETY: the boxes have six words for each piece, so has `keys`.
+        // SAFETY: the boxes have six words for each piece, and so does `keys`.
         unsafe { download(device, from, keys) }?;
         unite(&self.domains, keys, to);
         Ok(())
@@ -105,7 +105,7 @@ mod tests {
     use super::super::work::Coordinates;
     use super::*;
 
-    /// How often each vertex of a domain lies in one of its pieces.
+    /// How many pieces contain each vertex of a domain.
     fn seen(scene: &Scene, work: &Work, domain: usize) -> Vec<u32> {
         let slot = scene.layout.slots[domain];
         let mut seen = vec![0; slot.vertices];
@@ -143,7 +143,7 @@ mod tests {
 
     #[test]
     fn boxes_of_pieces_unite_to_those_of_domains_and_a_nan_stays() {
-        // Keys of -x and x: `ordered` of positive numbers sets the first bit, of negative ones turns all.
+        // Keys of -x and x: `ordered` sets the sign bit of positive numbers and inverts all bits of negative ones.
         let key = |x: f32| if x.is_sign_negative() { !x.to_bits() } else { x.to_bits() | 1 << 31 };
         let cube = |low: f32, high: f32| [[key(-low); 3], [key(high); 3]].concat();
         let keys = [cube(-1.0, 2.0), cube(0.5, 0.75), cube(-3.0, 0.25)].concat();

@@ -1,5 +1,5 @@
-//! Launches a kernel that may be put onto the device while the one before it ends (`kernels/chain.cuh`): what a launch
-//! costs then passes while the other still works. The kernel itself waits before it touches anything.
+//! Programmatic dependent launch (`kernels/chain.cuh`): a kernel may be scheduled while the previous kernel ends, which
+//! hides its launch latency. The kernel itself waits for the previous kernel before it accesses memory.
 
 use std::ffi::c_void;
 
@@ -8,14 +8,14 @@ use cudarc::driver::{CudaFunction, LaunchConfig, sys};
 use super::device::Device;
 use modalcast_model::error::{Result, during};
 
-/// The first compute capability whose kernels can wait for each other.
+/// First compute capability with programmatic dependent launch.
 const CHAINS: (i32, i32) = (9, 0);
 
-/// Starts `function` behind what the stream holds.
+/// Launches `function` on the device's stream.
 ///
 /// # Safety
-/// `args` is the kernel's only argument and names memory as the kernel expects it, and the kernel calls
-/// `await_previous` before all else.
+/// `args` is the kernel's only argument, its addresses are valid for the kernel, and the kernel calls `await_previous`
+/// before it accesses memory.
 pub(super) unsafe fn launch<T>(device: &Device, function: &CudaFunction, config: LaunchConfig, args: &T) -> Result<()> {
     let serialise = sys::CUlaunchAttributeID::CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION;
     let value = sys::CUlaunchAttributeValue { programmaticStreamSerializationAllowed: 1 };
@@ -33,7 +33,7 @@ pub(super) unsafe fn launch<T>(device: &Device, function: &CudaFunction, config:
         numAttrs: u32::from(device.capability() >= CHAINS),
     };
     let mut pointers = [std::ptr::from_ref(args).cast_mut().cast::<c_void>()];
-    // SAFETY: the attribute and the argument outlive the call, which copies both; the rest is the caller's promise.
+    // SAFETY: the attribute and the argument outlive the call, which copies both; the caller guarantees the rest.
     unsafe {
         sys::cuLaunchKernelEx(&config, function.cu_function(), pointers.as_mut_ptr(), std::ptr::null_mut()).result()
     }

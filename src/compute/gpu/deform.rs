@@ -1,5 +1,5 @@
-//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents, and a box of
-//! each warp's vertices.
+//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents, and a box
+//! of each warp's vertices.
 
 use std::sync::Arc;
 
@@ -17,20 +17,20 @@ use crate::storage::{Plane, TILE_QUADS, Tiles};
 use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::Scene;
 
-/// Tiles of `deform` that take as long as `batch` does for a tile of a group, about.
+/// Approximate cost of one batched tile of a group in tiles of `deform`.
 const WORK_OF_TILE: usize = 2;
 
-/// Words of U that go to the device in one piece while packing, so that packing needs little memory of its own.
+/// Words of U per upload, which limits the staging memory while U is packed.
 const PIECE: usize = 1 << 22;
 
-/// The kernel and what it reads of a scene.
+/// The kernel and the constant tables of a scene.
 #[derive(Debug)]
 pub struct Deform {
     function: CudaFunction,
     config: LaunchConfig,
-    /// For the domains whose U is read once for several of them.
+    /// Only in a scene with batches: domains whose U is read once per group.
     batch: Option<Batch>,
-    /// The same for a list of tiles, and the list, where there can be one.
+    /// The kernel for a tile list; only in a scene that can have partial steps.
     listed: Option<CudaFunction>,
     tiles: CudaSlice<u8>,
     lanes: CudaSlice<u8>,
@@ -44,18 +44,18 @@ pub struct Deform {
     list: CudaSlice<u8>,
     /// Four boxes of six keys per tile.
     boxes: CudaSlice<u8>,
-    /// Of tiles, and of those that a whole step launches.
+    /// Number of tiles, and number of those that a full step launches.
     count: u32,
     launched: u32,
     /// Quads before the first that has normals.
     directed: u64,
     packing: Arc<Packing>,
-    /// Of which `bounds` makes boxes, where the scene keeps them.
+    /// Pieces that `bounds` reduces to boxes; only if the scene keeps boxes.
     pieces: Option<Vec<Piece>>,
 }
 
 impl Deform {
-    /// Packs what the tables name onto the device. `batch` is the kernel of scenes with batches.
+    /// Uploads everything that the tables refer to. `batch` is the kernel of scenes with batches.
     pub fn new(
         device: &Device,
         scene: &Arc<Scene>,
@@ -69,7 +69,7 @@ impl Deform {
         let (scales, factors) = (upload(device, &load.scales)?, load.factors);
         let [normals, tangents] = rest_directions(scene, &work);
         let has_lists = most_domains(scene) > 0;
-        // What turns no normals has nothing to do in tiles of corners alone.
+        // Without ORIENT there is nothing to compute in tiles of corners alone.
         let launched = if kernel.defines.contains(&"ORIENT") { work.launched } else { work.with_vertices };
         let config = LaunchConfig { grid_dim: (blocks(kernel, launched), 1, 1), ..config(kernel) };
         Ok(Self {
@@ -105,47 +105,47 @@ impl Deform {
         })
     }
 
-    /// How coordinates are to be laid out for it.
+    /// The layout of coordinates that the kernel expects.
     pub const fn packing(&self) -> &Arc<Packing> {
         &self.packing
     }
 
-    /// What boxes of domains are made of, where the scene keeps them.
+    /// The pieces that boxes of domains are made of, if the scene keeps boxes.
     pub fn pieces(&self) -> Option<&[Piece]> {
         self.pieces.as_deref()
     }
 
-    /// The address of its boxes, and how many there are.
+    /// The address of the boxes, and their number.
     pub fn boxes(&self, device: &Device) -> (u64, u32) {
         (address(device, &self.boxes), 4 * self.count)
     }
 
-    /// Where `apply` puts the list of tiles.
+    /// Address of the tile list that `apply` writes.
     pub fn list(&self, device: &Device) -> u64 {
         address(device, &self.list)
     }
 
-    /// What a whole step launches.
+    /// The kernels that a full step launches.
     pub fn kernels(&self) -> Vec<(&'static str, &CudaFunction)> {
         let batch = self.batch.as_ref().map(|batch| ("batch", &batch.function));
         batch.into_iter().chain((self.launched > 0).then_some(("deform", &self.function))).collect()
     }
 
-    /// Starts the kernels of a whole step; the header among the values says where everything goes.
+    /// Starts the kernels of a full step; the header among `values` has the output addresses.
     pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
         if let Some(batch) = &self.batch {
             let [words, rest, scales, boxes] =
                 [&self.words, &self.rest, &self.scales, &self.boxes].map(|buffer| address(device, buffer));
             batch.launch(device, values, Shared { words, rest, scales, boxes })?;
         }
-        // Nothing may be left to do.
+        // `batch` may have covered all tiles.
         if self.launched == 0 {
             return Ok(());
         }
         self.launch_as(device, values, (&self.function, self.config))
     }
 
-    /// Starts it on the tiles of the list, as many as the header says.
+    /// Starts the kernel on the tiles of the list, whose length is in the header.
     pub fn launch_listed(&self, device: &Device, values: Values) -> Result<()> {
         let grid_dim = ((4 * self.count).min(LISTED_BLOCKS), 1, 1);
         let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
@@ -166,7 +166,7 @@ impl Deform {
             lanes: at(&self.lanes),
             words: at(&self.words),
             rest: at(&self.rest),
-            // Quads without normals come first and have no room; no tile of corners names them.
+            // Quads without normals come first and have no storage. No tile with corners refers to them.
             rest_normals: at(&self.normals).wrapping_sub(48 * self.directed),
             rest_tangents: at(&self.tangents).wrapping_sub(64 * self.directed),
             corner_shifts: at(&self.corner_shifts),
@@ -185,21 +185,24 @@ impl Deform {
         };
         let mut launch = device.stream().launch_builder(function);
         // SAFETY: `DeformArgs` is the kernel's only argument. The tables come from `Work`, whose tiles lie inside the
-        // words, x0, normals, transforms and q of the same scene, and the list names such tiles; there are as many boxes
-        // as warps; and the header's outputs have the sizes that `Output` checked or the plan says. Tangents and shifts are
-        // read only by a kernel that was compiled for a scene that has them.
+        // words, x0, normals, transforms and q of the same scene, and the list contains only such tiles. There are four
+        // boxes per tile, at least one for each warp. The header's outputs have the sizes that `Output` checked or the
+        // plan states. Tangents and shifts are read only by a kernel that was compiled for a scene that has them.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("deform"))?;
         Ok(())
     }
 }
 
-/// Blocks that so many tiles take.
+/// Number of blocks for so many tiles.
 pub(super) fn blocks(kernel: &Kernel, tiles: usize) -> u32 {
     let warps = tiles * if kernel.defines.contains(&"NARROW") { 4 } else { 1 };
     warps.div_ceil(kernel.threads as usize / TILE_QUADS) as u32
 }
 
-/// The function of a kernel, refused when it is made for other blocks than were planned.
+/// The function of a kernel.
+///
+/// # Errors
+/// `Fault` when it is compiled for another block size than planned.
 fn function(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
     let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
     let most = function.max_threads_per_block().map_err(during("deform"))?;
@@ -212,20 +215,20 @@ fn function(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
 
 /// The function of the kernel that computes the tiles of a list.
 fn listed(device: &Device, kernel: &Kernel) -> Result<CudaFunction> {
-    // A lane for each item: lists are short, and would else leave most of the device without work.
+    // One lane per item: lists are short, and would otherwise leave most of the device idle.
     let defines = kernel.defines.iter().copied().filter(|define| *define != "NARROW");
     let listed: Vec<&str> = defines.chain(["NARROW", "LISTED"]).collect();
     device.function(kernel.name, kernel.source.0, &listed)
 }
 
-/// Blocks that walk over a list of tiles: as many as a large device holds at once.
+/// Blocks that loop over a tile list: as many as are resident on a large device.
 const LISTED_BLOCKS: u32 = 132 * 12;
 
 pub(super) fn config(kernel: &Kernel) -> LaunchConfig {
     LaunchConfig { grid_dim: (kernel.blocks, 1, 1), block_dim: (kernel.threads, 1, 1), shared_mem_bytes: 0 }
 }
 
-/// U on its way to the device, source by source, and what is small of all shapes, kept until the end.
+/// Upload of U, source by source. Collects the small tables of all shapes until the end.
 struct Load<'a> {
     device: &'a Device,
     scene: &'a Scene,
@@ -265,7 +268,7 @@ impl<'a> Load<'a> {
         if self.piece.len() >= PIECE { self.send() } else { Ok(()) }
     }
 
-    /// The tiles of a shape; what is small of them is kept.
+    /// The tiles of a shape; collects their scales and factors.
     fn tiles_of(&mut self, shape: usize) -> Tiles {
         let tiles = Tiles::new(&self.scene.shapes[shape], self.scene.deformation.storage);
         let scale = self.work.first_scale[shape] as usize;
@@ -283,7 +286,7 @@ impl<'a> Load<'a> {
         Ok(())
     }
 
-    /// The words, all there, and what is small.
+    /// Uploads the remaining words. Returns the buffer, and the collected small tables.
     fn finish(mut self) -> Result<(CudaSlice<u8>, Self)> {
         if !self.piece.is_empty() {
             self.send()?;

@@ -1,7 +1,8 @@
-//! The deformer `cuda`: a step is one graph of copies and kernels, and the bounds come back with it.
+//! The deformer of the `cuda` backend: a step is one graph of copies and kernels, and its bounds are read back with it.
 //!
-//! A step can be submitted before the one before it has ended: its values are then written while that one runs. And the
-//! host can fetch the vertices of a step while the next runs: that one then writes another output.
+//! Steps are double-buffered. A step can be submitted while the previous one is in flight: the host writes its values
+//! while the previous step runs. The host can also fetch the vertices of a step while the next step runs: the next step
+//! then writes another output set.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -28,38 +29,39 @@ use modalcast_model::deform::{Backend, Deformed, Deformer, Fetch, Surface, Wante
 use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::{Changed, Scene, State};
 
-/// Steps that may be under way at once.
+/// Maximum number of steps in flight.
 pub const MOST_UNDER_WAY: usize = 2;
 
-/// The CUDA deformer of one scene. Lives and dies on the thread that owns the OpenGL context, and before the buffers
-/// that it shares.
+/// The CUDA deformer of one scene. Create and drop it on the thread that owns the OpenGL context, and drop it before
+/// the OpenGL buffers that it shares.
 pub struct CudaDeformer {
-    // Their graphs name the memory of all that follows.
+    // First, so dropped first: the graphs refer to the memory of the fields below.
     flights: Vec<Flight>,
     device: Arc<Device>,
     plan: Plan,
     kernels: Kernels,
     inputs: Inputs,
     output: Output,
-    /// u, of a scene that keeps it. One for all outputs, and so are boxes: both are read before the next step is submitted.
+    /// u, if the scene keeps displacements. All output sets share this buffer, and also the boxes, because both are
+    /// read before the next step is submitted.
     displacements: Option<CudaSlice<u8>>,
     rotation: Rotation,
-    /// Oldest first: the flight, and when its step was submitted.
+    /// Steps in flight, oldest first: ring slot and time of submission.
     under_way: VecDeque<(usize, Instant)>,
-    /// The flight of the last step.
+    /// Ring slot of the last step.
     last: usize,
     fetches: Fetches,
-    /// The last step's and what of it is fetched, until the next is submitted.
+    /// The last step's fetch and the attributes it copies; `None` after the next step is submitted.
     fetch: Option<(Wanted, Fetch)>,
-    // Declared before `surface`, so dropped before it: the locks are on its memory.
+    // Declared before `surface`, so dropped before it: the locks refer to its memory.
     locks: Vec<PageLock>,
     surface: Surface,
-    /// What of `surface` is what the device holds.
+    /// Attributes of `surface` that are up to date with the device.
     fresh: Wanted,
 }
 
 impl CudaDeformer {
-    /// Packs a scene onto the device. With `gl`, output goes straight into those buffers when the driver allows it.
+    /// Packs a scene onto the device. With `gl`, steps write directly into those buffers when the driver allows it.
     ///
     /// # Errors
     /// `Fault` when the device refuses; `Unavailable` when NVRTC is missing or the device's memory is too small.
@@ -78,7 +80,7 @@ impl CudaDeformer {
         };
         let output = Output::new(device, &plan, gl)?;
         let inputs = Inputs::new(device, kernels.deform.packing())?;
-        // Tables were copied from memory that is gone by now; wait here, so that a fault of theirs shows here.
+        // The tables were copied from temporary host memory. Wait here, so that an upload error is reported here.
         device.stream().synchronize().map_err(during("upload"))?;
         Ok(Self {
             flights: vec![Flight::new(device, &kernels, &inputs, output.is_shared())?],
@@ -102,27 +104,28 @@ impl CudaDeformer {
         })
     }
 
-    /// What it compiled and allocated. A second output comes once vertices are fetched beside a step, and a second set of
-    /// pinned memory once a step is submitted beside another.
+    /// The compiled kernels and allocated buffers. The plan does not count the second output set, which is allocated
+    /// when vertices are fetched concurrently with a step, nor the second ring slot of pinned memory, which is
+    /// allocated when a step is submitted while another is in flight.
     pub const fn plan(&self) -> &Plan {
         &self.plan
     }
 
-    /// Outputs that there are: two once vertices were fetched beside a step.
+    /// Number of output sets: two after vertices were fetched concurrently with a step.
     pub fn outputs(&self) -> usize {
         self.output.count()
     }
 
-    /// How far the modes that were left out may have moved a vertex in the last step, scene units.
+    /// Bound of the displacement that the truncated modes cause at any vertex in the last step, scene units.
     pub fn truncation_bound(&self) -> f64 {
         self.inputs.truncation_bound()
     }
 
-    /// Starts a step, whatever is still under way: at most [`MOST_UNDER_WAY`] with it. [`Self::finish`] waits for the
-    /// oldest.
+    /// Starts a step without waiting for the steps in flight, of which there may be [`MOST_UNDER_WAY`] with this one.
+    /// [`Self::finish`] waits for the oldest.
     ///
     /// # Errors
-    /// `Busy` when so many are under way; `Fault` of the device, after which none is.
+    /// `Busy` when [`MOST_UNDER_WAY`] steps are in flight; `Fault` of the device, after which no step is in flight.
     pub fn submit(&mut self, state: &State) -> Result<()> {
         if self.under_way.len() == MOST_UNDER_WAY {
             return Err(Error::Busy { queue: "steps under way", limit: MOST_UNDER_WAY });
@@ -136,10 +139,10 @@ impl CudaDeformer {
         Ok(())
     }
 
-    /// Waits for the oldest step that was submitted.
+    /// Waits for the oldest step in flight.
     ///
     /// # Errors
-    /// `Fault` of the device, after which no step is under way; also when none was.
+    /// `Fault` of the device, after which no step is in flight. Also `Fault` when no step was in flight.
     pub fn finish(&mut self) -> Result<Deformed> {
         let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
         let (flight, begin) = self.under_way.pop_front().ok_or_else(none)?;
@@ -149,12 +152,13 @@ impl CudaDeformer {
         Ok(Deformed { bounds, light, ms: own.unwrap_or(whole) })
     }
 
-    /// Starts the whole graph of the last step once more, for measuring it alone: outputs of our own stay where they are.
+    /// Starts the graph of the last full step again, to measure the graph alone. Only for outputs that the deformer
+    /// owns: shared OpenGL buffers are not mapped here.
     pub fn replay(&self) -> Result<()> {
         self.flights[self.last].launch(false)
     }
 
-    /// Writes a step's values and starts its graph; the flight that it took. `begin`: when the step was submitted.
+    /// Writes the values of a step and starts its graph. Returns the ring slot. `begin`: time of submission.
     fn start(&mut self, state: &State, begin: Instant) -> Result<usize> {
         let set = self.rotation.next_output();
         if let Err(error) = self.output.ensure(&self.device, &self.plan, set) {
@@ -172,11 +176,12 @@ impl CudaDeformer {
             _ => None,
         };
         let header = header(&turn, some, self.rotation.everything(some.is_none()));
-        // OpenGL's buffers were copied aside on this very stream.
+        // Shared OpenGL buffers are copied to the back buffer on this same stream, so the step is already ordered after
+        // it.
         if turn.is_read && !self.output.is_shared() {
             self.fetches.let_pass(&self.device, turn.output)?;
         }
-        // Normals that follow the surface read its positions again, and so do boxes.
+        // `normals` and the boxes read the positions again, so the driver must not discard them.
         let keep = some.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, |buffer| address(&self.device, buffer));
         let header = Header { displacements, ..header };
@@ -196,7 +201,7 @@ impl CudaDeformer {
         Ok(at)
     }
 
-    /// A flight whose step has ended; made if all there are are under way.
+    /// A ring slot whose step has ended; allocates one if all are in flight.
     fn free_flight(&mut self) -> Result<usize> {
         let is_free = |at: &usize| self.under_way.iter().all(|(flight, _)| flight != at);
         if let Some(at) = (0..self.flights.len()).find(is_free) {
@@ -206,10 +211,10 @@ impl CudaDeformer {
         Ok(self.flights.len() - 1)
     }
 
-    /// Waits for what is under way, because the next step overwrites what it reads, and takes no output and no value on
-    /// the device for whole. So does every step that fails.
+    /// Waits for all steps in flight, whose inputs the next step would overwrite, and marks all outputs and the values
+    /// on the device as invalid. Every failed step does the same.
     pub fn forget(&mut self) {
-        // Failures of their own add nothing.
+        // The step has already failed, so a second error adds nothing.
         self.device.stream().synchronize().ok();
         self.fetches.synchronize();
         self.under_way.clear();
@@ -226,13 +231,13 @@ impl CudaDeformer {
             normals: length(wanted.normals, Role::Normals),
             displacements: length(wanted.displacements, Role::Displacements),
         };
-        // What else is wanted leaves the output free for the next step.
+        // Other attributes do not need the output set, which remains free for the next step.
         let reading = lengths.are_of_output().then(|| self.rotation.read());
         let order = Order { set, lengths, reading, after: &self.flights[self.last].done };
         let Self { device, kernels, displacements, fetches, output, .. } = self;
         let copy_kept = |surface: &mut Surface| {
             if let Some(buffer) = displacements.as_ref() {
-                // SAFETY: the buffer has the bytes of the plan, and the list has that length or none.
+                // SAFETY: the buffer has the bytes of the plan, and the list has that length or is empty.
                 unsafe { download(device, address(device, buffer), &mut surface.displacements) }?;
             }
             match &mut kernels.bounds.boxes {
@@ -244,7 +249,7 @@ impl CudaDeformer {
         begun.inspect_err(|_| self.fetches.synchronize())
     }
 
-    /// Copies what of the output is wanted and not in `surface` yet.
+    /// Copies the wanted attributes that are not yet up to date in `surface`.
     fn bring(&mut self, wanted: Wanted) -> Result<()> {
         let fresh = self.fresh;
         if (wanted.positions || wanted.normals) && !fresh.covers(Wanted::VERTICES) {
@@ -269,10 +274,10 @@ impl CudaDeformer {
         let list = &mut self.surface.displacements;
         if list.is_empty() {
             list.resize(self.plan.bytes(Role::Displacements) as usize / 4, 0.0);
-            // SAFETY: the list never changes its length again, and the locks are dropped before it.
+            // SAFETY: the length of the list never changes again, and the locks are dropped before it.
             self.locks.extend(unsafe { PageLock::new(&self.device, list) });
         }
-        // SAFETY: the buffer has the bytes of the plan, and the list was made from the same number.
+        // SAFETY: the buffer has the bytes of the plan, from which the list has its length.
         unsafe { download(&self.device, address(&self.device, buffer), list) }
     }
 
@@ -284,7 +289,7 @@ impl CudaDeformer {
             let Surface { positions: first, normals: second, tangents: third, .. } = &mut self.surface;
             for (list, length) in [(first, positions), (second, normals), (third, tangents)] {
                 list.resize(length, 0.0);
-                // SAFETY: the list never changes its length again, and the locks are dropped before it.
+                // SAFETY: the length of the list never changes again, and the locks are dropped before it.
                 self.locks.extend(unsafe { PageLock::new(&self.device, list) });
             }
         }
@@ -292,7 +297,7 @@ impl CudaDeformer {
     }
 }
 
-/// The header of a step, but for where its outputs lie.
+/// The header of a step, without the addresses of its outputs.
 fn header(turn: &Turn, some: Option<Lengths>, everything: u32) -> Header {
     let lengths = some.unwrap_or_default();
     Header {
@@ -310,7 +315,7 @@ impl Deformer for CudaDeformer {
         Backend::Cuda
     }
 
-    /// Waits for the steps that were submitted before, too.
+    /// Also waits for the steps that were submitted before.
     fn deform(&mut self, state: &State) -> Result<Deformed> {
         while self.under_way.len() == MOST_UNDER_WAY {
             self.finish()?;
@@ -337,8 +342,8 @@ impl Deformer for CudaDeformer {
         Ok(&self.surface)
     }
 
-    /// Positions and normals travel beside the next step. Displacements and boxes, of which the device has but one, are
-    /// there when this returns.
+    /// Positions and normals are copied concurrently with the next step. Displacements and boxes exist once on the
+    /// device, so their copy is complete when this returns.
     fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
         if let Some((_, fetch)) = self.fetch.as_ref().filter(|(there, _)| there.covers(wanted)) {
             return Ok(fetch.clone());
@@ -359,15 +364,15 @@ impl Deformer for CudaDeformer {
 
 impl Drop for CudaDeformer {
     fn drop(&mut self) {
-        // Nothing may be freed that the device still uses. After a fault the answer is an error, and nothing runs.
+        // The device must not use memory that is about to be freed. After a fault the call fails, and no kernel runs.
         self.device.stream().synchronize().ok();
         self.fetches.synchronize();
     }
 }
 
-/// Refuses a scene that cannot fit before half of it is there.
+/// Refuses a scene that cannot fit before any part of it is uploaded.
 fn check_memory(device: &Device, plan: &Plan) -> Result<()> {
-    // What other scenes freed is given back when the stream has come to it.
+    // Frees are stream-ordered: synchronize, so that memory freed by other scenes counts as free.
     device.stream().synchronize().map_err(during("device"))?;
     let (free, _) = device.memory()?;
     if plan.total_bytes() <= free as u64 {

@@ -8,11 +8,11 @@ use cudarc::nvrtc::Ptx;
 use super::compile::{cubin, nvrtc};
 use modalcast_model::error::{Error, Result, during};
 
-/// The oldest CUDA driver interface that is used here, as cuDriverGetVersion counts (12.0).
+/// Minimum CUDA driver version, as cuDriverGetVersion counts (12.0).
 const OLDEST_DRIVER: i32 = 12_000;
 
-/// A CUDA device with its context current on this thread. All work on it goes through one stream, in order; only copies
-/// of vertices to the host have a stream of their own, ordered by events.
+/// A CUDA device with its context current on this thread. All work is ordered by one stream. Only the readback of
+/// vertices has a stream of its own, which is ordered by events.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -26,7 +26,7 @@ impl Device {
     /// Opens a device by ordinal.
     ///
     /// # Errors
-    /// `Unavailable` naming the missing library and what installs it; never a panic.
+    /// `Unavailable` with the missing library and how to install it; never a panic.
     pub fn open(ordinal: usize) -> Result<Arc<Self>> {
         let version = driver_version()?;
         if version < OLDEST_DRIVER {
@@ -42,8 +42,8 @@ impl Device {
 
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
-        // SAFETY: everything on this device goes through the one stream below, whose order is all the ordering needed;
-        // `fetch`, which has another, orders its copies by events of its own.
+        // SAFETY: event tracking orders accesses from several streams. All work on this device goes through the one
+        // stream below, which orders it; `fetch` has a second stream and orders its copies by its own events.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;
@@ -56,7 +56,7 @@ impl Device {
         &self.name
     }
 
-    /// The ordinal it was opened by.
+    /// The ordinal by which it was opened.
     pub const fn ordinal(&self) -> usize {
         self.ordinal
     }
@@ -74,10 +74,11 @@ impl Device {
         self.context.mem_get_info().map_err(during("device"))
     }
 
-    /// Whether kernels can be compiled for this device, so that a server can choose another backend before any scene.
+    /// Checks that kernels can be compiled for this device, so that a server can choose another backend before it loads
+    /// a scene.
     ///
     /// # Errors
-    /// `Unavailable` when NVRTC is missing or does not fit the driver, with what brings it.
+    /// `Unavailable` with the remedy when NVRTC is missing or does not fit the driver.
     pub fn check_compiler(&self) -> Result<()> {
         fits_driver(nvrtc()?.version, driver_version()?)
     }
@@ -99,7 +100,7 @@ impl Device {
         module.load_function(name).map_err(during("load kernel"))
     }
 
-    /// Several functions of a source that is compiled once; the first names it.
+    /// Several functions of a source that is compiled once; the first function names the module.
     ///
     /// # Errors
     /// As [`Self::function`].
@@ -128,13 +129,14 @@ fn no_device(ordinal: usize, reason: &str) -> Error {
 /// # Errors
 /// `Unavailable` when there is no driver or it does not start.
 pub(super) fn driver_version() -> Result<i32> {
-    // SAFETY: it only tries to load libcuda under its usual names. Without this question the calls below would panic.
+    // SAFETY: the call only tries to load libcuda under its usual names. Without this check the calls below would
+    // panic.
     if !unsafe { sys::is_culib_present() } {
         let reason = "libcuda.so.1 cannot be loaded".into();
         return Err(Error::Unavailable { what: "CUDA", reason, remedy: INSTALL.into() });
     }
     let mut version = 0;
-    // SAFETY: the library is there, and `version` is a live integer.
+    // SAFETY: the library is loaded, and `version` is a live integer.
     let answer = unsafe { sys::cuDriverGetVersion(&mut version) }.result().and_then(|()| result::init());
     let broken = |error: DriverError| Error::Unavailable {
         what: "CUDA",
@@ -144,7 +146,7 @@ pub(super) fn driver_version() -> Result<i32> {
     answer.map_err(broken).map(|()| version)
 }
 
-/// Machine code of a newer major version than the driver's does not load.
+/// Checks the NVRTC version: the driver does not load machine code of a newer major version.
 fn fits_driver(nvrtc: (i32, i32), driver: i32) -> Result<()> {
     if nvrtc.0 <= driver / 1000 {
         return Ok(());

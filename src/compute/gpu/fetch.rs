@@ -1,15 +1,15 @@
-//! Vertices on their way to the host: copied on a stream of their own, so that the next step runs beside it.
+//! Asynchronous readback of vertices: a stream of its own copies them to the host while the next step runs.
 //!
 //! ```text
 //! step k   [copy in][kernels]
 //! copy k                     [copy out      ]
-//! step k+1                   [copy in][kernels]      into the other output
+//! step k+1                   [copy in][kernels]      into the other output set
 //! ```
-//! OpenGL's buffers cannot take turns: they are copied to a back buffer on the device first, which takes a small part of
-//! the time of the way out, and the next step may overwrite them then. Displacements and boxes, of which the device has
-//! but one, are waited for at once.
+//! OpenGL's buffers cannot be double-buffered. They are first copied to a back buffer on the device, which takes a
+//! small part of the readback time; the next step may overwrite them after that copy. Displacements and boxes exist
+//! once on the device, so their copies are synchronous.
 //!
-//! Nothing here is made for a scene whose vertices nobody fetches.
+//! Streams, events and memory are allocated on the first fetch.
 
 use std::sync::Arc;
 
@@ -24,48 +24,49 @@ use modalcast_model::error::{Error, Result, during};
 
 const STAGE: &str = "fetch";
 
-/// Host surfaces that nobody holds and that are kept for the next readings all the same.
+/// Unused host slots that are kept for later readbacks.
 const SPARE: usize = 3;
 
-/// The stream, and the host memory that it fills.
+/// The copy stream, and the host slots that it fills.
 #[derive(Debug, Default)]
 pub(super) struct Fetches {
     stream: Option<Arc<CudaStream>>,
     slots: Vec<Slot>,
-    /// Copies that were begun.
+    /// Number of copies started.
     begun: u64,
-    /// Per output set, or of the back buffer, the end of the last copy from it.
+    /// Per output set, the end of the last copy from it. With OpenGL's buffers: the end of the last copy from the back
+    /// buffer.
     ends: Vec<CudaEvent>,
-    /// With OpenGL's buffers.
+    /// Only with OpenGL's buffers.
     back: Option<Back>,
 }
 
-/// A copy of OpenGL's buffers on the device.
+/// Copy of OpenGL's buffers on the device.
 #[derive(Debug)]
 struct Back {
-    /// Positions and normals, once they are wanted.
+    /// Positions and normals; each is allocated on its first use.
     parts: [Option<CudaSlice<u8>>; 2],
-    /// The end of the last copy into it.
+    /// End of the last copy into it.
     filled: CudaEvent,
 }
 
-/// One surface on the host.
+/// A host slot: the memory of one readback.
 #[derive(Debug)]
 struct Slot {
-    // Declared before `surface`, so dropped before it: the locks are on its memory.
+    // Declared before `surface`, so dropped before it: the locks refer to its memory.
     _locks: Vec<PageLock>,
-    /// Held here too, so that its memory stays; the only one while nobody reads it.
+    /// The slot keeps the memory alive. The slot is free while this is the only reference.
     surface: Arc<Surface>,
-    /// The end of the last copy into it.
+    /// End of the last copy into it.
     there: CudaEvent,
     lengths: Lists,
-    /// That copy among all.
+    /// Sequence number of that copy.
     age: u64,
-    /// What that copy's order called its reading.
+    /// Number of that copy's readback in `Rotation`, if it read an output set.
     reading: Option<u64>,
 }
 
-/// Numbers in the lists of a surface; 0 for what is not wanted.
+/// Lengths of the lists of a surface, in f32; 0 for an attribute that is not wanted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Lists {
     pub positions: usize,
@@ -74,26 +75,26 @@ pub(super) struct Lists {
 }
 
 impl Lists {
-    /// Whether a set of outputs is read for them.
+    /// Whether an output set has to be read for them.
     pub(super) const fn are_of_output(self) -> bool {
         self.positions + self.normals > 0
     }
 }
 
-/// A copy to begin.
+/// A copy to start.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Order<'a> {
-    /// The output set that is read.
+    /// The output set to read.
     pub set: usize,
     pub lengths: Lists,
-    /// What the reading of the output is called, if it is read.
+    /// Number of the readback in `Rotation`, if an output set is read.
     pub reading: Option<u64>,
-    /// The end of the step that wrote the output.
+    /// End of the step that wrote the output set.
     pub after: &'a CudaEvent,
 }
 
 impl Fetches {
-    /// Starts the copy of positions and normals, as far as they are wanted; `rest` fills the other lists meanwhile.
+    /// Starts the copy of the wanted positions and normals. Meanwhile `rest` fills the other lists.
     pub(super) fn start(
         &mut self,
         device: &Device,
@@ -115,7 +116,7 @@ impl Fetches {
         Ok(if is_read { Fetch::pending(surface) } else { Fetch::ready(surface) })
     }
 
-    /// Starts the copy from an output into a slot.
+    /// Starts the copy from an output set into a slot.
     fn start_reading(&mut self, device: &Device, output: &mut Output, order: Order<'_>, at: usize) -> Result<()> {
         let fail = during(STAGE);
         let own = match &self.stream {
@@ -134,16 +135,17 @@ impl Fetches {
         let slot = &mut self.slots[at];
         let surface = slot.unshared()?;
         for (from, to) in from.into_iter().zip([&mut surface.positions, &mut surface.normals]) {
-            // SAFETY: the outputs have the bytes of the plan, from which the lists have their lengths, or none. Nobody looks
-            // at the lists before the copy's event was waited for, the slot keeps them, and it goes after the stream was waited
-            // for.
+            // SAFETY: the outputs have the bytes of the plan, and each list has that length or is empty. The lists are
+            // not read before `wait` has synchronized on the copy's event. The slot keeps them alive, and it is dropped
+            // only after its event has completed or the stream is synchronized.
             unsafe { copy(from, to, &own) }?;
         }
         slot.there.record(&own).map_err(&fail)?;
         self.ends[order.set].record(&own).map_err(&fail)
     }
 
-    /// Copies OpenGL's buffers aside, and lets `own` wait for that; where the copies lie.
+    /// Copies OpenGL's buffers to the back buffer and makes `own` wait for that copy. Returns the addresses of the
+    /// copies.
     fn fill_back(
         &mut self,
         device: &Device,
@@ -168,8 +170,8 @@ impl Fetches {
         output.with(device, Use { set: order.set, access: Access::Read }, |from| {
             let copies = [from.positions, from.normals].into_iter().zip(to).zip(bytes);
             for ((from, to), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
-                // SAFETY: the outputs have the bytes of the plan, and so has what of the back buffer is wanted. Both live
-                // until the stream was waited for.
+                // SAFETY: outputs and back buffer have the bytes of the plan for each wanted list. Both live until the
+                // stream is synchronized.
                 unsafe { result::memcpy_dtod_async(to, from, bytes, device.stream().cu_stream()) }
                     .map_err(during(STAGE))?;
             }
@@ -180,7 +182,7 @@ impl Fetches {
         Ok(to)
     }
 
-    /// Waits for a copy; its surface, and what its reading was called.
+    /// Waits for a copy. Returns its surface and the number of its readback.
     pub(super) fn wait(&self, fetch: &Fetch) -> Result<(Arc<Surface>, Option<u64>)> {
         let own = self.slots.iter().find(|slot| fetch.is_of(&slot.surface));
         let stranger = || Error::Fault { stage: STAGE, reason: "not a fetch of this deformer".into() };
@@ -189,7 +191,7 @@ impl Fetches {
         Ok((Arc::clone(&slot.surface), slot.reading))
     }
 
-    /// Lets the device's stream wait for the last copy from an output set.
+    /// Makes the device's stream wait for the last copy from an output set.
     pub(super) fn let_pass(&self, device: &Device, set: usize) -> Result<()> {
         match self.ends.get(set) {
             Some(end) => device.stream().wait(end).map_err(during(STAGE)),
@@ -200,20 +202,20 @@ impl Fetches {
     /// Waits for all copies.
     pub(super) fn synchronize(&self) {
         if let Some(stream) = &self.stream {
-            // Its failure adds nothing to what the device's own stream says.
+            // The device's own stream reports the same fault.
             stream.synchronize().ok();
         }
     }
 
-    /// A slot of these lists that nobody holds. The oldest beyond the spare ones go, whatever their lists, once the device
-    /// has done with them.
+    /// A free slot with these list lengths. Frees the oldest free slots beyond [`SPARE`], of any lengths, whose copies
+    /// have ended.
     fn free_slot(&mut self, device: &Device, lengths: Lists) -> Result<usize> {
         let is_free = |slot: &Slot| Arc::strong_count(&slot.surface) == 1;
         let mut ages: Vec<u64> = self.slots.iter().filter(|slot| is_free(slot)).map(|slot| slot.age).collect();
         ages.sort_unstable();
         let oldest = ages.len().checked_sub(SPARE).map_or(0, |beyond| ages[beyond]);
         self.slots.retain(|slot| !is_free(slot) || slot.age >= oldest || !slot.there.is_complete());
-        // The one whose copy is the oldest: it has most likely ended.
+        // Take the slot with the oldest copy: that copy has most likely ended.
         let free = self.slots.iter().enumerate().filter(|(_, slot)| is_free(slot) && slot.lengths == lengths);
         if let Some((at, _)) = free.min_by_key(|(_, slot)| slot.age) {
             return Ok(at);
@@ -223,7 +225,7 @@ impl Fetches {
     }
 }
 
-/// Where positions and normals of a set of our own lie.
+/// Addresses of the positions and normals of an owned output set.
 fn addresses(device: &Device, output: &mut Output, set: usize) -> Result<[u64; 2]> {
     let mut found = [0; 2];
     output.with(device, Use { set, access: Access::Read }, |from| {
@@ -243,28 +245,31 @@ impl Slot {
             [(positions, lengths.positions), (normals, lengths.normals), (displacements, lengths.displacements)]
         {
             list.resize(length, 0.0);
-            // SAFETY: the list never changes its length again, and the locks are dropped before it.
+            // SAFETY: the length of the list never changes again, and the locks are dropped before it.
             locks.extend(unsafe { PageLock::new(device, list) });
         }
         Ok(Self { _locks: locks, surface: Arc::new(surface), there, lengths, age: 0, reading: None })
     }
 
-    /// The lists, while nobody else holds them.
+    /// Exclusive access to the lists.
+    ///
+    /// # Errors
+    /// `Fault` when another holder has a reference to them.
     fn unshared(&mut self) -> Result<&mut Surface> {
         let taken = || Error::Fault { stage: STAGE, reason: "the memory is in use".into() };
         Arc::get_mut(&mut self.surface).ok_or_else(taken)
     }
 }
 
-/// Starts a copy from the device.
+/// Starts a device-to-host copy.
 ///
 /// # Safety
-/// `from` is the address of at least as many bytes of device memory as `to` has, and nobody uses `to` before the stream
-/// has come to the end of the copy.
+/// `from` is the address of at least as many bytes of device memory as `to` has, and `to` is not accessed before the
+/// stream has completed the copy.
 unsafe fn copy(from: u64, to: &mut [f32], stream: &CudaStream) -> Result<()> {
     if to.is_empty() {
         return Ok(());
     }
-    // SAFETY: the caller vouches for both.
+    // SAFETY: the caller guarantees both conditions.
     unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(during(STAGE))
 }

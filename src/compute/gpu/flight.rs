@@ -1,5 +1,6 @@
-//! What one step under way has of its own: its values and lists on their way in, its answer, and the graphs that name
-//! that memory. A second one is made for a step that is submitted before the one before it has ended.
+//! A ring slot: the memory of one step in flight. It holds the input values and lists, the pinned memory for the bounds
+//! that are read back, and the graphs that refer to this memory. A second slot is made when a step is submitted before
+//! the previous one has ended.
 
 use std::sync::Arc;
 
@@ -21,35 +22,35 @@ use modalcast_model::scene::LightBounds;
 pub(super) struct Kernels {
     pub deform: Deform,
     pub bounds: Bounds,
-    /// Of a scene whose normals follow the surface.
+    /// Only in a scene whose normals follow the surface.
     pub normals: Option<Normals>,
-    /// Of a scene whose steps may change few domains.
+    /// Only in a scene that can have partial steps.
     pub apply: Option<Apply>,
 }
 
 /// Pinned memory of a step, and its graphs.
 pub(super) struct Flight {
-    // Graphs first: they name the memory of all that follows.
+    // First, so dropped first: the graphs refer to the memory of the fields below.
     whole: CudaGraph,
-    /// Of a list of changed domains.
+    /// Graph of a partial step.
     some: Option<CudaGraph>,
     pub values: Pinned,
     pub list: Option<List>,
     answer: PinnedHostSlice<u32>,
-    /// Recorded behind each step.
+    /// Recorded after each step.
     pub done: CudaEvent,
-    /// With OpenGL's buffers, recorded behind each mapping, which waits for frames.
+    /// Only with OpenGL's buffers: recorded after each mapping, which waits for frames in flight.
     mapped: Option<CudaEvent>,
-    /// Host milliseconds of the step before it asked for the mapping.
+    /// Host milliseconds of the step before it requested the mapping.
     pub before_ms: f64,
 }
 
 impl Flight {
-    /// `is_timed`: on the device, from behind the mapping on.
+    /// `is_timed`: measure the time of steps on the device, from the end of the mapping.
     pub(super) fn new(device: &Device, kernels: &Kernels, inputs: &Inputs, is_timed: bool) -> Result<Self> {
         let mut values = inputs.pinned(device)?;
         let mut list = kernels.apply.as_ref().map(|apply| apply.list(device)).transpose()?;
-        // SAFETY: the memory is written by the copy that ends every graph before anyone looks.
+        // SAFETY: the memory is uninitialized; the copy at the end of every graph writes it before it is read.
         let answer = unsafe { device.context().alloc_pinned_with_flags(kernels.bounds.words(), 0) };
         let mut answer = answer.map_err(during("allocate"))?;
         let parts = (kernels, inputs);
@@ -64,7 +65,7 @@ impl Flight {
         Ok(Self { whole, some, values, list, answer, done, mapped, before_ms: 0.0 })
     }
 
-    /// Marks on the stream that the step's outputs may be written from here on.
+    /// Records on the stream that the mapping has ended, after which the step may write its outputs.
     pub(super) fn mark_mapped(&self, device: &Device) -> Result<()> {
         match &self.mapped {
             Some(mapped) => mapped.record(device.stream()).map_err(during("deform")),
@@ -72,22 +73,23 @@ impl Flight {
         }
     }
 
-    /// Milliseconds of a step that was waited for, without the wait for frames; none where that is not timed. The host's
-    /// work behind the mapping counts as far as the device had to wait for it.
+    /// Milliseconds of a step that has ended, without the wait for frames; `None` if steps are not timed. Host work
+    /// after the mapping counts only as far as the device waited for it.
     pub(super) fn own_ms(&self) -> Result<Option<f64>> {
         let Some(mapped) = &self.mapped else { return Ok(None) };
         let ms = mapped.elapsed_ms(&self.done).map_err(during("deform"))?;
         Ok(Some(self.before_ms + f64::from(ms)))
     }
 
-    /// Starts the step's graph on the device's stream; its values are written. `some`: of the list.
+    /// Starts the step's graph on the device's stream; its values are already written. `some`: the graph of a partial
+    /// step.
     pub(super) fn launch(&self, some: bool) -> Result<()> {
         let graph = if some { self.some.as_ref() } else { Some(&self.whole) };
         let missing = || Error::Fault { stage: "deform", reason: "no graph was captured".into() };
         graph.ok_or_else(missing)?.launch().map_err(during("deform"))
     }
 
-    /// Waits for the end of the step, and returns its bounds, in light space too where the scene has a shadow.
+    /// Waits for the end of the step. Returns its bounds, and its bounds in light space if the scene has a shadow.
     pub(super) fn wait(&self) -> Result<(modalcast_model::scene::Bounds, Option<LightBounds>)> {
         self.done.synchronize().map_err(during("deform"))?;
         let keys = self.answer.as_slice().map_err(during("deform"))?;
@@ -95,21 +97,21 @@ impl Flight {
     }
 }
 
-/// What `start` puts on the stream, as a graph.
+/// Captures the work that `start` submits to the stream as a graph.
 fn capture(device: &Device, start: impl FnOnce() -> Result<()>) -> Result<CudaGraph> {
     let fail = during("capture");
     let stream = Arc::clone(device.stream());
-    // Relaxed: a look at pinned memory asks the driver whether it is in use, which stricter modes refuse.
+    // Relaxed: access to pinned memory asks the driver whether it is in use, which stricter modes forbid.
     stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
     let started = start();
-    // The capture ends whatever happened, or the stream would stay in it.
+    // End the capture even after an error; otherwise the stream would remain in capture mode.
     let graph = stream.end_capture(CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH);
     started?;
     let empty = || Error::Fault { stage: "capture", reason: "the graph is empty".into() };
     graph.map_err(&fail)?.ok_or_else(empty)
 }
 
-/// A step: copies in, kernels, the bounds out.
+/// Submits a step: upload, kernels, readback of the bounds.
 fn start(
     device: &Device,
     (kernels, inputs): (&Kernels, &Inputs),
@@ -129,6 +131,7 @@ fn start(
     kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, places))?;
     let bounds = places.header + std::mem::offset_of!(Header, bounds) as u64;
     let answer = answer.as_mut_slice().map_err(during("capture"))?;
-    // SAFETY: the header has twelve words of bounds, `answer` no more, and the step is waited for before they are read.
+    // SAFETY: the header has twelve words of bounds and `answer` at most as many. The host waits for the step before it
+    // reads `answer`.
     unsafe { result::memcpy_dtoh_async(answer, bounds, device.stream().cu_stream()) }.map_err(during("capture"))
 }

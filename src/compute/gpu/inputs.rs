@@ -1,10 +1,11 @@
-//! The values of a step on their way to the device: written to pinned memory once, in the order in which they lie there,
-//! large ones by several cores.
+//! The input values of a step and their upload. The host writes them once to pinned memory, in the layout of the device
+//! buffer; several cores write large steps.
 //!
 //! ```text
-//! [header][transforms: 12 f32 a mover][q, whole chunks of modes][with truncation: kept chunks of each domain]
+//! [header][transforms: 12 f32 per transform root][q, padded to whole chunks of modes][kept chunks of each domain]
 //! ```
-//! The pinned memory is write-combined: it is written from front to back and never read here.
+//! The kept chunks are present only with truncation. The pinned memory is write-combined: the host writes it from front
+//! to back and never reads it.
 
 use std::sync::Arc;
 
@@ -20,24 +21,25 @@ use crate::storage::{Amounts, Truncation, bound, modes_per_chunk, reaches};
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Scene, State};
 
-/// What decides how a scene's coordinates lie on the device.
+/// Layout of a scene's modal coordinates on the device.
 #[derive(Debug)]
 pub struct Packing {
     pub scene: Arc<Scene>,
     pub coordinates: Coordinates,
-    /// Per shape the factors of its modes; empty lists unless the storage has factors.
+    /// Per shape, the factors of its modes; empty unless the storage has factors.
     pub factors: Vec<Vec<f32>>,
     pub listing: Listing,
 }
 
-/// What lists of changed domains name.
+/// Tiles of each domain, from which a partial step derives its tile list.
 #[derive(Debug, Default)]
 pub struct Listing {
-    /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
+    /// Per domain, first tile and tile count: of tiles with vertices, and of tiles with corners alone.
     pub spans: Vec<[(u32, u32); 2]>,
-    /// Tiles of all.
+    /// Number of all tiles.
     pub tiles: usize,
-    /// As many tiles as a whole step is worth: batches read U once, but compute no less.
+    /// Cost of a full step in tiles, the limit of a partial step. A batched tile counts as several, because a batch
+    /// reads U once but computes every member.
     pub whole: usize,
 }
 
@@ -46,7 +48,7 @@ pub struct Listing {
 pub struct Values {
     pub header: u64,
     pub transforms: u64,
-    /// Constant: who follows whom, and by which frame. Of a scene with followers.
+    /// Constant: each follower's transform root and frame. Only in scenes with followers.
     pub following: u64,
     pub frames: u64,
     pub q: u64,
@@ -57,7 +59,7 @@ pub struct Values {
     pub kept: u64,
 }
 
-/// Bytes of the parts, in their order.
+/// Sizes of the parts in bytes, in buffer order.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sizes {
     pub transforms: u64,
@@ -83,7 +85,7 @@ impl Sizes {
     }
 }
 
-/// Where the values of a step lie on the device, and what writes them.
+/// The device buffers of a step's values, and their writer.
 #[derive(Debug)]
 pub struct Inputs {
     writer: Writer,
@@ -94,7 +96,7 @@ pub struct Inputs {
     sizes: Sizes,
 }
 
-/// Pinned memory for the values of one step on their way.
+/// Pinned staging buffer for the values of one step.
 pub type Pinned = PinnedHostSlice<f32>;
 
 impl Inputs {
@@ -110,9 +112,10 @@ impl Inputs {
         })
     }
 
-    /// Room for the values of a step.
+    /// Allocates a staging buffer for the values of a step.
     pub fn pinned(&self, device: &Device) -> Result<Pinned> {
-        // SAFETY: the memory is written whole before it is first read, in `write`.
+        // SAFETY: the contents of the memory are uninitialized; `write` writes all of it before the first copy reads
+        // it.
         unsafe { device.context().alloc_pinned(self.sizes.total() as usize / 4) }.map_err(during("allocate"))
     }
 
@@ -127,25 +130,26 @@ impl Inputs {
         Values { header, transforms, following, frames, q, stamps, kept_counts, kept }
     }
 
-    /// Writes a whole step. Nothing may be reading the pinned memory: the caller has waited for its last copy.
+    /// Writes a full step. The caller has waited for the last copy from this memory, so nothing reads it.
     pub fn write(&mut self, to: &mut Pinned, header: &Header, state: &State) -> Result<()> {
         self.writer.write(to.as_mut_slice().map_err(during("upload"))?, header, state);
         Ok(())
     }
 
-    /// Writes the header alone.
+    /// Writes only the header.
     pub(super) fn write_header(to: &mut Pinned, header: &Header) -> Result<()> {
         Front::new(to.as_mut_slice().map_err(during("upload"))?).put(std::slice::from_ref(header));
         Ok(())
     }
 
-    /// Starts the copy of the first `bytes`; the whole when `None`.
+    /// Starts the copy of the first `bytes` bytes, or of all with `None`.
     pub fn send(&self, device: &Device, from: &mut Pinned, bytes: Option<usize>) -> Result<()> {
         let fail = during("upload");
         let (to, host) = (address(device, &self.buffer), from.as_mut_slice().map_err(&fail)?);
         let bytes = bytes.unwrap_or(size_of_val(host));
-        // SAFETY: `pinned` and `buffer` have `bytes` bytes and outlive the copy: the deformer waits for it before it
-        // writes there again and before it goes away, and a graph that holds the copy goes before both.
+        // SAFETY: the staging buffer and `self.buffer` have `bytes` bytes and outlive the copy: the deformer waits for
+        // the copy before it writes the staging buffer again and before it drops it. A graph that contains the copy is
+        // dropped first.
         let sent = unsafe {
             let host = std::slice::from_raw_parts(host.as_ptr().cast::<u8>(), bytes);
             result::memcpy_htod_async(to, host, device.stream().cu_stream())
@@ -153,23 +157,23 @@ impl Inputs {
         sent.map_err(fail)
     }
 
-    /// Bytes that a whole step copies.
+    /// Bytes that a full step copies.
     pub const fn bytes(&self) -> u64 {
         self.sizes.total()
     }
 
-    /// Chunks of modes that each domain sums at the last step; `None` when it sums all.
+    /// Number of chunks of modes that each domain sums in the last step; `None` when all are summed.
     pub fn kept_chunks(&self) -> Option<&[u32]> {
         self.writer.truncation.as_ref().map(|choice| choice.counts.as_slice())
     }
 
-    /// How far leaving modes out may move a vertex at the last step, scene units.
+    /// Bound of the displacement that the truncated modes cause at any vertex in the last step, scene units.
     pub(super) fn truncation_bound(&self) -> f64 {
         self.writer.truncation.as_ref().map_or(0.0, |choice| choice.bound)
     }
 }
 
-/// Writes the values of steps, in the order of their parts. Pure.
+/// Writes the values of steps in buffer order. Pure.
 #[derive(Debug)]
 pub struct Writer {
     packing: Arc<Packing>,
@@ -182,7 +186,7 @@ impl Writer {
         Self { packing: Arc::clone(packing), truncation }
     }
 
-    /// Writes a whole step; `to` has the words of `Sizes::total`.
+    /// Writes a full step; `to` has [`Sizes::total`] bytes.
     pub fn write(&mut self, to: &mut [f32], header: &Header, state: &State) {
         let mut to = Front::new(to);
         to.put(std::slice::from_ref(header));
@@ -194,13 +198,13 @@ impl Writer {
     }
 }
 
-/// Who follows whom; empty where nobody does.
+/// Transform root and frame of each domain; empty in a scene without followers.
 pub(super) fn following(scene: &Scene) -> Vec<Following> {
     scene.movers.following().iter().map(|[mover, frame]| Following { mover: *mover, frame: *frame }).collect()
 }
 
 impl Packing {
-    /// All coordinates as they lie on the device, and the padding at the end.
+    /// Writes all coordinates in the layout of the device, and zeros the padding at the end.
     fn write_q(&self, state: &State, to: &mut [f32]) {
         if self.coordinates.as_packed {
             let mut to = Front::new(to);
@@ -220,10 +224,11 @@ impl Packing {
         });
     }
 
-    /// The coordinates of one domain, times the factors of its modes, filled up to whole chunks.
+    /// Passes the coordinates of one domain to `put`, multiplied by the factors of their modes and padded to whole
+    /// chunks.
     pub(super) fn put_q(&self, domain: usize, q: &[f32], mut put: impl FnMut(f32)) {
         let factors = &self.factors[self.scene.domains[domain].shape];
-        // A power of two: exact, unless the product leaves f32.
+        // The factor is a power of two, so the product is exact unless it overflows or underflows f32.
         q.iter()
             .enumerate()
             .for_each(|(mode, amount)| put(factors.get(mode).map_or(*amount, |factor| amount * factor)));
@@ -234,13 +239,13 @@ impl Packing {
     }
 }
 
-/// Domains that a core decides about at a time: a few microseconds each.
+/// Domains per parallel work item of the truncation; a domain takes a few microseconds.
 const DECIDED_TOGETHER: usize = 64;
 
-/// Which chunks of modes each domain sums.
+/// Modal truncation: which chunks of modes each domain sums.
 #[derive(Debug)]
 struct Choice {
-    /// Scene units.
+    /// Error budget, scene units.
     budget: f64,
     /// Per shape.
     reaches: Vec<Vec<f64>>,
@@ -248,7 +253,7 @@ struct Choice {
     truncations: Vec<Truncation>,
     bound: f64,
     counts: Vec<u32>,
-    /// Two chunks a word.
+    /// Chunk indices, two u16 per word.
     chunks: Vec<u32>,
 }
 
@@ -264,7 +269,7 @@ impl Choice {
         }
     }
 
-    /// A chunk is summed when one of its modes is: its others come for free.
+    /// Keeps a chunk when at least one of its modes is kept: reading the chunk reads its other modes too.
     fn write(&mut self, packing: &Packing, state: &State, to: &mut Front) {
         let scene = &packing.scene;
         let per_chunk = modes_per_chunk(scene.deformation.storage);
@@ -276,7 +281,7 @@ impl Choice {
         self.bound = 0.0;
         let (reaches, budget) = (&self.reaches, self.budget);
         let decide = |(domain, truncation): (usize, &mut Truncation)| {
-            // Nothing is left out of nothing, whatever T.
+            // Without modes nothing can be truncated, and the norm of T does not matter.
             if scene.rank_of(domain) > 0 {
                 let reaches = &reaches[scene.domains[domain].shape];
                 let norm = bound::norm(&state.composed(scene, domain));
@@ -322,7 +327,7 @@ mod tests {
         state
     }
 
-    /// All words of a step, one by one.
+    /// All words of a step, written one by one.
     fn plainly(packing: &Packing, state: &State) -> Vec<f32> {
         let scene = &packing.scene;
         let mut words = vec![0.0; size_of::<Header>() / 4];

@@ -1,9 +1,11 @@
-//! OpenGL buffers as device memory: registered once, mapped together for each step, unmapped before anything is drawn.
+//! CUDA-OpenGL interop: OpenGL buffers as device memory. They are registered once, mapped together for each step, and
+//! unmapped before the next draw.
 //!
-//! Mapping orders the two APIs, so that nobody waits on the host: what OpenGL was told before a mapping ends before work that
-//! the stream is given after it, and what the stream was given before an unmapping ends before what OpenGL is told after it.
-//! A frame may therefore still be under way when the next step is given to the stream: that step waits on the device until it
-//! is drawn and its pixels have left. It never runs beside a frame; nor is that wait part of the step's time (`flight`).
+//! Map and unmap order the two APIs on the device, so the host never waits. OpenGL commands issued before a map
+//! complete before CUDA work that is submitted to the stream after it. CUDA work submitted before an unmap completes
+//! before OpenGL commands that are issued after it. A frame may therefore be in flight when the next step is submitted:
+//! the step waits on the device until the frame is drawn and its pixels are read back. A step never runs concurrently
+//! with a frame that uses its buffers, and this wait is not part of the step's time (`flight`).
 
 use std::ffi::{c_int, c_uint};
 use std::sync::Arc;
@@ -20,16 +22,16 @@ use modalcast_model::raster::GlBuffer;
 
 const STAGE: &str = "interop";
 
-/// `CU_GL_DEVICE_LIST_ALL`: every device that the current context draws with.
+/// `CU_GL_DEVICE_LIST_ALL`: every CUDA device that the current OpenGL context uses.
 const ALL_DEVICES: c_uint = 1;
 
-/// The most buffers that are mapped together.
+/// Maximum number of buffers that are mapped together.
 const MOST: usize = 3;
 
 type RegisterBuffer = unsafe extern "C" fn(*mut CUgraphicsResource, c_uint, c_uint) -> CUresult;
 type GetDevices = unsafe extern "C" fn(*mut c_uint, *mut c_int, c_uint, c_uint) -> CUresult;
 
-/// What a mapping is for. The driver may drop what a buffer held when all of it will be written and nothing read.
+/// Purpose of a mapping. With `WriteAll` the driver may discard the old contents of the buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Access {
     WriteAll,
@@ -37,44 +39,45 @@ pub(super) enum Access {
     Read,
 }
 
-/// What registers buffers of the OpenGL context that is current on this thread.
+/// Registers buffers of the OpenGL context that is current on this thread.
 #[derive(Debug)]
 pub(super) struct Sharing {
     register: RegisterBuffer,
-    /// Kept as long as its function.
+    /// Keeps `register` loaded.
     _library: Library,
 }
 
 impl Sharing {
-    /// Finds out whether that context draws on this device.
+    /// Checks that the current OpenGL context draws on this device.
     ///
     /// # Errors
-    /// `Fault` saying why nothing can be shared.
+    /// `Fault` with the reason why nothing can be shared.
     pub(super) fn open(device: &Device) -> Result<Self> {
         let fail = during(STAGE);
-        // SAFETY: the driver is loaded already; this only counts one more user of it.
+        // SAFETY: the driver library is already loaded, so this only increments its reference count and runs no
+        // initializer.
         let library = unsafe { Library::new("libcuda.so.1") }.map_err(|error| fail(error.to_string()))?;
         check_device(&library, device)?;
-        // SAFETY: the type is that of cudaGL.h.
+        // SAFETY: the type matches the declaration in cudaGL.h.
         let register = unsafe { library.get::<RegisterBuffer>(b"cuGraphicsGLRegisterBuffer\0") };
         let register = *register.map_err(|error| fail(error.to_string()))?;
         Ok(Self { register, _library: library })
     }
 
-    /// Registers a buffer; it must have at least the bytes that it is said to have once it is mapped.
+    /// Registers a buffer. Each mapping checks that the buffer has at least `buffer.bytes` bytes.
     ///
     /// # Errors
-    /// `Fault` naming the buffer that was refused.
+    /// `Fault` with the name of the buffer that the driver refused.
     pub(super) fn register(&self, device: &Device, buffer: GlBuffer) -> Result<Registered> {
         let mut resource = std::ptr::null_mut();
-        // SAFETY: `resource` is a live pointer; an unknown buffer name is refused by the driver.
+        // SAFETY: `resource` is a live pointer; the driver refuses an unknown buffer name.
         let answer = unsafe { (self.register)(&mut resource, buffer.name, 0) };
         answer.result().map_err(|error| during(STAGE)(format!("buffer {}: {error}", buffer.name)))?;
         Ok(Registered { resource, buffer, access: None, context: Arc::clone(device.context()) })
     }
 }
 
-/// A buffer that CUDA may map; unregistered when dropped.
+/// An OpenGL buffer that CUDA may map; unregistered on drop.
 #[derive(Debug)]
 pub(super) struct Registered {
     resource: CUgraphicsResource,
@@ -88,7 +91,7 @@ impl Registered {
         self.buffer
     }
 
-    /// Tells the driver what the next mapping is for, if that changed.
+    /// Announces the purpose of the next mapping to the driver, if it differs from the last one.
     fn announce(&mut self, access: Access) -> Result<(), DriverError> {
         use sys::CUgraphicsMapResourceFlags_enum as Flags;
         if self.access == Some(access) {
@@ -106,7 +109,10 @@ impl Registered {
         Ok(())
     }
 
-    /// Where it is mapped, if it is large enough.
+    /// Device address of the mapped buffer.
+    ///
+    /// # Errors
+    /// `Fault` when the buffer is smaller than expected.
     fn address(&self) -> Result<u64> {
         let fail = during(STAGE);
         let GlBuffer { name, bytes: expected } = self.buffer;
@@ -124,18 +130,18 @@ impl Registered {
 
 impl Drop for Registered {
     fn drop(&mut self) {
-        // Answers are dropped on purpose: nothing is left to be done, and a device that failed says so at its next call.
+        // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
         self.context.bind_to_thread().ok();
-        // SAFETY: registered once, unregistered once.
+        // SAFETY: the resource was registered once and is unregistered once.
         unsafe { sys::cuGraphicsUnregisterResource(self.resource) }.result().ok();
     }
 }
 
-/// Maps buffers, each once and at most three, by one call; lets `work` use their addresses on the device's stream, and
-/// unmaps them whatever it returned.
+/// Maps at most three distinct buffers by one call, runs `work` with their addresses, and unmaps them whether `work`
+/// succeeds or not. `work` submits to the device's stream.
 ///
 /// # Errors
-/// What `work` returned, or a `Fault` of mapping.
+/// The error of `work`, or a `Fault` of mapping.
 pub(super) fn mapped(
     device: &Device,
     uses: &mut [(&mut Registered, Access)],
@@ -149,11 +155,11 @@ pub(super) fn mapped(
     }
     let stream = device.stream().cu_stream();
     let (count, resources) = (uses.len().min(MOST) as c_uint, resources.as_mut_ptr());
-    // SAFETY: all are registered and unmapped, and the stream is of the same device. Frames that OpenGL still draws from
-    // them end before the stream goes on.
+    // SAFETY: all resources are registered and unmapped, and the stream belongs to the same device. OpenGL frames that
+    // read the buffers complete before later work on the stream.
     unsafe { sys::cuGraphicsMapResources(count, resources, stream) }.result().map_err(&fail)?;
     let worked = addresses(uses).and_then(work);
-    // SAFETY: they were mapped just now; work that was started on the stream ends before OpenGL goes on.
+    // SAFETY: they were mapped above; the work that `work` submitted completes before OpenGL uses the buffers.
     let unmapped = unsafe { sys::cuGraphicsUnmapResources(count, resources, stream) }.result();
     worked.and(unmapped.map_err(fail))
 }
@@ -166,7 +172,7 @@ fn addresses(uses: &[(&mut Registered, Access)]) -> Result<[u64; MOST]> {
     Ok(list)
 }
 
-/// Positions, normals and perhaps tangents, registered with CUDA.
+/// OpenGL buffers of positions, normals and optionally tangents, registered with CUDA.
 #[derive(Debug)]
 pub(super) struct Interop {
     positions: Registered,
@@ -175,11 +181,11 @@ pub(super) struct Interop {
 }
 
 impl Interop {
-    /// Registers the buffers of the OpenGL context that is current on this thread. `sizes` are the bytes of positions,
-    /// normals and tangents; 0 tangents means none.
+    /// Registers the buffers of the OpenGL context that is current on this thread. `sizes`: bytes of positions, normals
+    /// and tangents; 0 bytes of tangents means no tangents.
     ///
     /// # Errors
-    /// `Fault` saying what was refused; nothing stays registered.
+    /// `Fault` with the refused resource; nothing remains registered.
     pub(super) fn register(device: &Device, buffers: GlBuffers, sizes: [u64; 3]) -> Result<Self> {
         let missing = || during(STAGE)("the renderer gave no buffer for tangents");
         let [positions, normals, tangents] = sizes;
@@ -197,10 +203,11 @@ impl Interop {
         Ok(interop)
     }
 
-    /// Maps all buffers, lets `work` use their addresses on the device's stream, and unmaps them whatever it returned.
+    /// Maps all buffers, runs `work` with their addresses, and unmaps them whether `work` succeeds or not. `work`
+    /// submits to the device's stream.
     ///
     /// # Errors
-    /// What `work` returned, or a `Fault` of mapping.
+    /// The error of `work`, or a `Fault` of mapping.
     pub(super) fn mapped(
         &mut self,
         device: &Device,
@@ -216,14 +223,15 @@ impl Interop {
     }
 }
 
-/// Whether OpenGL draws on this CUDA device; with any other, or Mesa's rasteriser, registering cannot work.
+/// Checks that OpenGL draws on this CUDA device. Registration cannot work with another device or with Mesa's software
+/// rasterizer.
 fn check_device(library: &Library, device: &Device) -> Result<()> {
     let refused = |reason: String| Error::Fault { stage: STAGE, reason };
-    // SAFETY: the type is that of cudaGL.h.
+    // SAFETY: the type matches the declaration in cudaGL.h.
     let get = unsafe { library.get::<GetDevices>(b"cuGLGetDevices_v2\0") };
     let get = get.map_err(|error| refused(error.to_string()))?;
     let (mut count, mut devices) = (0, [0; 16]);
-    // SAFETY: `devices` has as many places as the call is told.
+    // SAFETY: `devices` has as many elements as the call receives in its third argument.
     let answer = unsafe { get(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, ALL_DEVICES) };
     answer.result().map_err(|error| refused(format!("no current OpenGL context of a CUDA device: {error}")))?;
     let drawing = &devices[..devices.len().min(count as usize)];

@@ -1,4 +1,5 @@
-//! The structs of `kernels/layout.cuh`, field by field; both sides assert the sizes, tests compare the offsets.
+//! The structs that host and kernels share, field by field as in `kernels/layout.cuh`. Both sides assert the sizes, and
+//! tests compare the offsets.
 
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::DeviceRepr;
@@ -7,7 +8,7 @@ use crate::storage::TILE_QUADS;
 use modalcast_model::domain::RING_START;
 use modalcast_model::scene::Movers;
 
-/// Threads of a block of every kernel but `deform`, and the packed corners that one block computes.
+/// Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
 pub(super) const BLOCK: u32 = 256;
 
 /// `first_tangent` of a shape without tangents.
@@ -16,10 +17,11 @@ pub(super) const NO_TANGENTS: u32 = u32::MAX;
 /// `first_member` of a shape without smoothing groups.
 pub(super) const NO_GROUPS: u32 = u32::MAX;
 
-/// `frame` of a domain that follows no other.
+/// `frame` of a domain that follows no other domain.
 pub(super) const NO_FRAME: u32 = Movers::NO_FRAME;
 
-/// Parts of [`Tile`]'s kind: the items of the last quad, or 0 in a mixed tile; what is computed of the items.
+/// Bit fields of [`Tile::kind`]: the number of items of the last quad (0 in a mixed tile), and flags for whether the
+/// tile computes vertices and corners.
 pub(super) const TILE_LAST: u8 = 7;
 pub(super) const TILE_VERTICES: u8 = 8;
 pub(super) const TILE_CORNERS: u8 = 16;
@@ -66,7 +68,7 @@ pub(super) struct Lane {
     pub first_q: u32,
 }
 
-/// A changed domain in the list of `apply`.
+/// An entry of the list of changed domains that `apply` reads.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Change {
@@ -76,7 +78,7 @@ pub(super) struct Change {
     pub source: u32,
 }
 
-/// Whose transform a domain has, and which frame it has in it; in scenes with followers.
+/// The transform root of a domain and its frame relative to that root; only in scenes with followers.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Following {
@@ -84,7 +86,7 @@ pub(super) struct Following {
     pub frame: u32,
 }
 
-/// Arguments of `deform`; pointers are device addresses, as in all arguments below.
+/// Arguments of `deform`. Pointers are device addresses, as in all arguments below.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct DeformArgs {
@@ -110,7 +112,7 @@ pub(super) struct DeformArgs {
     pub reserved: u32,
 }
 
-/// Domains of one shape whose U `batch` reads once.
+/// Domains of one shape, for which `batch` reads U once.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Group {
@@ -123,7 +125,7 @@ pub(super) struct Group {
     pub members: u32,
 }
 
-/// One of them.
+/// A domain of a [`Group`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Member {
@@ -161,7 +163,7 @@ pub(super) struct BatchArgs {
     pub boxes: u64,
 }
 
-/// A part of a domain of which `bounds` makes a box.
+/// A part of a domain that `bounds` reduces to one box.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub struct Piece {
@@ -202,7 +204,7 @@ pub(super) struct ApplyArgs {
     pub list: u64,
 }
 
-/// Where the corners of one domain lie, and the vertices around which `normals` gathers.
+/// Offsets of the corners of one domain, and of the vertices that `normals` gathers around them.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct NormalSlot {
@@ -263,10 +265,10 @@ unsafe impl DeviceRepr for ApplyArgs {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for NormalsArgs {}
 
-/// A size or an offset that both sides must agree on.
+/// A size, offset or constant that must be the same on host and device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Agreement {
-    /// The C++ expression, e.g. `OFFSET(VertexSlot, rank)`.
+    /// The C++ expression, e.g. `OFFSET(Tile, rest)`.
     pub expression: String,
     /// Its value on the host.
     pub host: u32,
@@ -325,10 +327,10 @@ pub fn agreements() -> Vec<Agreement> {
     list
 }
 
-/// The start of a source that states agreements: NVRTC has no `offsetof`, so this is what that macro expands to.
+/// The start of a source that contains agreements. NVRTC has no `offsetof`; `OFFSET` is what that macro expands to.
 pub(super) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
 
-/// A kernel `report` that writes the device's value of every agreement, in order, into its only argument.
+/// Source of a kernel `report` that writes the device's value of every agreement, in order, to its only argument.
 pub(super) fn report_source() -> String {
     let line = |(index, agreement): (usize, &Agreement)| {
         format!("    values[{index}] = (unsigned)({});\n", agreement.expression)

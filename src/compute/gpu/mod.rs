@@ -1,31 +1,32 @@
-//! CUDA: one launcher per kernel, with the kernel's name.
+//! The CUDA backend: one launcher module per kernel, with the name of the kernel.
 //!
-//! Kernels live in `kernels/*.cu`; NVRTC compiles them for the device that is there, with the parts that the scene
-//! needs ([`plan()`]), and a cache on disk keeps the machine code. A step is one graph: a copy to the device, at most four
-//! launches whatever the number of domains, straight into OpenGL's buffers when the driver shares them, and the bounds
-//! on their way back.
+//! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the device that is present, with only the
+//! features that the scene needs ([`plan`]), and a disk cache keeps the machine code. A step is one CUDA graph: a
+//! host-to-device copy, at most four kernel launches for any number of domains, and a readback of the bounds. The
+//! kernels write directly into OpenGL's buffers when the driver shares them.
 //!
 //! ```text
 //! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> answer
 //! ```
-//! `apply` is there in steps that change few domains, `batch` in the others where domains share a large U, `normals` where
-//! normals follow the deformed surface.
+//! A partial step, which changes few domains, launches `apply`. A full step launches `batch` if the scene has domains
+//! that share a large U. `normals` is launched if normals follow the deformed surface.
 //!
-//! | file | what |
+//! | file | content |
 //! |---|---|
-//! | `plan` | scene to kernels with their macros, buffers and launches |
-//! | `work`, `pack`, `rings`, `layout` | scene to the tables that kernels read; pure |
-//! | `inputs`, `staging` | the values of a step on their way to the device |
+//! | `plan` | derives the kernels with their macros, the buffers and the launches from the scene |
+//! | `work`, `pack`, `rings`, `layout` | derive the tables that the kernels read from the scene; pure |
+//! | `inputs`, `staging` | the input values of a step and their upload |
 //! | `apply`, `batch`, `deform`, `bounds`, `normals` | the launchers |
-//! | `chain` | a launch that begins while the kernel before it ends |
-//! | `deformer`, `flight` | the graph of a step, its pinned memory and its answer |
-//! | `output`, `interop` | where the vertices go |
-//! | `boxes` | a box of each domain, where the scene keeps them |
-//! | `rotation` | which of two outputs a step writes while the other is read, and what it lacks; pure |
-//! | `fetch` | vertices on their way to the host, beside the next step |
-//! | `raster` | triangles to samples in OpenGL's buffers, beside OpenGL's own rasteriser |
+//! | `chain` | programmatic dependent launch: a launch that overlaps the end of the kernel before it |
+//! | `deformer`, `flight` | the graph of a step, its pinned memory and the readback of its bounds |
+//! | `output`, `interop` | the output buffers |
+//! | `boxes` | a bounding box per domain, if the scene asks for them |
+//! | `rotation` | double buffering of the outputs: which one a step writes and which domains it lacks; pure |
+//! | `fetch` | asynchronous readback of vertices, concurrent with the next step |
+//! | `raster` | compute rasterizer: triangles to samples in OpenGL's buffers, next to OpenGL's own rasterizer |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
-//! | `probe`, `report` | what is there, and whether the device agrees on layouts |
+//! | `probe`, `report` | device capabilities; check that host and device agree on struct layouts |
+//! | `trials` | benchmark kernels |
 
 pub mod apply;
 mod batch;
@@ -63,13 +64,13 @@ pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use raster::{GlRaster, RasterForm, Spread};
 pub use report::device_values;
-/// OpenGL buffers to write into, by name.
+/// Names of the OpenGL buffers that receive the output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GlBuffers {
     /// 3 f32 per vertex.
     pub positions: u32,
     /// 3 f32 per corner.
     pub normals: u32,
-    /// 4 f32 per corner, when the scene has normal maps.
+    /// 4 f32 per corner; only if the scene has normal maps.
     pub tangents: Option<u32>,
 }

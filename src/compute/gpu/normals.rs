@@ -1,4 +1,4 @@
-//! Launches `kernels/normals.cu`: world normals and tangents that follow the deformed triangles, of all corners at once.
+//! Launches `kernels/normals.cu`: world normals and tangents of all corners, which follow the deformed triangles.
 
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig};
 
@@ -14,7 +14,7 @@ use super::rings::{self, Rings};
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 
-/// The kernel and what it reads of a scene.
+/// The kernel and its constant tables.
 #[derive(Debug)]
 pub struct Normals {
     pub function: CudaFunction,
@@ -55,8 +55,8 @@ impl Normals {
         })
     }
 
-    /// Starts the kernel, behind the one that writes the positions; the header among the values says where they lie and
-    /// where normals and tangents go.
+    /// Starts the kernel after the one that writes the positions. The header among `values` has the addresses of the
+    /// positions, normals and tangents.
     pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
         let args = NormalsArgs {
             header: values.header,
@@ -77,10 +77,11 @@ impl Normals {
             groups: self.groups,
             reserved: 0,
         };
-        // SAFETY: `NormalsArgs` is the kernel's only argument, and the kernel waits first. The tables come from `pack` and `rings`: members name
-        // groups, rings name vertices of their shape, and slots lie inside the rest normals, tangents, positions and
-        // transforms of the same scene. The header's outputs have the sizes that `Output` checked, and tangents are
-        // read and written only by a kernel that was compiled for a scene with normal maps.
+        // SAFETY: `NormalsArgs` is the kernel's only argument, and the kernel calls `await_previous` before it accesses
+        // memory. The tables come from `pack` and `rings`: members refer to groups, rings refer to vertices of their
+        // shape, and slots lie inside the rest normals, tangents, positions and transforms of the same scene. The
+        // header's outputs have the sizes that `Output` checked. Tangents are read and written only by a kernel that
+        // was compiled for a scene with normal maps.
         unsafe { chain::launch(device, &self.function, self.config, &args) }
     }
 }

@@ -1,4 +1,4 @@
-//! Where positions, normals and tangents go: OpenGL's buffers when the driver allows it, else buffers of our own.
+//! Output buffers of positions, normals and tangents: OpenGL's buffers when the driver shares them, else owned ones.
 
 use cudarc::driver::CudaSlice;
 
@@ -10,7 +10,7 @@ use super::plan::{Plan, Role};
 use modalcast_model::deform::Surface;
 use modalcast_model::error::Result;
 
-/// Device addresses of the outputs while they may be used; `tangents` is 0 when the scene has none.
+/// Device addresses of the outputs, valid while the outputs are mapped; `tangents` is 0 when the scene has none.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Addresses {
     pub positions: u64,
@@ -18,16 +18,16 @@ pub(super) struct Addresses {
     pub tangents: u64,
 }
 
-/// The three outputs; each has exactly the bytes that the plan says, or more.
+/// The three output buffers; each has at least the bytes of the plan.
 #[derive(Debug)]
 pub(super) enum Output {
-    /// One set, or two once the host reads one while the next step writes the other.
+    /// One set, or two after a step was submitted while the host reads the other set.
     Own(Vec<Buffers>),
-    /// OpenGL draws from these, so there is one set.
+    /// Buffers that OpenGL draws from, so there is one set.
     Shared(Interop),
 }
 
-/// A set of our own.
+/// A set of owned buffers.
 #[derive(Debug)]
 pub(super) struct Buffers {
     positions: CudaSlice<u8>,
@@ -35,7 +35,7 @@ pub(super) struct Buffers {
     tangents: Option<CudaSlice<u8>>,
 }
 
-/// What a use of the outputs is for: which set, and how.
+/// An access to an output set.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Use {
     pub set: usize,
@@ -67,7 +67,7 @@ impl Buffers {
 }
 
 impl Output {
-    /// OpenGL's buffers when they are given and the driver registers them; a refusal is logged, not returned.
+    /// Uses OpenGL's buffers if they are given and the driver registers them. A refusal is logged, not returned.
     pub(super) fn new(device: &Device, plan: &Plan, gl: Option<GlBuffers>) -> Result<Self> {
         match gl.map(|buffers| Interop::register(device, buffers, sizes(plan))) {
             Some(Ok(interop)) => return Ok(Self::Shared(interop)),
@@ -81,12 +81,12 @@ impl Output {
         matches!(self, Self::Shared(_))
     }
 
-    /// Sets that there may be.
+    /// Maximum number of sets.
     pub(super) const fn most(&self) -> usize {
         if self.is_shared() { 1 } else { 2 }
     }
 
-    /// Sets that there are.
+    /// Number of allocated sets.
     pub(super) fn count(&self) -> usize {
         match self {
             Self::Own(sets) => sets.len(),
@@ -94,10 +94,10 @@ impl Output {
         }
     }
 
-    /// Makes a set if it is not there.
+    /// Allocates a set unless it exists.
     ///
     /// # Errors
-    /// `Fault` when the device has no room; the sets that were there stay as they are.
+    /// `Fault` when the device has not enough memory; the existing sets remain unchanged.
     pub(super) fn ensure(&mut self, device: &Device, plan: &Plan, set: usize) -> Result<()> {
         match self {
             Self::Own(sets) if sets.len() <= set => {
@@ -108,10 +108,10 @@ impl Output {
         }
     }
 
-    /// Copies a set into `surface`, whose lists have the right lengths, and waits for it.
+    /// Copies a set into `surface`, whose lists have the right lengths, and waits for the copies.
     pub(super) fn read(&mut self, device: &Device, set: usize, surface: &mut Surface) -> Result<()> {
         self.with(device, Use { set, access: Access::Read }, |from| {
-            // SAFETY: the outputs have the bytes of the plan, and the lists were made from the same numbers.
+            // SAFETY: the outputs have the bytes of the plan, from which the lists have their lengths.
             unsafe {
                 download(device, from.positions, &mut surface.positions)?;
                 download(device, from.normals, &mut surface.normals)?;
@@ -120,7 +120,8 @@ impl Output {
         })
     }
 
-    /// Lets `work` use a set, which is there, on the device's stream.
+    /// Runs `work` with the addresses of an existing set, mapped if it is shared. `work` submits to the device's
+    /// stream.
     pub(super) fn with(
         &mut self,
         device: &Device,

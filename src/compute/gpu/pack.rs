@@ -1,9 +1,9 @@
-//! A scene to the tables that `normals` reads: slots, blocks, rest normals and tangents. Pure.
+//! Tables of `normals`, derived from a scene: slots, blocks, rest normals and tangents. Pure.
 
 use super::layout::{BLOCK, NO_TANGENTS};
 use modalcast_model::scene::Scene;
 
-/// Where the corners of one domain lie. Instances share `first_normal` and `first_tangent`.
+/// Offsets of the corners of one domain. Instances share `first_normal` and `first_tangent`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct CornerSlot {
     pub first: u32,
@@ -27,13 +27,13 @@ pub(super) fn corner_slots(scene: &Scene) -> Vec<CornerSlot> {
     scene.domains.iter().zip(&scene.layout.slots).map(slot).collect()
 }
 
-/// The domain of the first item of each block, and one more entry: the last domain. `firsts` are the first items of all
-/// domains in order, `items` how many there are.
+/// The domain of the first item of each block, followed by the last domain. `firsts`: the first items of all domains in
+/// order. `items`: the number of items.
 pub(super) fn first_domains(firsts: impl Iterator<Item = u32>, items: usize) -> Vec<u32> {
     let mut blocks: Vec<u32> = Vec::with_capacity(items.div_ceil(BLOCK as usize) + 1);
     let mut last = 0;
     for (domain, first) in firsts.enumerate() {
-        // All blocks that begin before this domain does begin in the one before it.
+        // All blocks that begin before this domain's first item begin in the previous domain.
         while (blocks.len() as u64) * u64::from(BLOCK) < u64::from(first) {
             blocks.push(last);
         }
@@ -46,7 +46,7 @@ pub(super) fn first_domains(firsts: impl Iterator<Item = u32>, items: usize) -> 
     blocks
 }
 
-/// Rest normals of all shapes, a plane per axis.
+/// Rest normals of all shapes, one plane per axis.
 pub(super) fn rest_normals(scene: &Scene) -> Vec<f32> {
     let all = |axis: usize| {
         scene.shapes.iter().flat_map(move |shape| shape.mesh.corners().normals.iter().map(move |normal| normal[axis]))
@@ -54,12 +54,12 @@ pub(super) fn rest_normals(scene: &Scene) -> Vec<f32> {
     (0..3).flat_map(all).collect()
 }
 
-/// Corners of all shapes: the length of one plane of [`rest_normals`].
+/// Number of corners of all shapes: the length of one plane of [`rest_normals`].
 pub(super) fn rest_corners(scene: &Scene) -> usize {
     scene.shapes.iter().map(|shape| shape.mesh.corners().vertices.len()).sum()
 }
 
-/// Tangents of all shapes that have them.
+/// Tangents of all shapes that have tangents.
 pub(super) fn rest_tangents(scene: &Scene) -> Vec<[f32; 4]> {
     scene.shapes.iter().flat_map(|shape| shape.tangents()).copied().collect()
 }
@@ -111,12 +111,12 @@ pub(super) mod tests {
         Scene::new(parts(shapes, normal_maps, rigid)).expect("a scene")
     }
 
-    /// The same without normal maps, all but the first domain following it.
+    /// Such a scene without normal maps; all domains follow the first one.
     pub(in super::super) fn on_the_first(shapes: &[(usize, usize)]) -> Arc<Scene> {
         followed(shapes, Deformation::default())
     }
 
-    /// The same, deformed so.
+    /// Such a scene with these deformation settings.
     pub(in super::super) fn followed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
         let mut parts = parts(shapes, false, true);
         parts.deformation = deformation;
@@ -125,42 +125,42 @@ pub(super) mod tests {
         Scene::new(parts).expect("a scene")
     }
 
-    /// The same without normal maps, U stored so.
+    /// A scene without normal maps, with this storage of U.
     pub(in super::super) fn stored(shapes: &[(usize, usize)], storage: Storage) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.storage = storage;
         Scene::new(parts).expect("a scene")
     }
 
-    /// The same without normal maps, deformed so.
+    /// A scene without normal maps, with these deformation settings.
     pub(in super::super) fn deformed(shapes: &[(usize, usize)], deformation: Deformation) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation = deformation;
         Scene::new(parts).expect("a scene")
     }
 
-    /// The same without normal maps, with exact normals.
+    /// A scene without normal maps, with exact normals.
     pub(in super::super) fn exact(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.deformation.normals = Normals::Exact;
         Scene::new(parts).expect("a scene")
     }
 
-    /// The same without normal maps, with displacements and boxes.
+    /// A scene without normal maps, with displacements and boxes.
     pub(in super::super) fn kept(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         (parts.deformation.displacements, parts.deformation.boxes) = (true, true);
         Scene::new(parts).expect("a scene")
     }
 
-    /// The same without normal maps and shadow.
+    /// A scene without normal maps and without a shadow.
     pub(in super::super) fn unlit(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         parts.look.shadow = None;
         Scene::new(parts).expect("a scene")
     }
 
-    /// Every shape used by two domains, corner i being vertex i.
+    /// Every shape used by two domains; corner i is vertex i.
     pub(in super::super) fn alike(shapes: &[(usize, usize)]) -> Arc<Scene> {
         let mut parts = parts(shapes, false, false);
         for shape in &mut parts.shapes {

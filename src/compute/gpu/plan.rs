@@ -1,4 +1,4 @@
-//! Scene to what a step costs on the device: kernels with their defines, buffers in bytes, launches and copies. Pure.
+//! The plan of a scene on the device: kernels with their macros, buffers in bytes, launches and copies. Pure.
 
 use serde::Serialize;
 
@@ -13,7 +13,7 @@ use crate::storage::TILE_QUADS;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Scene, Storage};
 
-/// A kernel file and the macros that switch parts of it on.
+/// A kernel source file and the macros that enable its optional features.
 #[derive(Debug)]
 pub(super) struct KernelSource {
     pub name: &'static str,
@@ -21,7 +21,7 @@ pub(super) struct KernelSource {
     pub features: &'static [&'static str],
 }
 
-/// All kernels there are.
+/// All kernels of a step.
 pub(super) const KERNELS: [KernelSource; 5] = [
     KernelSource {
         name: "deform",
@@ -53,33 +53,33 @@ pub(super) const KERNELS: [KernelSource; 5] = [
     },
 ];
 
-/// The macros that choose what U is stored in; none for f32.
+/// The macros that select the storage type of U; f32 has none.
 pub(super) const STORAGES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE_INT8"];
 
-/// Tiles below which a lane takes one vertex instead of four, because the device would not be filled: eight warps for
-/// each multiprocessor of a large device.
+/// Below this number of tiles a lane computes one vertex instead of four, because the tiles would not fill the device:
+/// eight warps for each multiprocessor of a large device.
 const FEW_TILES: usize = 1024;
 
-/// What a launch is for.
+/// Purpose of a kernel launch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Launch {
-    /// In whole steps, domains whose U is read once for several of them; in scenes that have such.
+    /// Full steps only: domains that share a U, which is read once per group. Only in scenes with such domains.
     Batch,
     Deform,
     Bounds,
     /// Normals that follow the surface.
     Normals,
-    /// In steps that change few domains, before all others; in scenes where there can be such steps.
+    /// Partial steps only, before all other launches. Only in scenes that can have partial steps.
     Apply,
 }
 
-/// A kernel as one scene compiles it; launched at most once a step.
+/// A kernel as compiled for one scene; launched at most once per step.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Kernel {
     pub launch: Launch,
     pub name: &'static str,
-    /// Macros that switch parts of it on.
+    /// Macros that enable optional features.
     pub defines: Vec<&'static str>,
     pub blocks: u32,
     pub threads: u32,
@@ -87,7 +87,7 @@ pub struct Kernel {
     pub(super) source: Source,
 }
 
-/// The text of a kernel file; its name says enough where a kernel is shown.
+/// The text of a kernel source file; `Debug` prints only its length.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) struct Source(pub(super) &'static str);
 
@@ -97,7 +97,7 @@ impl std::fmt::Debug for Source {
     }
 }
 
-/// What a device buffer holds.
+/// Content of a device buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
@@ -105,30 +105,30 @@ pub enum Role {
     Words,
     /// x0 of every shape.
     Rest,
-    /// Scales of U, with `Int8`.
+    /// Scales of U; only with `Int8`.
     Scales,
-    /// The work of each warp, and a list of some of it where there can be lists.
+    /// The work of each warp, and the tile list of partial steps if the scene can have them.
     Tiles,
     Lanes,
-    /// From vertices to corners, per domain; where they differ.
+    /// Per domain, offset from its first vertex to its first corner; only if an offset differs from zero.
     CornerShifts,
     /// Groups of domains, and the work of each block of `batch`.
     Batches,
-    /// A box of each warp's vertices.
+    /// A bounding box of each warp's vertices.
     Boxes,
     /// The step that last changed each domain.
     Stamps,
-    /// Who follows whom, and the frames of those who do.
+    /// Transform root of each domain, and the frames of followers.
     Frames,
     RestNormals,
     RestTangents,
-    /// The smoothing group of each corner, where normals follow the surface.
+    /// The smoothing group of each corner; only if normals follow the surface.
     Members,
-    /// Vertices around each group, and where they begin.
+    /// Vertices around each smoothing group, and the offset of each group's ring.
     Rings,
-    /// The geometric normal of each group at rest.
+    /// The geometric normal of each smoothing group at rest.
     GroupNormals,
-    /// Where each domain's corners lie.
+    /// Offsets of each domain's corners.
     CornerSlots,
     /// The first domain of each block of corners.
     CornerBlocks,
@@ -137,9 +137,9 @@ pub enum Role {
     Positions,
     Normals,
     Tangents,
-    /// u, where the scene keeps it.
+    /// u; only if the scene keeps displacements.
     Displacements,
-    /// The parts of domains that boxes are made of, and their boxes, where the scene keeps them.
+    /// The pieces of domains that `bounds` reduces to boxes, and their boxes; only if the scene keeps boxes.
     Pieces,
     DomainBoxes,
 }
@@ -151,37 +151,37 @@ pub struct Buffer {
     pub bytes: u64,
 }
 
-/// A part that the scene does without.
+/// An optional feature that the scene does not use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct LeftOut {
     /// The flag of [`modalcast_model::scene::Needs`] that is off, or "batches".
     pub feature: &'static str,
     /// What is not compiled, computed or stored.
     pub what: &'static str,
-    /// Device bytes that are not allocated, as far as they are known: rings that are not made have no length.
+    /// Device bytes saved, as far as they are known: the length of rings is unknown until they are built.
     pub bytes: u64,
 }
 
 /// What the CUDA deformer compiles, allocates and launches for a scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Plan {
-    /// Those that the scene has, in the order in which a step launches them; `apply` is first where it is launched.
+    /// The kernels of the scene in launch order, except `apply`, which is last here and first in a partial step.
     pub kernels: Vec<Kernel>,
     pub buffers: Vec<Buffer>,
-    /// Bytes to the device and from it in each step, besides the vertices themselves.
+    /// Bytes that each step copies to the device and back, without the vertices.
     pub bytes_in: u64,
     pub bytes_out: u64,
-    /// Pinned bytes of the list of changed domains; 0 for a scene whose steps are always whole.
+    /// Pinned bytes of the lists of a partial step; 0 for a scene whose steps are always full.
     pub bytes_of_changes: u64,
     pub left_out: Vec<LeftOut>,
 }
 
-/// Where everything lies: made once, planned from and then uploaded.
+/// Tables of the scene on the device, built once for the plan and the upload.
 #[derive(Debug)]
 pub struct Tables {
     pub(super) coordinates: Coordinates,
     pub(super) work: Work,
-    /// The parts of domains that boxes are made of.
+    /// The parts of domains that `bounds` reduces to boxes.
     pub(super) pieces: Vec<Piece>,
 }
 
@@ -193,12 +193,12 @@ impl Tables {
     }
 }
 
-/// What a scene costs.
+/// The plan of a scene.
 pub fn plan(scene: &Scene) -> Plan {
     plan_of(scene, &Tables::new(scene))
 }
 
-/// The same from tables that are there.
+/// The plan of a scene from existing tables.
 pub fn plan_of(scene: &Scene, Tables { coordinates, work, pieces }: &Tables) -> Plan {
     let needs = scene.needs;
     let layout = &scene.layout;
@@ -279,12 +279,12 @@ pub const fn storage_define(storage: Storage) -> Option<&'static str> {
     }
 }
 
-/// Whether a lane takes one item instead of four.
+/// Whether a lane computes one item instead of four.
 pub(super) const fn is_narrow(work: &Work) -> bool {
     work.launched < FEW_TILES
 }
 
-/// Threads of a block of `deform`: WARPS in its source, which the launcher compares.
+/// Threads per block of `deform`: 32 WARPS of its source, which the launcher verifies.
 fn threads_of(defines: &[&str]) -> u32 {
     let one = ["MODES", "SHEAR", "LISTED"].iter().any(|macro_name| defines.contains(macro_name));
     TILE_QUADS as u32 * if one { 1 } else { 2 }
@@ -311,7 +311,7 @@ fn kernels(scene: &Scene, work: &Work, pieces: &[Piece]) -> Vec<Kernel> {
         Kernel { launch, name: kernel.name, defines, blocks, threads: BLOCK, source: Source(kernel.source) }
     };
     let few = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MOST_BLOCKS / 4);
-    // Eight threads make a box of a domain, and wait for the memory most of the time.
+    // Eight threads reduce one piece of a domain and mostly wait for memory, so more blocks hide the latency.
     let many = pieces.len().div_ceil(BLOCK as usize / 8).min(4 * MOST_BLOCKS);
     let boxes = if needs.boxes { few.max(many) } else { few };
     let batch = (!work.batched.blocks.is_empty()).then(|| batch::kernel(scene, &work.batched, batch));
@@ -346,7 +346,7 @@ fn deform_defines(scene: &Scene, work: &Work) -> Vec<&'static str> {
     on.chain(storage_define(scene.deformation.storage).filter(|_| needs.modes)).collect()
 }
 
-/// Blocks of the kernels that walk over lists: two for each multiprocessor of a large device.
+/// Maximum number of blocks of the kernels that loop over lists: two per multiprocessor of a large device.
 const MOST_BLOCKS: usize = 264;
 
 fn left_out(scene: &Scene, batched: bool, [tangents, displacements, boxes]: [u64; 3]) -> Vec<LeftOut> {
@@ -380,7 +380,7 @@ fn left_out(scene: &Scene, batched: bool, [tangents, displacements, boxes]: [u64
     all.filter(|(needed, _)| !needed).map(|(_, part)| part).collect()
 }
 
-/// Blocks that cover so many corners.
+/// Number of blocks that cover so many corners.
 fn blocks(items: usize) -> u32 {
     items.div_ceil(BLOCK as usize) as u32
 }
@@ -407,9 +407,9 @@ impl Plan {
         self.kernel(launch).ok_or_else(missing)
     }
 
-    /// The most kernel launches of one step, whatever the number of domains.
+    /// Maximum number of kernel launches of one step, for any number of domains.
     pub fn launches(&self) -> usize {
-        // A step is whole, and then has batches, or of a list.
+        // A full step may launch `batch` but not `apply`; a partial step may launch `apply` but not `batch`.
         let whole = self.kernels.iter().filter(|kernel| kernel.launch != Launch::Apply).count();
         let listed = self.kernels.iter().filter(|kernel| kernel.launch != Launch::Batch).count();
         if self.kernel(Launch::Apply).is_some() { whole.max(listed) } else { whole }

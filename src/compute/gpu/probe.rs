@@ -1,4 +1,4 @@
-//! What CUDA finds on this machine, for `doctor`: driver, devices, NVRTC, cache. Never fails, never panics.
+//! Probes CUDA on this machine for `doctor`: driver, devices, NVRTC, kernel cache. Never fails, never panics.
 
 use cudarc::driver::sys::CUdevice_attribute as Attribute;
 use cudarc::driver::{CudaContext, DriverError, result};
@@ -17,26 +17,26 @@ pub struct DeviceInfo {
     pub memory_bytes: u64,
 }
 
-/// What is there, and in words what is not.
+/// The available CUDA components, and a message for each missing one.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Probe {
     /// Version of the kernel driver, e.g. "580.159.04".
     pub driver: Option<String>,
-    /// Version of CUDA that the driver knows, e.g. "13.0".
+    /// CUDA version that the driver supports, e.g. "13.0".
     pub cuda: Option<String>,
-    /// Why no device can be used, with the remedy.
+    /// Reason why no device can be used, with the remedy.
     pub cuda_problem: Option<String>,
     pub devices: Vec<DeviceInfo>,
-    /// Where NVRTC was found.
+    /// Path of NVRTC.
     pub nvrtc: Option<String>,
     pub nvrtc_version: Option<String>,
-    /// Why NVRTC cannot be used, with the package that brings it.
+    /// Reason why NVRTC cannot be used, with the package to install.
     pub nvrtc_problem: Option<String>,
-    /// Where compiled kernels are kept.
+    /// Folder of the compiled kernels.
     pub kernel_cache: Option<String>,
 }
 
-/// Looks at this machine.
+/// Probes this machine.
 pub fn probe() -> Probe {
     let mut probe = Probe {
         driver: kernel_driver(),
@@ -78,7 +78,7 @@ impl Probe {
 /// Name, capability and memory of a device, without a context on it.
 fn describe(ordinal: i32) -> Result<DeviceInfo, DriverError> {
     let device = result::device::get(ordinal)?;
-    // SAFETY: `device` came from the driver just now.
+    // SAFETY: the driver returned `device` above.
     let (major, minor, memory) = unsafe {
         let major = result::device::get_attribute(device, Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR)?;
         let minor = result::device::get_attribute(device, Attribute::CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR)?;
@@ -88,14 +88,14 @@ fn describe(ordinal: i32) -> Result<DeviceInfo, DriverError> {
     Ok(DeviceInfo { ordinal, name, capability, memory_bytes: memory as u64 })
 }
 
-/// The version that the kernel module gives itself; none without an NVIDIA driver.
+/// The version of the NVIDIA kernel module; `None` without an NVIDIA driver.
 fn kernel_driver() -> Option<String> {
     let read = |path: &str| std::fs::read_to_string(path).ok();
     let text = read("/sys/module/nvidia/version").or_else(|| read("/proc/driver/nvidia/version"))?;
     version_in(&text)
 }
 
-/// The first word that is made of digits and dots.
+/// The first word that consists of digits and dots.
 fn version_in(text: &str) -> Option<String> {
     let is_version = |word: &&str| word.contains('.') && word.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
     text.split_whitespace().find(is_version).map(String::from)

@@ -1,16 +1,17 @@
-//! Launches `kernels/raster.cu`: which triangle each sample of a window sees and how deep, or depth alone, by atomic minima.
+//! The compute rasterizer: launches `kernels/raster.cu`. For each sample of a window it computes the visible triangle
+//! and its depth, or depth alone, by atomic minima.
 //!
-//! A thread draws a triangle near few samples, a warp one of up to 64 x 64 pixels; of larger and clipped ones a warp draws
-//! a tile. Queues between the kernels have room for every triangle, so that nothing overflows, and their lengths
-//! stay on the device. Of a cut-out a sample is kept where alpha is large enough, asked before the minimum; meshes without
-//! any compile nothing of that.
+//! A thread draws a triangle that is near few samples, a warp draws one of up to 64 x 64 pixels. A larger or clipped
+//! triangle is cut into tiles, which warps draw. The queues between the kernels have capacity for every triangle, so
+//! they cannot overflow, and their lengths stay on the device. Samples of cut-outs are tested for alpha before the
+//! atomic minimum. Meshes without cut-outs compile none of that code.
 //!
-//! | file | what |
+//! | file | content |
 //! |---|---|
-//! | `form` | the variants of the kernels |
-//! | [`check`] | which meshes are refused |
-//! | `cut_out` | texture coordinates, surfaces and images of cut-outs |
-//! | `opengl` | positions and samples in OpenGL's buffers |
+//! | [`form`] | the variants of the kernels |
+//! | [`check`] | validation of meshes |
+//! | [`mod@cut_out`] | texture coordinates, surfaces and images of cut-outs |
+//! | [`opengl`] | positions and samples in OpenGL's buffers |
 
 mod check;
 mod cut_out;
@@ -32,11 +33,11 @@ use modalcast_model::error::{Result, during};
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{Faces, Group, Window};
 
-/// Threads of a block, and blocks of a multiprocessor where blocks take turns.
+/// Threads per block, and resident blocks per multiprocessor for kernels that loop over a queue.
 const BLOCK: u32 = 128;
 const RESIDENT: u32 = 16;
 
-/// What a sample holds before anything is drawn.
+/// Clear value of a sample.
 const NOTHING: u32 = u32::MAX;
 
 /// Arguments of all kernels; pointers are device addresses.
@@ -67,7 +68,7 @@ const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from k
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for RasterArgs {}
 
-/// What was queued and counted.
+/// Lengths of the queues, and triangle counts by path.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct Tally {
@@ -79,7 +80,7 @@ struct Tally {
 
 const _: () = assert!(size_of::<Tally>() == 48, "Tally differs from kernels/raster.cuh");
 
-/// Bytes of an entry of the large queue.
+/// Bytes per entry of the large queue.
 const LARGE: u64 = 16;
 
 /// The compiled kernels of one form.
@@ -87,14 +88,14 @@ const LARGE: u64 = 16;
 pub struct Functions {
     form: RasterForm,
     raster: CudaFunction,
-    /// Where there are cut-outs.
+    /// Only for meshes with cut-outs.
     raster_cut: Option<CudaFunction>,
     raster_warps: CudaFunction,
     raster_tiles: CudaFunction,
 }
 
 impl Functions {
-    /// Compiles a form, or takes it from the cache.
+    /// Compiles the kernels of a form, or takes them from the cache.
     ///
     /// # Errors
     /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
@@ -111,15 +112,15 @@ impl Functions {
         })
     }
 
-    /// Each with its name.
+    /// The functions with their names.
     pub fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
         let list = [Some(&self.raster), self.raster_cut.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
         FUNCTIONS.into_iter().zip(list).filter_map(|(name, function)| function.map(|function| (name, function)))
     }
 }
 
-/// What is drawn where, once: addresses on the device, of as many vertices as [`check`] was told and of a sample for each
-/// pixel.
+/// The inputs of one pass. `positions` and `target` are device addresses, of the vertices that [`check`] was called
+/// with and of one sample per pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct Pass<'a> {
     pub functions: &'a Functions,
@@ -129,7 +130,7 @@ pub struct Pass<'a> {
     pub target: u64,
 }
 
-/// A mesh's triangles on the device, and the queues for them.
+/// A mesh's triangles on the device, and the queues between the kernels.
 #[derive(Debug)]
 pub struct Core {
     triangles: CudaSlice<u8>,
@@ -137,12 +138,12 @@ pub struct Core {
     large: CudaSlice<u8>,
     tally: CudaSlice<u8>,
     cut: Option<Cut>,
-    /// Blocks of the kernels that take turns.
+    /// Blocks of the kernels that loop over a queue.
     blocks: u32,
 }
 
 impl Core {
-    /// Puts triangles and cut-outs that [`check`] and [`check_cut_outs`] let pass onto the device.
+    /// Uploads triangles and cut-outs, which [`check`] and [`check_cut_outs`] must have accepted.
     ///
     /// # Errors
     /// `Fault` when the device refuses.
@@ -160,7 +161,7 @@ impl Core {
         })
     }
 
-    /// Whether its passes need functions with cut-outs.
+    /// Whether its passes need the functions for cut-outs.
     pub const fn is_cut(&self) -> bool {
         self.cut.is_some()
     }
@@ -186,7 +187,7 @@ impl Core {
         start(device, &functions.raster_tiles, self.blocks, args)
     }
 
-    /// Launches of a pass over these groups.
+    /// Number of launches of a pass over these groups.
     pub fn launches(&self, groups: &[Group]) -> usize {
         let of_group = |group: &Group| {
             let (whole, cut) = self.split(*group);
@@ -195,7 +196,7 @@ impl Core {
         2 + groups.iter().map(of_group).sum::<usize>()
     }
 
-    /// The part of a group before the first cut-out, and the rest.
+    /// Splits a group before the first cut-out.
     fn split(&self, group: Group) -> (Group, Group) {
         let first = self.cut.as_ref().map_or(u32::MAX, |cut| cut.first);
         let whole = first.saturating_sub(group.first).min(group.triangles);
@@ -203,13 +204,13 @@ impl Core {
         (Group { triangles: whole, ..group }, cut)
     }
 
-    /// Triangles of the last pass by what became of them, as the kernels' paths are numbered; zeros unless its form counts.
+    /// Triangle counts of the last pass, indexed by `Path` of the kernels; zeros unless the form counts.
     ///
     /// # Errors
     /// `Fault` when the device fails.
     pub fn counts(&self, device: &Device) -> Result<[u32; 8]> {
         let mut tally = [Tally::zeroed()];
-        // SAFETY: the buffer is one tally.
+        // SAFETY: the buffer has the size of one `Tally`.
         unsafe { download(device, address(device, &self.tally), &mut tally) }?;
         Ok(tally[0].counts)
     }
@@ -236,7 +237,7 @@ impl Core {
         }
     }
 
-    /// Empty queues and samples without anything.
+    /// Empties the queues and clears the samples.
     fn clear(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
         let form = pass.functions.form;
         let nothing = if form.depth_only { 1.0_f32.to_bits() } else { NOTHING };
@@ -244,7 +245,7 @@ impl Core {
         let tally = (address(device, &self.tally), 0, size_of::<Tally>() as u64 / 4);
         for (buffer, word, words) in [(pass.target, nothing, words), tally] {
             let stream = device.stream().cu_stream();
-            // SAFETY: the buffer has these words, all of which are written on the stream that orders its readers.
+            // SAFETY: the buffer has at least this many words. The stream orders the write before its readers.
             let set = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
             set.result().map_err(during("raster"))?;
         }
@@ -255,8 +256,9 @@ impl Core {
 fn start(device: &Device, function: &CudaFunction, blocks: u32, args: RasterArgs) -> Result<()> {
     let mut launch = device.stream().launch_builder(function);
     let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
-    // SAFETY: `RasterArgs` is the kernels' only argument. `check` saw that triangles name vertices that are there and
-    // groups triangles; queues have room for each of them, and the target a sample for each pixel.
+    // SAFETY: `RasterArgs` is the kernels' only argument. `check` verified that triangles refer to existing vertices
+    // and groups to existing triangles. The queues have capacity for each triangle, and the target has a sample for
+    // each pixel.
     unsafe { launch.arg(&args).launch(config) }.map_err(during("raster"))?;
     Ok(())
 }

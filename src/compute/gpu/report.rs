@@ -1,4 +1,4 @@
-//! Asks the device itself for every size and offset that it shares with the host.
+//! Reads every size and offset that host and device share from the device itself, to compare them with the host's.
 
 use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 

@@ -1,23 +1,23 @@
-//! Smoothing groups of a scene to the tables that `normals` reads. Pure.
+//! Tables of `normals` for smoothing groups: the ring of vertices around each group. Pure.
 
 use super::layout::{NO_GROUPS, NormalSlot};
 use super::pack;
 use modalcast_model::domain::{Shape, Smoothing};
 use modalcast_model::scene::Scene;
 
-/// The tables, with the groups of all shapes numbered through.
+/// The tables; groups are numbered through all shapes.
 #[derive(Debug, Default)]
 pub(super) struct Rings {
     /// The group of each corner of the shapes that have groups.
     pub members: Vec<u32>,
-    /// Where each group's ring begins, and where the last ends.
+    /// Offset of each group's ring, and the end of the last one.
     pub begins: Vec<u32>,
     pub rings: Vec<u32>,
-    /// Geometric normals at rest, a plane per axis.
+    /// Geometric normals at rest, one plane per axis.
     pub normals: Vec<f32>,
 }
 
-/// Their lengths.
+/// Lengths of the tables.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Counts {
     pub members: u64,
@@ -38,8 +38,8 @@ impl Counts {
         })
     }
 
-    /// Bytes of the members that a scene with exact normals would have; what its rings would take is not known before
-    /// they are made.
+    /// Bytes that the members would need in a scene with exact normals. The size of its rings is unknown until they are
+    /// built.
     pub(super) fn bytes_of_possible_members(scene: &Scene) -> u64 {
         let shapes = scene.shapes.iter().filter(|shape| shape.modes.rank() > 0);
         shapes.map(|shape| 4 * shape.mesh.corners().vertices.len() as u64).sum()
@@ -63,7 +63,7 @@ impl Rings {
     }
 }
 
-/// One slot per domain, for `normals`.
+/// The slots of `normals`, one per domain.
 pub(super) fn slots(scene: &Scene) -> Vec<NormalSlot> {
     let mut members = 0;
     let first_member = |shape: &Shape| {

@@ -1,60 +1,61 @@
-//! Which output a step writes, and what that output lacks besides the step's own changes. Pure.
+//! Double buffering of the outputs: which output a step writes, and which domains that output lacks besides the step's
+//! own changes. Pure.
 //!
-//! While the host copies one output, the next step goes to another, so that neither waits. That other one shows an older
-//! step: what changed since is remembered for it, and computed anew with what the step itself changes. As long as nobody
-//! reads beside the steps there is one output.
+//! While the host copies one output, the next step writes another, so neither waits. The other output shows an older
+//! step. The rotation records which domains changed since then, and the step computes them again together with its own
+//! changes. As long as no readback is in flight when a step begins, there is one output.
 
 use modalcast_model::scene::{Changed, State};
 
-/// Steps, outputs and their ages.
+/// The steps, the outputs, and the step that each output shows.
 #[derive(Debug)]
 pub(super) struct Rotation {
-    /// The last step that was begun.
+    /// The last step that began.
     begun: u32,
     /// The last step that changed all domains.
     everything: u32,
-    /// Serial number of the state whose values lie on the device; none after a fault.
+    /// Serial number of the state whose values are on the device; `None` after a fault.
     serial: Option<u64>,
-    /// Whether the step under way follows that state, so that what it changed is known.
+    /// Whether the current step directly follows that state, so that its list of changes is complete.
     follows: bool,
     /// The output that the last step wrote.
     at: usize,
     outputs: Vec<Age>,
-    /// Outputs that there may be.
+    /// Maximum number of outputs.
     most_outputs: usize,
-    /// Domains that a list may name.
+    /// Maximum number of domains in a list of changes.
     most_changes: usize,
-    /// Readings that began.
+    /// Number of readbacks that began.
     readings: u64,
 }
 
-/// What one output shows.
+/// Content of one output.
 #[derive(Debug, Default)]
 struct Age {
-    /// The last step that it shows whole; 0 when it shows none.
+    /// The last step that the output shows completely; 0 when its content is not valid.
     shown: u32,
-    /// Domains that changed since; none when they are too many for a list.
+    /// Domains that changed since then; `None` when they are too many for a list.
     behind: Option<Vec<u32>>,
-    /// The last reading of it, until the host knows that it has ended.
+    /// The last readback of the output, until the host knows that it has ended.
     reading: Option<u64>,
 }
 
 /// A step that begins.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Turn {
-    /// The output that it writes.
+    /// The output that the step writes.
     pub output: usize,
-    /// Whether a copy may still read that output.
+    /// Whether a copy may still be reading that output.
     pub is_read: bool,
     pub step: u32,
     /// The step that the output shows.
     pub shown: u32,
-    /// Domains that the output lacks, when a list of them and the step's own changes is enough.
+    /// Domains that the output lacks, if a partial step is possible; `None` requires a full step.
     pub behind: Option<Vec<u32>>,
 }
 
 impl Rotation {
-    /// Of a scene whose lists may name so many domains.
+    /// `most_changes`: maximum number of domains in a list of changes.
     pub(super) fn new(most_outputs: usize, most_changes: usize) -> Self {
         Self {
             begun: 0,
@@ -69,21 +70,20 @@ impl Rotation {
         }
     }
 
-    /// The output that the next step should write: another one while the last is read.
+    /// The output that the next step writes: the other one while the last one is being read.
     pub(super) fn next_output(&self) -> usize {
         if self.outputs[self.at].reading.is_some() { (self.at + 1) % self.most_outputs } else { self.at }
     }
 
-    /// From now on there is but one output, because there is no room for more.
+    /// Disables the second output, because the device has no memory for it.
     pub(super) fn stay(&mut self) {
         self.most_outputs = self.at + 1;
     }
 
-    /// Begins a step of `state`, whose output is that of [`Self::next_output`] and shows nothing whole until
-    /// [`Self::end`].
+    /// Begins a step of `state`, which writes [`Self::next_output`]. That output is not valid until [`Self::end`].
     pub(super) fn begin(&mut self, state: &State) -> Turn {
         if self.begun == u32::MAX {
-            // Old stamps on the device then look new, which costs work once and is never wrong.
+            // The old stamps on the device then look new, which costs work once and is never wrong.
             self.forget();
             (self.begun, self.everything) = (0, 0);
         }
@@ -103,7 +103,7 @@ impl Rotation {
         Turn { output: self.at, is_read: age.reading.is_some(), step: self.begun, shown, behind }
     }
 
-    /// The last step that changed all domains, with this one if it is of all.
+    /// The last step that changed all domains; the current step if `all` is set.
     pub(super) const fn everything(&mut self, all: bool) -> u32 {
         if all {
             self.everything = self.begun;
@@ -111,8 +111,8 @@ impl Rotation {
         self.everything
     }
 
-    /// The step is on its way: its output will show it whole, and all others lack what it changed, however it was
-    /// computed.
+    /// Ends the submission of a step: its output shows it completely, and all other outputs lack the domains that it
+    /// changed, whether the step was full or partial.
     pub(super) fn end(&mut self, state: &State) {
         self.serial = Some(state.serial);
         for (index, age) in self.outputs.iter_mut().enumerate() {
@@ -131,24 +131,24 @@ impl Rotation {
         }
     }
 
-    /// The output that shows the last step, unless that failed.
+    /// The output that shows the last step, unless that step failed.
     pub(super) fn shown(&self) -> Option<usize> {
         (self.outputs[self.at].shown > 0).then_some(self.at)
     }
 
-    /// A reading of the last output begins; its number.
+    /// Begins a readback of the last output. Returns its number.
     pub(super) fn read(&mut self) -> u64 {
         self.readings += 1;
         self.outputs[self.at].reading = Some(self.readings);
         self.readings
     }
 
-    /// The host knows that a reading has ended.
+    /// Records that the host has seen the end of a readback.
     pub(super) fn has_read(&mut self, number: u64) {
         self.outputs.iter_mut().filter(|age| age.reading == Some(number)).for_each(|age| age.reading = None);
     }
 
-    /// After a fault nothing is whole, neither an output nor the values on the device. Readings go on.
+    /// Invalidates all outputs and the values on the device after a fault. Readbacks in flight continue.
     pub(super) fn forget(&mut self) {
         self.serial = None;
         self.outputs.iter_mut().for_each(|age| (age.shown, age.behind) = (0, None));
@@ -160,14 +160,14 @@ mod tests {
     use super::super::pack::tests::scene;
     use super::*;
 
-    /// A state that follows the one before by these changes.
+    /// A state that follows the previous one by these changes.
     fn state(serial: u64, changed: &[u32]) -> State {
         let mut state = State::rest(&scene(&[(7, 1)], false, false));
         (state.serial, state.changed) = (serial, Changed::Some(changed.to_vec()));
         state
     }
 
-    /// Makes a step as the deformer does: of a list where the turn allows it.
+    /// Makes a step as the deformer does: partial where the turn allows it.
     fn step(rotation: &mut Rotation, state: &State) -> Turn {
         let turn = rotation.begin(state);
         assert_eq!(rotation.shown(), None, "half a step is shown to nobody");
@@ -186,7 +186,7 @@ mod tests {
             assert_eq!((turn.output, turn.is_read, turn.behind.as_deref()), (0, false, Some([].as_slice())));
             assert_eq!(turn.shown, turn.step - 1);
         }
-        // A reading that ended before the next step changes nothing.
+        // A readback that ended before the next step changes nothing.
         let number = rotation.read();
         rotation.has_read(number);
         assert_eq!(step(&mut rotation, &state(5, &[3])).output, 0);
@@ -215,7 +215,7 @@ mod tests {
     fn an_output_that_waits_collects_changes_until_they_are_too_many() {
         for (steps, listed) in [(4, true), (9, true), (10, false)] {
             let mut rotation = Rotation::new(2, 10);
-            // Both outputs whole, then one of them idle.
+            // Make both outputs valid, then leave one of them idle.
             for serial in 1..5 {
                 step(&mut rotation, &state(serial, &[]));
                 rotation.read();

@@ -1,13 +1,13 @@
-//! Host memory on its way to the device: pinned, write-combined, written from front to back and never read here.
+//! Writes staging buffers: pinned, write-combined host memory, written from front to back and never read by the host.
 
 use std::ops::Range;
 
 use bytemuck::Pod;
 use rayon::prelude::*;
 
-/// Bytes from which several cores write. `report deform` measures both ways on either side of it (`host_writes`).
+/// Bytes from which several cores write. `report deform` measures both ways below and above this limit (`host_writes`).
 pub const PARALLEL: usize = 1 << 20;
-/// Words of one core's part: long runs, of which there are enough for many cores.
+/// Words per parallel part: long runs, but enough parts for many cores.
 const PART: usize = 1 << 15;
 
 /// The unwritten rest of a list, written from its front.
@@ -23,7 +23,7 @@ impl<'a> Front<'a> {
         copy(self.take(words.len()), words);
     }
 
-    /// The next so many words, for the caller to write.
+    /// The next `count` words, for the caller to write.
     pub(super) fn take(&mut self, count: usize) -> &'a mut [f32] {
         let (part, rest) = std::mem::take(&mut self.0).split_at_mut(count);
         self.0 = rest;
@@ -31,18 +31,18 @@ impl<'a> Front<'a> {
     }
 }
 
-/// Copies on as many cores as pay.
+/// Copies on several cores if the list is large enough.
 fn copy(to: &mut [f32], from: &[f32]) {
     if size_of_val(from) < PARALLEL { to.copy_from_slice(from) } else { copy_on_all_cores(to, from) }
 }
 
-/// Copies part by part; both lists have one length.
+/// Copies part by part; both lists have the same length.
 pub fn copy_on_all_cores(to: &mut [f32], from: &[f32]) {
     to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| to.copy_from_slice(from));
 }
 
-/// Cuts a list before each of these items, whose first words ascend, and fills the parts on as many cores as pay:
-/// `fill(items, part)`.
+/// Fills a list of items, whose first words `firsts` ascend, by `fill(items, part)`. A large list is cut at item
+/// boundaries into parts that several cores fill.
 pub(super) fn fill_parts(list: &mut [f32], firsts: &[u32], fill: impl Fn(Range<usize>, &mut [f32]) + Sync) {
     if size_of_val(list) < PARALLEL {
         fill(0..firsts.len(), list);

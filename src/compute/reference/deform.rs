@@ -3,7 +3,7 @@
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, State};
 
-/// World positions relative to their domains' cells, three f64 per vertex, packed as the layout says.
+/// World positions relative to their domains' cells, three f64 per vertex, in the packed order of the scene's layout.
 pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     let mut positions = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {
@@ -22,7 +22,7 @@ pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     positions
 }
 
-/// u = U q of every vertex in the frame of its domain, three f64 each, packed as the layout says.
+/// u = U q of every vertex in the frame of its domain, three f64 each, in the packed order of the scene's layout.
 pub fn displacements(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     let mut displacements = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {
@@ -36,7 +36,7 @@ pub fn displacements(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     displacements
 }
 
-/// Adds a vertex's three rows of U q.
+/// Adds the three rows of U q of a vertex.
 fn add_modes(shape: &Shape, q: &[f32], vertex: usize, coordinates: &mut [f64; 3]) {
     for (component, coordinate) in coordinates.iter_mut().enumerate() {
         for (mode, amount) in q.iter().enumerate() {

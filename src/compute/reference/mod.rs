@@ -1,4 +1,4 @@
-//! The definition in f64, plain and without cleverness. Shares no code with the other deformers.
+//! The reference deformer, which defines the results in plain f64 loops. Shares no code with the other deformers.
 
 mod deform;
 mod normals;
@@ -16,7 +16,7 @@ use modalcast_model::deform::{Backend, Deformed, Deformer, Surface};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Bounds, LightBounds, Scene, Slot, State};
 
-/// The deformer `reference`: computes in f64 and rounds once.
+/// The deformer of the `reference` backend: computes in f64 and rounds once.
 #[derive(Debug)]
 pub struct ReferenceDeformer {
     scene: Arc<Scene>,
@@ -24,12 +24,13 @@ pub struct ReferenceDeformer {
 }
 
 impl ReferenceDeformer {
-    /// A deformer of one scene.
+    /// Creates a deformer of one scene.
     pub fn new(scene: &Arc<Scene>) -> Self {
         Self { scene: Arc::clone(scene), surface: Surface::default() }
     }
 
-    /// What readers want besides vertices. A displacement that f32 does not hold spoils the bounds.
+    /// Computes displacements and boxes if the scene keeps them. A displacement that overflows f32 makes the bounds
+    /// NaN.
     fn keep(&mut self, state: &State, bounds: &mut Bounds) {
         let (scene, surface) = (&self.scene, &mut self.surface);
         if scene.needs.displacements {

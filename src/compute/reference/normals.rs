@@ -1,32 +1,33 @@
 //! Normals and tangents that follow the deformed triangles. Twin of `kernels/normals.cu`.
 //!
 //! # Definition
-//! Around each smoothing group (see [`modalcast_model::domain::Smoothing`]) the area vectors (b - a) x (c - a) of its triangles
-//! are summed: once at rest, turned by the cofactors of A as area vectors are, and once over the positions x of this
-//! step. The least rotation that takes the first direction to the second, applied to the rigid normal of
-//! `reference/orient.rs`, is the exact normal. So
-//! - at q = 0 it is the rigid normal, whatever an author made of it (smoothed, weighted, bent on purpose);
+//! Around each smoothing group (see [`modalcast_model::domain::Smoothing`]) the area vectors (b - a) x (c - a) of its
+//! triangles are summed twice: at rest, transformed by the cofactors of A as area vectors are, and over the positions x
+//! of this step. The exact normal is the rigid normal of `reference/orient.rs`, rotated by the smallest rotation that
+//! takes the first direction to the second. It follows that
+//! - at q = 0 it is the rigid normal, whatever the author intended (smoothed, weighted, deliberately bent);
 //! - where rest normals are those of the triangles, it is the area-weighted normal of the deformed triangles, and where
 //!   they oppose the winding, its opposite: a rotation that takes g to h takes -g to -h;
-//! - a mirroring T needs no rule of its own: it turns both sums alike, and the rigid normal has its sign;
-//! - corners of one group with one rest normal keep one normal: seams stay closed and hard edges stay hard.
+//! - a mirroring T needs no rule of its own: it transforms both sums alike, and the rigid normal has its sign;
+//! - corners of one group with the same rest normal keep a common normal: seams stay closed and hard edges stay hard.
 //!
-//! A tangent is carried by the same rotation, then made orthogonal to the new normal; the bitangent keeps its sign, or
+//! A tangent is rotated by the same rotation, then made orthogonal to the new normal. The bitangent keeps its sign, or
 //! is flipped by a mirroring T as in the rigid case. That takes no memory and no reads beyond those of rigid tangents
-//! and exact normals. It follows how the surface tilts, not how modes turn or shear it within itself: that would take
-//! texture gradients per triangle, and so 8 more bytes per entry of every ring.
+//! and exact normals. The tangent follows the tilt of the surface, but not its rotation or shear by modes within the
+//! surface. That would need texture gradients per triangle, and so 8 more bytes per entry of every ring.
 //!
-//! # What is kept
-//! A corner keeps its rigid normal and tangent where there is nothing to follow: its shape has no modes; its group has
-//! no area at rest, or areas that cancel; or its area in this step is not above [`RESOLUTION`] times
-//! B = sum of l (l + w) over both edges of each triangle, with l the sum of an edge's absolute components and w that of
-//! the group's own position. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area
-//! vectors by at most 2^-23 B: what is followed is off by at most asin(2^-23 B / |sum|) < 1.8 degrees for positions
-//! that were rounded once, and what rounding alone could have made is not followed. One metre of domain at 10^7 metres
-//! thus shows rigid normals; put the scene's origin near it.
+//! # Fallback
+//! A corner keeps its rigid normal and tangent where no rotation can be determined: its shape has no modes; its group
+//! has no area at rest, or areas that cancel; or its area in this step is not above [`RESOLUTION`] times B. Here B =
+//! sum of l (l + w) over both edges of each triangle, with l the sum of an edge's absolute components and w that of the
+//! group's own position. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area
+//! vectors by at most 2^-23 B. For positions that were rounded once, the direction of the sum is therefore off by at
+//! most asin(2^-23 B / |sum|) < 1.8 degrees, and no rotation that rounding alone could cause is applied. A domain of
+//! one meter at 10^7 meters thus shows rigid normals; put the scene's origin near it.
 //!
-//! Close to half a turn the axis of the least rotation is ill determined: rest normals that differ from the geometric
-//! ones by an angle d may be off by 2 d there, and in the limit the part across is left where it was.
+//! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the
+//! geometric ones by an angle d may be off by 2 d there, and in the limit the component perpendicular to the normal is
+//! not rotated.
 
 use nalgebra::Vector3;
 
@@ -40,7 +41,7 @@ const RESOLUTION: f64 = 1.0 / 262_144.0;
 /// Squared length of the sum of two unit vectors below which they are opposite: half a turn, within 1e-5 rad.
 const OPPOSITE: f64 = 1e-10;
 
-/// World unit normals, one per corner, of a surface at `positions` (what `deform` returned for the same state).
+/// World unit normals, one per corner, of a surface at `positions` (the result of `deform` for the same state).
 pub fn exact_normals(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> Vec<[f64; 3]> {
     let mut normals = orient_normals(scene, state);
     for_each_turned(scene, state, positions, |corner, turn| {
@@ -67,15 +68,15 @@ pub fn exact_tangents(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> V
     tangents
 }
 
-/// The unit directions between which a group's surface turned.
+/// The rotation of a group's surface, as its unit directions before and after.
 struct Turn {
     from: Vector3<f64>,
     to: Vector3<f64>,
 }
 
 impl Turn {
-    /// The least rotation from one to the other: the part along `from` goes along `to`; the part across is reflected
-    /// at the plane across their middle.
+    /// Applies the smallest rotation that takes `from` to `to`: the component along `from` is moved to `to`, the rest
+    /// is reflected at the plane perpendicular to their bisector.
     fn carry(&self, vector: Vector3<f64>) -> Vector3<f64> {
         let along = self.from.dot(&vector);
         let across = vector - self.from * along;
@@ -91,14 +92,14 @@ fn turned_normal(turn: &Turn, rigid: [f64; 3]) -> Vector3<f64> {
     direction(turn.carry(rigid.into())).unwrap_or(turn.to)
 }
 
-/// A tangent without its part along the normal; where nothing else is left, any unit vector across.
+/// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
 fn beside(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
     let flat = tangent - normal * normal.dot(&tangent);
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     if flat.norm() > 1e-6 { flat.normalize() } else { normal.cross(&axis).normalize() }
 }
 
-/// Calls `act` with each packed corner whose surface has turned in a way that can be told.
+/// Calls `act` with each packed corner for which the rotation of the surface can be determined.
 fn for_each_turned(scene: &Scene, state: &State, positions: &[[f64; 3]], mut act: impl FnMut(usize, &Turn)) {
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
         let shape = scene.shape_of(domain);
@@ -118,14 +119,14 @@ fn for_each_turned(scene: &Scene, state: &State, positions: &[[f64; 3]], mut act
     }
 }
 
-/// The area vectors around a group, and B.
+/// The sum of the area vectors around a group, and its rounding scale B.
 #[derive(Clone, Default)]
 struct Area {
     sum: Vector3<f64>,
     rounding: f64,
 }
 
-/// Of each group.
+/// The areas of all groups.
 fn areas(mesh: &Mesh, members: &[u32], position: impl Fn(usize) -> [f64; 3]) -> Vec<Area> {
     let mut areas = vec![Area::default(); members.len()];
     let l1 = |vector: Vector3<f64>| vector.abs().sum();
@@ -145,7 +146,7 @@ fn areas(mesh: &Mesh, members: &[u32], position: impl Fn(usize) -> [f64; 3]) -> 
     areas
 }
 
-/// A vector over its length, which neither over- nor underflows.
+/// A vector divided by its length, without overflow or underflow; `None` if it is zero or not finite.
 fn direction(vector: Vector3<f64>) -> Option<Vector3<f64>> {
     let largest = vector.amax();
     (largest > 0.0 && largest.is_finite()).then(|| (vector / largest).normalize())

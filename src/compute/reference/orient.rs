@@ -1,16 +1,17 @@
-//! Normals by the inverse transpose of A, tangents by A, both of unit length. Twin of `kernels/orient.cuh`.
+//! Rigid normals by the inverse transpose of A, tangents by A, both of unit length. Twin of `kernels/orient.cuh`.
 
 use nalgebra::{Matrix3, Vector3};
 
 use modalcast_model::scene::{Scene, State};
 
-/// World unit normals, one per corner. A domain whose A is singular keeps the direction that its cofactors give, and a
-/// normal that vanishes under them becomes +Z.
+/// World unit normals, one per corner. If A is singular, the cofactors still give the direction, and a normal that they
+/// map to zero becomes +Z.
 pub fn orient_normals(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
     let mut normals = Vec::with_capacity(scene.layout.corners);
     for domain in 0..scene.domains.len() {
         let linear = state.composed(scene, domain).linear();
-        // The inverse transpose is the cofactor matrix over the determinant; only its sign survives normalising.
+        // The inverse transpose is the cofactor matrix over the determinant; only the determinant's sign survives
+        // normalization.
         let turn = cofactors(&linear) * linear.determinant().signum();
         for normal in &scene.shape_of(domain).mesh.corners().normals {
             normals.push(unit(turn * Vector3::from(*normal).cast::<f64>()).into());

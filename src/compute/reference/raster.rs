@@ -1,22 +1,22 @@
-//! What a rasteriser draws, sample by sample: the definition of `kernels/raster.cu`, in plain loops.
+//! The reference rasterizer, sample by sample: defines the result of `kernels/raster.cu`, in plain loops.
 //!
-//! Corners are taken into clip space in f32, each sum and product rounded by itself, clipped by the near plane and a guard
-//! around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and snapped to 1/256 pixel. From there
-//! on coverage is exact, in integers: a sample belongs to the triangle on whose inner side of all edges it lies; one on an
-//! edge belongs to the triangle that has it as its top or left edge. So triangles that share an edge cover every sample
-//! between them once. Depth is z/w, linear in the window, in f32 from the exact edge values. Of a cut-out that is left where
-//! alpha is large enough ([`cut_out`]).
+//! Corners are transformed to clip space in f32, with each sum and product rounded separately, clipped by the near
+//! plane and a guard band around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and snapped
+//! to 1/256 pixel. From there on coverage is exact, in integers: a triangle covers the samples on the inner side of all
+//! its edges. A sample on an edge belongs to the triangle for which it is a top or left edge, so triangles that share
+//! an edge cover each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values.
+//! Cut-outs keep the samples whose alpha is large enough ([`cut_out`]).
 
 pub mod cut_out;
 
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{Faces, Group, Window};
 
-/// Parts of a pixel, and the least w that is divided by.
+/// Subpixel steps per pixel, and the smallest w of a divisor.
 const CELL: i32 = 256;
 const LEAST_W: f32 = f32::from_bits((127 - 100) << 23);
 
-/// What a sample holds before anything is drawn.
+/// Clear value of a sample.
 pub const NOTHING: u64 = u64::MAX;
 
 /// A corner in the window: 1/256 pixel with y down, and depth.
@@ -27,17 +27,17 @@ pub struct Corner {
     pub z: f32,
 }
 
-/// Why a triangle has no sample.
+/// Reason why a triangle is culled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Dropped {
-    /// A corner is no finite point of clip space.
+    /// A corner is not finite in clip space.
     NotFinite,
-    /// Beyond one plane of the view, or nothing of it is left by the planes that clip.
+    /// Outside one plane of the view frustum, or nothing remains after clipping.
     Outside,
-    /// Snapped, it has no area.
+    /// No area after snapping.
     Flat,
     Back,
-    /// No sample lies in the box of its corners.
+    /// The box of its corners contains no sample.
     Missed,
 }
 
@@ -47,16 +47,16 @@ pub type Samples = [i32; 4];
 /// A triangle after clipping.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outline {
-    /// 3 to 8 corners of a convex polygon; not turned.
+    /// 3 to 8 corners of a convex polygon, in the triangle's own orientation.
     pub corners: Vec<Corner>,
-    /// Twice its area in (1/256 pixel)^2, positive where the corners follow clockwise on the screen.
+    /// Twice its area in (1/256 pixel)^2, positive where the corners are clockwise on the screen.
     pub area: i64,
     pub samples: Samples,
     /// Whether a plane clipped it.
     pub clipped: bool,
 }
 
-/// Samples of a window: the least depth of each and whose it is.
+/// Samples of a window: the least depth of each and its triangle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Raster {
     window: Window,
@@ -65,17 +65,17 @@ pub struct Raster {
 }
 
 impl Raster {
-    /// A window without anything.
+    /// An empty window.
     pub fn new(window: Window) -> Self {
         Self { window, keys: vec![NOTHING; window.pixels()] }
     }
 
-    /// Draws the triangles of a group; positions are three numbers a vertex.
+    /// Draws the triangles of a group; positions are three numbers per vertex.
     pub fn draw(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: Group) {
         self.draw_where(positions, triangles, group, |_, _| true);
     }
 
-    /// The same of a mesh of which some triangles are cut out.
+    /// Draws the triangles of a group of a mesh with cut-outs.
     pub fn draw_cut_out(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: Group, cut_outs: &CutOuts) {
         let window = self.window;
         self.draw_where(positions, triangles, group, |triangle, pixel| {
@@ -98,7 +98,7 @@ impl Raster {
         }
     }
 
-    /// Depths, 1 where there is nothing.
+    /// Depths; 1 where nothing was drawn.
     pub fn depths(&self) -> Vec<f32> {
         let depth = |key: &u64| if *key == NOTHING { 1.0 } else { f32::from_bits((key >> 32) as u32) };
         self.keys.iter().map(depth).collect()
@@ -123,10 +123,10 @@ impl Raster {
     }
 }
 
-/// A triangle clipped and snapped, or why it is not drawn.
+/// Clips and snaps a triangle.
 ///
 /// # Errors
-/// Why it is dropped.
+/// The reason why the triangle is culled.
 pub fn outline(window: &Window, positions: &[f32], triangle: [u32; 3], faces: Faces) -> Result<Outline, Dropped> {
     let corners = corners(window, positions, triangle);
     if !corners.as_flattened().iter().all(|number| number.is_finite()) {
@@ -161,7 +161,7 @@ pub fn corners(window: &Window, positions: &[f32], triangle: [u32; 3]) -> [[f32;
     triangle.map(|vertex| to_clip(window, &positions[3 * vertex as usize..][..3]))
 }
 
-/// The triangles of a fan over the outline, each turned so that its corners follow clockwise on the screen.
+/// A triangle fan over the outline, each triangle oriented so that its corners are clockwise on the screen.
 pub fn pieces(outline: &Outline) -> Vec<[Corner; 3]> {
     let corners = &outline.corners;
     let turned = |at: usize| {
@@ -171,7 +171,7 @@ pub fn pieces(outline: &Outline) -> Vec<[Corner; 3]> {
     (1..corners.len() - 1).map(turned).filter(|piece| area(piece) > 0).collect()
 }
 
-/// Depth of a piece at a pixel's sample, if it lies inside and not behind the far plane.
+/// Depth of a piece at a pixel's sample, if the sample lies inside and not behind the far plane.
 pub fn depth_at(piece: &[Corner; 3], column: i32, row: i32) -> Option<f32> {
     let (x, y) = (CELL * column + CELL / 2, CELL * row + CELL / 2);
     let [a, b, c] = piece;
@@ -185,13 +185,13 @@ pub fn depth_at(piece: &[Corner; 3], column: i32, row: i32) -> Option<f32> {
     (z <= 1.0).then_some(if z > 0.0 { z } else { 0.0 })
 }
 
-/// The value of an edge at a point: positive on its right, where y goes down.
+/// The edge function at a point: positive on the right of the edge, with y down.
 pub fn edge(from: &Corner, to: &Corner, x: i32, y: i32) -> i64 {
     let [across, down] = [to.x - from.x, to.y - from.y].map(i64::from);
     across * i64::from(y - from.y) - down * i64::from(x - from.x)
 }
 
-/// Top and left edges take the samples on them.
+/// Least covered value of an edge function: samples on top and left edges are covered.
 fn least(from: &Corner, to: &Corner) -> i64 {
     i64::from(!(to.y < from.y || (to.y == from.y && to.x > from.x)))
 }
@@ -213,7 +213,7 @@ fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
     (0..3).any(|axis| beyond(axis, 1.0) || beyond(axis, -1.0))
 }
 
-/// Not negative on the inner side of a plane: the near one, then the sides of the guard.
+/// Signed distance to a plane, not negative on the inner side: the near plane, then the sides of the guard band.
 fn inside(window: &Window, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
     let [guard_x, guard_y] = window.guard().map(|guard| guard * w);
     [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
@@ -233,14 +233,15 @@ fn clip(window: &Window, corners: &[[f32; 4]; 3]) -> Vec<[f32; 4]> {
                 kept.push(if of_a >= 0.0 { cut(a, b, of_a, of_b) } else { cut(b, a, of_b, of_a) });
             }
         }
-        // Rounding may bend a polygon by a hair; a convex one gets one corner more from a plane, at most.
+        // Rounding may make a polygon slightly concave; a plane adds at most one corner to a convex polygon.
         kept.truncate(8);
         list = kept;
     }
     list
 }
 
-/// From the inner end of an edge towards its outer one, whichever triangle of the edge asks.
+/// Intersection of an edge with a plane, always computed from the inner end, so that both triangles of an edge get the
+/// same result.
 fn cut(inner: &[f32; 4], outer: &[f32; 4], of_inner: f32, of_outer: f32) -> [f32; 4] {
     let t = of_inner / (of_inner - of_outer);
     std::array::from_fn(|axis| inner[axis] + t * (outer[axis] - inner[axis]))
@@ -255,7 +256,7 @@ fn snap(window: &Window, [x, y, z, w]: &[f32; 4]) -> Corner {
     Corner { x: snapped(across), y: snapped(down), z: z * inverse * 0.5 + 0.5 }
 }
 
-/// The samples in the box of the corners, cut by the window.
+/// The samples in the box of the corners, clipped to the window.
 fn samples(window: &Window, corners: &[Corner]) -> Samples {
     let ends = |of: fn(&Corner) -> i32, side: u32| {
         let all = || corners.iter().map(of);

@@ -1,16 +1,16 @@
-//! How far a deformer's x may be off, before it has computed anything: one number per source of error.
+//! A-priori bounds of the error of a deformer's x, one number per source of error.
 //!
 //! The sum of a vertex is a chain of fused multiply-adds from +0 over its modes in ascending order, then `+ x0`, then
-//! three fused multiply-adds per row of T, all in f32. With u = 2^-24 and gamma_k = k u / (1 - k u) a chain of k
-//! roundings is off by at most gamma_k times the sum of the magnitudes of its terms (Higham, Accuracy and Stability of
-//! Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding that underflows. A
-//! compensated sum is off by u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot Product, 2005,
-//! proposition 5.5), plus 5 k 2^-149.
+//! three fused multiply-adds per row of T, all in f32. With u = 2^-24 and gamma_k = k u / (1 - k u), the error of a
+//! chain of k roundings is at most gamma_k times the sum of the magnitudes of its terms (Higham, Accuracy and Stability
+//! of Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding that underflows. The
+//! error of a compensated sum is at most u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot
+//! Product, 2005, proposition 5.5), plus 5 k 2^-149.
 //!
-//! T of a follower is a product T_m F, rounded as [`Composed::rounded`] says: three roundings an entry, so that entry by
-//! entry it is off by at most gamma_3 |T_m| |F|, and its translation by gamma_3 (|T_m| |f| + |t_m|).
+//! T of a follower is a product T_m F, rounded as [`Composed::rounded`] defines: three roundings per entry. The error
+//! of its linear part is at most gamma_3 |T_m| |F| per entry, that of its translation gamma_3 (|T_m| |f| + |t_m|).
 //!
-//! A bound is a length: that of the error of a vertex's position, in scene units. It holds for sums without overflow, and
+//! A bound is a length, the maximum error of a vertex position in scene units. It holds for sums without overflow, and
 //! is infinite where q times a factor overflows f32.
 
 use rayon::prelude::*;
@@ -19,7 +19,7 @@ use super::{Products, Tiles};
 use modalcast_model::domain::{Composed, Shape, Transform};
 use modalcast_model::scene::Storage;
 
-/// A little more than what the few thousand f64 operations of a bound can lose.
+/// Safety factor, slightly more than the few thousand f64 operations of a bound can lose.
 const ROUND_UP: f64 = 1.0 + 1e-12;
 /// Half a unit in the last place of f32, relative.
 const UNIT: f64 = 1.0 / (1 << 24) as f64;
@@ -27,10 +27,10 @@ const UNIT: f64 = 1.0 / (1 << 24) as f64;
 const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
 const SQRT_3: f64 = 1.732_050_807_568_878;
 
-/// The largest error of a vertex of one tile or domain by source, in scene units.
+/// Maximum error of a vertex of one tile or domain by source, in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
 pub struct Bound {
-    /// Entries of U as they are stored: of r modes `sum_j |q_j| step_j / 2` per axis.
+    /// Rounding of the entries of U to the storage type: for r modes `sum_j |q_j| step_j / 2` per axis.
     pub storage: f64,
     /// q times the factor or scale of a mode, rounded to f32.
     pub coordinates: f64,
@@ -38,19 +38,19 @@ pub struct Bound {
     pub accumulation: f64,
     /// `x0 + u`.
     pub rest: f64,
-    /// Multiplying with A and adding the translation.
+    /// Multiplication by A and addition of the translation.
     pub transform: f64,
-    /// Multiplying the transform of a mover with the frame of its follower; 0 of a mover.
+    /// Product of the transform of a root and the frame of its follower; 0 for a root.
     pub frame: f64,
 }
 
 impl Bound {
-    /// All sources together.
+    /// The sum of all sources.
     pub fn total(&self) -> f64 {
         (self.storage + self.coordinates + self.accumulation + self.rest + self.transform + self.frame) * ROUND_UP
     }
 
-    /// Source by source the larger one.
+    /// The maximum per source.
     pub fn max(self, other: Self) -> Self {
         Self {
             storage: self.storage.max(other.storage),
@@ -63,28 +63,28 @@ impl Bound {
     }
 }
 
-/// What a bound depends on besides the shape.
+/// Inputs of a bound besides the shape.
 #[derive(Debug, Clone, Copy)]
 pub struct Step<'a> {
-    /// Coordinates of the domain; zero where a mode is left out.
+    /// Coordinates of the domain; zero for truncated modes.
     pub q: &'a [f32],
-    /// As [`modalcast_model::scene::State::composed`] has it.
+    /// As returned by [`modalcast_model::scene::State::composed`].
     pub transform: Composed,
     pub compensated: bool,
 }
 
-/// A mode of a tile.
+/// Bounds of a mode in a tile.
 #[derive(Debug, Clone, Copy, Default)]
 struct Reach {
-    /// The longest of its vertices' rows, as stored.
+    /// The longest row of its vertices, as stored.
     length: f64,
-    /// An entry is off by at most this.
+    /// Maximum rounding error of an entry.
     half_step: f64,
-    /// Its stored entries times this are its decoded ones.
+    /// Decoded entries are stored entries times this factor.
     factor: f32,
 }
 
-/// What bounds need to know of one shape in one storage type.
+/// Tables of one shape in one storage type from which bounds are computed.
 #[derive(Debug, Clone)]
 pub struct Reaches {
     rank: usize,
@@ -95,7 +95,7 @@ pub struct Reaches {
 }
 
 impl Reaches {
-    /// Looks at every entry of `shape`, which `tiles` were made of.
+    /// Reads every entry of `shape`, from which `tiles` were made.
     pub fn new(shape: &Shape, tiles: &Tiles) -> Self {
         let modes = |tile: usize| (0..tiles.rank()).map(move |mode| reach(shape, tiles, tile, mode));
         let rest = |tile: usize| {
@@ -120,7 +120,7 @@ impl Reaches {
             if amount == 0.0 || reach.length == 0.0 {
                 continue;
             }
-            // The product of two f32 is exact in f64, so what its rounding loses is known.
+            // The product of two f32 is exact in f64, so its rounding error in f32 is known.
             let (exact, rounded) = (amount * f64::from(reach.factor), f64::from(q.abs() * reach.factor));
             lost += stored_length(reach) * (exact - rounded).abs();
             moved += stored_length(reach) * rounded;
@@ -129,7 +129,7 @@ impl Reaches {
         self.finish(tile, step, [SQRT_3 * storage, lost, moved, terms])
     }
 
-    /// What taking its sums from tensor cores adds to the bounds of tile `tile`, scene units.
+    /// Additional error of the vertices of tile `tile` when its sums are computed by tensor cores, scene units.
     pub fn products(&self, tile: usize, step: &Step, products: Products) -> f64 {
         let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(step.q);
         let amount = |(reach, q): (&Reach, &f32)| f64::from(q.abs() * reach.factor);
@@ -146,7 +146,7 @@ impl Reaches {
         (0..self.rest.len()).map(|tile| self.tile(tile, step)).fold(Bound::default(), Bound::max)
     }
 
-    /// How far u may be off at the vertices of a tile, in scene units of the domain: neither x0 nor T has a part in it.
+    /// Maximum error of u at the vertices of a tile, in scene units of the domain; independent of x0 and T.
     pub fn displacement(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
         let step = Step { q, transform: Transform::IDENTITY.into(), compensated };
         let Bound { storage, coordinates, accumulation, .. } = self.tile(tile, &step);
@@ -173,8 +173,8 @@ impl Reaches {
     }
 }
 
-/// How far the linear part (in the Frobenius norm) and the translation of [`Composed::rounded`] may be from the exact
-/// product; zeros of a mover.
+/// Maximum difference of the linear part (in the Frobenius norm) and of the translation of [`Composed::rounded`] from
+/// the exact product; zeros for a transform root.
 fn rounding(transform: &Composed) -> [f64; 2] {
     let Some(frame) = transform.frame else { return [0.0; 2] };
     let sizes =
@@ -189,14 +189,14 @@ fn rounding(transform: &Composed) -> [f64; 2] {
     [linear, length(&mut all.filter(|at| !is_linear(at)).map(|at| entries[at]))]
 }
 
-/// At least `||A||_2` of the linear part, as it is and as deformers round it. By at most 1e-7 of itself too large, and
-/// for a follower by what rounding the product of its frame may add.
+/// Upper bound of `||A||_2` of the linear part, exact and as deformers round it. Too large by at most a relative 1e-7,
+/// and for a follower by the rounding error that the product with its frame may add.
 pub fn norm(transform: &Composed) -> f64 {
     let [turned, _] = rounding(transform);
     (norm_of(&transform.rounded()) + turned) * ROUND_UP
 }
 
-/// At least `||A||_2`, by at most 1e-7 of itself too large. The root of the largest eigenvalue of A^T A, by the
+/// Upper bound of `||A||_2`, too large by at most a relative 1e-7. The root of the largest eigenvalue of A^T A, by the
 /// trigonometric formula for 3x3 matrices (Smith, Eigenvalues of a symmetric 3x3 matrix, 1961).
 fn norm_of(transform: &Transform) -> f64 {
     let linear = transform.linear();
@@ -204,7 +204,7 @@ fn norm_of(transform: &Transform) -> f64 {
     if largest == 0.0 {
         return 0.0;
     }
-    // Of entries of at most 1, so that no square leaves f64.
+    // Scale entries to at most 1, so that no square over- or underflows f64.
     let linear = linear / largest;
     let gram = linear.transpose() * linear;
     let mean = gram.trace() / 3.0;
@@ -254,16 +254,16 @@ fn factor(tiles: &Tiles, tile: usize, mode: usize) -> f32 {
     }
 }
 
-/// The most that rounding to the storage type moves an entry of a tile whose largest one is `largest`.
+/// Maximum rounding error of an entry of a tile in the storage type; `largest` is the tile's largest entry.
 fn half_step(tiles: &Tiles, tile: usize, mode: usize, largest: f32) -> f64 {
     let factor = f64::from(factor(tiles, tile, mode));
-    // Half the distance of neighbours: 2^-11 of the power of two below f16, 2^-8 below bf16; both have a smallest one.
+    // Half the spacing: 2^-11 of the power of two below for f16, 2^-8 for bf16; both types have a smallest spacing.
     let below = f64::exp2(f64::from(super::pack::exponent(largest)));
     match tiles.storage() {
         _ if largest == 0.0 => 0.0,
         Storage::F32 => 0.0,
         Storage::F16 => (below * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
-        // A whole smallest step: an f32 lies between, so a value there may be rounded twice.
+        // A whole smallest step: the value may be rounded twice, first to f32.
         Storage::Bf16 => (below * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
         Storage::Int8 => factor / 2.0 * ROUND_UP,
     }

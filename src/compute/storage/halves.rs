@@ -1,30 +1,31 @@
-//! Coordinates as tensor cores take them beside U in 16 bits: each as two numbers of U's own type.
+//! Coordinates for tensor cores with U in 16 bits: each coordinate is split into two numbers of U's type.
 //!
-//! A number x becomes h = round(x) and l = round(x - h). Of a type with p significant bits, |x - h| <= 2^-p |x| and
-//! |x - h - l| <= 2^-2p |x|, unless l falls among the denormal numbers: 2^-22 with f16, 2^-16 with bf16. All coordinates
-//! of a domain are multiplied by one power of two first, so that the largest lies in [2^13, 2^14): then nothing
-//! overflows f16, and what is lost in its denormals is at most 2^-25, 2^-38 of the largest.
+//! A number x becomes h = round(x) and l = round(x - h). For a type with p significant bits, |x - h| <= 2^-p |x|.
+//! Unless l is denormal, |x - h - l| <= 2^-2p |x|: 2^-22 with f16, 2^-16 with bf16. All coordinates of a domain are
+//! first multiplied by one power of two, so that the largest lies in [2^13, 2^14). Then nothing overflows f16, and the
+//! loss in its denormals is at most 2^-25, 2^-38 of the largest.
 
 use half::{bf16, f16};
 
 use modalcast_model::scene::Storage;
 
-/// The power of two below the largest coordinate, after scaling.
+/// Exponent of the power of two at or below the largest coordinate, after scaling.
 const LARGEST: i32 = 13;
-/// Largest coordinates below 2^-113 are scaled as if they were that large: so 2 to the -126 takes it back.
+/// Largest coordinates below 2^-113 are scaled as if they were 2^-113, so that the inverse scaling is at least 2^-126.
 const LEAST: i32 = -113;
 
-/// The coordinates of one domain.
+/// The split coordinates of one domain.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Halves {
     storage: Storage,
     pairs: Vec<[u16; 2]>,
-    /// Of the scaling power of two: taking it back multiplies by 2 to this.
+    /// Exponent of the inverse scaling: sums are multiplied by 2 to this power.
     exponent: i32,
 }
 
 impl Halves {
-    /// Splits finite coordinates, times the factors of their modes, for U in `F16`; in any other storage for `Bf16`.
+    /// Splits finite coordinates, already multiplied by the factors of their modes, for U in `F16`; for any other
+    /// storage, in `Bf16`.
     pub fn new(amounts: &[f32], storage: Storage) -> Self {
         let largest = amounts.iter().fold(0.0, |largest: f32, amount| largest.max(amount.abs()));
         let exponent = exponent_of(largest).max(LEAST) - LARGEST;
@@ -42,58 +43,58 @@ impl Halves {
         self.pairs[mode]
     }
 
-    /// What sums are to be multiplied by: a power of two that f32 holds.
+    /// Factor of the inverse scaling, by which sums are multiplied: a power of two that f32 can represent.
     pub fn shrink(&self) -> f32 {
         f64::from(self.exponent).exp2() as f32
     }
 
-    /// What both numbers of a mode stand for.
+    /// The value that both numbers of a mode represent.
     pub fn worth(&self, mode: usize) -> f64 {
         let [high, low] = self.pairs[mode];
         (value(high, self.storage) + value(low, self.storage)) * f64::from(self.exponent).exp2()
     }
 }
 
-/// How far products of tensor cores may be off, besides the storage of U.
+/// Relative error bounds of products by tensor cores, in addition to the storage error of U.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Products {
-    /// Of each coordinate.
+    /// Relative to each coordinate.
     pub coordinate: f64,
-    /// Of the largest coordinate of the domain, for each.
+    /// For each coordinate, relative to the largest coordinate of the domain.
     pub floor: f64,
-    /// Of the sum of the magnitudes of all terms.
+    /// Relative to the sum of the magnitudes of all terms.
     pub sum: f64,
 }
 
-/// Half a unit of the last of 24 bits, twice: what truncating an addend to the exponent of the largest loses.
+/// 2^-23: the relative loss of truncating an addend that is aligned to the exponent of the largest.
 const TRUNCATED: f64 = 1.0 / (1 << 23) as f64;
-/// Modes of a product.
+/// Modes per product.
 const STEP: usize = 16;
-/// Truncations of a product of 16 terms, done at once or in two halves: of each term and of the sum before, and of
-/// what comes out.
+/// Truncations of a product of 16 terms, computed at once or in two halves: of each term and of the previous sum, and
+/// of the result.
 const TRUNCATIONS: f64 = 20.0;
 
 impl Products {
-    /// Of `rank` modes in this storage type.
+    /// Bounds for `rank` modes in this storage type.
     ///
-    /// A tensor core multiplies exactly, aligns all terms and the sum before to the largest of them, and truncates
+    /// A tensor core multiplies exactly, aligns all terms and the previous sum to the largest of them, and truncates
     /// (Fasi, Higham, Mikaitis, Pranesh, Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 7:e330,
-    /// 2021). So no product loses more than `TRUNCATIONS` units of the sum of all magnitudes, and there are two for
-    /// every 16 modes.
+    /// 2021). A product therefore loses at most `TRUNCATIONS` units of the sum of all magnitudes, and there are two
+    /// products for every 16 modes.
     pub fn of(storage: Storage, rank: usize) -> Self {
         let coordinate = f64::from(if storage == Storage::F16 { -22_i8 } else { -16 }).exp2();
         let sum = 2.0 * rank.div_ceil(STEP) as f64 * TRUNCATIONS * TRUNCATED;
-        // The magnitudes are those of rounded coordinates, and compound a little.
+        // The magnitudes are those of rounded coordinates, so their errors compound slightly.
         Self { coordinate, floor: f64::from(-25 - LARGEST).exp2(), sum: sum * (1.0 + 2.0 * sum + 1e-4) }
     }
 
-    /// The least that the largest coordinate counts for.
+    /// Lower limit of the largest coordinate in the `floor` bound.
     pub(super) fn least() -> f64 {
         f64::from(LEAST).exp2()
     }
 }
 
-/// The power of two at or below a number; that of the smallest f32 for zero.
+/// Exponent of the power of two at or below a number; for zero, that of the smallest f32.
 fn exponent_of(number: f32) -> i32 {
     let bits = f64::from(number).to_bits();
     if number == 0.0 { -149 } else { (bits >> 52) as i32 - 1023 }

@@ -1,4 +1,4 @@
-//! Columns of U to planes: scales, factors, rounding. Tile by tile on all cores.
+//! Encodes columns of U as planes: scales, factors, rounding. Parallel over tiles.
 
 use half::{bf16, f16};
 use rayon::prelude::*;
@@ -16,8 +16,9 @@ pub(super) fn rest_quad(vertices: &[[f32; 3]]) -> [f32; 12] {
     quad
 }
 
-/// 2^s per mode such that the largest stored entry lies in [2^14, 2^15) for `F16`, in [1, 2) for `Bf16`; 1 for a mode
-/// of zeros. s is at least -149, where 2^s is the smallest f32: columns below 2^-135 are stored smaller, as exactly.
+/// Factors 2^s per mode such that the largest stored entry lies in [2^14, 2^15) for `F16`, in [1, 2) for `Bf16`; 1 for
+/// a mode of zeros. s is at least -149, where 2^s is the smallest f32: columns below 2^-135 are stored smaller, without
+/// loss of precision.
 pub(super) fn factors(modes: &Modes, storage: Storage) -> Vec<f32> {
     let top = match storage {
         Storage::F16 => 14,
@@ -31,13 +32,13 @@ pub(super) fn factors(modes: &Modes, storage: Storage) -> Vec<f32> {
     (0..modes.rank()).into_par_iter().map(factor).collect()
 }
 
-/// Writes the planes of `F32`, `F16` or `Bf16`, which are zeros so far.
+/// Writes the planes of `F32`, `F16` or `Bf16`; they must be zero.
 pub(super) fn fill_floats(modes: &Modes, tiles: &[Tile], storage: (Storage, &[f32]), planes: &mut [Plane]) {
     let (storage, factors) = storage;
     let inverse = |mode: usize| 1.0 / f64::from(factors[mode]);
     each_tile(modes, storage, tiles, planes).for_each(|(tile, planes)| match storage {
         Storage::F32 => write(modes, tile, storage, planes, |_, entry| entry.to_ne_bytes()),
-        // The quotient is exact in f64, and in f32 unless it is far below what the type can hold.
+        // The quotient is exact in f64, and in f32 unless it is far below the range of the storage type.
         Storage::F16 => write(modes, tile, storage, planes, |mode, entry| {
             f16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_ne_bytes()
         }),
@@ -66,10 +67,10 @@ pub(super) fn fill_codes(modes: &Modes, tiles: &[Tile], planes: &mut [Plane], sc
     });
 }
 
-/// The stored code of zero.
+/// The code of zero.
 const ZERO_CODE: u8 = 128;
 
-/// Each tile with its planes: only a shape's last tile is shorter than the others.
+/// Each tile with its planes. Only the last tile of a shape is shorter.
 fn each_tile<'a>(
     modes: &Modes,
     storage: Storage,
@@ -80,12 +81,12 @@ fn each_tile<'a>(
     tiles.par_iter().zip(planes.par_chunks_mut(3 * chunks * TILE_QUADS))
 }
 
-/// The entries of a tile's vertices in one mode, three a vertex.
+/// The entries of a tile's vertices in one mode, three per vertex.
 fn rows<'a>(modes: &'a Modes, tile: &Tile, mode: usize) -> &'a [f32] {
     &modes.column(mode)[3 * tile.first_vertex..][..3 * tile.vertices]
 }
 
-/// Puts every entry of a tile where it belongs.
+/// Writes every entry of a tile to its byte offset.
 fn write<const SIZE: usize>(
     modes: &Modes,
     tile: &Tile,
@@ -106,7 +107,7 @@ fn write<const SIZE: usize>(
     }
 }
 
-/// 1/127 of the largest entry, rounded up; so 127 steps reach it, and a tile of zeros has step 0.
+/// 1/127 of the largest entry, rounded up, so that 127 steps reach it. A tile of zeros has step 0.
 fn step_between_codes(largest: f32) -> f32 {
     let exact = f64::from(largest) / 127.0;
     let near = exact as f32;
@@ -119,11 +120,11 @@ fn largest(entries: &[f32]) -> f32 {
 
 /// The floor of the binary logarithm of a positive number.
 pub(super) fn exponent(number: f32) -> i32 {
-    // Every f32 is a normal f64.
+    // Every f32 is a normal number in f64.
     ((f64::from(number).to_bits() >> 52) & 0x7ff) as i32 - 1023
 }
 
-/// 2^s, exact, for s of -1022 to 1023.
+/// 2^s, exact, for s in -1022 to 1023.
 pub(super) const fn power_of_two(s: i32) -> f64 {
     f64::from_bits(((s + 1023) as u64) << 52)
 }

@@ -1,4 +1,4 @@
-//! The tiles of one shape, and what one entry is worth in them.
+//! The tiles of one shape, and the decoded value of an entry.
 
 use std::ops::Range;
 
@@ -8,27 +8,27 @@ use super::{QUAD, TILE_QUADS, modes_per_chunk, pack};
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::Storage;
 
-/// 16 bytes of a quad's chunk: what one lane loads at once.
+/// 16 bytes of a quad's chunk: the unit that one lane loads at once.
 #[repr(C, align(16))]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct Plane(pub [u8; 16]);
 
-/// Where one tile lies.
+/// Offsets and sizes of one tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tile {
-    /// The first quad in the shape, and the count W of quads.
+    /// The first quad in the shape, and the number W of quads.
     pub first_quad: usize,
     pub quads: usize,
-    /// The first vertex in the shape, and the count of vertices that are there.
+    /// The first vertex in the shape, and the number of vertices without padding.
     pub first_vertex: usize,
     pub vertices: usize,
     /// The first of its `3 C W` planes.
     pub first_plane: usize,
-    /// The first of its `C K` scales, if the storage has any.
+    /// The first of its `C K` scales, if the storage has scales.
     pub first_scale: usize,
 }
 
-/// U and x0 of one shape in tiles. The module's page says how they lie.
+/// U and x0 of one shape in tiles. The module documentation describes the layout.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tiles {
     storage: Storage,
@@ -44,7 +44,7 @@ impl Tiles {
     /// Rounds a shape's U to the storage type.
     ///
     /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15) or in
-    /// [1, 2); `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
+    /// [1, 2). `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
     pub fn new(shape: &Shape, storage: Storage) -> Self {
         let rest = shape.mesh.rest();
         let rank = shape.modes.rank();
@@ -71,37 +71,37 @@ impl Tiles {
         tiles
     }
 
-    /// The type that entries are stored in.
+    /// The storage type of the entries.
     pub const fn storage(&self) -> Storage {
         self.storage
     }
 
-    /// n.
+    /// n, the number of vertices.
     pub const fn vertices(&self) -> usize {
         self.vertices
     }
 
-    /// r.
+    /// r, the number of modes.
     pub const fn rank(&self) -> usize {
         self.rank
     }
 
-    /// Q, a quarter of n rounded up.
+    /// Q, a quarter of n rounded up: the number of quads.
     pub const fn quads(&self) -> usize {
         self.vertices.div_ceil(QUAD)
     }
 
-    /// C, the chunks of modes; 0 without modes.
+    /// C, the number of chunks of modes; 0 without modes.
     pub const fn chunks(&self) -> usize {
         self.rank.div_ceil(modes_per_chunk(self.storage))
     }
 
-    /// The count of tiles.
+    /// Number of tiles.
     pub const fn count(&self) -> usize {
         self.quads().div_ceil(TILE_QUADS)
     }
 
-    /// Where tile `tile` lies.
+    /// Offsets of tile `tile`.
     pub fn tile(&self, tile: usize) -> Tile {
         let first_quad = TILE_QUADS * tile;
         let quads = TILE_QUADS.min(self.quads() - first_quad);
@@ -121,24 +121,24 @@ impl Tiles {
         &self.planes
     }
 
-    /// The planes as bytes, as a device takes them.
+    /// The planes as bytes, for the upload to a device.
     pub fn bytes(&self) -> &[u8] {
         bytemuck::cast_slice(&self.planes)
     }
 
-    /// The bytes of tile `tile` in [`Self::bytes`].
+    /// The range of tile `tile` in [`Self::bytes`].
     pub fn byte_range(&self, tile: usize) -> Range<usize> {
         let place = self.tile(tile);
         let first = 16 * place.first_plane;
         first..first + 48 * self.chunks() * place.quads
     }
 
-    /// `Int8`: the step between codes per tile and mode, `[tile][C K]`, zero for modes that only fill up. Else empty.
+    /// `Int8`: the step between codes per tile and mode, `[tile][C K]`, zero for padding modes. Else empty.
     pub fn scales(&self) -> &[f32] {
         &self.scales
     }
 
-    /// `F16` and `Bf16`: per mode the power of two that its stored entries are multiplied by. Else empty.
+    /// `F16` and `Bf16`: per mode the power of two by which its stored entries are multiplied. Else empty.
     pub fn factors(&self) -> &[f32] {
         &self.factors
     }
@@ -148,7 +148,7 @@ impl Tiles {
         &self.rest
     }
 
-    /// Entry of vertex `vertex`, axis `axis`, mode `mode`, as it is stored: exact in f64.
+    /// The stored entry of vertex `vertex`, axis `axis`, mode `mode`: exact in f64.
     pub fn decoded(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
         let per_chunk = modes_per_chunk(self.storage);
         let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
@@ -187,7 +187,7 @@ mod tests {
         (9, 512),
     ];
 
-    /// Half the distance between neighbours of an entry, in units of the entry's mode.
+    /// Half the spacing of the storage type at an entry, in units of the entry's mode.
     fn half_step(tiles: &Tiles, tile: Tile, mode: usize, entry: f64) -> f64 {
         let exponent = |value: f64| value.abs().log2().floor();
         match tiles.storage() {
@@ -245,7 +245,7 @@ mod tests {
                 if storage == Storage::Int8 && filled > rank {
                     let place = tiles.tile(0);
                     assert!(tiles.scales()[rank..filled].iter().all(|scale| *scale == 0.0));
-                    // The last chunk's last byte is vertex 3, axis 2 of a mode that only fills up.
+                    // The last byte of the last chunk is vertex 3, axis 2 of a padding mode.
                     assert_eq!(tiles.planes()[place.first_plane + (3 * tiles.chunks() - 1) * place.quads].0[15], 128);
                 }
             }
@@ -257,7 +257,7 @@ mod tests {
         let shape = shape(9, 5, &mut Noise(3));
         let tiles = Tiles::new(&shape, Storage::F32);
         let float = |at: usize| f32::from_ne_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
-        // Three quads: mode 2, axis 1, vertex 6 is quad 1, place 2.
+        // Three quads: mode 2, axis 1, vertex 6 is in quad 1 at position 2.
         assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.at(6, 1, 2));
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest()[6][1]);
         assert_eq!(tiles.rest()[2][1], 0.0);
@@ -267,7 +267,7 @@ mod tests {
         let want = (shape.modes.at(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
         assert_eq!(f32::from(code), want);
         let tiles = Tiles::new(&shape, Storage::F16);
-        // Chunk 1, mode 3 is its second: group 4 is plane 2, bytes 0 to 7.
+        // Mode 3 is the second mode of chunk 1: its group 4 is plane 2, bytes 0 to 7.
         let bytes = &tiles.planes()[9 + 2 * 3 + 1].0[4..6];
         let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
         assert_eq!(f16::from_f32(shape.modes.at(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);

@@ -1,34 +1,35 @@
-//! Which modes cannot matter at a step's q, and what leaving them out costs.
+//! Modal truncation: which modes can be left out at a step's q, and a bound of the resulting error.
 //!
-//! Leaving modes D out moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, because a sum is not
-//! longer than its parts together and A lengthens nothing by more than its norm. A mode whose q crosses a limit back
-//! and forth would pop in and out: it goes only when all that is out stays within half the budget, and comes back when
-//! the whole budget is exceeded.
+//! Leaving out the modes D moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, by the triangle
+//! inequality and the norm of A. Hysteresis prevents a mode whose q oscillates around a limit from popping: a mode is
+//! left out only when all truncated modes together stay within half the budget, and returns when the whole budget is
+//! exceeded.
 
 use modalcast_model::domain::Modes;
 
-/// A little more than the roundings of 513 additions and three products in f64.
+/// Safety factor, slightly more than the rounding error of 513 additions and three products in f64.
 const ROUND_UP: f64 = 1.0 + 1e-12;
 
-/// `max_i ||U_ij||_2` per mode, rounded up, scene units per unit of q: the farthest that a mode moves a vertex.
+/// `max_i ||U_ij||_2` per mode, rounded up, scene units per unit of q: the largest displacement of a vertex by the
+/// mode.
 pub fn reaches(modes: &Modes) -> Vec<f64> {
     let square = |row: &[f32]| row.iter().map(|entry| f64::from(*entry).powi(2)).sum::<f64>();
     let reach = |mode: usize| modes.column(mode).chunks_exact(3).map(square).fold(0.0, f64::max).sqrt() * ROUND_UP;
     (0..modes.rank()).map(reach).collect()
 }
 
-/// What decides in one step which modes of a domain matter.
+/// Inputs of the truncation of a domain in one step.
 #[derive(Debug, Clone, Copy)]
 pub struct Amounts<'a> {
-    /// Finite coordinates, r of them.
+    /// Finite coordinates, one per mode.
     pub q: &'a [f32],
     /// From [`reaches`].
     pub reaches: &'a [f64],
-    /// At least `||A||_2`, as [`super::bound::norm`] gives it.
+    /// Upper bound of `||A||_2`, from [`super::bound::norm`].
     pub norm: f64,
 }
 
-/// The modes of one domain that are left out, from step to step.
+/// The truncated modes of one domain, updated step by step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truncation {
     out: Vec<bool>,
@@ -39,18 +40,18 @@ pub struct Truncation {
 }
 
 impl Truncation {
-    /// Of a domain of `rank` modes, none left out yet.
+    /// A domain with `rank` modes, none truncated.
     pub fn new(rank: usize) -> Self {
         let all: Vec<u16> = (0..rank as u16).collect();
         Self { out: vec![false; rank], costs: vec![0.0; rank], ascending: all.clone(), kept: all, bound: 0.0 }
     }
 
-    /// Keeps all modes until the next step is decided, as if none had been before.
+    /// Resets to the initial state: keeps all modes until the next update.
     pub fn forget(&mut self) {
         *self = Self::new(self.out.len());
     }
 
-    /// Decides for a step. `budget` is the farthest that a vertex may be off, in scene units.
+    /// Updates the truncation for a step. `budget` is the maximum error of a vertex, in scene units.
     pub fn update(&mut self, amounts: Amounts, budget: f64) {
         for (cost, (q, reach)) in self.costs.iter_mut().zip(amounts.q.iter().zip(amounts.reaches)) {
             *cost = amounts.norm * (f64::from(q.abs()) * reach);
@@ -71,12 +72,12 @@ impl Truncation {
         &self.kept
     }
 
-    /// No vertex is off by more than this for the modes that are left out, in scene units. Within the budget.
+    /// Maximum error of any vertex from the truncated modes, in scene units. Within the budget.
     pub const fn bound(&self) -> f64 {
         self.bound
     }
 
-    /// The costliest modes return until the rest fits. Returns what the rest costs.
+    /// Restores the costliest truncated modes until the rest fits the budget. Returns the cost of the rest.
     fn bring_back(&mut self, budget: f64) -> f64 {
         let mut total = 0.0;
         for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
@@ -89,7 +90,7 @@ impl Truncation {
         total
     }
 
-    /// The cheapest modes go while all that is out fits. Returns what it costs then.
+    /// Truncates the cheapest modes while the total cost fits the budget. Returns the total cost.
     fn leave_out(&mut self, mut total: f64, budget: f64) -> f64 {
         for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
             if self.out[mode] {
@@ -116,7 +117,7 @@ mod tests {
         truncation.update(Amounts { q, reaches, norm: 1.0 }, budget);
     }
 
-    /// The farthest that leaving out all but `kept` moves a vertex.
+    /// The largest displacement of a vertex by all modes but `kept`.
     fn farthest(shape: &Shape, q: &[f32], kept: &[u16]) -> f64 {
         let dropped = || (0..q.len()).filter(|mode| !kept.contains(&(*mode as u16)));
         let part = |vertex: usize, axis: usize| -> f64 {
@@ -143,7 +144,7 @@ mod tests {
                 assert!(error <= truncation.bound() && truncation.bound() <= budget, "seed {seed}: {error}");
                 assert!(truncation.kept().is_sorted());
                 left_out += rank - truncation.kept().len();
-                // One mode more than it says: the judge can fail.
+                // With one more truncated mode than reported, the error often exceeds the bound, so this test can fail.
                 let one_less = truncation.kept().split_first().map_or(&[][..], |(_, rest)| rest);
                 seen += usize::from(farthest(&shape, &q, one_less) > truncation.bound());
             }
@@ -175,7 +176,7 @@ mod tests {
             decide(&mut truncation, &q, &[1.0, 1.0], 1.0);
             changes += usize::from(truncation.kept() != before);
             before = truncation.kept().to_vec();
-            // Without memory: whatever fits into half the budget goes.
+            // Without hysteresis, every mode that fits half the budget is truncated.
             let mut naive = Truncation::new(2);
             decide(&mut naive, &q, &[1.0, 1.0], 1.0);
             naive_changes += usize::from(naive.kept().len() != naive_before);

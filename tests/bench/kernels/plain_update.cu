@@ -1,12 +1,12 @@
-// x = T (x0 + u) of every packed vertex: what follows a product that a library computed. Only trials use it.
+// x = T (x0 + u) of every packed vertex, after a library has computed the product u. Only for benchmarks.
 //   slots       [domains] PlainSlot                                                                              (in)
 //   domains     [vertices] u32: the domain of each packed vertex; not read with SINGLE                           (in)
 //   rest        [vertices][3] f32                                                                                (in)
 //   transforms  [domains][3] float4: rows of T                                                                   (in)
 //   u           f32, three per vertex of a domain with modes                                                     (in)
 //   positions   [vertices][3] f32                                                                                (out)
-// Launch: 256 threads a block, a thread a vertex.
-// CPU twin: the tests of tests/bench/src/kernels/plain_update.rs.
+// Launch: 256 threads per block, a thread per vertex.
+// CPU twin: the tests of src/compute/gpu/trials/plain_update.rs.
 constexpr unsigned BLOCK = 256;
 constexpr unsigned long long RIGID = 0xffffffffffffffffull;
 

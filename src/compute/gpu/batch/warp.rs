@@ -1,4 +1,4 @@
-//! A warp of `kernels/batch.cu` in step, with its ring, its stages and its ways out.
+//! Emulates a warp of `kernels/batch.cu` in lockstep, with its ring of stages and its coalesced stores.
 
 use crate::testing::transformed_axis;
 use std::sync::Arc;
@@ -11,15 +11,15 @@ use super::{MOST, WARPS};
 use crate::storage::{Plane, TILE_QUADS, modes_per_chunk};
 use modalcast_model::scene::{Scene, State, Storage};
 
-/// Quads and vertices of a warp, 16 byte words of a stage, and stages of its ring.
+/// Quads and vertices of a warp, 16-byte words of a stage, and stages of its ring.
 const QUADS: usize = TILE_QUADS / WARPS;
 const VERTICES: usize = 4 * QUADS;
 const STAGE: usize = 12 * QUADS;
 const STAGES: usize = 3;
-/// What no result may depend on: a NaN in every storage but `Int8`.
+/// Fill for memory that no result may depend on: a NaN in every storage type but `Int8`.
 const POISON: Plane = Plane([0xff; 16]);
 
-/// What the kernel reads.
+/// The inputs of the kernel.
 pub(super) struct Tables {
     pub scene: Arc<Scene>,
     pub work: Work,
@@ -51,14 +51,14 @@ impl Tables {
     }
 }
 
-/// One warp of a block, in step.
+/// One warp of a block, in lockstep.
 pub(super) struct Warp<'a> {
     tables: &'a Tables,
     pub group: Group,
     tile: usize,
     first_word: usize,
     width: usize,
-    /// Quads of the tile before the warp's.
+    /// Quads of the tile before those of the warp.
     before: usize,
     pub quads: usize,
     first: usize,
@@ -140,7 +140,7 @@ impl<'a> Warp<'a> {
         sums
     }
 
-    /// What two domains stage, [domain][vertex][3].
+    /// What the warp stages for two domains, [domain][vertex][3].
     pub(super) fn staged(&self, sums: &[[[f32; MOST]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * VERTICES];
         let tile = 3 * (self.group.rest as usize + TILE_QUADS * self.tile);

@@ -1,4 +1,5 @@
-//! Compiled kernels on disk, by the SHA-256 of all that decides them. A cache that fails costs time and nothing else.
+//! Disk cache of compiled kernels, keyed by the SHA-256 of everything that determines them. A cache failure only costs
+//! compile time.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -15,17 +16,17 @@ pub(super) struct Cache {
 }
 
 impl Cache {
-    /// The folder that the environment names: MODALCAST_CACHE, or `modalcast` in XDG_CACHE_HOME or `~/.cache`.
+    /// The folder that the environment selects: MODALCAST_CACHE, or `modalcast` in XDG_CACHE_HOME or `~/.cache`.
     pub(super) fn of_environment() -> Self {
         Self { folder: folder_of(|name| std::env::var_os(name)) }
     }
 
-    /// Where the compiled kernels are.
+    /// The folder of the compiled kernels.
     pub(super) fn folder(&self) -> Option<&Path> {
         self.folder.as_deref()
     }
 
-    /// What is stored under a key, if it is there and whole.
+    /// The bytes stored under a key, if they exist and are not damaged.
     pub(super) fn get(&self, key: &str) -> Option<Vec<u8>> {
         let mut bytes = std::fs::read(self.path(key)?).ok()?;
         if bytes.len() <= DIGEST || Sha256::digest(&bytes[DIGEST..]).as_slice() != &bytes[..DIGEST] {
@@ -35,7 +36,8 @@ impl Cache {
         Some(bytes.split_off(DIGEST))
     }
 
-    /// Stores under a key. The file appears whole or not at all, so two servers may share the folder.
+    /// Stores bytes under a key. The file is renamed into place, so it appears complete or not at all, and several
+    /// servers may share the folder.
     pub(super) fn put(&self, key: &str, bytes: &[u8]) {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let Some(path) = self.path(key) else { return };
@@ -47,7 +49,7 @@ impl Cache {
             .and_then(|()| std::fs::write(&part, content))
             .and_then(|()| std::fs::rename(&part, &path));
         if let Err(error) = stored {
-            // Nobody else knows the part's name; if it is there it is ours to remove.
+            // The name of the part is unique to this call, so removing it is safe.
             std::fs::remove_file(&part).ok();
             tracing::warn!(%error, path = %path.display(), "a compiled kernel could not be cached");
         }
@@ -58,7 +60,7 @@ impl Cache {
     }
 }
 
-/// The key of a list of texts, lengths included so that no two lists share one.
+/// The key of a list of texts. It includes their lengths, so that no two lists share a key.
 pub(super) fn key_of(ingredients: &[&str]) -> String {
     let mut hash = Sha256::new();
     for text in ingredients {

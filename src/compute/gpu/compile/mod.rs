@@ -1,4 +1,4 @@
-//! Kernels to machine code: by NVRTC, or from disk where an earlier run left it.
+//! Machine code of kernels: compiled by NVRTC, or taken from the disk cache.
 
 #[cfg(any(test, feature = "testing"))]
 mod assembled;
@@ -16,7 +16,7 @@ use self::nvrtc::Job;
 pub(super) use self::nvrtc::nvrtc;
 use modalcast_model::error::Result;
 
-/// Machine code (a cubin) of a source with macros for compute capability `major.minor`.
+/// Machine code (a cubin) of a source with macros, for compute capability `major.minor`.
 ///
 /// # Errors
 /// `Unavailable` when NVRTC is missing or does not know the architecture; `Fault` with the compiler's log.
@@ -35,7 +35,7 @@ pub(super) fn cubin(name: &str, source: &str, defines: &[&str], capability: (i32
     Ok(cubin)
 }
 
-/// Where compiled kernels are kept, if anywhere.
+/// The folder of the kernel cache, if there is one.
 pub(super) fn folder() -> Option<PathBuf> {
     Cache::of_environment().folder().map(PathBuf::from)
 }

@@ -1,4 +1,4 @@
-//! CUDA C++ source to machine code for one architecture, by NVRTC, found and bound at run time.
+//! Compiles CUDA C++ source to machine code for one architecture with NVRTC, which is found and loaded at run time.
 
 use std::ffi::{CStr, CString, c_char, c_int, c_void};
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use libloading::Library;
 
 use modalcast_model::error::{Error, Result, during};
 
-/// What brings NVRTC to a machine without it.
+/// How to install NVRTC.
 const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip install --target .tools/nvrtc \
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
@@ -27,12 +27,12 @@ const HEADERS: [(&str, &str); 11] = [
     ("turn.cuh", include_str!("../../../../kernels/turn.cuh")),
 ];
 
-/// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not know.
+/// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not support.
 const INVALID_OPTION: c_int = 5;
 
 type Program = *mut c_void;
 
-/// The ten functions that are used, and the library they live in.
+/// The NVRTC functions in use, and the library that they belong to.
 struct Functions {
     version: unsafe extern "C" fn(*mut c_int, *mut c_int) -> c_int,
     error: unsafe extern "C" fn(c_int) -> *const c_char,
@@ -56,7 +56,7 @@ struct Functions {
 /// A loaded NVRTC.
 pub(in super::super) struct Nvrtc {
     functions: Functions,
-    /// Where it was found: a path, or a name that the loader resolved.
+    /// Path of the library, or the name that the loader resolved.
     pub path: PathBuf,
     /// Major and minor version.
     pub version: (i32, i32),
@@ -68,7 +68,7 @@ impl std::fmt::Debug for Nvrtc {
     }
 }
 
-/// A source and the options to compile it with.
+/// A source and its compiler options.
 #[derive(Debug)]
 pub(super) struct Job<'a> {
     pub name: &'a str,
@@ -80,7 +80,7 @@ impl<'a> Job<'a> {
     /// Compiles `source` for compute capability `major.minor`, with the macros in `defines`.
     pub(super) fn new(name: &'a str, source: &'a str, defines: &[&str], capability: (i32, i32)) -> Self {
         let (major, minor) = capability;
-        // Stated rather than left to defaults: results must be those of IEEE arithmetic, denormals included.
+        // Explicit rather than by default: results must follow IEEE arithmetic, including denormals.
         let mut options: Vec<String> =
             ["--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true"]
                 .map(String::from)
@@ -90,7 +90,7 @@ impl<'a> Job<'a> {
         Self { name, source, options }
     }
 
-    /// Everything that decides the machine code, besides the compiler.
+    /// Everything besides the compiler version that determines the machine code: the ingredients of the cache key.
     pub(super) fn ingredients(&self) -> Vec<&str> {
         let headers = HEADERS.iter().flat_map(|(name, text)| [*name, *text]);
         [self.name, self.source].into_iter().chain(headers).chain(self.options.iter().map(String::as_str)).collect()
@@ -100,7 +100,7 @@ impl<'a> Job<'a> {
 /// The NVRTC of this process, loaded at the first call.
 ///
 /// # Errors
-/// `Unavailable` naming what was tried and the wheel that brings it.
+/// `Unavailable` with the failed candidate and the wheel to install.
 pub(in super::super) fn nvrtc() -> Result<&'static Nvrtc> {
     static LOADED: OnceLock<Result<Nvrtc>> = OnceLock::new();
     LOADED.get_or_init(|| Nvrtc::find(&candidates())).as_ref().map_err(Clone::clone)
@@ -112,7 +112,7 @@ impl Nvrtc {
         for candidate in candidates {
             match Self::load(candidate) {
                 Ok(nvrtc) => return Ok(nvrtc),
-                // A file that is there but does not load tells more than a name that nobody knows.
+                // A file that exists but does not load is more informative than a name that the loader cannot find.
                 Err(error) if candidate.is_file() || candidates.len() == 1 => {
                     reason = format!("{}: {error}", candidate.display());
                 }
@@ -124,15 +124,15 @@ impl Nvrtc {
 
     fn load(path: &Path) -> Result<Self> {
         let fail = during("nvrtc");
-        // SAFETY: NVRTC's initialisers do nothing but set up the library; the name or path is the operator's choice.
+        // SAFETY: NVRTC's initializers only set up the library; the operator chooses the name or path.
         let library = unsafe { Library::new(path) }.map_err(|error| fail(error.to_string()))?;
         let functions = Functions::bind(library, builtins(path)).map_err(|error| fail(error.to_string()))?;
         let (mut major, mut minor) = (0, 0);
-        // SAFETY: both pointers are to live integers.
+        // SAFETY: both pointers refer to live integers.
         let code = unsafe { (functions.version)(&mut major, &mut minor) };
         functions.check(code).map_err(fail)?;
         let nvrtc = Self { functions, path: path.to_path_buf(), version: (major, minor) };
-        // Only compiling shows whether it finds its own second file.
+        // Only a compilation shows whether NVRTC finds its builtins library.
         nvrtc.compile(&Job { name: "nothing", source: "", options: Vec::new() })?;
         Ok(nvrtc)
     }
@@ -145,13 +145,13 @@ impl Nvrtc {
         self.compile_with_log(job).map(|(cubin, _)| cubin)
     }
 
-    /// The same, and what the compiler said.
+    /// Machine code (a cubin) of a job, and the compiler's log.
     pub(super) fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
         let fail = during("compile");
         let options = strings(job.options.iter().map(String::as_str))?;
         let pointers: Vec<_> = options.iter().map(|option| option.as_ptr()).collect();
         let program = Running::create(&self.functions, job)?;
-        // SAFETY: the program is live, and `pointers` holds as many NUL-terminated strings as it says.
+        // SAFETY: the program is live, and `pointers` holds the stated number of NUL-terminated strings.
         let code = unsafe { (self.functions.compile)(program.handle, pointers.len() as c_int, pointers.as_ptr()) };
         let log = program.bytes(self.functions.log_size, self.functions.log).unwrap_or_default();
         let log = String::from_utf8_lossy(&log).trim_end_matches('\0').trim().to_owned();
@@ -167,7 +167,7 @@ impl Nvrtc {
 
 impl Functions {
     fn bind(library: Library, companions: Vec<Library>) -> Result<Self, libloading::Error> {
-        // SAFETY: the types are those of nvrtc.h of CUDA 11.1 to 13; the library is kept as long as the functions.
+        // SAFETY: the types match nvrtc.h of CUDA 11.1 to 13; the library is kept as long as the functions.
         unsafe {
             Ok(Self {
                 version: *library.get(b"nvrtcVersion\0")?,
@@ -188,12 +188,12 @@ impl Functions {
         if code == 0 {
             return Ok(());
         }
-        // SAFETY: NVRTC answers any code with a NUL-terminated string of static lifetime.
+        // SAFETY: NVRTC returns a NUL-terminated string of static lifetime for any code.
         Err(unsafe { CStr::from_ptr((self.error)(code)) }.to_string_lossy().into_owned())
     }
 }
 
-/// A program inside NVRTC; destroyed when dropped.
+/// An NVRTC program; destroyed on drop.
 struct Running<'a> {
     functions: &'a Functions,
     handle: Program,
@@ -217,17 +217,17 @@ impl<'a> Running<'a> {
         Ok(Self { functions, handle })
     }
 
-    /// Asks for a size, then for that many bytes.
+    /// Queries a size, then reads that many bytes.
     fn bytes(
         &self,
         size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
         read: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
     ) -> Result<Vec<u8>, String> {
         let mut length = 0;
-        // SAFETY: the program is live and `length` a live integer.
+        // SAFETY: the program is live and `length` is a live integer.
         self.functions.check(unsafe { size(self.handle, &mut length) })?;
         let mut bytes = vec![0_u8; length];
-        // SAFETY: NVRTC writes as many bytes as it said; the buffer has them.
+        // SAFETY: NVRTC writes exactly `length` bytes, the size of the buffer.
         self.functions.check(unsafe { read(self.handle, bytes.as_mut_ptr().cast()) })?;
         Ok(bytes)
     }
@@ -235,20 +235,20 @@ impl<'a> Running<'a> {
 
 impl Drop for Running<'_> {
     fn drop(&mut self) {
-        // SAFETY: the handle came from `create` and is destroyed once. A failure leaves nothing to be done.
+        // SAFETY: the handle came from `create` and is destroyed once. After a failure no cleanup remains.
         let _ = unsafe { (self.functions.destroy)(&mut self.handle) };
     }
 }
 
-/// NVRTC asks the loader for its builtins by bare name, which nobody finds in a folder off the search path; one that is
-/// loaded already answers to that name.
+/// Loads NVRTC's builtins library from the folder of NVRTC. NVRTC opens it by its bare name, which the loader does not
+/// find outside the search path; a library that is already loaded under that name is found.
 fn builtins(nvrtc: &Path) -> Vec<Library> {
     let folder = nvrtc.parent().filter(|folder| !folder.as_os_str().is_empty());
     let files = folder.map(entries).unwrap_or_default().into_iter();
     let wanted = |file: &PathBuf| {
         file.file_name().is_some_and(|name| name.to_string_lossy().starts_with("libnvrtc-builtins.so"))
     };
-    // SAFETY: a library of data without initialisers, from the folder that the operator chose for NVRTC.
+    // SAFETY: a data library without initializers, from the folder that the operator chose for NVRTC.
     files.filter(wanted).filter_map(|file| unsafe { Library::new(file) }.ok()).collect()
 }
 
@@ -256,7 +256,7 @@ fn strings<'a>(texts: impl IntoIterator<Item = &'a str>) -> Result<Vec<CString>>
     texts.into_iter().map(|text| CString::new(text).map_err(during("compile"))).collect()
 }
 
-/// Where NVRTC may be, best first. A path in MODALCAST_NVRTC is the only candidate: an explicit wish is not overruled.
+/// Candidate paths of NVRTC, best first. If MODALCAST_NVRTC is set, it is the only candidate: no fallback.
 fn candidates() -> Vec<PathBuf> {
     if let Some(path) = std::env::var_os("MODALCAST_NVRTC").filter(|path| !path.is_empty()) {
         return vec![path.into()];
@@ -264,7 +264,7 @@ fn candidates() -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> = ["libnvrtc.so.13", "libnvrtc.so"].map(PathBuf::from).into();
     let beside = std::env::current_exe().ok();
     let above = beside.iter().flat_map(|exe| exe.ancestors().skip(1).take(4));
-    // Never the working directory: starting the server somewhere must not run what lies there.
+    // Never search the working directory: starting the server in some folder must not execute a library in it.
     for folder in above {
         find_below(&folder.join(".tools/nvrtc"), 5, &mut found);
     }
@@ -289,7 +289,7 @@ fn find_below(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// What lies in a folder, sorted; nothing when it cannot be read.
+/// Paths of the entries of a folder, sorted; empty when the folder cannot be read.
 fn entries(folder: &Path) -> Vec<PathBuf> {
     let mut list: Vec<_> =
         std::fs::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path())).collect();

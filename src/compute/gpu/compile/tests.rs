@@ -1,4 +1,4 @@
-//! What NVRTC makes of every kernel, for several architectures: it needs no device.
+//! Compiles every kernel with NVRTC for several architectures; needs no device.
 
 use rayon::prelude::*;
 
@@ -18,7 +18,7 @@ fn spills_of_all_functions_are_added_and_a_log_without_them_is_no_proof() {
 /// Macros of a variant, and the architecture.
 type Variant = (Vec<&'static str>, (i32, i32));
 
-/// Macros of `deform` that no scene asks for: those of lists.
+/// Macros of `deform` that are not features of a scene: LISTED, for tile lists.
 const MORE: [&str; 1] = ["LISTED"];
 
 /// U in f32, and in each type that has a macro.
@@ -32,11 +32,12 @@ fn subsets(of: &[&'static str]) -> Vec<Vec<&'static str>> {
     (0..1 << of.len()).map(|set| chosen(set).map(|bit| of[bit]).collect()).collect()
 }
 
-/// Variants of `deform` that are looked at: all that its features allow would take hours.
+/// Tested variants of `deform`: all combinations of its features would take hours.
 fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
     let large = (9, 0);
     let mut list: Vec<Variant> = features.iter().chain(&MORE).map(|feature| (vec![*feature], large)).collect();
-    // What the sum, the shape of a tile and the way to normals each take of the registers; lists are always narrow.
+    // The registers that the sum, the shape of a tile and the kind of normals need; kernels for lists are always
+    // narrow.
     let shapes: [&[&str]; 3] = [&[], &["NARROW"], &["NARROW", "LISTED"]];
     let orient: [&[&str]; 4] =
         [&[], &["ORIENT"], &["ORIENT", "NORMAL_MAPS"], &["ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"]];
@@ -52,7 +53,7 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
         for more in subsets(&["TRUNCATED", "COMPENSATED"]) {
             with(&sum(&more), &orient, &[]);
         }
-        // What readers and followers add, to the least and to the most.
+        // The registers that readback outputs and followers add, to the smallest and to the largest sum.
         for more in [&[][..], &["TRUNCATED", "COMPENSATED"]] {
             with(&sum(more), &orient[1..3], &["DISPLACEMENTS"]);
             with(&sum(more), &orient[1..3], &["FOLLOWERS"]);
@@ -70,7 +71,7 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
     list
 }
 
-/// All that `batch` is compiled with on a large device, and the most vectors elsewhere.
+/// All variants of `batch` for a large device, and the largest group size for the other architectures.
 fn variants_of_batch(features: &[&'static str]) -> Vec<Variant> {
     let counts = subsets(features).into_iter().filter(|set| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8")));
     let large: Vec<Vec<&str>> =
@@ -80,7 +81,7 @@ fn variants_of_batch(features: &[&'static str]) -> Vec<Variant> {
     large.into_iter().map(|set| (set, (9, 0))).chain(others).collect()
 }
 
-/// All that the other kernels have.
+/// All variants of the other kernels.
 fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
     let capabilities = [(7, 5), (8, 0), (9, 0), (12, 0)];
     capabilities
@@ -89,7 +90,7 @@ fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
         .collect()
 }
 
-/// Compiles all variants on all cores. NVRTC keeps programs apart.
+/// Compiles all variants on all cores. NVRTC programs are independent of each other.
 fn compiled(kernel: &plan::KernelSource, variants: &[Variant]) -> Vec<Assembled> {
     let one = |(defines, capability): &Variant| Assembled::new(kernel.name, kernel.source, defines, *capability);
     variants.par_iter().map(one).collect()
@@ -106,7 +107,7 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
         }(kernel.features);
         let spills = |(variant, compiled): (&Variant, Assembled)| {
             let spilled = compiled.spilled();
-            // Its header says what, and how seldom.
+            // The header comment of batch.cu says what it spills and how rarely.
             let allowed = if kernel.name == "batch" { 16 } else { 0 };
             (spilled > allowed).then(|| format!("{variant:?}: {spilled} bytes"))
         };
@@ -115,7 +116,7 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
     }
 }
 
-/// Macros that add code, each with the macro that it builds on; the others choose among code of about the same length.
+/// Macros that add code, each with the macros that it builds on. The other macros choose among code of similar length.
 const ADD: [(&str, &str, &[&str]); 14] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED", &["MODES"]),
@@ -132,7 +133,7 @@ const ADD: [(&str, &str, &[&str]); 14] = [
     ("normals", "SHEAR", &[]),
     ("normals", "FOLLOWERS", &[]),
 ];
-/// `apply` asks one question more with followers, which is less than what its file is filled up to.
+/// Macros that choose among code of similar length. FOLLOWERS of `apply` adds less code than the padding of its file.
 const CHOOSE: [(&str, &str); 5] =
     [("batch", "BATCH_8"), ("batch", "BATCH_4"), ("deform", "NARROW"), ("deform", "TRUNCATED"), ("apply", "FOLLOWERS")];
 

@@ -1,4 +1,4 @@
-//! What scenes cost.
+//! Tests of the plans of scenes.
 
 use super::super::pack::tests::{deformed, exact, kept, on_the_first, scene, stored, unlit};
 use super::super::rings::Rings;
@@ -98,7 +98,7 @@ fn displacements_and_boxes_are_outputs_and_macros_of_kernels_that_are_there_and_
     assert_eq!([bytes("displacements"), bytes("boxes")], [Some(12 * 2 * (7 + 300)), Some(40 * 4)]);
 }
 
-/// The macros of what is kept for readers.
+/// The macros of outputs that are kept for readers.
 const KEPT: [&str; 2] = ["DISPLACEMENTS", "BOXES"];
 
 #[test]

@@ -1,17 +1,18 @@
-//! Which meshes are refused.
+//! Validation of meshes for the compute rasterizer.
 
 use super::cut_out::size_of_level;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::Group;
 
-/// The most triangles, exclusive: 24 bits count what is queued, beside 40 bits of tiles.
+/// Exclusive limit of triangles: 24 bits count queue entries, next to 40 bits of tiles.
 const MOST: usize = 1 << 24;
 
-/// Refuses what would be read or queued out of bounds. Groups may not overlap, or a triangle could be queued twice.
+/// Refuses meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, or a triangle could
+/// be queued twice.
 ///
 /// # Errors
-/// `Invalid` naming triangles or groups.
+/// `Invalid` with the name of the invalid field.
 pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[Group]) -> Result<()> {
     let count = triangles.len();
     if count >= MOST {
@@ -32,10 +33,10 @@ pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[Group]) -> Result<
     Ok(())
 }
 
-/// Refuses cut-outs that do not fit a mesh of `triangles`, or themselves.
+/// Refuses cut-outs that do not fit a mesh of `triangles` triangles, or that are inconsistent.
 ///
 /// # Errors
-/// `Invalid` naming what does not fit.
+/// `Invalid` with the name of the invalid field.
 pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
     let CutOuts { first, uvs, surfaces, table, images, anisotropy } = cut_outs;
     let left = triangles.saturating_sub(*first as usize);
@@ -57,7 +58,7 @@ pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
     images.iter().try_for_each(check_image)
 }
 
-/// All levels, each with its texels.
+/// Checks that the image has all mip levels, each with all its texels.
 fn check_image(image: &AlphaImage) -> Result<()> {
     let levels = image.width.max(image.height).checked_ilog2().map_or(0, |levels| levels as usize + 1);
     if image.width.min(image.height) == 0 || image.levels.len() != levels {

@@ -1,4 +1,4 @@
-//! Cut-outs on the device: texture coordinates, surfaces, and images as textures that the device filters.
+//! Cut-outs on the device: texture coordinates, surfaces, and alpha images as textures with hardware filtering.
 
 use std::sync::Arc;
 
@@ -11,10 +11,10 @@ use super::super::memory::{address, upload};
 use modalcast_model::error::{Result, during};
 use modalcast_model::raster::{AlphaImage, CutOuts};
 
-/// The most samples that hardware takes along the longer side of a footprint.
+/// Maximum anisotropy that the hardware supports.
 const MOST_ANISOTROPY: f32 = 16.0;
 
-/// An entry of the table of surfaces.
+/// An entry of the surface table.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct Surface {
@@ -25,10 +25,10 @@ struct Surface {
 
 const _: () = assert!(size_of::<Surface>() == 16, "Surface differs from kernels/cut_out.cuh");
 
-/// What `CUT` reads.
+/// Device tables that the kernels read with `CUT`.
 #[derive(Debug)]
 pub(super) struct Cut {
-    /// The first triangle that is cut out.
+    /// The first cut-out triangle.
     pub(super) first: u32,
     uvs: CudaSlice<u8>,
     surfaces: CudaSlice<u8>,
@@ -36,7 +36,7 @@ pub(super) struct Cut {
     _images: Vec<Image>,
 }
 
-/// Its addresses.
+/// Device addresses of the tables.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Addresses {
     pub(super) uvs: u64,
@@ -45,10 +45,10 @@ pub(super) struct Addresses {
 }
 
 impl Cut {
-    /// Puts cut-outs that `check` let pass onto the device.
+    /// Uploads cut-outs, which `check_cut_outs` must have accepted.
     ///
     /// # Errors
-    /// `Fault` when the device refuses, as it does an image that is too large for it.
+    /// `Fault` when the device refuses, for example an image that exceeds its texture size.
     pub(super) fn new(device: &Device, cut_outs: &CutOuts) -> Result<Self> {
         let image = |image| Image::new(device, image, cut_outs.anisotropy);
         let images = cut_outs.images.iter().map(image).collect::<Result<Vec<_>>>()?;
@@ -66,7 +66,7 @@ impl Cut {
             table: upload(device, &table)?,
             _images: images,
         };
-        // The table goes now, and so may what it was made of.
+        // Wait for the copies: the host memory of `table` and `cut_outs` may be freed after this call.
         device.stream().synchronize().map_err(during("upload"))?;
         Ok(cut)
     }
@@ -80,10 +80,10 @@ impl Cut {
     }
 }
 
-/// An image as a texture. Dropped when nothing on the stream reads it any more.
+/// An image as a texture. Drop it only when no work on the stream reads it.
 #[derive(Debug)]
 struct Image {
-    /// Never 0 for a texture that is there.
+    /// 0 until the texture is created.
     texture: CUtexObject,
     array: CUmipmappedArray,
     context: Arc<CudaContext>,
@@ -93,7 +93,7 @@ impl Image {
     fn new(device: &Device, image: &AlphaImage, anisotropy: f32) -> Result<Self> {
         let fail = during("texture");
         let array = create(image).map_err(&fail)?;
-        // From here on its drop destroys what there is.
+        // From here on, dropping `own` destroys what was created.
         let mut own = Self { texture: 0, array, context: Arc::clone(device.context()) };
         for (level, texels) in image.levels.iter().enumerate() {
             own.fill(device, level as u32, (size_of_level(image, level), texels)).map_err(&fail)?;
@@ -102,7 +102,7 @@ impl Image {
         Ok(own)
     }
 
-    /// Copies a level from the host, on the device's stream.
+    /// Copies a mip level from the host, on the device's stream.
     fn fill(
         &self,
         device: &Device,
@@ -130,11 +130,12 @@ impl Image {
             WidthInBytes: width,
             Height: height,
         };
-        // SAFETY: `check` saw that a level has its texels; `Cut::new` waits for the copy before they can go.
+        // SAFETY: `check_cut_outs` verified that each level has all its texels; `Cut::new` waits for the copy before
+        // they can be freed.
         unsafe { sys::cuMemcpy2DAsync_v2(&copy, device.stream().cu_stream()) }.result()
     }
 
-    /// A texture that repeats, filtered within levels, between them, and along footprints.
+    /// Creates a texture object with wrap addressing and trilinear, anisotropic filtering.
     fn filtered(&self, image: &AlphaImage, anisotropy: f32) -> Result<CUtexObject, DriverError> {
         use sys::CUaddress_mode_enum::CU_TR_ADDRESS_MODE_WRAP as WRAP;
         use sys::CUfilter_mode_enum::CU_TR_FILTER_MODE_LINEAR as LINEAR;
@@ -158,7 +159,8 @@ impl Image {
             reserved: [0; 12],
         };
         let mut texture = 0;
-        // SAFETY: `texture` is a live integer and the descriptions live for the call; no view means the whole array.
+        // SAFETY: `texture` is a live integer and the descriptors live for the call; a null view selects the whole
+        // array.
         unsafe { sys::cuTexObjectCreate(&mut texture, &resource, &filter, std::ptr::null()) }.result()?;
         Ok(texture)
     }
@@ -174,25 +176,25 @@ fn create(image: &AlphaImage) -> Result<CUmipmappedArray, DriverError> {
         Flags: 0,
     };
     let mut array = std::ptr::null_mut();
-    // SAFETY: `array` is a live pointer and the description lives for the call.
+    // SAFETY: `array` is a live pointer and the descriptor lives for the call.
     unsafe { sys::cuMipmappedArrayCreate(&mut array, &description, image.levels.len() as u32) }.result()?;
     Ok(array)
 }
 
-/// Texels across and down of a level.
+/// Width and height of a mip level in texels.
 pub(super) fn size_of_level(image: &AlphaImage, level: usize) -> [usize; 2] {
     [image.width, image.height].map(|side| (side as usize >> level).max(1))
 }
 
 impl Drop for Image {
     fn drop(&mut self) {
-        // Answers are dropped on purpose: nothing is left to be done, and a device that failed says so at its next call.
+        // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
         self.context.bind_to_thread().ok();
         if self.texture != 0 {
             // SAFETY: created once, destroyed once.
             unsafe { sys::cuTexObjectDestroy(self.texture) }.result().ok();
         }
-        // SAFETY: as above; its texture is gone.
+        // SAFETY: created once, destroyed once, after its texture.
         unsafe { sys::cuMipmappedArrayDestroy(self.array) }.result().ok();
     }
 }

@@ -1,42 +1,42 @@
-//! The variants of the kernels.
+//! The variants of the rasterization kernels.
 
 use modalcast_model::scene::Window;
 
 pub(in super::super) const SOURCE: &str = include_str!("../../../../kernels/raster.cu");
 
-/// The functions in it: those that a group is launched with, its whole triangles and then its cut-outs, and those behind.
-/// Without [`CUT`] there is no second.
+/// The functions of the source: two launched per group, for its opaque triangles and for its cut-outs, and two that
+/// process the queues. Without [`CUT`] the source has no `raster_cut`.
 pub(in super::super) const FUNCTIONS: [&str; 4] = ["raster", "raster_cut", "raster_warps", "raster_tiles"];
 pub(in super::super) const WHOLE: [&str; 3] = [FUNCTIONS[0], FUNCTIONS[2], FUNCTIONS[3]];
 
-/// The macro of meshes with cut-outs.
+/// The macro for meshes with cut-outs.
 const CUT: &str = "CUT";
 
-/// Who draws the triangles that could be drawn by a thread; for comparisons, the result is the same.
+/// Which path draws the triangles that are small enough for a thread; for benchmarks, the result is the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Spread {
-    /// Threads and warps by size.
+    /// Threads and warps by triangle size.
     #[default]
     BySize,
-    /// No threads: warps, by tiles where triangles are large.
+    /// No threads: warps, and tiles for large triangles.
     Warps,
-    /// Tiles alone.
+    /// Only tiles.
     Tiles,
 }
 
-/// Which variant of the kernels.
+/// A variant of the kernels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterForm {
-    /// Depth without ids, as shadow maps want it.
+    /// Depth without ids, for shadow maps.
     pub depth_only: bool,
-    /// Whether triangles are counted by their path.
+    /// Whether to count triangles by path.
     pub counted: bool,
-    /// By size where depth is alone.
+    /// Ignored with `depth_only`, which always uses [`Spread::BySize`].
     pub spread: Spread,
 }
 
 impl RasterForm {
-    /// The macros that it is compiled with, for meshes with cut-outs or without.
+    /// The macros of this form, for meshes with or without cut-outs.
     pub(in super::super) fn defines(self, cut: bool) -> Vec<&'static str> {
         let more =
             [(cut, CUT), (self.counted, "COUNT")].into_iter().filter_map(|(wanted, name)| wanted.then_some(name));

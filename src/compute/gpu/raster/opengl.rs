@@ -1,4 +1,4 @@
-//! The rasteriser that OpenGL's passes may give way to: positions and samples in OpenGL's buffers.
+//! The compute rasterizer on OpenGL's buffers, which can replace OpenGL's own passes of depth and ids.
 
 use std::sync::Arc;
 
@@ -9,13 +9,14 @@ use modalcast_model::error::{Error, Result, during};
 use modalcast_model::raster::{GlBuffer, Mesh, Order, Rasteriser};
 use modalcast_model::scene::{Faces, Group};
 
-/// Bytes of a vertex's position.
+/// Bytes of a vertex position.
 const VERTEX: u64 = 12;
 
-/// Draws one mesh by CUDA. Lives and dies on the thread that owns the OpenGL context, and before its buffers.
+/// Draws one mesh with CUDA. Create and drop it on the thread that owns the OpenGL context, and drop it before the
+/// OpenGL buffers.
 #[derive(Debug)]
 pub struct GlRaster {
-    // Buffers are given back to OpenGL before anything else goes.
+    // First, so dropped first: unregisters the OpenGL buffers.
     positions: Registered,
     depth: Kind,
     ids: Kind,
@@ -24,7 +25,7 @@ pub struct GlRaster {
     device: Arc<Device>,
 }
 
-/// One kind of pass: its kernels, and the buffer that it drew into from its first pass on.
+/// A kind of pass, depth or ids: its kernels, and the target buffer, registered by its first pass.
 #[derive(Debug)]
 struct Kind {
     into: Option<Registered>,
@@ -33,7 +34,7 @@ struct Kind {
     groups: Vec<Group>,
 }
 
-/// What a pass of a kind takes.
+/// Kernels, groups and target of a pass that is ready.
 type Ready<'a> = (&'a Functions, &'a [Group], &'a mut Registered);
 
 impl Kind {
@@ -42,7 +43,7 @@ impl Kind {
         Self { into: None, functions: None, form, groups }
     }
 
-    /// Its kernels, compiled unless they are.
+    /// The kernels, compiled at the first call.
     fn compiled(&mut self, device: &Device, core: &Core) -> Result<&Functions> {
         let functions = match self.functions.take() {
             Some(functions) => functions,
@@ -51,7 +52,7 @@ impl Kind {
         Ok(self.functions.insert(functions))
     }
 
-    /// Compiles and registers what is missing for a pass.
+    /// Compiles the kernels and registers the target of a pass, unless that has been done before.
     fn prepare(&mut self, device: &Device, (sharing, core): (&Sharing, &Core), into: GlBuffer) -> Result<Ready<'_>> {
         self.compiled(device, core)?;
         if self.into.as_ref().is_some_and(|own| own.buffer() != into) {
@@ -65,21 +66,22 @@ impl Kind {
         Ok((self.functions.as_ref().ok_or_else(missing)?, &self.groups, self.into.insert(registered)))
     }
 
-    /// Gives the buffer back to OpenGL once nothing draws into it any more.
+    /// Unregisters the target after all work on it has completed.
     fn let_go(&mut self, device: &Device) {
-        // A failure adds nothing: the device says so at its next call.
+        // A fault is reported by the next call to the device.
         device.stream().synchronize().ok();
         self.into = None;
     }
 }
 
 impl GlRaster {
-    /// Puts a mesh's triangles onto the device and registers its positions, which are those of the OpenGL context that is
-    /// current on this thread. Kernels are compiled by [`Rasteriser::make_ready`], or at the first pass that wants them.
+    /// Uploads a mesh's triangles and registers its positions, a buffer of the OpenGL context that is current on this
+    /// thread. Kernels are compiled by [`Rasteriser::make_ready`], or at the first pass that needs them.
     ///
     /// # Errors
-    /// `Invalid` when there are 2^24 triangles or more, one names no vertex, a group no triangle, or cut-outs do not fit;
-    /// `Fault` when the device refuses, or CUDA cannot share OpenGL's buffer.
+    /// `Invalid` when there are 2^24 triangles or more, a triangle refers to a missing vertex, a group to missing
+    /// triangles, or the cut-outs do not fit the mesh. `Fault` when the device refuses, or CUDA cannot share OpenGL's
+    /// buffer.
     pub fn new(device: &Arc<Device>, mesh: Mesh) -> Result<Self> {
         check(mesh.positions.bytes / VERTEX, &mesh.triangles, &mesh.groups)?;
         let cut_outs = mesh.cut_outs.filter(|cut_outs| (cut_outs.first as usize) < mesh.triangles.len());
@@ -97,12 +99,12 @@ impl GlRaster {
             core: Core::new(device, &mesh.triangles, cut_outs.as_ref())?,
             device: Arc::clone(device),
         };
-        // The triangles were copied from memory that goes now; a fault of that copy shows here.
+        // Wait here: the triangles were copied from temporary host memory, and a fault of the copy is reported here.
         device.stream().synchronize().map_err(during("upload"))?;
         Ok(raster)
     }
 
-    /// Draws one window or two, mapped together.
+    /// Draws one window or two, with all buffers mapped together.
     fn pass(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()> {
         let Self { positions, depth: of_depth, ids: of_ids, sharing, core, device } = self;
         device.context().bind_to_thread().map_err(during("device"))?;
@@ -133,7 +135,7 @@ impl GlRaster {
 }
 
 impl Rasteriser for GlRaster {
-    /// Draws; targets of what failed are let go of.
+    /// Draws the requested windows. After a failure the targets are unregistered.
     fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()> {
         let drawn = if depth.is_some() || ids.is_some() { self.pass(depth, ids) } else { Ok(()) };
         if drawn.is_err() {
@@ -164,7 +166,7 @@ impl Rasteriser for GlRaster {
 
 impl Drop for GlRaster {
     fn drop(&mut self) {
-        // A failure adds nothing: the device says so at its next call.
+        // A fault is reported by the next call to the device.
         self.device.stream().synchronize().ok();
     }
 }

@@ -1,41 +1,42 @@
-//! Domains that share a shape, in groups for which `batch` reads U once. Pure.
+//! Groups of domains that share a shape, for which `batch` reads U once. Pure.
 
 use super::super::layout::{Block, Group, Member};
 use super::{Coordinates, Work, chunks_of, quads_of};
 use crate::storage::TILE_QUADS;
 use modalcast_model::scene::{Batches, Scene};
 
-/// The most domains of a group.
+/// Maximum number of domains of a group.
 pub(in super::super) const MOST: usize = 16;
 
-/// In scenes that choose, a shape has batches when its U takes so many bytes, about a third of a large device's L2 cache,
+/// With `Batches::Auto`, a shape has batches when its U has at least so many bytes, about a third of a large device's
+/// L2 cache. Measured on an H200: of U of two domains, both ways took the same time at 20 MB.
 const LARGE: u64 = 16 << 20;
-/// or when all its domains together would read so many. Below either, reading from the cache again is faster: a batch takes
-/// a warp of few, and long. Measured on an H200, where both ways took as long as each other at about 100 MB of 16,000
-/// vertices, and at 20 MB of two domains.
+/// A shape also has batches when all its domains together would read at least so many bytes of U. Below both limits it
+/// is faster to read U again from the cache, because a batch uses few warps for a long time. Measured on an H200: both
+/// ways took the same time at about 100 MB of 16,000 vertices.
 const MUCH: u64 = 128 << 20;
 
-/// Blocks that keep a large device busy to the end; beyond so many, a block has several tiles, for which it loads T and q
-/// once, up to [`LONGEST`].
+/// Number of blocks that keep a large device busy to the end. With more work, a block processes a run of up to
+/// [`LONGEST`] tiles, for which it loads T and q once.
 const ENOUGH_BLOCKS: usize = 4096;
 const LONGEST: usize = 8;
 
-/// What `batch` computes of a scene.
+/// The work list of `batch`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(in super::super) struct Batched {
     pub groups: Vec<Group>,
     pub members: Vec<Member>,
     pub blocks: Vec<Block>,
-    /// The most chunks of modes of a group.
+    /// Maximum number of chunks of modes of a group.
     pub chunks: usize,
-    /// The most members of a group.
+    /// Maximum number of members of a group.
     pub most: usize,
 }
 
-/// Of each shape, whether its domains are deformed together.
+/// Per shape, whether its domains are deformed in batches.
 pub(in super::super) fn shapes(scene: &Scene) -> Vec<bool> {
     let needs = scene.needs;
-    // They sum in other ways, or write more.
+    // `batch` neither truncates nor compensates its sums, and writes no displacements.
     let never = needs.truncation || needs.compensated || needs.displacements;
     let mut users = vec![0_usize; scene.shapes.len()];
     scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
@@ -54,12 +55,12 @@ pub(in super::super) fn shapes(scene: &Scene) -> Vec<bool> {
 }
 
 impl Batched {
-    /// Tiles of all groups.
+    /// Number of tiles of all groups.
     pub(in super::super) fn tiles(&self) -> usize {
         self.blocks.iter().map(|block| (block.end - block.tile) as usize).sum()
     }
 
-    /// Of the tiles that are there; `first_words` are those of the shapes.
+    /// Groups the domains of an existing work list; `first_words` are the first words of the shapes.
     pub(super) fn new(
         scene: &Scene,
         (work, coordinates): (&Work, &Coordinates),
@@ -77,7 +78,7 @@ impl Batched {
             let of = &scene.shapes[shape];
             let first_group = all.groups.len();
             let users = &users[shape];
-            // Groups of the same size: none of them is nearly empty.
+            // Split evenly, so that no group is nearly empty.
             let count = users.len().div_ceil(MOST);
             for list in users.chunks(users.len().div_ceil(count)) {
                 all.groups.push(Group {
@@ -98,7 +99,7 @@ impl Batched {
                 all.most = all.most.max(list.len());
             }
             all.chunks = all.chunks.max(chunks_of(scene, of));
-            // Groups of one shape side by side: what one reads of U the next one finds in the cache.
+            // Blocks of the groups of one shape are adjacent: U that one block reads is in the cache for the next.
             let groups = first_group as u32..all.groups.len() as u32;
             let end = tiles_of(shape) as u32;
             all.blocks.extend((0..end).step_by(run).flat_map(|tile| {

@@ -1,23 +1,24 @@
-//! Where reduced coordinates lie on the device. Pure.
+//! Layout of modal coordinates on the device. Pure.
 
 use crate::storage::modes_per_chunk;
 use modalcast_model::scene::{Scene, Storage};
 
-/// Where a domain's coordinates lie on the device: whole chunks of them.
+/// Offsets of the domains' coordinates on the device, padded to whole chunks.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Coordinates {
-    /// Of each domain.
+    /// Per domain.
     pub first: Vec<u32>,
-    /// Numbers of all, a multiple of four.
+    /// Number of all coordinates, a multiple of four.
     pub total: usize,
-    /// Whether they lie as in the scene's own packing.
+    /// Whether the layout equals the scene's own packing.
     pub as_packed: bool,
 }
 
 impl Coordinates {
     pub fn new(scene: &Scene) -> Self {
         let storage = scene.deformation.storage;
-        // Factors belong to a shape and lists of modes to a domain, so those who share coordinates cannot share these.
+        // Factors belong to a shape and lists of kept modes to a domain, so domains that share coordinates cannot share
+        // these.
         if storage == Storage::F32 && !scene.needs.truncation {
             let first = scene.layout.slots.iter().map(|slot| slot.first_q as u32).collect();
             return Self { first, total: scene.layout.coordinates.next_multiple_of(4), as_packed: true };

@@ -1,11 +1,12 @@
-//! A scene to the work list of `deform`: one tile per warp, whatever domains it holds. Pure.
+//! The work list of `deform`, derived from a scene: one tile per warp, of one or of several domains. Pure.
 //!
 //! A tile computes vertices, or corners, or both where corner i of a shape is its vertex i.
-//! A shape of more than `SMALL` quads, or one with modes that several domains share, is cut into tiles of its own, and
-//! its U lies on the device once. The quads of smaller domains with the same number of chunks fill tiles together, so
-//! that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first: a long tile that began last would be
-//! waited for. Vertices of domains that `batches` puts into groups have tiles too, behind all others: a whole step leaves
-//! them to `batch`, and a list of changed domains names them.
+//!
+//! A shape of more than [`SMALL`] quads, or one with modes that several domains share, is cut into tiles of its own,
+//! and its U is stored once. The quads of smaller domains with the same number of chunks fill tiles together (mixed
+//! tiles), so that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first, because a long tile that
+//! begins last would delay the end of the step. Vertices of domains that [`batches`] puts into groups have tiles too,
+//! after all others: a full step leaves them to `batch`, and the tile list of a partial step refers to them.
 
 pub(super) mod batches;
 mod coordinates;
@@ -22,13 +23,13 @@ use crate::storage::{Plane, TILE_QUADS, Tiles, modes_per_chunk};
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, Storage};
 
-/// The most quads of a domain that shares a tile with others.
+/// Maximum number of quads of a domain that shares a tile with other domains.
 const SMALL: usize = TILE_QUADS / 2;
 
-/// Vertices of a quad.
+/// Vertices per quad.
 const QUAD: usize = crate::storage::QUAD;
 
-/// What lies in the words, in order.
+/// A section of the words; the sections follow each other in order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Source {
     /// All tiles of a shape.
@@ -37,40 +38,41 @@ pub(super) enum Source {
     Mixed(Vec<usize>),
 }
 
-/// The work list, and where everything it names lies.
+/// The work list, and the offsets of all data that it refers to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Work {
     pub tiles: Vec<Tile>,
-    /// Of each shape, whether one lane has a vertex and its corner: different kernels compute those of batches.
+    /// Per shape, whether one lane computes a vertex and the corner of the same index. False for batched shapes, whose
+    /// vertices and corners are computed by different kernels.
     pub alike: Vec<bool>,
-    /// Tiles before those that a whole step leaves to `batch`.
+    /// Number of tiles before those that a full step leaves to `batch`.
     pub launched: usize,
-    /// Of those, the first that have vertices; tiles of corners alone follow.
+    /// Among these, the number of tiles that have vertices; tiles of corners alone follow.
     pub with_vertices: usize,
     pub batched: Batched,
     pub lanes: Vec<Lane>,
     /// The first scale of each lane; only with `Int8`.
     pub lane_scales: Vec<u32>,
     pub sources: Vec<Source>,
-    /// Words of 16 bytes.
+    /// Number of words of 16 bytes.
     pub words: u64,
     pub quads: Quads,
-    /// Of each shape, its first scale, and the scales of all.
+    /// Per shape, its first scale; and the number of all scales.
     pub first_scale: Vec<u32>,
     pub scales: u64,
-    /// Of each domain, the first and the count of its tiles of vertices, and of those of corners alone.
+    /// Per domain, first tile and tile count: of tiles with vertices, and of tiles with corners alone.
     pub spans: Vec<[(u32, u32); 2]>,
-    /// Of each domain, from its first vertex to its first corner, wrapping; empty when all are at the same place.
+    /// Per domain, the wrapping offset from its first vertex to its first corner; empty when all offsets are zero.
     pub corner_shifts: Vec<u32>,
 }
 
-/// Whether corner i of a shape is its vertex i, so that one lane has both.
+/// Whether corner i of a shape is its vertex i, so that one lane can compute both.
 fn is_alike(shape: &Shape) -> bool {
     let corners = &shape.mesh.corners().vertices;
     corners.len() == shape.mesh.rest().len() && corners.iter().enumerate().all(|(at, vertex)| at as u32 == *vertex)
 }
 
-/// Whether `deform` turns normals; those that follow the surface come after it.
+/// Whether `deform` rotates the rest normals. Otherwise `normals` computes them from the deformed surface.
 pub(super) fn orients(scene: &Scene) -> bool {
     !scene.needs.exact_normals
 }
@@ -79,11 +81,11 @@ pub(super) fn orients(scene: &Scene) -> bool {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Role {
     chunks: usize,
-    /// Parts of [`Tile`]'s kind.
+    /// Flags of [`Tile::kind`].
     flags: u8,
 }
 
-/// One tile before it has its place: of one domain, or of the whole of several.
+/// A tile before its offsets are assigned: a part of one domain, or several whole domains.
 enum Item {
     Own { domain: usize, tile: usize },
     Mixed(Vec<usize>),
@@ -129,7 +131,7 @@ impl Work {
         work
     }
 
-    /// Room for scales of every shape, and no tiles yet.
+    /// An empty work list, with offsets for the scales of every shape.
     fn empty(scene: &Scene, alike: Vec<bool>) -> Self {
         let storage = scene.deformation.storage;
         let (mut scales, mut first_scale) = (0_u64, Vec::new());
@@ -158,7 +160,7 @@ impl Work {
         }
     }
 
-    /// The first word of a shape that is stored by itself; its place is taken at the first call.
+    /// The first word of a shape that has tiles of its own; allocated at the first call.
     fn place_words(&mut self, scene: &Scene, shape: usize, chunks: usize, places: &mut [Option<u64>]) -> u64 {
         if chunks == 0 {
             return 0;
@@ -171,7 +173,7 @@ impl Work {
         })
     }
 
-    /// The tiles of a domain's role follow each other.
+    /// Records a tile of a domain. The tiles of one domain and role are contiguous.
     fn note_span(&mut self, domain: usize, role: Role, index: u32) {
         let (first, count) = &mut self.spans[domain][usize::from(role.flags & TILE_VERTICES == 0)];
         if *count == 0 {
@@ -232,7 +234,7 @@ impl Work {
         }
     }
 
-    /// The vertices of a domain, or its corners in a tile of corners alone.
+    /// Items of a domain: its vertices, or its corners in a tile of corners alone.
     fn place(&self, scene: &Scene, role: Role, domain: usize) -> Place {
         let (slot, shape) = (scene.layout.slots[domain], scene.domains[domain].shape);
         if role.flags & TILE_VERTICES > 0 {
@@ -243,19 +245,19 @@ impl Work {
     }
 }
 
-/// Items of a domain, the first packed one, and the first quad of what they are at rest.
+/// Number of items of a domain, its first packed item, and its first quad at rest.
 struct Place {
     items: usize,
     first: u32,
     rest: u32,
 }
 
-/// Whether so many items of a domain are too many to share a tile.
+/// Whether a domain with so many items has tiles of its own.
 const fn has_own_tiles(items: usize) -> bool {
     items.div_ceil(QUAD) > SMALL
 }
 
-/// Of each shape, whether its vertices have tiles of their own.
+/// Per shape, whether its vertices have tiles of their own.
 fn own_tiles(scene: &Scene) -> Vec<bool> {
     let mut users = vec![0_usize; scene.shapes.len()];
     scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
@@ -269,7 +271,7 @@ fn own_tiles(scene: &Scene) -> Vec<bool> {
 fn items(scene: &Scene, alike: &[bool]) -> Vec<(Role, Item)> {
     let own = own_tiles(scene);
     let mut items = Vec::new();
-    // Per role, the domains that wait for their tile to fill up, and its quads.
+    // Per role, the domains of the mixed tile that is being filled, and the number of its quads.
     let mut open: std::collections::BTreeMap<Role, (Vec<usize>, usize)> = std::collections::BTreeMap::new();
     let mut add = |domain: usize, role: Role, count: usize, own: bool| {
         let quads = count.div_ceil(QUAD);
@@ -314,7 +316,7 @@ fn chunks_of(scene: &Scene, shape: &Shape) -> usize {
     shape.modes.rank().div_ceil(modes_per_chunk(scene.deformation.storage))
 }
 
-/// The quads of whole small shapes side by side: [chunk][3][width], from [chunk][3][own width] of each.
+/// The quads of small shapes side by side: [chunk][3][width], from [chunk][3][own width] of each.
 pub(super) fn side_by_side(shapes: &[Tiles]) -> Vec<Plane> {
     let rows = 3 * shapes.first().map_or(0, Tiles::chunks);
     let mut words = Vec::with_capacity(shapes.iter().map(|tiles| tiles.planes().len()).sum());

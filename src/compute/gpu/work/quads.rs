@@ -1,19 +1,19 @@
-//! Where x0, normals and tangents at rest lie on the device, in quads as `deform` reads them. Pure.
+//! Layout of x0, normals and tangents at rest on the device, in quads as `deform` reads them. Pure.
 
 use super::{QUAD, Work, has_own_tiles, orients, own_tiles};
 use crate::storage::TILE_QUADS;
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::Scene;
 
-/// Where quads of x0, normals and tangents lie: first x0 of shapes whose corners are others than their vertices, then
-/// x0, normals and tangents of those whose corner i is vertex i, then normals and tangents of the others.
+/// Offsets of the quads of x0, normals and tangents. The order is: x0 of shapes whose corners differ from their
+/// vertices; x0, normals and tangents of shapes whose corner i is vertex i; normals and tangents of the first kind.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(in super::super) struct Quads {
-    /// Of each shape, its first quad of x0.
+    /// Per shape, its first quad of x0.
     pub vertices: Vec<u32>,
-    /// Of each shape, its first quad of normals and tangents.
+    /// Per shape, its first quad of normals and tangents.
     pub corners: Vec<u32>,
-    /// Quads of x0, and the first that has normals.
+    /// Number of quads with x0, and the first quad that has normals.
     pub rest: u64,
     pub directed: u64,
     /// The end of all quads.
@@ -21,7 +21,7 @@ pub(in super::super) struct Quads {
 }
 
 impl Quads {
-    /// `alike`: of each shape, whether one lane has a vertex and its corner.
+    /// `alike`: per shape, whether one lane computes a vertex and its corner.
     pub(super) fn new(scene: &Scene, alike: &[bool]) -> Self {
         let orients = orients(scene);
         let places = |own: &dyn Fn(&Shape, bool) -> Option<usize>, next: &mut u64| -> Vec<u32> {
@@ -48,7 +48,7 @@ impl Quads {
     }
 }
 
-/// x0 of all shapes, three fours a quad.
+/// x0 of all shapes, three float4 per quad.
 pub(in super::super) fn rest_positions(scene: &Scene, work: &Work) -> Vec<[f32; 4]> {
     let mut all = vec![[0.0; 4]; 3 * work.quads.rest as usize];
     let own = own_tiles(scene);
@@ -59,8 +59,8 @@ pub(in super::super) fn rest_positions(scene: &Scene, work: &Work) -> Vec<[f32; 
     all
 }
 
-/// Normals and tangents at rest of all shapes, three and four fours a quad from the first that has any; none where a
-/// scene needs none.
+/// Normals and tangents at rest of all shapes, three and four float4 per quad, from the first quad that has normals.
+/// Empty where the scene needs none.
 pub(in super::super) fn rest_directions(scene: &Scene, work: &Work) -> [Vec<[f32; 4]>; 2] {
     if !orients(scene) {
         return [Vec::new(), Vec::new()];
@@ -83,7 +83,8 @@ pub(in super::super) fn rest_directions(scene: &Scene, work: &Work) -> [Vec<[f32
     [normals, tangents]
 }
 
-/// Quads of N numbers as the kernel reads them: per tile of its own `[N][width]` fours, else `[N]` fours a quad.
+/// Quads of N components as the kernel reads them: `[N][width]` float4 per tile of one domain, else `[N]` float4 per
+/// quad.
 fn arranged<const N: usize>(quads: &[[[f32; 4]; N]], own: bool) -> Vec<[f32; 4]> {
     if !own {
         return quads.as_flattened().to_vec();
@@ -94,7 +95,7 @@ fn arranged<const N: usize>(quads: &[[[f32; 4]; N]], own: bool) -> Vec<[f32; 4]>
     quads.chunks(TILE_QUADS).flat_map(tile).collect()
 }
 
-/// Numbers of items, as quads: what fills up is zero.
+/// Components of items, as quads; the padding is zero.
 fn quads_of_items<const N: usize>(items: &[[f32; N]]) -> Vec<[[f32; 4]; N]> {
     let mut quads = vec![[[0.0; 4]; N]; items.len().div_ceil(QUAD)];
     for (at, item) in items.iter().enumerate() {

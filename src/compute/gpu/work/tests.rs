@@ -1,11 +1,11 @@
-//! The work list of `deform`, walked as the kernel does.
+//! Tests that walk the work list of `deform` as the kernel does.
 
 use super::super::layout::TILE_LAST;
 use super::super::pack::tests::{scene, stored};
 use super::*;
 use std::sync::Arc;
 
-/// What lies in the words, scales and x0 of a scene, as `deform` loads them.
+/// Words, scales and x0 of a scene, as `deform` loads them.
 pub(in super::super) struct Loaded {
     pub words: Vec<Plane>,
     pub scales: Vec<f32>,
@@ -37,7 +37,7 @@ pub(in super::super) fn load(scene: &Scene, work: &Work) -> Loaded {
     loaded
 }
 
-/// A lane as the kernel sees it: domain, first item, items, first quad of x0, first q, first scale.
+/// A lane as the kernel sees it: domain, first item, number of items, first quad of x0, first q, first scale.
 fn lane(work: &Work, tile: &Tile, quad: usize) -> (usize, u32, usize, u32, u32, u32) {
     let last = usize::from(tile.kind & TILE_LAST);
     if last > 0 {
@@ -54,7 +54,7 @@ fn lane(work: &Work, tile: &Tile, quad: usize) -> (usize, u32, usize, u32, u32, 
     }
 }
 
-/// Counts the tiles that compute each packed corner, and checks where they look for its rest normal.
+/// Counts the tiles that compute each packed corner, and checks the offset of its rest normal.
 fn check_corners(scene: &Scene, work: &Work) {
     let mut seen = vec![0; scene.layout.corners];
     let shifts = &work.corner_shifts;
@@ -143,7 +143,7 @@ fn small_rigid_domains_fill_tiles_together_and_those_with_modes_do_unless_they_s
     let vertices = |work: &Work| -> Vec<Tile> {
         work.tiles.iter().filter(|tile| tile.kind & TILE_VERTICES > 0).copied().collect()
     };
-    // Two instances of each: those with modes share U and stay apart.
+    // Two instances of each shape: those with modes share U and have tiles of their own.
     let work = check(&scene(&[(7, 0); 40], false, false));
     assert_eq!(vertices(&work).len(), 80 * 2 / 32);
     assert!(vertices(&work).iter().all(|tile| (tile.kind & TILE_LAST, tile.width) == (0, 32)));

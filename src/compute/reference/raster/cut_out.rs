@@ -1,15 +1,16 @@
-//! What is left of a cut-out, sample by sample: the definition of `kernels/cut_out.cuh`.
+//! The alpha test of cut-outs, sample by sample: defines the result of `kernels/cut_out.cuh`.
 //!
-//! Texture coordinates at a sample are shares of those of the corners, by the edge functions of the corners in homogeneous
-//! coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997): right in perspective,
-//! and for corners behind the eye, without clipping. Corners are taken relative to the sample first, so that a small
-//! triangle far from the middle keeps its digits. All in f32, each sum and product rounded by itself, in the kernel's order.
-//! Then the image is filtered, which hardware does with fewer digits, and along the footprint where it is asked to.
+//! The texture coordinates of a sample are weighted sums of those of the corners. The weights are the edge functions of
+//! the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous
+//! coordinates", 1997): perspective-correct without clipping, also for corners behind the eye. The corners are first
+//! taken relative to the sample, so that a small triangle far from the center keeps its precision. All is f32, with
+//! each sum and product rounded separately, in the kernel's order. The image is then filtered; the hardware filters
+//! with lower precision, and anisotropically if requested.
 
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::Window;
 
-/// Where an image is asked at a sample: texture coordinates, and their change to the next pixel across and down.
+/// A texture footprint: texture coordinates of a sample, and their derivatives by the pixel in x and y.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Footprint {
     pub uv: [f32; 2],
@@ -17,8 +18,8 @@ pub struct Footprint {
     pub down: [f32; 2],
 }
 
-/// The footprint of a pixel's sample on a triangle with these corners in clip space. Zeros where it has no numbers, as
-/// where w is beyond 2^-50 to 2^50.
+/// The footprint of a pixel's sample on a triangle with these corners in clip space. Zeros where it is not finite, as
+/// where w is outside 2^-50 to 2^50.
 pub fn footprint(window: &Window, corners: &[[f32; 4]; 3], uvs: &[[f32; 2]; 3], [column, row]: [i32; 2]) -> Footprint {
     let step = window.half().map(|half| 1.0 / half);
     let sample = [(column as f32 + 0.5) * step[0] - 1.0, 1.0 - (row as f32 + 0.5) * step[1]];
@@ -33,12 +34,13 @@ pub fn footprint(window: &Window, corners: &[[f32; 4]; 3], uvs: &[[f32; 2]; 3], 
     };
     let edges = cross(&x, &y);
     let inverse = 1.0 / (edges[0] + edges[1] + edges[2]);
-    // Snapping may put a sample outside of the corners as they were: no share is below zero.
+    // Snapping may put a sample outside the unsnapped corners, so clamp the weights to zero.
     let shares = edges.map(|edge| (edge * inverse).max(0.0));
     let whole = 1.0 / (shares[0] + shares[1] + shares[2]);
     let sum = |of: [f32; 3]| of[0] + of[1] + of[2];
     let uv = [0, 1].map(|axis| sum([0, 1, 2].map(|at| shares[at] * uvs[at][axis])) * whole);
-    // By how much the shares change to the next pixel across and down, times what the corners differ by from here.
+    // Derivatives of the weights by the pixel in x and y, times the differences of the corners' texture coordinates
+    // from this sample's.
     let change = |rates: [f32; 3], step: f32| {
         [0, 1].map(|axis| sum([0, 1, 2].map(|at| rates[at] * (uvs[at][axis] - uv[axis]))) * (step * inverse))
     };
@@ -47,14 +49,14 @@ pub fn footprint(window: &Window, corners: &[[f32; 4]; 3], uvs: &[[f32; 2]; 3], 
     if is_finite { Footprint { uv, across, down } } else { Footprint::default() }
 }
 
-/// Alpha of a triangle that is cut out, at a footprint.
+/// Alpha of a cut-out triangle at a footprint.
 pub fn alpha(cut_outs: &CutOuts, triangle: u32, footprint: &Footprint) -> f32 {
     let surface = &cut_outs.table[cut_outs.surfaces[(triangle - cut_outs.first) as usize] as usize];
     let image = surface.image.map_or(1.0, |image| filtered(&cut_outs.images[image as usize], footprint));
     surface.alpha * image
 }
 
-/// Whether something is left of a triangle at a pixel's sample.
+/// Whether a triangle keeps a pixel's sample; always true for triangles before the first cut-out.
 pub(super) fn keeps(
     cut_outs: &CutOuts,
     window: &Window,
@@ -67,7 +69,7 @@ pub(super) fn keeps(
     alpha(cut_outs, triangle, &footprint) >= surface.least
 }
 
-/// Bilinear in the two levels whose texels are about as long as the footprint's longer side, and between them.
+/// Trilinear filtering: the two mip levels are those whose texels are about as long as the footprint's longer side.
 fn filtered(image: &AlphaImage, footprint: &Footprint) -> f32 {
     let size = [image.width as f32, image.height as f32];
     let length = |side: [f32; 2]| (side[0] * size[0]).hypot(side[1] * size[1]);

@@ -1,12 +1,12 @@
 use super::*;
 use crate::testing::{Noise, shape, with_columns};
 
-/// Random coordinates and a sheared, perhaps mirroring transform.
+/// A random transform with shear, possibly mirroring.
 fn transform(noise: &mut Noise) -> Composed {
     Transform(std::array::from_fn(|_| 2.0 * noise.next())).into()
 }
 
-/// What the page describes, in f32 on stored entries, with axis `axis + turn` read for `axis`.
+/// The sums that the module describes, in f32 on stored entries. Reads axis `axis + turn` in place of `axis`.
 fn chained(shape: &Shape, tiles: &Tiles, step: &Step, turn: usize) -> Vec<[f32; 3]> {
     let t = step.transform.rounded().0;
     let position = |vertex: usize| {
@@ -42,7 +42,7 @@ fn exact(shape: &Shape, step: &Step) -> Vec<[f64; 3]> {
     (0..shape.mesh.rest().len()).map(position).collect()
 }
 
-/// The largest error, as a part of the bound of its tile; infinite for a NaN.
+/// The largest error relative to the bound of its tile; infinite for a NaN.
 fn worst(got: &[[f32; 3]], want: &[[f64; 3]], bounds: impl Fn(usize) -> f64) -> f64 {
     let part = |(vertex, (got, want)): (usize, (&[f32; 3], &[f64; 3]))| {
         let error = length([0, 1, 2].map(|axis| f64::from(got[axis]) - want[axis]));
@@ -52,7 +52,7 @@ fn worst(got: &[[f32; 3]], want: &[[f64; 3]], bounds: impl Fn(usize) -> f64) -> 
     got.iter().zip(want).enumerate().map(part).fold(0.0, f64::max)
 }
 
-/// Measured over bound, as it should be and with axes mistaken.
+/// Measured error over bound, for correct axes and for swapped axes.
 fn judge(shape: &Shape, storage: Storage, step: &Step) -> [f64; 2] {
     let tiles = Tiles::new(shape, storage);
     let reaches = Reaches::new(shape, &tiles);
@@ -149,8 +149,8 @@ fn columns_that_differ_by_a_factor_of_1e12_keep_their_digits_in_f16_and_would_ov
 #[test]
 fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
     let mut noise = Noise(11);
-    // Mode 0 is denormal, mode 1 zero in the first tile, mode 2 zero everywhere; mode 3 has one entry far below the rest,
-    // and all of its second tile is too small for f16.
+    // Mode 0 is denormal, mode 1 is zero in the first tile, mode 2 is zero everywhere. Mode 3 has one entry far below
+    // the rest, and all of its second tile is too small for f16.
     let entry = |mode: usize, row: usize, value: f32| match mode {
         0 => value * 1e-41,
         1 if row < 3 * 128 => 0.0,
