@@ -132,12 +132,13 @@ fn keep(shared: &Shared, folder: &Path) {
     }
 }
 
-/// Writes beside the file, then renames: a reader sees the old or the new, never a half.
+/// Replaces a file atomically: writes a temporary file in the same folder, syncs and renames it. A reader sees either
+/// the old or the new content.
 pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let beside = path.with_extension("new");
     let mut file = fs::File::create(&beside)?;
     file.write_all(bytes)?;
-    // Without this a power failure could leave the new name with none of the bytes.
+    // Without the sync a power failure could leave an empty file under the new name.
     file.sync_all()?;
     fs::rename(&beside, path)
 }
@@ -147,7 +148,7 @@ fn path_of(folder: &Path, name: &str) -> PathBuf {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is a single assignment, so a poisoned lock is still sound.
+    // Every change under these locks is a single operation, so the state behind a poisoned lock is valid.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -208,7 +209,7 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<State> {
     })
 }
 
-/// The shared cell, then the translations.
+/// Decodes the shared cell (24 bytes), then the translations (24 bytes each).
 fn decode_cells(bytes: &[u8]) -> Result<Cells> {
     let point = |bytes: &[u8]| {
         std::array::from_fn(|axis| {
