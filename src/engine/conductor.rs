@@ -54,7 +54,7 @@ pub(super) struct Means {
     pub config: Arc<Config>,
 }
 
-/// The one writer of a scene.
+/// The current writer of a scene.
 struct Writer {
     lane: Arc<Lane>,
     who: String,

@@ -16,7 +16,7 @@
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]
-//! host      [give k+1 ]                  [give k+2 ]
+//! host      [submit k+1]                 [submit k+2]
 //! frame k                                [copy out, encode, send]
 //! ```
 

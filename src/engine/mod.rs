@@ -2,8 +2,8 @@
 //! and one task per open scene, and persists uploads, the list of open scenes and their last steps across restarts.
 //!
 //! A scene's task serializes all operations on the scene (`conductor`). A writer sends steps through a bounded queue
-//! (`lane`) and a subscriber receives results through a bounded channel (`viewer`). A queue that overflows, or a
-//! lossless subscriber that blocks the writer for too long, ends with an error that names the limit.
+//! (`lane`) and a subscriber receives results through a bounded channel (`viewer`). Exceeding a bound, or blocking the
+//! writer for too long, yields an error that names the limit.
 
 mod blocking;
 mod command;
