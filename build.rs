@@ -1,4 +1,5 @@
-//! Names this build by a hash of all sources, so that `modalcast` and `modalcast-report` can tell whether they belong together.
+//! Sets `MODALCAST_BUILD` to a hash of all sources, so that `modalcast` can check that `modalcast-report` was built
+//! from the same sources.
 
 use std::fs;
 use std::path::{Path, PathBuf};

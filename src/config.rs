@@ -1,5 +1,5 @@
-//! Every limit and path of the server in one value, checked once and immutable afterwards. Sizes are bytes, pixels or
-//! counts as the field says.
+//! The server's configuration: all limits and paths in one value, validated once and immutable afterwards. The name or
+//! documentation of a field gives its unit: bytes, pixels or a count.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -7,73 +7,74 @@ use std::time::Duration;
 
 use modalcast_model::error::{Result, invalid};
 
-/// Which deformer to use.
+/// The deformation backend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum BackendChoice {
-    /// CUDA when a device opens, else the CPU.
+    /// CUDA if a device can be opened, else the CPU.
     #[default]
     Auto,
     Cpu,
     Cuda,
-    /// The definition in f64; slow.
+    /// The f64 reference implementation; slow.
     Reference,
 }
 
-/// Which OpenGL renderer to use.
+/// The OpenGL renderer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum RendererChoice {
-    /// The CUDA device in use, else any hardware, else Mesa's software rasteriser.
+    /// The CUDA device in use, else any GPU, else Mesa's software rasterizer.
     #[default]
     Auto,
-    /// Mesa's software rasteriser.
+    /// Mesa's software rasterizer.
     Software,
-    /// None: vertices only.
+    /// No renderer; vertices only.
     Off,
 }
 
-/// The server's settings.
+/// The server's configuration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
-    /// Where the server listens. Loopback unless somebody says otherwise; port 0 is any free port.
+    /// The address to listen on. The default is loopback; port 0 selects a free port.
     pub listen: SocketAddr,
-    /// The folder of scenes that clients may open; `None`: the built-in ones only.
+    /// The folder of scenes that clients may open; `None` allows the built-in scenes only.
     pub scenes: Option<PathBuf>,
-    /// Where uploads, the list of open scenes and their last steps are kept. One server at a time uses it.
+    /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
     pub state: PathBuf,
     pub backend: BackendChoice,
-    /// CUDA's ordinal of the device.
+    /// The CUDA device ordinal.
     pub cuda_device: usize,
     pub renderer: RendererChoice,
-    /// Whether frames may be drawn by a renderer that runs on the CPU.
+    /// Whether a renderer that runs on the CPU may draw frames.
     pub allow_software: bool,
-    /// The largest message that the server reads.
+    /// The largest message that the server accepts, in bytes.
     pub message_bytes: usize,
-    /// The largest piece of a reply; its message is a few hundred bytes longer.
+    /// The largest chunk of data in one reply message, in bytes. The message also contains a head.
     pub chunk_bytes: usize,
     /// The largest image side in pixels.
     pub frame_side: u32,
-    /// How many scenes may be open.
+    /// Limit on open scenes.
     pub open_scenes: usize,
-    /// The acknowledgement window of a step stream that names none, and the largest.
+    /// Default and largest acknowledgment window of a step stream, in steps.
     pub window: u32,
     pub largest_window: u32,
-    /// The largest upload of one scene, and its number of files.
+    /// Limits on one upload: total size in bytes and number of files.
     pub upload_bytes: u64,
     pub upload_files: u32,
-    /// How long a request waits that names no deadline, and the longest that any waits.
+    /// Default and largest deadline of a single request.
     pub deadline: Duration,
     pub longest_deadline: Duration,
-    /// Frame and vertex streams per scene, and single requests waiting on one scene.
+    /// Limits per scene: frame and vertex streams, and single requests that wait for a step.
     pub subscribers: usize,
     pub waiting: usize,
-    /// How long a lossless subscriber may hold back a writer before it is cut off.
+    /// How long a lossless subscriber may block the writer, and how long an upload may stall, before the server ends
+    /// it.
     pub stall: Duration,
-    /// How long streams may take to end when the server stops.
+    /// Time for streams to end when the server shuts down.
     pub drain: Duration,
-    /// Connections at a time, and how long a new one may stay silent.
+    /// Limit on open connections, and time within which a new connection must send its first byte.
     pub connections: usize,
     pub first_byte: Duration,
-    /// How often a peer is asked whether it lives, and how long it may take to answer.
+    /// Interval of HTTP/2 keepalive pings, and time within which the peer must answer one.
     pub keepalive: Duration,
     pub keepalive_timeout: Duration,
 }
@@ -110,7 +111,8 @@ impl Default for Config {
     }
 }
 
-/// The user's state folder after the XDG convention, else a folder beside the caller.
+/// The default state folder: `$XDG_STATE_HOME/modalcast`, else `~/.local/state/modalcast`, else `modalcast-state` in
+/// the working directory.
 fn default_state() -> PathBuf {
     let folder = |name: &str| std::env::var_os(name).filter(|path| !path.is_empty()).map(PathBuf::from);
     let base = folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")));
@@ -118,7 +120,7 @@ fn default_state() -> PathBuf {
 }
 
 impl Config {
-    /// The settings themselves if every limit makes sense.
+    /// Returns the configuration if every limit is in its range.
     ///
     /// # Errors
     /// `Invalid` naming the limit and its range.

@@ -1,57 +1,58 @@
-//! modalcast owns deformable objects: each domain is a mesh with a modal matrix U. A physics process elsewhere sends
-//! reduced coordinates q and transforms T; the server computes
+//! modalcast is a server for modal deformable objects. A scene consists of domains; each domain is a mesh with a modal
+//! matrix U. A separate physics process sends reduced coordinates q and transforms T, and the server computes
 //!
 //! ```text
 //! x = T (x0 + U q)
 //! ```
 //!
-//! renders headless and streams frames or vertices back.
+//! for every vertex, renders headless and streams frames or vertices to clients.
 //!
 //! # Crates
-//! Cargo enforces the tiers: a crate sees only the crates below it. Each lies in its folder of `src`.
+//! Cargo enforces the tiers: a crate depends only on the crates below it in this table.
 //!
-//! | crate | what it is | built on |
+//! | crate | contents | depends on |
 //! |---|---|---|
-//! | `modalcast` (`src`) | the server: gRPC, the engine, the command line | `modalcast-compute`, `modalcast-render`, `modalcast-model`, `modalcast-proto` |
-//! | `modalcast-compute` (`src/compute`) | deformers in CUDA, on the CPU and in f64; exports the kernels it launches | `modalcast-model` |
-//! | `modalcast-render` (`src/render`) | EGL and OpenGL: buffers, passes, readback | `modalcast-model` |
-//! | `modalcast-model` (`src/model`) | scenes as values, their files, the traits of deformers and rasterizers | |
+//! | `modalcast` (`src`) | the server: gRPC services, engine, command line | `modalcast-compute`, `modalcast-render`, `modalcast-model`, `modalcast-proto` |
+//! | `modalcast-compute` (`src/compute`) | deformers for CUDA and the CPU, and an f64 reference; exports its kernels | `modalcast-model` |
+//! | `modalcast-render` (`src/render`) | the renderer: EGL and OpenGL buffers, passes and readback | `modalcast-model` |
+//! | `modalcast-model` (`src/model`) | scenes, their file formats, the traits of deformers and rasterizers | |
 //!
-//! Beside them: `proto` (the contract), `clients/rust` and `clients/dynamics` (no crate of the server), `tests/bench` (every
-//! measurement; `modalcast report` starts its program).
+//! Further crates: `proto` (the gRPC contract), `clients/rust` and `clients/dynamics` (they use no crate of the
+//! server), and `tests/bench` (all benchmarks; `modalcast report` starts its program).
 //!
 //! # Modules
-//! A test (`tests/it/layering.rs`) reads this table: inside of its crate a module uses only what its row names, and the
-//! dependencies have no cycle.
+//! A test (`tests/it/layering.rs`) reads this table. It checks that a module uses only the modules of its crate that
+//! its row names, and that the dependencies have no cycle.
 //!
-//! | module | what lives here | may use |
+//! | module | contents | may use |
 //! |---|---|---|
 //! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `frame`, `telemetry` |
-//! | `modalcast::service` | gRPC: wire to values and back; the only module that names proto | `config`, `engine`, `telemetry` |
-//! | `modalcast::engine` | the device thread, scenes by name, admission, subscribers, what survives a restart | `config`, `frame`, `telemetry` |
-//! | `modalcast::frame` | pixels and numbers to bytes, color maps with their legends; pure functions | |
-//! | `modalcast::telemetry` | stage names and times, tracing | |
-//! | `modalcast::config` | every limit and path, validated once | |
-//! | `modalcast-compute::gpu` | CUDA: one launcher per kernel, with the kernel's name | `storage` |
-//! | `modalcast-compute::cpu` | the f32 deformer of machines without a GPU | `storage` |
-//! | `modalcast-compute::reference` | the same in f64, plain: the definition that the others are tested against | |
-//! | `modalcast-compute::storage` | U in tiles as cpu and gpu read it: storage types, a-priori bounds, mode truncation; pure | |
-//! | `modalcast-model::load` | files to scenes: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
-//! | `modalcast-model::tree` | the built-in scene: beams to modes, modes to skin | `scene`, `domain`, `error` |
-//! | `modalcast-model::deform` | what every deformer does, as a trait | `scene`, `error` |
-//! | `modalcast-model::raster` | what draws into samples beside OpenGL, as a trait | `scene`, `error` |
-//! | `modalcast-model::scene` | the set of domains, its packing and needs; one step as values; cameras | `domain`, `error` |
-//! | `modalcast-model::domain` | mesh, modes U, material, texture; parsed once, immutable | `error` |
-//! | `modalcast-model::error` | what can go wrong, sorted by who can act | |
+//! | `modalcast::service` | gRPC services: convert between wire messages and values; the only module that uses the protobuf types | `config`, `engine`, `telemetry` |
+//! | `modalcast::engine` | the device thread, scenes by name, admission, subscriptions, persistent state | `config`, `frame`, `telemetry` |
+//! | `modalcast::frame` | PNG encoding, color maps with legends; pure functions | |
+//! | `modalcast::telemetry` | stage names and times, logging | |
+//! | `modalcast::config` | all limits and paths, validated once | |
+//! | `modalcast-compute::gpu` | the CUDA deformer: one launcher per kernel, with the kernel's name | `storage` |
+//! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
+//! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
+//! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds, mode truncation; pure functions | |
+//! | `modalcast-model::load` | scene loaders: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
+//! | `modalcast-model::tree` | the built-in scene: a tree of beams, their modes, and the skin they deform | `scene`, `domain`, `error` |
+//! | `modalcast-model::deform` | the trait of deformers | `scene`, `error` |
+//! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `error` |
+//! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `error` |
+//! | `modalcast-model::domain` | mesh, modes U, material, texture; validated once, immutable | `error` |
+//! | `modalcast-model::error` | the error type; its variants distinguish who can act on an error | |
 //!
 //! # Invariants
-//! 1. No dependency points up.
-//! 2. No proto type below `service`.
-//! 3. No GL or CUDA call off the device thread.
-//! 4. Every channel is bounded and says what it does when full.
-//! 5. No kernel without a launcher of its name and a twin: of its name too, unless the test's table names another.
-//! 6. Behind the constructors of `domain` and `scene` no length, index or float is checked again.
-//! 7. Nothing below `engine` knows of streams or sessions.
+//! 1. No module or crate depends on a higher tier.
+//! 2. Only `service` uses protobuf types.
+//! 3. In the server, OpenGL and CUDA are called on the device thread only.
+//! 4. Every channel is bounded, and its documentation states what happens when it is full.
+//! 5. Every kernel has a launcher of the same name and a CPU twin. The twin has the same name unless the table in
+//!    `tests/it/layering.rs` names another one.
+//! 6. The constructors of `domain` and `scene` validate every length, index and float; later code relies on that.
+//! 7. Nothing below `engine` depends on streams or sessions.
 //! 8. Nothing panics on input.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
@@ -63,5 +64,5 @@ pub mod frame;
 pub mod service;
 pub mod telemetry;
 
-/// A hash of all sources that this program was built from.
+/// Hash of all sources that this program was built from; 16 hexadecimal digits.
 pub const BUILD: &str = env!("MODALCAST_BUILD");

@@ -1,4 +1,4 @@
-//! The server's binary: see `modalcast --help`.
+//! The `modalcast` binary; see `modalcast --help`.
 
 use std::process::ExitCode;
 

@@ -1,8 +1,8 @@
-//! Stage names in one enum, stage times in milliseconds, and the log.
+//! Telemetry: stage names, stage times in milliseconds, and logging.
 
 use std::io::IsTerminal as _;
 
-/// A stage of the work; its name is the same in logs, replies and records.
+/// A stage of processing a step. Its name is the same in logs, replies and reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Stage {
     Parse,
@@ -17,7 +17,7 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// All stages, in the order in which a step passes through them.
+    /// All stages in processing order.
     pub const ALL: [Self; 9] = [
         Self::Parse,
         Self::Queue,
@@ -30,12 +30,12 @@ impl Stage {
         Self::Copy,
     ];
 
-    /// The stage of that name.
+    /// The stage with this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|stage| stage.name() == name)
     }
 
-    /// The stage's name.
+    /// Name of the stage in logs and replies.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Parse => "parse",
@@ -51,7 +51,7 @@ impl Stage {
     }
 }
 
-/// Milliseconds per stage, in the order in which they were run.
+/// Milliseconds per stage, in the order of execution.
 pub type StageTimes = Vec<(Stage, f64)>;
 
 /// Milliseconds since `begin`.
@@ -59,16 +59,16 @@ pub fn ms_since(begin: std::time::Instant) -> f64 {
     begin.elapsed().as_secs_f64() * 1e3
 }
 
-/// Sends the log to stderr; `RUST_LOG` chooses what is in it, else everything from `info` on. `RUST_LOG=info,opengl=debug`
-/// asks for what the OpenGL driver thinks of its use, too.
+/// Writes the log to stderr. `RUST_LOG` sets the filter; the default is `info`. `RUST_LOG=info,opengl=debug` also logs
+/// the debug messages of the OpenGL driver.
 ///
-/// A second call changes nothing.
+/// Has no effect if a logger is already installed.
 pub fn log_to_stderr() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
     let colours = std::io::stderr().is_terminal();
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(colours);
-    // Somebody else's log stays.
+    // Fails only if a logger is already installed, which is kept.
     log.try_init().ok();
 }
 

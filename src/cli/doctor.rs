@@ -1,4 +1,5 @@
-//! `modalcast doctor`: what this machine has for deforming and drawing, and what it lacks, by file or package.
+//! `modalcast doctor`: reports the devices and libraries for deforming and drawing on this machine, and names missing
+//! files or packages.
 
 use serde_json::{Value, json};
 
@@ -7,13 +8,13 @@ use modalcast_compute::gpu;
 use modalcast_model::error::during;
 use modalcast_render::{Prefer, Renderer};
 
-/// Looks at driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 when no frame can be drawn.
+/// Checks the driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 if no frame can be drawn.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast doctor
   modalcast doctor --json")]
 pub(super) struct Args {
-    /// Print JSON.
+    /// Print the report as JSON.
     #[arg(long)]
     json: bool,
 }
@@ -28,7 +29,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(report["can_draw"] == true)
 }
 
-/// All that the command knows of this machine.
+/// Collects the report as JSON.
 pub(super) fn examine() -> Value {
     let renderer = Renderer::open(Prefer::Any).map(|renderer| renderer.info().clone());
     let devices = modalcast_render::devices();
@@ -45,7 +46,7 @@ pub(super) fn examine() -> Value {
     })
 }
 
-/// What `--backend auto` would choose: a device, and a compiler that fits its driver.
+/// Whether `--backend auto` would choose CUDA: it needs a device and an NVRTC version that fits the driver.
 fn deforms_on_cuda() -> bool {
     gpu::Device::open(0).and_then(|device| device.check_compiler()).is_ok()
 }

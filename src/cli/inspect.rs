@@ -1,4 +1,5 @@
-//! `modalcast inspect`: what a scene holds, what it needs, and what leaving out the rest saved.
+//! `modalcast inspect`: prints the content of a scene, the features it needs, and the memory and passes saved by
+//! omitting the other features.
 
 use serde_json::{Value, json};
 
@@ -9,10 +10,10 @@ use modalcast_model::error::during;
 use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
-/// Domains that the table for people lists before it sums up the rest; `--json` lists all.
+/// Number of domains that the text table lists; `--json` lists all.
 const LISTED: usize = 24;
 
-/// Shows a scene: per domain its size; totals; which features it does without, and what that saved.
+/// Shows the size of each domain, the totals, the features that the scene needs, and the savings from unused features.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast inspect tree
@@ -20,7 +21,7 @@ const LISTED: usize = 24;
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
     scene: String,
-    /// Print JSON.
+    /// Print the description as JSON.
     #[arg(long)]
     json: bool,
 }
@@ -35,7 +36,8 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(true)
 }
 
-/// Bytes of a shape as it is kept: rest positions, corners, triangles, U, and rings where normals need them.
+/// Bytes of a domain's shape in host memory: rest positions, corners, triangles, U, and the vertex rings if the normals
+/// need them.
 fn bytes_of(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
@@ -82,7 +84,7 @@ fn json(scene: &Scene) -> Value {
 }
 
 fn totals(scene: &Scene) -> Value {
-    // Instances share a shape, so shapes are counted once.
+    // Instances share a shape, so each shape is counted once.
     let mut seen = vec![false; scene.shapes.len()];
     let mut bytes = 0;
     for (index, domain) in scene.domains.iter().enumerate() {
@@ -126,7 +128,7 @@ fn lines(scene: &Scene) -> Vec<String> {
     lines
 }
 
-/// What the deformer and the renderer make for the scene, and what they leave out.
+/// The kernels, passes and memory that the deformer and the renderer plan for the scene, and the parts that they omit.
 fn plans(scene: &Scene) -> Vec<String> {
     let (deform, render) = (gpu::plan(scene), modalcast_render::plan(scene));
     let kernels: Vec<String> =

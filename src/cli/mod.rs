@@ -32,7 +32,7 @@ enum Command {
     Doctor(doctor::Args),
 }
 
-/// The exit codes of all commands, for their help.
+/// Help text on the exit codes of all commands.
 pub const EXIT_CODES: &str = "\
 Exit codes:
   0  done
@@ -44,7 +44,7 @@ Exit codes:
   5  something must be installed or freed: the message says what
   6  a fault of the server or the device";
 
-/// What a command ends with: whether its own check passed.
+/// Result of a command: whether its own check passed, or an error.
 pub type Outcome = modalcast_model::error::Result<bool>;
 
 /// Runs the command line and returns the process's exit code.
@@ -62,7 +62,7 @@ pub fn run() -> u8 {
     finish(outcome)
 }
 
-/// The exit code of an outcome; an error is printed.
+/// Converts an outcome to an exit code; prints an error to stderr.
 pub fn finish(outcome: Outcome) -> u8 {
     match outcome {
         Ok(true) => 0,
@@ -83,12 +83,12 @@ fn exit_code(error: &Error) -> u8 {
     }
 }
 
-/// Prints a line of a command's result. The only way to standard output, so that logs never mix with results.
+/// Prints a line of a command's result. Nothing else writes to standard output, so that logs never mix with results.
 pub fn say(line: impl std::fmt::Display) {
     if let Err(error) = writeln!(std::io::stdout(), "{line}")
         && error.kind() != std::io::ErrorKind::BrokenPipe
     {
-        // A reader that has seen enough is no fault; a full disk is worth a word.
+        // A closed pipe is normal, for example with `head`; other errors such as a full disk are reported.
         eprintln!("modalcast: standard output: {error}");
     }
 }

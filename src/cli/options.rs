@@ -1,10 +1,10 @@
-//! Options that several commands share.
+//! Option types and helpers that several commands share.
 
 use std::str::FromStr;
 
 use modalcast_model::error::{Error, Result, invalid};
 
-/// The size of an image, written 1280x720.
+/// The size of an image in pixels, written as 1280x720.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Size {
     pub width: u32,
@@ -29,7 +29,7 @@ impl std::fmt::Display for Size {
     }
 }
 
-/// Does work that may take a while behind a spinner, which shows only on a terminal.
+/// Runs `work` while a spinner is displayed; the spinner appears only on a terminal.
 pub fn working<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
     let spinner = indicatif::ProgressBar::new_spinner().with_message(what);
     spinner.enable_steady_tick(std::time::Duration::from_millis(120));
@@ -38,7 +38,7 @@ pub fn working<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
     done
 }
 
-/// A point, written X,Y,Z.
+/// Parses a point written as X,Y,Z.
 pub fn triple(text: &str) -> Result<[f64; 3]> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
     let triple = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());

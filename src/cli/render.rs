@@ -1,4 +1,4 @@
-//! `modalcast render`: one frame, no network.
+//! `modalcast render`: renders one frame without a server.
 
 use std::fs;
 use std::path::PathBuf;
@@ -22,34 +22,35 @@ use modalcast_model::scene::{Camera, Lens, Scene, State, View};
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
     scene: String,
-    /// Coordinates of all domains in order, concatenated: one-dimensional .npy of f32 or f64.
+    /// Coordinates q of all domains in order, concatenated: a one-dimensional .npy file of f32 or f64. Default: at
+    /// rest.
     #[arg(long)]
     q: Option<PathBuf>,
-    /// The PNG file to write.
+    /// PNG file to write.
     #[arg(long)]
     out: PathBuf,
-    /// The size in pixels.
+    /// Image size in pixels.
     #[arg(long, default_value = "1280x720")]
     size: Size,
-    /// Where the camera is, in scene units; without it the camera frames the scene.
+    /// Camera position in scene units. Default: a camera that frames the scene.
     #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "target")]
     eye: Option<[f64; 3]>,
-    /// What the camera looks at.
+    /// Point that the camera looks at, in scene units.
     #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
     target: Option<[f64; 3]>,
-    /// Vertical field of view in degrees; 35 without it.
+    /// Vertical field of view in degrees. Default: 35.
     #[arg(long, requires = "eye")]
     field_of_view: Option<f64>,
-    /// A colour map with a legend in place of colours: `displacement`, or the number of a column of U, from 0.
+    /// Render a color map with a legend: `displacement`, or the index of a column of U, from 0.
     #[arg(long, value_parser = map, value_name = "MAP")]
     map: Option<Showing>,
-    /// The value at the bright end of the map; fitted to the frame without it.
+    /// Value at the bright end of the color map; 0 fits it to the frame.
     #[arg(long, requires = "map", default_value_t = 0.0)]
     largest: f64,
-    /// Which deformer to use.
+    /// Deformation backend.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendChoice,
-    /// Which OpenGL renderer to use.
+    /// OpenGL renderer.
     #[arg(long, value_enum, default_value_t)]
     renderer: RendererChoice,
 }
@@ -77,7 +78,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(true)
 }
 
-/// The PNG of a colour map.
+/// Renders a color map to PNG.
 fn mapped(args: &Args, bench: &mut Workbench, staged: &mut Staged, showing: Showing) -> Result<Vec<u8>> {
     let scene = Arc::clone(staged.scene());
     let showing = match showing {
@@ -107,7 +108,7 @@ fn camera(args: &Args, scene: &Scene) -> Camera {
     Camera { view, lens: Lens::FieldOfView(args.field_of_view.unwrap_or(35.0)), near: 0.0, far: 0.0 }
 }
 
-/// Reads q and checks its shape against the scene.
+/// Reads q from a .npy file and checks its shape against the scene.
 fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
     let place = format!("q in {}", path.display());
     let wanted = format!("{} coordinates, all domains in order", scene.layout.coordinates);
@@ -115,14 +116,14 @@ fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
         return Err(Error::NotFound { what: "q", given: path.display().to_string() });
     }
     let bytes = fs::metadata(path).map_err(|error| invalid(&place, "a .npy file", error))?.len();
-    // The header of a .npy file and f64 entries: nothing larger can fit.
+    // f64 entries and a .npy header: no valid file is larger.
     let most = 8 * scene.layout.coordinates as u64 + 65536;
     if bytes > most {
         return Err(invalid(&place, format!("{wanted}: at most {most} bytes"), format!("{bytes} bytes")));
     }
     let bytes = fs::read(path).map_err(|error| invalid(&place, "a readable file", error))?;
     let array = load::parse_numpy(&bytes).map_err(|error| error.within(&place))?;
-    // A leading axis of one is what saving a single step of a trajectory leaves.
+    // Axes of length one are accepted, because saving a single step of a trajectory leaves a leading one.
     let sides = array.shape.iter().filter(|side| **side != 1).count();
     if array.entries.len() != scene.layout.coordinates || sides > 1 {
         return Err(invalid(format!("{place}: shape"), wanted, format!("{:?}", array.shape)));

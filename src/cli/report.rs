@@ -1,4 +1,4 @@
-//! `modalcast report`: starts `modalcast-report`, a program of its own that lies beside this one, so that a server is built
+//! `modalcast report`: starts `modalcast-report`, a separate executable in the same folder, so that the server is built
 //! without its benchmarks.
 
 use std::ffi::OsString;
@@ -9,7 +9,7 @@ use modalcast_model::error::{Error, Result, during};
 
 use super::Outcome;
 
-/// The program with the benchmarks.
+/// File name of the executable with the benchmarks.
 const PROGRAM: &str = "modalcast-report";
 
 const EXAMPLES: &str = "Examples:
@@ -21,7 +21,7 @@ const EXAMPLES: &str = "Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, disable_help_flag = true)]
 pub(super) struct Args {
-    /// The arguments of modalcast-report.
+    /// Arguments for modalcast-report.
     #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENTS")]
     arguments: Vec<OsString>,
 }
@@ -31,11 +31,11 @@ pub(super) fn run(args: &Args) -> Outcome {
     let program = own.with_file_name(PROGRAM);
     check_build(&program)?;
     let status = Command::new(&program).args(&args.arguments).status().map_err(during("report"))?;
-    // Its exit codes are this program's.
+    // `modalcast-report` uses the same exit codes.
     std::process::exit(status.code().unwrap_or(6));
 }
 
-/// Refuses a sibling that is missing or was built from other sources: its measurements would not be of this server.
+/// Rejects a program that is missing or was built from other sources, because it would not measure this server.
 fn check_build(program: &Path) -> Result<()> {
     let refusal = |reason: String| Error::Unavailable {
         what: PROGRAM,

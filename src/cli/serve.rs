@@ -1,4 +1,4 @@
-//! `modalcast serve`: the server, until it is told to stop.
+//! `modalcast serve`: runs the server until it receives SIGTERM or Ctrl-C.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use crate::service;
 use modalcast_model::error::{Result, during};
 use modalcast_model::load::Repository;
 
-/// Serves scenes over gRPC until it is told to stop (SIGTERM or Ctrl-C), then drains and ends.
+/// Serves scenes over gRPC until SIGTERM or Ctrl-C, then ends open streams and exits.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast serve                                   the built-in scenes on loopback
@@ -20,43 +20,43 @@ use modalcast_model::load::Repository;
   modalcast serve --listen 0.0.0.0:50051            for other machines too
   modalcast serve --backend cpu --renderer software as on a machine without a GPU")]
 pub(super) struct Args {
-    /// Where to listen; port 0 is any free one. The address is printed as 'listening on URL'.
+    /// Address to listen on; port 0 selects a free port. The address is printed as 'listening on URL'.
     #[arg(long, env = "MODALCAST_LISTEN", default_value_t = Config::default().listen)]
     listen: SocketAddr,
-    /// The folder of scenes that clients may open. Nothing outside it is ever read.
+    /// Folder of scenes that clients may open. Files outside it are never read.
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
-    /// Where uploads, the list of open scenes and their last steps are kept.
+    /// Folder for uploads, the list of open scenes and their last steps. Default: the user's XDG state folder.
     #[arg(long, env = "MODALCAST_STATE")]
     state: Option<PathBuf>,
-    /// Which deformer to use.
+    /// Deformation backend.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendChoice,
-    /// CUDA's number of the device.
+    /// CUDA device ordinal.
     #[arg(long, default_value_t = 0)]
     cuda_device: usize,
-    /// Which OpenGL renderer to use.
+    /// OpenGL renderer.
     #[arg(long, value_enum, default_value_t)]
     renderer: RendererChoice,
-    /// Refuse to draw on the CPU.
+    /// Do not draw frames with a software renderer.
     #[arg(long)]
     hardware_only: bool,
-    /// The largest message that is read, in bytes.
+    /// Largest accepted message, in bytes.
     #[arg(long, default_value_t = Config::default().message_bytes)]
     message_bytes: usize,
-    /// The largest side of a frame, in pixels.
+    /// Largest side of a frame, in pixels.
     #[arg(long, default_value_t = Config::default().frame_side)]
     frame_side: u32,
-    /// How many scenes may be open.
+    /// Limit on open scenes.
     #[arg(long, default_value_t = Config::default().open_scenes)]
     open_scenes: usize,
-    /// How many steps of a lossless stream may wait for their acknowledgement unless it asks otherwise.
+    /// Default window of a step stream: how many steps may be unacknowledged.
     #[arg(long, default_value_t = Config::default().window)]
     window: u32,
-    /// The largest upload of one scene, in bytes.
+    /// Largest upload of one scene, in bytes.
     #[arg(long, default_value_t = Config::default().upload_bytes)]
     upload_bytes: u64,
-    /// How long a request waits that names no deadline, in milliseconds.
+    /// Deadline of a request that sets none, in milliseconds.
     #[arg(long, default_value_t = 30_000, value_parser = clap::value_parser!(u64).range(1..=600_000))]
     deadline_ms: u64,
 }
@@ -94,7 +94,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 async fn serve(config: Config) -> Result<()> {
     let repository = Arc::new(Repository::new(config.scenes.as_deref())?);
-    // The address is taken before scenes are loaded, so that a second server fails at once.
+    // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
     let engine = Engine::start(config, repository).await?;
     let address = listener.local_addr().map_err(during("serve"))?;
@@ -106,7 +106,7 @@ async fn serve(config: Config) -> Result<()> {
     service::serve(engine, listener, told_to_stop()).await
 }
 
-/// Logs what deforms and what draws; a software renderer is said to be one.
+/// Logs the backend and the renderer; warns about a software renderer.
 fn describe(info: &Info) {
     tracing::info!("deforming on {} ({})", info.backend.name(), info.device);
     match &info.renderer {
@@ -116,7 +116,7 @@ fn describe(info: &Info) {
     }
 }
 
-/// Ctrl-C or SIGTERM.
+/// Waits for Ctrl-C or SIGTERM.
 async fn told_to_stop() {
     let interrupt = tokio::signal::ctrl_c();
     match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
@@ -128,7 +128,7 @@ async fn told_to_stop() {
         }
         Err(error) => {
             tracing::warn!("SIGTERM will not be heard: {error}");
-            interrupt.await.ok(); // Without a signal there is nothing else to wait for.
+            interrupt.await.ok(); // If Ctrl-C cannot be handled either, the server stops.
         }
     }
 }

@@ -1,8 +1,8 @@
-//! Work that would block the runtime's own threads.
+//! Runs blocking work off the async runtime's worker threads.
 
 use modalcast_model::error::{Result, during};
 
-/// Runs long work on a blocking thread. A panic there is a fault of that work alone.
+/// Runs blocking or long work on a thread of tokio's blocking pool. A panic becomes a `Fault` of `stage`.
 pub(super) async fn run_blocking<T: Send + 'static>(
     stage: &'static str,
     work: impl FnOnce() -> Result<T> + Send + 'static,

@@ -1,4 +1,4 @@
-//! What the device thread can be asked for.
+//! Commands to the device thread.
 
 use std::sync::Arc;
 
@@ -11,15 +11,16 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Rectangle, Scene, State};
 use modalcast_render::{Hit, Image, Survey};
 
-/// Names a staged scene on the device thread.
+/// Identifies a loaded scene on the device thread.
 pub(super) type SceneId = u64;
 
+/// The channel that carries a command's answer.
 pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
 
-/// Vertices and the milliseconds until they were there.
+/// Vertices in host memory, and the milliseconds from the start of the copy to its completion.
 pub(super) type Copied = (Arc<Surface>, f64);
 
-/// A question to the device thread, and where its answer goes.
+/// A command to the device thread with the channel for its answer.
 pub(super) enum Command {
     Stage {
         id: SceneId,
@@ -37,7 +38,7 @@ pub(super) enum Command {
         size: (u32, u32),
         reply: Reply<Image>,
     },
-    /// A frame of numbers, with the legend of a colour map.
+    /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.
     Survey {
         id: SceneId,
         camera: Camera,
@@ -52,7 +53,7 @@ pub(super) enum Command {
         rectangle: Rectangle,
         reply: Reply<Vec<Hit>>,
     },
-    /// Brings what is wanted to the host, beside the command after it.
+    /// Copies the wanted vertex attributes to the host. The copy overlaps with the commands after it.
     Copy {
         id: SceneId,
         wanted: Wanted,

@@ -1,6 +1,7 @@
-//! One task per scene. It alone orders what happens to the scene: a step is deformed, shown to whoever waits for it, and
-//! then acknowledged. The next comes after that, but for what is late (`late`): while vertices and frames leave the device,
-//! it is computed. It waits for the device, never for a client.
+//! The scene actor: one task per scene that serializes all operations on the scene. It deforms a step, delivers the
+//! step to subscribers and single requests, and then acknowledges it to the writer. The next step is computed while
+//! vertices and frames of the previous one are still being read back from the device (`late`). The task awaits the
+//! device but never a client.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -20,7 +21,7 @@ use modalcast_model::deform::{Surface, Wanted};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Scene, State};
 
-/// Which step a single request wants. Numbers are those of the current run.
+/// The step that a single request asks for. Numbers refer to the current run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Which {
     Current,
@@ -28,7 +29,7 @@ pub enum Which {
     Minimum(u64),
 }
 
-/// A single request that waits for its step.
+/// A single request that is waiting for its step.
 #[derive(Debug)]
 pub(super) struct Ask {
     pub which: Which,
@@ -36,7 +37,8 @@ pub(super) struct Ask {
     pub reply: oneshot::Sender<Result<Shown>>,
 }
 
-/// What a scene can be told. The queue is bounded; whoever finds it full hears `Busy`.
+/// A message to a scene's task. The mailbox is bounded: a request that finds it full fails with `Busy`; `Stop` waits
+/// for capacity.
 pub(super) enum Message {
     Drive { who: String, policy: Policy, window: u32, reply: oneshot::Sender<Result<(Place, u64)>> },
     Watch { viewer: Viewer, reply: oneshot::Sender<Result<()>> },
@@ -44,7 +46,7 @@ pub(super) enum Message {
     Stop { error: Error, done: oneshot::Sender<()> },
 }
 
-/// What all scenes share.
+/// Services that all scenes share.
 #[derive(Debug, Clone)]
 pub(super) struct Means {
     pub worker: Worker,
@@ -52,41 +54,41 @@ pub(super) struct Means {
     pub config: Arc<Config>,
 }
 
-/// The one writer of a scene.
+/// The current writer of a scene.
 struct Writer {
     lane: Arc<Lane>,
     who: String,
     since: Instant,
 }
 
-/// A step that is done and not yet acknowledged.
+/// A completed step that is not acknowledged yet.
 pub(super) struct Done {
     lane: Arc<Lane>,
     step: u64,
     stages: StageTimes,
 }
 
-/// A scene in play.
+/// The state machine of one open scene.
 pub(super) struct Conductor {
     pub(super) name: String,
     pub(super) id: SceneId,
     pub(super) scene: Arc<Scene>,
     pub(super) means: Means,
     pub(super) state: Arc<State>,
-    /// The last run given to a writer; 0 before the first.
+    /// The run of the latest writer; 0 before the first writer.
     run: u64,
-    /// How many steps the scene has seen, merged ones included.
+    /// Number of steps applied to the scene, merged ones included.
     pub(super) count: u64,
     writer: Option<Writer>,
     pub(super) viewers: Vec<Viewer>,
     pub(super) asks: Vec<Ask>,
-    /// A step that is done but not yet shown to every lossless viewer.
+    /// A completed step that is not yet delivered to every lossless viewer.
     pending: Option<(Arc<Lane>, u64)>,
-    /// Times of the current step until its vertices were there.
+    /// Stage times of the current step up to the end of its deformation.
     pub(super) stages: StageTimes,
-    /// What leaves the device, oldest first: of the current step, and frames of the one before it.
+    /// Readbacks in flight, oldest first: those of the current step, and frames of the step before it.
     pub(super) late: VecDeque<Late>,
-    /// What somebody has asked for of the current vertices.
+    /// Vertex attributes of the current step that a single copy brought to the host, cached for later readers.
     pub(super) surface: Option<Held>,
     last_step: watch::Sender<Option<StepName>>,
     wake: Arc<Notify>,
@@ -96,13 +98,13 @@ pub(super) struct Conductor {
 #[derive(Debug, Clone)]
 pub(super) struct Held {
     pub surface: Arc<Surface>,
-    /// What of them is there.
+    /// The attributes that `surface` contains.
     pub parts: Wanted,
-    /// Milliseconds of copying.
+    /// Duration of the copy in milliseconds.
     pub ms: f64,
 }
 
-/// How a scene begins.
+/// Initial values of a scene's task.
 pub(super) struct Beginning {
     pub name: String,
     pub id: SceneId,
@@ -112,7 +114,8 @@ pub(super) struct Beginning {
 }
 
 impl Conductor {
-    /// A staged scene that shows `beginning.state`.
+    /// The task of a scene that is loaded on the device and deformed to `beginning.state`. Also returns the channel
+    /// that carries the last completed step.
     pub(super) fn new(beginning: Beginning, means: Means) -> (Self, watch::Receiver<Option<StepName>>) {
         let Beginning { name, id, scene, state, wake } = beginning;
         let has_step = state.run > 0;
@@ -138,14 +141,14 @@ impl Conductor {
         (conductor, told)
     }
 
-    /// Runs until it is told to stop or nobody can reach it any more.
+    /// Runs until it receives `Stop` or every sender of the mailbox is dropped.
     pub(super) async fn conduct(mut self, mut mailbox: mpsc::Receiver<Message>) {
         let (error, done) = loop {
             self.tend().await;
             let stall = self.next_stall();
             tokio::select! {
-                // In this order: a request that came before a step is in place when the step is done. Every turn of
-                // the loop tends, so messages do not starve steps.
+                // Biased, so that a request sent before a step is registered when the step completes. Each iteration
+                // calls `tend`, so messages do not starve steps.
                 biased;
                 message = mailbox.recv() => match message {
                     Some(Message::Stop { error, done }) => break (error, Some(done)),
@@ -159,11 +162,11 @@ impl Conductor {
         self.end(error).await;
         drop(mailbox);
         if let Some(done) = done {
-            done.send(()).ok(); // Whoever stopped the scene need not wait for it.
+            done.send(()).ok(); // Fails only if the caller no longer waits.
         }
     }
 
-    /// Does all that can be done now, and at most one step.
+    /// Delivers everything that can be delivered now and computes at most one step.
     async fn tend(&mut self) {
         self.answer_asks().await;
         let holds_back = self.holds_back();
@@ -173,7 +176,7 @@ impl Conductor {
         }
         let done = self.pending.take().map(|(lane, step)| Done { lane, step, stages: self.stages.clone() });
         match self.late.back_mut().filter(|late| late.count == self.count) {
-            // Acknowledged after what is late of it.
+            // Acknowledge the step after its last readback in flight.
             Some(late) => late.done = done.or(late.done.take()),
             None => {
                 self.settle().await;
@@ -187,14 +190,15 @@ impl Conductor {
         match lane.and_then(|lane| Some((lane.take()?, lane))) {
             Some((waiting, lane)) => {
                 self.step(lane, waiting).await;
-                // There may be more to do; messages get their turn first.
+                // There may be more work; handle waiting messages first.
                 self.wake.notify_one();
             }
             None => self.settle().await,
         }
     }
 
-    /// Computes the next step while what is late arrives. Only frames of the step before it may be late after that.
+    /// Computes the next step while readbacks are in flight. When this returns, only frames of the step before it may
+    /// still be in flight.
     async fn step(&mut self, lane: Arc<Lane>, waiting: Waiting) {
         let mut stages = waiting.stages();
         let number = waiting.update.number;
@@ -224,7 +228,7 @@ impl Conductor {
                 self.pending = Some((lane, number));
             }
             Err(error) => {
-                // After the acknowledgements of the steps before it.
+                // Reports are ordered, so the acknowledgements of earlier steps come first.
                 self.settle().await;
                 lane.report(number, Err(error));
             }
@@ -232,7 +236,7 @@ impl Conductor {
     }
 
     fn receive(&mut self, message: Message) {
-        // An ignored result below means: the asker has gone, and its answer goes with it.
+        // A failed send below means that the caller no longer waits; its reply is dropped.
         match message {
             Message::Drive { who, policy, window, reply } => {
                 reply.send(self.admit(who, policy, window)).ok();
@@ -249,12 +253,12 @@ impl Conductor {
                     ask.reply.send(Err(Error::Busy { queue: "requests that wait for a step", limit })).ok();
                 }
             }
-            // Taken by the caller.
+            // Handled in `conduct`.
             Message::Stop { .. } => {}
         }
     }
 
-    /// One writer at a time; a dead one makes room.
+    /// Admits one writer at a time; a writer whose queue is closed is replaced.
     fn admit(&mut self, who: String, policy: Policy, window: u32) -> Result<(Place, u64)> {
         if let Some(writer) = self.writer.as_ref().filter(|writer| !writer.lane.is_closed()) {
             let seconds = writer.since.elapsed().as_secs();
@@ -279,12 +283,13 @@ impl Conductor {
         Ok(())
     }
 
-    /// Whether a step waits, so that it can be computed while the vertices of this one leave the device.
+    /// Whether another step is queued. If so, readbacks of the current step are only begun and overlap with computing
+    /// it.
     pub(super) fn has_next(&self) -> bool {
         self.writer.as_ref().is_some_and(|writer| !writer.lane.is_closed() && writer.lane.has_waiting())
     }
 
-    /// Whether lossless viewers hold the step back: only under a lossless writer that still lives.
+    /// Whether lossless viewers exert back-pressure: only if the pending step's writer is lossless and still connected.
     fn holds_back(&self) -> bool {
         self.pending.as_ref().is_some_and(|(lane, _)| lane.policy() == Policy::Lossless && !lane.is_closed())
     }
@@ -294,13 +299,16 @@ impl Conductor {
         self.holds_back() && self.viewers.iter().any(owes)
     }
 
-    /// When the first viewer that holds back the writer is to be cut off.
+    /// Deadline at which the viewer that has blocked the writer for the longest is cut off.
     fn next_stall(&self) -> Option<Instant> {
         let first = self.viewers.iter().filter_map(|viewer| viewer.stalled).min()?;
         Some(first + self.means.config.stall)
     }
 
-    /// Whether a request can be answered now; an error when it never will be.
+    /// Whether a request can be answered now.
+    ///
+    /// # Errors
+    /// `Gone` when the scene has passed the exact step that is asked for.
     pub(super) fn is_ready(&self, which: Which) -> Result<bool> {
         let of_this_run = self.state.run == self.run && self.run > 0;
         let here = of_this_run.then_some(self.state.step);
@@ -328,9 +336,9 @@ impl Conductor {
         self.viewers.iter().for_each(|viewer| viewer.end(error.clone()));
         self.viewers.clear();
         for ask in self.asks.drain(..) {
-            ask.reply.send(Err(error.clone())).ok(); // The asker has gone.
+            ask.reply.send(Err(error.clone())).ok(); // Fails only if the caller no longer waits.
         }
-        // The device thread may be gone already; then so is the scene.
+        // Fails only if the device thread has ended, which frees the scene too.
         self.means.worker.unstage(self.id).await.ok();
     }
 }

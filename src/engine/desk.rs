@@ -1,10 +1,10 @@
-//! What the device thread does with commands, and in which order it answers them.
+//! The command loop of the device thread: executes commands and decides in which order it answers them.
 //!
-//! Frames go through the renderer's ring: one is begun, the commands after it are obeyed, and it is answered once the device
-//! has drawn it, or before a further one when as many are under way as the ring has places. Its pixels are copied by two
-//! threads of the desk's own, so that the device's next command does not wait for that. They are not those that all work
-//! shares: a long job there, such as growing a scene, would keep the copies waiting, and the ring's places with them, and
-//! so the frames of all scenes.
+//! Frames pass through the renderer's ring buffer. The loop submits a frame, executes the commands after it, and
+//! answers the frame once the device has drawn it, or before the next submission when every ring slot is in flight. Two
+//! dedicated threads copy the pixels, so that the next command does not wait for the copy. They are separate from
+//! rayon's global thread pool because a long job in that pool, such as building a scene, would delay the copies. A
+//! delayed copy occupies its ring slot and so delays the frames of all scenes.
 
 use std::collections::{HashMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -22,24 +22,25 @@ use modalcast_model::error::{Result, during};
 use modalcast_model::scene::Camera;
 use modalcast_render::{FRAMES_UNDER_WAY, Hit, Image, Pick};
 
-/// How long the thread waits for a frame before it looks for a command again.
+/// How long the thread waits for a frame before it polls the command queue again.
 const SLICE: Duration = Duration::from_micros(100);
 /// Threads that copy pixels.
 const COPIERS: usize = 2;
 
-/// The device thread's own.
+/// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
 pub(super) struct Desk {
     workbench: Workbench,
     copiers: ThreadPool,
     scenes: HashMap<SceneId, Staged>,
-    /// Vertices on their way, oldest first.
+    /// Vertex readbacks in flight, oldest first.
     arriving: VecDeque<Arriving>,
-    /// Picks on their way, likewise.
+    /// Picks in flight, oldest first.
     picks: VecDeque<(Pick, Reply<Vec<Hit>>)>,
-    /// Frames on their way, likewise: as many as the ring has places.
+    /// Frames in flight, oldest first; at most [`FRAMES_UNDER_WAY`].
     frames: VecDeque<(Drawing, Reply<Image>)>,
 }
 
+/// A vertex readback in flight.
 struct Arriving {
     id: SceneId,
     fetch: Fetch,
@@ -47,13 +48,13 @@ struct Arriving {
     reply: Reply<Copied>,
 }
 
-/// Obeys commands until one ends the thread or nobody can give any.
+/// Executes commands until `Quit` arrives or every sender is dropped.
 pub(super) fn work(mut desk: Desk, mut inbox: mpsc::Receiver<Command>) {
     while let Some(command) = next(&mut desk, &mut inbox) {
         if matches!(command, Command::Quit) {
             break;
         }
-        // They have had one command's time to arrive in; those that this one begins will have the next one's.
+        // Wait for readbacks that were started before this command. Readbacks that it starts overlap with the next one.
         let arriving = desk.arriving.len();
         guarded(|| desk.obey(command));
         for _ in 0..arriving {
@@ -74,7 +75,7 @@ pub(super) fn work(mut desk: Desk, mut inbox: mpsc::Receiver<Command>) {
     }
 }
 
-/// The next command. While there is none, what is on its way is waited for and answered.
+/// The next command. While the queue is empty, waits for readbacks in flight and answers them.
 fn next(desk: &mut Desk, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
     while !(desk.arriving.is_empty() && desk.picks.is_empty() && desk.frames.is_empty()) {
         match inbox.try_recv() {
@@ -85,7 +86,8 @@ fn next(desk: &mut Desk, inbox: &mut mpsc::Receiver<Command>) -> Option<Command>
     inbox.blocking_recv()
 }
 
-/// A panic costs the one command whose reply it drops; the thread and all scenes live on.
+/// Catches a panic of one command. The panicking command drops its reply channel, so its caller gets an error; the
+/// thread continues with the next command.
 fn guarded(act: impl FnOnce()) {
     if catch_unwind(AssertUnwindSafe(act)).is_err() {
         tracing::error!("a command panicked on the device thread");
@@ -93,7 +95,10 @@ fn guarded(act: impl FnOnce()) {
 }
 
 impl Desk {
-    /// Starts the threads that copy.
+    /// Starts the threads that copy pixels.
+    ///
+    /// # Errors
+    /// `Fault` when the threads cannot be started.
     pub(super) fn new(workbench: Workbench) -> Result<Self> {
         let copiers = ThreadPoolBuilder::new().num_threads(COPIERS).thread_name(|index| format!("pixels {index}"));
         let copiers = copiers.build().map_err(during("threads that copy pixels"))?;
@@ -101,18 +106,18 @@ impl Desk {
         Ok(Self { workbench, copiers, scenes: HashMap::new(), arriving, picks, frames })
     }
 
-    /// What deforms and what draws.
+    /// The backend that deforms and the renderer that draws.
     pub(super) const fn info(&self) -> &Info {
         self.workbench.info()
     }
 
     fn obey(&mut self, command: Command) {
         let Self { workbench, scenes, .. } = self;
-        // Every ignored result below means: the asker has gone, and its answer goes with it.
+        // A failed send below means that the caller no longer waits; its reply is dropped.
         match command {
             Command::Stage { id, scene, reply } => {
                 let staged = workbench.stage(&scene).map(|staged| scenes.insert(id, staged));
-                // Nobody would ever put away a scene that nobody waits for.
+                // The caller has gone, so no `Unstage` would ever follow.
                 if reply.send(staged.map(|_| ())).is_err()
                     && let Some(staged) = scenes.remove(&id)
                 {
@@ -136,7 +141,7 @@ impl Desk {
                 }
             }
             Command::Copy { id, wanted, reply } if !reply.is_closed() => self.copy((id, wanted), reply),
-            // Whoever asked has given up waiting: nothing is made.
+            // The caller no longer waits, so the work is skipped.
             Command::Draw { .. }
             | Command::Survey { .. }
             | Command::Pick { .. }
@@ -151,7 +156,7 @@ impl Desk {
         }
     }
 
-    /// Begins a frame, after the oldest was waited for where the ring is full.
+    /// Submits a frame. Waits for the oldest frame first if the ring is full.
     fn draw(&mut self, (id, camera, (width, height)): (SceneId, Camera, (u32, u32)), reply: Reply<Image>) {
         while self.frames.len() >= FRAMES_UNDER_WAY {
             self.answer_frame();
@@ -162,12 +167,12 @@ impl Desk {
         match drawing {
             Ok(drawing) => self.frames.push_back((drawing, reply)),
             Err(error) => {
-                reply.send(Err(error)).ok(); // The asker has gone, and its answer goes with it.
+                reply.send(Err(error)).ok(); // Fails only if the caller no longer waits.
             }
         }
     }
 
-    /// Begins to copy; what is there at once is handed over at once.
+    /// Starts a vertex readback; answers immediately if the vertices are already in host memory.
     fn copy(&mut self, (id, wanted): (SceneId, Wanted), reply: Reply<Copied>) {
         let begin = Instant::now();
         match find(&mut self.scenes, id).and_then(|staged| staged.fetch(wanted)) {
@@ -185,7 +190,7 @@ impl Desk {
         }
     }
 
-    /// Answers one thing that is on its way, or waits for it a little.
+    /// Answers one readback in flight, or waits for a frame for at most [`SLICE`].
     fn attend(&mut self) {
         if !self.arriving.is_empty() {
             return self.hand_over();
@@ -198,17 +203,17 @@ impl Desk {
         }
     }
 
-    /// Waits for the pick that has been under way for the longest.
+    /// Waits for the oldest pick in flight and answers it.
     fn answer_pick(&mut self) {
         let Some((pick, reply)) = self.picks.pop_front() else { return };
         reply.send(self.workbench.finish_pick(pick)).ok(); // As above.
     }
 
-    /// Waits for the frame that has been under way for the longest, and lets another thread copy and send its pixels.
+    /// Waits for the oldest frame in flight; a copy thread then copies and sends its pixels.
     fn answer_frame(&mut self) {
         let Some((drawing, reply)) = self.frames.pop_front() else { return };
         if reply.is_closed() {
-            return; // Nobody waits for it.
+            return; // The caller no longer waits.
         }
         match self.workbench.finish_draw(drawing) {
             Ok(pixels) => self.copiers.spawn(move || {
@@ -222,7 +227,7 @@ impl Desk {
         }
     }
 
-    /// Waits for the vertices that have been under way for the longest.
+    /// Waits for the oldest vertex readback in flight and answers it.
     fn hand_over(&mut self) {
         let Some(Arriving { id, fetch, begin, reply }) = self.arriving.pop_front() else { return };
         let surface = find(&mut self.scenes, id).and_then(|staged| staged.fetched(&fetch));

@@ -1,4 +1,4 @@
-//! A subscription whose frames are encoded ahead: several at once, delivered in order.
+//! A frame subscription with parallel encoding: encodes several frames concurrently and delivers them in order.
 
 use std::collections::VecDeque;
 
@@ -8,28 +8,29 @@ use super::frame_encoder::{Encoded, Format, FrameEncoder};
 use super::viewer::{Body, Delivery, Feed, Shown};
 use modalcast_model::error::{Error, Result, during};
 
-/// Bytes of pixels that one stream may hold before it takes no further frame. A single larger frame is taken alone.
+/// Budget of pixel bytes that one stream may hold before it accepts no further frame. A single larger frame is encoded
+/// alone.
 const IN_FLIGHT_BYTES: usize = 128 << 20;
-/// Frames that a stream of the newest steps holds: one that is sent and one that is encoded meanwhile. More would be older
-/// when they arrive.
+/// Frames in flight of a [`Delivery::Latest`] stream. The next frame is encoded while the previous one is sent; further
+/// frames would only add latency.
 const LATEST_IN_FLIGHT: usize = 2;
 
-/// Encoded frames of a [`Feed`], in its order. A lossless feed has as many frames in flight as there are cores; when these are
-/// not collected, the feed is not read and holds back its writer.
+/// Encoded frames of a [`Feed`], in the order of the feed. A lossless feed has at most one frame in flight per core. If
+/// the client does not read them, the feed is not read either and exerts back-pressure on the writer.
 #[derive(Debug)]
 pub struct EncodedFeed {
     feed: Feed,
     encoder: FrameEncoder,
     format: Format,
-    /// How many frames are still to be taken from the feed.
+    /// Number of frames that are still to be taken from the feed.
     remaining: u64,
     /// Oldest first.
     in_flight: VecDeque<Encoding>,
-    /// Why the feed has ended; reported after the frames in flight.
+    /// The error that ended the feed; reported after the frames in flight.
     ended: Option<Error>,
 }
 
-/// A frame that is being encoded. Dropping it cancels the work unless a thread has begun it.
+/// A frame that is being encoded. Dropping it cancels the encoding unless a thread has already started it.
 #[derive(Debug)]
 struct Encoding {
     task: JoinHandle<Result<Encoded>>,
@@ -43,16 +44,16 @@ impl Drop for Encoding {
 }
 
 impl EncodedFeed {
-    /// Encodes the first `frames` of a feed; all of them when it is 0.
+    /// Encodes the first `frames` frames of a feed; 0 means all.
     pub fn new(feed: Feed, encoder: FrameEncoder, format: Format, frames: u64) -> Self {
         let remaining = if frames == 0 { u64::MAX } else { frames };
         Self { feed, encoder, format, remaining, in_flight: VecDeque::new(), ended: None }
     }
 
-    /// The next frame; none after the last that was asked for. Safe to drop while it waits.
+    /// The next frame; `None` after the requested number of frames. Cancel-safe.
     ///
     /// # Errors
-    /// Why the feed has ended, after the frames that it has handed out; `Fault` when a frame cannot be encoded.
+    /// The error that ended the feed, after the frames in flight; `Fault` when a frame cannot be encoded.
     pub async fn next(&mut self) -> Result<Option<Encoded>> {
         loop {
             let has_capacity = self.has_capacity();
@@ -97,7 +98,7 @@ impl EncodedFeed {
     }
 }
 
-/// Waits for the frame that was begun first, and removes it. Safe to drop while it waits.
+/// Waits for the oldest frame in flight and removes it. Cancel-safe.
 async fn finish_oldest(in_flight: &mut VecDeque<Encoding>) -> Result<Encoded> {
     let Some(oldest) = in_flight.front_mut() else { return std::future::pending().await };
     let encoded = (&mut oldest.task).await;
@@ -121,7 +122,7 @@ mod tests {
         Feed::new(View::Vertices(Wanted::VERTICES), delivery, Arc::default())
     }
 
-    /// Delivers frames of growing size for as long as the feed takes any; how many it took.
+    /// Delivers frames of decreasing size for as long as the feed accepts them. Returns how many it accepted.
     async fn fill(viewer: &Viewer, frames: &mut EncodedFeed, numbers: std::ops::Range<u64>) -> usize {
         let mut taken = 0;
         for number in numbers {
@@ -142,7 +143,7 @@ mod tests {
             let (viewer, feed) = feed(delivery);
             let mut frames = EncodedFeed::new(feed, encoder, Format::Png, 0);
             let taken = fill(&viewer, &mut frames, 0..20).await;
-            // A lossless feed holds two more, which the encoder has not taken.
+            // A lossless feed buffers two more frames, which the encoder has not taken.
             let held = if delivery == Delivery::Lossless { 2 } else { 0 };
             assert_eq!((frames.in_flight.len(), taken), (most, most + held), "{delivery:?}");
             threads.add_permits(cores);

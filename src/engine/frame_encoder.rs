@@ -1,4 +1,5 @@
-//! Frames as bytes for the wire: PNG or raw pixels. All streams share one encoder, which uses at most one thread per core.
+//! Encodes frames for the wire as PNG or raw pixels. All streams share one encoder, which uses at most one thread per
+//! core.
 
 use std::num::NonZero;
 use std::sync::Arc;
@@ -14,32 +15,32 @@ use crate::telemetry::{Stage, StageTimes, ms_since};
 use modalcast_model::error::{Result, during};
 use modalcast_render::{Image, Paths, Survey};
 
-/// How pixels travel.
+/// Wire format of pixels. Multi-byte values are little-endian; the top row comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     Png,
-    /// RGBA8, top row first.
+    /// RGBA8 sRGB.
     Rgba,
-    /// f32 a pixel: depth.
+    /// One f32 per pixel: depth.
     F32,
-    /// u32 a pixel: domains.
+    /// One u32 per pixel: domain indices.
     U32,
-    /// Three f32 a pixel: normals.
+    /// Three f32 per pixel: normals.
     F32x3,
 }
 
-/// A step as bytes.
+/// An encoded result of one step.
 #[derive(Debug, Clone)]
 pub struct Encoded {
     pub step: StepName,
     pub skipped: u64,
     pub stages: StageTimes,
-    /// Of colours: who drew the frame.
+    /// The rasterizers that drew a color frame; default for other results.
     pub paths: Paths,
     pub bytes: Bytes,
 }
 
-/// Color pixels of one step, shared by all subscribers of the same view. Their PNG is made once, when the first asks for it.
+/// Color pixels of one step, shared by all subscribers with the same view. The PNG is encoded once, on first use.
 #[derive(Debug)]
 pub struct ColorFrame {
     pub width: u32,
@@ -47,7 +48,7 @@ pub struct ColorFrame {
     /// RGBA8 sRGB, top row first.
     pub rgba: Bytes,
     paths: Paths,
-    /// With the milliseconds that encoding took.
+    /// The PNG and the milliseconds that encoding took.
     png: OnceCell<(Bytes, f64)>,
 }
 
@@ -58,7 +59,7 @@ impl From<Image> for ColorFrame {
     }
 }
 
-/// Encodes frames off the device thread. Clones share the limit on threads.
+/// Encodes frames off the device thread. Clones share one limit on threads.
 #[derive(Debug, Clone)]
 pub struct FrameEncoder {
     threads: Arc<Semaphore>,
@@ -75,15 +76,15 @@ impl FrameEncoder {
         Self { threads: Arc::new(Semaphore::new(cores)), cores }
     }
 
-    /// How many frames are encoded at once.
+    /// Number of frames that are encoded concurrently.
     pub(super) const fn cores(&self) -> usize {
         self.cores
     }
 
-    /// Encodes what a frame or a survey shows.
+    /// Encodes a color frame or an AOV.
     ///
     /// # Errors
-    /// `Fault` when the PNG encoder refuses, or when `shown` is not a picture.
+    /// `Fault` when the PNG encoder fails, or when `shown` is not a picture.
     pub async fn encode(&self, shown: Shown, format: Format) -> Result<Encoded> {
         let mut stages = shown.stages;
         let mut paths = Paths::default();
@@ -106,8 +107,8 @@ impl FrameEncoder {
         Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, paths, bytes })
     }
 
-    /// PNG of a frame and the milliseconds that encoding took; made by the first caller, and by the next one if that is
-    /// cancelled.
+    /// The PNG of a frame and the milliseconds that encoding took. The first caller encodes it; if that caller is
+    /// cancelled, the next one does.
     async fn png(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
         let encode = || {
             let frame = Arc::clone(frame);
@@ -116,7 +117,8 @@ impl FrameEncoder {
         frame.png.get_or_try_init(encode).await.cloned()
     }
 
-    /// Runs work on a blocking thread once one of the cores is free; its bytes and milliseconds, waiting excluded.
+    /// Runs work on a blocking thread as soon as the thread limit permits. Returns the bytes and the run time in
+    /// milliseconds, without the wait.
     async fn run(&self, work: impl FnOnce() -> Result<Vec<u8>> + Send + 'static) -> Result<(Bytes, f64)> {
         let permit = Arc::clone(&self.threads).acquire_owned().await.map_err(during("encode"))?;
         run_blocking("encode", move || {
@@ -147,7 +149,7 @@ pub(super) mod tests {
         Shown { step, skipped: 0, stages: vec![], cells: None, body: Body::Frame(Arc::new(image.into())) }
     }
 
-    /// An encoder of which the test decides when it may work.
+    /// An encoder without threads. It starts to work when the test adds permits to the semaphore.
     pub(in crate::engine) fn paused(cores: usize) -> (FrameEncoder, Arc<Semaphore>) {
         let encoder = FrameEncoder { threads: Arc::new(Semaphore::new(0)), cores };
         let threads = Arc::clone(&encoder.threads);

@@ -1,4 +1,4 @@
-//! The way to one open scene: what everybody may know of it, and its bounded mailbox.
+//! Handle to one open scene: its immutable description and a sender to the bounded mailbox of its task.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,16 +16,16 @@ use crate::telemetry::ms_since;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::{RawUpdate, Scene, State, Update};
 
-/// How many messages may wait for one scene.
+/// Capacity of a scene's mailbox in messages.
 const MAILBOX: usize = 128;
 
-/// An open scene.
+/// Handle to an open scene.
 #[derive(Debug)]
 pub struct Host {
     pub name: String,
     pub origin: Origin,
     pub scene: Arc<Scene>,
-    /// Why no frame can be drawn, if so.
+    /// The reason why no frame can be drawn; `None` if frames can be drawn.
     no_frames: Option<Error>,
     largest_window: u32,
     mailbox: mpsc::Sender<Message>,
@@ -34,19 +34,23 @@ pub struct Host {
     closing: AtomicBool,
 }
 
-/// What a scene begins with.
+/// Arguments of [`Host::open`].
 pub(super) struct Opening {
     pub name: String,
     pub origin: Origin,
     pub scene: Arc<Scene>,
     pub id: SceneId,
-    /// The state that survived a restart, if one did.
+    /// The state restored from a checkpoint, if there is one.
     pub state: Option<State>,
     pub no_frames: Option<Error>,
 }
 
 impl Host {
-    /// Stages a scene on the device, brings back its state and starts its task.
+    /// Loads a scene onto the device, restores its state and starts its task. An unusable restored state is logged and
+    /// replaced by the rest state.
+    ///
+    /// # Errors
+    /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
     pub(super) async fn open(opening: Opening, means: Means) -> Result<Self> {
         let Opening { name, origin, scene, id, state, no_frames } = opening;
         means.worker.stage(id, &scene).await?;
@@ -70,15 +74,16 @@ impl Host {
         Ok(Self { name, origin, scene, no_frames, largest_window, mailbox, last_step, wake, closing })
     }
 
-    /// The last step that was done, if there was any.
+    /// The last completed step, if there is one.
     pub fn last_step(&self) -> Option<StepName> {
         *self.last_step.borrow()
     }
 
-    /// Becomes the writer. The window is what is asked for, within the limit.
+    /// Acquires the writer lease. The window is clamped to 1 through the configured limit.
     ///
     /// # Errors
-    /// `Taken` with who holds the place and since when; `NotFound` when the scene has been closed.
+    /// `Taken` naming the current writer and how long it has held the lease; `NotFound` when the scene is closed;
+    /// `Busy` when the mailbox is full.
     pub async fn drive(&self, who: String, policy: Policy, window: u32) -> Result<Drive> {
         let window = window.clamp(1, self.largest_window);
         let (place, run) = self.tell(|reply| Message::Drive { who, policy, window, reply }).await?;
@@ -86,10 +91,11 @@ impl Host {
         Ok(Drive { place, scene: Arc::clone(&self.scene), run, window, policy, last: None })
     }
 
-    /// Subscribes to the scene's steps. When this returns, the subscription holds.
+    /// Subscribes to the scene's steps. The subscription is active when this returns.
     ///
     /// # Errors
-    /// `Unavailable` when frames are wanted and nothing draws, `Busy` when there are too many subscribers.
+    /// `Unavailable` when frames are requested and there is no renderer; `Busy` when there are too many subscribers or
+    /// the mailbox is full; `NotFound` when the scene is closed.
     pub async fn watch(&self, view: View, delivery: Delivery) -> Result<Feed> {
         self.check_view(&view)?;
         let (viewer, feed) = Feed::new(view, delivery, Arc::clone(&self.wake));
@@ -97,20 +103,21 @@ impl Host {
         Ok(feed)
     }
 
-    /// Waits for a step and shows it. Dropping the future gives up; nothing is drawn then.
+    /// Waits for a step and returns a result of it. Dropping the future cancels the request before it is drawn.
     ///
     /// # Errors
-    /// `Gone` when an exact step has passed, `Unavailable` when nothing draws, `Busy` when too many wait.
+    /// `Gone` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when too many requests
+    /// wait; `NotFound` when the scene is closed.
     pub async fn show(&self, which: Which, view: View) -> Result<Shown> {
         self.check_view(&view)?;
         self.tell(|reply| Message::Ask(Ask { which, view, reply })).await
     }
 
-    /// Ends every stream of the scene and frees it. Returns when it is freed.
+    /// Ends every stream of the scene with `error` and frees the scene. Returns after the scene is freed.
     pub(super) async fn stop(&self, error: Error) {
         self.closing.store(true, Ordering::Release);
         let (done, stopped) = oneshot::channel();
-        // A closed mailbox means that the scene has stopped already.
+        // A closed mailbox means that the scene's task has already ended.
         if self.mailbox.send(Message::Stop { error, done }).await.is_ok() {
             stopped.await.ok();
         }
@@ -139,25 +146,25 @@ impl Host {
     }
 }
 
-/// The writer's place of a scene; dropping it makes room for the next writer.
+/// The writer's handle to a scene. Dropping it releases the writer lease.
 #[derive(Debug)]
 pub struct Drive {
     place: Place,
     scene: Arc<Scene>,
-    /// Counts the writers of the scene.
+    /// Number of this writer among the scene's writers, from 1.
     pub run: u64,
-    /// How many steps may be without acknowledgement.
+    /// Steps that may be unacknowledged at a time.
     pub window: u32,
     pub policy: Policy,
     last: Option<u64>,
 }
 
 impl Drive {
-    /// Takes a step in. What is refused leaves no trace.
+    /// Checks and queues a step. A rejected step has no effect.
     ///
     /// # Errors
-    /// `Invalid` with field, expected and given for whatever is wrong with the step, the window included; or whatever
-    /// ended the drive.
+    /// `Invalid` with field, expected and given for a malformed step or one beyond the window; or the error with which
+    /// the server ended the stream.
     pub fn step(&mut self, raw: &RawUpdate) -> Result<()> {
         let begin = Instant::now();
         if let Some(last) = self.last.filter(|last| raw.number <= *last) {
@@ -169,20 +176,20 @@ impl Drive {
         Ok(())
     }
 
-    /// Waits for what became of a step. Safe to drop while it waits.
+    /// Waits for the next report. Cancel-safe.
     ///
     /// # Errors
-    /// Why the drive was ended by the server.
+    /// The error with which the server ended the stream, after all reports.
     pub async fn next_report(&self) -> Result<Report> {
         self.place.0.next_report().await
     }
 
-    /// Whether there is nothing left to hear of.
+    /// Whether every accepted step is reported and every report is taken.
     pub fn is_drained(&self) -> bool {
         self.place.0.is_drained()
     }
 
-    /// Whether the server has ended it.
+    /// Whether the server has ended the stream.
     pub fn is_ended(&self) -> bool {
         self.place.0.is_closed()
     }

@@ -1,6 +1,6 @@
-//! Keeps the last step of every scene on disk: one file per scene, written by a thread of its own at most ten times a
-//! second and put in place by a rename, so that a killed server loses at most the last tenth of a second and never
-//! half a step.
+//! Checkpoint store: persists the last step of every scene, one file per scene. A background thread writes at most ten
+//! times per second and replaces files by an atomic rename. A killed server therefore loses about the last 0.1 s plus
+//! the duration of a write, and never leaves a partial file.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,19 +16,20 @@ use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, during, invalid};
 use modalcast_model::scene::{Cells, Scene, State};
 
-/// Time between two writings.
+/// Pause between two rounds of writes.
 const REST: Duration = Duration::from_millis(100);
 
-/// A step file: this, then run and number (u64), time (f64), the counts of q and of transforms (u64), q (f32), the
-/// transforms (12 f32 each), and the SHA-256 of all before it. Little-endian.
+/// Magic number of a checkpoint file. The file continues with run and step number (u64), time (f64, seconds), the
+/// counts of coordinates and of transforms (u64), q (f32), the transforms (12 f32 each), and the SHA-256 of all bytes
+/// before the hash. Little-endian.
 const MAGIC: &[u8; 8] = b"MCSTEP01";
-/// A step file of a state with cells: as above, with the shared cell (3 f64) and the translations (3 f64 each) after the
-/// transforms.
+/// Magic number of a checkpoint with cells: as above, plus the shared cell (3 f64) and one translation (3 f64) per
+/// transform after the transforms.
 const MAGIC_CELLS: &[u8; 8] = b"MCSTEP02";
 const HEAD: usize = 8 + 5 * 8;
 const HASH: usize = 32;
 
-/// Writes steps behind the scenes' backs.
+/// Writes checkpoints in the background.
 #[derive(Debug)]
 pub(super) struct Keeper {
     folder: PathBuf,
@@ -40,19 +41,22 @@ pub(super) struct Keeper {
 struct Shared {
     notes: Mutex<Notes>,
     changed: Condvar,
-    /// Held while files are written or removed; taken before `notes`.
+    /// Held while files are written or removed. Lock order: `files` before `notes`.
     files: Mutex<()>,
 }
 
 #[derive(Debug, Default)]
 struct Notes {
-    /// The newest state of each scene that is not on disk yet: one entry per scene at most.
+    /// Dirty states: the newest state of each scene that is not on disk yet, at most one per scene.
     fresh: BTreeMap<String, Arc<State>>,
     stopping: bool,
 }
 
 impl Keeper {
     /// Starts the thread that writes into `folder`.
+    ///
+    /// # Errors
+    /// `Fault` when the folder or the thread cannot be created.
     pub(super) fn start(folder: PathBuf) -> Result<Self> {
         fs::create_dir_all(&folder).map_err(during("state folder"))?;
         let shared = Arc::new(Shared::default());
@@ -64,16 +68,16 @@ impl Keeper {
         Ok(Self { folder, shared, thread: Mutex::new(Some(thread)) })
     }
 
-    /// Notes the newest state of a scene. Never waits for the disk.
+    /// Records the newest state of a scene. Never waits for the disk.
     pub(super) fn note(&self, name: &str, state: &Arc<State>) {
         lock(&self.shared.notes).fresh.insert(name.to_owned(), Arc::clone(state));
         self.shared.changed.notify_one();
     }
 
-    /// The kept state of a scene, if there is one that fits it. Reads from disk.
+    /// The checkpoint of a scene, if there is one. Reads from disk.
     ///
     /// # Errors
-    /// `Invalid` when the file is damaged or was written for another scene.
+    /// `Invalid` when the file is damaged or its size does not match the scene; `Fault` of the disk.
     pub(super) fn load(&self, name: &str, scene: &Scene) -> Result<Option<State>> {
         match fs::read(path_of(&self.folder, name)) {
             Ok(bytes) => decode(&bytes, scene).map(Some),
@@ -86,16 +90,16 @@ impl Keeper {
     pub(super) fn forget(&self, name: &str) {
         let _files = lock(&self.shared.files);
         lock(&self.shared.notes).fresh.remove(name);
-        // Most often there was no step, and so no file.
+        // Usually the scene had no step, so there is no file.
         fs::remove_file(path_of(&self.folder, name)).ok();
     }
 
-    /// Writes what is left and ends the thread. Waits for the disk.
+    /// Writes the dirty states and ends the thread. Waits for the disk.
     pub(super) fn finish(&self) {
         lock(&self.shared.notes).stopping = true;
         self.shared.changed.notify_one();
         if let Some(thread) = lock(&self.thread).take() {
-            thread.join().ok(); // A panic of the thread was logged by the panic hook.
+            thread.join().ok(); // The panic hook has already printed a panic of the thread.
         }
     }
 }
@@ -128,12 +132,13 @@ fn keep(shared: &Shared, folder: &Path) {
     }
 }
 
-/// Writes beside the file, then renames: a reader sees the old or the new, never a half.
+/// Replaces a file atomically: writes a temporary file in the same folder, syncs and renames it. A reader sees either
+/// the old or the new content.
 pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let beside = path.with_extension("new");
     let mut file = fs::File::create(&beside)?;
     file.write_all(bytes)?;
-    // Without this a power failure could leave the new name with none of the bytes.
+    // Without the sync a power failure could leave an empty file under the new name.
     file.sync_all()?;
     fs::rename(&beside, path)
 }
@@ -143,7 +148,7 @@ fn path_of(folder: &Path, name: &str) -> PathBuf {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is a single assignment, so a poisoned lock is still sound.
+    // Every change under these locks is a single operation, so the state behind a poisoned lock is valid.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -204,7 +209,7 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<State> {
     })
 }
 
-/// The shared cell, then the translations.
+/// Decodes the shared cell (24 bytes), then the translations (24 bytes each).
 fn decode_cells(bytes: &[u8]) -> Result<Cells> {
     let point = |bytes: &[u8]| {
         std::array::from_fn(|axis| {

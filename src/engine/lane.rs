@@ -1,5 +1,5 @@
-//! The steps of one writer on their way to its scene, and the reports on their way back. Both are bounded by the
-//! window: `lossless` refuses a step beyond it, `latest` merges the step into the one that waits.
+//! The bounded queue of steps from one writer to its scene, and the queue of reports back to the writer. The window
+//! bounds both: `lossless` rejects a step beyond the window, `latest` merges a step into the one already queued.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,20 +11,20 @@ use crate::telemetry::{Stage, StageTimes, ms_since};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Update;
 
-/// What happens to steps that come faster than they are done.
+/// What happens to steps that arrive faster than the scene completes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Policy {
-    /// Each is deformed, in order.
+    /// Every step is deformed, in order.
     Lossless,
-    /// They are merged, so that the state equals having applied all.
+    /// Queued steps are merged into one whose effect on the state equals applying all of them in order.
     Latest,
 }
 
-/// A step that was accepted and waits.
+/// An accepted step in the queue.
 #[derive(Debug)]
 pub(super) struct Waiting {
     pub update: Update,
-    /// Steps that were merged into this one.
+    /// Number of older steps that were merged into this one.
     pub merged: u64,
     parse_ms: f64,
     since: Instant,
@@ -35,35 +35,35 @@ impl Waiting {
         Self { update, merged: 0, parse_ms, since: Instant::now() }
     }
 
-    /// Parse and queue times until now.
+    /// Parse time, and queue time until now.
     pub(super) fn stages(&self) -> StageTimes {
         vec![(Stage::Parse, self.parse_ms), (Stage::Queue, ms_since(self.since))]
     }
 }
 
-/// What became of a step.
+/// The outcome of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Report {
-    /// All steps up to this one are done or superseded. `skipped` counts the merged ones since the stream began.
+    /// All steps up to this one are completed or superseded. `skipped` counts the steps merged since the stream began.
     Done { step: u64, skipped: u64, stages: StageTimes },
-    /// The step was taken back; the scene is as before it.
+    /// The step failed; the scene is as it was before the step.
     Refused { step: u64, error: Error },
 }
 
-/// Shared by a writer's handle and its scene. No lock is held across an await.
+/// The step queue, shared by a writer's handle and its scene. The lock is never held across an await.
 #[derive(Debug)]
 pub(super) struct Lane {
     policy: Policy,
     window: usize,
     inner: Mutex<Inner>,
-    /// Wakes the scene.
+    /// Notifies the scene of a new step or a closed queue.
     scene: Arc<Notify>,
-    /// Wakes the writer.
+    /// Notifies the writer of a report or the end.
     writer: Notify,
 }
 
-/// The writer's place at a lane. Dropping it makes room for the next writer, also where it is dropped on its way to a
-/// client that has gone.
+/// The writer's lease on a scene. Dropping it closes the queue and admits the next writer, also if the reply that
+/// carries the lease is dropped because the client has disconnected.
 #[derive(Debug)]
 pub(super) struct Place(pub Arc<Lane>);
 
@@ -76,13 +76,13 @@ impl Drop for Place {
 #[derive(Debug, Default)]
 struct Inner {
     waiting: VecDeque<Waiting>,
-    /// Steps taken and not yet reported: more than one while what is late of the others leaves the device.
+    /// Steps taken and not yet reported. More than one while readbacks of the earlier ones are in flight.
     in_work: usize,
     reports: VecDeque<Report>,
     skipped: u64,
-    /// The writer has gone.
+    /// The writer has dropped its lease.
     closed: bool,
-    /// The scene has ended it, and why.
+    /// The error with which the server ended the queue.
     ended: Option<Error>,
 }
 
@@ -95,10 +95,10 @@ impl Lane {
         self.policy
     }
 
-    /// Takes a step in.
+    /// Queues a step.
     ///
     /// # Errors
-    /// `Invalid` naming the window when the step is beyond it; whatever ended the lane.
+    /// `Invalid` naming the window when the step is beyond it, or the error that ended the queue.
     pub(super) fn offer(&self, step: Waiting) -> Result<()> {
         let mut inner = self.lock();
         if let Some(error) = &inner.ended {
@@ -120,7 +120,7 @@ impl Lane {
         Ok(())
     }
 
-    /// The next step to work on. It counts against the window until its report is taken.
+    /// Removes the next step to compute. The step counts against the window until its report is taken.
     pub(super) fn take(&self) -> Option<Waiting> {
         let mut inner = self.lock();
         let step = inner.waiting.pop_front()?;
@@ -128,12 +128,12 @@ impl Lane {
         Some(step)
     }
 
-    /// Whether a step waits.
+    /// Whether a step is queued.
     pub(super) fn has_waiting(&self) -> bool {
         !self.lock().waiting.is_empty()
     }
 
-    /// Tells what became of the oldest step in work.
+    /// Reports the outcome of the oldest step in work.
     pub(super) fn report(&self, step: u64, outcome: Result<StageTimes>) {
         let mut inner = self.lock();
         inner.in_work = inner.in_work.saturating_sub(1);
@@ -142,8 +142,8 @@ impl Lane {
             Ok(stages) => Report::Done { step, skipped, stages },
             Err(error) => Report::Refused { step, error },
         };
-        // Under `latest` a writer may be slow to read. A newer "done" says all that the older one said; refusals are
-        // never dropped, so a writer that reads none of them is cut off in the end.
+        // Under `latest` a writer may read reports slowly. A newer `Done` covers the older one and replaces it.
+        // `Refused` is never dropped, so a writer that reads none of them is cut off eventually.
         let supersedes = matches!((inner.reports.back(), &report), (Some(Report::Done { .. }), Report::Done { .. }));
         if inner.reports.len() >= self.window && supersedes {
             inner.reports.pop_back();
@@ -156,10 +156,10 @@ impl Lane {
         self.writer.notify_one();
     }
 
-    /// Waits for the next report. Safe to drop while it waits.
+    /// Waits for the next report. Cancel-safe.
     ///
     /// # Errors
-    /// Whatever ended the lane, after all reports were taken.
+    /// The error that ended the queue, after all reports were taken.
     pub(super) async fn next_report(&self) -> Result<Report> {
         loop {
             {
@@ -175,13 +175,13 @@ impl Lane {
         }
     }
 
-    /// Whether every accepted step has been reported and the report been taken.
+    /// Whether every accepted step is reported and every report is taken.
     pub(super) fn is_drained(&self) -> bool {
         let inner = self.lock();
         inner.in_work == 0 && inner.waiting.is_empty() && inner.reports.is_empty()
     }
 
-    /// The writer has gone: steps that still wait are dropped.
+    /// Called when the writer drops its lease. Drops the queued steps.
     pub(super) fn close(&self) {
         let mut inner = self.lock();
         inner.closed = true;
@@ -194,7 +194,7 @@ impl Lane {
         inner.closed || inner.ended.is_some()
     }
 
-    /// The scene takes no more steps.
+    /// Ends the queue with an error from the scene. Drops the queued steps.
     pub(super) fn end(&self, error: Error) {
         let mut inner = self.lock();
         inner.ended.get_or_insert(error);
@@ -212,7 +212,8 @@ impl Lane {
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
-        // Every change under the lock is complete before anything can panic, so a poisoned lock is still sound.
+        // Every change under the lock completes before anything can panic, so the state behind a poisoned lock is
+        // valid.
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

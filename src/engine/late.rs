@@ -1,21 +1,22 @@
-//! What is late: vertices that leave the device while the next step is computed, and frames that are drawn and brought back
-//! while the next step is computed and its own frames are begun. Each is handed over, in order, as it arrives. `read` is the
-//! way of the pixels to memory that the host reads.
+//! Device-to-host readbacks in flight. Vertices are read back while the next step is computed; frames are drawn and
+//! read back while the next step is computed and its own frames are submitted. Readbacks are delivered in order as they
+//! complete. In the diagrams `read` is the transfer of the pixels to host-readable memory.
 //!
-//! A deformer with vertices of its own computes beside the frames that are under way:
+//! A deformer with its own vertex memory computes concurrently with the frames in flight:
 //!
 //! ```text
 //! deformer  [deform k+1  ]          [deform k+2  ]
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
 //! ```
 //!
-//! One that writes into OpenGL's buffers does not: to map them waits for all that OpenGL was told before (`gpu::interop`),
-//! and so for reading frame k too. What overlaps is the host's part. Step k+1 is written and given to the device while
-//! frame k is drawn, and begins as soon as that is read; frame k is copied out, encoded and sent while frame k+1 is drawn.
+//! A deformer that writes into OpenGL buffers does not: mapping them is ordered after all OpenGL commands issued before
+//! (`gpu::interop`), including the readback of frame k. Only the host's work overlaps. Step k+1 is recorded and
+//! submitted while frame k is drawn, and starts on the device as soon as frame k is read. Frame k is copied out,
+//! encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]
-//! host      [give k+1 ]                  [give k+2 ]
+//! host      [submit k+1]                 [submit k+2]
 //! frame k                                [copy out, encode, send]
 //! ```
 
@@ -31,20 +32,21 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::Cells;
 use modalcast_render::{FRAMES_UNDER_WAY, Image};
 
-/// Something of a step that leaves the device, and who waits for it.
+/// A device-to-host readback in flight and its subscribers.
 pub(super) struct Late {
     leaving: Leaving,
-    /// How many steps the scene had counted then.
+    /// The scene's step count when the readback was started.
     pub count: u64,
     step: StepName,
     stages: StageTimes,
     cells: Option<Arc<Cells>>,
-    /// With the steps that each has missed.
+    /// A reserved slot per subscriber, and the number of steps that the subscriber skipped.
     claims: Vec<(Claim, u64)>,
-    /// The step's acknowledgement, which comes after all that is late of it: with the last.
+    /// The step's acknowledgement, attached to the last readback of the step and sent after it.
     pub done: Option<Done>,
 }
 
+/// The pending result of a readback.
 pub(super) enum Leaving {
     Vertices(Asked<Copied>),
     Frame(View, Asked<Image>),
@@ -55,7 +57,7 @@ impl Leaving {
         matches!(self, Self::Frame(view, _) if view == wanted)
     }
 
-    /// Waits until it is there, with the stages that this took. Safe to drop while it waits.
+    /// Waits for the result; returns it with its stage times. Cancel-safe.
     async fn there(&mut self) -> Result<(Body, StageTimes)> {
         match self {
             Self::Vertices(copying) => {
@@ -72,7 +74,7 @@ impl Leaving {
 }
 
 impl Conductor {
-    /// Something of the current step that was begun just now.
+    /// A readback of the current step that was just started.
     pub(super) fn late(&self, leaving: Leaving, claims: Vec<(Claim, u64)>) -> Late {
         Late {
             leaving,
@@ -85,9 +87,10 @@ impl Conductor {
         }
     }
 
-    /// Gives a viewer with room its frame of the current step late: one of its view that was begun for another viewer, else one
-    /// that begins now, unless too many others have. `begun` are the frames of this step that are not in the queue yet. Returns
-    /// whether the viewer gets one.
+    /// Subscribes a viewer with capacity to a frame of the current step that is delivered asynchronously: a frame of
+    /// the same view in flight for another viewer, else a new frame, unless [`FRAMES_UNDER_WAY`] were begun already.
+    /// `begun` holds frames of this step that are not in the queue of readbacks yet. Returns whether the viewer gets a
+    /// frame.
     pub(super) fn begin_frame(&mut self, viewer: &mut Viewer, begun: &mut Vec<Late>) -> bool {
         let Some((camera, size)) = viewer.view.frame() else { return false };
         if viewer.seen == self.count || !viewer.has_room() {
@@ -109,7 +112,7 @@ impl Conductor {
         true
     }
 
-    /// Waits for what is late for the longest, and hands it over. Safe to drop while it waits.
+    /// Waits for the oldest readback in flight and delivers it. Cancel-safe.
     pub(super) async fn settle_oldest(&mut self) {
         let Some(late) = self.late.front_mut() else { return };
         let there = late.leaving.there().await;
@@ -126,26 +129,27 @@ impl Conductor {
         acknowledge(done);
     }
 
-    /// Hands over all that is late of steps before this one.
+    /// Delivers all readbacks of steps whose count is below `count`.
     pub(super) async fn settle_before(&mut self, count: u64) {
         while self.late.front().is_some_and(|late| late.count < count) {
             self.settle_oldest().await;
         }
     }
 
-    /// Hands over all that is late.
+    /// Delivers all readbacks in flight.
     pub(super) async fn settle(&mut self) {
         self.settle_before(u64::MAX).await;
     }
 
-    /// Hands over vertices, which the next step was not to wait for and nothing after it is to overtake.
+    /// Delivers readbacks until no vertices are in flight. The submission of the next step does not wait for vertices,
+    /// but its results must not overtake them.
     pub(super) async fn settle_vertices(&mut self) {
         while self.late.iter().any(|late| matches!(late.leaving, Leaving::Vertices(_))) {
             self.settle_oldest().await;
         }
     }
 
-    /// Hands over what is late for a viewer, so that it can be served at once.
+    /// Delivers readbacks until none is in flight for `viewer`, so that the viewer can then be served synchronously.
     pub(super) async fn settle_for(&mut self, viewer: &Viewer) {
         while self.late.iter().any(|late| late.claims.iter().any(|(claim, _)| claim.is_of(viewer))) {
             self.settle_oldest().await;
@@ -154,7 +158,7 @@ impl Conductor {
 }
 
 impl View {
-    /// Camera and size of a frame of colours.
+    /// Camera and size in pixels of a color frame; `None` for other views.
     const fn frame(&self) -> Option<(modalcast_model::scene::Camera, (u32, u32))> {
         match *self {
             Self::Frame { camera, width, height, showing: super::viewer::Showing::Colour } => {

@@ -1,4 +1,4 @@
-//! The state folder: a lock so that one server uses it, and `scenes.json`, the list of scenes that are open.
+//! The state folder: a lock that limits the folder to one server, and the catalog `scenes.json` of open scenes.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -9,18 +9,18 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use super::keep::replace;
 use modalcast_model::error::{Error, Result, during, invalid};
 
-/// Where a scene came from.
+/// The origin of a scene.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum Origin {
     /// A built-in name, or a path inside the repository.
     Repository { source: String },
-    /// Files that a client sent; `entry` names the one to open, or is empty.
+    /// Files that a client uploaded. `entry` is the path to open; empty means the folder.
     Upload { entry: String },
 }
 
 impl Origin {
-    /// In words, for lists.
+    /// Readable description for lists and errors.
     pub fn source(&self) -> String {
         match self {
             Self::Repository { source } => source.clone(),
@@ -30,20 +30,20 @@ impl Origin {
     }
 }
 
-/// The names and origins of open scenes, on disk at all times.
+/// The catalog of open scenes: names and origins, written to disk at every change.
 #[derive(Debug)]
 pub(super) struct Ledger {
     folder: PathBuf,
     entries: Mutex<BTreeMap<String, Origin>>,
-    /// Held by the server that uses the folder; the operating system frees it when the process dies.
+    /// File lock of the server that uses the folder. The operating system releases it when the process dies.
     lock: Mutex<Option<File>>,
 }
 
 impl Ledger {
-    /// Takes the folder and reads its list.
+    /// Locks the folder, reads its catalog and removes unfinished uploads.
     ///
     /// # Errors
-    /// `Unavailable` when another server uses the folder, or it cannot be made or read.
+    /// `Unavailable` when another server uses the folder, or when the folder cannot be created or read.
     pub(super) fn open(folder: &Path) -> Result<Self> {
         let unusable = |reason: String| Error::Unavailable {
             what: "state folder",
@@ -63,32 +63,32 @@ impl Ledger {
         self.guard().clone()
     }
 
-    /// Adds a scene. Writes to disk; a failure changes nothing.
+    /// Adds a scene. Writes to disk; a failure leaves the catalog unchanged.
     pub(super) fn add(&self, name: &str, origin: &Origin) -> Result<()> {
         self.change(|entries| entries.insert(name.to_owned(), origin.clone())).map(drop)
     }
 
-    /// Removes a scene; whether it was there. Writes to disk; a failure changes nothing.
+    /// Removes a scene; returns whether it was listed. Writes to disk; a failure leaves the catalog unchanged.
     pub(super) fn remove(&self, name: &str) -> Result<bool> {
         self.change(|entries| entries.remove(name)).map(|entry| entry.is_some())
     }
 
-    /// Where steps are kept.
+    /// The folder of the checkpoints.
     pub(super) fn steps(&self) -> PathBuf {
         self.folder.join("steps")
     }
 
-    /// Where an upload's files lie.
+    /// The folder of an upload's files.
     pub(super) fn upload(&self, name: &str) -> PathBuf {
         self.folder.join("uploads").join(name)
     }
 
-    /// Lets another server use the folder.
+    /// Releases the lock, so that another server may use the folder.
     pub(super) fn release(&self) {
         self.lock.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
-    /// Changes the list on disk, then here, so that both are always the same.
+    /// Changes the catalog on disk first and in memory only if that succeeds, so that both agree.
     fn change<T>(&self, change: impl FnOnce(&mut BTreeMap<String, Origin>) -> T) -> Result<T> {
         let mut entries = self.guard();
         let mut changed = entries.clone();
@@ -104,7 +104,8 @@ impl Ledger {
     }
 }
 
-/// The list on disk; empty when there is none. A damaged one is set aside, so that it is neither lost nor in the way.
+/// Reads the catalog; empty if there is none. A damaged file is renamed to `scenes.json.damaged`, so that it is kept
+/// and the server can start.
 fn read(path: &Path) -> io::Result<BTreeMap<String, Origin>> {
     let bytes = match fs::read(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
@@ -117,20 +118,21 @@ fn read(path: &Path) -> io::Result<BTreeMap<String, Origin>> {
     })
 }
 
-/// Uploads that a killed server never finished.
+/// Removes uploads that a killed server did not finish.
 fn remove_leftovers(uploads: &Path) {
     let Ok(folders) = fs::read_dir(uploads) else { return };
     for folder in folders.flatten() {
         if folder.file_name().to_string_lossy().starts_with('.') {
-            fs::remove_dir_all(folder.path()).ok(); // It is tried again at the next start.
+            fs::remove_dir_all(folder.path()).ok(); // The next start tries again.
         }
     }
 }
 
-/// The name itself if it may name a scene, and so a file.
+/// Returns `name` if it is valid as the name of a scene. The name is also used as a file name.
 ///
 /// # Errors
-/// `Invalid` for anything but 1 to 64 letters, digits, dots, dashes and underscores that begin with no dot.
+/// `Invalid` unless the name has 1 to 64 ASCII letters, digits, dots, dashes and underscores and does not start with a
+/// dot.
 pub fn checked_name(name: &str) -> Result<&str> {
     let fits = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
     if name.is_empty() || name.len() > 64 || name.starts_with('.') || !name.chars().all(fits) {
@@ -140,7 +142,11 @@ pub fn checked_name(name: &str) -> Result<&str> {
     Ok(name)
 }
 
-/// The name of a scene that was opened without one: the last part of its source.
+/// The default name of a scene: the last path component of its source without extension, with `-` in place of
+/// characters that are not allowed.
+///
+/// # Errors
+/// `Invalid` when the source yields no valid name.
 pub(super) fn own_name(source: &str) -> Result<String> {
     let last = source.trim_end_matches('/').rsplit('/').next().unwrap_or_default();
     let stem = last.rsplit_once('.').map_or(last, |(stem, _)| if stem.is_empty() { last } else { stem });
@@ -189,7 +195,7 @@ mod tests {
         assert!(ledger.entries().is_empty() && !list.exists());
         assert_eq!(fs::read(folder.path().join("scenes.json.damaged")).expect("set aside"), b"{\"a\":");
         drop(ledger);
-        // A folder in its place can be read by nobody.
+        // A folder in place of the file is unreadable for every user, root included.
         fs::create_dir(&list).expect("a folder");
         assert!(matches!(Ledger::open(folder.path()), Err(Error::Unavailable { .. })));
     }

@@ -1,8 +1,9 @@
-//! The engine: one device thread, one task per open scene, and what survives a restart. Sources in, steps in, pictures
-//! and vertices out.
+//! The engine: loads scenes, applies steps to them, and produces frames, picks and vertices. It runs one device thread
+//! and one task per open scene, and persists uploads, the list of open scenes and their last steps across restarts.
 //!
-//! A scene's task orders everything that happens to it (`conductor`); a writer reaches it through a bounded lane
-//! (`lane`), a subscriber through a bounded feed (`viewer`), and both are told when they are too fast or too slow.
+//! A scene's task serializes all operations on the scene (`conductor`). A writer sends steps through a bounded queue
+//! (`lane`) and a subscriber receives results through a bounded channel (`viewer`). Exceeding a bound, or blocking the
+//! writer for too long, yields an error that names the limit.
 
 mod blocking;
 mod command;
@@ -63,13 +64,13 @@ use crate::config::Config;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
 
-/// How many scenes are read from disk at a time.
+/// Scenes that are read from disk concurrently.
 const LOADS: usize = 2;
 
-/// How many uploads may be under way.
+/// Uploads that may be in progress at a time.
 const UPLOADS: usize = 8;
 
-/// The engine. Clones share everything.
+/// Handle to the engine. A clone is shallow: all clones share one device thread and one set of scenes.
 #[derive(Clone)]
 pub struct Engine {
     shared: Arc<Shared>,
@@ -87,15 +88,15 @@ struct Shared {
     next_id: AtomicU64,
     stopping: AtomicBool,
     device: Mutex<Option<JoinHandle<()>>>,
-    // Last: the state folder is free for another server only when nobody here writes to it any more.
+    // Last field, so that its lock on the state folder is released only after every writer above is dropped.
     ledger: Ledger,
 }
 
 impl Engine {
-    /// Opens the devices and the state folder, then every scene that was open when the last server stopped.
+    /// Opens the state folder and the devices, then reopens every scene in the folder's list of open scenes.
     ///
     /// # Errors
-    /// `Unavailable` when a device asked for by name is not there, or another server uses the state folder.
+    /// `Unavailable` when a backend requested by name cannot be opened, or another server uses the state folder.
     pub async fn start(config: Config, source: Arc<dyn SceneSource>) -> Result<Self> {
         let config = Arc::new(config);
         let state = config.state.clone();
@@ -125,41 +126,42 @@ impl Engine {
         Ok(engine)
     }
 
-    /// What deforms and what draws.
+    /// The backend that deforms and the renderer that draws.
     pub fn info(&self) -> &Info {
         &self.shared.info
     }
 
-    /// The settings.
+    /// The server's configuration.
     pub fn config(&self) -> &Config {
         &self.shared.config
     }
 
-    /// What encodes frames. All its clones share one limit on threads.
+    /// The frame encoder. All its clones share one limit on threads.
     pub fn encoder(&self) -> &FrameEncoder {
         &self.shared.encoder
     }
 
-    /// The largest image side that the settings and the renderer allow.
+    /// The largest image side in pixels that both the configuration and the renderer allow.
     pub fn frame_side(&self) -> u32 {
         let renderer = self.shared.info.renderer.as_ref().map_or(u32::MAX, |info| info.max_side);
         self.shared.config.frame_side.min(renderer)
     }
 
-    /// Opens a source of the repository under a name (its own when empty). What is open already is answered as it is.
+    /// Opens a source of the repository under a name; an empty name means the source's own name. If the name is already
+    /// open from the same source, returns the open scene.
     ///
     /// # Errors
-    /// `Taken` when the name belongs to another source, `Busy` when too many scenes are open, and whatever is wrong
-    /// with the source.
+    /// `Taken` when the name belongs to another source, `Busy` when too many scenes are open, and the errors of
+    /// [`SceneSource::open`].
     pub async fn open(&self, source: &str, name: &str) -> Result<Arc<Host>> {
         let name = if name.is_empty() { ledger::own_name(source)? } else { checked_name(name)?.to_owned() };
         self.admit(name, Origin::Repository { source: source.into() }, None).await
     }
 
-    /// An open scene.
+    /// The open scene with this name.
     ///
     /// # Errors
-    /// `NotFound` when none of that name is open, `Unavailable` when the server stops.
+    /// `NotFound` when no open scene has this name, `Unavailable` when the server is shutting down.
     pub fn find(&self, name: &str) -> Result<Arc<Host>> {
         if self.is_stopping() {
             return Err(stopping());
@@ -167,15 +169,15 @@ impl Engine {
         self.shared.registry.find(name)
     }
 
-    /// All open scenes, by name.
+    /// All open scenes, sorted by name.
     pub fn list(&self) -> Vec<Arc<Host>> {
         self.shared.registry.list()
     }
 
-    /// What [`Self::open`] accepts.
+    /// The sources that [`Self::open`] accepts.
     ///
     /// # Errors
-    /// `Fault` when the repository could not be read.
+    /// `Fault` when listing the repository panics.
     pub async fn sources(&self) -> Result<Vec<String>> {
         let source = Arc::clone(&self.shared.source);
         run_blocking("repository", move || Ok(source.list())).await
@@ -184,8 +186,8 @@ impl Engine {
     /// Begins an upload.
     ///
     /// # Errors
-    /// `Invalid` for a name, entry or size that cannot be; `Taken` when the name is in use; `Busy` when too many are under
-    /// way.
+    /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `Taken` when the name is
+    /// in use; `Busy` when too many uploads are in progress; `Fault` of the disk.
     pub async fn begin_upload(&self, announced: Announcement) -> Result<Upload> {
         checked_name(&announced.scene)?;
         let config = &self.shared.config;
@@ -203,29 +205,30 @@ impl Engine {
         run_blocking("upload", move || Upload::begin(&uploads, announced, place)).await
     }
 
-    /// Opens a finished upload. A failure leaves nothing of it behind.
+    /// Opens a complete upload as a scene. On failure the uploaded files are removed.
     ///
     /// # Errors
-    /// `Invalid` naming what is missing or wrong in the files; `Taken` when the name has been used meanwhile.
+    /// `Invalid` naming the missing or malformed file; `Taken` when the name was claimed in the meantime.
     pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<Host>> {
         upload.finish()?;
         let (name, entry) = (upload.announced.scene.clone(), upload.announced.entry.clone());
         self.admit(name, Origin::Upload { entry }, Some(upload)).await
     }
 
-    /// Closes a scene and ends its streams; an upload's files and the kept step are removed.
+    /// Closes a scene and ends its streams; removes its persisted step and, for an upload, its files.
     ///
     /// # Errors
-    /// `NotFound` when none of that name is open or kept.
+    /// `NotFound` when the name is neither open nor in the list of open scenes, `Busy` while the scene is being opened.
     pub async fn close(&self, name: &str) -> Result<()> {
         let engine = self.clone();
         let name = checked_name(name)?.to_owned();
-        // A task of its own: the work must be whole even when the caller goes away.
+        // A separate task, so that closing completes even if the caller is cancelled.
         let work = async move { engine.close_whole(&name).await };
         tokio::spawn(work).await.map_err(modalcast_model::error::during("close"))?
     }
 
-    /// Ends every stream with `Unavailable`, writes what is to be kept and lets the devices go.
+    /// Ends every stream with `Unavailable`, writes outstanding checkpoints, joins the device thread and releases the
+    /// state folder.
     pub async fn shutdown(&self) {
         if self.shared.stopping.swap(true, Ordering::AcqRel) {
             return;
@@ -258,7 +261,7 @@ impl Engine {
             let engine = self.clone();
             openings.spawn(async move {
                 if let Err(error) = engine.admit(name.clone(), origin, None).await {
-                    // It stays in the list: the next start may find its files again.
+                    // The entry remains in the list, because the files may be available again at the next start.
                     tracing::warn!(scene = name, %error, "a kept scene could not be opened");
                 }
             });
@@ -266,7 +269,8 @@ impl Engine {
         openings.join_all().await;
     }
 
-    /// Opens a scene once, however many ask for it, in a task of its own that no caller's end breaks off.
+    /// Opens a scene, once for all concurrent callers. Runs in a separate task, so that a cancelled caller does not
+    /// cancel the opening.
     async fn admit(&self, name: String, origin: Origin, upload: Option<Upload>) -> Result<Arc<Host>> {
         if self.is_stopping() {
             return Err(stopping());
@@ -318,7 +322,7 @@ impl Engine {
         Ok(host)
     }
 
-    /// Reads a scene's files. A panic of a loader is a fault of this call alone.
+    /// Reads a scene's files. A panic in a loader becomes a `Fault` of this call.
     async fn load(&self, name: &str, origin: &Origin, upload: Option<Upload>) -> Result<Arc<Scene>> {
         let stopped = |_| stopping();
         let _permit = self.shared.loads.acquire().await.map_err(stopped)?;
@@ -329,7 +333,7 @@ impl Engine {
             Origin::Repository { source: path } => source.open(&path),
             Origin::Upload { entry } => {
                 if let Some(upload) = upload {
-                    // A step kept for an older scene of this name means nothing to the new one.
+                    // A checkpoint of an older scene with this name does not apply to the new one.
                     engine.shared.means.keeper.forget(&key);
                     upload.settle(&place)?;
                 }
@@ -354,8 +358,8 @@ impl Engine {
             engine.shared.ledger.remove(&key)
         })
         .await;
-        // The name is free only now, so that nobody's new files are removed with the old ones; but free it is, even
-        // when the list could not be written.
+        // The name is released only after the files are removed, so that a new upload under it does not lose its files.
+        // It is released even if the list could not be written.
         if let Some(seat) = &seat {
             self.shared.registry.remove(name, seat);
         }

@@ -1,4 +1,4 @@
-//! Vertices as bytes for the wire, packed off the device thread.
+//! Packs vertices into bytes for the wire, off the device thread.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -12,26 +12,26 @@ use modalcast_model::error::{Result, during, invalid};
 use modalcast_model::scene::{Bounds, Cells, Layout, Scene, Slot};
 use modalcast_render::Paths;
 
-// Vertices are copied as they lie in memory, and the wire is little-endian.
+// Vertices are copied in memory order, and the wire format is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"), "vertices would need their bytes swapped");
 
-/// How the most domains of one reply with vertices are bounded: their counts travel in its first message.
+/// Limit on the domains of one vertex reply, because the first message carries counts for every domain.
 const MOST_DOMAINS: usize = 65_536;
 
-/// Vertices as bytes, and what they are relative to.
+/// Vertices as bytes, and the origin of their positions.
 #[derive(Debug, Clone)]
 pub struct Packed {
     pub encoded: Encoded,
-    /// World position, metres.
+    /// Origin of the positions in the world, meters.
     pub origin: [f64; 3],
-    /// Bytes of the chosen domains' own origins at the end of the reply; 0 when `origin` holds for all of them.
+    /// Size in bytes of the per-domain origins at the end of the reply; 0 if `origin` applies to all selected domains.
     pub origin_bytes: u64,
 }
 
-/// Bytes of a domain's box.
+/// Bytes of a domain's box: 6 f32.
 const BOX_BYTES: u64 = 24;
 
-/// Which vertices of a scene.
+/// The domains and vertex attributes that a reader selects.
 #[derive(Debug, Clone)]
 pub struct Selection {
     scene: Arc<Scene>,
@@ -41,11 +41,11 @@ pub struct Selection {
 }
 
 impl Selection {
-    /// What is wanted of the chosen domains of a scene, or of all when none is named.
+    /// Selects attributes of the given domains; an empty list selects all domains.
     ///
     /// # Errors
-    /// `Invalid` when an index is out of range, the list is longer than the scene, nothing is wanted or the scene does not
-    /// keep what is.
+    /// `Invalid` when an index is out of range, the list is longer than the scene or than 65 536 domains, no attribute
+    /// is selected, or the scene does not keep a selected attribute.
     pub fn new(scene: &Arc<Scene>, domains: Vec<u32>, wanted: Wanted) -> Result<Self> {
         check_kept(scene, wanted)?;
         let domains = checked_domains("selection.domains", scene, domains)?;
@@ -55,40 +55,40 @@ impl Selection {
         Ok(Self { scene: Arc::clone(scene), domains, wanted })
     }
 
-    /// Bytes of the positions.
+    /// Size of the positions in bytes.
     pub fn position_bytes(&self) -> u64 {
         if self.wanted.positions { self.triples() } else { 0 }
     }
 
-    /// Bytes of the displacements.
+    /// Size of the displacements in bytes.
     pub fn displacement_bytes(&self) -> u64 {
         if self.wanted.displacements { self.triples() } else { 0 }
     }
 
-    /// Bytes of the boxes.
+    /// Size of the boxes in bytes.
     pub fn box_bytes(&self) -> u64 {
         if self.wanted.boxes { BOX_BYTES * self.domains.len() as u64 } else { 0 }
     }
 
-    /// Bytes of three numbers for each vertex.
+    /// Size in bytes of 3 f32 per vertex of the selected domains.
     fn triples(&self) -> u64 {
         self.vertices().map(|count| 12 * u64::from(count)).sum()
     }
 
-    /// Vertices of each chosen domain.
+    /// Vertex count of each selected domain.
     pub fn vertices(&self) -> impl Iterator<Item = u32> {
         let slots = &self.scene.layout.slots;
         self.domains.iter().map(|domain| slots[*domain as usize].vertices as u32)
     }
 
-    /// Corners of each chosen domain.
+    /// Corner count of each selected domain.
     pub fn corners(&self) -> impl Iterator<Item = u32> {
         let slots = &self.scene.layout.slots;
         self.domains.iter().map(|domain| slots[*domain as usize].corners as u32)
     }
 }
 
-/// Refuses what the scene does not keep, by the scene's option.
+/// Rejects attributes that the scene does not keep; the error names the option of `scene.toml` that enables them.
 fn check_kept(scene: &Scene, wanted: Wanted) -> Result<()> {
     if wanted == Wanted::default() {
         return Err(invalid("selection.without_vertices", "displacements or boxes instead", "neither"));
@@ -106,7 +106,7 @@ fn check_kept(scene: &Scene, wanted: Wanted) -> Result<()> {
     }
 }
 
-/// The domains that a list names, or all.
+/// Checks a list of domain indices; an empty list means all domains in order. `field` names the list in errors.
 ///
 /// # Errors
 /// `Invalid` when an index is out of range or the list is longer than the scene.
@@ -124,11 +124,11 @@ pub fn checked_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<
     }
 }
 
-/// Packs what is wanted of the chosen domains: all positions in row order of U, then all normals, displacements and
-/// boxes, then the origins of the domains when they are not all the same.
+/// Packs the selected attributes of the selected domains: all positions in row order of U, then all normals, all
+/// displacements and all boxes, then the per-domain origins if they differ.
 ///
 /// # Errors
-/// `Fault` when it was a picture that was shown.
+/// `Fault` when `shown` does not contain vertices.
 pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<Packed> {
     let Body::Vertices(surface) = shown.body else { return Err(during("copy")("a picture is no vertices")) };
     let mut stages = shown.stages;
@@ -147,7 +147,7 @@ pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<P
     Ok(Packed { encoded, origin, origin_bytes })
 }
 
-/// The origin of the reply in metres; appends the chosen domains' own ones when they differ from it.
+/// Returns the origin of the reply in meters; appends per-domain origins to `bytes` if any differs from it.
 fn push_origins(selection: &Selection, cells: Option<&Cells>, bytes: &mut Vec<u8>) -> [f64; 3] {
     let scene = &selection.scene;
     let metres = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
@@ -177,7 +177,7 @@ fn pack(surface: &Surface, selection: &Selection) -> Vec<u8> {
     put(wanted.displacements, &surface.displacements, &vertices);
     for domain in selection.domains.iter().filter(|_| wanted.boxes) {
         let Bounds { min, max } = surface.boxes[*domain as usize];
-        // They are f32 numbers, so that nothing is rounded here.
+        // The bounds are f32 values stored as f64, so the conversion is exact.
         let sides = [min, max].map(|corner| corner.map(|number| number as f32));
         bytes.extend_from_slice(bytemuck::cast_slice(&sides));
     }

@@ -1,4 +1,5 @@
-//! What a pick found, with what a client needs to push there: the rows of U at the point, and A.
+//! The result of a pick, with the data that a client needs to apply a force at the point: the rows of U and the linear
+//! part A of the transform.
 
 use std::sync::Arc;
 
@@ -9,18 +10,19 @@ use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Scene, State};
 use modalcast_render::Hit;
 
-/// One hit.
+/// One hit of a pick.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picked {
-    /// Lengths are scene units.
+    /// Lengths are in scene units.
     pub hit: Hit,
     /// A, the linear part of `world_from_domain` at the step, row-major.
     pub linear: [f32; 9],
-    /// The 3 x r block of U at the point, row-major: a force f there (world axes) is f_q = U^T A^T f on the coordinates.
+    /// The 3 x r block of U at the point, row-major. A force f at the point (world axes) acts on the coordinates as
+    /// f_q = U^T A^T f.
     pub modes: Vec<f32>,
 }
 
-/// The hits of one step.
+/// All hits of a pick in one step.
 #[derive(Debug, Clone)]
 pub struct Picks {
     pub step: StepName,
@@ -28,7 +30,7 @@ pub struct Picks {
     pub hits: Vec<Picked>,
 }
 
-/// Hits with the linear parts of their domains' transforms; modes come later, off the device's path.
+/// Adds the linear parts of the domains' transforms to hits. [`resolve_picks`] adds the modes outside the scene's task.
 pub(super) fn with_transforms(state: &State, scene: &Scene, hits: Vec<Hit>) -> Vec<Picked> {
     let one = |hit: Hit| {
         let rows = state.transform_of(scene, hit.domain).0;
@@ -38,10 +40,10 @@ pub(super) fn with_transforms(state: &State, scene: &Scene, hits: Vec<Hit>) -> V
     hits.into_iter().map(one).collect()
 }
 
-/// Adds the block of U to every hit when `with_modes`.
+/// Adds the block of U to every hit if `with_modes` is true.
 ///
 /// # Errors
-/// `Fault` when it was no pick that was shown.
+/// `Fault` when `shown` is not a pick.
 pub async fn resolve_picks(shown: Shown, scene: &Arc<Scene>, with_modes: bool) -> Result<Picks> {
     let Body::Picked(mut hits) = shown.body else { return Err(during("pick")("a picture is no pick")) };
     let scene = Arc::clone(scene);

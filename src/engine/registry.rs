@@ -1,4 +1,5 @@
-//! Scenes by name. A name is claimed before its scene is loaded, so that two openings of one name share one loading.
+//! The registry of scenes by name. A name is reserved before its scene is loaded, so that concurrent openings of one
+//! name share one load.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -11,16 +12,19 @@ use super::ledger::Origin;
 use super::not_open;
 use modalcast_model::error::{Error, Result};
 
-/// A claimed name, and its scene once that is loaded.
+/// A reserved name, and its scene once the scene is loaded.
 pub(super) struct Seat {
     origin: Origin,
     cell: OnceCell<Arc<Host>>,
-    /// How many openings sit here; changed under the registry's lock only.
+    /// Number of concurrent openings; modified only under the registry's lock.
     openings: AtomicUsize,
 }
 
 impl Seat {
-    /// The scene, loaded by the first who asks; the others wait, and the next of them tries anew if that fails.
+    /// The scene, loaded by the first caller. The other callers wait; if the load fails, the next caller retries it.
+    ///
+    /// # Errors
+    /// The error of `load`; `Busy` when the scene is being closed.
     pub(super) async fn open<F>(&self, load: impl FnOnce() -> F) -> Result<Arc<Host>>
     where
         F: Future<Output = Result<Arc<Host>>>,
@@ -32,13 +36,13 @@ impl Seat {
         }
     }
 
-    /// The scene, if it is loaded.
+    /// The scene; `None` while it is not loaded.
     pub(super) fn host(&self) -> Option<&Arc<Host>> {
         self.cell.get()
     }
 }
 
-/// All claimed names.
+/// All reserved names.
 pub(super) struct Registry {
     limit: usize,
     seats: Mutex<BTreeMap<String, Arc<Seat>>>,
@@ -49,8 +53,11 @@ impl Registry {
         Self { limit, seats: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Claims a name, or joins whoever claimed it for the same source, until [`Self::leave`]. A `fresh` claim joins
-    /// nobody.
+    /// Reserves a name until [`Self::leave`], or joins an existing reservation with the same origin. With `fresh` the
+    /// name must be free.
+    ///
+    /// # Errors
+    /// `Taken` when the name is reserved for another origin, `Busy` when too many scenes are open.
     pub(super) fn seat(&self, name: &str, origin: &Origin, fresh: bool) -> Result<Arc<Seat>> {
         let mut seats = self.lock();
         if let Some(seat) = seats.get(name) {
@@ -88,7 +95,7 @@ impl Registry {
         self.lock().values().filter_map(|seat| seat.host().cloned()).filter(|host| !host.is_closing()).collect()
     }
 
-    /// Ends an opening. The last one gives the name back if none has brought a scene.
+    /// Ends an opening. The last one releases the name if no scene was loaded.
     pub(super) fn leave(&self, name: &str, seat: &Arc<Seat>) {
         let mut seats = self.lock();
         let is_last = seat.openings.fetch_sub(1, Ordering::Relaxed) == 1;
@@ -97,7 +104,7 @@ impl Registry {
         }
     }
 
-    /// Gives the name of a closed scene back, unless somebody else has claimed it since.
+    /// Releases the name of a closed scene unless another opening has reserved it since.
     pub(super) fn remove(&self, name: &str, seat: &Arc<Seat>) {
         let mut seats = self.lock();
         if seats.get(name).is_some_and(|held| Arc::ptr_eq(held, seat)) {
@@ -106,7 +113,7 @@ impl Registry {
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Seat>>> {
-        // Every change under the lock is one insertion or removal, so a poisoned lock is still sound.
+        // Every change under the lock is one insertion or removal, so the map behind a poisoned lock is valid.
         self.seats.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,4 +1,5 @@
-//! Shows the scene's current step: to requests whose step is there, and to viewers that have not seen it.
+//! Delivers the scene's current step: to single requests whose step has been reached, and to viewers that have not
+//! received the step yet.
 
 use std::mem;
 use std::sync::Arc;
@@ -13,7 +14,7 @@ use modalcast_model::deform::{Surface, Wanted};
 use modalcast_model::error::{Error, Result};
 
 impl Conductor {
-    /// Answers every request whose step is there or gone; forgets those that nobody waits for.
+    /// Answers every request whose step has been reached or passed; drops requests whose caller no longer waits.
     pub(super) async fn answer_asks(&mut self) {
         for ask in mem::take(&mut self.asks) {
             if ask.reply.is_closed() {
@@ -27,13 +28,14 @@ impl Conductor {
                 }
                 Err(error) => Err(error),
             };
-            ask.reply.send(answer).ok(); // The asker has gone, and its answer goes with it.
+            ask.reply.send(answer).ok(); // Fails only if the caller no longer waits.
         }
     }
 
-    /// Gives the current step to every viewer that has room for it. A lossless viewer without room holds back the
-    /// writer while `holds_back`, and is cut off when it does so for too long. While a next step waits, vertices and a few
-    /// frames are only begun: they are late, and handed over once that step is under way.
+    /// Delivers the current step to every viewer with capacity. While `holds_back` is true, a lossless viewer without
+    /// capacity blocks the writer (back-pressure) and is cut off after `Config::stall`. If another step is queued,
+    /// vertices and at most [`modalcast_render::FRAMES_UNDER_WAY`] frames are only started here; they are delivered
+    /// while that step is computed.
     pub(super) async fn serve_viewers(&mut self, holds_back: bool) {
         let viewers = mem::take(&mut self.viewers);
         let wanted = self.wanted(&viewers);
@@ -44,7 +46,7 @@ impl Conductor {
             if viewer.is_gone() {
                 continue;
             }
-            // Room may have come only now.
+            // The viewer may have gained capacity after `wanted` was computed, so its own attributes are checked again.
             if copied && self.wants(&viewer).is_some_and(|own| wanted.covers(own)) {
                 let skipped = viewer.see(self.count);
                 readers.push((viewer.claim(), skipped));
@@ -63,7 +65,8 @@ impl Conductor {
         self.late.extend(frames);
     }
 
-    /// What a viewer that has room for the current step wants of its vertices.
+    /// The vertex attributes that a viewer requests of the current step; `None` if it has no capacity or has received
+    /// it.
     fn wants(&self, viewer: &Viewer) -> Option<Wanted> {
         match viewer.view {
             View::Vertices(wanted) if viewer.seen < self.count && viewer.has_room() => Some(wanted),
@@ -71,14 +74,15 @@ impl Conductor {
         }
     }
 
-    /// What all of them together want, so that one copy serves them.
+    /// The union of the vertex attributes that all viewers request, so that one copy serves them all.
     fn wanted(&self, viewers: &[Viewer]) -> Wanted {
         let there = viewers.iter().filter(|viewer| !viewer.is_gone());
         there.filter_map(|viewer| self.wants(viewer)).fold(Wanted::default(), Wanted::or)
     }
 
-    /// False when the viewer is to be dropped. `others`: what all viewers want of the vertices; `drawn`: the frames that this
-    /// step was drawn into for viewers before, which are shared.
+    /// Delivers the current step to one viewer and waits for it. Returns false when the viewer is to be dropped.
+    /// `others` are the vertex attributes that all viewers request. `drawn` holds the frames of this step that were
+    /// drawn for earlier viewers; viewers with the same view share them.
     async fn serve(
         &mut self,
         viewer: &mut Viewer,
@@ -88,7 +92,7 @@ impl Conductor {
         if viewer.seen == self.count {
             return true;
         }
-        // Nobody waits for what is late for a viewer that could not take more.
+        // Wait for the viewer's readbacks in flight only if it has capacity for a further result.
         if viewer.has_room() {
             self.settle_for(viewer).await;
             let skipped = viewer.see(self.count);
@@ -116,7 +120,7 @@ impl Conductor {
         is_patient
     }
 
-    /// Draws or copies the current step; a copy is of what others want too.
+    /// Draws, picks or copies the current step. A copy also covers the attributes in `others`.
     async fn show(&mut self, view: &View, skipped: u64, others: Wanted) -> Result<Shown> {
         let mut stages = self.stages.clone();
         let body = match *view {
@@ -143,18 +147,19 @@ impl Conductor {
         Ok(Shown { step: StepName::of(&self.state), skipped, stages, cells: self.state.cells.clone(), body })
     }
 
-    /// What of the current vertices was copied.
+    /// The attributes of the current vertices that are cached in host memory.
     fn there(&self) -> Wanted {
         self.surface.as_ref().map_or(Wanted::default(), |held| held.parts)
     }
 
-    /// What is wanted of the current vertices, copied from the device once per step unless somebody then asks for more.
+    /// The current vertices with at least the wanted attributes, and the copy's duration in milliseconds. They are
+    /// copied from the device once per step unless a later request needs further attributes.
     async fn vertices(&mut self, (wanted, others): (Wanted, Wanted)) -> Result<(Arc<Surface>, f64)> {
         let there = self.there();
         if let Some(held) = self.surface.as_ref().filter(|_| there.covers(wanted)) {
             return Ok((Arc::clone(&held.surface), held.ms));
         }
-        // What was there before comes again, so that readers in turn do not drive each other out.
+        // The cached attributes are copied again, so that alternating readers do not evict each other's attributes.
         let parts = there.or(wanted).or(others);
         let (surface, ms) = self.means.worker.copy(self.id, parts).wait().await?;
         self.surface = Some(Held { surface: Arc::clone(&surface), parts, ms });
@@ -162,8 +167,8 @@ impl Conductor {
     }
 }
 
-/// The stages among the passes of a picture. Its pass "encode" makes bytes of light, and is part of the stage that draws;
-/// the stage of that name comes later.
+/// The passes of a frame that are stages. The renderer's pass "encode" converts linear light to sRGB bytes and is not
+/// [`Stage::Encode`], which is the PNG encoding.
 pub(super) fn known(passes: &[(&'static str, f64)]) -> StageTimes {
     let stage = |name: &str| Stage::named(name).filter(|stage| *stage != Stage::Encode);
     passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
@@ -186,7 +191,7 @@ mod tests {
     use modalcast_model::scene::{Camera, State};
     use modalcast_render::{Image, Paths};
 
-    /// A scene at its first step, and what it asks of the device.
+    /// A scene at its first step, and the receiver of its device commands.
     fn scene(folder: &std::path::Path) -> (Conductor, mpsc::Receiver<Command>) {
         let scene = testing::two_strips();
         let state = Arc::new(State { run: 1, step: 1, ..State::rest(&scene) });
@@ -197,13 +202,13 @@ mod tests {
         (Conductor::new(beginning, means).0, device)
     }
 
-    /// A subscriber of frames of this width.
+    /// A subscriber to frames of this width in pixels.
     fn viewer(delivery: Delivery, width: u32) -> (Viewer, Feed) {
         let camera = Camera::framing(&testing::two_strips(), width, 8);
         Feed::new(View::Frame { camera, width, height: 8, showing: Showing::Colour }, delivery, Arc::default())
     }
 
-    /// The next frame that the device is asked for within a while: its width, and who is answered.
+    /// The next frame that is requested from the device within `ms` milliseconds: its width and its reply channel.
     async fn asked(device: &mut mpsc::Receiver<Command>, ms: u64) -> Option<(u32, Reply<Image>)> {
         match timeout(Duration::from_millis(ms), device.recv()).await.ok()?? {
             Command::Draw { size, reply, .. } => Some((size.0, reply)),
@@ -217,13 +222,14 @@ mod tests {
             .expect("somebody waits");
     }
 
-    /// Shows the second step to a viewer whose frame of the first is late, and then to one that has room: how soon the device
-    /// is asked for what, and the widths and steps that both get.
+    /// Delivers the second step to a viewer whose frame of the first step is in flight, then to a viewer with capacity.
+    /// Returns the width of the frame that is requested before the frame in flight completes, if any, and the widths
+    /// and steps that both viewers receive.
     async fn served(late: Delivery) -> (Option<u32>, Vec<(u32, u64)>) {
         let folder = tempfile::tempdir().expect("a folder");
         let (mut conductor, mut device) = scene(folder.path());
         let ((mut slow, mut slow_feed), (fast, mut fast_feed)) = (viewer(late, 16), viewer(Delivery::Lossless, 24));
-        // It asks, and has what a lossless one has beforehand.
+        // Polling grants a `Latest` feed one credit; a lossless feed has credits from the start.
         timeout(Duration::ZERO, slow_feed.next()).await.expect_err("nothing yet");
         let mut begun = Vec::new();
         assert!(conductor.begin_frame(&mut slow, &mut begun));
@@ -262,7 +268,8 @@ mod tests {
         assert_eq!(served(Delivery::Latest).await, (Some(24), vec![(16, 1), (24, 2)]));
     }
 
-    /// Shows a step to three viewers, two of one view: how often the device draws, and who has got a frame.
+    /// Delivers a step to three viewers, two of which share a view. Returns how many frames the device draws and the
+    /// widths that the viewers receive.
     async fn drawn_for_three(has_next: bool) -> (usize, Vec<u32>) {
         let folder = tempfile::tempdir().expect("a folder");
         let (mut conductor, mut device) = scene(folder.path());

@@ -1,4 +1,4 @@
-//! Where scenes come from: a name or a path becomes a checked scene.
+//! The source of scenes: resolves a name or path to a validated scene.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -7,21 +7,21 @@ use modalcast_model::error::Result;
 use modalcast_model::load::Repository;
 use modalcast_model::scene::Scene;
 
-/// Opens scenes for the engine. Called on threads that may wait for the disk.
+/// Opens scenes for the engine. The engine calls it on threads that may block on the disk.
 pub trait SceneSource: Send + Sync + 'static {
-    /// Opens a built-in name or a path of the server's repository.
+    /// Opens a built-in scene or a path in the server's repository.
     ///
     /// # Errors
-    /// `NotFound`, or `Invalid` with what is wrong with the files or the path.
+    /// `NotFound` when there is no such scene, `Invalid` naming the problem in the path or the files.
     fn open(&self, source: &str) -> Result<Arc<Scene>>;
 
-    /// Opens `entry` of an uploaded folder, or the folder itself when it is empty, without leaving the folder.
+    /// Opens `entry` of an uploaded folder, or the folder itself if `entry` is empty. Reads nothing outside the folder.
     ///
     /// # Errors
     /// As [`Self::open`].
     fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>>;
 
-    /// What [`Self::open`] accepts.
+    /// The sources that [`Self::open`] accepts.
     fn list(&self) -> Vec<String>;
 }
 
@@ -31,7 +31,7 @@ impl SceneSource for Repository {
     }
 
     fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>> {
-        // The dot in front keeps an upload's file from being taken for a built-in name.
+        // With the leading "./" a file name is never resolved as a built-in name.
         Self::new(Some(folder))?.open(&format!("./{entry}"))
     }
 

@@ -1,4 +1,5 @@
-//! One scene on the device thread: its deformer, its OpenGL buffers once they are needed, and the last good state.
+//! A scene loaded on the device thread: its deformer, its OpenGL buffers (created on first use), and the last valid
+//! state.
 
 use std::sync::Arc;
 
@@ -11,24 +12,25 @@ use modalcast_model::raster::{Mesh, Rasteriser};
 use modalcast_model::scene::{Bounds, Camera, LightBounds, Scene, State, nearest_cell};
 use modalcast_render::{Renderer, SceneBuffers, Shot};
 
-/// Positions beyond this (in scene units) are refused like infinite ones: their squares overflow the f32 of shaders.
+/// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
+/// shaders.
 const FARTHEST: f64 = 1e18;
 
-/// Pixels of the frames that are measured to choose what draws.
+/// Size in pixels of the frames that are measured to choose between the rasterizers.
 const MEASURED: [u32; 2] = [1920, 1080];
 
-/// What the buffers hold, in the frame that suits a camera.
+/// Description of the content of the buffers, in the coordinate frame that the camera needs.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Filled {
     bounds: Bounds,
-    /// None in a frame of the camera's own: the deformer measured in others.
+    /// `None` in a camera-relative frame, because the deformer computed them in the frames of the domains' cells.
     light: Option<LightBounds>,
-    /// Whether an upload was needed.
+    /// Whether vertices were uploaded.
     pub(super) uploaded: bool,
 }
 
 impl Filled {
-    /// A frame of it.
+    /// The parameters of a frame of these buffers; the size is in pixels.
     pub(super) const fn shot(&self, camera: Camera, [width, height]: [u32; 2]) -> Shot {
         Shot { camera, width, height, bounds: self.bounds, light: self.light }
     }
@@ -42,18 +44,19 @@ pub struct Staged {
     /// Whether the buffers hold the vertices of the last deformation.
     filled: bool,
     bounds: Bounds,
-    /// Of the same vertices; with a shadow.
+    /// Bounds of the same vertices in light space; only if the scene has a shadow.
     light: Option<LightBounds>,
-    /// What the deformer's output shows.
+    /// The state that the deformer's output shows.
     shown: Arc<State>,
-    /// Counts what was deformed, refused states and their repair too: each is another content of the buffers.
+    /// Number of deformations, including rejected states and the deformations that undo them, since each one changes
+    /// the content of the buffers.
     turn: u64,
-    /// The colour map whose values the buffers hold.
+    /// The color map whose values are in the buffers.
     mapped: Option<(Showing, Legend)>,
 }
 
 impl Staged {
-    /// A scene whose output is to be made by [`Self::rest`] before anything else.
+    /// A scene without output. [`Self::rest`] must be called before any other method.
     pub(super) fn new(scene: &Arc<Scene>, deformer: Box<dyn Deformer>, buffers: Option<SceneBuffers>) -> Self {
         let shown = Arc::new(State::rest(scene));
         Self {
@@ -84,13 +87,13 @@ impl Staged {
         &self.scene
     }
 
-    /// Bounds of the last deformation, each domain relative to its cell; finite.
+    /// Bounds of the last deformation in scene units, each domain relative to its cell. Always finite.
     pub const fn bounds(&self) -> Bounds {
         self.bounds
     }
 
-    /// Deforms a state. A state whose vertices are not finite is refused; the previous one stays and is deformed again,
-    /// so that nobody ever sees the refused one.
+    /// Deforms the scene to a state. If a vertex is not finite or beyond 1e18 units, the state is rejected and the
+    /// previous state is deformed again, so that no reader sees the rejected one.
     ///
     /// # Errors
     /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
@@ -98,13 +101,13 @@ impl Staged {
         self.deform_shared(&Arc::new(state.clone()))
     }
 
-    /// [`Self::deform`] of a state that others hold too, without a copy of it.
+    /// [`Self::deform`] of a shared state, without a copy.
     pub(super) fn deform_shared(&mut self, state: &Arc<State>) -> Result<Deformed> {
         self.filled = false;
         let deformed = match self.run(state) {
             Ok(deformed) => deformed,
             Err(error) => {
-                // The output may be half written. If this fails too, the first error tells more.
+                // The output may be partially written, so restore it. If that fails too, the first error says more.
                 self.run(&Arc::clone(&self.shown)).ok();
                 return Err(error);
             }
@@ -132,13 +135,14 @@ impl Staged {
         self.deformer.surface()
     }
 
-    /// Makes the buffers if need be and brings the last deformation into them, in a frame that suits the camera.
+    /// Creates the buffers on first use and fills them with the last deformation. If the domains have different cells,
+    /// the positions are rebased to the cell nearest the camera.
     pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<Filled> {
         let uploaded = self.fill_shared(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
         let apart = match &self.shown.cells {
             Some(cells) if !cells.is_one() => Arc::clone(cells),
-            // All domains have one origin, so what the deformer wrote is drawn as it is.
+            // All domains share one origin, so the deformer's output is drawn unchanged.
             cells => {
                 buffers.relative_to(cells.as_ref().map_or([0.0; 3], |cells| cells.shared()));
                 buffers.hold_step(self.turn);
@@ -152,18 +156,20 @@ impl Staged {
         Ok(Filled { bounds, light: None, uploaded: true })
     }
 
-    /// Begins to bring what is wanted of the last deformation to host memory, beside what is deformed next.
+    /// Starts copying the wanted attributes of the last deformation to host memory. The copy overlaps with the next
+    /// deformation.
     pub(super) fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
         self.deformer.fetch(wanted)
     }
 
-    /// Waits until all of it is there.
+    /// Waits until the copy is complete.
     pub(super) fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
         self.deformer.fetched(fetch)
     }
 
-    /// Brings the values of a colour map into the buffers, which are filled; tells their legend. A mode's shape never changes
-    /// and is computed once; none for what is no colour map.
+    /// Uploads the values of a color map into the buffers, which must be filled, and returns the legend; `None` if
+    /// `showing` is not a color map. A mode shape does not depend on the state, so it is not recomputed while its
+    /// values are in the buffers.
     pub(super) fn map_values(&mut self, renderer: &mut Renderer, showing: Showing) -> Result<Option<Legend>> {
         let fixed = matches!(showing, Showing::Mode { .. });
         if let Some((_, legend)) = self.mapped.as_ref().filter(|(held, _)| fixed && *held == showing) {
@@ -184,7 +190,8 @@ impl Staged {
         Ok(Some(legend))
     }
 
-    /// Makes the buffers if need be and fills those that the deformer does not write itself.
+    /// Creates the buffers on first use and uploads the vertices unless the deformer writes the buffers itself. Returns
+    /// whether vertices were uploaded.
     fn fill_shared(&mut self, renderer: &mut Renderer) -> Result<bool> {
         let shares = self.deformer.shares_buffers();
         let buffers = match self.buffers.take() {
@@ -200,7 +207,7 @@ impl Staged {
         Ok(true)
     }
 
-    /// Gives the scene's buffers a rasteriser beside OpenGL.
+    /// Adds a compute rasterizer to the scene's buffers, next to OpenGL.
     pub(super) fn draw_beside(
         &mut self,
         renderer: &mut Renderer,
@@ -211,7 +218,8 @@ impl Staged {
         renderer.draw_beside(buffers, make)
     }
 
-    /// Lets the faster of both draw each pass, as frames of this size are drawn of the scene where it is.
+    /// Measures both rasterizers on frames of [`MEASURED`] pixels of the current state and selects the faster one per
+    /// pass.
     pub(super) fn choose_paths(&mut self, renderer: &mut Renderer) -> Result<()> {
         let camera = Camera::framing(&self.scene, MEASURED[0], MEASURED[1]);
         let filled = self.fill_buffers(renderer, &camera)?;
@@ -223,19 +231,19 @@ impl Staged {
         self.buffers.as_ref().ok_or_else(no_buffers)
     }
 
-    /// Drops the deformer first: it may have the buffers mapped.
+    /// Drops the deformer first, because it may have the buffers registered with CUDA.
     pub(super) fn into_buffers(self) -> Option<SceneBuffers> {
         drop(self.deformer);
         self.buffers
     }
 
-    /// Names the first domain with a vertex out of range.
+    /// The error that names the domain of the first vertex out of range.
     fn overflow(&mut self, state: &State) -> Result<Error> {
         let scene = Arc::clone(&self.scene);
         let surface = self.deformer.read(Wanted { positions: true, displacements: true, ..Wanted::default() })?;
         let is_far = |number: &f32| number.is_nan() || f64::from(*number).abs() > FARTHEST;
         let far = surface.positions.iter().position(is_far);
-        // A position may be in range whose displacement is not.
+        // A displacement may be out of range although its position is not.
         let at = far.or_else(|| surface.displacements.iter().position(|number| !number.is_finite())).unwrap_or(0);
         let domain = scene.layout.slots.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
         let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));

@@ -1,16 +1,16 @@
-//! Scenes for the unit tests of this module.
+//! Test scenes for the unit tests of the engine.
 
 use std::sync::Arc;
 
 use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast_model::scene::{Deformation, Parts, Scene};
 
-/// Two strips of two triangles with two modes each; the second hangs on the first.
+/// Two strips of two triangles with two modes each; the second is attached to the first.
 pub(super) fn two_strips() -> Arc<Scene> {
     strips(Deformation::default())
 }
 
-/// The same, with displacements and boxes for readers.
+/// The same scene with displacements and boxes enabled.
 pub(super) fn kept_strips() -> Arc<Scene> {
     strips(Deformation { displacements: true, boxes: true, ..Deformation::default() })
 }

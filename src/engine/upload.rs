@@ -1,5 +1,5 @@
-//! Uploaded files on their way to disk: paths stay inside a fresh folder, sizes and SHA-256 are those declared. A folder
-//! that is not finished disappears with its [`Upload`].
+//! Writes uploaded files to disk. Paths cannot leave a new temporary folder; sizes and SHA-256 hashes are checked
+//! against the declared ones. Dropping an unfinished [`Upload`] removes its folder.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -12,36 +12,37 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use modalcast_model::error::{Result, during, invalid};
 
-/// The longest path, in bytes, and its most folders.
+/// Limits of a path: its length in bytes and its number of components, the file name included.
 const LONGEST_PATH: usize = 240;
 const DEEPEST: usize = 16;
 
 static COUNTER: AtomicU64 = AtomicU64::new(0);
 
-/// What a client says it will send.
+/// The header of an upload: what the client is going to send.
 #[derive(Debug, Clone, Default)]
 pub struct Announcement {
     /// The name to open the scene under.
     pub scene: String,
-    /// Which of the paths to open; empty: the folder.
+    /// The uploaded path to open; empty means the folder.
     pub entry: String,
     pub files: u32,
     pub total_bytes: u64,
 }
 
-/// One upload under way. Its functions wait for the disk.
+/// An upload in progress. Its methods block on the disk.
 #[derive(Debug)]
 pub struct Upload {
     pub(super) announced: Announcement,
     folder: PathBuf,
     paths: BTreeSet<String>,
-    /// Bytes announced by the files so far.
+    /// Sum of the declared sizes of the files so far, in bytes.
     claimed: u64,
     open: Option<Open>,
-    /// Its place among the uploads under way.
+    /// Permit that counts against the limit on concurrent uploads.
     _place: OwnedSemaphorePermit,
 }
 
+/// The file that is being received.
 #[derive(Debug)]
 struct Open {
     path: String,
@@ -53,7 +54,10 @@ struct Open {
 }
 
 impl Upload {
-    /// A fresh folder beside the finished uploads.
+    /// Creates a temporary folder next to the finished uploads.
+    ///
+    /// # Errors
+    /// `Invalid` for a malformed entry path, `Fault` of the disk.
     pub(super) fn begin(uploads: &Path, announced: Announcement, place: OwnedSemaphorePermit) -> Result<Self> {
         if !announced.entry.is_empty() {
             checked_path("header.entry", &announced.entry)?;
@@ -64,11 +68,11 @@ impl Upload {
         Ok(Self { announced, folder, paths: BTreeSet::new(), claimed: 0, open: None, _place: place })
     }
 
-    /// Begins the next file.
+    /// Begins the next file. `bytes` is its size; `sha256` must have 32 bytes.
     ///
     /// # Errors
-    /// `Invalid` for a path that leaves the folder or comes twice, for more files or bytes than announced, for a hash
-    /// that is none, and when the file before it is not whole; `Fault` of the disk.
+    /// `Invalid` for a path that leaves the folder or was sent before, for more files or bytes than the header
+    /// declares, for a malformed hash, and when the previous file is incomplete; `Fault` of the disk.
     pub fn file(&mut self, path: &str, bytes: u64, sha256: &[u8]) -> Result<()> {
         self.check_whole()?;
         checked_path("file.path", path)?;
@@ -100,10 +104,11 @@ impl Upload {
         self.finish_file()
     }
 
-    /// The next bytes of the file begun last.
+    /// Appends bytes to the current file.
     ///
     /// # Errors
-    /// `Invalid` when they are more than announced or the finished file's hash differs; `Fault` of the disk.
+    /// `Invalid` when the bytes exceed the declared size or the complete file has a different hash; `Fault` of the
+    /// disk.
     pub fn chunk(&mut self, bytes: &[u8]) -> Result<()> {
         let count = bytes.len() as u64;
         let Some(open) = self.open.as_mut().filter(|open| count <= open.left) else {
@@ -116,10 +121,10 @@ impl Upload {
         self.finish_file()
     }
 
-    /// Checks that everything announced is there.
+    /// Checks that all declared files and bytes have arrived.
     ///
     /// # Errors
-    /// `Invalid` naming what is missing.
+    /// `Invalid` naming the header field or file that does not match.
     pub(super) fn finish(&mut self) -> Result<()> {
         self.check_whole()?;
         if self.paths.len() != self.announced.files as usize {
@@ -131,7 +136,7 @@ impl Upload {
         Ok(())
     }
 
-    /// Moves the folder to its place, over whatever an earlier upload of that name left there.
+    /// Moves the folder to `place` and replaces an earlier upload of that name.
     pub(super) fn settle(mut self, place: &Path) -> Result<()> {
         if place.exists() {
             fs::remove_dir_all(place).map_err(during("upload"))?;
@@ -164,12 +169,12 @@ impl Upload {
 impl Drop for Upload {
     fn drop(&mut self) {
         if !self.folder.as_os_str().is_empty() {
-            fs::remove_dir_all(&self.folder).ok(); // What stays is removed at the next start.
+            fs::remove_dir_all(&self.folder).ok(); // The next start removes leftovers.
         }
     }
 }
 
-/// Relative, forward slashes, every part a plain name.
+/// Checks that a path is relative, uses forward slashes and consists of plain names.
 fn checked_path(field: &str, path: &str) -> Result<()> {
     let is_plain = |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0', ':']);
     let parts = path.split('/').count();
@@ -233,7 +238,7 @@ mod tests {
     fn a_fault_of_the_disk_is_not_the_clients() {
         let folder = tempfile::tempdir().expect("a folder");
         let mut upload = begin(folder.path(), 1, 0);
-        // A link to itself can be made into nothing, whoever tries.
+        // No user, root included, can create a folder below a symbolic link that points to itself.
         fs::remove_dir(&upload.folder).expect("is there");
         std::os::unix::fs::symlink(&upload.folder, &upload.folder).expect("linked");
         assert!(matches!(upload.file("a/b", 0, &sha(b"")), Err(Error::Fault { .. })));

@@ -1,4 +1,4 @@
-//! A number per vertex for colour maps: how far a step has moved it, or one mode's shape.
+//! Per-vertex values for color maps: the displacement in a step, or the shape of one mode.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -9,10 +9,11 @@ use modalcast_model::deform::Surface;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, State};
 
-/// The least end of a fitted scale of displacements, in diagonals of the scene: below it they may be rounding.
+/// Lower bound of a fitted displacement scale, as a fraction of the scene's diagonal. Smaller displacements may be
+/// rounding errors.
 const LEAST: f64 = 1e-5;
 
-/// The mode of a scene, when one of its domains has it.
+/// Returns `mode` if at least one domain of the scene has a mode with this index.
 ///
 /// # Errors
 /// `Invalid` when every domain has fewer modes.
@@ -24,10 +25,11 @@ pub fn checked_mode(scene: &Scene, mode: u32) -> Result<u32> {
     }
 }
 
-/// |u| of every vertex in metres: the distance of its deformed position from T x0, which is the point of the rigid body.
+/// |u| of every vertex in meters: the distance of its deformed position from T x0, its position in the rigid domain.
 ///
-/// It is as wrong as the deformer's positions are, and no more than that: T x0 and the difference are computed in f64. Those
-/// positions are f32 relative to the domain's cell, so that a domain a kilometre away from it is off by up to 0.1 mm.
+/// The error is that of the deformer's positions, because T x0 and the difference are computed in f64. The positions
+/// are f32 relative to the domain's cell, so a vertex one kilometer from the cell's origin has an error of up to 0.1
+/// mm.
 pub(super) fn displacements(scene: &Scene, state: &State, surface: &Surface) -> Vec<f32> {
     let domains = scene.domains.par_iter().zip(&scene.layout.slots).enumerate();
     let of_domain = domains.flat_map_iter(|(index, (domain, slot))| {
@@ -44,8 +46,8 @@ pub(super) fn displacements(scene: &Scene, state: &State, surface: &Surface) -> 
     of_domain.collect()
 }
 
-/// The length of every vertex's three entries of one column of U, times the scene's unit: metres that it moves per unit of
-/// its coordinate, before T. Zero in domains that do not have the mode.
+/// The norm of every vertex's three entries of one column of U, times the scene's unit: the displacement in meters per
+/// unit of the coordinate, before T. Zero in domains without the mode.
 pub(super) fn mode_shape(scene: &Scene, mode: usize) -> Vec<f32> {
     let of_domain = scene.domains.par_iter().zip(&scene.layout.slots).flat_map_iter(|(domain, slot)| {
         let modes = &scene.shapes[domain.shape].modes;
@@ -57,7 +59,8 @@ pub(super) fn mode_shape(scene: &Scene, mode: usize) -> Vec<f32> {
     of_domain.collect()
 }
 
-/// The legend of a colour map of these values: `Showing` names the end of the scale, or it is fitted to the largest value.
+/// The legend of a color map of these values. The end of the scale is that of `showing`, or is fitted to the largest
+/// value if that is 0.
 pub(super) fn legend(scene: &Scene, showing: Showing, values: &[f32]) -> Legend {
     let most = f64::from(values.iter().copied().fold(0.0, f32::max));
     let (title, asked, least) = match showing {

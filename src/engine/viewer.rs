@@ -1,5 +1,6 @@
-//! One subscriber of a scene: its side in the scene ([`Viewer`]) and its side in the reply stream ([`Feed`]). A feed
-//! holds at most two pictures; `latest` ones are made only when the feed asks for them.
+//! A subscription to a scene: the scene's end ([`Viewer`]) and the reply stream's end ([`Feed`]) of a bounded channel
+//! with credit-based flow control. A feed buffers at most two results. With [`Delivery::Latest`] a result is produced
+//! only when the feed is polled.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -16,19 +17,20 @@ use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::{Camera, Cells, Rectangle, State};
 use modalcast_render::Survey;
 
-/// How many pictures a lossless subscriber may be behind before it holds back the writer.
+/// Results that a lossless subscriber may leave unread before it blocks the writer.
 const AHEAD: usize = 2;
 
-/// Which steps a subscriber gets.
+/// Which steps a subscriber receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// Every step from the next one on, in order; being slow holds back a lossless writer.
+    /// Every step from the next one on, in order. A slow subscriber blocks a lossless writer; under a `Latest` writer
+    /// it skips steps.
     Lossless,
-    /// The newest step, beginning with the current one if there was any.
+    /// The newest step, starting with the current one if the scene has had a step.
     Latest,
 }
 
-/// What a subscriber wants to see of a step.
+/// The result that a subscriber requests of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum View {
     Frame {
@@ -38,7 +40,7 @@ pub enum View {
         showing: Showing,
     },
     Vertices(Wanted),
-    /// What a small rectangle of a picture of this size shows.
+    /// The surface points at the pixels of a rectangle in a picture of this size in pixels.
     Pick {
         camera: Camera,
         picture: [u32; 2],
@@ -46,7 +48,7 @@ pub enum View {
     },
 }
 
-/// What of a step a frame shows.
+/// The quantity that a frame shows.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Showing {
     #[default]
@@ -55,21 +57,21 @@ pub enum Showing {
     Depth,
     Domains,
     Normals,
-    /// |u| as a colour map; `largest` metres at its bright end, or 0 for a scale that is fitted to each frame.
+    /// |u| as a color map. `largest` is the value at its bright end in meters; 0 fits the scale to each frame.
     Displacement {
         largest: f64,
     },
-    /// One column of U as a colour map, in metres per unit of its coordinate; `largest` as above.
+    /// One column of U as a color map, in meters per unit of its coordinate; `largest` as above.
     Mode {
         mode: u32,
         largest: f64,
     },
 }
 
-/// A step by name: numbers belong to one run of one writer.
+/// Identifies a step. Step numbers are unique within one run; each writer starts a new run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepName {
-    /// 0 before the first step of all.
+    /// 0 before the scene's first step.
     pub run: u64,
     pub number: u64,
     /// Simulation time in seconds.
@@ -82,52 +84,52 @@ impl StepName {
     }
 }
 
-/// What a step looks like.
+/// The content of a result.
 #[derive(Debug, Clone)]
 pub enum Body {
     Frame(Arc<ColorFrame>),
     Vertices(Arc<Surface>),
-    /// Numbers in place of colours; a colour map of them when there is a legend.
+    /// Values instead of colors; to be shown as a color map if a legend is present.
     Survey(Survey, Option<Legend>),
     Picked(Vec<Picked>),
 }
 
-/// A view of one step.
+/// The result of one view of one step.
 #[derive(Debug, Clone)]
 pub struct Shown {
     pub step: StepName,
-    /// Steps passed over since this subscriber's last one.
+    /// Steps that this subscriber skipped since its last result.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// What vertices are relative to, when that is not the scene's origin for all.
+    /// The cells that the vertices are relative to; `None` if all are relative to the scene's origin.
     pub cells: Option<Arc<Cells>>,
     pub body: Body,
 }
 
-/// Why a feed ends, and whether even a reply under way is broken off.
+/// Why a feed ends. `now` aborts a reply that is being sent.
 #[derive(Debug, Clone)]
 struct End {
     error: Error,
     now: bool,
 }
 
-/// The scene's side.
+/// The scene's end of a subscription.
 #[derive(Debug)]
 pub(super) struct Viewer {
     pub view: View,
     pub delivery: Delivery,
-    /// How many steps the scene had counted at this viewer's last one.
+    /// The scene's step count at this viewer's last result.
     pub seen: u64,
-    /// Since when it holds back the writer.
+    /// When this viewer began to block the writer.
     pub stalled: Option<Instant>,
     credits: Arc<AtomicUsize>,
     items: mpsc::Sender<Result<Shown>>,
-    /// Whether it was given a refusal.
+    /// Whether it has received an error, which ends the feed.
     over: Arc<AtomicBool>,
     end: watch::Sender<Option<End>>,
 }
 
-/// A viewer's room for one picture.
+/// A permit to send one result to a viewer; it consumes one credit.
 #[derive(Debug)]
 pub(super) struct Claim {
     items: mpsc::Sender<Result<Shown>>,
@@ -135,34 +137,34 @@ pub(super) struct Claim {
 }
 
 impl Claim {
-    /// Hands over a picture; a refusal ends the feed. False when the viewer is to be dropped.
+    /// Sends a result; an error ends the feed. Returns false when the viewer is to be dropped.
     pub(super) fn deliver(self, shown: Result<Shown>) -> bool {
         let lives = shown.is_ok();
         if !lives {
             self.over.store(true, Ordering::Release);
         }
-        // There is room for every credit, so this fails only when the other side has gone, or was refused before.
+        // The channel has capacity for every credit, so this fails only if the feed was dropped or received an error.
         self.items.try_send(shown).is_ok() && lives
     }
 
-    /// Whether it is this viewer's.
+    /// Whether the permit belongs to this viewer.
     pub(super) fn is_of(&self, viewer: &Viewer) -> bool {
         self.items.same_channel(&viewer.items)
     }
 }
 
 impl Viewer {
-    /// Whether it can take a picture now.
+    /// Whether the viewer has a credit for a further result.
     pub(super) fn has_room(&self) -> bool {
         self.credits.load(Ordering::Acquire) > 0
     }
 
-    /// Whether the other side has gone, or was told why it gets no more.
+    /// Whether the feed was dropped or has received a final error.
     pub(super) fn is_gone(&self) -> bool {
         self.items.is_closed() || self.over.load(Ordering::Acquire)
     }
 
-    /// Notes that it gets the newest of `count` steps; how many it has missed.
+    /// Records that the viewer receives step number `count` of the scene. Returns how many steps it skipped.
     pub(super) fn see(&mut self, count: u64) -> u64 {
         let skipped = count - self.seen - 1;
         self.seen = count;
@@ -170,24 +172,24 @@ impl Viewer {
         skipped
     }
 
-    /// Takes the room for one picture, which comes now or later.
+    /// Consumes one credit for a result that is sent now or later.
     pub(super) fn claim(&self) -> Claim {
         self.credits.fetch_sub(1, Ordering::AcqRel);
         Claim { items: self.items.clone(), over: Arc::clone(&self.over) }
     }
 
-    /// Ends the feed after what it holds.
+    /// Ends the feed after its buffered results.
     pub(super) fn end(&self, error: Error) {
         self.end.send_replace(Some(End { error, now: false }));
     }
 
-    /// Ends the feed at once.
+    /// Ends the feed immediately; see [`Feed::cut_off`].
     pub(super) fn cut_off(&self, error: Error) {
         self.end.send_replace(Some(End { error, now: true }));
     }
 }
 
-/// The reply stream's side.
+/// The reply stream's end of a subscription.
 #[derive(Debug)]
 pub struct Feed {
     delivery: Delivery,
@@ -199,7 +201,7 @@ pub struct Feed {
 }
 
 impl Feed {
-    /// Both sides of a subscription; `scene` is woken when the feed wants more.
+    /// Creates both ends of a subscription. `scene` is notified whenever the feed grants a credit.
     pub(super) fn new(view: View, delivery: Delivery, scene: Arc<Notify>) -> (Viewer, Self) {
         let ahead = if delivery == Delivery::Lossless { AHEAD } else { 0 };
         let credits = Arc::new(AtomicUsize::new(ahead));
@@ -210,15 +212,15 @@ impl Feed {
         (viewer, Self { delivery, asked: false, credits, items: inbox, end: ended, scene })
     }
 
-    /// Which steps it gets.
+    /// Which steps the feed receives.
     pub(super) const fn delivery(&self) -> Delivery {
         self.delivery
     }
 
-    /// The next picture. Safe to drop while it waits.
+    /// The next result. Cancel-safe.
     ///
     /// # Errors
-    /// Why the feed has ended.
+    /// The reason for which the feed has ended.
     pub async fn next(&mut self) -> Result<Shown> {
         if self.delivery == Delivery::Latest && !self.asked {
             self.asked = true;
@@ -238,7 +240,7 @@ impl Feed {
         let is_cut = |end: &Option<End>| end.as_ref().is_some_and(|end| end.now);
         match end.wait_for(is_cut).await.map(|end| end.clone()) {
             Ok(Some(end)) => end.error,
-            // The scene has ended without a cut: what the feed holds may still be read.
+            // The scene has ended without a cut-off, so buffered results may still be read.
             _ => std::future::pending().await,
         }
     }
@@ -256,7 +258,7 @@ impl Feed {
 
 impl Drop for Feed {
     fn drop(&mut self) {
-        // The scene may be waiting for this very feed.
+        // This feed may be the one that blocks the scene's writer.
         self.items.close();
         self.scene.notify_one();
     }

@@ -1,4 +1,4 @@
-//! The tools of the device thread: a backend that deforms and, where there is one, a renderer. Scenes become [`Staged`].
+//! Device context: owns the deformation backend and the optional renderer, and loads scenes onto both ([`Staged`]).
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,46 +17,48 @@ use modalcast_model::raster::{Mesh, Rasteriser};
 use modalcast_model::scene::{Camera, Rastering, Rectangle, Scene};
 use modalcast_render::{Field, Hit, Image, Pick, Pixels, Prefer, Renderer, SceneBuffers, Survey, Ticket};
 
-/// What deforms and what draws, for people to read.
+/// Description of the deformation backend and the renderer in use.
 #[derive(Debug, Clone)]
 pub struct Info {
     pub backend: Backend,
-    /// The CUDA device's name, or the reason why there is none.
+    /// The name of the CUDA device, or the reason why none is in use.
     pub device: String,
-    /// What draws, or why nothing does.
+    /// The renderer, or the reason why there is none.
     pub renderer: Result<modalcast_render::Info>,
 }
 
-/// A frame under way.
+/// A frame in flight.
 #[derive(Debug)]
 pub struct Drawing {
     ticket: Ticket,
-    /// Milliseconds of bringing its vertices to the renderer, if they had to be.
+    /// Milliseconds spent on uploading vertices to the renderer; `None` if no upload was needed.
     upload_ms: Option<f64>,
 }
 
 impl Drawing {
-    /// Whether [`Workbench::finish_draw`] would not wait, after waiting for it at most so long.
+    /// Waits for at most `limit`; returns whether [`Workbench::finish_draw`] would now return without waiting.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
         self.ticket.is_ready_within(limit)
     }
 }
 
-/// Owns the device and the renderer. Lives on one thread; the command line's `render` uses it directly.
+/// Owns the CUDA device and the renderer. Must remain on the thread that created it: the device thread of the server,
+/// or the main thread of `modalcast render`.
 #[derive(Debug)]
 pub struct Workbench {
-    // Scenes are put away by `unstage` before either is dropped; OpenGL goes before the CUDA context that it maps.
+    // Field order is drop order: the OpenGL context is dropped before the CUDA context that maps its buffers. Scenes
+    // must be freed by `unstage` before either is dropped.
     renderer: Result<Renderer>,
     device: Option<Arc<gpu::Device>>,
     info: Info,
 }
 
 impl Workbench {
-    /// Opens what the settings ask for and the machine has.
+    /// Opens the configured backend and renderer.
     ///
     /// # Errors
-    /// `Unavailable` when CUDA is asked for by name and is not there. A missing renderer is no error until a frame is
-    /// asked for.
+    /// `Unavailable` when CUDA is requested by name and cannot be opened. A missing renderer is an error only once a
+    /// frame is requested.
     pub fn open(config: &Config) -> Result<Self> {
         let (backend, device, note) = open_backend(config)?;
         let renderer = open_renderer(config, device.is_some());
@@ -73,20 +75,21 @@ impl Workbench {
         self.info.backend
     }
 
-    /// What deforms and what draws.
+    /// The backend and the renderer.
     pub const fn info(&self) -> &Info {
         &self.info
     }
 
-    /// What the last frame really ran; none without a renderer.
+    /// Statistics of the passes that the last frame executed; `None` without a renderer.
     pub fn ran(&self) -> Option<&modalcast_render::Ran> {
         self.renderer.as_ref().ok().map(Renderer::ran)
     }
 
-    /// Prepares a scene and deforms it at rest. OpenGL buffers are made now only when the deformer writes into them.
+    /// Loads a scene and deforms it to the rest state. Creates OpenGL buffers here only if the deformer or a CUDA
+    /// rasterizer uses them; otherwise the first frame creates them.
     ///
     /// # Errors
-    /// `Fault` when the device refuses; `Invalid` when the rest state itself overflows.
+    /// `Fault` of the device; `Invalid` when the rest state overflows.
     pub fn stage(&mut self, scene: &Arc<Scene>) -> Result<Staged> {
         let mut buffers = None;
         let deformer: Box<dyn Deformer> = match (self.device.clone(), self.info.backend) {
@@ -115,11 +118,12 @@ impl Workbench {
         }
     }
 
-    /// Gives a scene whose look asks for it a rasteriser in CUDA, and lets the faster of both draw each pass where it asks for
-    /// that. Where there can be none, OpenGL draws and the log says why.
+    /// Creates the compute (CUDA) rasterizer of a scene if its look requests one, and, for [`Rastering::Fastest`],
+    /// measures both rasterizers and selects the faster one per pass. If the compute rasterizer cannot be created,
+    /// OpenGL draws and the reason is logged.
     ///
     /// # Errors
-    /// Those of drawing the frames that are measured.
+    /// The errors of drawing the measured frames.
     fn draw_beside(&mut self, staged: &mut Staged) -> Result<()> {
         let scene = Arc::clone(staged.scene());
         let (wanted, Some(device), Ok(renderer)) = (scene.look.raster, &self.device, &mut self.renderer) else {
@@ -136,25 +140,27 @@ impl Workbench {
         if wanted == Rastering::Fastest { staged.choose_paths(renderer) } else { Ok(()) }
     }
 
-    /// Frees what a staged scene holds.
+    /// Frees a loaded scene.
     pub fn unstage(&mut self, staged: Staged) {
         let buffers = staged.into_buffers();
         self.unload(buffers);
     }
 
-    /// Draws the vertices of the last deformation. The image's passes name "upload" too when there was one.
+    /// Draws the vertices of the last deformation; `width` and `height` are in pixels. The image's passes include
+    /// "upload" if the vertices had to be uploaded.
     ///
     /// # Errors
-    /// `Unavailable` without a renderer, `Invalid` for a camera or size that makes no sense, `Fault` of OpenGL.
+    /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
     pub fn draw(&mut self, staged: &mut Staged, camera: &Camera, width: u32, height: u32) -> Result<Image> {
         let drawing = self.begin_draw(staged, camera, width, height)?;
         self.finish_draw(drawing).map(Pixels::into_image)
     }
 
-    /// Begins to draw the vertices of the last deformation, without waiting for the device; another may be deformed then.
+    /// Submits a frame of the last deformation without waiting for the device. The scene may be deformed again while
+    /// the frame is in flight.
     ///
     /// # Errors
-    /// As [`Self::draw`]; `Busy` when too many are under way.
+    /// As [`Self::draw`]; `Busy` when every ring slot is in flight.
     pub fn begin_draw(&mut self, staged: &mut Staged, camera: &Camera, width: u32, height: u32) -> Result<Drawing> {
         let camera = camera.checked()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
@@ -165,7 +171,7 @@ impl Workbench {
         Ok(Drawing { ticket: renderer.submit(staged.buffers()?, &shot)?, upload_ms })
     }
 
-    /// Waits for a frame; any thread may then take its pixels.
+    /// Waits for a frame. Any thread may then copy its pixels.
     ///
     /// # Errors
     /// `Fault` when the device does not finish.
@@ -178,8 +184,8 @@ impl Workbench {
         })
     }
 
-    /// Numbers in place of colours, and the legend when they are to be a colour map. For what shows colour, use
-    /// [`Self::draw`].
+    /// Renders an AOV: depth, domains, normals or the values of a color map, and the legend of a color map. `size` is
+    /// in pixels. For color frames use [`Self::draw`].
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -204,7 +210,7 @@ impl Workbench {
         Ok((survey, legend))
     }
 
-    /// Begins to pick in a rectangle of a picture of this size, without waiting for the device.
+    /// Submits a pick in a rectangle of a picture of `size` pixels without waiting for the device.
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -221,7 +227,7 @@ impl Workbench {
         renderer.begin_pick(staged.buffers()?, &shot, rectangle)
     }
 
-    /// Waits for a pick; the hits, row by row.
+    /// Waits for a pick; returns the hits row by row.
     ///
     /// # Errors
     /// `Fault` when the device does not finish.
@@ -229,7 +235,7 @@ impl Workbench {
         self.renderer.as_mut().map_err(|error| error.clone())?.finish_pick(pick)
     }
 
-    /// Buffers that CUDA may map: only when the renderer is that very device.
+    /// Buffers that CUDA can map; `None` unless the renderer runs on a CUDA device.
     fn shareable_buffers(&mut self, scene: &Arc<Scene>) -> Result<Option<SceneBuffers>> {
         match &mut self.renderer {
             Ok(renderer) if renderer.info().cuda_device.is_some() => renderer.load(scene).map(Some),
@@ -258,7 +264,7 @@ fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, S
     }
 }
 
-/// A device that deforms: one without a compiler for its kernels does not count.
+/// Opens the CUDA device; fails if no NVRTC version fits it, since it could not compile the kernels.
 fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
     let device = gpu::Device::open(config.cuda_device)?;
     device.check_compiler()?;
@@ -277,7 +283,7 @@ fn open_renderer(config: &Config, cuda: bool) -> Result<Renderer> {
         RendererChoice::Software => Renderer::open(Prefer::Software),
         RendererChoice::Auto if cuda => {
             let ordinal = i32::try_from(config.cuda_device).unwrap_or(i32::MAX);
-            // A driver without its EGL half still deforms; frames then come from whatever else draws.
+            // A driver without EGL can still deform; another renderer then draws the frames.
             Renderer::open(Prefer::Cuda(ordinal)).or_else(|_| Renderer::open(Prefer::Any))
         }
         RendererChoice::Auto => Renderer::open(Prefer::Any),

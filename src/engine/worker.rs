@@ -1,6 +1,6 @@
-//! The device thread: takes commands (`command`) from a bounded queue, owns the workbench and every staged scene (`desk`),
-//! answers each command once. Vertices, picks and frames are answered late: they leave the device while commands after
-//! theirs are obeyed.
+//! Handle to the device thread, which receives commands (`command`) from a bounded queue, owns the device context and
+//! every loaded scene (`desk`), and answers each command at most once. Vertices, picks and frames are answered
+//! asynchronously: their readback overlaps with the commands after them.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::{Camera, Rectangle, Scene, State};
 use modalcast_render::{FRAMES_UNDER_WAY, Hit, Image, Survey};
 
-/// The way to the device thread. The thread ends when the last one of these is gone.
+/// Sends commands to the device thread. The thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
 pub(super) struct Worker {
     commands: mpsc::Sender<Command>,
@@ -27,9 +27,12 @@ pub(super) struct Worker {
 
 impl Worker {
     /// Starts the thread and waits until it has opened its devices.
+    ///
+    /// # Errors
+    /// `Unavailable` when the requested backend cannot be opened, `Fault` when a thread cannot be started.
     pub(super) async fn start(config: &Arc<Config>) -> Result<(Self, Info, std::thread::JoinHandle<()>)> {
-        // Each scene has at most a few frames, a copy and the step after them under way, and each opening one more; so
-        // nobody is turned away by a full queue unless scenes are opened faster than the limit of open scenes allows.
+        // A scene queues at most FRAMES_UNDER_WAY frames, one copy and the next step, and an opening queues one command
+        // more. The queue is therefore full only when scenes are opened faster than the limit on open scenes allows.
         let limit = (3 + FRAMES_UNDER_WAY) * config.open_scenes + 8;
         let (commands, inbox) = mpsc::channel(limit);
         let (tell, told) = oneshot::channel();
@@ -38,7 +41,7 @@ impl Worker {
             .name("device".into())
             .spawn(move || match Workbench::open(&config).and_then(Desk::new) {
                 Ok(desk) => {
-                    tell.send(Ok(desk.info().clone())).ok(); // The starter has gone; the queue is closed then too.
+                    tell.send(Ok(desk.info().clone())).ok(); // Fails if the caller has gone; the queue is closed then.
                     work(desk, inbox);
                 }
                 Err(error) => {
@@ -50,7 +53,7 @@ impl Worker {
         Ok((Self { commands, limit }, info, thread))
     }
 
-    /// The way to somebody who plays the device, and the commands that he is given.
+    /// A handle for tests that play the device thread, and the receiver of its commands.
     #[cfg(test)]
     pub(super) fn played() -> (Self, mpsc::Receiver<Command>) {
         let (commands, inbox) = mpsc::channel(16);
@@ -62,13 +65,13 @@ impl Worker {
         self.ask(|reply| Command::Stage { id, scene, reply }).await
     }
 
-    /// Begins to deform.
+    /// Starts deforming a scene to a state.
     pub(super) fn deform(&self, id: SceneId, state: &Arc<State>) -> Asked<Deformed> {
         let state = Arc::clone(state);
         self.begin(|reply| Command::Deform { id, state, reply })
     }
 
-    /// Begins to draw what was deformed last, whatever is asked of the scene next.
+    /// Starts drawing the last deformation. Later commands do not affect the frame.
     pub(super) fn begin_draw(&self, id: SceneId, camera: Camera, size: (u32, u32)) -> Asked<Image> {
         self.begin(|reply| Command::Draw { id, camera, size, reply })
     }
@@ -93,19 +96,20 @@ impl Worker {
         self.ask(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
     }
 
-    /// Begins to copy what is wanted of the last deformation, whatever is asked of the scene next.
+    /// Starts copying the wanted attributes of the last deformation. Later commands do not affect the copy.
     pub(super) fn copy(&self, id: SceneId, wanted: Wanted) -> Asked<Copied> {
         self.begin(|reply| Command::Copy { id, wanted, reply })
     }
 
-    /// Waits for room: a scene must never stay on the device because the queue was full.
+    /// Waits for queue capacity, so that a scene never remains on the device because the queue was full.
     pub(super) async fn unstage(&self, id: SceneId) -> Result<()> {
         let (reply, answer) = oneshot::channel();
         self.commands.send(Command::Unstage { id, reply }).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
     }
 
-    /// Ends the thread after the commands before. Waits for room; not to be called where waiting is not allowed.
+    /// Ends the thread after the commands already queued. Blocks until the queue has capacity, so it must not be called
+    /// on a runtime thread.
     pub(super) fn quit(&self) {
         // A closed queue means that the thread has ended.
         self.commands.blocking_send(Command::Quit).ok();
@@ -115,7 +119,7 @@ impl Worker {
         self.begin(make).wait().await
     }
 
-    /// Sends a command whose answer is waited for later.
+    /// Sends a command; the caller awaits the answer later.
     fn begin<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> Asked<T> {
         let (reply, answer) = oneshot::channel();
         Asked(match self.commands.try_send(make(reply)) {
@@ -126,7 +130,7 @@ impl Worker {
     }
 }
 
-/// What the device thread was asked for, in the order in which it was asked.
+/// The pending answer to a command that was sent to the device thread.
 #[derive(Debug)]
 pub(super) struct Asked<T>(Result<oneshot::Receiver<Result<T>>>);
 
@@ -135,7 +139,7 @@ impl<T> Asked<T> {
         self.there().await
     }
 
-    /// The same, safe to drop while it waits; not to be asked again once it has answered.
+    /// As [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
     pub(super) async fn there(&mut self) -> Result<T> {
         match &mut self.0 {
             Ok(answer) => answer.await.map_err(|_| gone())?,
@@ -144,7 +148,7 @@ impl<T> Asked<T> {
     }
 }
 
-/// A dropped reply means that the command panicked or that the thread has ended.
+/// The error for a dropped reply channel: the command panicked or the thread has ended.
 fn gone() -> Error {
     during("device")("the device thread gave no answer")
 }

@@ -1,34 +1,34 @@
-//! The legend of a colour map: a bar with ticks, their numbers and a title, drawn over a picture.
+//! The legend of a color map: a color bar with ticks, labels and a title, composited over a picture.
 
 use std::fmt::Write as _;
 
 use super::map::viridis;
 use modalcast_model::error::{Result, during};
 
-/// What the colours say.
+/// Title and scale of a color map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Legend {
-    /// What is shown, with its unit.
+    /// The quantity and its unit.
     pub title: String,
-    /// The value at the bright end; the dark end is 0.
+    /// The value at the bright end of the scale; the dark end is 0.
     pub largest: f64,
 }
 
-/// The least width and height of a picture that has room for a legend.
+/// The smallest width and height in pixels of a picture that gets a legend.
 const ROOM: [u32; 2] = [240, 160];
-/// The legend's box in units of which a picture of 720 rows has one a pixel.
+/// Width and height of the legend's box in pixels of a picture with 720 rows; scaled for other sizes.
 const WIDTH: f64 = 330.0;
 const HEIGHT: f64 = 84.0;
-/// The bar inside of the box.
+/// The color bar inside the box: left, top, width, height, in the same unit.
 const BAR: (f64, f64, f64, f64) = (26.0, 34.0, 278.0, 16.0);
-/// Colours of the bar between which it is interpolated.
+/// Number of intervals of the color bar's gradient.
 const STOPS: u32 = 64;
 
-/// Draws the legend into the lower left corner of RGBA8 pixels, top row first. A picture smaller than 240 x 160 stays as it
-/// is.
+/// Draws the legend into the lower left corner of RGBA8 pixels, top row first. A picture smaller than 240 x 160 remains
+/// unchanged.
 ///
 /// # Errors
-/// `Fault` when the drawing fails.
+/// `Fault` when the legend cannot be rasterized.
 pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Result<()> {
     if width < ROOM[0] || height < ROOM[1] {
         return Ok(());
@@ -48,7 +48,7 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
         let first = 4 * (row as usize * width as usize + margin as usize);
         let end = first.max(4 * (row as usize + 1) * width as usize).min(first + own.len());
         for (under, over) in rgba[first..end].chunks_exact_mut(4).zip(own.chunks_exact(4)) {
-            // Premultiplied, over what is there.
+            // Premultiplied alpha, "over" operator.
             let left = 255 - u32::from(over[3]);
             (0..3).for_each(|at| under[at] = (u32::from(over[at]) + u32::from(under[at]) * left / 255).min(255) as u8);
         }
@@ -56,14 +56,15 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
     Ok(())
 }
 
-/// The smallest of 1, 2, 2.5 and 5 times a power of ten that is not below a value: a scale that people can read.
+/// Rounds up to 1, 2, 2.5 or 5 times a power of ten, so that the scale has readable ticks. Returns 1 for values that
+/// are not finite and positive.
 pub fn round_up(value: f64) -> f64 {
     if !(value.is_finite() && value > 0.0) {
         return 1.0;
     }
     let decade = 10f64.powi(value.log10().floor() as i32);
     let steps = [1.0, 2.0, 2.5, 5.0, 10.0].map(|step| step * decade);
-    // A hair below, so that 0.2 is not pushed to 0.25 by rounding.
+    // With a relative tolerance, so that rounding errors do not push 0.2 to 0.25.
     steps.into_iter().find(|step| *step >= value * (1.0 - 1e-9)).unwrap_or(10.0 * decade)
 }
 
@@ -92,7 +93,7 @@ fn svg(legend: &Legend) -> String {
     text + "</svg>"
 }
 
-/// Places from 0 to 1 and their labels: three to five equal steps from 0 to the largest value.
+/// Tick positions from 0 to 1 and their labels: three to five equal intervals from 0 to the largest value.
 fn ticks(largest: f64) -> Vec<(f64, String)> {
     let leading = largest / 10f64.powi(largest.log10().floor() as i32);
     let is = |round: f64| (leading - round).abs() < 1e-6;
@@ -108,7 +109,7 @@ fn ticks(largest: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// A number with at most three digits that count.
+/// Formats a number with at most three significant digits.
 fn label(value: f64) -> String {
     if value == 0.0 {
         return "0".into();

@@ -1,9 +1,10 @@
-//! Numbers to colours: viridis, and a picture of numbers as RGBA8 sRGB.
+//! Color mapping: viridis, and the conversion of an AOV of values to RGBA8 sRGB.
 
-/// Viridis of 0 to 1 as encoded sRGB, 0 to 1 a channel. Perceptually uniform and right for the colour-blind.
+/// The viridis color map: maps 0 to 1 to encoded sRGB, 0 to 1 per channel; values outside are clamped. It is
+/// perceptually uniform and suitable for color-blind readers.
 ///
-/// The map is by Smith and van der Walt (matplotlib, 2015); the polynomial of sixth degree is Matt Zucker's fit of it
-/// (shadertoy.com/view/WlfXRN, CC0). Its colours differ from the table's by at most 0.02 a channel.
+/// The map is by Smith and van der Walt (matplotlib, 2015). The polynomial of degree six is Matt Zucker's fit
+/// (shadertoy.com/view/WlfXRN, CC0). Its colors differ from the table by at most 0.02 per channel.
 pub fn viridis(share: f32) -> [f32; 3] {
     const TERMS: [[f32; 3]; 7] = [
         [0.277_727_33, 0.005_407_344_5, 0.334_099_8],
@@ -21,14 +22,15 @@ pub fn viridis(share: f32) -> [f32; 3] {
     })
 }
 
-/// What lies behind a picture of numbers, linear.
+/// Gray level of the background, linear.
 const BEHIND: f32 = 0.87;
-/// The share of the light that does not depend on where a surface faces.
+/// The fraction of the light that does not depend on the orientation of the surface.
 const EVEN: f32 = 0.62;
 
-/// A picture of words as `render` surveys values: per sample the share of the scale (lower 16 bits) and the cosine to the
-/// eye (upper 16 bits), 0 where nothing is. Surfaces that face the eye have exactly viridis's colour; those that turn away
-/// are darker by at most 38 % of the light, so that the shape can be seen. A pixel is the mean of its samples' light.
+/// Converts samples of values from the renderer to RGBA8 sRGB. Each sample is a word with the fraction of the scale
+/// (lower 16 bits) and the cosine of the angle between normal and view direction (upper 16 bits); 0 means background. A
+/// surface that faces the camera has exactly the viridis color. A surface that turns away has up to 38 % less light, so
+/// that the shape is visible. A pixel is the mean of its samples in linear light.
 pub fn paint(words: &[u32], samples: usize) -> Vec<u8> {
     let light = |word: u32| match word {
         0 => [BEHIND; 3],
@@ -46,7 +48,7 @@ pub fn paint(words: &[u32], samples: usize) -> Vec<u8> {
         let [r, g, b] = sum.map(|channel| (255.0 * encoded(channel)).round() as u8);
         [r, g, b, 255]
     };
-    // Neighbours mostly show the same background.
+    // Cache the last pixel, because neighboring pixels mostly show the same background.
     let mut last = (Vec::new(), [0; 4]);
     let mut rgba = Vec::with_capacity(4 * words.len() / samples.max(1));
     for words in words.chunks_exact(samples.max(1)) {

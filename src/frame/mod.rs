@@ -1,4 +1,4 @@
-//! Pixels to bytes, and numbers to colour maps: pure functions, run off the device thread.
+//! Encodes pixels as PNG and values as color maps. Pure functions that run off the device thread.
 
 mod legend;
 mod map;
@@ -8,7 +8,8 @@ pub use map::{paint, viridis};
 
 use modalcast_model::error::Result;
 
-/// RGBA8 pixels of a survey of values (little-endian words, `samples` of them a pixel), with their legend.
+/// Converts an AOV of values to RGBA8 sRGB pixels with a legend. `words` are little-endian u32, `samples` per pixel;
+/// see [`paint`]. `size` is the width and height in pixels.
 ///
 /// # Errors
 /// `Fault` when the legend cannot be drawn.
@@ -19,11 +20,11 @@ pub fn colour_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -
     Ok(rgba)
 }
 
-/// PNG of RGBA8 sRGB pixels, top row first; RGB when every pixel is opaque. Filter Sub with fast compression: on rendered
-/// frames it takes a quarter of the time of adaptive filters, and its files are smaller.
+/// Encodes RGBA8 sRGB pixels, top row first, as PNG; as RGB if every pixel is opaque. Uses filter Sub with fast
+/// compression, which on rendered frames takes a quarter of the time of adaptive filters and yields smaller files.
 ///
 /// # Errors
-/// `Fault` when the encoder refuses.
+/// `Fault` when the encoder fails.
 pub fn png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
     match opaque_rgb(rgba) {
         Some(rgb) => encode_png(width, height, png::ColorType::Rgb, &rgb),
@@ -31,7 +32,7 @@ pub fn png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
     }
 }
 
-/// The pixels without alpha, when every alpha is 255.
+/// The pixels without alpha; `None` unless every alpha is 255.
 fn opaque_rgb(rgba: &[u8]) -> Option<Vec<u8>> {
     let (pixels, _) = rgba.as_chunks::<4>();
     if pixels.iter().fold(u8::MAX, |all, pixel| all & pixel[3]) != u8::MAX {
@@ -51,7 +52,7 @@ fn encode_png(width: u32, height: u32, color: png::ColorType, pixels: &[u8]) -> 
     encoder.set_color(color);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
-    // Sets a filter of its own, so the filter comes second.
+    // `set_compression` also sets a filter, so `set_filter` must come after it.
     encoder.set_compression(png::Compression::Fast);
     encoder.set_filter(png::Filter::Sub);
     let mut writer = encoder.write_header().map_err(&fail)?;

@@ -1,5 +1,5 @@
-//! Wire to values and back: scenes, steps, pictures, stage times. Numbers off the wire are believed only behind the
-//! constructors of `scene`.
+//! Conversions between wire messages and values: scenes, steps, pictures, stage times. Numbers from the wire are
+//! untrusted until a constructor of `scene` has validated them.
 
 use modalcast_proto::v1;
 
@@ -11,10 +11,10 @@ use modalcast_model::scene::{Camera, RawUpdate, Rectangle, Scene, TransformForma
 mod camera;
 mod output;
 
-/// The most bytes of remarks that a description carries.
+/// Limit in bytes on the remarks in one scene description.
 const MOST_REMARKS: usize = 64 << 10;
 
-/// What everybody may know of an open scene.
+/// The public description of an open scene.
 pub(super) fn scene_info(host: &Host, with_remarks: bool) -> v1::SceneInfo {
     let scene = &host.scene;
     let layout = &scene.layout;
@@ -88,7 +88,7 @@ pub(super) fn raw_update(step: v1::Step) -> Result<RawUpdate> {
     })
 }
 
-/// Unspecified means lossless.
+/// Parses a policy; unspecified means lossless.
 pub(super) fn policy(number: i32) -> Result<Policy> {
     match v1::Policy::try_from(number) {
         Ok(v1::Policy::Unspecified | v1::Policy::Lossless) => Ok(Policy::Lossless),
@@ -104,7 +104,7 @@ pub(super) const fn wire_policy(policy: Policy) -> v1::Policy {
     }
 }
 
-/// Unspecified means the newest.
+/// Parses a delivery; unspecified means latest.
 pub(super) fn delivery(number: i32) -> Result<Delivery> {
     match v1::Delivery::try_from(number) {
         Ok(v1::Delivery::Lossless) => Ok(Delivery::Lossless),
@@ -113,7 +113,7 @@ pub(super) fn delivery(number: i32) -> Result<Delivery> {
     }
 }
 
-/// A picture that can be drawn: what to show, and as what to send it.
+/// Validates a picture; returns the view to render and the wire format.
 pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Picture>) -> Result<(View, Format)> {
     let picture = picture.unwrap_or_default();
     let (showing, format) = output::parse(scene, &picture)?;
@@ -134,7 +134,7 @@ pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Pictur
     Ok((View::Frame { camera, width, height, showing }, format))
 }
 
-/// A rectangle of a picture, and the view that picks in it.
+/// Validates a pick request; returns the view that picks in its rectangle.
 pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<View> {
     let bare = request.picture.clone().map(|wire| v1::Picture {
         width: wire.width,
@@ -188,7 +188,7 @@ pub(super) const fn which_of_vertices(step: Option<&v1::get_vertices_request::St
     }
 }
 
-/// A step as people say it, for errors.
+/// A readable name of the requested step, for errors.
 pub(super) fn said(which: Which, scene: &str) -> String {
     match which {
         Which::Current => format!("the step that scene '{scene}' shows"),

@@ -1,4 +1,5 @@
-//! A scene described so that a client needs nothing else: domains, arrays, and rows of U, in chunks of at most 1 MiB.
+//! Describes a scene completely for clients without a copy of it: domains, mesh arrays and rows of U, in chunks of at
+//! most 1 MiB.
 
 use std::sync::Arc;
 
@@ -14,7 +15,7 @@ use crate::engine::{Host, checked_domains};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
-/// Describes the chosen domains and sends the arrays asked for.
+/// Describes the selected domains and sends the requested arrays.
 pub(super) fn scene(
     host: Arc<Host>,
     request: v1::DescribeSceneRequest,
@@ -42,7 +43,7 @@ pub(super) fn scene(
     }))
 }
 
-/// Rows of one domain's U: three per vertex asked for.
+/// Sends rows of one domain's U: three per requested vertex.
 pub(super) fn modes(
     host: Arc<Host>,
     request: v1::ReadModesRequest,
@@ -64,7 +65,7 @@ pub(super) fn modes(
     if let Some(at) = chosen.iter().position(|vertex| *vertex as usize >= vertices) {
         return Err(invalid(format!("vertices[{at}]"), format!("an index below {vertices}"), chosen[at]));
     }
-    // Rows are cut between vertices, so that no more than one chunk of them is ever made.
+    // Chunks end between vertices, so that only one chunk of rows is in memory at a time.
     let row_bytes = 12 * rank;
     let per_chunk = (most / row_bytes.max(1)).max(1);
     let total = (row_bytes * chosen.len()) as u64;
@@ -92,7 +93,7 @@ fn array(number: i32) -> Result<v1::Array> {
     }
 }
 
-/// As many descriptions per message as fit a chunk.
+/// Sends the descriptions, as many per message as fit a chunk.
 async fn send_descriptions(
     scene: &Scene,
     domains: &[u32],

@@ -1,4 +1,5 @@
-//! Pictures: one with a deadline, or a stream of them. Every frame names the step it shows and travels in chunks.
+//! `FrameService`: single frames with a deadline, frame streams and picks. Every frame names its step and is sent in
+//! chunks.
 
 use bytes::Bytes;
 use modalcast_proto::v1;
@@ -10,7 +11,7 @@ use super::status::status;
 use super::stream::{Deadline, Outlet, Replies, pieces, respond};
 use crate::engine::{Encoded, EncodedFeed, Engine, Format, View};
 
-/// `FrameService`.
+/// Implementation of `FrameService`.
 pub(super) struct Frames(pub(super) Engine);
 
 #[tonic::async_trait]
@@ -60,7 +61,7 @@ impl v1::frame_service_server::FrameService for Frames {
         let host = self.0.find(&request.scene).map_err(status)?;
         let (view, format) = picture(&self.0, &host.scene, request.picture).map_err(status)?;
         let delivery = delivery(request.delivery).map_err(status)?;
-        // The subscription holds before the reply's head is sent, so that a client may count on the next step.
+        // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let feed = host.watch(view, delivery).await.map_err(status)?;
         let frames = EncodedFeed::new(feed, self.0.encoder().clone(), format, request.frames);
         let most = self.0.config().chunk_bytes;
@@ -69,7 +70,7 @@ impl v1::frame_service_server::FrameService for Frames {
     }
 }
 
-/// Sends every frame in chunks until the stream ends, the client leaves or the feed is cut off.
+/// Sends frames in chunks until the stream ends, the client disconnects or the feed is cut off.
 async fn send_frames<C: Iterator<Item = v1::FrameChunk>>(
     mut frames: EncodedFeed,
     cut: impl Fn(&Encoded) -> C,

@@ -1,11 +1,11 @@
-//! What a client should know of the server: `ServerService`.
+//! `ServerService`: version, devices and limits of the server.
 
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use crate::engine::Engine;
 
-/// `ServerService`.
+/// Implementation of `ServerService`.
 pub(super) struct Info(pub(super) Engine);
 
 #[tonic::async_trait]

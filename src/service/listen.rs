@@ -1,5 +1,5 @@
-//! Connections, one by one: a place is taken before one is accepted, one that stays silent is closed, and running out of
-//! file descriptors makes the listener wait instead of spin.
+//! Accepts connections under a limit. A permit is acquired before a connection is accepted; a connection that sends
+//! nothing is closed; when file descriptors run out, the listener pauses instead of spinning.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,13 +14,13 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-/// How many connections that have spoken may wait for the server.
+/// Connections with received data that may be queued for the server.
 const AHEAD: usize = 16;
 
-/// How long the listener rests after it could not accept.
+/// Pause of the listener after a failed accept.
 const REST: Duration = Duration::from_millis(50);
 
-/// An accepted connection and its place.
+/// An accepted connection with its permit.
 #[derive(Debug)]
 pub(super) struct Connection {
     stream: TcpStream,
@@ -28,7 +28,8 @@ pub(super) struct Connection {
     _place: OwnedSemaphorePermit,
 }
 
-/// Accepts at most `most` connections at a time; each must send its first byte within `silence`. Ends with its reader.
+/// Accepts connections, at most `most` open at a time; each must send its first byte within `silence`. Stops when the
+/// returned stream is dropped.
 pub(super) fn connections(
     listener: TcpListener,
     most: usize,
@@ -63,12 +64,12 @@ async fn accept(listener: &TcpListener, places: &Arc<Semaphore>) -> io::Result<C
     Ok(Connection { stream, remote, _place: place })
 }
 
-/// Hands a connection on once it has spoken; drops it when it does not.
+/// Forwards a connection once it has sent its first byte; drops it if it sends nothing within `silence`.
 async fn hear(connection: Connection, silence: Duration, ready: mpsc::Sender<io::Result<Connection>>) {
     let mut first = [0];
     let spoke = tokio::time::timeout(silence, connection.stream.peek(&mut first)).await;
     if matches!(spoke, Ok(Ok(1))) {
-        ready.send(Ok(connection)).await.ok(); // The server has stopped, and the connection goes with it.
+        ready.send(Ok(connection)).await.ok(); // Fails only if the server has stopped.
     }
 }
 

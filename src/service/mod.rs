@@ -1,4 +1,5 @@
-//! gRPC: wire to values and back. The only module that names proto; one file per group of calls.
+//! The gRPC services: translate between wire messages and the engine's values. The only module that uses the protobuf
+//! types; one file per group of calls.
 
 mod convert;
 mod describe;
@@ -25,13 +26,14 @@ use crate::config::Config;
 use crate::engine::Engine;
 use modalcast_model::error::{Error, Result, during};
 
-/// The largest message that the server sends: a chunk and its envelope.
+/// The largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head. The head of a vertex
+/// reply lists up to 65 536 domains with their counts.
 const LARGEST_REPLY: usize = 3 << 20;
 
 /// Binds the configured address.
 ///
 /// # Errors
-/// `Unavailable` when the address is taken or not ours.
+/// `Unavailable` when the address is in use or does not belong to this machine.
 pub async fn bind(config: &Config) -> Result<TcpListener> {
     TcpListener::bind(config.listen).await.map_err(|error| Error::Unavailable {
         what: "listening address",
@@ -40,8 +42,8 @@ pub async fn bind(config: &Config) -> Result<TcpListener> {
     })
 }
 
-/// Serves until `shutdown` is there, then says so to health checks, ends every stream, and stops within the configured
-/// drain time whatever clients do.
+/// Serves until `shutdown` completes. Then reports "not serving" to health checks, ends every stream and returns within
+/// the configured drain time, whether or not clients close their connections.
 ///
 /// # Errors
 /// `Fault` when the transport fails.
@@ -65,11 +67,11 @@ pub async fn serve(
         if tokio::time::timeout_at(end, draining.shutdown()).await.is_err() {
             tracing::warn!("the device did not stop in time");
         }
-        stop.send(()).ok(); // The transport has failed, and the receiver went with it.
+        stop.send(()).ok(); // Fails only if the transport has failed and dropped the receiver.
         end
     };
     let told = async {
-        stopped.await.ok(); // A drain that is dropped means stop, too.
+        stopped.await.ok(); // A dropped sender means stop, too.
     };
     let mut transport = std::pin::pin!(transport(&config).serve_with_incoming_shutdown(routes, connections, told));
     let end = tokio::select! {
@@ -94,7 +96,7 @@ async fn set_health(health: &HealthReporter, serving: bool) {
     }
 }
 
-/// Every limit of the transport, because the library's defaults leave some of them off.
+/// The transport with every limit set explicitly, because the library's defaults disable some of them.
 fn transport(config: &Config) -> Server {
     Server::builder()
         .max_concurrent_streams(128)
@@ -115,7 +117,7 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
     use v1::server_service_server::ServerServiceServer;
     use v1::step_service_server::StepServiceServer;
     use v1::vertex_service_server::VertexServiceServer;
-    // Every server has the same limits, but their builder has no common trait.
+    // A macro, because the generated servers share no trait for these methods.
     macro_rules! limited {
         ($server:expr) => {
             $server.max_decoding_message_size(config.message_bytes).max_encoding_message_size(LARGEST_REPLY)

@@ -1,4 +1,4 @@
-//! Picks as replies: a head, then hits in messages that stay small.
+//! Pick replies: a head, then the hits in messages of limited size.
 
 use bytes::Bytes;
 use modalcast_proto::v1;
@@ -10,7 +10,7 @@ use super::stream::{Deadline, Replies, respond};
 use crate::engine::{Engine, Picked, Picks, resolve_picks};
 use modalcast_model::scene::Scene;
 
-/// Bytes of a hit without its modes, at most.
+/// Upper bound on the size of a hit without its modes, in bytes.
 const HIT_BYTES: usize = 256;
 
 /// Answers one pick request.
@@ -36,7 +36,7 @@ pub(super) fn answer(
     }))
 }
 
-/// Messages of about `most` bytes; at least one.
+/// Splits a reply into messages of about `most` bytes; at least one message.
 fn responses(picks: &Picks, scene: &Scene, most: usize) -> Vec<v1::PickResponse> {
     let head =
         v1::PickHead { step: Some(step_id(picks.step)), hits: picks.hits.len() as u32, stages: stages(&picks.stages) };

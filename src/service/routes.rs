@@ -1,4 +1,4 @@
-//! Calls to services, by the first part of their path.
+//! Routes calls to services by the first component of their path.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -20,7 +20,7 @@ pub(super) struct Routes {
 }
 
 impl Routes {
-    /// The same with one more service.
+    /// Adds a service.
     pub(super) fn with<S>(self, service: S) -> Self
     where
         S: NamedService + Clone + Send + Sync + 'static,

@@ -1,4 +1,4 @@
-//! Scenes: open, upload, list, delete, describe, and rows of U.
+//! `SceneService`: opens, uploads, lists, deletes and describes scenes, and reads rows of U.
 
 use std::time::{Duration, Instant};
 
@@ -14,13 +14,13 @@ use super::stream::{Replies, guarded};
 use crate::engine::{Engine, Upload};
 use modalcast_model::error::{Error, Result, during, invalid};
 
-/// The most bytes of source names that a list carries.
+/// Limit in bytes on the source names in one list.
 const MOST_SOURCES: usize = 512 << 10;
 
-/// The slowest upload that is waited for to its end, bytes per second.
+/// The lowest sustained upload rate that the server accepts, in bytes per second.
 const SLOWEST_UPLOAD: f64 = 32768.0;
 
-/// `SceneService`.
+/// Implementation of `SceneService`.
 pub(super) struct Scenes(pub(super) Engine);
 
 #[tonic::async_trait]
@@ -107,8 +107,8 @@ impl v1::scene_service_server::SceneService for Scenes {
     }
 }
 
-/// How long an upload is waited for. Waiting uses it up and bytes bring it back, so that a client which falls silent,
-/// or sends a byte now and then, does not keep its place and its disk space for ever.
+/// Time budget for waiting on an upload (a token bucket). Waiting consumes it and received bytes refill it, so that a
+/// client that stalls or trickles bytes does not hold its upload permit and disk space forever.
 struct Patience {
     most: Duration,
     left: Duration,
@@ -119,7 +119,10 @@ impl Patience {
         Self { most, left: most }
     }
 
-    /// Waits for the client; only that is counted, not the work on what it sent.
+    /// Waits for the client. Only this wait consumes the budget; processing the received data does not.
+    ///
+    /// # Errors
+    /// `DEADLINE_EXCEEDED` when the budget is used up.
     async fn hold<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
         let begin = Instant::now();
         let late = |_| Error::Deadline { what: "enough of the upload".into(), ms: self.most.as_millis() as u64 };
@@ -134,7 +137,7 @@ impl Patience {
     }
 }
 
-/// Takes in one part of an upload. Disk work is done where waiting is allowed.
+/// Processes one part of an upload. Disk access runs on a blocking thread.
 async fn receive(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<Upload> {
     let mut upload = match (upload, part) {
         (None, Part::Header(header)) => return engine.begin_upload(announcement(header)).await,

@@ -1,5 +1,5 @@
-//! Errors of the server as gRPC statuses and as rejections. The code is chosen in one match without a wildcard; the
-//! status's details are the bytes of the same `Rejection` that a step stream would send.
+//! Converts errors to gRPC statuses and to rejections. One match without a wildcard selects the status code. The
+//! details of a status are the serialized `Rejection` that a step stream would send.
 
 use modalcast_proto::v1::Rejection;
 use prost::Message as _;
@@ -7,7 +7,8 @@ use tonic::{Code, Status};
 
 use modalcast_model::error::Error;
 
-/// The most letters of one text of a refusal: it travels in headers or between steps, whatever a client has sent.
+/// Limit in characters on each text of a rejection. Clients control parts of the text, and it is sent in headers or
+/// between steps.
 const LONGEST: usize = 512;
 
 fn short(text: String) -> String {
@@ -17,7 +18,7 @@ fn short(text: String) -> String {
     }
 }
 
-/// The refusal as a message: field, expected, given.
+/// Converts an error to a rejection: field, expected, given. `step` is the number of the rejected step, if any.
 pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
     let (field, expected, given) = match error.clone() {
         Error::Invalid { field, expected, given } => (field, expected, given),
@@ -32,7 +33,7 @@ pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
     Rejection { step, field: short(field), expected: short(expected), given: short(given) }
 }
 
-/// The status of an error.
+/// Converts an error to a gRPC status.
 pub(super) fn status(error: Error) -> Status {
     let code = match error {
         Error::Invalid { .. } => Code::InvalidArgument,
@@ -48,8 +49,8 @@ pub(super) fn status(error: Error) -> Status {
     Status::with_details(code, short(error.to_string()), details.encode_to_vec().into())
 }
 
-/// What a fault of transport under a client's stream is called: a message over the limit is `RESOURCE_EXHAUSTED` as
-/// everywhere else in gRPC.
+/// Converts a transport error of a client's stream. Tonic reports a message over the size limit as `OUT_OF_RANGE`; it
+/// becomes `RESOURCE_EXHAUSTED`, as in other gRPC implementations.
 pub(super) fn transport(fault: Status, limit: usize) -> Status {
     if fault.code() != Code::OutOfRange {
         return fault;

@@ -1,5 +1,5 @@
-//! Steps: one bidirectional stream per physics process. The stream's task always reads, so that a slow scene never
-//! blocks the connection; what it cannot take it refuses, and the stream goes on.
+//! `StepService`: one bidirectional stream per physics process. The stream's task always reads, so that a slow scene
+//! never blocks the connection. A step that cannot be accepted is answered with a rejection; the stream stays open.
 
 use std::collections::VecDeque;
 
@@ -14,10 +14,10 @@ use super::stream::{Deadline, Outlet, Replies, respond};
 use crate::engine::{Drive, Engine, Report};
 use modalcast_model::error::{Error, Result, invalid};
 
-/// How many replies may wait for a client that does not read; beyond, the stream ends.
+/// Replies that are buffered for a client that does not read. The stream ends with an error beyond this limit.
 const MOST_REPLIES: usize = 256;
 
-/// `StepService`.
+/// Implementation of `StepService`.
 pub(super) struct Steps(pub(super) Engine);
 
 #[tonic::async_trait]
@@ -41,18 +41,18 @@ impl v1::step_service_server::StepService for Steps {
     }
 }
 
-/// One stream.
+/// The state of one step stream.
 struct Session {
     engine: Engine,
     who: String,
     inbound: Streaming<v1::DriveSceneRequest>,
-    /// The writer's place, once it was given.
+    /// The writer lease, once it is acquired.
     drive: Option<Drive>,
     replies: VecDeque<v1::DriveSceneResponse>,
 }
 
 impl Session {
-    /// Reads, and sends what there is to tell, until the client has said all and has been told all.
+    /// Reads requests and sends replies until the client has closed its side and all replies are sent.
     async fn run(mut self, outlet: Outlet<v1::DriveSceneResponse>) -> Result<(), Status> {
         let mut listens = true;
         loop {
@@ -82,7 +82,8 @@ impl Session {
         }
     }
 
-    /// Answers one message. Only a client that reads no answers is an error.
+    /// Handles one message. Invalid input is answered with a rejection; only an overflow of the reply queue is an
+    /// error.
     async fn receive(&mut self, message: v1::DriveSceneRequest) -> Result<(), Status> {
         let refused = match message.kind {
             Some(Asked::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
@@ -132,7 +133,7 @@ impl Session {
         Ok(())
     }
 
-    /// The server ends the stream: what was done is still told, as far as the client reads.
+    /// Ends the stream with a server-side error. First sends the buffered replies, for at most half the drain time.
     async fn say_farewell(mut self, outlet: &Outlet<v1::DriveSceneResponse>, error: Error) -> Result<(), Status> {
         let patience = self.engine.config().drain / 2;
         let tell = async {
@@ -141,13 +142,13 @@ impl Session {
             }
             Ok::<(), Status>(())
         };
-        // Whether or not it read them: the reason comes last.
+        // The error comes last, whether or not the client has read the replies.
         tokio::time::timeout(patience, tell).await.ok();
         Err(status(error))
     }
 }
 
-/// Waits for the drive's next report; for ever while there is no drive.
+/// Waits for the next report; pends forever without a writer lease.
 async fn next_report(drive: Option<&Drive>) -> Result<Report> {
     match drive {
         Some(drive) => drive.next_report().await,

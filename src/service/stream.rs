@@ -1,5 +1,5 @@
-//! Reply streams: a task feeds a bounded channel, replies are cut into chunks of at most 1 MiB, deadlines hold to the
-//! last chunk, and a panic costs its own call only.
+//! Reply streams. A task sends messages through a bounded channel; replies are split into chunks of at most 1 MiB; a
+//! deadline covers the whole reply up to the last chunk; a panic ends only its own call.
 
 use std::pin::Pin;
 use std::time::{Duration, Instant};
@@ -18,10 +18,10 @@ use modalcast_model::error::{Error, Result};
 /// A reply stream.
 pub(super) type Replies<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// How many messages of a reply may wait for the connection.
+/// Messages of a reply that may be buffered for the connection.
 const AHEAD: usize = 2;
 
-/// Where a task puts its replies; waits while the client is slow.
+/// Sender of a reply stream. Sending waits while the client reads slowly (back-pressure).
 #[derive(Debug)]
 pub(super) struct Outlet<T>(mpsc::Sender<Result<T, Status>>);
 
@@ -29,17 +29,20 @@ impl<T> Outlet<T> {
     /// Sends one message.
     ///
     /// # Errors
-    /// When the client has gone.
+    /// `CANCELLED` when the client has disconnected.
     pub(super) async fn send(&self, message: T) -> Result<(), Status> {
         self.0.send(Ok(message)).await.map_err(|_| gone())
     }
 
-    /// Waits until there is room for a message; dropping the future loses nothing.
+    /// Waits until the channel has capacity for a message. Cancel-safe.
+    ///
+    /// # Errors
+    /// `CANCELLED` when the client has disconnected.
     pub(super) async fn ready(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
         self.0.reserve().await.map_err(|_| gone())
     }
 
-    /// Waits until the client has gone.
+    /// Waits until the client has disconnected.
     pub(super) async fn closed(&self) {
         self.0.closed().await;
     }
@@ -49,8 +52,8 @@ fn gone() -> Status {
     Status::cancelled("the client has gone")
 }
 
-/// A stream that `work` fills. How `work` ends is how the stream ends; there is always room to say so. When the client
-/// leaves, `work` is dropped wherever it waits, so that what it holds is free for others.
+/// Creates a reply stream that `work` fills. The result of `work` ends the stream; one slot of the channel is reserved
+/// for it. When the client disconnects, `work` is dropped at its next await, so that its resources are released.
 pub(super) fn respond<T, W, F>(work: W) -> Response<Replies<T>>
 where
     T: Send + 'static,
@@ -76,7 +79,7 @@ where
     Response::new(Box::pin(ReceiverStream::new(replies)))
 }
 
-/// Runs a single call's work so that a panic costs that call only.
+/// Runs the work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call.
 pub(super) async fn guarded<T: Send + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<Response<T>, Status> {
@@ -86,29 +89,29 @@ pub(super) async fn guarded<T: Send + 'static>(
     }
 }
 
-/// Cuts a reply into pieces, each with its offset; an empty reply is one empty piece.
+/// Splits a reply into pieces of at most `most` bytes, each with its offset. An empty reply is one empty piece.
 pub(super) fn pieces(bytes: Bytes, most: usize) -> impl Iterator<Item = (u64, Bytes)> {
     let starts = (0..bytes.len().max(1)).step_by(most.max(1));
     starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + most))))
 }
 
-/// When a call must be over.
+/// The deadline of a call.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Deadline {
-    /// `None`: never.
+    /// The instant, and the time limit in milliseconds for errors; `None` means no deadline.
     at: Option<(Instant, u64)>,
 }
 
 impl Deadline {
-    /// Of a single request: the smaller of what it says (0: nothing) and what its `grpc-timeout` header says, or the
-    /// configured one if neither; never later than the configured longest.
+    /// The deadline of a single request: the smaller of `ms` (milliseconds; 0 means unset) and the `grpc-timeout`
+    /// header, else the configured default; limited to the configured maximum.
     pub(super) fn of_request(metadata: &MetadataMap, ms: u32, config: &Config) -> Self {
         let asked = (ms > 0).then(|| Duration::from_millis(ms.into()));
         let time = asked.into_iter().chain(header(metadata)).min().unwrap_or(config.deadline);
         Self::after(time.min(config.longest_deadline))
     }
 
-    /// Of a stream: what its `grpc-timeout` header says, if it has one.
+    /// The deadline of a stream: its `grpc-timeout` header, if present.
     pub(super) fn of_stream(metadata: &MetadataMap) -> Self {
         header(metadata).map_or(Self { at: None }, Self::after)
     }
@@ -117,7 +120,7 @@ impl Deadline {
         Self { at: Instant::now().checked_add(time).map(|at| (at, time.as_millis() as u64)) }
     }
 
-    /// The work's result, or `DEADLINE_EXCEEDED` when it is not there in time; the work is dropped then.
+    /// Awaits `work`. If the deadline passes first, drops `work` and returns `DEADLINE_EXCEEDED` naming `what`.
     pub(super) async fn hold<T>(self, what: &str, work: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
         let Some((at, ms)) = self.at else { return work.await };
         match tokio::time::timeout_at(at.into(), work).await {
@@ -131,7 +134,7 @@ fn header(metadata: &MetadataMap) -> Option<Duration> {
     parse_timeout(metadata.get("grpc-timeout")?.to_str().ok()?)
 }
 
-/// The header's at most eight digits and its unit.
+/// Parses a `grpc-timeout` header: 1 to 8 digits and a unit.
 fn parse_timeout(text: &str) -> Option<Duration> {
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|digit| digit.is_ascii_digit()) {

@@ -1,5 +1,5 @@
-//! Deformed vertices: those of one step with a deadline, or of every step. Positions in row order of U, then normals, and
-//! what else a reader wants and the scene keeps: displacements, boxes.
+//! `VertexService`: deformed vertices of one step with a deadline, or of every step. A reply contains positions in row
+//! order of U, then normals, and the displacements and boxes if they are requested and the scene keeps them.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use super::stream::{Deadline, Outlet, Replies, pieces, respond};
 use crate::engine::{Engine, Feed, Host, Packed, Selection, View, pack_vertices};
 use modalcast_model::deform::Wanted;
 
-/// `VertexService`.
+/// Implementation of `VertexService`.
 pub(super) struct Vertices(pub(super) Engine);
 
 #[tonic::async_trait]
@@ -55,18 +55,18 @@ impl v1::vertex_service_server::VertexService for Vertices {
         let host = self.0.find(&request.scene).map_err(status)?;
         let selection = select(&host, request.selection)?;
         let delivery = delivery(request.delivery).map_err(status)?;
-        // The subscription holds before the reply's head is sent, so that a client may count on the next step.
+        // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let feed = host.watch(View::Vertices(selection.wanted), delivery).await.map_err(status)?;
         let show = Show { selection, most: self.0.config().chunk_bytes, steps: request.steps };
         Ok(respond(move |outlet| deadline.hold("the end of the vertex stream", show.run(feed, outlet))))
     }
 }
 
-/// How a stream of vertices is sent.
+/// Parameters of a vertex stream.
 struct Show {
     selection: Arc<Selection>,
     most: usize,
-    /// 0: without end.
+    /// Number of steps to send; 0 means no limit.
     steps: u64,
 }
 

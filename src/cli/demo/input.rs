@@ -1,4 +1,4 @@
-//! What a demo shows: the scene, where the server finds it, and the physics that lies beside it.
+//! Input of the demo: the scene, the repository from which the server opens it, and the physics files next to it.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,17 +10,20 @@ use modalcast_model::scene::Scene;
 
 pub(super) struct Input {
     pub(super) scene: Arc<Scene>,
-    /// The name by which the server opens it.
+    /// The source name that the server opens.
     pub(super) source: String,
-    /// The server's repository; none for a built-in scene.
+    /// The server's repository; `None` for a built-in scene.
     pub(super) repository: Option<PathBuf>,
-    /// Vega's cubic polynomial and configuration, if they lie beside the model.
+    /// Vega's cubic polynomial and configuration, if the model's folder contains exactly one file of each kind.
     pub(super) cubic: Option<PathBuf>,
     pub(super) vega_config: Option<PathBuf>,
 }
 
 impl Input {
-    /// Finds a scene by built-in name or path.
+    /// Loads a scene by built-in name or path.
+    ///
+    /// # Errors
+    /// Those of loading the scene.
     pub(super) fn find(source: &str) -> Result<Self> {
         let scene = working("loading", || load::open(source))?;
         let path = Path::new(source);
@@ -31,7 +34,7 @@ impl Input {
         let folder = if path.is_dir() { path.clone() } else { path.parent().unwrap_or(&path).to_path_buf() };
         Ok(Self {
             scene,
-            // With "./" it is a path, even where a built-in scene has that name.
+            // With the leading "./" the name is never resolved as a built-in scene.
             source: format!("./{name}"),
             repository: path.parent().map(Path::to_path_buf),
             cubic: only_file(&folder, "cub"),
@@ -40,7 +43,7 @@ impl Input {
     }
 }
 
-/// The file of a folder with this ending, if there is exactly one.
+/// The file with this extension in a folder; `None` unless there is exactly one.
 fn only_file(folder: &Path, ending: &str) -> Option<PathBuf> {
     let entries = std::fs::read_dir(folder).ok()?;
     let mut found = entries.filter_map(|entry| Some(entry.ok()?.path()));

@@ -1,5 +1,5 @@
-//! `modalcast demo`: the server, a physics process and two fetching clients as separate processes on this machine; then
-//! a table of what came out, and whether it kept its promises.
+//! `modalcast demo`: runs the server, a physics process and two receiving clients as separate processes on this
+//! machine, then prints a table of the results and checks them against acceptance criteria.
 
 mod input;
 mod processes;
@@ -20,42 +20,42 @@ use modalcast_model::error::{Result, during};
 use processes::{Process, program};
 use verdict::Verdict;
 
-/// Drives a scene with a physics process, fetches its frames and vertices over the network, and checks them.
+/// Drives a scene with a physics process, receives its frames and vertices over the network, and checks them.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast demo                                the built-in tree in the wind: 60 frames into out/
   modalcast demo --scene path/to/simpleBridge   a Vega folder under its own cubic forces
   modalcast demo --frames 10 --size 640x360")]
 pub(super) struct Args {
-    /// What to show: a built-in name, or a path to a model or a scene folder.
+    /// Scene: a built-in name, or a path to a model or a scene folder.
     #[arg(long, default_value = "tree")]
     scene: String,
-    /// How many steps to drive, and frames to save.
+    /// Number of steps to drive and of frames to save.
     #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(2..=1000))]
     frames: u32,
-    /// The size of the frames in pixels.
+    /// Frame size in pixels.
     #[arg(long, default_value = "1280x720")]
     size: Size,
-    /// Simulated seconds from one frame to the next.
+    /// Simulated time between frames, in seconds.
     #[arg(long, default_value_t = 1.0 / 24.0)]
     dt: f64,
-    /// The folder for the frames; frames of an earlier demo there are replaced.
+    /// Folder for the frames. Frames of an earlier demo in it are replaced.
     #[arg(long, default_value = "out")]
     out: PathBuf,
-    /// Which deformer the server uses.
+    /// Deformation backend of the server.
     #[arg(long, value_enum, default_value_t = BackendChoice::Auto)]
     backend: BackendChoice,
-    /// Where to write the table as JSON too.
+    /// Also write the table as JSON to this file.
     #[arg(long)]
     report: Option<PathBuf>,
-    /// How long the processes may take in all, in seconds.
+    /// Time limit for all processes together, in seconds.
     #[arg(long, default_value_t = 600, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     timeout: u64,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
     let input = Input::find(&args.scene)?;
-    // What the processes leave here is worthless once they have ended, and goes with the folder.
+    // Temporary files of the processes; removed with the folder.
     let scratch = tempfile::tempdir().map_err(during("demo"))?;
     let ran = drive(args, &input, scratch.path())?;
     let verdict = working("comparing with the f64 reference", || Verdict::of(&input.scene, &ran, args.frames))?;
@@ -70,7 +70,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(verdict.broken().is_empty())
 }
 
-/// The verdict with what it was measured on and how, to be kept.
+/// The verdict as JSON, with the command, version and machine for reproducibility.
 fn record(verdict: &Verdict) -> serde_json::Value {
     let command: Vec<String> = std::env::args().skip(1).collect();
     serde_json::json!({
@@ -82,16 +82,16 @@ fn record(verdict: &Verdict) -> serde_json::Value {
     })
 }
 
-/// What the processes told and left.
+/// The results of the demo's processes.
 struct Ran {
     frames: serde_json::Value,
     sim: serde_json::Value,
     server: serde_json::Value,
-    /// steps x coordinates, as the physics process sent them.
+    /// Shape (steps, coordinates), as sent by the physics process.
     q: ndarray::Array2<f32>,
-    /// steps x domains x 12.
+    /// Shape (steps, domains, 12), as sent by the physics process.
     transforms: ndarray::Array3<f32>,
-    /// steps x vertices x 3, as they came over the network.
+    /// Shape (steps, vertices, 3), as received over the network.
     vertices: ndarray::Array3<f32>,
     frames_on_disk: usize,
 }
@@ -161,7 +161,7 @@ fn read<D: ndarray::Dimension>(path: &std::path::Path) -> Result<ndarray::Array<
     ndarray_npy::read_npy(path).map_err(|error| during("demo")(format!("{}: {error}", path.display())))
 }
 
-/// The frames of a demo in a folder: `frame_00000.png` and so on, and nothing else that may lie there.
+/// The frame files of a demo in a folder: `frame_00000.png` and so on. Other files are ignored.
 fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
     let entries = fs::read_dir(folder).map_err(during("demo"))?;
     let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
@@ -169,7 +169,7 @@ fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Whether `modalcast-fetch frames` gives a file this name.
+/// Whether this is a file name that `modalcast-fetch frames` writes.
 fn is_frame(name: &str) -> bool {
     let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".png"));
     number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|digit| digit.is_ascii_digit()))

@@ -1,4 +1,4 @@
-//! Child processes of the demo: started, listened to, and never left behind.
+//! Child processes of the demo: starts them, reads their output, and kills them when dropped.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::PathBuf;
@@ -10,10 +10,13 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use modalcast_model::error::{Error, Result, during};
 
-/// Lines that a child may be ahead of us. A child that prints more waits, which harms nobody here.
+/// Buffered output lines per child. A child that prints more blocks until lines are read, which is harmless here.
 const LINES: usize = 1024;
 
-/// A program of this project beside this executable.
+/// The path of a program of this project in the folder of this executable.
+///
+/// # Errors
+/// `Unavailable` when the program does not exist.
 pub(super) fn program(name: &str) -> Result<PathBuf> {
     let here = std::env::current_exe().map_err(during("demo"))?;
     let path = here.with_file_name(name);
@@ -27,7 +30,7 @@ pub(super) fn program(name: &str) -> Result<PathBuf> {
     })
 }
 
-/// A running child. Dropping it ends it.
+/// A running child process. Dropping it kills the process.
 pub(super) struct Process {
     name: &'static str,
     child: Child,
@@ -36,7 +39,7 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts a program; its errors and logs go where ours go.
+    /// Starts a program; it inherits stderr.
     pub(super) fn start(name: &'static str, program: &PathBuf, flags: &[impl AsRef<std::ffi::OsStr>]) -> Result<Self> {
         let mut child = Command::new(program)
             .args(flags)
@@ -56,7 +59,7 @@ impl Process {
         Ok(Self { name, child, lines, begin: Instant::now() })
     }
 
-    /// Waits for a line with this beginning and returns the rest of it.
+    /// Waits for a line that starts with `beginning` and returns the rest of it.
     pub(super) fn wait_for(&mut self, beginning: &str, end: Instant) -> Result<String> {
         loop {
             let line = self.next_line(end, beginning)?;
@@ -66,7 +69,7 @@ impl Process {
         }
     }
 
-    /// Waits for the end and returns the last line, which is JSON.
+    /// Waits until the process exits and returns its last output line, which is JSON.
     pub(super) fn finish(mut self, end: Instant) -> Result<serde_json::Value> {
         let mut last = String::new();
         while let Some(line) = self.line_or_end(end, "its end")? {
@@ -79,10 +82,10 @@ impl Process {
         serde_json::from_str(&last).map_err(|error| during("demo")(format!("{} said '{last}': {error}", self.name)))
     }
 
-    /// Asks the child to end, as Ctrl-C would, and waits a little before insisting.
+    /// Sends SIGTERM and waits for at most 15 s; dropping the process kills it if it is still running.
     pub(super) fn stop(&mut self) {
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
-            kill_process(pid, Signal::TERM).ok(); // It has ended already, then.
+            kill_process(pid, Signal::TERM).ok(); // Fails only if it has already exited.
         }
         let end = Instant::now() + Duration::from_secs(15);
         while Instant::now() < end && matches!(self.child.try_wait(), Ok(None)) {
@@ -111,7 +114,7 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Already gone is as good as killed.
+        // Killing fails if the process has already exited.
         self.child.kill().ok();
         self.child.wait().ok();
     }

@@ -1,4 +1,4 @@
-//! What came out of a demo, against the f64 reference and the demo's promises.
+//! Compares the results of a demo with the f64 reference and with the demo's acceptance criteria.
 
 use serde_json::{Value, json};
 
@@ -8,10 +8,10 @@ use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, State};
 
-/// The largest error of received vertices, as a fraction of the scene's diagonal.
+/// Tolerance for the error of received vertices, as a fraction of the scene's diagonal.
 const LARGEST_ERROR: f64 = 1e-5;
 
-/// The largest gap of a joint, likewise.
+/// Tolerance for the gap of a joint, as a fraction of the scene's diagonal.
 const LARGEST_GAP: f64 = 1e-3;
 
 pub(super) struct Verdict {
@@ -20,14 +20,16 @@ pub(super) struct Verdict {
     steps: usize,
     steps_per_second: f64,
     stages: Vec<(String, f64)>,
-    /// Largest distance to the reference, and it as a fraction of the diagonal.
+    /// Largest distance to the reference, in scene units and as a fraction of the diagonal.
     error: f64,
     relative_error: f64,
-    /// Largest distance from rest, in scene units, and where the scene is highest as a fraction of its height.
+    /// Largest distance from the rest position, in scene units and as a fraction of the diagonal.
     displacement: f64,
     relative_displacement: f64,
+    /// Largest distance from the rest position in the top tenth of the scene, as a fraction of the scene's height.
     sway: f64,
-    /// Largest distance of a child's origin from the displaced centre of the ring that carries it, of the diagonal.
+    /// Largest distance of a child's origin from the displaced center of the ring that carries it, as a fraction of the
+    /// diagonal; `None` without joints.
     joint_gap: Option<f64>,
     least: Least,
     frames: usize,
@@ -36,6 +38,9 @@ pub(super) struct Verdict {
 
 impl Verdict {
     /// Compares every received vertex of every step with the reference.
+    ///
+    /// # Errors
+    /// `Invalid` when the recorded arrays have different step or vertex counts.
     pub(super) fn of(scene: &Scene, ran: &Ran, wanted: u32) -> Result<Self> {
         let steps = ran.vertices.shape()[0];
         if ran.q.shape()[0] != steps
@@ -83,7 +88,7 @@ impl Verdict {
         })
     }
 
-    /// The promises that were not kept.
+    /// The acceptance criteria that are not met.
     pub(super) fn broken(&self) -> Vec<String> {
         let promises = [
             (self.relative_error <= LARGEST_ERROR, format!("vertices within {LARGEST_ERROR:.0e} of the diagonal")),
@@ -160,21 +165,22 @@ impl Crown {
     }
 }
 
-/// How much must move for the demo to show anything.
+/// Minimum motion that a demo must show, as fractions of the diagonal and the height.
 struct Least {
     displacement: f64,
     sway: f64,
 }
 
 impl Least {
-    /// A deforming scene moves by 2 % of its diagonal; one of jointed deforming parts sways by 3 % of its height.
+    /// 2 % of the diagonal for a scene with modes, 0.01 % for a rigid one. A scene with modes and attached domains must
+    /// also sway by 3 % of its height.
     fn of(scene: &Scene) -> Self {
         let jointed = scene.needs.modes && scene.domains.iter().any(|domain| domain.attachment.is_some());
         Self { displacement: if scene.needs.modes { 0.02 } else { 1e-4 }, sway: if jointed { 0.03 } else { 0.0 } }
     }
 }
 
-/// A child on the ring of a deforming parent.
+/// A child domain and the ring of parent vertices that carries it.
 struct Joint {
     /// Index of the child's transform.
     mover: usize,
@@ -183,7 +189,7 @@ struct Joint {
 }
 
 impl Joint {
-    /// The joints whose rest frame sits at the centre of its ring, so that the ring alone tells where it must be.
+    /// The joints whose rest frame is at the center of their ring, so that the ring determines the expected position.
     fn all(scene: &Scene, rest: &[[f64; 3]]) -> Vec<Self> {
         let state = State::rest(scene);
         let diagonal = scene.rest_bounds.diagonal();
@@ -202,7 +208,7 @@ impl Joint {
         state.transforms[self.mover].translation().into()
     }
 
-    /// Distance of the child's origin, as sent, from the centre of the ring, as received.
+    /// Distance in scene units of the child's origin, as sent, from the center of the ring, as received.
     fn gap(&self, got: &ndarray::ArrayView2<'_, f32>, state: &State) -> f64 {
         let ring = self.ring.iter().map(|vertex| [0, 1, 2].map(|axis| f64::from(got[[*vertex, axis]])));
         distance(centre(ring), self.origin(state))
@@ -231,7 +237,7 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The larger of two, where NaN is the worst.
+/// The larger of two values; a NaN `b` counts as infinity.
 fn worse(a: f64, b: f64) -> f64 {
     if b.is_nan() { f64::INFINITY } else { a.max(b) }
 }
@@ -240,7 +246,7 @@ fn text(value: &Value, key: &str) -> String {
     value[key].as_str().unwrap_or("unknown").to_owned()
 }
 
-/// Median milliseconds per stage, as the fetching client summed them up.
+/// Median milliseconds per stage, as reported by the receiving client.
 fn stages(frames: &Value) -> Vec<(String, f64)> {
     let object = frames["stages_ms"].as_object();
     object
@@ -259,7 +265,7 @@ mod tests {
         assert_eq!(worse(1.0, 2.0), 2.0);
     }
 
-    /// Two steps of the tree at rest, as honest processes would leave them.
+    /// Results with two steps of a scene at rest, as correct processes would record them.
     fn at_rest(scene: &Scene) -> Ran {
         let (domains, vertices) = (scene.domains.len(), scene.layout.vertices);
         let state = State::rest(scene);

@@ -1,11 +1,11 @@
-//! A camera off the wire. What it leaves out is as in the camera that frames the scene.
+//! Parses a camera from the wire. Unset parts are taken from the camera that frames the scene.
 
 use modalcast_proto::v1;
 
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Camera, Lens, View};
 
-/// The checked camera.
+/// Parses and validates a camera.
 pub(super) fn parse(framing: Camera, camera: v1::Camera) -> Result<Camera> {
     let view = match camera.view {
         None => framing.view,

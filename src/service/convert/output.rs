@@ -1,4 +1,4 @@
-//! What a picture shows off the wire, and as what it is sent.
+//! Parses the output and the format of a picture from the wire.
 
 use modalcast_proto::v1;
 
@@ -6,10 +6,10 @@ use crate::engine::{Format, Showing, checked_mode};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
-/// The end of a colour map's scale must be below this, and above its inverse.
+/// The end of a color map's scale must be below this value and at least its inverse.
 const FARTHEST: f64 = 1e30;
 
-/// The checked output and a format that fits it.
+/// Parses the output; returns it with a format that is valid for it.
 pub(super) fn parse(scene: &Scene, picture: &v1::Picture) -> Result<(Showing, Format)> {
     let output = v1::Output::try_from(picture.output)
         .map_err(|_| invalid("picture.output", "an output of this version", picture.output))?;
