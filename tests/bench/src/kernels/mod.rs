@@ -1,19 +1,19 @@
-//! What only measures: no server runs any of it. A [`Trial`] is one way to deform, timed as kernels alone and judged by
+//! What only measures: no server runs any of it. A `Trial` is one way to deform, timed as kernels alone and judged by
 //! its positions.
 //!
 //! | file | what |
 //! |---|---|
-//! | [`trial`] | what a trial is, and what the driver says of its kernels |
-//! | [`turns`] | values of several steps that lie on the device before the clock starts |
-//! | [`measure`] | the stopwatch |
-//! | [`roof`] | the best rates of the device, to compare with |
-//! | [`ours`] | the deformer's own kernels as a trial |
-//! | [`mod@batch_mma`] | many vectors q of one U at once by tensor cores, with an order and a rounding of its own |
-//! | [`mod@ingest`] | the way of a step's values to the device |
-//! | [`mod@overlap`] | steps that the host reads, one after the other and side by side |
-//! | [`cublas`], [`plain_update`] | a library's products, and the vertex update behind them |
-//! | [`mod@raster`] | the rasteriser on positions and samples of its own |
-//! | [`thesis`] | the kernels of the thesis |
+//! | `trial` | what a trial is, and what the driver says of its kernels |
+//! | `turns` | values of several steps that lie on the device before the clock starts |
+//! | `measure` | the stopwatch |
+//! | `roof` | the best rates of the device, to compare with |
+//! | `ours` | the deformer's own kernels as a trial |
+//! | `batch_mma` | many vectors q of one U at once by tensor cores, with an order and a rounding of its own |
+//! | `ingest` | the way of a step's values to the device |
+//! | `overlap` | steps that the host reads, one after the other and side by side |
+//! | `cublas`, [`plain_update`] | a library's products, and the vertex update behind them |
+//! | `raster` | the rasteriser on positions and samples of its own |
+//! | `thesis` | the kernels of the thesis |
 
 mod batch_mma;
 mod cublas;
