@@ -16,7 +16,7 @@ fn texel(scene: &Scene, deformed: &Deformed, is_lit: bool) -> [f64; 2] {
 }
 
 /// Texels fitted to the light-space boxes of tiles have less than half the area of texels fitted to the corners of the
-/// bounds. Texels fitted to the exact vertices are at most 20 % smaller still.
+/// bounds, and less than 1.2 times the area of texels fitted to the exact vertices.
 #[test]
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
     let scene = load::open("tree").expect("built in");
