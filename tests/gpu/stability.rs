@@ -15,7 +15,7 @@ fn left_out(deformer: &CudaDeformer, _: &Scene) -> f64 {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_q_of_1e30_1e_minus_38_and_denormals_stay_within_the_bound() {
+fn gpu_huge_tiny_and_denormal_q_stay_within_the_bound() {
     extremes::huge_and_tiny_amounts(deformer);
 }
 

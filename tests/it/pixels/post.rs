@@ -39,7 +39,7 @@ fn tone_curves_have_their_known_values() {
     let shown = |light: [f32; 3], look: &dyn Fn(Look) -> Look| {
         picture(&glowing(light, look).add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), white()).scene()).at(32, 32)
     };
-    // A threshold too high for any bloom. The bloom pass then applies the tone curve to unchanged light.
+    // A threshold that only the light of 1e30 exceeds. The bloom pass inverts the tone curve and applies it again.
     let idle = Some(Bloom { threshold: 1000.0, ..Bloom::default() });
     for light in [[0.01, 0.18, 0.5], [1.0, 2.0, 8.0], [0.0, 30.0, 1e30]] {
         let wide = light.map(f64::from);
@@ -119,7 +119,8 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
     assert!(shown.image.rgba != plain.image.rgba, "control");
 }
 
-/// Light above white is clamped per sample before samples are averaged, also when it is kept for the bloom.
+/// Each sample goes through the tone curve, a clamp here, before the samples of a pixel are averaged. The light for the
+/// bloom is extracted from each sample before that.
 #[test]
 fn bright_edges_stay_antialiased_with_bloom() {
     let shown = |bloom: Option<Bloom>| {
