@@ -1,4 +1,5 @@
-//! A scene that is reached by steps that change a few domains each is bit for bit the one that is computed whole.
+//! Partial steps: a state reached by steps that change a few domains each has the bits of the same state computed in
+//! full.
 
 use std::sync::Arc;
 
@@ -10,7 +11,7 @@ use super::readers::{kept, wrong_box};
 use super::{Shown, run, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
-/// A step that names these domains' coordinates and transforms, off the wire.
+/// A wire step that names the domains of its coordinates and of its transforms.
 fn update(scene: &Scene, random: &mut Random, (q, transforms): (&[u32], &[u32])) -> Update {
     let rank: usize = q.iter().map(|domain| scene.rank_of(*domain as usize)).sum();
     let numbers: Vec<f32> = (0..rank).map(|_| random.number()).collect();
@@ -32,20 +33,20 @@ fn update(scene: &Scene, random: &mut Random, (q, transforms): (&[u32], &[u32]))
     Update::parse(scene, &raw).expect("a step")
 }
 
-/// Applies such a step.
+/// Applies a random step that names these domains.
 pub(crate) fn apply(scene: &Scene, state: &mut State, random: &mut Random, named: (&[u32], &[u32])) {
     state.apply(scene, &update(scene, random, named));
 }
 
-/// A domain of several tiles, one without modes, and one that shares the coordinates of the one before it.
+/// A domain of several tiles, one without modes, and one that shares the coordinates of the domain before it.
 const LARGE: u32 = 26;
 const RIGID: u32 = 27;
 const SHARER: u32 = 29;
-/// The domains of [`crowd`], of which a list may name a quarter.
+/// Number of domains of [`crowd`]. A list of changes may name at most a quarter of them.
 const CROWD: u32 = 40;
 
-/// Small domains of many ranks, whose corners are their vertices or not, a large one, one without modes, instances, and
-/// domains of one shape or of two that share coordinates.
+/// A scene of small domains of many ranks, with and without separate corners, a large domain, one without modes,
+/// instances, and domains of one shape or of two shapes that share coordinates.
 fn crowd(deformation: Deformation, normal_maps: bool) -> Arc<Scene> {
     let mut random = Random(50);
     let mut shapes: Vec<Shape> = (0..20).map(|at| strip(&mut random, 5 + at % 9, at % 5)).collect();
@@ -54,7 +55,7 @@ fn crowd(deformation: Deformation, normal_maps: bool) -> Arc<Scene> {
     shapes.push(strip(&mut random, 200, 0));
     shapes.push(strip(&mut random, 40, 4));
     let mut of: Vec<usize> = (0..29).collect();
-    // A sharer of another shape's coordinates, then instances.
+    // A domain that shares the coordinates of another shape, then instances.
     of.extend([9, 28, 28, 28, 4, 4, 28, 28, 28, 0, 27]);
     let mut parts = scenes::parts(shapes);
     parts.deformation = deformation;
@@ -69,19 +70,19 @@ fn crowd(deformation: Deformation, normal_maps: bool) -> Arc<Scene> {
     scene
 }
 
-/// What happens between two states that are shown.
+/// Event between two states that are shown.
 #[derive(Clone, Copy, PartialEq)]
 enum Between {
     Nothing,
-    /// A state is not shown.
+    /// A state is applied but not shown.
     Skipped,
-    /// A state is refused, and the one before shown again.
+    /// A state is refused, and the state before it is shown again.
     Refused,
-    /// Another history is shown.
+    /// A state of another history is shown.
     Other,
 }
 
-/// What each step names, coordinates first.
+/// Domains that each step names: first those of its coordinates, then those of its transforms.
 fn script() -> Vec<(Vec<u32>, Vec<u32>, Between)> {
     use Between::{Nothing, Other, Refused, Skipped};
     let all: Vec<u32> = (0..CROWD).collect();
@@ -110,7 +111,7 @@ fn script() -> Vec<(Vec<u32>, Vec<u32>, Between)> {
     ]
 }
 
-/// A deformer that is given the steps as they come, and one that is given the same states as if all had changed.
+/// A deformer that receives partial steps, and one that receives the same states with every domain marked as changed.
 struct Both<D> {
     listed: D,
     whole: D,
@@ -123,7 +124,7 @@ impl<D: Deformer> Both<D> {
         let mut whole = state.clone();
         whole.touch();
         let (listed, whole) = (run(&mut self.listed, state), run(&mut self.whole, &whole));
-        // A refused state is not shown; its bounds are not finite, and NaNs equal nothing.
+        // The bounds of a refused state are not finite, and NaNs equal nothing, so its numbers are not compared.
         if listed.bounds.is_finite() {
             if !listed.surface.boxes.is_empty() {
                 assert_eq!(wrong_box(&self.scene, &listed), None, "{name}, show {}", self.shows);
@@ -166,7 +167,8 @@ fn follow<D: Deformer>(name: &str, scene: &Arc<Scene>, make: &impl Fn(&Arc<Scene
         }
         last = shown;
     }
-    // Once more the same serial number; and where nothing depends on earlier steps, a deformer that saw none.
+    // The same serial number once more. Without truncation nothing depends on earlier steps, so a fresh deformer gives
+    // the same bits.
     assert_eq!(both.show(&state, name).difference(&last), None, "{name}: again");
     if !scene.needs.truncation {
         assert_eq!(run(&mut make(scene), &state).difference(&last), None, "{name}: anew");
@@ -174,7 +176,7 @@ fn follow<D: Deformer>(name: &str, scene: &Arc<Scene>, make: &impl Fn(&Arc<Scene
     eprintln!("{name}: {} shows, {moved} of them with moved domains, agree bit by bit", both.shows);
 }
 
-/// Twenty steps, in every storage and with what a scene may ask for.
+/// Twenty steps for every storage type and every feature of a deformation.
 pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let plain = |storage| Deformation { storage, ..Deformation::default() };
     let exact = |storage| Deformation { normals: Normals::Exact, ..plain(storage) };
@@ -202,8 +204,8 @@ pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
     }
 }
 
-/// Whether a deformer takes a state's word for what changed: it then leaves a domain where it was that changed and is not
-/// listed, and computes the one that is.
+/// Whether a deformer trusts a state's list of changes: it then skips a changed domain that is not listed, and computes
+/// a listed one.
 pub(crate) fn believes_lists<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) -> bool {
     let scene = crowd(Deformation::default(), false);
     let mut deformer = make(&scene);

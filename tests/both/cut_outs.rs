@@ -1,4 +1,4 @@
-//! Soups of which a part is cut out, and what of them no two filters need agree on.
+//! Triangle soups with cut-outs, and the samples where two filters may disagree.
 
 use modalcast_compute::reference::raster::cut_out::{alpha, footprint};
 use modalcast_compute::reference::raster::{Raster, corners, depth_at, outline, pieces};
@@ -8,14 +8,14 @@ use modalcast_model::scene::{Faces, Group, Window};
 use super::soups::{Soup, flat, perspective, soups};
 use crate::scenes::Random;
 
-/// Triangles from `first` on are cut out of a soup.
+/// A soup whose triangles from `first` on are cut out.
 pub(crate) struct Holes {
     pub(crate) soup: Soup,
     pub(crate) cut_outs: CutOuts,
 }
 
 impl Holes {
-    /// What the definition draws.
+    /// The result of the definition.
     pub(crate) fn drawn(&self) -> Raster {
         let Soup { window, positions, triangles, groups, .. } = &self.soup;
         let mut raster = Raster::new(*window);
@@ -23,7 +23,7 @@ impl Holes {
         raster
     }
 
-    /// Samples at which some alpha is within `tolerance` of what it must reach.
+    /// Samples at which an alpha value is within `tolerance` of its threshold.
     pub(crate) fn doubtful(&self, tolerance: f32) -> Vec<bool> {
         let (soup, cut_outs) = (&self.soup, &self.cut_outs);
         let mut list = vec![false; soup.window.pixels()];
@@ -52,7 +52,7 @@ impl Holes {
     }
 }
 
-/// An image whose level `l` has the texel `of(l, column, row)`.
+/// An image whose level `l` has the texels `of(l, column, row)`.
 pub(crate) fn image(width: u32, height: u32, mut of: impl FnMut(u32, u32, u32) -> u8) -> AlphaImage {
     let levels = (0..=width.max(height).ilog2()).map(|level| {
         let [width, height] = [width, height].map(|side| (side >> level).max(1));
@@ -61,8 +61,8 @@ pub(crate) fn image(width: u32, height: u32, mut of: impl FnMut(u32, u32, u32) -
     AlphaImage { width, height, levels: levels.collect() }
 }
 
-/// Soups whose images say the same everywhere, and surfaces without any: nothing is left to the filter. All but the first
-/// third of the triangles are cut out.
+/// Soups whose images are uniform, and surfaces without an image, so that the result does not depend on the filter. All
+/// but the first third of the triangles are cut out.
 pub(crate) fn plain_holes() -> Vec<Holes> {
     let mut random = Random(21);
     let surface = |alpha, least, image| Surface { alpha, least, image };
@@ -88,8 +88,8 @@ pub(crate) fn plain_holes() -> Vec<Holes> {
     soups().into_iter().map(holes).collect()
 }
 
-/// Two triangles that are the whole window, `side` pixels, with an image from corner to corner: u grows to the right, v
-/// downwards. In a window of the image's own size each sample is the middle of a texel.
+/// Two triangles that fill a window of `side` x `side` pixels, with an image from corner to corner: u grows to the
+/// right, v downwards. In a window of the size of the image, each sample is the center of a texel.
 pub(crate) fn sheet(side: u32, image: AlphaImage) -> Holes {
     let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| [x, y, 0.0]).concat();
     let triangles = vec![[0, 1, 2], [0, 2, 3]];
@@ -106,8 +106,8 @@ pub(crate) fn sheet(side: u32, image: AlphaImage) -> Holes {
     Holes { soup: Soup { name: "a sheet", positions, triangles, groups, window: flat(side, side) }, cut_outs }
 }
 
-/// A floor one below the eye that goes on behind it, in `cuts` x `cuts` rectangles, and a wall at its end that is whole. The
-/// floor's image is smooth, so that filters of few digits differ little.
+/// A floor one unit below the eye that continues behind it, split into `cuts` x `cuts` rectangles, and a wall without
+/// holes at its end. The floor's image is smooth, so that filters of low precision differ little.
 pub(crate) fn floor(cuts: u32) -> Holes {
     let mut positions = [[-20.0, -9.0, -20.5], [20.0, -9.0, -20.5], [20.0, 9.0, -20.5], [-20.0, 9.0, -20.5]].concat();
     let mut triangles = vec![[0, 1, 2], [0, 2, 3]];
@@ -139,7 +139,7 @@ pub(crate) fn floor(cuts: u32) -> Holes {
     Holes { soup: Soup { name: "a floor", positions, triangles, groups, window }, cut_outs }
 }
 
-/// One wave across and one down, in levels that differ, so that a wrong one shows.
+/// One wave across and one down. The levels differ, so that reading a wrong level is detected.
 fn waves() -> AlphaImage {
     let wave = |at: u32, of: u32| (std::f32::consts::TAU * (at as f32 + 0.5) / of as f32).sin();
     image(64, 32, |level, column, row| {

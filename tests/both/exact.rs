@@ -1,11 +1,12 @@
-//! Where two rasterisers may see different triangles: samples on an edge, and those where depths tie, told in f64.
+//! Samples where two rasterizers may see different triangles, found in f64: samples on an edge, and samples where
+//! depths tie.
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
-/// A step of the snapped corners, pixels.
+/// Grid spacing of snapped corners in pixels.
 const EDGE: f64 = 1.0 / 256.0;
 
-/// A triangle in homogeneous window coordinates, exact but for f64.
+/// A triangle in homogeneous window coordinates, exact up to f64.
 pub(crate) struct Exact {
     edges: [Vector3<f64>; 3],
     depths: Vector3<f64>,
@@ -29,20 +30,20 @@ impl Exact {
         self.edges.map(|edge| self.turn.signum() * edge.dot(&sample) / edge.xy().norm())
     }
 
-    /// Whether a sample lies on an edge but for a step of the snapped corners.
+    /// Whether a sample lies within one snapping step of an edge.
     fn is_on_edge(&self, sample: Vector3<f64>) -> bool {
         let distances = self.distances(sample);
         distances.iter().all(|own| *own >= -EDGE) && distances.iter().any(|own| own.abs() <= EDGE)
     }
 
-    /// Depth in the window at a sample.
+    /// Window depth at a sample.
     pub(crate) fn depth(&self, sample: Vector3<f64>) -> f64 {
         let shares = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
         0.5 * shares.dot(&self.depths) / shares.dot(&self.weights) + 0.5
     }
 }
 
-/// Samples that differ, and those of them that no rule excuses.
+/// Numbers of differing samples: on an edge, at a depth tie, and unexplained.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Differences {
     pub(crate) edges: usize,
@@ -50,7 +51,7 @@ pub(crate) struct Differences {
     pub(crate) wrong: usize,
 }
 
-/// Samples that differ; depths tie where they differ by `least` or less.
+/// Compares two lists of ids. Depths tie if they differ by `least` or less.
 pub(crate) fn compare(
     got: &[Option<u32>],
     want: &[Option<u32>],

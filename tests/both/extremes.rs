@@ -1,4 +1,4 @@
-//! Positions at the edges of f32.
+//! Positions at the limits of f32.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use modalcast_model::scene::{Deformation, Scene, State, Storage};
 use super::{beyond, run, scene_of, strip, within};
 use crate::scenes::{self, Random};
 
-/// Every storage, with and without compensation.
+/// Every storage type, with and without compensated summation.
 fn deformations() -> impl Iterator<Item = Deformation> {
     let of = |storage| [false, true].map(|compensated| Deformation { storage, compensated, ..Deformation::default() });
     Storage::ALL.into_iter().flat_map(of)
@@ -20,7 +20,7 @@ fn named(deformation: Deformation) -> String {
     format!("{}{}", deformation.storage.name(), if deformation.compensated { " compensated" } else { "" })
 }
 
-/// One domain with these columns whose vertices are all at 0 at rest: nothing hides the sum.
+/// One domain with these columns whose rest positions are all 0, so that nothing hides the sum.
 pub(super) fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> Arc<Scene> {
     let like = scenes::shape(&mut Random(1), vertices, 0).mesh;
     let mesh = Mesh::new(vec![[0.0; 3]; vertices], like.corners().clone(), like.triangles().to_vec()).expect("a mesh");
@@ -38,7 +38,7 @@ fn negated(state: &State) -> State {
     other
 }
 
-/// q of 1e30, and so small that f32 has few digits left for it.
+/// q of 1e30, and q so small that f32 has few significant digits left.
 pub(crate) fn huge_and_tiny_amounts<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let columns = noise(&mut Random(31), 3 * 140 * 9);
     for deformation in deformations() {
@@ -51,7 +51,7 @@ pub(crate) fn huge_and_tiny_amounts<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D
             let shown = run(&mut deformer, &state);
             assert!(shown.bounds.is_finite(), "{name}: {:?}", shown.bounds);
             within(&name, (&scene, &state), &shown.surface.positions, 0.0);
-            // f16 and int8 multiply q by a factor first, of which denormals do not leave enough to tell signs apart.
+            // f16 and int8 first multiply q by a scale. Denormals then have too few digits to distinguish signs.
             let tells =
                 amount >= 1e-38 || amount == 1e-42 && matches!(deformation.storage, Storage::F32 | Storage::Bf16);
             if tells {
@@ -62,7 +62,7 @@ pub(crate) fn huge_and_tiny_amounts<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D
     }
 }
 
-/// Columns of U from 1e-6 to 1e6, each with q that makes it matter, and with q alike.
+/// Columns of U from 1e-6 to 1e6, with q that balances their scales and with equal q.
 pub(crate) fn columns_of_every_scale<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let (vertices, rank) = (140, 13);
     let scale = |mode: usize| 10_f32.powi(mode as i32 - 6);
@@ -86,10 +86,10 @@ pub(crate) fn columns_of_every_scale<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
     }
 }
 
-/// The plain sum of modes that nearly cancel is worse than the compensated one's bound by this.
+/// Least ratio of the error of the plain sum to the bound of the compensated sum, for nearly canceling modes.
 const WORSE: f64 = 1000.0;
 
-/// Modes in pairs that nearly cancel: compensation keeps the digits that the plain sum loses.
+/// Pairs of modes that nearly cancel: the compensated sum keeps the digits that the plain sum loses.
 pub(crate) fn modes_that_nearly_cancel<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let (mut random, vertices, rank) = (Random(17), 200, 64);
     let half = noise(&mut random, 3 * vertices * rank / 2);
@@ -105,7 +105,8 @@ pub(crate) fn modes_that_nearly_cancel<D: Deformer>(make: impl Fn(&Arc<Scene>) -
         let want = reference::deform(&scene, &state).into_flattened();
         let part = |(row, (got, want)): (usize, (&f32, &f64))| {
             let term = |mode: usize| (f64::from(modes.at(row / 3, row % 3, mode)) * f64::from(state.q[mode])).abs();
-            // Dot2: half a unit in the last place of the sum, and gamma squared of the terms; then four roundings.
+            // Bound of Dot2: half a unit in the last place of the sum plus gamma squared times the terms; then four
+            // roundings.
             let terms = (0..rank).map(term).sum::<f64>();
             let bound = f64::exp2(-24.0) * 5.0 * want.abs() + (65.0 * f64::exp2(-24.0)).powi(2) * terms;
             (f64::from(*got) - want).abs() / bound
@@ -118,7 +119,7 @@ pub(crate) fn modes_that_nearly_cancel<D: Deformer>(make: impl Fn(&Arc<Scene>) -
     assert!(plain > WORSE, "a plain sum is {plain} of that bound");
 }
 
-/// Partial sums that no f32 holds on the way to one that does, and infinity less infinity in the transform.
+/// Partial sums beyond f32 whose total is finite, and infinity minus infinity in the transform.
 pub(crate) fn finite_sums_that_overflow_on_their_way<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let column = |row: [f32; 3]| row.repeat(5);
     let columns = [[1.0, 1.0, 0.0]; 4].map(column).concat();
@@ -140,11 +141,11 @@ pub(crate) fn finite_sums_that_overflow_on_their_way<D: Deformer>(make: impl Fn(
             assert!(off <= 1e-5, "{name}: {positions:?}");
         };
         judge(&state, [0.0, 0.0, 0.75]);
-        // x = y = 6e38: the first row takes one from the other, the second is infinity times zero in f32.
+        // x = y = 6e38: the first row subtracts them, and the second row is infinity times zero in f32.
         state.q = vec![3e38, 3e38, 0.0, 0.0, 0.75];
         state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 5.0, 0.0, 0.0, 1.0, -5.0]);
         judge(&state, [0.75, 5.75, -4.25]);
-        // The control: what is not finite in the end is told, and forgotten afterwards.
+        // Control: a result that is not finite is reported, for that step only.
         state.transforms[0].0[1] = 1.0;
         assert!(!run(&mut deformer, &state).bounds.is_finite(), "{name}");
         state.q = vec![1.0, 0.0, 0.0, 0.0, 1.0];
@@ -152,7 +153,7 @@ pub(crate) fn finite_sums_that_overflow_on_their_way<D: Deformer>(make: impl Fn(
     }
 }
 
-/// A tile whose rows of U are all zero has no scale: it stays where q of 0 puts it, whatever q.
+/// A tile whose rows of U are all zero has no scale: it keeps its positions at q = 0 for every q.
 pub(crate) fn tiles_of_zeros<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let (vertices, rank) = (300, 6);
     let shape = scenes::shape(&mut Random(33), vertices, rank);
@@ -183,7 +184,7 @@ pub(crate) fn tiles_of_zeros<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     }
 }
 
-/// Ranks about those of chunks and groups of chunks, for one vertex, less than a quad's worth of lanes, and two tiles.
+/// Ranks around the sizes of chunks and groups of chunks, for one vertex, for less than two quads, and for two tiles.
 pub(crate) fn ranks_of_all_sizes<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for storage in Storage::ALL {
         for rank in [1, 3, 31, 33, 512] {

@@ -1,4 +1,4 @@
-//! Domains that follow others by constant frames: T = T_mover F.
+//! Domains that follow others by constant frames: T = T_root F.
 
 use std::sync::Arc;
 
@@ -15,14 +15,15 @@ use super::surfaces::largest_error;
 use super::{Shown, beyond, run, strip, within};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
-/// Largest accepted error of a component of a unit vector; products of shears are worse conditioned than each alone.
+/// Largest accepted error of a component of a unit vector. Products of shears have a worse condition number than single
+/// shears.
 const DIRECTION: f64 = 1e-4;
 
-/// Vertices and ranks of the shapes.
+/// Numbers of vertices and ranks of the shapes.
 const SIZES: [(usize, usize); 9] =
     [(1, 0), (1, 3), (7, 0), (31, 1), (33, 4), (130, 31), (257, 0), (300, 33), (2000, 2)];
 
-/// A similarity, every third mirrored; unless `rigid`, every second sheared too.
+/// A similarity transform; every third is mirrored. Unless `rigid`, every second is sheared too.
 fn frame(random: &mut Random, at: usize, rigid: bool) -> Transform {
     let mut frame = random.similarity(at.is_multiple_of(3));
     if !rigid && at.is_multiple_of(2) {
@@ -32,11 +33,12 @@ fn frame(random: &mut Random, at: usize, rigid: bool) -> Transform {
     frame
 }
 
-/// A third of the domains are movers, and the others follow an earlier domain each, be it a follower itself.
+/// A scene in which one third of the domains are transform roots. Each other domain follows an earlier one, which may
+/// be a follower itself.
 pub(crate) fn grove(count: usize, deformation: Deformation, rigid: bool) -> Parts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> = SIZES.iter().map(|(vertices, rank)| strip(&mut random, *vertices, *rank)).collect();
-    // And corners that are no vertices.
+    // A shape with more corners than vertices.
     shapes.push(scenes::shape(&mut random, 40, 2));
     let kinds = shapes.len();
     let mut parts = scenes::parts(shapes);
@@ -53,7 +55,7 @@ pub(crate) fn grove(count: usize, deformation: Deformation, rigid: bool) -> Part
     parts
 }
 
-/// The same scene where nobody follows, in a state whose transforms are told by `place`.
+/// The same scene without followers, in a state whose transforms are given by `place`.
 fn apart(mut parts: Parts, state: &State, place: impl Fn(usize) -> Transform) -> (Arc<Scene>, State) {
     parts.domains.iter_mut().for_each(|domain| domain.follows = None);
     let scene = Scene::new(parts).expect("a scene");
@@ -69,7 +71,7 @@ fn turned(shown: &Shown, scene: &Scene, state: &State) -> [f64; 2] {
     [normals, largest_error(&shown.surface.tangents, orient_tangents(scene, state).as_flattened())]
 }
 
-/// Mirrored, sheared and chained frames of small and large shapes in every storage.
+/// Mirrored, sheared and chained frames of small and large shapes for every storage type.
 pub(crate) fn frames_of_all_sizes<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for (storage, rigid) in Storage::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
         let name = format!("followers, {}, rigid {rigid}", storage.name());
@@ -82,11 +84,11 @@ pub(crate) fn frames_of_all_sizes<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) 
         let errors = turned(&shown, &scene, &state);
         eprintln!("{name}: normals off by {:.2e}, tangents by {:.2e}", errors[0], errors[1]);
         assert!(errors.iter().all(|error| *error <= DIRECTION), "{name}: {errors:?}");
-        // A mover in the place of each has the same bits.
+        // A root at the place of each follower has the same bits.
         let (others, placed) = apart(parts(), &state, |domain| state.transform_of(&scene, domain));
         let twin = run(&mut make(&others), &placed);
         assert!(twin.bounds == shown.bounds && bits(&twin.surface.positions) == bits(&shown.surface.positions));
-        // The control: without their frames all followers are elsewhere and look elsewhere.
+        // Control: without their frames all followers have other positions and normals.
         let (others, bare) = apart(parts(), &state, |domain| state.transforms[scene.movers.of(domain)]);
         let followers: Vec<usize> = (0..45).filter(|domain| domain % 3 != 0).collect();
         assert_eq!(beyond((&others, &bare), &shown.surface.positions, 0.0), followers, "{name}");
@@ -98,18 +100,18 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|number| number.to_bits()).collect()
 }
 
-/// The mover of a domain, from parent to parent.
+/// The transform root of a domain, found along its parents.
 fn root(scene: &Scene, domain: usize) -> usize {
     scene.domains[domain].follows.map_or(domain, |follow| root(scene, follow.parent))
 }
 
-/// Domains that a step changes: named ones, and those whose mover is named.
+/// Domains that a step changes: named ones, and those whose transform root is named.
 fn changed_by(scene: &Scene, q: &[u32], transforms: &[u32]) -> Vec<u32> {
     let moves = |domain: &u32| q.contains(domain) || transforms.contains(&(root(scene, *domain as usize) as u32));
     (0..scene.domains.len() as u32).filter(moves).collect()
 }
 
-/// A list that moves some movers and bends some followers gives the bits of the whole.
+/// A list that moves some roots and bends some followers gives the bits of a full step.
 pub(crate) fn steps_of_movers<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let plain = Deformation::default();
     for deformation in [
@@ -155,7 +157,7 @@ fn moves(scene: &Scene, domain: u32, [before, after]: [&Shown; 2]) -> bool {
     own(before) != own(after)
 }
 
-/// A step that puts a domain 10,000 km away, without turning it.
+/// A step that moves a domain by an f64 translation without rotating it.
 fn far_step(domain: u32, translation: [f64; 3]) -> RawUpdate {
     let rotation = [0.0_f32, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
     let bytes: Vec<u8> = rotation.chain(translation.into_iter().flat_map(f64::to_le_bytes)).collect();
@@ -167,7 +169,7 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawUpdate {
     }
 }
 
-/// Followers are in the cell of their mover, and as exact there as at home.
+/// Followers are in the origin cell of their root, and as precise there as near the origin.
 pub(crate) fn far_away<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
     let mut parts = scenes::parts(vec![strip(&mut random, 50, 0)]);
@@ -197,7 +199,7 @@ pub(crate) fn far_away<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     assert!(rounded > 0.1, "the control: in f32 from the origin it would be off by {rounded} m");
 }
 
-/// T and F are each far beyond what f32 holds of their product; what they make of tiny vertices is not.
+/// The product of T and F exceeds the range of f32; the positions that it gives to tiny vertices do not.
 pub(crate) fn products_that_overflow<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(65);
     let rest: Vec<[f32; 3]> = (0..37).map(|_| random.triple().map(|number| number * 1e-20)).collect();

@@ -1,4 +1,4 @@
-//! The judge of positions: errors against the f64 twin as parts of their a-priori bounds.
+//! Comparison of positions and displacements with the f64 twin, relative to their a-priori bounds.
 
 use modalcast_compute::reference;
 use modalcast_compute::storage::bound::{Reaches, Step};
@@ -7,14 +7,14 @@ use modalcast_model::scene::{Scene, State};
 
 const TILE: usize = QUAD * TILE_QUADS;
 
-/// Of each domain the largest error of a vertex as a part of the bound of its tile; infinite for what is not finite.
-/// Modes that were left out may move a vertex by `left_out` more, in scene units.
+/// Largest error of each domain relative to the bound of its tile; infinite for values that are not finite. Truncated
+/// modes add `left_out`, in scene units, to the bound.
 fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], left_out: f64) -> Vec<f64> {
     let bound = |reaches: &Reaches, tile: usize, step: &Step| reaches.tile(tile, step).total() + left_out;
     parts((scene, state), positions, &reference::deform(scene, state), bound)
 }
 
-/// The same of displacements.
+/// The same for displacements.
 fn parts_of_displacement_bound(scene: &Scene, state: &State, displacements: &[f32]) -> Vec<f64> {
     let bound = |reaches: &Reaches, tile: usize, step: &Step| reaches.displacement(tile, step.q, step.compensated);
     parts((scene, state), displacements, &reference::displacements(scene, state), bound)
@@ -47,13 +47,13 @@ fn parts(
     (0..scene.domains.len()).map(part).collect()
 }
 
-/// Of a bound of 0, as that of a domain without modes, no error is no part.
+/// Ratio of an error to its bound. No error gives 0 even if the bound is 0, as for a domain without modes.
 fn part_of(error: f64, bound: f64) -> f64 {
     let part = if error == 0.0 { 0.0 } else { error / bound };
     if part.is_nan() { f64::INFINITY } else { part }
 }
 
-/// Prints the largest part of its bound that an error takes up, and refuses more than all of it.
+/// Prints the largest ratio of an error to its bound, and panics if it exceeds 1.
 pub(crate) fn within(name: &str, (scene, state): (&Scene, &State), positions: &[f32], left_out: f64) {
     let parts = parts_of_bound(scene, state, positions, left_out);
     let worst = (0..parts.len()).max_by(|a, b| parts[*a].total_cmp(&parts[*b])).expect("a domain");
@@ -61,7 +61,7 @@ pub(crate) fn within(name: &str, (scene, state): (&Scene, &State), positions: &[
     assert!(parts[worst] <= 1.0, "{name}: '{}' is {} of its bound off", scene.domains[worst].name, parts[worst]);
 }
 
-/// [`within`] of displacements.
+/// [`within`] for displacements.
 pub(crate) fn displacements_within(name: &str, (scene, state): (&Scene, &State), displacements: &[f32]) {
     let parts = parts_of_displacement_bound(scene, state, displacements);
     let worst = (0..parts.len()).max_by(|a, b| parts[*a].total_cmp(&parts[*b])).expect("a domain");
@@ -69,20 +69,20 @@ pub(crate) fn displacements_within(name: &str, (scene, state): (&Scene, &State),
     assert!(parts[worst] <= 1.0, "{name}: u of '{}' is {} of its bound off", scene.domains[worst].name, parts[worst]);
 }
 
-/// The domains with a displacement beyond its bound.
+/// Domains with a displacement error beyond its bound.
 pub(crate) fn displacements_beyond((scene, state): (&Scene, &State), displacements: &[f32]) -> Vec<usize> {
     let parts = parts_of_displacement_bound(scene, state, displacements);
     (0..parts.len()).filter(|domain| parts[*domain] > 1.0).collect()
 }
 
-/// The domains with an error beyond its bound.
+/// Domains with a position error beyond its bound.
 pub(crate) fn beyond((scene, state): (&Scene, &State), positions: &[f32], left_out: f64) -> Vec<usize> {
     let parts = parts_of_bound(scene, state, positions, left_out);
     (0..parts.len()).filter(|domain| parts[*domain] > 1.0).collect()
 }
 
 #[test]
-fn the_judge_of_bounds_refuses_a_wrong_vertex_and_what_is_not_finite() {
+fn judge_refuses_wrong_and_non_finite_vertices() {
     let mut random = crate::scenes::Random(1);
     let shapes = vec![super::strip(&mut random, 130, 3), super::strip(&mut random, 7, 0)];
     let scene = super::scene_of(shapes, 1, Default::default(), false);

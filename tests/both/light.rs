@@ -1,4 +1,4 @@
-//! What vertices take up in light space: nothing is outside, little is between, and a scene without a shadow is not measured.
+//! Light-space bounds: they contain every vertex, they are tight, and a scene without a shadow has none.
 
 use std::sync::Arc;
 
@@ -9,11 +9,11 @@ use modalcast_model::scene::{Batches, Bounds, Deformation, LightBounds, Scene, S
 use super::{Shown, run, scene_of};
 use crate::scenes::{self, Random};
 
-/// Vertices of a tile, of which a box is made.
+/// Vertices per tile; each tile contributes one box.
 pub(crate) const TILE: usize = 128;
 
-/// A thin coil along the diagonal of a cube of side 2, which bends in smooth waves: the box of a tile of it is small, that
-/// of all of it is not.
+/// A thin coil along the diagonal of a cube of side 2, bent by smooth waves. The box of each of its tiles is small,
+/// while the box of the whole coil is not.
 pub(crate) fn coil(vertices: usize, rank: usize) -> Shape {
     let along = |vertex: usize| vertex as f32 / vertices as f32;
     let point = |vertex: usize| {
@@ -29,35 +29,36 @@ pub(crate) fn coil(vertices: usize, rank: usize) -> Shape {
     Shape::new(mesh, modes).expect("a shape")
 }
 
-/// Coils of tiles of their own and of shared ones.
+/// Coils that fill tiles of their own and coils that share tiles.
 pub(crate) fn coils(deformation: Deformation) -> Arc<Scene> {
     scene_of(vec![coil(5000, 4), coil(700, 2), coil(9, 1)], 2, deformation, false)
 }
 
-/// The smallest box along the axes of a scene's light that holds all of the packed positions, tile by tile of `size`.
+/// The smallest box along the light axes of a scene that contains the boxes of all tiles of `size` packed positions.
 pub(crate) fn along(scene: &Scene, positions: &[f32], size: usize) -> LightBounds {
     let axes = scene.light_axes().expect("the look has a shadow");
     let tile = |positions: &[f32]| LightBounds::of_box(&axes, &Bounds::of(positions));
     positions.chunks(3 * size).map(tile).fold(LightBounds::EMPTY, LightBounds::union)
 }
 
-/// How far `inner` reaches out of `outer`, or a NaN if there is one.
+/// Distance by which `inner` exceeds `outer`, or NaN if either contains a NaN.
 pub(crate) fn beyond(outer: &LightBounds, inner: &LightBounds) -> f64 {
     let ends = (0..3).flat_map(|axis| [outer.0.min[axis] - inner.0.min[axis], inner.0.max[axis] - outer.0.max[axis]]);
     ends.fold(0.0, |most: f64, end| if end.is_nan() || most.is_nan() { f64::NAN } else { most.max(end) })
 }
 
-/// The sum of the largest coordinates: what f32 rounds in proportion to.
+/// Sum of the largest absolute coordinates; the rounding error of f32 is proportional to it.
 pub(crate) fn reach(bounds: &Bounds) -> f64 {
     bounds.min.iter().zip(&bounds.max).map(|(min, max)| min.abs().max(max.abs())).sum()
 }
 
-/// The largest diagonal of the box of a tile.
+/// Largest diagonal of the box of a tile.
 fn widest(positions: &[f32]) -> f64 {
     positions.chunks(3 * TILE).map(|tile| Bounds::of(tile).diagonal()).fold(0.0, f64::max)
 }
 
-/// What a step says of light space, which holds every vertex and not much more than the corners of the bounds.
+/// Light bounds of a step, checked to contain every vertex and to exceed the box of the corners of the bounds only by
+/// rounding.
 fn held(name: &str, scene: &Scene, shown: &Shown) -> LightBounds {
     let light = shown.light.expect("the look has a shadow");
     let (exact, corners) = (along(scene, &shown.surface.positions, 1), along_corners(scene, &shown.bounds));
@@ -73,7 +74,7 @@ fn along_corners(scene: &Scene, bounds: &Bounds) -> LightBounds {
     LightBounds::of_box(&scene.light_axes().expect("the look has a shadow"), bounds)
 }
 
-/// Random, smooth, moved far away, of one vertex, and of domains that share a tile.
+/// Scenes that are random, smooth, far away or tiny, that have one vertex, or whose domains share tiles.
 pub(crate) fn every_vertex_is_held<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let together = Deformation { batches: Batches::Always, ..Deformation::default() };
     let scenes = [
@@ -95,7 +96,7 @@ pub(crate) fn every_vertex_is_held<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
     }
 }
 
-/// Half the volume at most of what the corners give, and no more than a tile's diagonal beyond the vertices.
+/// Less than half the volume of the box of the corners, and no more than the diagonal of a tile beyond the vertices.
 pub(crate) fn a_thin_scene_is_fitted_closely<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let scene = scene_of(vec![coil(5000, 4)], 1, Deformation::default(), false);
     let shown = run(&mut make(&scene), &State::rest(&scene));
@@ -109,7 +110,7 @@ pub(crate) fn a_thin_scene_is_fitted_closely<D: Deformer>(make: impl Fn(&Arc<Sce
     assert!(light < 0.5 * corners && exact <= light);
 }
 
-/// A look without a shadow asks for nothing, and what overflows is told.
+/// A look without a shadow has no light bounds, and overflow is reported.
 pub(crate) fn nothing_is_measured_without_a_shadow_and_overflow_is_told<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let mut parts = scenes::parts(vec![scenes::shape(&mut Random(3), 300, 2)]);
     parts.domains = vec![scenes::domain(0, 0); 2];

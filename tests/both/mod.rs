@@ -1,5 +1,5 @@
-//! What any deformer must do at the edges of f32 and from step to step. A check takes a function that makes the deformer
-//! of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
+//! Checks that every deformer must pass: the limits of f32, partial steps, followers and readers. Each check takes a
+//! function that creates the deformer of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
 
 pub(crate) mod changes;
 #[allow(dead_code, reason = "each test binary uses a part")]
@@ -25,7 +25,7 @@ use modalcast_model::scene::{Bounds, Deformation, LightBounds, Scene, State};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 pub(crate) use judge::{beyond, displacements_beyond, displacements_within, within};
 
-/// All that a step gives.
+/// All results of a step.
 #[derive(Debug, Clone)]
 pub(crate) struct Shown {
     pub(crate) bounds: Bounds,
@@ -39,7 +39,7 @@ pub(crate) fn run(deformer: &mut dyn Deformer, state: &State) -> Shown {
 }
 
 impl Shown {
-    /// The first number that differs in a bit, in words.
+    /// Describes the first number whose bits differ.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         let lists = |shown: &Self| {
             let Surface { positions, normals, tangents, displacements, .. } = shown.surface.clone();
@@ -60,7 +60,7 @@ impl Shown {
     }
 }
 
-/// A shape whose corner i is its vertex i, in the unit cube.
+/// A shape in the unit cube whose corner i is its vertex i.
 pub(crate) fn strip(random: &mut Random, vertices: usize, rank: usize) -> Shape {
     let other = scenes::shape(random, vertices, rank);
     let normals = (0..vertices).map(|_| random.triple()).collect();
@@ -71,7 +71,7 @@ pub(crate) fn strip(random: &mut Random, vertices: usize, rank: usize) -> Shape 
     Shape::new(mesh, other.modes).expect("a shape")
 }
 
-/// Domains called by their index, `instances` of each shape.
+/// A scene of domains named by their index, with `instances` domains per shape.
 pub(crate) fn scene_of(
     shapes: Vec<Shape>,
     instances: usize,
@@ -88,7 +88,7 @@ pub(crate) fn scene_of(
 }
 
 #[test]
-fn a_bit_a_length_and_a_bound_are_differences() {
+fn difference_detects_bits_lengths_and_bounds() {
     let surface = Surface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..Surface::default() };
     let shown = Shown { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
     assert_eq!(shown.difference(&shown), None);

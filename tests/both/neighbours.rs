@@ -1,4 +1,4 @@
-//! The same domain has the same bits alone, among a thousand others, and in a scene large enough for other kernels.
+//! A domain has the same bits alone, among a thousand others, and in a scene large enough for other kernel variants.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use modalcast_model::scene::{Deformation, Scene, State, Storage};
 use super::{Shown, run, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
-/// Shapes that are looked at: smaller than a quad's multiple, in mixed tiles and in tiles of their own.
+/// Shapes under test: with vertex counts that are no multiple of a quad, in shared tiles and in tiles of their own.
 fn looked_at() -> Vec<Shape> {
     let mut random = Random(61);
     vec![
@@ -21,8 +21,8 @@ fn looked_at() -> Vec<Shape> {
     ]
 }
 
-/// A scene with one domain of each of these between `before` and `after` domains of other shapes, and `instances` domains
-/// of a shape of four tiles; and where the first of these is.
+/// A scene with one domain of each shape under test between `before` and `after` domains of other shapes, and
+/// `instances` domains of a shape of four tiles. Also returns the index of the first domain under test.
 fn among(deformation: Deformation, (before, after): (usize, usize), instances: usize) -> (Arc<Scene>, usize) {
     let mut random = Random(62);
     let mut shapes: Vec<Shape> = (0..before + after).map(|at| strip(&mut random, 3 + at % 6, at % 6)).collect();
@@ -39,7 +39,7 @@ fn among(deformation: Deformation, (before, after): (usize, usize), instances: u
     (Scene::new(parts).expect("a scene"), before)
 }
 
-/// The values of the looked at domains, wherever they are, amidst random others.
+/// A state with the values `own` for the domains under test and random values for the others.
 fn state_of(scene: &Scene, first: usize, own: &State) -> State {
     let mut state = scenes::state(scene, 63);
     let mut q = own.q.iter();
@@ -62,12 +62,12 @@ fn bits_of(shown: &Shown, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
     .map(|numbers| numbers.iter().map(|number| number.to_bits()).collect())
 }
 
-/// Whether the GPU has so few tiles that a lane takes one vertex instead of four.
+/// Whether the GPU plan has so few tiles that each lane computes one vertex instead of four.
 pub(crate) fn is_narrow(scene: &Scene) -> bool {
     plan(scene).kernel(Launch::Deform).expect("every scene has it").defines.contains(&"NARROW")
 }
 
-/// Alone, among a thousand, among a thousand and 270 instances; and run again after another state.
+/// Compares the bits of domains alone, among a thousand others, and with 270 instances more, also after another state.
 pub(crate) fn alone_and_among_others<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated) in Storage::ALL.map(|storage| (storage, storage == Storage::Bf16)) {
         let deformation = Deformation { storage, compensated, ..Deformation::default() };
@@ -84,7 +84,7 @@ pub(crate) fn alone_and_among_others<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
                 let (got, want) = (bits_of(&got, &scene, first + at), bits_of(&want, &alone, at));
                 assert!(got == want, "{name}, shape {at} among {} others", scene.domains.len());
             }
-            // The judge can fail, and the run in between leaves nothing behind.
+            // Control: another state gives other bits. It does not affect later steps.
             let other = run(&mut deformer, &scenes::state(&scene, 65));
             assert!(bits_of(&other, &scene, first) != bits_of(&want, &alone, 0));
             assert_eq!(run(&mut deformer, &state).difference(&got), None, "{name}: again");

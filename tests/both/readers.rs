@@ -1,4 +1,4 @@
-//! What a scene keeps for readers: displacements, and a box of each domain.
+//! Attributes that a scene keeps for readers: displacements, and a box per domain.
 
 use std::sync::Arc;
 
@@ -13,12 +13,12 @@ use super::neighbours::is_narrow;
 use super::{Shown, changes, displacements_beyond, displacements_within, run, scene_of, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
-/// The same with displacements and boxes.
+/// The same deformation with displacements and boxes.
 pub(crate) fn kept(deformation: Deformation) -> Deformation {
     Deformation { displacements: true, boxes: true, ..deformation }
 }
 
-/// The first domain whose box is not that of its positions.
+/// The first domain whose box differs from the bounds of its positions.
 pub(crate) fn wrong_box(scene: &Scene, shown: &Shown) -> Option<usize> {
     let slots = &scene.layout.slots;
     assert_eq!(shown.surface.boxes.len(), slots.len(), "a box of each domain");
@@ -29,15 +29,15 @@ pub(crate) fn wrong_box(scene: &Scene, shown: &Shown) -> Option<usize> {
     (0..slots.len()).find(|domain| shown.surface.boxes[*domain] != of(*domain))
 }
 
-/// Vertices and ranks for every kind of tile: shared ones, own ones, several of a domain; with `many`, of so many domains
-/// that a lane takes four vertices.
+/// Numbers of vertices and ranks for every kind of tile: shared, own, and several per domain. With `many` there are so
+/// many domains that a lane computes four vertices.
 fn sizes(many: bool) -> Vec<(usize, usize)> {
     let few = [(1, 3), (7, 2), (9, 0), (31, 1), (64, 5), (65, 0), (130, 33), (1, 0), (300, 4)];
     let others = (0..900).map(|at| (3 + at % 9, at % 4)).chain([(4097, 0), (5000, 3)]);
     if many { others.collect() } else { few.to_vec() }
 }
 
-/// Each twice, or with `many` the last one 30 times.
+/// A scene with two domains per shape, or with `many` one domain per shape and 30 of the last.
 fn scene(deformation: Deformation, many: bool) -> Arc<Scene> {
     let mut random = Random(101);
     let shape = |(at, (vertices, rank)): (usize, (usize, usize))| match at % 2 {
@@ -56,7 +56,8 @@ fn scene(deformation: Deformation, many: bool) -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
-/// u within its bound, a box that holds its domain and nothing more, and vertices of the bits that they have without.
+/// Displacements are within their bound, boxes are tight, and vertices have the bits that they have without these
+/// attributes.
 pub(crate) fn displacements_and_boxes_equal_their_twins<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated, many) in Storage::ALL.into_iter().flat_map(|storage| {
         [(storage, false, false), (storage, true, false), (storage, storage == Storage::Bf16, true)]
@@ -73,7 +74,7 @@ pub(crate) fn displacements_and_boxes_equal_their_twins<D: Deformer>(make: impl 
         assert_eq!(vertices.difference(&without), None, "{name}: keeping changes no vertex");
         displacements_within(&name, (&kept, &state), &with.surface.displacements);
         assert_eq!(wrong_box(&kept, &with), None, "{name}");
-        // The judges can fail, for each domain that has modes; the others have zeros.
+        // Control: other coordinates exceed the bound of each domain with modes; the other domains have zeros.
         let mut other = state.clone();
         other.q.iter_mut().for_each(|number| *number = -*number);
         let bent: Vec<usize> = (0..kept.domains.len()).filter(|domain| kept.rank_of(*domain) > 0).collect();
@@ -84,7 +85,7 @@ pub(crate) fn displacements_and_boxes_equal_their_twins<D: Deformer>(make: impl 
     }
 }
 
-/// A scene none of whose domains has modes has displacements of zero, and boxes.
+/// A scene in which no domain has modes has zero displacements, and boxes.
 pub(crate) fn a_scene_without_modes_has_zeros<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(103);
     let shapes = vec![strip(&mut random, 7, 0), scenes::shape(&mut random, 300, 0)];
@@ -95,7 +96,7 @@ pub(crate) fn a_scene_without_modes_has_zeros<D: Deformer>(make: impl Fn(&Arc<Sc
     assert_eq!(wrong_box(&scene, &shown), None);
 }
 
-/// What is read alone is that of the last step, and so is what is read after it.
+/// Attributes read alone are those of the last step, and so are attributes read later.
 pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let scene = scene(kept(Deformation::default()), false);
     let (mut deformer, mut random) = (make(&scene), Random(105));
@@ -128,8 +129,8 @@ pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
     }
 }
 
-/// What is fetched is what was wanted of its own step and nothing else; another wish for the same step is granted too, and
-/// all of it stays whatever is deformed later.
+/// A fetch returns the requested attributes of its own step and nothing else. Other requests for the same step succeed
+/// too, and fetched data stay valid when later steps are computed.
 pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let scene = scene(kept(Deformation::default()), false);
     let (mut deformer, mut random, mut state) = (make(&scene), Random(108), scenes::state(&scene, 109));
@@ -149,13 +150,13 @@ pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) ->
                     (wanted.displacements, got.displacements == want.displacements, got.displacements.is_empty()),
                     (wanted.boxes, got.boxes == want.boxes, got.boxes.is_empty()),
                 ];
-                // What an earlier wish brought may serve a smaller one.
+                // A smaller request may receive the attributes of an earlier one.
                 let is = |(wanted, same, empty): &(bool, bool, bool)| *same || !wanted && *empty;
                 assert!(parts.iter().all(is) && got.tangents.is_empty(), "before step {step}: {wanted:?}, {parts:?}");
             }
         }
     }
-    // The control: the next step has other parts.
+    // Control: the next step has other attributes.
     let (last, _) = before.pop().expect("a step");
     changes::apply(&scene, &mut state, &mut random, (&[1, 6], &[2, 6]));
     let next = run(&mut deformer, &state).surface;
@@ -163,23 +164,24 @@ pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) ->
     assert!(last.displacements != next.displacements && last.boxes != next.boxes);
 }
 
-/// One of sixteen.
+/// One of the sixteen combinations of attributes.
 fn wish(number: usize) -> Wanted {
     let bit = |at: usize| number >> at & 1 == 1;
     Wanted { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
 }
 
-/// Two modes of ones along x and y, one along z, so that u is known.
+/// Modes of ones along x and y (twice) and along z, so that u is known.
 fn ones(deformation: Deformation) -> Arc<Scene> {
     let column = |row: [f32; 3]| row.repeat(5);
     let columns = [column([1.0, 1.0, 0.0]), column([1.0, 1.0, 0.0]), column([0.0, 0.0, 1.0])].concat();
     columns_of(5, columns, deformation)
 }
 
-/// Shrinks so much that x is finite where u is not.
+/// Shrinks so much that x is finite where u overflows.
 const TINY: Transform = Transform([1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0]);
 
-/// A displacement that f32 holds survives a sum that overflows on its way; one that it does not hold is told, whatever x.
+/// A displacement in the range of f32 survives intermediate overflow. One that overflows is reported, even if x is
+/// finite.
 pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated) in Storage::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
         let plain = Deformation { storage, compensated, ..Deformation::default() };
@@ -188,7 +190,7 @@ pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: 
         let (mut without, mut with) = (make(&bare), make(&kept));
         let mut state = State::rest(&kept);
         state.transforms[0] = TINY;
-        // 6e38 is too much.
+        // u is 6e38, which exceeds f32.
         state.q = vec![3e38, 3e38, 0.75];
         assert!(run(&mut without, &state).bounds.is_finite(), "{name}: x is finite");
         assert!(!run(&mut with, &state).bounds.is_finite(), "{name}: u is not");
@@ -197,7 +199,7 @@ pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: 
         assert!(shown.bounds.is_finite() && wrong_box(&kept, &shown).is_none(), "{name}: {:?}", shown.bounds);
         displacements_within(&name, (&kept, &state), &shown.surface.displacements);
     }
-    // Partial sums that overflow where the whole does not.
+    // Partial sums overflow although the total is finite.
     let row = [1.0_f32, -1.0, 0.5].repeat(5);
     let scene = columns_of(5, [row.clone(), row.clone(), row.clone(), row].concat(), kept(Deformation::default()));
     let mut state = State::rest(&scene);
@@ -211,7 +213,7 @@ pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: 
     }
 }
 
-/// The workbench refuses a step that loses a displacement by its domain's name, and nobody reads it.
+/// A step with an overflowing displacement is refused with the name of its domain, and no reader sees it.
 pub(crate) fn lost_displacements_are_refused_by_name(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut bench = Workbench::open(&config).expect("a workbench");

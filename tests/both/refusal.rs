@@ -1,4 +1,4 @@
-//! Steps that overflow are told, refused by the domain's name, and leave nothing behind.
+//! Steps that overflow are reported, are refused with the name of the domain, and do not affect later steps.
 
 use std::sync::Arc;
 
@@ -23,10 +23,10 @@ fn scene(storage: Storage) -> Arc<Scene> {
     scene_of(shapes, 2, Deformation { storage, ..Deformation::default() }, true)
 }
 
-/// Large enough that f32 overflows in the transform if it did not in the sum.
+/// Large enough that f32 overflows in the transform if it does not in the sum.
 const FAR: Transform = Transform([1e3, -2e3, 1e3, 0.0, 1e3, 1e3, -3e3, 0.0, -1e3, 1e3, 1e3, 0.0]);
 
-/// A step that overflows makes the bounds not finite, and the next good one is that of a deformer that never saw it.
+/// A step that overflows gives bounds that are not finite. The next valid step equals that of a fresh deformer.
 pub(crate) fn overflow_is_told_and_forgotten<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for storage in Storage::ALL {
         let scene = scene(storage);
@@ -41,7 +41,7 @@ pub(crate) fn overflow_is_told_and_forgotten<D: Deformer>(make: impl Fn(&Arc<Sce
             bad.q[first..first + 2].fill(amount);
             bad.transforms[1] = FAR;
             assert!(!deformer.deform(&bad).expect("deforms").bounds.is_finite(), "{}: {amount:e}", storage.name());
-            // Another domain changes in the step after the refused one: its state's history has no overflow.
+            // Another domain changes in the step after the refused one; the history of that state contains no overflow.
             changes::apply(&scene, &mut good, &mut random, (&[2], &[]));
             let after = run(&mut deformer, &good);
             assert!(after.bounds.is_finite() && after.difference(&before).is_some());
@@ -50,7 +50,7 @@ pub(crate) fn overflow_is_told_and_forgotten<D: Deformer>(make: impl Fn(&Arc<Sce
     }
 }
 
-/// The workbench refuses the step by the domain's name, and its vertices stay those of the last good step.
+/// The step is refused with the name of its domain, and the vertices stay those of the last valid step.
 pub(crate) fn overflow_is_refused_by_name(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut bench = Workbench::open(&config).expect("a workbench");
@@ -70,7 +70,7 @@ pub(crate) fn overflow_is_refused_by_name(backend: BackendChoice) {
         assert_eq!(staged.surface().expect("vertices"), &before);
         assert!(staged.bounds().is_finite());
     }
-    // What comes next counts from the last good step.
+    // The next step applies to the last valid step.
     changes::apply(&scene, &mut good, &mut random, (&[6], &[]));
     staged.deform(&good).expect("a good step");
     let after = staged.surface().expect("vertices").clone();

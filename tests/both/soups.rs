@@ -1,4 +1,4 @@
-//! Triangles that are hard to rasterise, and the windows that they are drawn in.
+//! Triangle soups that are hard to rasterize, and their windows.
 
 use modalcast_compute::reference::raster::Raster;
 use modalcast_model::scene::{Faces, Group, Window};
@@ -6,7 +6,7 @@ use nalgebra::{Matrix4, Point3, Vector3};
 
 use crate::scenes::Random;
 
-/// A mesh in a window.
+/// A mesh and the window that it is drawn in.
 pub(crate) struct Soup {
     pub(crate) name: &'static str,
     pub(crate) positions: Vec<f32>,
@@ -32,7 +32,7 @@ impl Soup {
         Self::new(name, positions, (0..count).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect(), window)
     }
 
-    /// What the definition draws.
+    /// The result of the definition.
     pub(crate) fn drawn(&self) -> Raster {
         let mut raster = Raster::new(self.window);
         self.groups.iter().for_each(|group| raster.draw(&self.positions, &self.triangles, *group));
@@ -40,19 +40,19 @@ impl Soup {
     }
 }
 
-/// An eye at the origin that looks along -z, 60 degrees high.
+/// A camera at the origin that looks along -z with a vertical field of view of 60 degrees.
 pub(crate) fn perspective(width: u32, height: u32, near: f64, far: f64) -> Window {
     let aspect = f64::from(width) / f64::from(height);
     let clip = nalgebra::Perspective3::new(aspect, 60.0_f64.to_radians(), near, far);
     Window::new(&clip.to_homogeneous(), width, height).expect("a window")
 }
 
-/// Clip space itself.
+/// A window whose scene coordinates are clip space.
 pub(crate) fn flat(width: u32, height: u32) -> Window {
     Window::new(&Matrix4::identity(), width, height).expect("a window")
 }
 
-/// Triangles with their corners around random middles.
+/// Triangles with random corners around random centers.
 fn scattered(random: &mut Random, count: usize, reach: f32, size: [f32; 3]) -> Vec<f32> {
     let mut positions = Vec::with_capacity(9 * count);
     for _ in 0..count {
@@ -65,7 +65,7 @@ fn scattered(random: &mut Random, count: usize, reach: f32, size: [f32; 3]) -> V
     positions
 }
 
-/// A fan around a middle, with some corners on samples and on the border.
+/// A fan around a center; its rim lies beyond the border of [`flat`].
 pub(crate) fn fan(window: Window) -> Soup {
     let mut random = Random(11);
     let mut positions = vec![0.05, -0.03, 0.0];
@@ -80,7 +80,7 @@ pub(crate) fn fan(window: Window) -> Soup {
     soup
 }
 
-/// Triangles without area: corners that are one vertex, and corners on a line; between them one that has some.
+/// Triangles without area, with repeated vertices or collinear corners, and between them one with area.
 fn degenerate() -> Soup {
     let mut positions = scattered(&mut Random(9), 8, 0.8, [0.6; 3]);
     positions.extend([[-0.9, -0.9, 0.0], [0.0, 0.0, 0.1], [0.9, 0.9, 0.2]].concat());
@@ -91,7 +91,7 @@ fn degenerate() -> Soup {
     Soup::new("degenerate", positions, triangles.collect(), flat(160, 90))
 }
 
-/// All of them.
+/// All soups.
 pub(crate) fn soups() -> Vec<Soup> {
     let mut random = Random(5);
     let random = &mut random;

@@ -1,4 +1,4 @@
-//! Normals and tangents at their edges.
+//! Normals and tangents in extreme cases.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use crate::scenes::{self, Random};
 /// Largest accepted error of a component of a unit vector.
 const DIRECTION: f64 = 2e-5;
 
-/// The largest error; infinite for a NaN or another length.
+/// Largest error; infinite for a NaN or for another length.
 pub(crate) fn largest_error(got: &[f32], want: &[f64]) -> f64 {
     let error = |(got, want): (&f32, &f64)| {
         let error = (f64::from(*got) - want).abs();
@@ -22,7 +22,7 @@ pub(crate) fn largest_error(got: &[f32], want: &[f64]) -> f64 {
     if got.len() == want.len() { got.iter().zip(want).map(error).fold(0.0, f64::max) } else { f64::INFINITY }
 }
 
-/// A mirror, a shear, both, and scales that are far from even.
+/// A mirror, a shear, both, and strongly anisotropic scales.
 pub(crate) fn shears_and_mirrors<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let scene = scenes::scene(&[(40, 3), (200, 2)], 2, true, false);
     let mut state = scenes::state(&scene, 6);
@@ -44,18 +44,18 @@ pub(crate) fn shears_and_mirrors<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let (normal, tangent) = errors(&state);
     eprintln!("shears and mirrors: normals off by {normal:.2e}, tangents by {tangent:.2e}");
     assert!(normal <= DIRECTION && tangent <= DIRECTION);
-    // The control: without its mirror the first domain's tangents have the other sign, and its normals the other side.
+    // Control: without its mirror, the first domain has tangents of the other sign and mirrored normals.
     state.transforms[0] = Transform::IDENTITY;
     let (normal, tangent) = errors(&state);
     assert!(normal > 0.1 && tangent > 0.1);
 }
 
-/// Where a vertex is, what a triangle names, and the uvs of so many corners.
+/// Position of a vertex, vertices of a triangle, and texture coordinates for a number of corners.
 type Place = fn(usize) -> [f32; 3];
 type Fan = fn(u32) -> [u32; 3];
 type Uvs = fn(usize) -> Vec<[f32; 2]>;
 
-/// Meshes whose triangles have no area, with and without uvs.
+/// Meshes whose triangles have no area, with and without texture coordinates.
 fn flat_meshes() -> Vec<Mesh> {
     let places: [Place; 3] =
         [|_| [0.5, -0.25, 1.0], |at| [at as f32, 0.0, 0.0], |at| [at as f32, (at * at) as f32, 1.0]];
@@ -74,13 +74,13 @@ fn flat_meshes() -> Vec<Mesh> {
     meshes
 }
 
-/// Whether the first three of `width` numbers are a unit vector.
+/// Whether the first three of every `width` numbers are a unit vector.
 fn are_unit(numbers: &[f32], width: usize) -> bool {
     let length = |part: &[f32]| part[..3].iter().map(|number| number * number).sum::<f32>().sqrt();
     numbers.chunks_exact(width).all(|part| (length(part) - 1.0).abs() < 1e-5)
 }
 
-/// Triangles of no area, uvs of none, and no uvs: directions are of unit length all the same.
+/// Triangles or texture coordinates without area, and missing texture coordinates, still give unit directions.
 pub(crate) fn no_area_and_no_uvs<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     assert!(are_unit(&[0.6, 0.8, 0.0], 3) && !are_unit(&[0.0; 3], 3) && !are_unit(&[f32::NAN; 3], 3));
     let modes = scenes::shape(&mut Random(35), 9, 2).modes;

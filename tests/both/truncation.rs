@@ -1,4 +1,4 @@
-//! Modes that are left out within a budget.
+//! Mode truncation within an error budget.
 
 use std::sync::Arc;
 
@@ -9,11 +9,11 @@ use super::extremes::columns_of;
 use super::{beyond, changes, run, scene_of, strip, within};
 use crate::scenes::{self, Random};
 
-/// Metres, and scene units.
+/// Budget in meters, which are scene units here.
 const BUDGET: f64 = 0.02;
 
-/// Of twenty random states, each a step of two domains after the one before, errors are within their bounds and what a
-/// deformer says it left out, and that is within the budget. `left_out` says it, in scene units.
+/// Runs twenty random states, each of which changes two domains. Errors stay within their bounds plus the reported
+/// truncation bound, and that bound stays within the budget. `left_out` returns it in scene units.
 pub(crate) fn errors_within_the_budget<D: Deformer>(
     make: impl Fn(&Arc<Scene>) -> D,
     left_out: impl Fn(&D, &Scene) -> f64,
@@ -35,7 +35,7 @@ pub(crate) fn errors_within_the_budget<D: Deformer>(
         for number in 0..20 {
             let named = [number % 8, (number + 5) % 8];
             changes::apply(&scene, &mut state, &mut random, (&named, &named));
-            // Ever smaller amounts of higher modes, as of a body that swings.
+            // Amplitudes decrease with the mode, as for a vibrating body.
             for domain in named {
                 let slot = scene.layout.slots[domain as usize];
                 let own = &mut state.q[slot.first_q..][..slot.rank];
@@ -55,13 +55,14 @@ pub(crate) fn errors_within_the_budget<D: Deformer>(
     }
 }
 
-/// How often the second of two modes comes and goes while its amount swings about half of the budget.
+/// Number of times that the second of two modes appears or disappears while its amplitude oscillates around half of the
+/// budget.
 fn changes_of_a_swinging_mode(storage: Storage, mut deform: impl FnMut(&Arc<Scene>, &State) -> Vec<f32>) -> usize {
     let (vertices, rank, swinging) = (5, 8, 4);
     let mut columns = vec![0.0; 3 * vertices * rank];
     for vertex in 0..vertices {
         columns[3 * vertex + 1] = 1.0;
-        // In another chunk, whatever the storage: one that is summed brings all of its modes.
+        // The mode is in another chunk for every storage type, because a chunk is summed with all of its modes.
         columns[3 * vertices * swinging + 3 * vertex] = 1.0;
     }
     let scene = columns_of(vertices, columns, Deformation { storage, truncation: Some(1.0), ..Deformation::default() });
@@ -81,7 +82,7 @@ fn changes_of_a_swinging_mode(storage: Storage, mut deform: impl FnMut(&Arc<Scen
     count
 }
 
-/// A mode that swings about the limit goes once and stays away; without memory it would come and go.
+/// A mode near the limit is truncated once and stays so (hysteresis); without memory it flickers.
 pub(crate) fn no_flicker<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     for storage in Storage::ALL {
         let mut kept: Option<D> = None;

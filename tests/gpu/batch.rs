@@ -1,4 +1,4 @@
-//! Many coordinate vectors for one U, read once: each instance is where the deformer puts it alone, bit by bit.
+//! Batches read U once for many coordinate vectors: each instance has the bits that it has without batches.
 
 use std::sync::Arc;
 
@@ -23,7 +23,7 @@ fn both(mut parts: impl FnMut() -> Parts) -> [Arc<Scene>; 2] {
     })
 }
 
-/// Shows states of a scene with batches and without, and returns in how many a bit differs.
+/// Deforms states of a scene with batches and without, and returns the number of states with a differing bit.
 fn differences(name: &str, [together, apart]: &[Arc<Scene>; 2]) -> usize {
     let (mut one, mut other) = (deformer(together), deformer(apart));
     assert!(one.plan().kernel(Launch::Batch).is_some(), "{name}: there is a batch");
@@ -45,9 +45,10 @@ fn differences(name: &str, [together, apart]: &[Arc<Scene>; 2]) -> usize {
     count.count()
 }
 
+/// For every size, rank, number of instances and storage type.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_batch_has_the_bits_of_domains_apart_at_every_size_rank_count_and_storage() {
+fn gpu_batches_have_the_bits_of_separate_domains() {
     for storage in Storage::ALL {
         for size in [
             (1, 3, 2),
@@ -69,8 +70,8 @@ fn gpu_a_batch_has_the_bits_of_domains_apart_at_every_size_rank_count_and_storag
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_blocks_with_several_tiles_have_the_bits_of_domains_apart() {
-    // More than 8,192 tiles, so that a block has two or three of them; the last is not whole.
+fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
+    // More than 8,192 tiles, so that a block has two or three of them; the last tile is not full.
     for (storage, vertices) in [(Storage::F32, 1_100_007), (Storage::Int8, 1_100_007), (Storage::F16, 1_600_001)] {
         let name = format!("{} n {vertices}", storage.name());
         let scenes = both(|| ensemble((vertices, 5, 3), Deformation { boxes: true, ..stored(storage) }));
@@ -80,9 +81,10 @@ fn gpu_blocks_with_several_tiles_have_the_bits_of_domains_apart() {
     }
 }
 
+/// With exact normals, normal maps, boxes and followers, in scenes that contain other domains too.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_batches_among_other_domains_agree_with_all_that_a_scene_may_ask_for() {
+fn gpu_batches_agree_with_every_feature_of_a_scene() {
     let exact = |storage| Deformation { normals: Normals::Exact, ..stored(storage) };
     let crowd = |deformation: Deformation, normal_maps: bool| {
         let mut random = Random(70);
@@ -94,7 +96,7 @@ fn gpu_batches_among_other_domains_agree_with_all_that_a_scene_may_ask_for() {
         let scene = scene_of(shapes.collect(), 19, deformation, normal_maps);
         let mut parts = scenes::parts(scene.shapes.clone());
         (parts.domains, parts.deformation) = (scene.domains.clone(), deformation);
-        // One that has nobody to share with.
+        // A domain whose shape has no other instance.
         parts.shapes.push(scenes::shape(&mut random, 90, 9));
         parts.domains.push(scenes::domain(sizes.len(), 0));
         parts
@@ -115,13 +117,13 @@ fn gpu_batches_among_other_domains_agree_with_all_that_a_scene_may_ask_for() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_what_overflows_on_its_way_in_f32_is_mended_in_a_batch_too() {
+fn gpu_batches_repair_intermediate_overflow() {
     for vertices in [300, 512] {
         let [together, apart] =
             both(|| ensemble((vertices, 5, 6), Deformation { boxes: true, ..Deformation::default() }));
         let (mut one, mut other) = (deformer(&together), deformer(&apart));
         let mut state = scenes::state(&together, 4);
-        // The sum of domain 1 overflows for good; the products of domain 3 do, although their sum need not.
+        // The sum of domain 1 overflows. The products of domain 3 overflow too, although their sum may be finite.
         state.q[5..10].fill(f32::MAX);
         state.transforms[3] = Transform([2e38, 2e38, -2e38, 0.0, 3e38, -3e38, 3e38, 0.0, 1e38, 1e38, 1e38, 0.0]);
         state.q[15..20].fill(3.0);

@@ -1,4 +1,4 @@
-//! The device itself: what it agrees on with the host, what it refuses, what it gives back.
+//! The device: struct layouts agree with the host, missing devices are refused, and memory is released.
 
 use modalcast_compute::gpu::{CudaDeformer, Device, agreements, device_values, probe};
 use modalcast_model::deform::Deformer;
@@ -20,7 +20,7 @@ fn gpu_host_and_device_agree_on_every_size_and_offset() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_probe_names_the_device_that_opens() {
+fn gpu_probe_names_the_opened_device() {
     let (probe, device) = (probe(), Device::open(0).expect("a CUDA device"));
     assert_eq!(probe.devices[0].name, device.name());
     assert_eq!(probe.devices[0].capability, format!("{}.{}", device.capability().0, device.capability().1));
@@ -31,14 +31,14 @@ fn gpu_the_probe_names_the_device_that_opens() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_an_ordinal_beyond_the_last_device_is_refused() {
+fn gpu_ordinal_beyond_the_last_device_is_refused() {
     let refusal = Device::open(probe().devices.len()).expect_err("beyond the last");
     assert!(matches!(&refusal, Error::Unavailable { what: "CUDA device", .. }), "{refusal}");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_memory_returns_when_deformers_go() {
+fn gpu_dropped_deformers_release_their_memory() {
     let device = Device::open(0).expect("a CUDA device");
     let scene = scenes::scene(&[(20_000, 30)], 2, true, false);
     let state = scenes::state(&scene, 1);

@@ -1,4 +1,4 @@
-//! Many domains of one shape.
+//! Scenes with many domains of one shape.
 
 use std::sync::Arc;
 
@@ -6,7 +6,7 @@ use modalcast_model::scene::{Deformation, Parts, Scene, State, Storage};
 
 use crate::scenes::{self, Random};
 
-/// `count` domains of one shape, deformed so.
+/// Parts with `count` domains of one shape and this deformation.
 pub(crate) fn ensemble((vertices, rank, count): (usize, usize, usize), deformation: Deformation) -> Parts {
     let mut parts = scenes::parts(vec![scenes::shape(&mut Random(7), vertices, rank)]);
     parts.domains = vec![scenes::domain(0, 0); count];

@@ -1,4 +1,5 @@
-//! Zero rows, the sign of what overflows, singular and tiny transforms. What holds of any deformer is in `tests/both`.
+//! Zero rows, the signs of overflows, and singular or tiny transforms on the device. Checks for every deformer are in
+//! `tests/both`.
 
 use modalcast_compute::reference::orient_normals;
 use modalcast_model::deform::Deformer;
@@ -11,7 +12,7 @@ use crate::twins::deformer;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_vertices_whose_rows_of_u_are_zero_stay_bit_equal_to_q_of_zero() {
+fn gpu_vertices_with_zero_rows_do_not_move() {
     let mut random = Random(1);
     let shape = scenes::shape(&mut random, 700, 9);
     let mut entries = shape.modes.columns().to_vec();
@@ -41,7 +42,7 @@ fn gpu_vertices_whose_rows_of_u_are_zero_stay_bit_equal_to_q_of_zero() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_what_overflows_shows_in_the_bounds_of_its_axis_with_its_sign() {
+fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     let mut random = Random(4);
     let shape = scenes::shape(&mut random, 1000, 1);
     let mut column = vec![0.0; 3000];
@@ -53,7 +54,7 @@ fn gpu_what_overflows_shows_in_the_bounds_of_its_axis_with_its_sign() {
     let scene = Scene::new(parts).expect("a scene");
     let mut state = State::rest(&scene);
     state.q[0] = f32::MAX;
-    // Infinity less infinity in the first row, which is finite in f64; the others have no f32.
+    // Infinity minus infinity in the first row, which is finite in f64. The other rows overflow in f32.
     state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
     let bounds = deformer(&scene).deform(&state).expect("deforms").bounds;
     assert!(bounds.min[0].is_finite() && bounds.max[0].is_finite(), "{bounds:?}");
@@ -61,9 +62,10 @@ fn gpu_what_overflows_shows_in_the_bounds_of_its_axis_with_its_sign() {
     assert!(bounds.min[2] == f64::NEG_INFINITY && bounds.max[2].is_finite(), "{bounds:?}");
 }
 
+/// Normals and tangents of singular, tiny and huge transforms.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_normals_and_tangents_of_singular_tiny_and_huge_transforms_equal_the_twin() {
+fn gpu_directions_of_singular_transforms_equal_the_twin() {
     let linear: [[f32; 9]; 10] = [
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
         [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
@@ -86,7 +88,7 @@ fn gpu_normals_and_tangents_of_singular_tiny_and_huge_transforms_equal_the_twin(
     }
     let mut deformer = deformer(&scene);
     check("edge transforms", &scene, &state, &mut deformer);
-    // The twin of other transforms is no twin.
+    // Control: the twin of other transforms differs.
     let normals = &deformer.surface().expect("copies").normals;
     let other = orient_normals(&scene, &State::rest(&scene));
     assert!(largest_error(normals, &other, DIRECTION).is_err(), "the judge can fail");

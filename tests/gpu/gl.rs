@@ -15,22 +15,23 @@ pub(crate) struct Gl {
 impl Gl {
     pub(crate) fn open() -> Self {
         let renderer = Renderer::open(Prefer::Cuda(0)).expect("OpenGL on the CUDA device");
-        // SAFETY: the library is loaded already, by the renderer.
+        // SAFETY: loading runs the initializers of libEGL. They have run already, because the renderer has loaded the
+        // library.
         let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("EGL");
         let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |found| found as *const _);
-        // SAFETY: the renderer's context is current, and outlives this one.
+        // SAFETY: the renderer's context is current on this thread and outlives `api`.
         let api = unsafe { glow::Context::from_loader_function(address) };
         Self { renderer, api }
     }
 
-    /// A buffer of these numbers.
+    /// A buffer that contains these numbers.
     pub(crate) fn filled<T: bytemuck::Pod>(&self, list: &[T]) -> GlBuffer {
         let buffer = self.room(size_of_val(list) as u64);
         self.write(buffer, list);
         buffer
     }
 
-    /// A buffer of ones.
+    /// A buffer in which all bits are one.
     pub(crate) fn room(&self, bytes: u64) -> GlBuffer {
         let ones = vec![u8::MAX; bytes.max(16) as usize];
         // SAFETY: the context is current on this thread, as in all calls below.
@@ -44,17 +45,18 @@ impl Gl {
     }
 
     pub(crate) fn write<T: bytemuck::Pod>(&self, to: GlBuffer, list: &[T]) {
-        // SAFETY: as above; OpenGL refuses what does not fit.
+        // SAFETY: as above; OpenGL refuses writes beyond the end of the buffer.
         unsafe {
             self.api.bind_buffer(glow::COPY_WRITE_BUFFER, Some(native(to)));
             self.api.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, bytemuck::cast_slice(list));
         }
     }
 
-    /// The first `count` numbers of a buffer, in the order of OpenGL's commands: nobody waits for CUDA here.
+    /// Reads the first `count` numbers of a buffer, in the order of OpenGL commands. The call does not synchronize with
+    /// CUDA.
     pub(crate) fn read<T: bytemuck::Pod>(&self, from: GlBuffer, count: usize) -> Vec<T> {
         let mut list = vec![T::zeroed(); count];
-        // SAFETY: as above.
+        // SAFETY: as above; `list` has exactly the requested size.
         unsafe {
             self.api.bind_buffer(glow::COPY_READ_BUFFER, Some(native(from)));
             self.api.get_buffer_sub_data(glow::COPY_READ_BUFFER, 0, bytemuck::cast_slice_mut(&mut list));

@@ -1,4 +1,4 @@
-//! CUDA writes into OpenGL's buffers: the same vertices and the same picture as with a copy.
+//! CUDA writes into OpenGL buffers: vertices and pictures equal those with a copy.
 
 use std::sync::Arc;
 
@@ -23,7 +23,7 @@ fn stage() -> (Renderer, Arc<Device>, Arc<Scene>) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_vertices_in_shared_buffers_equal_the_twin_and_the_copied_ones_bit_by_bit() {
+fn gpu_shared_buffers_have_the_bits_of_copied_ones() {
     let (mut renderer, device, scene) = stage();
     let buffers = renderer.load(&scene).expect("loads");
     let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&buffers))).expect("a deformer");
@@ -46,7 +46,7 @@ fn gpu_vertices_in_shared_buffers_equal_the_twin_and_the_copied_ones_bit_by_bit(
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_shared_buffers_are_fetched_beside_the_step_that_overwrites_them() {
+fn gpu_shared_buffers_are_fetched_during_the_next_step() {
     let (mut renderer, device, scene) = stage();
     let buffers = renderer.load(&scene).expect("loads");
     let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&buffers))).expect("a deformer");
@@ -74,7 +74,7 @@ fn gpu_shared_buffers_are_fetched_beside_the_step_that_overwrites_them() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
+fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
     let (mut renderer, device, scene) = stage();
     let (state, other) = (scenes::state(&scene, 1), scenes::state(&scene, 2));
     let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
@@ -95,15 +95,16 @@ fn gpu_a_frame_of_shared_buffers_is_the_frame_of_uploaded_ones() {
     renderer.unload(to_fill);
 }
 
+/// Later steps overwrite the shared buffers while the frames are in flight.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_frames_under_way_keep_the_vertices_of_their_step_while_the_next_ones_overwrite_the_shared_buffers() {
+fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
     let (mut renderer, device, scene) = stage();
     let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
     let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&to_share))).expect("a deformer");
     let mut copied = CudaDeformer::new(&device, &scene, None).expect("a deformer");
     assert!(direct.shares_buffers(), "interop was refused");
-    // Large, so that a frame takes longer than a step.
+    // A large picture, so that a frame takes longer than a step.
     let shot =
         |bounds| Shot { camera: Camera::framing(&scene, 64, 64), width: 1920, height: 1080, bounds, light: None };
     let (mut frames, mut wanted) = (std::collections::VecDeque::new(), Vec::new());
@@ -133,7 +134,7 @@ fn gpu_frames_under_way_keep_the_vertices_of_their_step_while_the_next_ones_over
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_fall_back_to_copies() {
+fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let (mut renderer, device, scene) = stage();
     let small = renderer.load(&scenes::scene(&[(4, 0)], 1, true, false)).expect("loads");
     let good = renderer.load(&scene).expect("loads");

@@ -1,16 +1,16 @@
-//! The judges: largest error of numbers against the f64 twin, in a form that a NaN cannot pass.
+//! Comparisons with the f64 twin. They are written such that a NaN cannot pass.
 
 use modalcast_compute::gpu::CudaDeformer;
 use modalcast_compute::reference::{orient_normals, orient_tangents};
 use modalcast_model::deform::{Deformed, Deformer};
 use modalcast_model::scene::{Bounds, Scene, State};
 
-/// Largest accepted error of a position, as a part of the scene's diagonal.
+/// Largest accepted error of a position, relative to the scene's diagonal.
 pub(crate) const POSITION: f64 = 1e-5;
 /// Largest accepted error of a component of a unit vector.
 pub(crate) const DIRECTION: f64 = 1e-5;
 
-/// The largest error, or what is wrong. `limit` is absolute.
+/// The largest error, or a description of the first number that exceeds `limit`. The limit is absolute.
 pub(crate) fn largest_error<const N: usize>(got: &[f32], want: &[[f64; N]], limit: f64) -> Result<f64, String> {
     let want = want.as_flattened();
     if got.len() != want.len() {
@@ -28,7 +28,7 @@ pub(crate) fn largest_error<const N: usize>(got: &[f32], want: &[[f64; N]], limi
     Ok(largest)
 }
 
-/// Deforms and compares everything that comes out with the twin: positions, bounds, normals, tangents.
+/// Deforms a state and compares positions, bounds, normals and tangents with the twin.
 pub(crate) fn check(name: &str, scene: &Scene, state: &State, deformer: &mut CudaDeformer) -> Deformed {
     let deformed = deformer.deform(state).expect("deforms");
     let surface = deformer.surface().expect("copies");
@@ -58,13 +58,13 @@ fn bounds_of(positions: &[f32]) -> Bounds {
     bounds
 }
 
-/// The same numbers bit by bit.
+/// Whether two lists are equal bit by bit.
 pub(crate) fn same_bits(got: &[f32], want: &[f32]) -> bool {
     got.len() == want.len() && got.iter().zip(want).all(|(got, want)| got.to_bits() == want.to_bits())
 }
 
 #[test]
-fn the_judge_refuses_wrong_missing_and_not_finite_numbers() {
+fn judge_refuses_wrong_missing_and_non_finite_numbers() {
     let want = [[1.0, 2.0], [3.0, 4.0]];
     assert_eq!(largest_error(&[1.0, 2.0, 3.0, 4.0], &want, 1e-5), Ok(0.0));
     let slightly_off = largest_error(&[1.0, 2.0, 3.0, 4.000_005], &want, 1e-5).expect("within the limit");

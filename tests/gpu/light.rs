@@ -1,4 +1,4 @@
-//! What vertices take up in light space, by `bounds`: against its twin tile by tile, and what it costs.
+//! Light-space bounds from the kernel `bounds`, compared with its twin for each tile.
 
 use modalcast_model::deform::Deformer;
 use modalcast_model::scene::{Deformation, State};
@@ -10,26 +10,26 @@ use crate::twins::deformer;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_what_vertices_take_up_in_light_space_holds_every_one_of_them() {
+fn gpu_light_bounds_contain_every_vertex() {
     light::every_vertex_is_held(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_thin_scene_is_fitted_closely_in_light_space() {
+fn gpu_thin_scene_is_fitted_closely_in_light_space() {
     light::a_thin_scene_is_fitted_closely(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_light_space_is_not_measured_without_a_shadow_and_overflow_there_is_told() {
+fn gpu_light_bounds_need_a_shadow_and_report_overflow() {
     light::nothing_is_measured_without_a_shadow_and_overflow_is_told(deformer);
 }
 
-/// One domain's tiles are its vertices in their order, 128 each.
+/// The scene has one domain, so each tile is 128 consecutive vertices.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_light_bounds_are_those_of_the_boxes_of_tiles_at_every_size() {
+fn gpu_light_bounds_equal_those_of_tile_boxes() {
     for vertices in [2, 31, 32, 33, 127, 128, 129, 257, 5000, 16085, 200_000] {
         let scene = scene_of(vec![coil(vertices, 3)], 1, Deformation::default(), false);
         let mut deformer = deformer(&scene);

@@ -1,5 +1,6 @@
-//! The CUDA deformer against its f64 twin, on a real device. Everything that needs one is ignored without it; run with
-//! `--include-ignored --test-threads=1`. The binary needs no build tree: real inputs come from MODALCAST_DATA.
+//! The CUDA deformer compared with its f64 twin on a real device. Tests that need a device are ignored by default; run
+//! them with `--include-ignored --test-threads=1`. The binary needs no build tree; real inputs come from
+//! MODALCAST_DATA.
 
 mod batch;
 #[path = "../both/mod.rs"]

@@ -1,4 +1,4 @@
-//! Exact normals and tangents of the CUDA deformer equal those of the f64 twin over the same positions.
+//! Exact normals and tangents of the CUDA deformer equal those of the f64 twin for the same positions.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use crate::judge::{DIRECTION, largest_error, same_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random, domain};
 use crate::twins::deformer;
 
-/// A tube of `around` x `rows` vertices with a seam, hard rings every fifth row, and `rank` smooth modes.
+/// A tube of `around` x `rows` vertices with a seam, a hard ring every fifth row, and `rank` smooth modes.
 fn tube(random: &mut Random, around: u32, rows: u32, rank: usize) -> Shape {
     let angle = |column: u32| column as f32 / around as f32 * std::f32::consts::TAU;
     let place = |row: u32, column: u32| {
@@ -47,7 +47,7 @@ fn tube(random: &mut Random, around: u32, rows: u32, rank: usize) -> Shape {
     Shape::new(Mesh::new(rest, corners, triangles).expect("a tube"), modes).expect("a shape")
 }
 
-/// A scene of shapes with exact normals, each used by `instances` domains; with normal maps if asked.
+/// A scene of shapes with exact normals, `instances` domains per shape, and optional normal maps.
 fn scene_of(shapes: Vec<Shape>, instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
     let count = shapes.len();
     let mut parts = scenes::parts(shapes);
@@ -58,7 +58,7 @@ fn scene_of(shapes: Vec<Shape>, instances: usize, normal_maps: bool, rigid: bool
     Scene::new(parts).expect("a scene")
 }
 
-/// What the device computed, and the twin's normals and tangents over the device's own positions.
+/// Normals and tangents of the device, and those of the twin for the device's positions.
 struct Both {
     normals: Vec<f32>,
     tangents: Vec<f32>,
@@ -79,7 +79,7 @@ fn both(scene: &Scene, state: &State, deformer: &mut CudaDeformer) -> Both {
     }
 }
 
-/// The largest angle between unit vectors of the device and the twin, degrees.
+/// Largest angle between unit vectors of the device and of the twin, in degrees.
 fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
     let angle = |(got, want): (&[f32], &[f64; 3])| {
         let (got, want) = (Vector3::new(got[0], got[1], got[2]).cast::<f64>(), Vector3::from(*want));
@@ -89,7 +89,7 @@ fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
     got.chunks_exact(3).zip(want).map(angle).fold(0.0, f64::max)
 }
 
-/// Compares with the twin, and the twin with rigid normals, so that agreement means something.
+/// Compares the device with the twin, and with rigid normals as a control.
 fn check(name: &str, scene: &Scene, state: &State, deformer: &mut CudaDeformer) {
     let both = both(scene, state, deformer);
     let normal = largest_error(&both.normals, &both.want_normals, DIRECTION);
@@ -102,10 +102,10 @@ fn check(name: &str, scene: &Scene, state: &State, deformer: &mut CudaDeformer) 
     eprintln!("{name}: normal {normal:.2e} ({off:.1e} degrees), tangent {tangent:.2e}; rigid ones {rigid:.1} degrees");
 }
 
-/// The cpu's answer is as good a stand-in as any: the scenes are far from half a turn, where f32 could not tell the axis
-/// of a rotation, and far from rest.
+/// Runs on the CPU deformer, so that the assumption is checked without a device: the scenes are far from rest, and far
+/// from half a turn, where f32 cannot determine the axis of a rotation.
 #[test]
-fn the_scenes_of_these_tests_bend_but_do_not_fold() {
+fn test_scenes_bend_but_do_not_fold() {
     for (seed, around, rows, rank) in [(1, 16, 9, 3), (4, 24, 12, 3), (5, 16, 6, 2), (6, 70, 72, 8)] {
         let scene = scene_of(vec![tube(&mut Random(seed), around, rows, rank)], 3, true, false);
         for seed in 5..11 {
@@ -122,9 +122,10 @@ fn the_scenes_of_these_tests_bend_but_do_not_fold() {
     }
 }
 
+/// With and without normal maps and shear.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_equal_their_twin_with_and_without_normal_maps_and_shear() {
+fn gpu_exact_normals_equal_their_twin() {
     let mut random = Random(1);
     let shapes = [(16, 9, 3), (5, 2, 1), (40, 31, 12)];
     let shapes: Vec<_> = shapes.map(|(around, rows, rank)| tube(&mut random, around, rows, rank)).into();
@@ -139,9 +140,10 @@ fn gpu_exact_normals_equal_their_twin_with_and_without_normal_maps_and_shear() {
     }
 }
 
+/// At q = 0, and for shapes without modes.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_at_q_of_zero_and_of_shapes_without_modes_are_the_rigid_ones() {
+fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     let mut random = Random(2);
     let (bends, stiff) = (tube(&mut random, 20, 11, 2), tube(&mut random, 9, 7, 0));
     let scene = scene_of(vec![bends, stiff], 3, true, false);
@@ -149,7 +151,7 @@ fn gpu_exact_normals_at_q_of_zero_and_of_shapes_without_modes_are_the_rigid_ones
     let mut state = scenes::state(&scene, 6);
     state.q.fill(0.0);
     let both = both(&scene, &state, &mut deformer);
-    // Rounded positions turn a normal by about their rounding over the size of a triangle.
+    // Rounded positions turn a normal by about the rounding error divided by the size of a triangle.
     let still = |at: usize, got: &[f32], want: &[f64], width: usize, limit: f64| {
         let slot = scene.layout.slots[at];
         let (first, count) = (width * slot.first_corner, width * slot.corners);
@@ -169,9 +171,10 @@ fn gpu_exact_normals_at_q_of_zero_and_of_shapes_without_modes_are_the_rigid_ones
     assert!(largest_angle(bent, &orient_normals(&scene, &state)) > 5.0, "the judge can fail");
 }
 
+/// Bits do not depend on earlier steps or on the place of an instance in the packing.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_of_any_soup_are_unit_and_runs_and_places_do_not_change_a_bit() {
+fn gpu_exact_normals_are_unit_and_deterministic() {
     let mut random = Random(3);
     let scene = scene_of(vec![scenes::shape(&mut random, 700, 9), tube(&mut random, 33, 8, 5)], 3, true, false);
     let (mut state, other) = (scenes::state(&scene, 7), scenes::state(&scene, 8));
@@ -203,7 +206,7 @@ fn gpu_exact_normals_of_any_soup_are_unit_and_runs_and_places_do_not_change_a_bi
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_both_sides_of_a_seam_have_one_exact_normal_and_hard_edges_stay_hard() {
+fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
     let mut random = Random(4);
     let scene = scene_of(vec![tube(&mut random, 24, 12, 3)], 1, false, false);
     let mut deformer = deformer(&scene);
@@ -220,7 +223,7 @@ fn gpu_both_sides_of_a_seam_have_one_exact_normal_and_hard_edges_stay_hard() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_survive_collapse_overflow_and_every_scale_near_and_far() {
+fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
     let mut random = Random(5);
     let scene = scene_of(vec![tube(&mut random, 16, 6, 2)], 1, true, false);
     let mut deformer = deformer(&scene);
@@ -248,9 +251,10 @@ fn gpu_exact_normals_survive_collapse_overflow_and_every_scale_near_and_far() {
     }
 }
 
+/// Also prints the times of steps with rigid and with exact normals.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_of_a_million_corners_equal_their_twin_and_report_their_time() {
+fn gpu_exact_normals_of_a_million_corners_equal_the_twin() {
     let mut random = Random(6);
     let shape = tube(&mut random, 700, 720, 8);
     let mut times = [Normals::Rigid, Normals::Exact].map(|normals| {

@@ -1,4 +1,4 @@
-//! Vertices that are fetched while the next steps run are those of their own step, bit by bit.
+//! Vertices fetched while later steps run are those of their own step, bit by bit.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use crate::twins::deformer;
 
 const STEPS: usize = 50;
 
-/// Sixty domains of several tiles, of few quads and without modes.
+/// Sixty domains: some of several tiles, some of few quads, some without modes.
 fn crowd(deformation: Deformation) -> Arc<Scene> {
     let mut random = Random(70);
     let mut shapes: Vec<_> = (0..16).map(|at| both::strip(&mut random, 5 + at % 9, at % 5)).collect();
@@ -26,7 +26,7 @@ fn crowd(deformation: Deformation) -> Arc<Scene> {
     both::scene_of(shapes, 3, deformation, false)
 }
 
-/// The same, of which two of three domains follow one of the others, which come first.
+/// Sixty domains: the first twenty are transform roots, and each other domain follows one of them.
 fn following(deformation: Deformation) -> Arc<Scene> {
     let mut random = Random(73);
     let mut parts = scenes::parts((0..20).map(|at| both::strip(&mut random, 5 + 20 * at, at % 3)).collect());
@@ -42,20 +42,20 @@ fn following(deformation: Deformation) -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
-/// Some domains, none of them twice, ascending.
+/// A random set of domains without duplicates, in ascending order.
 fn some(scene: &Scene, random: &mut Random) -> Vec<u32> {
     let share = random.number().abs() / 10.0;
     (0..scene.domains.len() as u32).filter(|_| random.number().abs() < share).collect()
 }
 
-/// States that follow each other by random lists, now and then by one of all.
+/// A sequence of states with random lists of changes; every 17th marks every domain as changed.
 fn states(scene: &Scene) -> Vec<State> {
     let mut random = Random(71);
     let mut state = scenes::state(scene, 72);
     let next = |at: usize| {
         let (q, mut transforms) = (some(scene, &mut random), some(scene, &mut random));
         if scene.needs.followers {
-            // Those follow one of the others each, so that few of these are many domains.
+            // Each root moves its followers too, so few roots already change many domains.
             transforms.retain(|domain| *domain < 20);
             transforms.truncate(2);
         }
@@ -68,7 +68,7 @@ fn states(scene: &Scene) -> Vec<State> {
     (0..STEPS).map(next).collect()
 }
 
-/// What each step shows when it is computed whole and read before the next.
+/// Surfaces of each step, computed in full and read before the next step.
 fn plainly(scene: &Arc<Scene>, states: &[State]) -> Vec<Surface> {
     let mut deformer = deformer(scene);
     let mut show = |state: &State| {
@@ -88,7 +88,7 @@ fn is(got: &Surface, want: &Surface) -> bool {
         && got.tangents.is_empty()
 }
 
-/// Compares every fetch that is waited for with the step that it was begun in.
+/// Reads fetches in order and compares each with the step in which it was started.
 struct Reader<'a> {
     want: &'a [Surface],
     waiting: VecDeque<(usize, Fetch)>,
@@ -101,7 +101,7 @@ impl Reader<'_> {
             let Some((step, fetch)) = self.waiting.pop_front() else { break };
             let surface = deformer.fetched(&fetch).expect("arrives");
             assert!(is(&surface, &self.want[step]), "step {step}");
-            // Twice is the same memory.
+            // A second read returns the same memory.
             assert!(Arc::ptr_eq(&surface, &deformer.fetched(&fetch).expect("is there")));
             let other = (step + STEPS / 2) % self.want.len();
             assert!(!is(&surface, &self.want[other]), "the judge can fail");
@@ -117,26 +117,27 @@ fn deformations() -> Vec<Deformation> {
     vec![plain(Storage::F32), exact, plain(Storage::Int8), truncated, kept(plain(Storage::F32))]
 }
 
-/// Of all deformations, and some of them with followers.
+/// Scenes of all deformations, some of them also with followers.
 fn all_scenes() -> Vec<Arc<Scene>> {
     let exact = Deformation { normals: Normals::Exact, ..Deformation::default() };
     let followed = [Deformation::default(), exact, kept(Deformation::default())].map(following);
     deformations().into_iter().map(crowd).chain(followed).collect()
 }
 
+/// Fifty steps with random lists of changes, read while up to five later steps run.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_fifty_steps_of_random_lists_read_beside_the_next_are_those_read_one_by_one() {
+fn gpu_overlapped_reads_equal_blocking_reads() {
     for scene in all_scenes() {
         let states = states(&scene);
         let want = plainly(&scene, &states);
-        // How many fetches are behind when the oldest is waited for.
+        // Number of fetches in flight when the oldest one is read.
         for late in [0, 1, 2, 5] {
             let mut deformer = deformer(&scene);
             let mut reader = Reader { want: &want, waiting: VecDeque::new(), read: 0 };
             for (step, state) in states.iter().enumerate() {
                 deformer.deform(state).expect("deforms");
-                // Some are fetched and never read, some are not fetched.
+                // Some steps are fetched and never read, some are not fetched.
                 match step % 7 {
                     3 => drop(deformer.fetch(Wanted::ALL).expect("begins")),
                     5 => {}
@@ -162,7 +163,7 @@ fn without_tangents(surface: &Surface) -> Surface {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_two_steps_under_way_give_the_bounds_and_vertices_of_each() {
+fn gpu_two_steps_in_flight_keep_their_own_results() {
     for scene in all_scenes() {
         let states = states(&scene);
         let want = plainly(&scene, &states);
@@ -192,9 +193,10 @@ fn gpu_two_steps_under_way_give_the_bounds_and_vertices_of_each() {
     }
 }
 
+/// Fetches from before the fault stay readable.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_after_a_fault_in_the_middle_the_next_step_is_whole_and_readings_go_on() {
+fn gpu_steps_after_a_fault_are_computed_in_full() {
     let scene = crowd(Deformation::default());
     let states = states(&scene);
     let want = plainly(&scene, &states);
@@ -203,7 +205,7 @@ fn gpu_after_a_fault_in_the_middle_the_next_step_is_whole_and_readings_go_on() {
         deformer.submit(&states[step]).expect("starts");
         let fetch = deformer.fetch(Wanted::ALL).expect("begins");
         if step % 5 == 4 {
-            // What a failed step leaves behind: nothing that counts as whole.
+            // As after a failed step: no result counts as complete.
             deformer.forget();
             assert!(matches!(deformer.fetch(Wanted::ALL), Err(Error::Fault { .. })), "nothing is whole");
             assert!(matches!(deformer.finish(), Err(Error::Fault { .. })), "nothing is under way");
@@ -216,7 +218,7 @@ fn gpu_after_a_fault_in_the_middle_the_next_step_is_whole_and_readings_go_on() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_what_does_not_fit_together_is_refused_and_harms_nothing() {
+fn gpu_invalid_call_sequences_are_refused() {
     let scene = crowd(Deformation::default());
     let states = states(&scene);
     let want = plainly(&scene, &states[..3]);
@@ -226,14 +228,14 @@ fn gpu_what_does_not_fit_together_is_refused_and_harms_nothing() {
     one.submit(&states[0]).expect("starts");
     one.submit(&states[1]).expect("starts");
     assert!(matches!(one.submit(&states[2]), Err(Error::Busy { limit: MOST_UNDER_WAY, .. })));
-    // A step by itself waits for those before it.
+    // A blocking step waits for the steps before it.
     one.deform(&states[2]).expect("deforms");
     other.deform(&states[0]).expect("deforms");
     let strange = other.fetch(Wanted::VERTICES).expect("begins");
     assert!(matches!(one.fetched(&strange), Err(Error::Fault { .. })));
     let own = one.fetch(Wanted::VERTICES).expect("begins");
     assert!(is(&one.fetched(&own).expect("arrives"), &want[2]));
-    // What was read outlives the deformer.
+    // Data that were read outlive the deformer.
     let kept = other.fetched(&strange).expect("arrives");
     drop(other);
     assert!(is(&kept, &want[0]));
@@ -241,7 +243,7 @@ fn gpu_what_does_not_fit_together_is_refused_and_harms_nothing() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_second_output_is_made_for_those_alone_who_read_beside_steps() {
+fn gpu_second_output_exists_only_for_overlapped_reads() {
     let scene = crowd(Deformation::default());
     let states = states(&scene);
     let mut deformer = deformer(&scene);
@@ -268,7 +270,7 @@ fn gpu_a_second_output_is_made_for_those_alone_who_read_beside_steps() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_step() {
+fn gpu_box_and_displacement_readers_need_no_second_output() {
     let scene = following(kept(Deformation::default()));
     let states = states(&scene);
     let want = plainly(&scene, &states);
@@ -291,7 +293,7 @@ fn gpu_readers_of_boxes_and_displacements_alone_leave_the_output_to_the_next_ste
         }
         assert_eq!(deformer.outputs(), 1, "nobody reads an output");
     }
-    // Positions alone are all that travels, and wait for nothing else.
+    // Only positions are copied, and the fetch waits for nothing else.
     let positions = Wanted { positions: true, ..Wanted::default() };
     let fetch = deformer.fetch(positions).expect("begins");
     deformer.deform(&states[0]).expect("deforms");

@@ -1,5 +1,5 @@
-//! Frames whose triangles CUDA turns into samples, drawn as a server draws them: OpenGL's pictures, whatever is deformed
-//! meanwhile, and the same bits again.
+//! Frames rasterized by CUDA in the way that the server draws them. They equal OpenGL frames up to edges and depth
+//! ties, do not depend on steps computed meanwhile, and are deterministic.
 
 use std::sync::Arc;
 
@@ -16,7 +16,8 @@ use crate::both::exact::{Exact, compare};
 use crate::scenes;
 
 const SIZE: [u32; 2] = [960, 540];
-/// Hardware interpolates the depth of triangles that are hundreds of pixels wide to 3e-7 of the window's range.
+/// Depth tie threshold. Hardware interpolates the depth of triangles that are hundreds of pixels wide to 3e-7 of the
+/// depth range.
 const TIE: f64 = 4e-7;
 const BY_CUDA: Paths = Paths { shadow: Some(Path::Cuda), visibility: Some(Path::Cuda) };
 const BY_OPENGL: Paths = Paths { shadow: Some(Path::OpenGl), visibility: Some(Path::OpenGl) };
@@ -25,7 +26,7 @@ fn open() -> Workbench {
     Workbench::open(&Config { backend: BackendChoice::Cuda, ..Config::default() }).expect("a CUDA device")
 }
 
-/// The same scene with one sample a pixel, drawn so.
+/// The same scene with one sample per pixel and this rasterizer.
 fn drawn_by(scene: &Scene, raster: Rastering) -> Arc<Scene> {
     let look = Look { raster, antialias: Antialias::Fxaa, ..scene.look };
     Scene::new(Parts { look, ..scene.parts() }).expect("a good scene")
@@ -45,7 +46,7 @@ fn frames(scene: &Scene, raster: Rastering, states: &[State]) -> Vec<Image> {
     images
 }
 
-/// A still picture by one way, the place of the triangle that each pixel sees, and each triangle as f64 has it.
+/// A picture of a static scene, the index of the triangle that each pixel sees, and each triangle in f64.
 struct Still {
     image: Image,
     seen: Vec<Option<u32>>,
@@ -62,7 +63,7 @@ fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> Still {
         let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(&device, mesh)?) as Box<dyn Rasteriser>);
         renderer.draw_beside(&mut buffers, make).expect("given");
     }
-    // A near plane far enough off that depths tell surfaces apart.
+    // The near plane is far enough away that depth precision separates the surfaces.
     let camera = Camera { near: 1.0, far: 40.0, ..Camera::framing(scene, SIZE[0], SIZE[1]) };
     let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds: deformed.bounds, light: deformed.light };
     let image = renderer.draw(&buffers, &shot).expect("draws");
@@ -81,7 +82,7 @@ fn still(scene: &Arc<Scene>, state: &State, by_cuda: bool) -> Still {
     Still { image, seen, exact }
 }
 
-/// A soup of triangles that pierce each other, moved and mirrored; and a tree with cut-out leaves.
+/// A soup of intersecting triangles, moved and mirrored, and a tree with cut-out leaves.
 fn scenes_and_states() -> [(&'static str, Arc<Scene>, State); 2] {
     let soup = scenes::scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
     let tree = modalcast_model::load::open("tree").expect("built in");
@@ -96,13 +97,13 @@ fn under(scene: &Scene, shadow: Option<Shadow>) -> Arc<Scene> {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_pixels_see_the_triangles_that_opengl_shows_but_on_edges_and_where_depths_tie() {
+fn gpu_ids_equal_opengl_except_on_edges_and_depth_ties() {
     for (name, scene, state) in scenes_and_states() {
         let scene = under(&scene, None);
         let [want, got] = [false, true].map(|by_cuda| still(&scene, &state, by_cuda));
         let found = compare(&got.seen, &want.seen, &want.exact, (SIZE, TIE));
         eprintln!("{name}: {found:?} of {} pixels", got.seen.len());
-        // The rim of a hole is where filtered alpha meets its threshold: hardware weighs texels in 8 bits.
+        // At the rim of a hole the filtered alpha crosses its threshold, and hardware has 8-bit filter weights.
         let rims = if name == "tree" { SIZE[0] * SIZE[1] / 500 } else { 0 };
         assert!(found.wrong <= rims as usize, "{name}: {found:?}");
         let other = still(&scene, &State { q: state.q.iter().map(|q| q + 0.3).collect(), ..state.clone() }, true);
@@ -113,7 +114,7 @@ fn gpu_pixels_see_the_triangles_that_opengl_shows_but_on_edges_and_where_depths_
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_light_and_shadow_of_what_is_seen_alike_are_opengls() {
+fn gpu_shading_of_equal_ids_equals_opengl() {
     for (name, scene, state) in scenes_and_states() {
         for shadow in [None, Some(Shadow::default())] {
             let scene = under(&scene, shadow);
@@ -134,7 +135,7 @@ fn gpu_light_and_shadow_of_what_is_seen_alike_are_opengls() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_frames_by_cuda_say_so_and_have_the_same_bits_again() {
+fn gpu_cuda_frames_report_their_path_and_repeat_bits() {
     let scene = scenes::scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
     let states = [scenes::state(&scene, 1), scenes::state(&scene, 2)];
     let [want, got, again] =
@@ -148,7 +149,7 @@ fn gpu_frames_by_cuda_say_so_and_have_the_same_bits_again() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_frames_by_cuda_under_way_keep_their_step_while_the_next_is_deformed() {
+fn gpu_cuda_frames_in_flight_keep_their_step() {
     let scene = scenes::scene(&[(3000, 12), (700, 3)], 5, false, false);
     let states: Vec<State> = (0..6).map(|seed| scenes::state(&scene, seed)).collect();
     let want = frames(&scene, Rastering::Cuda, &states);
@@ -173,7 +174,7 @@ fn gpu_frames_by_cuda_under_way_keep_their_step_while_the_next_is_deformed() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_ground_hides_what_lies_below_it_whoever_draws() {
+fn gpu_ground_hides_geometry_below_on_both_paths() {
     let [(_, scene, state), _] = scenes_and_states();
     let look = Look { shadow: None, antialias: Antialias::None, ..scene.look };
     let scene = Scene::new(Parts { look, ..scene.parts() }).expect("a good scene");
@@ -186,7 +187,7 @@ fn gpu_the_ground_hides_what_lies_below_it_whoever_draws() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_frames_of_other_sizes_by_cuda_are_those_of_a_fresh_renderer() {
+fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
     let scene = drawn_by(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false), Rastering::Cuda);
     let draw = |bench: &mut Workbench, staged: &mut modalcast::engine::Staged, [width, height]: [u32; 2]| {
         let image = bench.draw(staged, &Camera::framing(&scene, width, height), width, height).expect("draws");
@@ -205,9 +206,10 @@ fn gpu_frames_of_other_sizes_by_cuda_are_those_of_a_fresh_renderer() {
     bench.unstage(staged);
 }
 
+/// The path is selected by measurement.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_faster_way_is_chosen_by_measurement_and_frames_of_another_size_follow() {
+fn gpu_fastest_path_draws_frames_of_every_size() {
     let scene = drawn_by(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false), Rastering::Fastest);
     let mut bench = open();
     let mut staged = bench.stage(&scene).expect("staged");

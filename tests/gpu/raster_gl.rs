@@ -1,4 +1,4 @@
-//! The rasteriser in OpenGL's buffers, against its definition.
+//! The compute rasterizer on OpenGL buffers, compared with its definition.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use crate::both::soups::{Soup, flat, soups};
 use crate::gl::Gl;
 use crate::scenes;
 
-/// Positions in a buffer of OpenGL's, and what draws them.
+/// A CUDA device and an OpenGL context on it.
 struct Stage {
     device: Arc<Device>,
     gl: Gl,
@@ -36,7 +36,7 @@ impl Stage {
         self.gl.read(into, window.pixels())
     }
 
-    /// Bits of depths.
+    /// Depths as bits.
     fn depth(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u32> {
         raster.draw(Some((window, into)), None).expect("draws");
         self.gl.read(into, window.pixels())
@@ -47,7 +47,7 @@ fn mesh(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) -> Mesh {
     Mesh { positions, triangles: soup.triangles.clone(), groups: soup.groups.clone(), cut_outs }
 }
 
-/// All triangles from both sides, as depth alone is drawn.
+/// Depths of all triangles with both faces, as in a depth-only pass.
 fn from_both_sides(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
     let mut raster = Raster::new(soup.window);
     let all = Group { first: 0, triangles: soup.triangles.len() as u32, faces: Faces::Both };
@@ -65,7 +65,7 @@ fn differing<T: PartialEq>(got: &[T], want: &[T]) -> usize {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_samples_in_opengls_buffers_have_the_bits_of_the_definition_run_after_run() {
+fn gpu_samples_have_the_bits_of_the_definition() {
     let stage = Stage::open();
     let mut backs = 0;
     for soup in soups() {
@@ -86,9 +86,10 @@ fn gpu_samples_in_opengls_buffers_have_the_bits_of_the_definition_run_after_run(
     assert!(backs > 1000, "control: {backs} samples see a back in depth alone");
 }
 
+/// In the id pass and in the depth pass.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_cut_outs_that_say_the_same_everywhere_have_the_bits_of_the_definition_in_both_passes() {
+fn gpu_uniform_cut_outs_have_the_bits_of_the_definition() {
     let stage = Stage::open();
     for holes in plain_holes() {
         let soup = &holes.soup;
@@ -103,7 +104,7 @@ fn gpu_cut_outs_that_say_the_same_everywhere_have_the_bits_of_the_definition_in_
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_positions_that_opengl_writes_are_drawn_without_a_wait() {
+fn gpu_positions_written_by_opengl_need_no_wait() {
     let stage = Stage::open();
     let mut soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
     let (mut raster, positions) = stage.raster(&soup, None);
@@ -122,9 +123,10 @@ fn gpu_positions_that_opengl_writes_are_drawn_without_a_wait() {
     }
 }
 
+/// OpenGL may give a new target the name of a deleted one.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_targets_change_with_the_size_of_frames_also_under_the_name_of_one_that_was_deleted() {
+fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
     let stage = Stage::open();
     let mut soup = soups().into_iter().find(|soup| soup.name == "large").expect("there");
     let (mut raster, _) = stage.raster(&soup, None);
@@ -138,7 +140,7 @@ fn gpu_targets_change_with_the_size_of_frames_also_under_the_name_of_one_that_wa
         raster.forget(keys.name);
         stage.gl.delete(keys);
     }
-    // Larger than needed, and two that take turns without being forgotten.
+    // Targets larger than needed, and two targets that alternate without being forgotten.
     let list = [0, 100].map(|more| stage.gl.room(8 * soup.window.pixels() as u64 + more));
     for keys in [list[0], list[1], list[0], list[1]] {
         stage.gl.write(keys, &vec![0_u64; soup.window.pixels()]);
@@ -146,9 +148,10 @@ fn gpu_targets_change_with_the_size_of_frames_also_under_the_name_of_one_that_wa
     }
 }
 
+/// The rasterizer stays usable afterwards.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_are_faults_and_harm_nothing() {
+fn gpu_unknown_or_small_buffers_are_refused() {
     let stage = Stage::open();
     let soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
     let pixels = soup.window.pixels() as u64;
@@ -169,7 +172,7 @@ fn gpu_buffers_that_opengl_does_not_know_or_that_are_too_small_are_faults_and_ha
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_positions_that_a_deformer_shares_are_drawn_step_by_step() {
+fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let mut stage = Stage::open();
     let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
     let buffers = stage.gl.renderer.load(&scene).expect("loads");

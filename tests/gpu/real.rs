@@ -1,4 +1,4 @@
-//! The real modal inputs, bent by at least 5 % of their diagonal, equal the f64 twin.
+//! The tree and the real modal inputs, deformed by at least 5 % of their diagonal, equal the f64 twin.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use crate::judge::check;
 use crate::scenes::Random;
 use crate::twins::deformer;
 
-/// Random coordinates, scaled so that the largest displacement is 6 % of the rest diagonal.
+/// A state with random coordinates, scaled so that the largest displacement is 6 % of the rest diagonal.
 fn bent(scene: &Scene) -> State {
     let mut random = Random(8);
     let mut state = State::rest(scene);
@@ -36,7 +36,7 @@ fn compare(name: &str, scene: &Arc<Scene>) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_tree_equals_the_twin() {
+fn gpu_tree_equals_the_twin() {
     compare("tree", &modalcast_model::load::open("tree").expect("the built-in scene"));
 }
 

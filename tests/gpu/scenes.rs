@@ -6,11 +6,11 @@ use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, 
 use modalcast_model::scene::{Parts, Scene, State};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-/// A small generator of repeatable numbers (splitmix64).
+/// A small deterministic random generator (splitmix64).
 pub(crate) struct Random(pub(crate) u64);
 
 impl Random {
-    /// Even in -1 to 1.
+    /// Uniform in -1 to 1.
     pub(crate) fn number(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -26,21 +26,22 @@ impl Random {
         Vector3::from(self.triple()).cast()
     }
 
-    /// A rotation times a scale, mirrored if asked.
+    /// A rotation times a scale, optionally mirrored.
     pub(crate) fn similarity(&mut self, mirror: bool) -> Transform {
         let turn = Rotation3::from_scaled_axis(self.vector() * 3.0).into_inner();
         let scale = f64::from(1.0 + 0.5 * self.number()) * if mirror { -1.0 } else { 1.0 };
         Transform::from_parts(&(turn * scale), &(self.vector() * 2.0))
     }
 
-    /// Any regular matrix.
+    /// A transform with a general linear part.
     pub(crate) fn shear(&mut self) -> Transform {
         let linear = Matrix3::from_columns(&[self.vector(), self.vector(), self.vector()]) + Matrix3::identity();
         Transform::from_parts(&linear, &(self.vector() * 2.0))
     }
 }
 
-/// A shape in the unit cube whose modes bend it by about its own size at q of 1. It has more corners than vertices.
+/// A shape with coordinates in -1 to 1 whose modes displace it by about its own size at q = 1. It has more corners than
+/// vertices.
 pub(crate) fn shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
     let rest = (0..vertices).map(|_| random.triple()).collect();
     let count = vertices + 3;
@@ -71,7 +72,7 @@ pub(crate) fn domain(shape: usize, material: usize) -> Domain {
     }
 }
 
-/// The index of [`parts`]'s material with a normal map; 0 is plain.
+/// Index of the material of [`parts`] with a normal map; material 0 has none.
 pub(crate) const NORMAL_MAPPED: usize = 1;
 
 /// Parts with the shapes, two materials and no domains.
@@ -84,7 +85,7 @@ pub(crate) fn parts(shapes: Vec<Shape>) -> Parts {
     parts
 }
 
-/// A scene of shapes (n, r), each used by `instances` domains; every other shape has a normal map if asked.
+/// A scene of shapes (n, r) with `instances` domains per shape; with `normal_maps`, every other shape has a normal map.
 pub(crate) fn scene(shapes: &[(usize, usize)], instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
     let mut random = Random(shapes.len() as u64);
     let mut parts = parts(shapes.iter().map(|(vertices, rank)| shape(&mut random, *vertices, *rank)).collect());
@@ -98,7 +99,7 @@ pub(crate) fn scene(shapes: &[(usize, usize)], instances: usize, normal_maps: bo
     Scene::new(parts).expect("a scene")
 }
 
-/// A random state; sheared where the scene allows it, every third domain mirrored.
+/// A random state: every third domain is sheared if the scene allows it, and every third is mirrored.
 pub(crate) fn state(scene: &Scene, seed: u64) -> State {
     let mut random = Random(seed);
     let mut state = State::rest(scene);

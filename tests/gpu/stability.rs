@@ -1,4 +1,4 @@
-//! The checks of any deformer, on the device, and scenes that only it is for.
+//! Runs the checks of `tests/both` on the device, and checks of scenes too large for the CPU tests.
 
 use modalcast::config::BackendChoice;
 use modalcast_compute::gpu::{CudaDeformer, Launch, Role};
@@ -15,7 +15,7 @@ fn left_out(deformer: &CudaDeformer, _: &Scene) -> f64 {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_q_of_1e30_1e_minus_38_and_denormals_stay_within_the_bound() {
+fn gpu_huge_tiny_and_denormal_q_stay_within_the_bound() {
     extremes::huge_and_tiny_amounts(deformer);
 }
 
@@ -27,25 +27,25 @@ fn gpu_columns_that_differ_by_1e12_stay_within_the_bound() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_modes_that_nearly_cancel_keep_their_digits_with_compensation_and_lose_them_without() {
+fn gpu_nearly_canceling_modes_need_compensated_sums() {
     extremes::modes_that_nearly_cancel(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_finite_sums_survive_overflow_on_their_way_and_infinity_less_infinity() {
+fn gpu_finite_sums_survive_intermediate_overflow() {
     extremes::finite_sums_that_overflow_on_their_way(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_tiles_of_zeros_stay_where_q_of_zero_puts_them() {
+fn gpu_zero_tiles_do_not_move() {
     extremes::tiles_of_zeros(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_rank_in_every_storage_stays_within_its_bound_down_to_one_vertex() {
+fn gpu_every_rank_and_storage_stays_within_its_bound() {
     extremes::ranks_of_all_sizes(deformer);
 }
 
@@ -57,19 +57,19 @@ fn gpu_shears_and_mirrors_equal_the_twin() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_triangles_without_area_and_missing_uvs_give_directions_of_unit_length() {
+fn gpu_zero_area_and_missing_uvs_give_unit_directions() {
     surfaces::no_area_and_no_uvs(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_overflow_is_told_and_forgotten() {
+fn gpu_overflow_is_reported_for_its_step_only() {
     refusal::overflow_is_told_and_forgotten(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_overflow_is_refused_by_the_name_of_its_domain() {
+fn gpu_overflow_refusal_names_the_domain() {
     refusal::overflow_is_refused_by_name(BackendChoice::Cuda);
 }
 
@@ -81,63 +81,63 @@ fn gpu_errors_of_twenty_truncated_states_stay_within_the_budget() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_mode_that_swings_about_the_limit_does_not_flicker() {
+fn gpu_mode_near_the_truncation_limit_does_not_flicker() {
     truncation::no_flicker(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
+fn gpu_partial_steps_have_the_bits_of_full_steps() {
     changes::steps_of_a_few_domains(deformer);
 }
 
-/// The control of the test above: steps do go by their lists.
+/// Control of the test above: steps do depend on their lists.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_domain_that_a_list_leaves_out_stays_where_it_was() {
+fn gpu_domain_missing_from_the_list_does_not_move() {
     assert!(changes::believes_lists(deformer));
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_displacements_and_boxes_equal_their_twins_and_change_no_vertex() {
+fn gpu_displacements_and_boxes_equal_their_twins() {
     readers::displacements_and_boxes_equal_their_twins(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_scene_without_modes_has_displacements_of_zero() {
+fn gpu_scene_without_modes_has_zero_displacements() {
     readers::a_scene_without_modes_has_zeros(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_displacements_and_boxes_are_read_alone_and_are_those_of_the_last_step() {
+fn gpu_displacements_and_boxes_are_read_alone() {
     readers::parts_are_read_alone(deformer);
     readers::parts_are_fetched_alone(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_displacements_that_no_f32_holds_are_told_and_others_survive() {
+fn gpu_displacement_overflow_is_reported_and_others_survive() {
     readers::lost_displacements_are_told_and_others_survive(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_lost_displacement_is_refused_by_the_name_of_its_domain() {
+fn gpu_displacement_overflow_refusal_names_the_domain() {
     readers::lost_displacements_are_refused_by_name(BackendChoice::Cuda);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_domain_has_the_same_bits_alone_and_among_a_thousand() {
+fn gpu_domain_has_the_same_bits_alone_and_among_others() {
     neighbours::alone_and_among_others(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_one_domain_of_four_million_vertices_stays_within_its_bound() {
+fn gpu_domain_of_four_million_vertices_is_within_its_bound() {
     let scene = scenes::scene(&[(4_000_000, 2)], 1, false, false);
     let mut state = scenes::state(&scene, 91);
     let mut deformer = deformer(&scene);
@@ -147,10 +147,10 @@ fn gpu_one_domain_of_four_million_vertices_stays_within_its_bound() {
     assert_eq!(both::beyond((&scene, &state), &positions, 0.0), [0], "the judge can fail");
 }
 
-/// Each its own shape, so that a tile holds quads of many.
+/// Each domain has its own shape, so that a tile contains quads of many domains.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_two_hundred_thousand_domains_of_seven_take_three_launches_and_stay_within_their_bounds() {
+fn gpu_two_hundred_thousand_domains_take_three_launches() {
     let mut random = Random(92);
     let shapes: Vec<_> = (0..200_000).map(|at| both::strip(&mut random, 7, at % 5)).collect();
     let scene = both::scene_of(shapes, 1, Deformation::default(), false);
@@ -161,7 +161,7 @@ fn gpu_two_hundred_thousand_domains_of_seven_take_three_launches_and_stay_within
     let mut state = scenes::state(&scene, 93);
     let shown = both::run(&mut deformer, &state);
     both::within("200,000 domains of 7", (&scene, &state), &shown.surface.positions, 0.0);
-    // A thousand of them change: the bits are those of the whole, and no other domain moves.
+    // A thousand domains change: the bits equal those of a full step, and no other domain moves.
     let few: Vec<u32> = (0..1000).map(|at| at * 199 + 7).collect();
     changes::apply(&scene, &mut state, &mut random, (&few, &few[..500]));
     let after = both::run(&mut deformer, &state);
@@ -174,38 +174,38 @@ fn gpu_two_hundred_thousand_domains_of_seven_take_three_launches_and_stay_within
     };
     let moved = (0..scene.domains.len()).filter(|domain| moves(*domain)).count();
     eprintln!("a thousand named: {moved} move");
-    // A fifth has no modes, and of the named ones half have a new transform.
+    // A fifth of the domains has no modes, and half of the named ones have a new transform.
     assert!(moved > 800 && moved <= 1000, "{moved}");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_followers_stay_within_their_bounds_and_have_the_bits_of_movers_in_their_places() {
+fn gpu_followers_have_the_bits_of_roots_in_their_places() {
     following::frames_of_all_sizes(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_steps_of_movers_give_the_bits_of_whole_ones_and_move_their_followers() {
+fn gpu_partial_steps_of_roots_move_their_followers() {
     following::steps_of_movers(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_followers_ten_thousand_kilometres_away_keep_the_millimetre() {
+fn gpu_followers_10000_km_away_keep_the_millimeter() {
     following::far_away(deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_products_of_frames_that_overflow_do_no_harm_where_the_vertices_do_not() {
+fn gpu_overflowing_frame_products_keep_finite_vertices() {
     following::products_that_overflow(deformer);
 }
 
-/// A step copies a thousand transforms instead of two hundred thousand, and a branch that moves takes its leaves along.
+/// A step copies a thousand transforms instead of two hundred thousand, and a moved branch moves its leaves.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_two_hundred_thousand_leaves_follow_a_thousand_branches_within_their_bounds() {
+fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     let mut random = Random(94);
     let shapes = vec![both::strip(&mut random, 60, 6), both::strip(&mut random, 4, 0), both::strip(&mut random, 7, 0)];
     let mut parts = scenes::parts(shapes);

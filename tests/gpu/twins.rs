@@ -1,4 +1,4 @@
-//! Positions, normals and tangents of the CUDA deformer equal those of the f64 twin, whatever the sizes.
+//! Positions, normals and tangents of the CUDA deformer equal those of the f64 twin at every size.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ pub(crate) fn deformer(scene: &Arc<Scene>) -> CudaDeformer {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_deform_and_orient_equal_their_twins_at_every_size_and_rank() {
+fn gpu_deform_and_orient_equal_twins_at_every_size_and_rank() {
     for vertices in [1, 31, 32, 33, 257, 16085] {
         for rank in [0, 1, 3, 20, 31, 33, 64, 512] {
             let scene = scenes::scene(&[(vertices, rank)], 3, rank % 2 == 1, false);
@@ -28,7 +28,7 @@ fn gpu_deform_and_orient_equal_their_twins_at_every_size_and_rank() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_combination_of_features_equals_its_twin() {
+fn gpu_every_feature_combination_equals_its_twin() {
     for (modes, normal_maps, rigid) in (0..8).map(|set| (set & 1 != 0, set & 2 != 0, set & 4 != 0)) {
         let rank = if modes { 5 } else { 0 };
         let scene = scenes::scene(&[(300, rank), (40, 0), (7, rank)], 4, normal_maps, rigid);
@@ -43,7 +43,7 @@ fn gpu_every_combination_of_features_equals_its_twin() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_twenty_thousand_small_domains_of_mixed_ranks_take_three_launches_and_equal_the_twin() {
+fn gpu_twenty_thousand_small_domains_take_three_launches() {
     let shapes: Vec<_> = (0..50).map(|index| (7, index % 5)).collect();
     let scene = scenes::scene(&shapes, 400, true, false);
     let mut deformer = deformer(&scene);
@@ -71,7 +71,7 @@ fn report(name: &str, deformer: &mut CudaDeformer, state: &State) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_domains_that_share_coordinates_move_alike() {
+fn gpu_domains_with_shared_coordinates_move_alike() {
     let mut random = Random(11);
     let mut parts = scenes::parts(vec![
         scenes::shape(&mut random, 100, 4),
@@ -94,10 +94,11 @@ fn gpu_domains_that_share_coordinates_move_alike() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_runs_and_places_in_the_packing_do_not_change_a_bit() {
+fn gpu_bits_do_not_depend_on_history_or_packing() {
     let scene = scenes::scene(&[(1000, 37), (33, 5)], 4, true, false);
     let (mut first, other) = (scenes::state(&scene, 20), scenes::state(&scene, 21));
-    // The first shape's instances are alike in all but their place, which no boundary of a block divides evenly.
+    // The instances of the first shape differ only in their place in the packing, and no block boundary divides them
+    // evenly.
     let q = first.q_of(&scene, 0).to_vec();
     for domain in [2, 4, 6] {
         first.transforms[domain] = first.transforms[0];

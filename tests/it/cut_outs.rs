@@ -1,4 +1,4 @@
-//! What is left of a cut-out, against geometry.
+//! Alpha tests of cut-outs in the compute rasterizer, compared with geometry.
 
 use modalcast_compute::reference::raster::cut_out::{Footprint, alpha, footprint};
 use modalcast_compute::reference::raster::{Raster, corners};
@@ -9,14 +9,14 @@ use nalgebra::{Matrix3, Vector3};
 use crate::both::cut_outs::{floor, image, plain_holes, sheet};
 use crate::both::soups::{flat, perspective};
 
-/// Texture coordinates where the ray through a sample meets the plane of a triangle, in f64. The eye is that of
-/// [`perspective`], 60 degrees high.
+/// Texture coordinates at the point where the ray through a sample meets the plane of a triangle, in f64. The eye is
+/// that of [`perspective`], with a vertical field of view of 60 degrees.
 fn by_ray(window: &Window, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     let [width, height] = window.size().map(f64::from);
     let focal = 1.0 / 30.0_f64.to_radians().tan();
     let ray = Vector3::new((2.0 * x / width - 1.0) * width / height / focal, (1.0 - 2.0 * y / height) / focal, -1.0);
     let [a, b, c] = triangle.map(Vector3::from);
-    // a + s (b - a) + t (c - a) = r ray
+    // Solve a + s (b - a) + t (c - a) = r ray.
     let solved = Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("a plane");
     [0, 1].map(|axis| {
         uvs[0][axis] + solved[0] * (uvs[1][axis] - uvs[0][axis]) + solved[1] * (uvs[2][axis] - uvs[0][axis])
@@ -31,7 +31,8 @@ struct Case {
 }
 
 impl Case {
-    /// The footprint, and the largest error of its coordinates and of its changes; the latter against differences.
+    /// Largest error of the texture coordinates of the footprint, and largest error of their derivatives. The
+    /// derivatives are compared with central differences.
     fn errors(&self) -> (f64, f64) {
         let positions: Vec<f32> = self.triangle.as_flattened().iter().map(|number| *number as f32).collect();
         let corners = corners(&self.window, &positions, [0, 1, 2]);
@@ -48,8 +49,9 @@ impl Case {
     }
 }
 
+/// Footprints equal the ray-cast texture coordinates and derivatives, also for triangles with corners behind the eye.
 #[test]
-fn texture_coordinates_are_those_of_the_ray_also_where_corners_are_behind_the_eye() {
+fn texture_coordinates_match_ray_cast_behind_the_eye() {
     let window = perspective(192, 128, 0.1, 100.0);
     let uvs = [[0.0, 0.0], [3.0, 0.0], [3.0, 5.0]];
     let tilted = [[-2.0, -2.0, -3.0], [2.5, -1.0, -5.0], [0.3, 3.0, -9.0]];
@@ -68,8 +70,8 @@ fn texture_coordinates_are_those_of_the_ray_also_where_corners_are_behind_the_ey
 }
 
 #[test]
-fn small_triangles_far_from_the_middle_keep_their_digits() {
-    // 16384 pixels wide, in the last column; 1/50 pixel in size.
+fn small_triangles_at_window_border_keep_precision() {
+    // The window is 16384 pixels wide. The triangle lies in the last column and is 1/50 pixel in size.
     let window = flat(16384, 64);
     let pixel = [16383, 1];
     let middle = [1.0 - 0.5 / 8192.0, 1.0 - 1.5 / 32.0];
@@ -79,18 +81,20 @@ fn small_triangles_far_from_the_middle_keep_their_digits() {
         [at(-1.0, -1.0), at(1.0, -1.0), at(0.0, 1.0)].as_flattened().iter().map(|number| *number as f32).collect();
     let got =
         footprint(&window, &corners(&window, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
-    // f32 tells 1/16384^2 of the window: a twentieth of this triangle.
+    // f32 resolves 1/16384^2 of the window here, which is a twentieth of this triangle.
     assert!((got.uv[0] - 0.5).abs() < 0.06 && (got.uv[1] - 0.5).abs() < 0.06, "{got:?}");
     assert!((got.across[0] / 50.0 - 1.0).abs() < 0.1, "{got:?}");
-    // Beside the triangle by a snap: the nearest of it, not what lies beyond.
+    // The sample lies outside of the triangle by a rounding step. Its coordinates are those of the nearest point of the
+    // triangle, not extrapolated ones.
     let beside =
         [at(0.2, -1.0), at(2.0, -1.0), at(1.2, 1.0)].as_flattened().iter().map(|n| *n as f32).collect::<Vec<_>>();
     let got = footprint(&window, &corners(&window, &beside, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
     assert!((0.0..=1.0).contains(&got.uv[0]) && (0.0..=1.0).contains(&got.uv[1]), "{got:?}");
 }
 
+/// Triangles without area, overflowing corners and texture coordinates that are not finite give a zero footprint.
 #[test]
-fn what_has_no_numbers_has_zeros() {
+fn degenerate_footprints_are_zero() {
     let window = flat(8, 8);
     let uvs = [[0.5, 0.25], [1.0, 0.0], [0.0, 1.0]];
     let of = |corners: [[f32; 4]; 3], uvs: [[f32; 2]; 3]| footprint(&window, &corners, &uvs, [3, 3]);
@@ -109,8 +113,9 @@ fn of_image(image: AlphaImage) -> CutOuts {
 }
 
 #[test]
-fn images_repeat_and_are_mixed_between_texels_and_levels() {
-    // 0, 51, 102 ... in a row of 4; level 1 is 2 texels of 255, level 2 one of 0.
+fn alpha_images_repeat_and_filter_trilinearly() {
+    // Level 0 is a row of 4 texels with values 0, 51, 102 and 153. Level 1 is two texels of 255, and level 2 is one
+    // texel of 0.
     let cut_outs = of_image(image(4, 1, |level, column, _| [51 * column as u8, 255, 0][level as usize]));
     let at = |u: f32, change: f32| {
         let footprint = Footprint { uv: [u, 0.3], across: [change, 0.0], down: [0.0; 2] };
@@ -120,7 +125,7 @@ fn images_repeat_and_are_mixed_between_texels_and_levels() {
     is(at(0.125, 0.0), 0.0);
     is(at(0.375, 0.25), 0.2);
     is(at(0.5, 0.1), 0.3);
-    // Between the last texel and the first.
+    // Halfway between the last texel and the first.
     is(at(0.0, 0.0), 0.3);
     for repeat in [-2.0, 1.0, 5.0] {
         is(at(0.375 + repeat, 0.0), 0.2);
@@ -132,8 +137,9 @@ fn images_repeat_and_are_mixed_between_texels_and_levels() {
     is(at(0.375, f32::MIN_POSITIVE), 0.2);
 }
 
+/// A sheet with one sample per texel reproduces its image row by row; at half the size it reproduces level 1.
 #[test]
-fn a_sheet_is_its_image_row_by_row_and_its_next_level_at_half_the_size() {
+fn sheet_reproduces_its_image_at_levels_0_and_1() {
     let mut random = crate::scenes::Random(3);
     let own = image(64, 64, |_, _, _| if random.number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
@@ -147,11 +153,11 @@ fn a_sheet_is_its_image_row_by_row_and_its_next_level_at_half_the_size() {
 }
 
 #[test]
-fn images_that_say_the_same_everywhere_leave_all_of_a_triangle_or_nothing() {
+fn uniform_images_keep_all_or_nothing_of_a_triangle() {
     let mut differing = 0;
     for holes in plain_holes() {
         let (soup, cut_outs) = (&holes.soup, &holes.cut_outs);
-        // Which surfaces leave anything, as their table says.
+        // Whether each surface of the table keeps any sample.
         let keeps = [false, true, false, true, true, false, false];
         let mut kept = Raster::new(soup.window);
         for group in &soup.groups {
@@ -170,8 +176,10 @@ fn images_that_say_the_same_everywhere_leave_all_of_a_triangle_or_nothing() {
     assert!(differing > 10_000, "control: {differing} samples see something else than without holes");
 }
 
+/// The floor is cut by its image, few of its samples are doubtful, and splitting it into smaller triangles changes few
+/// samples.
 #[test]
-fn a_floor_has_holes_through_which_the_wall_is_seen_and_little_of_it_is_doubtful() {
+fn wall_shows_through_holes_of_the_floor() {
     let holes = floor(1);
     let ids = holes.drawn().ids();
     let of = |wanted: fn(u32) -> bool| ids.iter().flatten().filter(|id| wanted(**id)).count();

@@ -1,4 +1,4 @@
-//! The cpu deformer equals its f64 twin, and the twin equals algebra.
+//! The CPU deformer equals its f64 twin, and the twin equals the algebra.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use modalcast_model::scene::{Parts, Scene, State};
 
 use crate::tolerance::{Tolerance, first_wrong, largest_error};
 
-/// Deterministic numbers in -1 to 1.
+/// Deterministic pseudo-random numbers in -1 to 1.
 pub(crate) struct Noise(pub(crate) u64);
 
 impl Noise {
@@ -49,7 +49,7 @@ pub(crate) fn domain(shape: usize, name: String) -> Domain {
     }
 }
 
-/// A scene of strips with a normal map, one per (n, r).
+/// A scene of strips with a normal map; each strip has n vertices and rank r, given as (n, r).
 fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
     let mut noise = Noise(42);
     let mut parts = Parts::named("strips");
@@ -62,7 +62,7 @@ fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
-/// Coordinates and sheared, mirrored transforms.
+/// A state with random coordinates q and sheared or mirrored transforms.
 pub(crate) fn shaken(scene: &Scene) -> State {
     let mut noise = Noise(7);
     let mut state = State::rest(scene);
@@ -77,7 +77,7 @@ const SIZES: [(usize, usize); 10] =
     [(1, 1), (3, 0), (31, 3), (32, 4), (33, 5), (257, 20), (256, 31), (1000, 33), (7, 512), (5000, 7)];
 
 #[test]
-fn cpu_equals_its_twin_for_all_sizes_ranks_shears_and_mirrors() {
+fn cpu_equals_twin_for_all_sizes_ranks_shears_and_mirrors() {
     let scene = strips(&SIZES);
     let state = shaken(&scene);
     let mut cpu = CpuDeformer::new(&scene);
@@ -99,8 +99,9 @@ fn cpu_equals_its_twin_for_all_sizes_ranks_shears_and_mirrors() {
     }
 }
 
+/// Negative control: a wrong coordinate, swapped transforms and a missing mode each exceed the tolerance.
 #[test]
-fn a_wrong_coordinate_a_wrong_transform_and_a_missing_mode_are_seen() {
+fn wrong_q_transform_or_missing_mode_is_detected() {
     let scene = strips(&SIZES);
     let state = shaken(&scene);
     let want = reference::deform(&scene, &state);
@@ -116,8 +117,9 @@ fn a_wrong_coordinate_a_wrong_transform_and_a_missing_mode_are_seen() {
     assert!(spoil(&|state| state.transforms.swap(4, 5)) > 1e-3);
 }
 
+/// q = 0 gives the rest positions, q = 1 adds one column of U, and other values scale that column.
 #[test]
-fn the_twin_gives_rest_at_zero_a_column_at_one_and_is_linear() {
+fn twin_is_linear_in_q() {
     let scene = strips(&[(50, 6)]);
     let modes = &scene.shape_of(0).modes;
     let rest = scene.shape_of(0).mesh.rest();
@@ -137,8 +139,9 @@ fn the_twin_gives_rest_at_zero_a_column_at_one_and_is_linear() {
     }
 }
 
+/// The normal of a sheared plane stays orthogonal to it. The control shows that the untransformed normal does not.
 #[test]
-fn normals_stay_orthogonal_to_a_sheared_plane_where_the_plain_matrix_fails() {
+fn normals_stay_orthogonal_to_a_sheared_plane() {
     let mut parts = Parts::named("plane");
     let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
     let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a plane");
@@ -147,7 +150,7 @@ fn normals_stay_orthogonal_to_a_sheared_plane_where_the_plain_matrix_fails() {
     parts.domains = vec![domain(0, "plane".into())];
     let scene = Scene::new(parts).expect("a scene");
     let mut state = State::rest(&scene);
-    // z += x: the plane tilts about y; A itself would leave the normal upright.
+    // z += x tilts the plane about y. Transforming the normal by A itself would leave it upright.
     state.transforms[0].0[8] = 1.0;
     let mut cpu = CpuDeformer::new(&scene);
     cpu.deform(&state).expect("deforms");
@@ -159,7 +162,7 @@ fn normals_stay_orthogonal_to_a_sheared_plane_where_the_plain_matrix_fails() {
 }
 
 #[test]
-fn overflow_makes_the_bounds_not_finite_and_large_but_finite_numbers_do_not() {
+fn only_overflow_makes_bounds_non_finite() {
     let scene = strips(&[(40, 3), (9, 0)]);
     let mut cpu = CpuDeformer::new(&scene);
     let mut bounds = |amount: f32| {
@@ -173,8 +176,9 @@ fn overflow_makes_the_bounds_not_finite_and_large_but_finite_numbers_do_not() {
     assert!(bounds(0.0).is_finite());
 }
 
+/// Repeated steps give the same bits. Vertices whose rows of U are zero stay bit-equal to their positions at q = 0.
 #[test]
-fn runs_are_bit_identical_and_rows_of_zeros_stay_where_q_zero_puts_them() {
+fn runs_are_bit_identical_and_zero_rows_do_not_move() {
     let mut parts = Parts::named("clamped");
     let mut shape = strip(300, 8, &mut Noise(3));
     let mut columns = shape.modes.columns().to_vec();

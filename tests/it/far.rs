@@ -1,4 +1,5 @@
-//! Transforms in their three formats over the wire, and domains ten thousand kilometres away: vertices to the millimetre.
+//! The three wire formats of transforms, and domains ten thousand kilometers from the origin: vertices are exact to the
+//! millimeter.
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast_model::scene::Scene;
@@ -10,7 +11,7 @@ use crate::service_harness::{
     Got, Server, config, expected, far_strips, get_vertices, rigid_step, state_after, step, strips,
 };
 
-/// One domain's place: quaternion x y z w, translation.
+/// Placement of one domain: quaternion x y z w and translation.
 type Place = ([f32; 4], [f64; 3]);
 
 fn ask(scene: &str, domains: &[u32]) -> v1::GetVerticesRequest {
@@ -23,7 +24,7 @@ fn turn(roll: f64, pitch: f64, yaw: f64) -> [f32; 4] {
     [turn.i, turn.j, turn.k, turn.w].map(|number| number as f32)
 }
 
-/// World positions in metres by plain f64: unit (R (x0 + U q) + t) with t as sent.
+/// World positions in meters, computed in f64: unit (R (x0 + U q) + t) with t as sent.
 fn truth(scene: &Scene, domain: usize, q: &[f32], (rotation, translation): Place) -> Vec<Vector3<f64>> {
     let [x, y, z, w] = rotation.map(f64::from);
     let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
@@ -39,7 +40,7 @@ fn truth(scene: &Scene, domain: usize, q: &[f32], (rotation, translation): Place
     shape.mesh.rest().iter().enumerate().map(one).collect()
 }
 
-/// World positions in metres as the reply says.
+/// World positions in meters, decoded from the reply.
 fn told(scene: &Scene, got: &Got) -> Vec<Vector3<f64>> {
     let mut points = got.positions.chunks_exact(3);
     let mut world = Vec::new();
@@ -63,7 +64,7 @@ async fn cpu() -> Server {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_three_formats_say_the_same_and_any_offset_of_their_bytes_will_do() {
+async fn transform_formats_agree_at_any_byte_alignment() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
@@ -84,7 +85,7 @@ async fn the_three_formats_say_the_same_and_any_offset_of_their_bytes_will_do() 
     let want = expected(&strips(), &steps[..1]);
     for (number, mut step) in steps.into_iter().enumerate() {
         step.number = number as u64;
-        // A field of odd length before the bytes moves them to another alignment in the message.
+        // An odd number of bytes before the transforms changes their alignment within the message.
         step.q_domains = vec![0; usize::from(number % 2 == 1)];
         step.q = vec![0; 8 * step.q_domains.len()].into();
         driver.acked(step).await;
@@ -92,20 +93,21 @@ async fn the_three_formats_say_the_same_and_any_offset_of_their_bytes_will_do() 
         assert_eq!((&got.positions, &got.normals), (&want.0, &want.1), "step {number}");
         assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0));
     }
-    // The control: another rotation gives other vertices.
+    // Control: another rotation gives other vertices.
     let other = rigid_step(9, RigidF32, &[(1, turn(0.3, -0.8, 2.1), place.1)]);
     assert_ne!(expected(&strips(), &[other]).0, want.0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_far_scene_and_a_domain_far_from_it_keep_the_millimetre() {
+async fn far_scene_and_far_domain_keep_millimeter_precision() {
     let server = cpu().await;
     let scene = far_strips();
     server.open("far").await;
     let mut driver = server.drive("far", v1::Policy::Lossless, 0).await;
     let q = [0.25, -0.5, 0.125, 0.75_f32];
     driver.acked(step(0, &[], &q)).await;
-    // In half metres from the world's origin: the one by the scene's origin, the other 10,000 km east of it.
+    // In half meters from the world origin. The first domain is near the scene origin, the second is 10,000 km east of
+    // it.
     let home = scene.origin.map(|metres| metres / scene.unit);
     let near = (turn(0.1, 0.2, 0.3), [home[0] + 3.001, home[1] - 2.003, home[2] + 0.007]);
     let away = (turn(-1.0, 0.5, 0.9), [home[0] + 2e7 + 1.234, home[1] + 0.001, home[2] - 700.021]);
@@ -116,10 +118,10 @@ async fn a_far_scene_and_a_domain_far_from_it_keep_the_millimetre() {
     let want = [truth(&scene, 0, &q[..2], near), truth(&scene, 1, &q[2..], away)].concat();
     let error = largest(&told(&scene, &got), &want);
     assert!(error <= 1e-3, "{error} m");
-    // The control: rounded to f32 against the scene's origin, the far one is off by more.
+    // Control: a far translation rounded to f32 relative to the scene origin is off by more than 1 cm.
     let rounded = away.1[0] - home[0] - f64::from((away.1[0] - home[0]) as f32);
     assert!(scene.unit * rounded.abs() > 1e-2, "{rounded}");
-    // Each alone, in any order, and without normals.
+    // A selection of domains in another order and without normals, then one domain only.
     let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true, ..Default::default() });
     let swapped = get_vertices(&server, v1::GetVerticesRequest { selection, ..ask("far", &[]) }).await.expect("both");
     let want = [truth(&scene, 1, &q[2..], away), truth(&scene, 0, &q[..2], near)].concat();
@@ -129,8 +131,10 @@ async fn a_far_scene_and_a_domain_far_from_it_keep_the_millimetre() {
     assert!(largest(&told(&scene, &alone), &truth(&scene, 0, &q[..2], near)) <= 1e-3);
 }
 
+/// When all domains move far away, the origin of the scene moves with them. A restart restores that origin and the
+/// vertices.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_scene_that_goes_far_takes_its_origin_along_and_keeps_it_over_a_restart() {
+async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let folder = tempfile::tempdir().expect("a folder");
     let settings = || Config { backend: BackendChoice::Cpu, ..config(folder.path()) };
     let server = Server::start(settings()).await;
@@ -154,7 +158,7 @@ async fn a_scene_that_goes_far_takes_its_origin_along_and_keeps_it_over_a_restar
     let server = Server::start(settings()).await;
     let kept = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
     assert_eq!((kept.step().number, &kept.positions, &kept.head.origin), (4, &got.positions, &got.head.origin));
-    // What comes next in f64 is added to what was kept.
+    // The next f64 transform applies to the state restored from the checkpoint.
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let moved = (places[1].0, [1e7 + 11.5, 0.001, -1e7]);
     driver.acked(rigid_step(0, RigidF64, &[(1, moved.0, moved.1)])).await;

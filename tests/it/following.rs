@@ -8,7 +8,7 @@ const BRANCH: u32 = 1;
 const LEAF: u32 = 2;
 const LEAFLET: u32 = 3;
 
-/// A step that moves domains by rows of 12 numbers.
+/// A step that moves domains; each row is a 3 x 4 matrix of 12 numbers.
 fn moved(number: u64, domains: &[u32], rows: &[[f32; 12]]) -> v1::Step {
     let transforms = rows.as_flattened().iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     v1::Step { transform_domains: domains.to_vec(), transforms, ..step(number, &[], &[]) }
@@ -23,7 +23,7 @@ const TURN: [f32; 12] = [0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0,
 const SHIFT: [f32; 12] = [1.0, 0.0, 0.0, 7.0, 0.0, 1.0, 0.0, 8.0, 0.0, 0.0, 1.0, 9.0];
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_moved_branch_moves_its_leaves_and_no_other_domain() {
+async fn moved_branch_moves_only_its_leaves() {
     let server = Server::fresh().await;
     server.open("twig").await;
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
@@ -33,7 +33,8 @@ async fn a_moved_branch_moves_its_leaves_and_no_other_domain() {
     let got = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
     assert_eq!(got, expected(&twig(), &[step]).0);
     assert_eq!(got[..12], at_rest[..12], "the other strip stays");
-    // The leaf's first vertex is at the origin of its frame, (0.5, 1, -0.25) in the branch's; then again in the leaf's.
+    // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
+    // frame. The leaflet applies the same frame again within the leaf's frame.
     let turned = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
     let first = |domain: usize| [got[12 * domain], got[12 * domain + 1], got[12 * domain + 2]];
     assert_eq!(first(LEAF as usize), turned([0.5, 1.0, -0.25]));
@@ -42,12 +43,14 @@ async fn a_moved_branch_moves_its_leaves_and_no_other_domain() {
     driver.finish().await;
 }
 
+/// A step without a list has one transform for each transform root. A step that contains the transform of a follower is
+/// refused and none of it is applied.
 #[tokio::test(flavor = "multi_thread")]
-async fn transforms_of_all_are_those_of_movers_and_one_of_a_follower_is_refused_whole() {
+async fn transform_of_a_follower_is_refused_whole() {
     let server = Server::fresh().await;
     server.open("twig").await;
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
-    // Without a list: both strips, and neither leaf.
+    // Transforms without a list of domains are those of both strips; the two followers have none.
     let all = moved(0, &[], &[SHIFT, TURN]);
     driver.acked(all.clone()).await;
     let got = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
@@ -61,7 +64,7 @@ async fn transforms_of_all_are_those_of_movers_and_one_of_a_follower_is_refused_
     );
     assert_eq!(get_vertices(&server, ask(&[])).await.expect("vertices").positions, got, "nothing was applied");
     driver.finish().await;
-    // Coordinates of a follower are its own.
+    // A follower has coordinates of its own: only the leaf bends.
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
     driver.acked(step(2, &[LEAF], &[0.5, -0.25])).await;
     let bent = get_vertices(&server, ask(&[])).await.expect("vertices").positions;

@@ -1,4 +1,5 @@
-//! Frames over the wire: the right step, size and bytes, with a deadline, single or streamed. Needs an EGL that draws.
+//! Frames over the wire: step, size, bytes and deadlines of single frames and of streams. Needs an EGL driver that can
+//! render.
 
 use modalcast::config::{Config, RendererChoice};
 use modalcast_proto::v1;
@@ -59,7 +60,7 @@ async fn next(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::Fr
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_frame_names_its_step_and_png_and_rgba_hold_the_same_pixels() {
+async fn frame_names_its_step_and_png_equals_rgba() {
     let server = server().await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let rest = render(&server, request()).await.expect("the rest state can be drawn");
@@ -81,8 +82,10 @@ async fn a_frame_names_its_step_and_png_and_rgba_hold_the_same_pixels() {
     }
 }
 
+/// A raw frame of 6.4 MB reaches a client with default message limits. A request without a picture gets the default
+/// size and format.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_large_raw_frame_travels_in_chunks_to_a_client_with_default_limits() {
+async fn large_frame_is_chunked_for_default_client_limits() {
     let server = server().await;
     let large = v1::RenderFrameRequest { picture: picture(1600, 1000, v1::Format::Rgba), ..request() };
     let frame = render(&server, large).await.expect("a frame");
@@ -92,8 +95,10 @@ async fn a_large_raw_frame_travels_in_chunks_to_a_client_with_default_limits() {
     assert_eq!((frame.head.width, frame.head.height, frame.head.format()), (1280, 720, v1::Format::Png));
 }
 
+/// A lossless stream delivers every step and ends after its count. A latest stream only moves forward and counts the
+/// steps that it skips.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_lossless_frame_stream_shows_every_step_and_a_latest_one_only_goes_forward() {
+async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
     let server = server().await;
     let subscribe = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
         scene: "strips".into(),
@@ -134,7 +139,7 @@ async fn a_lossless_frame_stream_shows_every_step_and_a_latest_one_only_goes_for
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_pictures_are_refused_by_name_and_deadlines_hold() {
+async fn bad_pictures_are_refused_and_deadlines_hold() {
     let server = server().await;
     let eye = |eye: Vec<f64>, up: Vec<f64>| v1::Camera {
         view: Some(v1::camera::View::LookAt(v1::LookAt { eye, target: vec![0.0; 3], up })),

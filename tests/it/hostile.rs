@@ -1,4 +1,5 @@
-//! Bad input, one by one: each is refused with field, expected and given, the stream goes on, and others never notice.
+//! Invalid input: each case is refused with field, expected and given. The stream stays open, and other clients are not
+//! affected.
 
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -11,10 +12,10 @@ use v1::upload_scene_request::Part;
 
 use crate::service_harness::{Driver, Server, details, expected, get_vertices, rigid_step, step, strips, within};
 
-/// A bad step: its name, the step, and how field, expected and given begin.
+/// An invalid step: the name of the case, the step, and the prefixes of field, expected and given.
 type BadStep = (&'static str, v1::Step, [&'static str; 3]);
 
-/// No rotation, as a quaternion.
+/// The identity rotation as a quaternion x y z w.
 const UPRIGHT: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 fn bad_steps() -> Vec<BadStep> {
@@ -70,7 +71,7 @@ fn bad_steps() -> Vec<BadStep> {
     ]
 }
 
-/// Bad steps in the other formats of transforms.
+/// Invalid steps in the rigid transform formats, and steps with a format that does not match their bytes.
 fn bad_formats() -> Vec<BadStep> {
     let bytes = |format: i32| v1::Step {
         transform_domains: vec![0],
@@ -123,8 +124,10 @@ fn begins(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> boo
     rejection.field.starts_with(field) && rejection.expected.starts_with(expected) && rejection.given.starts_with(given)
 }
 
+/// Every invalid step is refused by field and leaves the state unchanged. The same stream and the stream of another
+/// client continue.
 #[tokio::test(flavor = "multi_thread")]
-async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client_never_notices() {
+async fn bad_steps_are_refused_and_the_stream_stays_open() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
@@ -135,7 +138,8 @@ async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client
     driver.acked(good.clone()).await;
     let want = expected(&strips(), &[good]);
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
-    // A refused overflow keeps its number, so what follows counts from there.
+    // The server keeps the number of a step that it refused for overflow, so the numbers of the following steps
+    // increase.
     for (index, (name, mut bad, refusal)) in bad_steps().into_iter().chain(bad_formats()).enumerate() {
         let goes_back = bad.number < 11;
         bad.number += if goes_back { 0 } else { index as u64 };
@@ -154,7 +158,7 @@ async fn every_bad_step_is_refused_by_name_the_stream_goes_on_and_another_client
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_openings_are_refused_and_the_same_stream_can_open_after_them() {
+async fn stream_opens_after_refused_openings() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut driver = Driver::connect(server.channel().await).await;
@@ -171,11 +175,12 @@ async fn bad_openings_are_refused_and_the_same_stream_can_open_after_them() {
     driver.acked(step(0, &[0], &[0.0, 0.0])).await;
 }
 
+/// The scene keeps its last good step, and the other stream on the same connection continues.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_message_over_the_limit_ends_its_stream_only_and_the_scene_stays_as_it_was() {
+async fn oversized_message_ends_only_its_own_stream() {
     let server = Server::with(|config| modalcast::config::Config { message_bytes: 64 << 10, ..config }).await;
     server.open("strips").await;
-    // Both streams travel on one connection.
+    // Both streams share one connection.
     let channel = server.channel().await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("opens");
@@ -198,7 +203,7 @@ async fn a_message_over_the_limit_ends_its_stream_only_and_the_scene_stays_as_it
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_questions_are_refused_with_code_field_expected_and_given() {
+async fn bad_requests_are_refused_with_code_and_details() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut scenes = server.scenes().await;
@@ -244,7 +249,7 @@ async fn bad_questions_are_refused_with_code_field_expected_and_given() {
     server.open("strips").await;
 }
 
-/// An upload of one file `scene.txt`, to be spoilt.
+/// An upload of one file, `scene.txt`. Tests modify it to make it invalid.
 fn upload(contents: &[u8]) -> Vec<Part> {
     let header =
         v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
@@ -268,7 +273,7 @@ fn spoilt(change: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Ve
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_uploads_are_refused_by_name_and_leave_nothing_behind() {
+async fn bad_uploads_are_refused_and_leave_no_files() {
     let server = Server::with(|config| modalcast::config::Config { upload_bytes: 1000, ..config }).await;
     let uploads = server.engine.config().state.join("uploads");
     let path = |path: &'static str| spoilt(move |_, file| file.path = path.into());
@@ -315,8 +320,9 @@ async fn bad_uploads_are_refused_by_name_and_leave_nothing_behind() {
     assert_eq!(std::fs::read_dir(&uploads).expect("a folder").count(), 0);
 }
 
+/// Status details travel in an HTTP/2 header, so a refusal of a very long input is truncated.
 #[tokio::test(flavor = "multi_thread")]
-async fn no_refusal_is_larger_than_a_header_may_be() {
+async fn refusal_details_fit_into_a_header() {
     let server = Server::fresh().await;
     let request = v1::OpenSceneRequest { source: "x".repeat(500_000), scene: "name".into() };
     let status = server.scenes().await.open_scene(request).await.expect_err("no such source");

@@ -1,4 +1,5 @@
-//! The tables in `src/lib.rs` hold: modules use only what their row names, files stay small, kernels have their twins.
+//! Checks of the tables in `src/lib.rs` and of the layout of the repository: modules use only the modules of their row,
+//! files stay small, and every kernel has a launcher and a CPU twin.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -10,7 +11,7 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Module to what it may use, from the page's table.
+/// Maps each module to the modules that it may use, parsed from the page's table.
 fn table(page: &str) -> BTreeMap<String, BTreeSet<String>> {
     let names = |cell: &str| -> BTreeSet<String> { cell.split('`').skip(1).step_by(2).map(str::to_owned).collect() };
     let row = |line: &str| {
@@ -36,10 +37,11 @@ fn files(folder: &Path, endings: &[&str]) -> Vec<PathBuf> {
     found
 }
 
-/// Folders of `src` that are crates of their own.
+/// Folders of `src` that are separate crates.
 const TIERS: [&str; 3] = ["compute", "model", "render"];
 
-/// Crate and top-level module of a file of `src`, as the table names them; none of a crate's root.
+/// Crate and top-level module of a file of `src`, named as in the table. `None` for the root file of a crate and for
+/// test support.
 fn module_of(path: &Path) -> Option<(String, String)> {
     let inside = path.strip_prefix(root().join("src")).expect("inside src");
     let mut names = inside.iter().map(|name| name.to_string_lossy().into_owned()).peekable();
@@ -47,11 +49,11 @@ fn module_of(path: &Path) -> Option<(String, String)> {
     let package = tier.map_or("modalcast".to_owned(), |tier| format!("modalcast-{tier}"));
     let module = names.next().expect("a name").trim_end_matches(".rs").to_owned();
     let is_root = module == "lib" || module == "main";
-    // Test support is compiled for tests only and may use everything.
+    // Test support is compiled for tests only and may use every module.
     (!is_root && module != "testing").then_some((package, module))
 }
 
-/// Every module that a text names as `crate::name` or in `crate::{...}`, outside its comments.
+/// Every module that a source text names as `crate::name` or in `crate::{...}`, except in comment lines.
 fn uses(text: &str) -> BTreeSet<String> {
     let code: Vec<&str> = text.lines().filter(|line| !line.trim_start().starts_with("//")).collect();
     let name = |rest: &str| -> String {
@@ -65,7 +67,7 @@ fn uses(text: &str) -> BTreeSet<String> {
     names.filter(|name| !name.is_empty()).collect()
 }
 
-/// The entries of a group import up to its closing brace, without what is nested in them.
+/// The entries of a group import up to its closing brace; nested groups stay within their entry.
 fn first_names(group: &str) -> Vec<&str> {
     let (mut depth, mut begin, mut entries) = (0, 0, Vec::new());
     for (at, letter) in group.char_indices() {
@@ -86,7 +88,8 @@ fn first_names(group: &str) -> Vec<&str> {
     entries
 }
 
-/// What a module uses of its own crate that its row does not name, and proto outside of `service`.
+/// Uses that are not allowed: modules of the same crate that the row does not name, and `modalcast_proto` outside of
+/// `service`.
 fn illegal((package, module): (&str, &str), text: &str, table: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
     let row = |module: &str| table.get(&format!("{package}::{module}"));
     let Some(allowed) = row(module) else { return vec![format!("{package}::{module} is not in the table")] };
@@ -117,7 +120,8 @@ fn modules_use_only_what_their_row_names() {
 #[test]
 fn module_dependencies_have_no_cycle() {
     let table = table(&fs::read_to_string(root().join("src/lib.rs")).expect("the page"));
-    // Names are unique over the crates. Peeling modules that use nothing left over empties the table unless there is a cycle.
+    // Module names are unique across the crates. Repeatedly remove a module that uses none of the remaining ones; this
+    // empties the table unless there is a cycle.
     let name = |row: &String| row.rsplit("::").next().unwrap_or_default().to_owned();
     let mut left: BTreeMap<String, BTreeSet<String>> =
         table.iter().filter(|(row, _)| row.contains("::")).map(|(row, uses)| (name(row), uses.clone())).collect();
@@ -129,7 +133,7 @@ fn module_dependencies_have_no_cycle() {
     }
 }
 
-/// Cargo keeps the tiers apart only as long as no manifest names a tier above.
+/// Cargo enforces the order of the tiers as long as no manifest names a higher tier.
 #[test]
 fn manifests_depend_on_lower_tiers_only() {
     let page = fs::read_to_string(root().join("src/lib.rs")).expect("the page");
@@ -149,7 +153,7 @@ fn manifests_depend_on_lower_tiers_only() {
 }
 
 #[test]
-fn provoked_faults_are_seen() {
+fn forbidden_uses_are_detected() {
     let table = table("//! | `a::low` | x | |\n//! | `a::high` | x | `low` |\n//! | `b::other` | x | |\n");
     let none = Vec::<String>::new();
     assert_eq!(illegal(("a", "high"), "use crate::low::Thing;", &table), none);
@@ -161,13 +165,14 @@ fn provoked_faults_are_seen() {
     assert_eq!(illegal(("a", "low"), "use modalcast_proto::v1;", &table), ["low names proto"]);
 }
 
-/// A kernel that only trials launch, or that computes what another one does by another way: its twin is a test of its
-/// launcher, or beside it.
+/// Whether the twin of a kernel is a `twin_of_` function in the tests of its launcher, instead of a file of its own.
+/// This holds for kernels that only the benchmarks launch and for kernels that compute the result of another kernel in
+/// a different way.
 fn is_walked_in_tests(name: &str) -> bool {
     name.starts_with("thesis_") || ["roof", "plain_update", "batch", "batch_mma"].contains(&name)
 }
 
-/// Kernels that put into one place what deformers on the host find there: their twin is a method of the scene's values.
+/// Kernels whose CPU twin is a method of a model or reference type, instead of a file with the name of the kernel.
 const TWINS_ELSEWHERE: [(&str, Twin); 3] = [
     ("apply", Twin { file: "src/model/scene/state.rs", of: "State", method: "apply" }),
     ("bounds", Twin { file: "src/model/scene/camera.rs", of: "Bounds", method: "union" }),
@@ -182,7 +187,8 @@ struct Twin {
 }
 
 impl Twin {
-    /// Whether the file's text has the method in its type's own block, and the kernel's text names it.
+    /// Whether the text of the file defines the method in an `impl` block of the type, and the kernel's `CPU twin:`
+    /// comment names it.
     fn is_in(&self, file: &str, kernel: &str) -> bool {
         let block = file.split(&format!("\nimpl {} {{", self.of)).nth(1).and_then(|rest| rest.split("\n}\n").next());
         let has = block.is_some_and(|block| block.contains(&format!("\n    pub fn {}(", self.method)));
@@ -192,7 +198,7 @@ impl Twin {
 }
 
 #[test]
-fn a_twin_elsewhere_is_missed_when_its_method_is_or_when_the_kernel_does_not_name_it() {
+fn missing_or_unnamed_twin_method_is_detected() {
     let twin = Twin { file: "", of: "Sum", method: "add" };
     let (kernel, file) = ("// CPU twin: Sum::add.\n", "\nimpl Sum {\n    /// Adds.\n    pub fn add(self) {}\n}\n");
     assert!(twin.is_in(file, kernel));
@@ -203,8 +209,8 @@ fn a_twin_elsewhere_is_missed_when_its_method_is_or_when_the_kernel_does_not_nam
 }
 
 #[test]
-fn every_kernel_has_a_launcher_and_a_twin_of_its_name() {
-    // The server's kernels, then those of the benchmarks.
+fn every_kernel_has_a_launcher_and_a_twin() {
+    // Kernels of the server, then kernels of the benchmarks.
     let mut pairs = Vec::new();
     for (kernels, launchers) in [("kernels", "src/compute/gpu"), ("tests/bench/kernels", "tests/bench/src/kernels")] {
         let found = files(&root().join(kernels), &["cu"]);
@@ -245,7 +251,7 @@ fn files_have_at_most_five_hundred_lines() {
 }
 
 #[test]
-fn unsafe_has_its_addresses() {
+fn unsafe_code_stays_in_gpu_and_render() {
     for path in files(&root().join("src"), &["rs"]) {
         let inside = path.strip_prefix(root()).expect("inside").to_string_lossy().into_owned();
         let text = fs::read_to_string(&path).expect("a file");
@@ -256,9 +262,9 @@ fn unsafe_has_its_addresses() {
     }
 }
 
-/// Version floors below which a dependency has a known fault.
+/// Each floor is the lowest version without a known fault of the dependency.
 #[test]
-fn locked_versions_are_above_their_known_faults() {
+fn locked_versions_have_no_known_faults() {
     let lock = fs::read_to_string(root().join("Cargo.lock")).expect("the lock file");
     let floors = [
         ("h2", "0.4.16"),

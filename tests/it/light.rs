@@ -1,4 +1,5 @@
-//! What a shadow map gains by being fitted to the vertices in light space, not to the corners of their bounds.
+//! A shadow map fitted to the vertices in light space has smaller texels than one fitted to the corners of the scene
+//! bounds.
 
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference::ReferenceDeformer;
@@ -7,15 +8,17 @@ use modalcast_model::load;
 use modalcast_model::scene::{Camera, Scene, State};
 use modalcast_render::{Shot, shadow_texel};
 
-/// Sides of a texel in scene units, by a deformation.
+/// Side lengths of a shadow map texel in scene units, for a deformation.
 fn texel(scene: &Scene, deformed: &Deformed, is_lit: bool) -> [f64; 2] {
     let light = deformed.light.filter(|_| is_lit);
     let shot = Shot { camera: Camera::framing(scene, 64, 64), width: 64, height: 64, bounds: deformed.bounds, light };
     shadow_texel(scene, &shot).expect("the look has a shadow").map(|side| side.norm())
 }
 
+/// Texels fitted to the light-space boxes of tiles have less than half the area of texels fitted to the corners of the
+/// bounds, and less than 1.2 times the area of texels fitted to the exact vertices.
 #[test]
-fn texels_of_the_built_in_tree_have_less_than_half_the_area_that_the_corners_of_its_bounds_give_them() {
+fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
     let scene = load::open("tree").expect("built in");
     let state = State::rest(&scene);
     let exact = ReferenceDeformer::new(&scene).deform(&state).expect("deforms");

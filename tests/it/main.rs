@@ -1,4 +1,4 @@
-//! Claims that need no GPU. One binary.
+//! Tests that need no GPU, in one binary. The tests that render need an EGL driver; a software driver is enough.
 
 #[path = "../both/mod.rs"]
 mod both;

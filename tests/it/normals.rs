@@ -1,4 +1,4 @@
-//! Exact normals and tangents: the reference against algebra, the cpu deformer against the reference.
+//! Exact normals and tangents: the reference is compared with algebra, and the CPU deformer with the reference.
 
 mod build;
 mod extremes;
@@ -12,28 +12,29 @@ use build::{
     bent, cube, degrees, exact, largest_angle, on_cpu, scene, scene_with, sheet, sphere, state, tube, with_mode,
 };
 
-/// Largest accepted angle between the cpu's directions and the reference's, in degrees, where surfaces are smooth.
+/// Largest accepted angle between the CPU's directions and the reference's on smooth surfaces, in degrees.
 const TOLERANCE: f64 = 1e-3;
 
-/// Lifts a sheet to z = q x^2.
+/// Displaces a sheet to z = q x^2.
 fn parabola(rest: [f32; 3]) -> [f32; 3] {
     [0.0, 0.0, rest[0] * rest[0]]
 }
 
-/// A rotation, a mirror and a shear.
+/// A scaled rotation, a mirrored rotation and a rotated shear.
 fn linear_parts() -> [Matrix3<f64>; 3] {
     let turn = Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
     [turn * 2.0, turn * -1.0, turn * Matrix3::new(1.0, 0.7, -0.2, 0.0, 0.5, 0.4, 0.1, 0.0, 1.5)]
 }
 
-/// The directions that a matrix of cofactors gives.
+/// A normal transformed by the cofactor matrix of a linear map, normalized.
 fn by_cofactors(linear: Matrix3<f64>, normal: [f64; 3]) -> [f64; 3] {
     let inverse = linear.try_inverse().expect("regular");
     (inverse.transpose() * Vector3::from(normal)).normalize().into()
 }
 
+/// Control: rigid normals are off by more than 40 degrees.
 #[test]
-fn a_bent_strip_has_the_normals_and_tangents_of_its_parabola_and_rigid_ones_are_off_by_degrees() {
+fn bent_strip_has_normals_and_tangents_of_its_parabola() {
     let scene = scene(vec![with_mode(sheet(33, 5), parabola)]);
     let state = bent(&scene, 0.5);
     let (normals, tangents) = exact(&scene, &state);
@@ -42,7 +43,7 @@ fn a_bent_strip_has_the_normals_and_tangents_of_its_parabola_and_rigid_ones_are_
     let mut largest = 0.0_f64;
     let inner = |(_, rest): &(usize, &[f32; 3])| rest[0].abs() < 0.99 && rest[1].abs() < 0.99;
     for (corner, [x, ..]) in scene.shapes[0].mesh.rest().iter().enumerate().filter(inner) {
-        // The slope of a parabola is that of the chord over both neighbours.
+        // The slope of a parabola equals that of the chord over both neighbors.
         let slope = f64::from(*x);
         assert!(degrees(normals[corner], [-slope, 0.0, 1.0]) < 1e-5, "corner {corner}: {:?}", normals[corner]);
         let [along @ .., sign] = tangents[corner];
@@ -56,7 +57,7 @@ fn a_bent_strip_has_the_normals_and_tangents_of_its_parabola_and_rigid_ones_are_
 }
 
 #[test]
-fn a_box_sheared_by_a_mode_keeps_its_hard_edges_and_has_the_normals_of_its_faces() {
+fn sheared_box_has_face_normals_and_hard_edges() {
     let scene = scene(vec![with_mode(cube(), |[_, y, z]| [z - 0.5 * y, 0.0, 0.3 * z])]);
     let bend = Matrix3::new(1.0, -0.5, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.3);
     let corners = scene.shapes[0].mesh.corners();
@@ -75,7 +76,7 @@ fn a_box_sheared_by_a_mode_keeps_its_hard_edges_and_has_the_normals_of_its_faces
 }
 
 #[test]
-fn a_sphere_stretched_by_a_mode_has_the_normals_of_the_ellipsoid() {
+fn stretched_sphere_has_normals_of_the_ellipsoid() {
     let stretch = Matrix3::from_diagonal(&Vector3::new(2.0, 1.0, 0.5));
     let errors = [3, 4, 5].map(|level| {
         let scene = scene(vec![with_mode(sphere(level), |[x, _, z]| [x, 0.0, -0.5 * z])]);
@@ -93,12 +94,13 @@ fn a_sphere_stretched_by_a_mode_has_the_normals_of_the_ellipsoid() {
         assert!(rigid.iter().zip(&smooth).map(off).fold(0.0, f64::max) > 30.0, "rigid ones are no ellipsoid's");
         normals.iter().zip(&smooth).map(off).fold(0.0, f64::max)
     });
-    // Finer triangles come closer to the smooth surface.
+    // Finer triangles approximate the smooth surface better.
     assert!(errors[1] < 0.75 * errors[0] && errors[2] < 0.75 * errors[1] && errors[2] < 2.0, "{errors:?} degrees");
 }
 
+/// At q = 0 exact normals equal the rigid ones, for authored rest normals as well as for computed ones.
 #[test]
-fn at_q_of_zero_exact_equals_rigid_however_rest_normals_were_made() {
+fn exact_normals_equal_rigid_ones_at_zero_q() {
     let mut authored = sheet(9, 9);
     let corners = authored.corners().clone();
     let mut noise = crate::deformers::Noise(5);
@@ -116,7 +118,7 @@ fn at_q_of_zero_exact_equals_rigid_however_rest_normals_were_made() {
             assert!(degrees(*exact, *rigid) < 1e-10);
         }
         for ([exact @ .., sign], [rigid @ .., hand]) in tangents.iter().zip(&along) {
-            // Rest tangents are orthogonal to rest normals within the rounding of f32.
+            // Rest tangents are orthogonal to rest normals up to the rounding of f32.
             assert!((sign, true) == (hand, degrees(*exact, *rigid) < 2e-5) || *hand == 0.0);
         }
         assert!(largest_angle(&cpu.normals, &rigid) < TOLERANCE);
@@ -126,8 +128,10 @@ fn at_q_of_zero_exact_equals_rigid_however_rest_normals_were_made() {
     }
 }
 
+/// Corners on both sides of a seam of texture coordinates form one smoothing group. Control: sides with different rest
+/// normals form no group and differ by degrees.
 #[test]
-fn both_sides_of_a_seam_keep_one_normal_and_without_groups_they_would_not() {
+fn both_sides_of_a_uv_seam_share_one_normal() {
     let squash = |[x, _, z]: [f32; 3]| [2.0 * x + z, 0.0, -0.5 * z * z];
     let mut widest = [0.0_f64; 2];
     for (widest, tilt) in widest.iter_mut().zip([0.0, 0.2]) {
@@ -147,7 +151,7 @@ fn both_sides_of_a_seam_keep_one_normal_and_without_groups_they_would_not() {
 }
 
 #[test]
-fn rest_normals_against_the_winding_stay_against_it() {
+fn rest_normals_opposite_to_the_winding_stay_opposite() {
     let mesh = sheet(9, 9);
     let down = vec![[0.0, 0.0, -1.0]; 81];
     let flipped = modalcast_model::domain::Mesh::indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
@@ -158,8 +162,9 @@ fn rest_normals_against_the_winding_stay_against_it() {
     }
 }
 
+/// A mirror also flips the sign of each tangent.
 #[test]
-fn a_transform_turns_bent_normals_by_its_cofactors_and_a_mirror_flips_tangent_signs() {
+fn transforms_act_on_bent_normals_by_their_cofactors() {
     let scene = scene(vec![with_mode(sheet(9, 9), |[x, y, _]| [0.1 * y, 0.0, x * x - 0.4 * y])]);
     let (normals, tangents) = exact(&scene, &bent(&scene, 0.6));
     for linear in linear_parts() {
@@ -179,8 +184,9 @@ fn a_transform_turns_bent_normals_by_its_cofactors_and_a_mirror_flips_tangent_si
     }
 }
 
+/// Shapes without texture coordinates have zero tangents.
 #[test]
-fn tangents_are_unit_and_orthogonal_to_their_normals_and_shapes_without_uvs_have_none() {
+fn tangents_are_unit_and_orthogonal_to_normals() {
     let bare = modalcast_model::domain::Mesh::indexed(
         sheet(5, 5).rest().to_vec(),
         vec![build::UP; 25],
@@ -206,8 +212,9 @@ fn tangents_are_unit_and_orthogonal_to_their_normals_and_shapes_without_uvs_have
     }
 }
 
+/// Smoothing groups exist only in scenes with exact normals, and there only for shapes with modes.
 #[test]
-fn only_shapes_that_bend_in_a_scene_that_asks_have_groups() {
+fn only_deformable_shapes_have_smoothing_groups() {
     let rigid =
         modalcast_model::domain::Shape::new(sheet(3, 3), modalcast_model::domain::Modes::rigid()).expect("rigid");
     let shapes = || vec![with_mode(sheet(3, 3), parabola), rigid.clone()];

@@ -1,4 +1,4 @@
-//! Picks and pictures of numbers over the wire. Needs an EGL that draws.
+//! Picks and AOV frames (depth, domains, normals, value maps) over the wire. Needs an EGL driver that can render.
 
 use modalcast::config::{Config, RendererChoice};
 use modalcast_client::{Camera, Client, Code, Format, FrameRequest, Hit, Lens, Output, PickRequest, Picture, View};
@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 use crate::service_harness::{Server, far_strips, rigid_step, sheet, state_after, step, strips};
 
-/// Positions of picks, against the reference's triangle, in scene units: f32 vertices of a few units.
+/// Tolerance of picked positions against the reference's triangle, in scene units, for f32 vertices of a few units.
 const NEAR: f64 = 2e-6;
 
 async fn server(source: &str) -> (Server, Client) {
@@ -19,7 +19,7 @@ async fn server(source: &str) -> (Server, Client) {
     (server, client)
 }
 
-/// Looks at the strips from before, 40 pixels a unit.
+/// A camera in front of the strips, 40 pixels per unit at z = 0.
 fn picture() -> Picture {
     let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 160.0, fy: 160.0, cx: 48.0, cy: 40.0 };
@@ -27,7 +27,7 @@ fn picture() -> Picture {
     Picture { width: 96, height: 80, camera, ..Picture::default() }
 }
 
-/// The ray of a pixel of that picture meets its hit.
+/// Whether the position of a hit lies on the ray of its pixel in that picture.
 fn on_ray(hit: &Hit) -> bool {
     let [x, y] = hit.pixel.map(f64::from);
     let ray = Vector3::new((x + 0.5 - 48.0) / 160.0, (40.0 - y - 0.5) / 160.0, -1.0);
@@ -35,14 +35,14 @@ fn on_ray(hit: &Hit) -> bool {
     (point - ray * (ray.dot(&point) / ray.norm_squared())).norm() < NEAR
 }
 
-/// The scene's own U, 3n x r, of a domain.
+/// U of a domain, 3n x r, from the scene itself.
 fn modes(scene: &Scene, domain: u32) -> DMatrix<f64> {
     let shape = &scene.shapes[scene.domains[domain as usize].shape];
     let (rows, rank) = (3 * shape.mesh.rest().len(), shape.modes.rank());
     DMatrix::from_iterator(rows, rank, shape.modes.columns().iter().map(|entry| f64::from(*entry)))
 }
 
-/// U^T A^T f of a force that acts on the vertices of a triangle by their shares.
+/// U^T A^T f of a force f that acts on the vertices of a triangle, weighted by the barycentric coordinates.
 fn whole_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f64>) -> DVector<f64> {
     let modes = modes(scene, hit.domain);
     let mut on_vertices = DVector::zeros(modes.nrows());
@@ -61,7 +61,7 @@ fn position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_client_forms_the_force_on_q_from_a_pick_as_the_scene_itself_would() {
+async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
     let (server, client) = server("strips").await;
     let scene = strips();
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
@@ -98,8 +98,10 @@ async fn a_client_forms_the_force_on_q_from_a_pick_as_the_scene_itself_would() {
     assert!((Vector3::from(now.hits[0].position) - Vector3::from(before.hits[0].position)).norm() > 0.01, "it moved");
 }
 
+/// 4096 hits with their modes reach a client with default limits. Picks in a scene far from the world origin keep their
+/// precision.
 #[tokio::test(flavor = "multi_thread")]
-async fn many_hits_with_modes_arrive_in_small_messages_and_a_scene_far_away_keeps_its_digits() {
+async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let (_server, client) = server("sheet").await;
     let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(20.0), clip: None });
@@ -121,7 +123,7 @@ async fn many_hits_with_modes_arrive_in_small_messages_and_a_scene_far_away_keep
     let places = [0, 1].map(|domain| (domain, [0.0, 0.0, 0.0, 1.0], [3e7, -2e7 + 0.125, 2e7]));
     let moved = rigid_step(1, v1::TransformFormat::RigidF64, &places);
     server.drive("far", v1::Policy::Lossless, 0).await.acked(moved.clone()).await;
-    // Scene units from the scene's origin.
+    // In scene units from the scene origin.
     let at: [f64; 3] = std::array::from_fn(|axis| places[0].2[axis] - scene.origin[axis] / scene.unit);
     let near = |x: f64, y: f64, z: f64| [at[0] + x, at[1] + y, at[2] + z];
     let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
@@ -138,7 +140,7 @@ async fn server_of_far() -> (Server, Client) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_rectangles_outputs_and_steps_are_refused_by_name() {
+async fn bad_rectangles_outputs_and_steps_are_refused() {
     let (server, client) = server("strips").await;
     for (corner, size, field) in [
         ([0, 0], [65, 1], "rectangle.size"),
@@ -184,7 +186,7 @@ async fn bad_rectangles_outputs_and_steps_are_refused_by_name() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_output_arrives_in_its_format_and_agrees_with_a_pick() {
+async fn outputs_have_their_format_and_agree_with_picks() {
     let (server, client) = server("strips").await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     driver.acked(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
@@ -221,8 +223,9 @@ async fn every_output_arrives_in_its_format_and_agrees_with_a_pick() {
     }
 }
 
+/// One domain is far from the other. A camera near either domain picks it with full precision.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_domain_far_from_the_others_is_picked_from_beside_it_and_they_from_beside_them() {
+async fn distant_domains_are_picked_by_nearby_cameras() {
     let (server, client) = server("strips").await;
     let away = [1e7 + 1.25, 0.0, -1e7];
     let moved = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, [0.0, 0.0, 0.0, 1.0], away)]);

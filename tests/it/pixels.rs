@@ -1,4 +1,5 @@
-//! Pictures against arithmetic, each with a negative control. Runs on whatever EGL gives, Mesa's llvmpipe included.
+//! Rendered pixels compared with arithmetic; most tests have a negative control. Runs on any EGL driver, including
+//! Mesa's llvmpipe.
 
 mod below_ground;
 mod beside;

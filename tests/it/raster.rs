@@ -1,4 +1,5 @@
-//! The rasteriser's definition against geometry, and the kernel's own way through a mesh against the definition.
+//! The definition of the compute rasterizer is compared with geometry, and a CPU twin of the kernels' traversal with
+//! the definition.
 
 use modalcast_compute::reference::raster::{
     Corner, Dropped, NOTHING, Outline, Raster, depth_at, edge, outline, pieces,
@@ -7,19 +8,20 @@ use modalcast_model::scene::{Faces, Group, Window};
 
 use crate::both::soups::{Soup, fan, flat, perspective, soups};
 
-/// Numbers of `kernels/raster.cu`, checked against its text below.
+/// Constants of `kernels/raster.cu`; a test compares them with its text.
 const FEW: i32 = 32;
 const NARROW: i32 = 16384;
 const TILE: i32 = 64;
 const HALVINGS: u32 = 3;
 const BITS: u32 = 40;
 
-/// What the kernels do to one window: queues in any order, 32-bit edges where a thread or a warp draws.
+/// CPU twin of the raster kernels for one window. Queues may have any order, and the per-thread and per-warp paths use
+/// 32-bit edge functions.
 struct Walk<'a> {
     soup: &'a Soup,
     keys: Vec<u64>,
     medium: Vec<u32>,
-    /// First tile, triangle, box.
+    /// First tile, triangle, packed box.
     large: Vec<(u64, u32, u32)>,
     tally: u64,
     paths: [usize; 3],
@@ -35,7 +37,7 @@ impl Walk<'_> {
         outline(&self.soup.window, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
     }
 
-    /// `raster`: the narrow tests of `aim_whole`, and what each path pushes.
+    /// `raster`: the narrow tests of `aim_whole`, and the entries that each path pushes.
     fn aim(&mut self, triangle: u32, faces: Faces) {
         let Ok(outline) = self.outline(triangle, faces) else { return };
         let extent = |of: fn(&Corner) -> i32| {
@@ -63,7 +65,7 @@ impl Walk<'_> {
         }
     }
 
-    /// Debug builds of this test stop at an overflow of 32 bits.
+    /// Checked arithmetic panics when an edge function overflows 32 bits.
     fn draw_narrow(&mut self, outline: &Outline, triangle: u32) {
         let edge = |from: &Corner, to: &Corner, x: i32, y: i32| -> i32 {
             let [one, other] = [(to.x - from.x, y - from.y), (to.y - from.y, x - from.x)];
@@ -87,7 +89,7 @@ impl Walk<'_> {
         }
     }
 
-    /// The entry of a tile, as 32 lanes find it.
+    /// Index of the list entry that contains a tile, found by the 32-way search of a warp.
     fn find(&self, tile: u64) -> usize {
         let (mut low, mut high) = (0, self.large.len());
         while high - low > 1 {
@@ -99,8 +101,8 @@ impl Walk<'_> {
         low
     }
 
-    /// `raster_tiles`: one strip of a tile of the list, cut by the triangle's samples, with the rejection of what lies beyond
-    /// an edge.
+    /// `raster_tiles`: one strip of a listed tile, clipped to the triangle's samples. A strip that lies entirely beyond
+    /// an edge is rejected.
     fn strip(&mut self, at: u64, halvings: u32) {
         let tile = at >> halvings;
         let (first, triangle, box_of) = self.large[self.find(tile)];
@@ -131,7 +133,8 @@ impl Walk<'_> {
     }
 }
 
-/// `raster`, `raster_warps` and `raster_tiles` one after the other, queues backwards, tiles halved so many times.
+/// Runs `raster`, `raster_warps` and `raster_tiles` in sequence, with reversed queues and tiles halved `halvings`
+/// times.
 fn twin_of_raster(soup: &Soup, halvings: u32) -> (Vec<u64>, [usize; 3]) {
     let keys = vec![NOTHING; soup.window.pixels()];
     let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
@@ -146,8 +149,10 @@ fn twin_of_raster(soup: &Soup, halvings: u32) -> (Vec<u64>, [usize; 3]) {
     (walk.keys, walk.paths)
 }
 
+/// The per-thread, per-warp and per-tile paths equal the definition, and the 32-bit edge functions of the first two do
+/// not overflow.
 #[test]
-fn threads_warps_and_strips_of_tiles_draw_what_the_definition_draws_and_32_bits_hold_narrow_edges() {
+fn all_raster_paths_equal_the_definition() {
     let text = include_str!("../../kernels/raster.cu");
     for line in [
         format!("#define FEW {FEW}"),
@@ -170,7 +175,7 @@ fn threads_warps_and_strips_of_tiles_draw_what_the_definition_draws_and_32_bits_
     assert!(all.iter().all(|path| *path > 10), "every path is taken: {all:?}");
 }
 
-/// How many pieces of a fan take each sample, with the top-left rule or with every edge closed.
+/// Number of pieces that cover each sample, with the top-left rule or with all edges closed.
 fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
     let [width, height] = soup.window.size().map(|side| side as i32);
     let all: Vec<[Corner; 3]> = (soup.triangles.iter())
@@ -187,9 +192,9 @@ fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
 }
 
 #[test]
-fn a_fan_covers_every_sample_once() {
+fn fan_covers_every_sample_once() {
     let mut soup = fan(flat(128, 128));
-    // The middle on a sample, and spokes along rows and columns: many samples lie on edges.
+    // The center is on a sample and some spokes run along rows and columns, so many samples lie on edges.
     soup.positions[..2].copy_from_slice(&[1.0 / 128.0, 1.0 / 128.0]);
     for spoke in [0, 10, 20, 30] {
         let own = &mut soup.positions[3 * (1 + spoke)..][..2];
@@ -203,22 +208,24 @@ fn a_fan_covers_every_sample_once() {
 }
 
 #[test]
-fn a_fan_through_the_near_plane_covers_no_sample_twice_nor_leaves_any_out() {
+fn fan_clipped_by_near_plane_covers_every_sample_once() {
     let mut soup = fan(perspective(96, 64, 0.5, 100.0));
-    // A floor one below the eye, that goes on behind it.
+    // A floor one unit below the eye that continues behind it.
     for position in soup.positions.chunks_exact_mut(3) {
         let [x, y] = [position[0], position[1]];
         position.copy_from_slice(&[30.0 * x, -1.0, 30.0 * y]);
     }
     let counts = takers(&soup, false);
     assert!(counts.iter().all(|count| *count <= 1));
-    // The floor ends 57 away: 1 / 57 below the horizon, half a row; near is 0.5, so all rows below are floor.
+    // The floor ends at a distance of 57: 1 / 57 below the horizon, half a row. The near plane is at 0.5, so all rows
+    // below are floor.
     let rows = counts.chunks_exact(96).map(|row| row.iter().sum::<usize>()).collect::<Vec<_>>();
     assert!(rows[..32].iter().all(|count| *count == 0) && rows[34..].iter().all(|count| *count == 96), "{rows:?}");
 }
 
+/// A nearer triangle wins whatever its id.
 #[test]
-fn equal_depths_go_to_the_lower_id_and_a_nearer_one_wins_whatever_its_id() {
+fn depth_ties_go_to_the_lower_id() {
     let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
     let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
     let drawn = |triangles: &[[u32; 3]]| {
@@ -234,7 +241,7 @@ fn equal_depths_go_to_the_lower_id_and_a_nearer_one_wins_whatever_its_id() {
 }
 
 #[test]
-fn triangles_are_dropped_for_the_reason_that_they_give() {
+fn dropped_triangles_report_the_reason() {
     let window = flat(10, 10);
     let why = |corners: [[f32; 3]; 3], faces: Faces| outline(&window, &corners.concat(), [0, 1, 2], faces).err();
     let front = [[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]];
@@ -250,7 +257,7 @@ fn triangles_are_dropped_for_the_reason_that_they_give() {
 }
 
 #[test]
-fn a_plane_has_the_depth_of_its_equation_and_a_rectangle_the_samples_of_its_area() {
+fn plane_depth_and_rectangle_coverage_are_exact() {
     let (near, far) = (0.5, 50.0);
     let window: Window = perspective(200, 200, near, far);
     let corners = [[-2.0, -2.0, -4.0], [2.0, -2.0, -9.0], [-1.0, 3.0, -20.0]];
@@ -269,7 +276,8 @@ fn a_plane_has_the_depth_of_its_equation_and_a_rectangle_the_samples_of_its_area
         worst = worst.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
         seen += 1;
     }
-    // Corners move by up to 1/512 pixel, and the depth of this plane changes by less than 1e-3 a pixel.
+    // Corners move by up to 1/512 pixel when they are snapped, and the depth of this plane changes by less than 1e-3
+    // per pixel.
     assert!(seen > 1000 && worst < 4e-6, "{seen} samples, off by up to {worst:e}");
 
     let mut raster = Raster::new(flat(100, 100));

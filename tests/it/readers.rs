@@ -1,4 +1,5 @@
-//! Displacements and boxes over the wire: what the scene keeps is sent, alone if asked; what it does not keep is refused.
+//! Displacements and boxes over the wire: a scene sends the attributes that it keeps, alone if requested, and refuses
+//! requests for others.
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::{Delivery, View};
@@ -27,14 +28,14 @@ fn alone(domains: &[u32]) -> v1::VertexSelection {
     v1::VertexSelection { without_vertices: true, ..all(domains) }
 }
 
-/// What the twin says u is after some steps.
+/// Displacements u of the f64 twin after some steps.
 fn expected_u(steps: &[v1::Step]) -> Vec<f32> {
     let scene = kept_strips();
     let u = reference::displacements(&scene, &state_after(&scene, steps));
     u.into_flattened().into_iter().map(|number| number as f32).collect()
 }
 
-/// Boxes of packed domains of four vertices each.
+/// Bounding boxes of packed domains with four vertices each.
 fn boxes_of(positions: &[f32]) -> Vec<f32> {
     let sides = |positions| {
         let Bounds { min, max } = Bounds::of(positions);
@@ -48,7 +49,7 @@ fn largest_error(got: &[f32], want: &[f32]) -> f32 {
     got.iter().zip(want).map(|(got, want)| (got - want).abs()).fold(0.0, f32::max)
 }
 
-/// A step that turns and moves the second domain, so that its u is not its x less x0.
+/// A step that rotates and moves the second domain, so that its u differs from x - x0.
 fn turned() -> v1::Step {
     let turn = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
     let transforms = turn.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
@@ -56,7 +57,7 @@ fn turned() -> v1::Step {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_reader_gets_displacements_and_boxes_beside_the_vertices_or_alone() {
+async fn displacements_and_boxes_come_with_or_without_vertices() {
     for backend in [BackendChoice::Reference, BackendChoice::Cpu] {
         let server = Server::with(|config| Config { backend, ..config }).await;
         server.open("kept").await;
@@ -70,7 +71,7 @@ async fn a_reader_gets_displacements_and_boxes_beside_the_vertices_or_alone() {
                 assert!(largest_error(&got.displacements, &u[floats.clone()]) < 1e-6);
                 assert!(largest_error(&got.boxes, &boxes_of(&x[floats])) < 1e-6);
             };
-            // Alone first, so that vertices come after it from the same step.
+            // Read the attributes alone first; the vertices are then read from the same step.
             let reader = get_vertices(&server, ask("kept", alone(&[]))).await.expect("kept");
             assert!(reader.positions.is_empty() && reader.normals.is_empty());
             assert_eq!((reader.head.displacement_bytes, reader.head.box_bytes, reader.head.total), (96, 48, 144));
@@ -85,14 +86,14 @@ async fn a_reader_gets_displacements_and_boxes_beside_the_vertices_or_alone() {
             assert!(vertices.displacements.is_empty() && vertices.boxes.is_empty());
             assert_eq!(vertices.positions, both.positions);
         }
-        // The control: other steps give others.
+        // Control: other steps give other displacements.
         assert!(largest_error(&expected_u(&steps[..1]), &expected_u(&steps)) > 0.1);
         driver.finish().await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stream_of_boxes_has_one_of_each_step() {
+async fn box_stream_delivers_every_step() {
     let server = Server::fresh().await;
     server.open("kept").await;
     let boxes = v1::VertexSelection { boxes: true, without_vertices: true, ..Default::default() };
@@ -114,14 +115,15 @@ async fn a_stream_of_boxes_has_one_of_each_step() {
     }
 }
 
-/// What shows of a step, one list for each part.
+/// Step number and vertex data of a message.
 fn parts_of(shown: &modalcast::engine::Shown) -> (usize, &Surface) {
     let modalcast::engine::Body::Vertices(surface) = &shown.body else { panic!("not vertices") };
     (shown.step.number as usize, surface)
 }
 
+/// Feeds with different attributes receive every step while the next step is computed.
 #[tokio::test(flavor = "multi_thread")]
-async fn readers_of_different_parts_get_theirs_of_every_step_while_the_next_is_computed() {
+async fn readers_of_different_parts_get_every_step() {
     let server = Server::fresh().await;
     server.open("kept").await;
     let engine = server.engine.find("kept").expect("open");
@@ -166,7 +168,7 @@ async fn readers_of_different_parts_get_theirs_of_every_step_while_the_next_is_c
             assert!(!wanted.normals || surface.normals == n, "step {sent}");
         }
     }
-    // The control: steps differ in their positions and so in their boxes, and in u.
+    // Control: steps differ in positions, boxes and displacements.
     let (x, _, u) = want(0);
     assert!(x != want(1).0 && boxes_of(&x) != boxes_of(&want(1).0) && largest_error(&u, &want(1).2) > 1e-6);
     for sent in 0..40 {
@@ -176,7 +178,7 @@ async fn readers_of_different_parts_get_theirs_of_every_step_while_the_next_is_c
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_scene_does_not_keep_is_refused_by_its_option() {
+async fn attributes_not_kept_are_refused_by_option_name() {
     let server = Server::fresh().await;
     server.open("strips").await;
     for (selection, field, option) in [
@@ -209,14 +211,15 @@ async fn what_a_scene_does_not_keep_is_refused_by_its_option() {
     }
 }
 
+/// The state before the refused step stays readable.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_displacement_that_no_f32_holds_refuses_the_step_and_reaches_no_reader() {
+async fn displacement_overflow_refuses_the_step() {
     let server = Server::with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
     server.open("kept").await;
     let mut driver = server.drive("kept", Policy::Lossless, 0).await;
     driver.acked(step(1, &[1], &[0.5, -0.25])).await;
     let before = get_vertices(&server, ask("kept", alone(&[]))).await.expect("kept");
-    // x shrinks to what is in range; u of up to 3 q is not.
+    // The transform shrinks x into the range of f32; u of up to 3 q overflows.
     let tiny = [1e-24_f32, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0];
     let transforms = tiny.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     let lost = v1::Step { transform_domains: vec![1], transforms, ..step(2, &[1], &[f32::MAX; 2]) };
@@ -229,7 +232,7 @@ async fn a_displacement_that_no_f32_holds_refuses_the_step_and_reaches_no_reader
 }
 
 #[test]
-fn the_reference_keeps_displacements_and_boxes_too() {
+fn reference_keeps_displacements_and_boxes() {
     let reference = |scene: &std::sync::Arc<_>| ReferenceDeformer::new(scene);
     readers::displacements_and_boxes_equal_their_twins(reference);
     readers::a_scene_without_modes_has_zeros(reference);

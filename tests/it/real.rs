@@ -1,4 +1,4 @@
-//! The real inputs, at `MODALCAST_DATA` or `../shared/data`: every modal one deforms as its reference says.
+//! Real inputs from `MODALCAST_DATA` or `../shared/data`: every modal input deforms as its reference does.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use crate::deformers::Noise;
 use crate::service_harness::{Server, config, details, get_vertices};
 use crate::tolerance::largest_error;
 
-/// The real inputs that have modes.
+/// Real inputs with modes.
 const MODAL: [&str; 5] = ["vega/simpleBridge", "vega/A", "gltf/MorphStressTest", "sofa/hexaBeam", "sofa/finger"];
 
 fn data(path: &str) -> String {
@@ -24,7 +24,7 @@ fn data(path: &str) -> String {
     root.join(path).to_string_lossy().into_owned()
 }
 
-/// Random coordinates, scaled so that the largest displacement is this fraction of the diagonal.
+/// A state with random coordinates, scaled so that the largest displacement is this fraction of the diagonal.
 fn bent(scene: &Scene, fraction: f64) -> State {
     let mut noise = Noise(11);
     let mut state = State::rest(scene);
@@ -72,7 +72,7 @@ fn agrees(scene: &Arc<Scene>) {
 }
 
 #[test]
-fn the_tree_agrees_with_its_reference() {
+fn tree_agrees_with_its_reference() {
     agrees(&load::open("tree").expect("the tree"));
 }
 
@@ -86,7 +86,8 @@ fn real_modal_inputs_agree_with_their_reference() {
     }
 }
 
-/// Opens every modal input on a server of this backend, drives one step over gRPC, and compares what is streamed back.
+/// Opens every modal input on a server with this backend, drives one step over gRPC and compares the streamed vertices
+/// with the reference.
 async fn streamed_agrees(backend: BackendChoice) {
     let state = tempfile::tempdir().expect("a folder");
     let repository = Arc::new(load::Repository::new(Some(Path::new(&data("")))).expect("the real inputs"));
@@ -120,13 +121,13 @@ async fn real_vertices_streamed_by_the_cpu_agree_with_the_reference() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs an NVIDIA GPU and the real inputs"]
-async fn gpu_vertices_of_real_inputs_streamed_by_cuda_agree_with_the_reference() {
+async fn gpu_streamed_vertices_of_real_inputs_equal_the_reference() {
     streamed_agrees(BackendChoice::Cuda).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-async fn real_malformed_modes_are_refused_by_name_and_the_server_goes_on() {
+async fn real_malformed_modes_are_refused_and_the_server_continues() {
     let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
     std::fs::copy(data("sofa/ball/modes.txt"), scenes.path().join("modes.txt")).expect("copied");
     std::fs::copy(data("sofa/hexaBeam/hexaBeam.derived.obj"), scenes.path().join("ball.obj")).expect("copied");

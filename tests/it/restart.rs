@@ -1,4 +1,4 @@
-//! What survives a restart: open scenes, uploads and the last step, whether the server stopped or was killed.
+//! State that survives a restart: open scenes, uploads and the last step, after a clean stop or a kill.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ fn steps() -> [v1::Step; 2] {
     [step(4, &[], &[0.1, 0.2, 0.3, 0.4]), step(9, &[1], &[0.5, -0.5])]
 }
 
-/// Opens `strips`, drives it and returns the vertices of the last step.
+/// Opens `strips`, drives all steps and returns the vertices of the last step.
 async fn play(server: &Server) -> Vec<f32> {
     server.open("strips").await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
@@ -32,7 +32,8 @@ async fn play(server: &Server) -> Vec<f32> {
     get_vertices(server, ask("strips")).await.expect("vertices").positions
 }
 
-/// What a server on this folder shows of `strips`.
+/// Starts a server on this state folder and returns the step and vertices of `strips`. Also checks that a new writer
+/// can start a new run.
 fn shown_by_the_next_server(state: &Path) -> (v1::StepId, Vec<f32>) {
     runtime().block_on(async {
         let begin = Instant::now();
@@ -40,7 +41,7 @@ fn shown_by_the_next_server(state: &Path) -> (v1::StepId, Vec<f32>) {
         assert!(begin.elapsed() < Duration::from_secs(2), "{:?}", begin.elapsed());
         let got = get_vertices(&server, ask("strips")).await.expect("it is open again");
         let shown = (got.step(), got.positions);
-        // A writer begins a new run at any number.
+        // A writer starts a new run at any number.
         let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
         driver.acked(step(0, &[0], &[0.0, 0.0])).await;
         let got = get_vertices(&server, ask("strips")).await.expect("vertices");
@@ -50,7 +51,7 @@ fn shown_by_the_next_server(state: &Path) -> (v1::StepId, Vec<f32>) {
 }
 
 #[test]
-fn a_stopped_server_comes_back_with_its_scenes_and_their_last_step() {
+fn stopped_server_restores_scenes_and_last_steps() {
     let folder = tempfile::tempdir().expect("a folder");
     let before = runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;
@@ -64,15 +65,16 @@ fn a_stopped_server_comes_back_with_its_scenes_and_their_last_step() {
     assert_eq!(after, before);
 }
 
+/// The files are copied once the checkpoint of the last step is written; a server on the copy restores that step.
 #[test]
-fn a_server_that_dies_loses_nothing_that_is_a_moment_old() {
+fn killed_server_restores_the_last_checkpoint() {
     let folder = tempfile::tempdir().expect("a folder");
     let copy = tempfile::tempdir().expect("a folder");
     let doomed = runtime();
     let before = doomed.block_on(async {
         let server = Server::start(config(folder.path())).await;
         let before = play(&server).await;
-        // What a kill leaves is what is on disk at that moment: the files are copied while the server runs.
+        // A kill leaves the files that are on disk at that moment, so copy the files while the server runs.
         let begin = Instant::now();
         let is_kept = |bytes: Vec<u8>| bytes.get(16..24) == Some(9_u64.to_le_bytes().as_slice());
         while !std::fs::read(folder.path().join("steps/strips.step")).is_ok_and(is_kept) {
@@ -94,7 +96,7 @@ fn a_server_that_dies_loses_nothing_that_is_a_moment_old() {
 }
 
 #[test]
-fn a_damaged_step_is_left_out_and_its_scene_begins_at_rest() {
+fn scene_with_a_damaged_checkpoint_starts_at_rest() {
     let folder = tempfile::tempdir().expect("a folder");
     runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;
@@ -110,8 +112,9 @@ fn a_damaged_step_is_left_out_and_its_scene_begins_at_rest() {
     assert_eq!(after, expected(&strips(), &[]).0);
 }
 
+/// When the list of scenes cannot be written, opening and deleting fail, and the failed opening leaves its name free.
 #[test]
-fn a_list_that_cannot_be_written_fails_the_call_and_leaves_the_name_free() {
+fn catalog_write_failure_fails_the_call() {
     let folder = tempfile::tempdir().expect("a folder");
     let open = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: "name".into() };
     let delete = || v1::DeleteSceneRequest { scene: "name".into() };
@@ -127,7 +130,7 @@ fn a_list_that_cannot_be_written_fails_the_call_and_leaves_the_name_free() {
         assert_eq!(status.code(), tonic::Code::Internal, "{status:?}");
         assert!(server.engine.list().is_empty());
         std::fs::remove_dir(&obstacle).expect("out of the way");
-        // What could not be removed can be removed now, once, and the name has always been free.
+        // Deletion succeeds now, once. The failed opening did not reserve the name.
         scenes.delete_scene(delete()).await.expect("it was still in the list");
         let status = scenes.delete_scene(delete()).await.expect_err("it is gone");
         assert_eq!(status.code(), tonic::Code::NotFound, "{status:?}");
@@ -136,7 +139,7 @@ fn a_list_that_cannot_be_written_fails_the_call_and_leaves_the_name_free() {
 }
 
 #[test]
-fn an_upload_comes_back_and_a_closed_scene_does_not() {
+fn restart_restores_uploads_but_not_deleted_scenes() {
     let folder = tempfile::tempdir().expect("a folder");
     runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;

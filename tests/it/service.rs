@@ -1,4 +1,4 @@
-//! Scenes over the wire: open, describe, list, upload, delete; health, reflection and limits.
+//! Scenes over the wire: open, describe, list and delete; health, reflection and limits.
 
 use modalcast::engine::SceneSource;
 use modalcast_model::error::Result;
@@ -11,7 +11,7 @@ use v1::describe_scene_response::Part;
 
 use crate::service_harness::{Server, details, expected, get_vertices, sheet, strips, within};
 
-/// A source whose first opening fails when it is told to, and whose second takes a while.
+/// A source whose first opening fails on a signal, and whose later openings take 100 ms.
 struct FailsOnce {
     opened: std::sync::atomic::AtomicUsize,
     fail: std::sync::Mutex<std::sync::mpsc::Receiver<()>>,
@@ -36,8 +36,9 @@ impl SceneSource for FailsOnce {
     }
 }
 
+/// Two openings of one name overlap. The first fails, the second succeeds and stays registered.
 #[tokio::test(flavor = "multi_thread")]
-async fn an_opening_that_outlives_a_failed_one_of_the_same_name_is_registered() {
+async fn opening_after_a_concurrent_failure_is_registered() {
     let folder = tempfile::tempdir().expect("a folder");
     let (fail, told) = std::sync::mpsc::sync_channel(1);
     let source = std::sync::Arc::new(FailsOnce { opened: 0.into(), fail: told.into() });
@@ -60,7 +61,7 @@ async fn an_opening_that_outlives_a_failed_one_of_the_same_name_is_registered() 
     server.engine.open("other", "strips").await.expect("its name is free for another source");
 }
 
-/// The largest message: a chunk of 1 MiB and its envelope.
+/// Size limit of one message in bytes: a chunk of 1 MiB and its envelope.
 const LARGEST: usize = (1 << 20) + 4096;
 
 async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
@@ -104,7 +105,7 @@ async fn modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> V
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_client_that_holds_nothing_learns_the_whole_scene() {
+async fn client_can_read_the_whole_scene() {
     let server = Server::fresh().await;
     let info = server.open("strips").await;
     assert_eq!((info.domains, info.vertices, info.corners, info.triangles, info.coordinates), (2, 8, 8, 4, 4));
@@ -135,7 +136,7 @@ async fn a_client_that_holds_nothing_learns_the_whole_scene() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_description_says_who_follows_whom_and_where() {
+async fn description_contains_follow_parents_and_frames() {
     let server = Server::fresh().await;
     server.open("twig").await;
     let (domains, _) = describe(&server, "twig", &[]).await;
@@ -146,7 +147,7 @@ async fn a_description_says_who_follows_whom_and_where() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn replies_of_many_megabytes_pass_a_client_with_default_limits() {
+async fn large_replies_are_chunked_for_default_client_limits() {
     let server = Server::fresh().await;
     server.open("sheet").await;
     let scene = sheet();
@@ -164,8 +165,9 @@ async fn replies_of_many_megabytes_pass_a_client_with_default_limits() {
     assert_eq!((got.positions, got.normals), expected(&scene, &[]));
 }
 
+/// Deleting the scene ends the streams of all readers and writers with `NotFound`.
 #[tokio::test(flavor = "multi_thread")]
-async fn openings_at_the_same_time_share_one_scene_and_a_closed_one_is_gone_from_every_stream() {
+async fn concurrent_openings_share_one_scene() {
     let server = Server::fresh().await;
     let (a, b, c) = tokio::join!(server.open("strips"), server.open("strips"), server.open("strips"));
     assert!(a == b && b == c);
@@ -185,7 +187,7 @@ async fn openings_at_the_same_time_share_one_scene_and_a_closed_one_is_gone_from
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_number_of_scenes_is_limited_and_a_closed_one_makes_room() {
+async fn scene_limit_holds_and_a_deleted_scene_frees_a_slot() {
     let server = Server::with(|config| modalcast::config::Config { open_scenes: 1, ..config }).await;
     server.open("strips").await;
     let more = v1::OpenSceneRequest { source: "sheet".into(), scene: String::new() };
@@ -196,7 +198,7 @@ async fn the_number_of_scenes_is_limited_and_a_closed_one_makes_room() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_without_a_renderer_says_so_and_refuses_frames_only() {
+async fn server_without_renderer_refuses_only_frames() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut client = v1::server_service_client::ServerServiceClient::new(server.channel().await);
@@ -212,7 +214,7 @@ async fn a_server_without_a_renderer_says_so_and_refuses_frames_only() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn health_and_reflection_answer_and_a_stopped_server_has_ended_its_streams() {
+async fn health_and_reflection_answer_and_stop_ends_streams() {
     use tonic_reflection::pb::v1::ServerReflectionRequest;
     use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
     use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;

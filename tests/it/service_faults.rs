@@ -1,5 +1,5 @@
-//! Faults of transport and of patience: floods, silence, frozen peers, clients that do not read. Only the one who fails
-//! is cut off.
+//! Transport faults and timeouts: floods, silence, frozen peers and clients that do not read. Only the faulty client is
+//! disconnected.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,8 +17,9 @@ use v1::upload_scene_request::Part;
 
 use crate::service_harness::{Driver, PATIENCE, Server, step, within};
 
+/// Another stream on the same connection continues.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_flood_of_tiny_steps_is_merged_and_another_stream_of_the_connection_lives() {
+async fn flood_of_steps_is_merged_under_latest() {
     let server = Server::fresh().await;
     server.open("sheet").await;
     server.open("strips").await;
@@ -53,14 +54,15 @@ async fn a_flood_of_tiny_steps_is_merged_and_another_stream_of_the_connection_li
     assert!(skipped > 0 && skipped < COUNT);
 }
 
+/// Only the stream ends; its connection stays usable.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_writer_that_reads_no_refusals_is_cut_off_and_its_connection_lives() {
+async fn writer_that_reads_no_refusals_is_disconnected() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let channel = server.channel().await;
     let mut driver = Driver::connect(channel.clone()).await;
     assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
-    // So many long refusals that no buffer on the way holds them.
+    // Enough long refusals to fill every buffer between server and client.
     let open = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
     let (sender, mut replies) = driver.split();
     let flood = tokio::spawn(async move {
@@ -71,7 +73,7 @@ async fn a_writer_that_reads_no_refusals_is_cut_off_and_its_connection_lives() {
             }
         }
     });
-    // It reads nothing until it has lost its place, and another has it.
+    // The client reads nothing until it has lost its writer lease and another client has acquired it.
     let next = async {
         loop {
             let mut next = Driver::connect(channel.clone()).await;
@@ -97,7 +99,7 @@ async fn a_writer_that_reads_no_refusals_is_cut_off_and_its_connection_lives() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_silent_connection_is_closed_and_a_speaking_one_is_not() {
+async fn silent_connection_is_closed_and_active_one_is_not() {
     let server = Server::with(|config| Config { first_byte: Duration::from_millis(60), ..config }).await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
@@ -109,7 +111,7 @@ async fn a_silent_connection_is_closed_and_a_speaking_one_is_not() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_frozen_writer_is_released() {
+async fn frozen_writer_loses_its_lease() {
     let (keepalive, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
     let server = Server::with(|config| Config { keepalive, keepalive_timeout, ..config }).await;
     server.open("strips").await;
@@ -132,13 +134,13 @@ async fn a_frozen_writer_is_released() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_stops_in_time_whatever_its_clients_do() {
+async fn server_stops_in_time_despite_unread_streams() {
     let drain = Duration::from_millis(300);
     let server = Server::with(|config| Config { drain, ..config }).await;
     server.open("sheet").await;
     let subscribe =
         v1::StreamVerticesRequest { scene: "sheet".into(), delivery: 1, ..v1::StreamVerticesRequest::default() };
-    // Somebody who never reads, and a writer who never looks at its replies.
+    // A subscriber that never reads, and a writer that never reads its replies.
     let unread = server.vertices().await.stream_vertices(subscribe).await.expect("subscribes");
     let driver = server.drive("sheet", Policy::Lossless, 8).await;
     for number in 1..=8 {
@@ -151,7 +153,7 @@ async fn a_server_stops_in_time_whatever_its_clients_do() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_silent_upload_is_given_up_and_leaves_nothing_behind() {
+async fn silent_upload_times_out_and_leaves_no_files() {
     let server = Server::with(|config| Config { stall: Duration::from_millis(60), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5 };
     let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
@@ -163,7 +165,7 @@ async fn a_silent_upload_is_given_up_and_leaves_nothing_behind() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_upload_that_trickles_is_given_up_though_no_pause_is_long() {
+async fn slow_upload_times_out_despite_short_pauses() {
     let server = Server::with(|config| Config { stall: Duration::from_millis(400), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
@@ -177,7 +179,7 @@ async fn an_upload_that_trickles_is_given_up_though_no_pause_is_long() {
     assert_eq!(std::fs::read_dir(uploads).expect("a folder").count(), 0);
 }
 
-/// Forwards connections until it is frozen; then it keeps them open and forwards nothing.
+/// Forwards connections until it is frozen. Then it keeps them open and forwards nothing.
 struct Proxy {
     address: String,
     frozen: Arc<watch::Sender<bool>>,

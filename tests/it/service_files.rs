@@ -1,4 +1,5 @@
-//! Real files over the wire: a repository that is not left, uploads in the same grammar, and bad files by name.
+//! Real files over the wire: paths cannot leave the repository, uploads have the same grammar, and invalid files are
+//! refused by name.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -13,7 +14,7 @@ use crate::service_harness::{Server, config, details, get_vertices, step};
 
 const SQUARE: &str = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n";
 
-/// A NumPy file of f32 in row-major order.
+/// Bytes of a NumPy file of f32 in row-major order.
 fn npy(rows: usize, columns: usize, entries: &[f32]) -> Vec<u8> {
     let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
     let padded = format!("{header:<117}\n");
@@ -23,7 +24,7 @@ fn npy(rows: usize, columns: usize, entries: &[f32]) -> Vec<u8> {
     bytes
 }
 
-/// One mode that lifts the last vertex along z.
+/// One mode that moves the last vertex by 2 along z.
 fn lift() -> Vec<u8> {
     let mut entries = [0.0; 12];
     entries[11] = 2.0;
@@ -54,7 +55,7 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
     Ok(sent.into_inner().scene.expect("an info"))
 }
 
-/// Drives the one mode of a scene and returns where its last vertex is.
+/// Drives the single mode of a scene and returns the position of its last vertex.
 async fn lifted(server: &Server, scene: &str) -> [f32; 3] {
     let mut driver = server.drive(scene, v1::Policy::Lossless, 0).await;
     driver.acked(step(1, &[0], &[1.5])).await;
@@ -64,7 +65,7 @@ async fn lifted(server: &Server, scene: &str) -> [f32; 3] {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_path_of_the_repository_opens_and_none_leaves_it() {
+async fn repository_paths_open_and_cannot_escape() {
     let (state, outer) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
     let scenes = outer.path().join("scenes");
     std::fs::create_dir_all(scenes.join("deep")).expect("a folder");
@@ -86,7 +87,7 @@ async fn a_path_of_the_repository_opens_and_none_leaves_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_upload_is_read_by_the_same_grammar() {
+async fn upload_has_the_grammar_of_the_repository() {
     let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
     let server = server(state.path(), scenes.path()).await;
     let manifest = b"model = \"parts/square.obj\"\nmodes = \"parts/u.npy\"\nup = \"z\"\n";
@@ -98,7 +99,7 @@ async fn an_upload_is_read_by_the_same_grammar() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_files_are_refused_by_name_and_leave_nothing_behind() {
+async fn bad_files_are_refused_and_leave_no_files() {
     let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
     let server = server(state.path(), scenes.path()).await;
     let square = SQUARE.as_bytes();
@@ -110,7 +111,7 @@ async fn bad_files_are_refused_by_name_and_leave_nothing_behind() {
     type Files<'a> = Vec<(&'a str, &'a [u8])>;
     let wrong = npy(9, 1, &[0.0; 9]);
     let endless = npy(12, 1, &[f32::NAN; 12]);
-    // A name, the files, and words that the refusal must hold.
+    // Name of the case, files, and words that the refusal must contain.
     let table: Vec<(&str, Files<'_>, [&str; 2])> = vec![
         ("rows that are not 3n", vec![("a.obj", square), ("a.npy", &wrong)], ["rows", "12"]),
         ("truncated modes", vec![("a.obj", square), ("a.npy", short)], ["a.npy", ""]),

@@ -1,4 +1,4 @@
-//! A server on a free loopback port, scenes made in code, and clients with default limits.
+//! Test harness: a server on a free loopback port, scenes built in code, and clients with default limits.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -26,11 +26,12 @@ use v1::scene_service_client::SceneServiceClient;
 use v1::step_service_client::StepServiceClient;
 use v1::vertex_service_client::VertexServiceClient;
 
-/// The longest that any answer may take before a test gives up.
+/// Longest time that a test waits for an answer.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Scenes made in code: `strips` (two small domains), `far` (the same elsewhere), `kept` (the same for readers), `sheet`
-/// (more than 1 MiB of everything), `panic`.
+/// Source of scenes built in code: `strips` (two small domains), `far` (the same, far from the origin), `twig` (with
+/// followers), `kept` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (a loader that
+/// panics).
 pub(crate) struct InCode;
 
 impl SceneSource for InCode {
@@ -57,13 +58,13 @@ impl SceneSource for InCode {
     }
 }
 
-/// Two squares of four vertices and two modes; `right` hangs on `left`.
+/// Two squares of four vertices and two modes; `right` is attached to `left`.
 pub(crate) fn strips() -> Arc<Scene> {
     let (shape, domains) = two_strips(1.0);
     scene("strips", shape, domains)
 }
 
-/// Two strips, the second of which has two leaves: one follows it, and the other follows that leaf.
+/// Two strips; the second has a leaf that follows it and a leaflet that follows the leaf.
 pub(crate) fn twig() -> Arc<Scene> {
     let (shape, mut domains) = two_strips(1.0);
     let frame = Transform([0.0, -1.0, 0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -0.25]);
@@ -73,7 +74,7 @@ pub(crate) fn twig() -> Arc<Scene> {
     scene("twig", shape, domains)
 }
 
-/// The same in half metres, 17,000 km from the world's origin.
+/// [`strips`] in half meters, 17,000 km from the world origin.
 pub(crate) fn far_strips() -> Arc<Scene> {
     let (shape, domains) = two_strips(1.0);
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
@@ -81,7 +82,7 @@ pub(crate) fn far_strips() -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
-/// The same as [`strips`] with larger modes, displacements and boxes.
+/// [`strips`] with larger modes, displacements and boxes.
 pub(crate) fn kept_strips() -> Arc<Scene> {
     let (shape, domains) = two_strips(4.0);
     let deformation = Deformation { displacements: true, boxes: true, ..Deformation::default() };
@@ -140,7 +141,7 @@ fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
-/// Settings of a test server: the reference deformer, no renderer, any free port.
+/// Settings of a test server: reference deformer, no renderer, any free port.
 pub(crate) fn config(state: &Path) -> Config {
     Config {
         listen: ([127, 0, 0, 1], 0).into(),
@@ -158,12 +159,12 @@ pub(crate) struct Server {
     pub(crate) address: String,
     stop: Option<oneshot::Sender<()>>,
     task: JoinHandle<Result<()>>,
-    /// Kept until the server is gone.
+    /// Deleted after the server has stopped.
     folder: Option<tempfile::TempDir>,
 }
 
 impl Server {
-    /// A server with a fresh state folder.
+    /// Starts a server with a fresh state folder.
     pub(crate) async fn fresh() -> Self {
         Self::with(|config| config).await
     }
@@ -208,13 +209,13 @@ impl Server {
         FrameServiceClient::new(self.channel().await)
     }
 
-    /// Opens a scene under its own name.
+    /// Opens a source under its own name.
     pub(crate) async fn open(&self, source: &str) -> v1::SceneInfo {
         let request = v1::OpenSceneRequest { source: source.into(), scene: String::new() };
         self.scenes().await.open_scene(request).await.expect("opens").into_inner().scene.expect("an info")
     }
 
-    /// A step stream that has been opened.
+    /// Opens a step stream and expects success.
     pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> Driver {
         let mut driver = Driver::connect(self.channel().await).await;
         let opened = driver.open(scene, policy, window).await;
@@ -222,19 +223,19 @@ impl Server {
         driver
     }
 
-    /// Ends the server and waits for it.
+    /// Stops the server and waits for its end.
     pub(crate) async fn stop(mut self) -> Result<()> {
         self.stop.take().expect("not stopped yet").send(()).ok();
         within(self.task).await.expect("no panic")
     }
 }
 
-/// The result of some work, if it comes in time.
+/// Awaits a future and panics after [`PATIENCE`].
 pub(crate) async fn within<T>(work: impl Future<Output = T>) -> T {
     tokio::time::timeout(PATIENCE, work).await.expect("an answer in time")
 }
 
-/// A physics process.
+/// Client end of a step stream, as a physics process uses it.
 pub(crate) struct Driver {
     sender: mpsc::Sender<v1::DriveSceneRequest>,
     pub(crate) replies: Streaming<v1::DriveSceneResponse>,
@@ -285,19 +286,19 @@ impl Driver {
         }
     }
 
-    /// Says no more and waits until the server has said all.
+    /// Closes the requests and reads until the server ends the replies.
     pub(crate) async fn finish(self) {
         let Self { sender, mut replies } = self;
         drop(sender);
         while within(replies.message()).await.expect("a clean end").is_some() {}
     }
 
-    /// Its two directions, to be used at the same time.
+    /// Both directions, for concurrent use.
     pub(crate) fn split(self) -> (mpsc::Sender<v1::DriveSceneRequest>, Streaming<v1::DriveSceneResponse>) {
         (self.sender, self.replies)
     }
 
-    /// Goes away without a word.
+    /// Drops the stream without closing it properly.
     pub(crate) fn vanish(self) {}
 }
 
@@ -325,14 +326,14 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, places: &[(u3
     }
 }
 
-/// What the reference says the vertices are after some steps.
+/// Positions and normals of the reference after some steps.
 pub(crate) fn expected(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
     let state = state_after(scene, steps);
     let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
     (round(reference::deform(scene, &state)), round(reference::orient_normals(scene, &state)))
 }
 
-/// The state that some steps leave behind.
+/// State of the scene after some steps.
 pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> State {
     use v1::TransformFormat as Wire;
     let mut state = State::rest(scene);
@@ -356,16 +357,16 @@ pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> State {
     state
 }
 
-/// Vertices put together again.
+/// Vertex data joined from chunks.
 #[derive(Debug)]
 pub(crate) struct Got {
     pub(crate) head: v1::VertexHead,
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
     pub(crate) displacements: Vec<f32>,
-    /// Six numbers per chosen domain.
+    /// Six numbers per selected domain.
     pub(crate) boxes: Vec<f32>,
-    /// Three numbers per chosen domain; empty when the head's origin holds for all.
+    /// Three numbers per selected domain; empty if the head's origin applies to all domains.
     pub(crate) origins: Vec<f64>,
 }
 
@@ -375,7 +376,7 @@ impl Got {
     }
 }
 
-/// The vertices that the scene shows.
+/// Requests the vertices of a scene.
 pub(crate) async fn get_vertices(server: &Server, request: v1::GetVerticesRequest) -> Result<Got, tonic::Status> {
     let mut stream = within(server.vertices().await.get_vertices(request)).await?.into_inner();
     let mut chunks = Vec::new();
@@ -386,7 +387,7 @@ pub(crate) async fn get_vertices(server: &Server, request: v1::GetVerticesReques
     Ok(join(chunks))
 }
 
-/// The next step of a vertex stream.
+/// Reads the next step of a vertex stream; `None` at its end.
 pub(crate) async fn next_vertices(
     stream: &mut Streaming<v1::StreamVerticesResponse>,
 ) -> Result<Option<Got>, tonic::Status> {
@@ -421,7 +422,7 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> Got {
     Got { positions, normals, displacements, boxes, origins, head }
 }
 
-/// The refusal inside a status.
+/// Decodes the refusal in the details of a status.
 pub(crate) fn details(status: &tonic::Status) -> v1::Rejection {
     v1::Rejection::decode(status.details()).expect("a rejection in the details")
 }

@@ -1,4 +1,4 @@
-//! The checks of any deformer, on the cpu.
+//! Runs the checks of `tests/both` on the CPU deformer.
 
 use std::sync::Arc;
 
@@ -13,14 +13,14 @@ fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene)
 }
 
-/// How far a vertex may be off for the modes that were left out.
+/// Bound on the error of a vertex from truncated modes, the largest of all domains.
 fn left_out(deformer: &CpuDeformer, scene: &Scene) -> f64 {
     let bound = |domain| deformer.truncation(domain).map_or(0.0, Truncation::bound);
     (0..scene.domains.len()).map(bound).fold(0.0, f64::max)
 }
 
 #[test]
-fn q_of_1e30_1e_minus_38_and_denormals_stay_within_the_bound() {
+fn huge_tiny_and_denormal_q_stay_within_the_bound() {
     extremes::huge_and_tiny_amounts(deformer);
 }
 
@@ -30,22 +30,22 @@ fn columns_that_differ_by_1e12_stay_within_the_bound() {
 }
 
 #[test]
-fn modes_that_nearly_cancel_keep_their_digits_with_compensation_and_lose_them_without() {
+fn nearly_canceling_modes_need_compensated_sums() {
     extremes::modes_that_nearly_cancel(deformer);
 }
 
 #[test]
-fn finite_sums_survive_overflow_on_their_way_and_infinity_less_infinity() {
+fn finite_sums_survive_intermediate_overflow() {
     extremes::finite_sums_that_overflow_on_their_way(deformer);
 }
 
 #[test]
-fn tiles_of_zeros_stay_where_q_of_zero_puts_them() {
+fn zero_tiles_do_not_move() {
     extremes::tiles_of_zeros(deformer);
 }
 
 #[test]
-fn every_rank_in_every_storage_stays_within_its_bound_down_to_one_vertex() {
+fn every_rank_and_storage_stays_within_its_bound() {
     extremes::ranks_of_all_sizes(deformer);
 }
 
@@ -55,17 +55,17 @@ fn shears_and_mirrors_equal_the_twin() {
 }
 
 #[test]
-fn triangles_without_area_and_missing_uvs_give_directions_of_unit_length() {
+fn zero_area_and_missing_uvs_give_unit_directions() {
     surfaces::no_area_and_no_uvs(deformer);
 }
 
 #[test]
-fn overflow_is_told_and_forgotten() {
+fn overflow_is_reported_for_its_step_only() {
     refusal::overflow_is_told_and_forgotten(deformer);
 }
 
 #[test]
-fn overflow_is_refused_by_the_name_of_its_domain() {
+fn overflow_refusal_names_the_domain() {
     refusal::overflow_is_refused_by_name(BackendChoice::Cpu);
 }
 
@@ -75,78 +75,78 @@ fn errors_of_twenty_truncated_states_stay_within_the_budget() {
 }
 
 #[test]
-fn a_mode_that_swings_about_the_limit_does_not_flicker() {
+fn mode_near_the_truncation_limit_does_not_flicker() {
     truncation::no_flicker(deformer);
 }
 
 #[test]
-fn twenty_steps_of_a_few_domains_give_the_bits_of_whole_ones() {
+fn partial_steps_have_the_bits_of_full_steps() {
     changes::steps_of_a_few_domains(deformer);
     assert!(!changes::believes_lists(deformer), "the cpu compares values");
 }
 
 #[test]
-fn displacements_and_boxes_equal_their_twins_and_change_no_vertex() {
+fn displacements_and_boxes_equal_their_twins() {
     readers::displacements_and_boxes_equal_their_twins(deformer);
 }
 
 #[test]
-fn a_scene_without_modes_has_displacements_of_zero() {
+fn scene_without_modes_has_zero_displacements() {
     readers::a_scene_without_modes_has_zeros(deformer);
 }
 
 #[test]
-fn displacements_and_boxes_are_read_alone_and_are_those_of_the_last_step() {
+fn displacements_and_boxes_are_read_alone() {
     readers::parts_are_read_alone(deformer);
     readers::parts_are_fetched_alone(deformer);
 }
 
 #[test]
-fn displacements_that_no_f32_holds_are_told_and_others_survive() {
+fn displacement_overflow_is_reported_and_others_survive() {
     readers::lost_displacements_are_told_and_others_survive(deformer);
 }
 
 #[test]
-fn a_lost_displacement_is_refused_by_the_name_of_its_domain() {
+fn displacement_overflow_refusal_names_the_domain() {
     readers::lost_displacements_are_refused_by_name(BackendChoice::Cpu);
 }
 
 #[test]
-fn a_domain_has_the_same_bits_alone_and_among_a_thousand() {
+fn domain_has_the_same_bits_alone_and_among_others() {
     neighbours::alone_and_among_others(deformer);
 }
 
 #[test]
-fn followers_stay_within_their_bounds_and_have_the_bits_of_movers_in_their_places() {
+fn followers_have_the_bits_of_roots_in_their_places() {
     following::frames_of_all_sizes(deformer);
 }
 
 #[test]
-fn steps_of_movers_give_the_bits_of_whole_ones_and_move_their_followers() {
+fn partial_steps_of_roots_move_their_followers() {
     following::steps_of_movers(deformer);
 }
 
 #[test]
-fn followers_ten_thousand_kilometres_away_keep_the_millimetre() {
+fn followers_10000_km_away_keep_the_millimeter() {
     following::far_away(deformer);
 }
 
 #[test]
-fn products_of_frames_that_overflow_do_no_harm_where_the_vertices_do_not() {
+fn overflowing_frame_products_keep_finite_vertices() {
     following::products_that_overflow(deformer);
 }
 
 #[test]
-fn what_vertices_take_up_in_light_space_holds_every_one_of_them() {
+fn light_bounds_contain_every_vertex() {
     light::every_vertex_is_held(deformer);
 }
 
 #[test]
-fn a_thin_scene_is_fitted_closely_in_light_space() {
+fn thin_scene_is_fitted_closely_in_light_space() {
     light::a_thin_scene_is_fitted_closely(deformer);
 }
 
 #[test]
-fn light_space_is_not_measured_without_a_shadow_and_overflow_there_is_told() {
+fn light_bounds_need_a_shadow_and_report_overflow() {
     light::nothing_is_measured_without_a_shadow_and_overflow_is_told(deformer);
 }

@@ -1,4 +1,4 @@
-//! Steps over the wire: what is acknowledged is what the scene shows, in both policies.
+//! Steps over the wire: the scene shows the acknowledged steps, under both policies.
 
 use modalcast::engine::{Delivery, View, Which};
 use modalcast_model::deform::Wanted;
@@ -13,7 +13,7 @@ fn vertices_of(scene: &str) -> v1::GetVerticesRequest {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn acknowledged_steps_give_the_vertices_of_the_reference_and_name_their_step() {
+async fn acknowledged_steps_have_vertices_of_the_reference() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
@@ -31,13 +31,14 @@ async fn acknowledged_steps_give_the_vertices_of_the_reference_and_name_their_st
         let want = v1::StepId { run: 1, number: steps[sent].number, time: steps[sent].time };
         assert_eq!(got.step(), want);
     }
-    // The control: other steps give other vertices.
+    // Control: other steps give other vertices.
     assert_ne!(expected(&strips(), &steps[..2]), expected(&strips(), &steps));
     driver.finish().await;
 }
 
+/// The stream ends after the requested number of steps.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_stream() {
+async fn lossless_subscriber_gets_every_step_in_order() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let request = v1::StreamVerticesRequest {
@@ -46,7 +47,7 @@ async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_str
         delivery: v1::Delivery::Lossless.into(),
         steps: 30,
     };
-    // It may come before any step, and before any writer.
+    // Subscribing needs no step and no writer.
     let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
     let mut driver = server.drive("strips", Policy::Lossless, 4).await;
     let steps: Vec<_> = (0..40).map(|number| step(number * 2, &[1], &[0.01 * number as f32, 1.0])).collect();
@@ -67,8 +68,9 @@ async fn a_lossless_subscriber_gets_every_step_in_order_and_a_count_ends_its_str
     tokio::join!(read, write);
 }
 
+/// Steps are computed while the vertices of earlier steps are still being sent.
 #[tokio::test(flavor = "multi_thread")]
-async fn steps_that_are_computed_while_the_vertices_before_them_leave_keep_their_order_and_their_vertices() {
+async fn overlapped_steps_keep_their_order_and_vertices() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let engine = server.engine.find("strips").expect("open");
@@ -78,7 +80,7 @@ async fn steps_that_are_computed_while_the_vertices_before_them_leave_keep_their
     }
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
     let mut driver = server.drive("strips", Policy::Lossless, 40).await;
-    // All are sent at once, so that a next one always waits.
+    // All steps are sent at once, so that a step is always queued.
     for step in &steps {
         driver.step(step.clone()).await;
     }
@@ -107,8 +109,9 @@ async fn steps_that_are_computed_while_the_vertices_before_them_leave_keep_their
     driver.finish().await;
 }
 
+/// A subscriber that does not read holds back the writer. A step beyond the window is refused.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is_refused_by_name() {
+async fn unread_lossless_feed_applies_back_pressure() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut feed = server
@@ -119,7 +122,8 @@ async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is
         .await
         .expect("a feed");
     let mut driver = server.drive("strips", Policy::Lossless, 2).await;
-    // Two steps wait in the feed; the third is done but not acknowledged, the fourth waits, the fifth is too many.
+    // Two steps are queued in the feed. The third is computed but not acknowledged, the fourth waits, and the fifth
+    // exceeds the window.
     driver.acked(step(1, &[0], &[0.1, 0.0])).await;
     driver.acked(step(2, &[0], &[0.2, 0.0])).await;
     for number in 3..=5 {
@@ -128,7 +132,7 @@ async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is
     let rejection = driver.rejection().await;
     assert_eq!((rejection.step, rejection.field.as_str()), (Some(5), "window"));
     assert_eq!(rejection.expected, "at most 2 steps without acknowledgement");
-    // Reading lets the rest through, and the refused step was not applied.
+    // Reading releases the remaining steps. The refused step was not applied.
     for number in 1..=4 {
         assert_eq!(within(feed.next()).await.expect("goes on").step.number, number);
     }
@@ -140,7 +144,7 @@ async fn a_subscriber_that_does_not_read_holds_back_the_writer_and_the_window_is
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_subscriber_that_never_reads_is_cut_off_and_the_writer_goes_on() {
+async fn stalled_subscriber_is_cut_off_and_the_writer_goes_on() {
     let stall = std::time::Duration::from_millis(50);
     let server = Server::with(|config| modalcast::config::Config { stall, ..config }).await;
     server.open("strips").await;
@@ -162,8 +166,9 @@ async fn a_subscriber_that_never_reads_is_cut_off_and_the_writer_goes_on() {
     assert_eq!(within(feed.next()).await.expect_err("the end"), cut);
 }
 
+/// The final state equals that after applying every step.
 #[tokio::test(flavor = "multi_thread")]
-async fn under_latest_the_state_equals_having_applied_all_and_skipped_steps_are_counted() {
+async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     let server = Server::fresh().await;
     server.open("sheet").await;
     let mut driver = server.drive("sheet", Policy::Latest, 4).await;
@@ -171,7 +176,7 @@ async fn under_latest_the_state_equals_having_applied_all_and_skipped_steps_are_
         let rows = [1.0, 0.0, 0.0, offset, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
         rows.iter().flat_map(|number| number.to_le_bytes()).collect()
     };
-    // Only the first step moves the sheet, so losing any one shows.
+    // Only the first step moves the sheet, so a lost step changes the result.
     let mut steps = vec![v1::Step { transforms: transform(5.0).into(), ..step(1, &[], &[]) }];
     steps.extend((2..=200).map(|number| step(number, &[0], &[0.001 * number as f32, 0.5, 0.0, 1.0])));
     for step in &steps {
@@ -192,7 +197,7 @@ async fn under_latest_the_state_equals_having_applied_all_and_skipped_steps_are_
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_latest_subscriber_gets_the_current_step_at_once_and_counts_what_it_missed() {
+async fn latest_subscriber_gets_current_step_and_skip_count() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
@@ -208,8 +213,10 @@ async fn a_latest_subscriber_gets_the_current_step_at_once_and_counts_what_it_mi
     assert_eq!((second.step.number, second.skipped), (8, 4));
 }
 
+/// The refusal of the second writer names the address and the run of the first. The same stream opens the scene once
+/// the first writer has left.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_second_writer_is_told_who_holds_the_scene_and_comes_in_when_the_first_has_gone() {
+async fn second_writer_waits_for_the_first_to_leave() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut first = server.drive("strips", Policy::Lossless, 0).await;
@@ -220,7 +227,7 @@ async fn a_second_writer_is_told_who_holds_the_scene_and_comes_in_when_the_first
     assert!(refusal.given.contains("127.0.0.1") && refusal.given.contains("run 1"), "{refusal:?}");
     first.acked(step(101, &[0], &[0.2, 0.0])).await;
     first.finish().await;
-    // The very stream that was refused comes in, and its numbers begin anew.
+    // The refused stream can open the scene now, and its step numbers start again.
     let Told::Opened(opened) = second.open("strips", Policy::Latest, 100_000).await else { panic!("kept out") };
     assert_eq!((opened.run, opened.window), (2, 256));
     assert_eq!(opened.scene.and_then(|scene| scene.last_step).map(|step| (step.run, step.number)), Some((1, 101)));
@@ -238,13 +245,13 @@ async fn a_second_writer_is_told_who_holds_the_scene_and_comes_in_when_the_first
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn requests_whose_clients_have_left_make_room_for_others() {
+async fn requests_of_departed_clients_free_their_slots() {
     let server = Server::with(|config| modalcast::config::Config { waiting: 4, ..config }).await;
     server.open("strips").await;
     let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
     let never = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertices_of("strips") };
     let mut client = server.vertices().await;
-    // Of eight that wait for a step that never comes, four are turned away, and so is whoever comes next.
+    // Eight requests wait for a step that never comes. Four of them are refused, and so is every later request.
     let mut waits = Vec::new();
     for _ in 0..8 {
         waits.push(client.get_vertices(never.clone()).await.expect("a stream").into_inner());
@@ -264,8 +271,9 @@ async fn requests_whose_clients_have_left_make_room_for_others() {
     within(served).await;
 }
 
+/// A request for a step that has passed is refused with the number of the step.
 #[tokio::test(flavor = "multi_thread")]
-async fn exact_and_minimum_steps_are_waited_for_and_a_step_that_has_passed_is_named() {
+async fn requests_wait_for_exact_and_minimum_steps() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
@@ -273,7 +281,7 @@ async fn exact_and_minimum_steps_are_waited_for_and_a_step_that_has_passed_is_na
     let mut waiting = [Which::Exact(2), Which::Minimum(3), Which::Exact(5)]
         .map(|which| Box::pin(host.show(which, View::Vertices(Wanted::VERTICES))));
     for request in &mut waiting {
-        // One poll puts the request in place.
+        // One poll registers the request.
         assert!(tokio::time::timeout(std::time::Duration::ZERO, request).await.is_err(), "there is no step yet");
     }
     for number in [1, 2, 4, 5] {

@@ -1,5 +1,4 @@
-//! The cpu deformer stays within its a-priori bounds in every storage type, and its results depend on nothing else than
-//! the step.
+//! The CPU deformer stays within its a-priori bounds for every storage type, and its results depend only on the step.
 
 use std::sync::Arc;
 
@@ -16,8 +15,8 @@ use crate::deformers::{Noise, domain, shaken, strip};
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
 
-/// Strips of these sizes; the last two domains are instances of the first and of the fourth shape, and the very last one
-/// shares its coordinates too.
+/// A scene of strips of [`SIZES`]. The last two domains are instances of the first and of the fourth shape; the last
+/// one also shares the coordinates of its twin.
 fn scene_of(deformation: Deformation) -> Arc<Scene> {
     let mut noise = Noise(42);
     let mut parts = Parts::named("storages");
@@ -34,7 +33,7 @@ fn scene_of(deformation: Deformation) -> Arc<Scene> {
     Scene::new(parts).expect("a scene")
 }
 
-/// One domain with these columns and no rest positions besides 0.
+/// One domain with these columns of U and rest positions of zero.
 fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> Arc<Scene> {
     let mut parts = Parts::named("columns");
     parts.deformation = deformation;
@@ -54,7 +53,7 @@ fn run(deformer: &mut CpuDeformer, state: &State) -> (Deformed, Vec<f32>) {
     (told, deformer.surface().expect("a surface").positions.clone())
 }
 
-/// The bounds of the tiles of a domain. What is left out counts with its own.
+/// Error bound of each tile of a domain, including the bound of the truncated modes.
 fn bounds_of(scene: &Scene, state: &State, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
     let shape = scene.shape_of(domain);
     let tiles = Tiles::new(shape, scene.deformation.storage);
@@ -69,7 +68,7 @@ fn bounds_of(scene: &Scene, state: &State, deformer: &CpuDeformer, domain: usize
     (0..tiles.count()).map(|tile| reaches.tile(tile, &step).total() + left_out).collect()
 }
 
-/// Each domain's largest error as a part of the bound of its tile; infinite for a NaN.
+/// Largest error of each domain relative to the bound of its tile; infinite for NaN.
 fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let want = reference::deform(scene, state);
     let part = |domain: usize| {
@@ -86,13 +85,14 @@ fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], deformer: &Cp
     (0..scene.domains.len()).map(part).collect()
 }
 
+/// Control: a state with the wrong sign exceeds the bound.
 #[test]
-fn errors_stay_within_their_bounds_in_every_storage_and_a_wrong_sign_does_not() {
+fn errors_stay_within_bounds_in_every_storage() {
     for storage in Storage::ALL {
         for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
             let scene = scene_of(Deformation { storage, compensated, truncation, ..Deformation::default() });
             let mut state = shaken(&scene);
-            // Modes of ever smaller amounts, so that some may be left out.
+            // Decreasing amplitudes, so that some modes may be truncated.
             let count = state.q.len() as f32;
             state.q.iter_mut().enumerate().for_each(|(at, number)| *number *= f32::exp2(-12.0 * at as f32 / count));
             let mut deformer = CpuDeformer::new(&scene);
@@ -103,7 +103,7 @@ fn errors_stay_within_their_bounds_in_every_storage_and_a_wrong_sign_does_not() 
             let mut wrong = state.clone();
             wrong.q.iter_mut().for_each(|number| *number = -*number);
             let seen = parts_of_bound(&scene, &wrong, &positions, &deformer);
-            // What is within the budget may have any sign.
+            // Truncation may drop a mode within the budget, so its sign has no effect on the error.
             let bends = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
             for domain in (0..seen.len()).filter(|domain| bends(*domain)) {
                 assert!(
@@ -117,7 +117,7 @@ fn errors_stay_within_their_bounds_in_every_storage_and_a_wrong_sign_does_not() 
 }
 
 #[test]
-fn positions_depend_on_no_count_of_threads_and_on_no_earlier_step() {
+fn positions_do_not_depend_on_threads_or_earlier_steps() {
     for storage in Storage::ALL {
         let scene = scene_of(Deformation { storage, ..Deformation::default() });
         let mut state = shaken(&scene);
@@ -125,7 +125,8 @@ fn positions_depend_on_no_count_of_threads_and_on_no_earlier_step() {
         run(&mut kept, &state);
         let mut noise = Noise(5);
         for step in 0..6 {
-            // One domain's q and another one's T; the last step changes nothing, the one before everything.
+            // Each step changes q of one domain and the transform of another. The last step changes nothing, the one
+            // before it all of q.
             let slot = scene.layout.slots[[0, 4, 8, 3, 0, 0][step]];
             let moved = if step == 4 { 0..state.q.len() } else { slot.first_q..slot.first_q + slot.rank };
             if step < 5 {
@@ -151,8 +152,9 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
 }
 
 #[test]
-fn vertices_of_an_instance_and_of_a_larger_shape_are_those_of_the_shape_alone() {
-    // The first 129 vertices of a shape of 1500 rows, alone and together, fall into tiles of other sizes.
+fn vertices_do_not_depend_on_the_tiling() {
+    // The first 129 vertices of a shape of 1500 vertices, together with the others or alone, fall into tiles of
+    // different sizes.
     let mut noise = Noise(8);
     let columns: Vec<f32> = (0..4500 * 9).map(|_| noise.next()).collect();
     let few: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
@@ -167,7 +169,7 @@ fn vertices_of_an_instance_and_of_a_larger_shape_are_those_of_the_shape_alone() 
 }
 
 #[test]
-fn huge_tiny_and_denormal_coordinates_stay_within_the_bound() {
+fn huge_tiny_and_denormal_q_stay_within_the_bound() {
     for storage in Storage::ALL {
         for compensated in [false, true] {
             let scene = scene_of(Deformation { storage, compensated, ..Deformation::default() });
@@ -185,8 +187,9 @@ fn huge_tiny_and_denormal_coordinates_stay_within_the_bound() {
     }
 }
 
+/// A sum that overflows itself is reported by bounds that are not finite, for that step only.
 #[test]
-fn a_finite_sum_survives_terms_that_overflow_and_a_sum_that_overflows_is_told() {
+fn finite_sums_survive_overflowing_terms() {
     let mode = |entry: f32| vec![entry; 3 * 5];
     let columns = [mode(2.0), mode(2.0), mode(1.0)].concat();
     for storage in Storage::ALL {
@@ -195,12 +198,12 @@ fn a_finite_sum_survives_terms_that_overflow_and_a_sum_that_overflows_is_told() 
             let scene = columns_of(5, columns.clone(), deformation);
             let mut deformer = CpuDeformer::new(&scene);
             let mut state = State::rest(&scene);
-            // Infinite in the plain chain of f32, infinity minus infinity in the compensated one.
+            // Plain f32 summation gives infinity, and compensated summation gives infinity minus infinity.
             state.q = vec![3e38, -3e38, 0.75];
             assert!(2.0_f32.mul_add(state.q[1], 2.0_f32.mul_add(state.q[0], 0.0)).is_infinite());
             let (told, positions) = run(&mut deformer, &state);
             assert!(told.bounds.is_finite());
-            // The third mode is off by what its storage loses; the first two are the same and cancel.
+            // The third mode is rounded by its storage type. The first two modes are equal and cancel.
             assert!(positions.iter().all(|number| (number - 0.75).abs() <= 0.75 / 254.0), "{positions:?}");
             state.q = vec![3e38, 0.0, 1.0];
             assert!(!run(&mut deformer, &state).0.bounds.is_finite());
@@ -211,7 +214,7 @@ fn a_finite_sum_survives_terms_that_overflow_and_a_sum_that_overflows_is_told() 
 }
 
 #[test]
-fn a_budget_in_metres_leaves_modes_out_and_is_kept_in_scene_units() {
+fn truncation_budget_in_meters_holds_in_scene_units() {
     for unit in [1.0, 0.01] {
         let mut parts = Parts::named("millimetres");
         parts.unit = unit;
@@ -230,7 +233,7 @@ fn a_budget_in_metres_leaves_modes_out_and_is_kept_in_scene_units() {
         assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
         assert!(kept.len() > 2 && kept.len() < 20, "{kept:?}");
         assert!(parts_of_bound(&scene, &state, &positions, &deformer)[0] <= 1.0);
-        // What is left out adds nothing: the same as zeros there, bit by bit.
+        // Truncated modes contribute nothing: the result has the bits of a state with zeros for these modes.
         let mut zeroed = state.clone();
         (0..24).filter(|mode| !kept.contains(&(*mode as u16))).for_each(|mode| zeroed.q[mode] = 0.0);
         let plain = columns_and_rest(&scene);
@@ -239,7 +242,7 @@ fn a_budget_in_metres_leaves_modes_out_and_is_kept_in_scene_units() {
     }
 }
 
-/// The same scene without a budget.
+/// The same scene without a truncation budget.
 fn columns_and_rest(scene: &Scene) -> Arc<Scene> {
     let mut parts = Parts::named("plain");
     parts.materials = scene.materials.clone();

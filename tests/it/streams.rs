@@ -1,4 +1,5 @@
-//! Frames of a stream while later steps are computed: each is that of its step, in order, and acknowledged after it.
+//! Frames streamed while later steps are computed: each frame shows its own step, frames keep their order, and a step
+//! is acknowledged after its frames.
 
 use std::sync::Arc;
 
@@ -13,7 +14,7 @@ use crate::service_harness::{Server, kept_strips, state_after, step, within};
 
 const SIZE: (u32, u32) = (48, 32);
 const STEPS: u64 = 30;
-/// The step that is refused.
+/// Number of the step that is refused.
 const BAD: u64 = 13;
 
 fn cameras(count: usize) -> Vec<Camera> {
@@ -30,7 +31,7 @@ fn steps() -> Vec<v1::Step> {
     (0..STEPS).map(|number| step(number, &[1], &[q(number), 0.5])).collect()
 }
 
-/// The pictures of every good step, drawn one by one.
+/// Reference pictures of every valid step, rendered one by one.
 fn expected(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
     let (scene, steps) = (kept_strips(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
@@ -58,8 +59,9 @@ async fn server() -> Server {
     server
 }
 
+/// More cameras than frames can be in flight: every frame is that of its step, and the steps are answered in order.
 #[tokio::test(flavor = "multi_thread")]
-async fn frames_of_more_cameras_than_can_be_under_way_are_each_that_of_its_step_and_acknowledged_in_order() {
+async fn frames_of_many_cameras_show_their_own_step() {
     let (server, cameras) = (server().await, cameras(5));
     let host = server.engine.find("kept").expect("open");
     let mut feeds = Vec::new();
@@ -68,7 +70,7 @@ async fn frames_of_more_cameras_than_can_be_under_way_are_each_that_of_its_step_
     }
     let positions = modalcast_model::deform::Wanted { positions: true, ..Default::default() };
     let mut vertices = host.watch(View::Vertices(positions), Delivery::Lossless).await.expect("a feed");
-    // One that leaves in the middle, and one that never reads.
+    // One feed is dropped halfway, and one is never read.
     let mut leaver = Some(host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed"));
     let _idle = host.watch(view(cameras[0]), Delivery::Latest).await.expect("a feed");
     let mut driver = server.drive("kept", Policy::Lossless, 40).await;
@@ -102,7 +104,7 @@ async fn frames_of_more_cameras_than_can_be_under_way_are_each_that_of_its_step_
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_scene_that_is_closed_while_frames_are_under_way_hands_over_what_was_begun_and_ends() {
+async fn closing_a_scene_delivers_frames_in_flight() {
     let (server, cameras) = (server().await, cameras(2));
     let host = Arc::clone(&server.engine.find("kept").expect("open"));
     let mut feed = host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed");

@@ -1,13 +1,13 @@
-//! The judge of numbers, and the test that the judge can fail.
+//! Comparison of numbers with a tolerance, and the test that the comparison can fail.
 
-/// Absolute and relative closeness.
+/// Absolute and relative tolerance.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tolerance {
     pub(crate) abs: f64,
     pub(crate) rel: f64,
 }
 
-/// The first place where `got` is not close to `want`, in words. NaN is close to nothing.
+/// Describes the first element where `got` is not close to `want`. NaN is close to nothing.
 pub(crate) fn first_wrong(got: &[f32], want: &[f64], tolerance: Tolerance) -> Option<String> {
     if got.len() != want.len() || want.is_empty() {
         return Some(format!("{} numbers, expected {} and at least one", got.len(), want.len()));
@@ -18,7 +18,7 @@ pub(crate) fn first_wrong(got: &[f32], want: &[f64], tolerance: Tolerance) -> Op
     })
 }
 
-/// The largest distance between two lists of points, or infinity when one is not finite.
+/// Largest distance between two lists of points; infinite if a point is not finite.
 pub(crate) fn largest_error(got: &[f32], want: &[[f64; 3]]) -> f64 {
     assert_eq!(got.len(), 3 * want.len(), "as many points");
     let error = |(got, want): (&[f32], &[f64; 3])| {
@@ -29,7 +29,7 @@ pub(crate) fn largest_error(got: &[f32], want: &[[f64; 3]]) -> f64 {
 }
 
 #[test]
-fn the_judge_refuses_wrong_swapped_short_and_not_finite_numbers() {
+fn judge_refuses_wrong_swapped_short_or_non_finite_numbers() {
     let tolerance = Tolerance { abs: 1e-6, rel: 1e-6 };
     let want = [1.0, 2.0];
     assert_eq!(first_wrong(&[1.0, 2.0], &want, tolerance), None);

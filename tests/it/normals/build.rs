@@ -1,4 +1,4 @@
-//! Meshes whose deformed normals are known by algebra, and scenes of them.
+//! Meshes whose deformed normals are known analytically, and scenes of these meshes.
 
 use std::sync::Arc;
 
@@ -12,14 +12,14 @@ use nalgebra::{Matrix3, Vector3};
 
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 
-/// A shape with one mode: its displacement at each rest position.
+/// A shape with one mode; the function gives the displacement at each rest position.
 pub(crate) fn with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
     let column: Vec<f32> = mesh.rest().iter().flat_map(|rest| displacement(*rest)).collect();
     let modes = Modes::from_columns(column.len(), 1, column).expect("modes");
     Shape::new(mesh, modes).expect("a shape")
 }
 
-/// A flat grid over -1..1 x -1..1 at z = 0, facing up, u along x.
+/// A flat grid over -1..1 x -1..1 at z = 0 that faces +Z; u runs along x.
 pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
     let at = |index: u32, count: u32| 2.0 * index as f32 / (count - 1) as f32 - 1.0;
     let places = (0..rows).flat_map(|row| (0..columns).map(move |column| (at(column, columns), at(row, rows))));
@@ -29,14 +29,14 @@ pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
     Mesh::indexed(rest, normals, uvs, quads(columns, rows)).expect("a sheet")
 }
 
-/// Two triangles per cell of a grid, all cut alike.
+/// Two triangles per cell of a grid, all split along the same diagonal.
 pub(crate) fn quads(columns: u32, rows: u32) -> Vec<[u32; 3]> {
     let cells = (0..rows - 1).flat_map(|row| (0..columns - 1).map(move |column| row * columns + column));
     cells.flat_map(|at| [[at, at + 1, at + columns + 1], [at, at + columns + 1, at + columns]]).collect()
 }
 
-/// A tube about y whose first and last corners lie on one line of vertices, as a seam of texture coordinates has it.
-/// The normals of the last line are turned by `tilt` degrees.
+/// A tube about y. Its first and last columns of corners share one line of vertices, as at a seam of texture
+/// coordinates. The normals of the last column are rotated by `tilt` degrees.
 pub(crate) fn tube(around: u32, rows: u32, tilt: f32) -> Mesh {
     let turn = |column: u32| column as f32 / around as f32 * std::f32::consts::TAU;
     let rest = (0..rows).flat_map(|row| (0..around).map(move |at| [turn(at).cos(), row as f32, -turn(at).sin()]));
@@ -50,7 +50,7 @@ pub(crate) fn tube(around: u32, rows: u32, tilt: f32) -> Mesh {
     Mesh::new(rest.collect(), corners, quads(around + 1, rows)).expect("a tube")
 }
 
-/// A unit cube of 8 vertices and 24 corners: every edge is hard.
+/// A unit cube of 8 vertices and 24 corners; every edge is hard.
 pub(crate) fn cube() -> Mesh {
     let rest = (0..8_u8).map(|at| [0, 1, 2].map(|axis| f32::from(at >> axis & 1))).collect();
     let (mut corners, mut triangles) = (Corners::default(), Vec::new());
@@ -67,7 +67,7 @@ pub(crate) fn cube() -> Mesh {
     Mesh::new(rest, corners, triangles).expect("a cube")
 }
 
-/// A sphere of 8 x 4^level triangles with its area-weighted normals.
+/// A unit sphere of 8 x 4^level triangles with area-weighted normals.
 pub(crate) fn sphere(level: u32) -> Mesh {
     let mut triangles: Vec<[Vector3<f64>; 3]> = octants();
     for _ in 0..level {
@@ -101,7 +101,7 @@ fn octants() -> Vec<[Vector3<f64>; 3]> {
     signs.map(triangle).collect()
 }
 
-/// A scene of shapes with exact normals; those with uvs have a normal map.
+/// A scene of shapes with exact normals; shapes with texture coordinates have a normal map.
 pub(crate) fn scene(shapes: Vec<Shape>) -> Arc<Scene> {
     scene_with(shapes, Normals::Exact)
 }
@@ -131,7 +131,7 @@ fn domain(shape: usize) -> Domain {
     }
 }
 
-/// The state with every coordinate at q and every transform the given linear part and translation.
+/// A state in which every coordinate is q and every transform has the given linear part and translation.
 pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> State {
     let mut state = State::rest(scene);
     state.q.fill(q);
@@ -139,32 +139,32 @@ pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f
     state
 }
 
-/// At rest but for q.
+/// The rest state with every coordinate set to q.
 pub(crate) fn bent(scene: &Scene, q: f32) -> State {
     state(scene, q, Matrix3::identity(), [0.0; 3])
 }
 
-/// What the cpu deformer makes of a state.
+/// The surface that the CPU deformer computes for a state.
 pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &State) -> Surface {
     let mut cpu = CpuDeformer::new(scene);
     cpu.deform(state).expect("deforms");
     cpu.surface().expect("a surface").clone()
 }
 
-/// The exact normals and tangents of the reference.
+/// Exact normals and tangents of the reference.
 pub(crate) fn exact(scene: &Scene, state: &State) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
     let positions = modalcast_compute::reference::deform(scene, state);
     let tangents = modalcast_compute::reference::exact_tangents(scene, state, &positions);
     (modalcast_compute::reference::exact_normals(scene, state, &positions), tangents)
 }
 
-/// The angle between two directions in degrees, NaN when one is.
+/// Angle between two directions in degrees; NaN if a component is NaN.
 pub(crate) fn degrees(a: [f64; 3], b: [f64; 3]) -> f64 {
     let (a, b) = (Vector3::from(a), Vector3::from(b));
     a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
 }
 
-/// The largest angle between f32 triples and directions, infinite when one is NaN or not of unit length.
+/// Largest angle in degrees between f32 triples and directions; infinite if a triple is NaN or not of unit length.
 pub(crate) fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
     assert_eq!(got.len(), 3 * want.len(), "as many directions");
     let angle = |(got, want): (&[f32], &[f64; 3])| {

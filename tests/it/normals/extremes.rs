@@ -1,4 +1,4 @@
-//! Exact normals at the edges of f32: no area, far away, tiny, huge, overflowed, folded over.
+//! Exact normals at the limits of f32: no area, far from the origin, tiny, huge, overflowed and folded.
 
 use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
@@ -7,10 +7,10 @@ use nalgebra::{Matrix3, Vector3};
 use super::build::{bent, degrees, exact, largest_angle, on_cpu, scene, sheet, state, tube, with_mode};
 use super::{TOLERANCE, linear_parts, parabola};
 
-/// Twice the bound for positions that were rounded once: the cpu's own sum is rounded a few times more.
+/// Twice the bound for positions that are rounded once, because the CPU's own sum is rounded a few more times.
 const BOUND: f64 = 2.0 / 8_388_608.0;
 
-/// The largest part of its bound that the angle of any corner takes up; see `reference/normals.rs`.
+/// Largest ratio of the angular error of a corner to its bound; see `reference/normals.rs`.
 fn part_of_bound(scene: &Scene, positions: &[[f64; 3]], got: &[f32], want: &[[f64; 3]]) -> f64 {
     let mesh = &scene.shapes[0].mesh;
     let mut sums = vec![(Vector3::zeros(), 0.0); want.len()];
@@ -35,8 +35,10 @@ fn part_of_bound(scene: &Scene, positions: &[[f64; 3]], got: &[f32], want: &[[f6
     most
 }
 
+/// A sheet collapsed to a line or to a point keeps its rigid normals. A sheet that is almost collapsed has the normals
+/// of its folded surface.
 #[test]
-fn a_sheet_crushed_to_a_line_or_a_point_keeps_its_rigid_normals_and_one_nearly_so_does_not() {
+fn collapsed_sheet_keeps_its_rigid_normals() {
     let crush = |axes: [f32; 3]| move |rest: [f32; 3]| [0, 1, 2].map(|axis| -axes[axis] * rest[axis]);
     for axes in [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]] {
         let scene = scene(vec![with_mode(sheet(9, 9), crush(axes))]);
@@ -50,19 +52,20 @@ fn a_sheet_crushed_to_a_line_or_a_point_keeps_its_rigid_normals_and_one_nearly_s
             assert!(cpu.tangents.iter().all(|number| number.is_finite()));
         }
     }
-    // Folded up on its way to a line: a thousandth of its width is left, and the normals follow.
+    // Almost collapsed to a line: a thousandth of the width is left, and the normals follow the folded surface.
     let folded = scene(vec![with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
     let (normals, _) = exact(&folded, &bent(&folded, 1.0));
     assert!(normals.iter().all(|normal| degrees(*normal, [-0.002, 0.0, 0.001]) < 0.01));
     assert!(largest_angle(&on_cpu(&folded, &bent(&folded, 1.0)).normals, &normals) < 0.1);
 }
 
+/// Corners without triangles keep their rest normals.
 #[test]
-fn triangles_without_area_add_nothing_and_corners_without_triangles_keep_their_normals() {
+fn zero_area_triangles_do_not_change_normals() {
     let mesh = sheet(5, 5);
     let mut triangles = mesh.triangles().to_vec();
     let (clean, corners) = (triangles.clone(), mesh.corners().clone());
-    // On one line in x, and vertices twice; no other triangle has the corner 24.
+    // The added triangles are collinear in x or repeat vertices. No remaining triangle contains corner 24.
     triangles.extend([[0, 1, 3], [6, 6, 7], [8, 8, 8]]);
     triangles.retain(|triangle| !triangle.contains(&24));
     let of = |triangles: Vec<[u32; 3]>| {
@@ -83,14 +86,14 @@ fn triangles_without_area_add_nothing_and_corners_without_triangles_keep_their_n
 }
 
 #[test]
-fn tiny_and_huge_domains_have_the_normals_of_plain_ones() {
+fn normals_do_not_depend_on_the_scale_of_a_domain() {
     let scene = scene(vec![with_mode(sheet(17, 9), parabola)]);
     for linear in linear_parts() {
         let (want, along) = exact(&scene, &state(&scene, 0.5, linear, [0.0; 3]));
         for scale in [1e-40, 1e-30, 1e-20, 1e18, 1e30, 1e37] {
             let state = state(&scene, 0.5, linear * scale, [0.0; 3]);
             let cpu = on_cpu(&scene, &state);
-            // Positions of 1e-40 are denormal: five digits are left of them.
+            // Positions of 1e-40 are denormal, with about five significant digits.
             let tolerance = if scale < 1e-38 { 0.1 } else { TOLERANCE };
             let error = largest_angle(&cpu.normals, &want);
             assert!(error < tolerance, "scale {scale}: off by {error} degrees");
@@ -103,8 +106,9 @@ fn tiny_and_huge_domains_have_the_normals_of_plain_ones() {
     }
 }
 
+/// Domains so small that the rounding of far positions hides their shape fall back to rigid normals.
 #[test]
-fn far_from_the_origin_the_error_keeps_its_bound_and_what_rounding_hides_is_not_followed() {
+fn normals_far_from_the_origin_stay_within_their_bound() {
     let scene = scene(vec![with_mode(tube(24, 6, 0.0), |[x, y, _]| [0.2 * y * y, 0.1 * x, 0.3 * x * y])]);
     let far = [1e7, -1e7, 1e7];
     for (size, follows) in [(1e6, true), (1e5, true), (1.0, false), (1e-3, false)] {
@@ -127,7 +131,7 @@ fn far_from_the_origin_the_error_keeps_its_bound_and_what_rounding_hides_is_not_
 }
 
 #[test]
-fn overflow_and_half_turns_give_finite_unit_normals() {
+fn overflow_and_half_turns_give_unit_normals() {
     let scene = scene(vec![with_mode(tube(16, 4, 0.0), |[x, y, z]| [-2.0 * x, y, -2.0 * z])]);
     for q in [1.0, 1e30, 3e38, -3e38] {
         for scale in [1.0, 1e-30, 1e10] {
@@ -139,8 +143,8 @@ fn overflow_and_half_turns_give_finite_unit_normals() {
             }
         }
     }
-    // Half a turn about y: the normals turn with the surface, but for twice the angle between them and those of the
-    // triangles, which is at most half of one of 16 sides.
+    // Half a turn about y: the normals turn with the surface, up to twice the angle between them and the normals of the
+    // triangles. That angle is at most half of one of the tube's 16 sides.
     let (normals, _) = exact(&scene, &bent(&scene, 1.0));
     for (normal, rest) in normals.iter().zip(&scene.shapes[0].mesh.corners().normals) {
         assert!(degrees(*normal, rest.map(f64::from)) >= 180.0 - 22.5);

@@ -1,4 +1,4 @@
-//! Exact normals of domains that a step leaves alone are kept, and are those that a fresh deformer computes.
+//! Exact normals of unchanged domains are reused between steps and equal those of a fresh deformer.
 
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::deform::{Deformer, Surface};
@@ -8,7 +8,7 @@ use super::build::{cube, scene, sheet, sphere, state, tube, with_mode};
 use super::linear_parts;
 use crate::deformers::Noise;
 
-/// A wave that bends and shears.
+/// A displacement that bends and shears.
 fn wave([x, y, z]: [f32; 3]) -> [f32; 3] {
     [0.3 * y * z, 0.2 * x * x, (2.0 * x + y).sin() + 0.4 * z]
 }
@@ -17,18 +17,18 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|number| number.to_bits()).collect()
 }
 
-/// All numbers of a surface as bits.
+/// Positions, normals and tangents of a surface as bits.
 fn all(surface: &Surface) -> [Vec<u32>; 3] {
     [&surface.positions, &surface.normals, &surface.tangents].map(|numbers| bits(numbers))
 }
 
-/// The normals of one domain as bits.
+/// Normals of one domain as bits.
 fn normals_of(scene: &Scene, surface: &Surface, domain: usize) -> Vec<u32> {
     let slot = scene.layout.slots[domain];
     bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
 }
 
-/// Changes the q of one domain, the T of another, or both of all; returns which domains it changed.
+/// Changes q of some domains, their transforms, or both, depending on the step. Returns the changed domains.
 fn change(scene: &Scene, state: &mut State, step: usize, noise: &mut Noise) -> Vec<usize> {
     let domains = match step {
         0 => vec![3],
@@ -49,8 +49,9 @@ fn change(scene: &Scene, state: &mut State, step: usize, noise: &mut Noise) -> V
     domains
 }
 
+/// After each step, all vertices and directions have the bits of a fresh deformer with any number of threads.
 #[test]
-fn normals_of_unchanged_domains_are_kept_and_all_are_those_of_a_fresh_deformer_on_any_number_of_threads() {
+fn unchanged_domains_keep_their_normals() {
     let meshes = [sheet(33, 30), cube(), tube(40, 20, 0.0), sphere(3), sheet(2, 2)];
     let scene = scene(meshes.map(|mesh| with_mode(mesh, wave)).into());
     let mut state = state(&scene, 0.4, linear_parts()[2], [1.0, 2.0, 3.0]);

@@ -1,4 +1,4 @@
-//! What hangs below the ground: measurement outputs and picks contain all of it.
+//! Geometry below the ground plane: AOVs other than depth and picks ignore the ground; depth includes it.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use nalgebra::{Matrix4, Vector3};
 
 use super::build::{Stage, camera, facing, open};
 
-/// Pixels a side.
+/// Side of the picture in pixels.
 const SIZE: u32 = 64;
 
 /// A wall of 40 x 30 pixels on the ground.
@@ -21,12 +21,12 @@ fn wall(samples: u32, ground: Option<Ground>) -> Arc<Scene> {
     stage.add(facing(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).scene()
 }
 
-/// From a little above the ground, so that it may hide what is below.
+/// A camera slightly above the ground, so that the ground can hide the geometry below it.
 fn from_above() -> Camera {
     Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..camera(SIZE) }
 }
 
-/// Words of a field, and the hits of all pixels, when the wall has sunk by half of its height.
+/// Words of an AOV and the hits of all pixels, with the wall lowered by half of its height.
 fn measure(scene: &Arc<Scene>, field: Field) -> (Vec<u32>, Vec<Hit>) {
     let mut state = State::rest(scene);
     state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
@@ -60,7 +60,7 @@ fn measurements_below_the_ground_equal_those_without_ground() {
 }
 
 #[test]
-fn depth_contains_the_ground() {
+fn depth_includes_the_ground() {
     let [with, without] = [Some(Ground::default()), None].map(|ground| measure(&wall(1, ground), Field::Depth).0);
     let infinite = |words: &[u32]| words.iter().filter(|word| f32::from_bits(**word) == f32::INFINITY).count();
     assert!(infinite(&without) > infinite(&with) + 1000, "the ground is seen beside the wall");

@@ -1,5 +1,5 @@
-//! Frames that a rasteriser beside OpenGL draws, through the definition of such a one: their pictures are OpenGL's, and the
-//! frames say who drew them.
+//! Frames drawn by the compute rasterizer instead of OpenGL, with the reference rasterizer in its place. Their pictures
+//! equal those of OpenGL up to a few samples on edges, and each frame reports the path that drew it.
 
 use std::sync::Arc;
 
@@ -16,11 +16,11 @@ use nalgebra::{Matrix4, Vector3};
 
 use super::build::{Stage, facing, lying, open};
 
-/// The reference rasteriser, on buffers of the OpenGL context that is current.
+/// The reference rasterizer, reading and writing buffers of the current OpenGL context.
 struct Plain {
     mesh: Mesh,
     gl: glow::Context,
-    /// How far everything is drawn aside, in normalised device coordinates: for controls.
+    /// Shift of everything drawn along x, in normalized device coordinates; not zero in controls.
     aside: f64,
 }
 
@@ -32,10 +32,12 @@ impl std::fmt::Debug for Plain {
 
 impl Plain {
     fn new(mesh: Mesh, aside: f64) -> Self {
-        // SAFETY: the library is loaded already.
+        // SAFETY: loading runs the initializers of libEGL. They have run already, because the renderer of this test has
+        // loaded the library.
         let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("libEGL");
         let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |place| place as *const _);
-        // SAFETY: a context is current on this thread while its scene is loaded.
+        // SAFETY: a context is current on this thread while its scene is loaded, and `address` returns the functions of
+        // that context.
         let gl = unsafe { glow::Context::from_loader_function(address) };
         Self { mesh, gl, aside }
     }
@@ -43,7 +45,7 @@ impl Plain {
     fn positions(&self) -> Vec<f32> {
         let GlBuffer { name, bytes } = self.mesh.positions;
         let mut positions = vec![0_f32; bytes as usize / 4];
-        // SAFETY: a buffer of the current context and a list of its size.
+        // SAFETY: the buffer belongs to the current context, and `positions` has the size of the buffer.
         unsafe {
             self.gl.bind_buffer(glow::COPY_READ_BUFFER, Some(named(name)));
             self.gl.get_buffer_sub_data(glow::COPY_READ_BUFFER, 0, bytemuck::cast_slice_mut(&mut positions));
@@ -64,7 +66,7 @@ impl Plain {
         if (bytes.len() as u64) > into.bytes {
             return Err(invalid("raster.buffer", format!("{} bytes", bytes.len()), into.bytes));
         }
-        // SAFETY: a buffer of the current context, large enough.
+        // SAFETY: the buffer belongs to the current context and has at least `bytes.len()` bytes, as checked above.
         unsafe {
             self.gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(named(into.name)));
             self.gl.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, bytes);
@@ -92,11 +94,11 @@ fn named(name: u32) -> glow::Buffer {
     glow::NativeBuffer(std::num::NonZeroU32::new(name).expect("a name"))
 }
 
-/// Who draws a scene.
+/// Rasterizer that draws a scene.
 #[derive(Clone, Copy, PartialEq)]
 enum By {
     OpenGl,
-    /// Everything this far aside.
+    /// The compute rasterizer, with everything shifted along x by this amount of normalized device coordinates.
     Beside(f64),
 }
 
@@ -129,7 +131,7 @@ fn give(renderer: &mut Renderer, buffers: &mut SceneBuffers, by: By) {
     }
 }
 
-/// A wall, half of a box below the ground, and a lid, under a slanting sun.
+/// A wall, a lid above the ground and a square in the plane of the ground, lit by a slanting sun.
 fn yard(shadow: Option<Shadow>, samples: u32) -> Stage {
     let mut stage = Stage::new();
     let defaults = modalcast_model::scene::Look::default();
@@ -149,13 +151,14 @@ fn differing<T: PartialEq>(one: &[T], other: &[T]) -> usize {
     one.iter().zip(other).filter(|(one, other)| one != other).count()
 }
 
-/// Bytes of pixels that differ by more than a few levels.
+/// Number of bytes that differ by more than four levels.
 fn far_off(one: &Image, other: &Image) -> usize {
     one.rgba.iter().zip(&other.rgba).filter(|(one, other)| one.abs_diff(**other) > 4).count()
 }
 
+/// Ground and shadow included, for every way of blurring.
 #[test]
-fn a_frame_drawn_beside_opengl_is_opengls_ground_and_shadow_included() {
+fn compute_rasterized_frame_equals_opengl() {
     for blurring in [Blurring::Tiles, Blurring::Rows, Blurring::Fragments] {
         let shadow = Shadow { size: 256, blurring, ..Shadow::default() };
         let scene = yard(Some(shadow), 1).scene();
@@ -177,8 +180,9 @@ fn a_frame_drawn_beside_opengl_is_opengls_ground_and_shadow_included() {
     }
 }
 
+/// Frames of both paths alternate on one render target, and each equals the frame of a fresh renderer.
 #[test]
-fn frames_by_opengl_and_beside_it_that_share_a_target_do_not_see_each_other() {
+fn opengl_and_compute_frames_share_a_target() {
     let mut stage = yard(None, 1);
     stage.0.look.ground = None;
     let scene = stage.scene();
@@ -208,7 +212,7 @@ fn frames_by_opengl_and_beside_it_that_share_a_target_do_not_see_each_other() {
 }
 
 #[test]
-fn the_ground_hides_what_lies_below_it_and_not_what_lies_in_it() {
+fn ground_hides_geometry_below_but_not_in_its_plane() {
     let scene = yard(None, 1).scene();
     let seen = |by: By, down: f32| {
         let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
@@ -239,7 +243,7 @@ fn the_ground_hides_what_lies_below_it_and_not_what_lies_in_it() {
 }
 
 #[test]
-fn what_it_may_not_draw_is_drawn_by_opengl() {
+fn opengl_draws_what_the_compute_rasterizer_cannot() {
     let paths = |stage: Stage| show(&stage.scene(), from_above(), By::Beside(0.0)).ran.paths;
     let (opengl, cuda) = (Some(Path::OpenGl), Some(Path::Cuda));
     let base = Shadow { size: 128, ..Shadow::default() };
@@ -255,8 +259,9 @@ fn what_it_may_not_draw_is_drawn_by_opengl() {
     assert_eq!(paths(yard(None, 4)), Paths { shadow: None, visibility: opengl }, "and nothing is made for it");
 }
 
+/// Cameras of one step share its shadow. OpenGL draws a rebased scene until the scene returns to the shared positions.
 #[test]
-fn cameras_of_one_step_share_the_shadow_and_a_scene_apart_is_opengls_until_it_comes_together() {
+fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let scene = yard(Some(Shadow { size: 256, ..Shadow::default() }), 1).scene();
     let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
     let deformed = deformer.deform(&State::rest(&scene)).expect("deforms");
@@ -291,7 +296,7 @@ fn cameras_of_one_step_share_the_shadow_and_a_scene_apart_is_opengls_until_it_co
     assert!(together.rgba == alone.rgba, "the same picture again");
 }
 
-/// A rasteriser that always fails.
+/// A rasterizer whose draw calls always fail.
 #[derive(Debug)]
 struct Broken;
 
@@ -305,8 +310,9 @@ impl Rasteriser for Broken {
     }
 }
 
+/// The frame of the failure and all later frames are drawn by OpenGL.
 #[test]
-fn a_rasteriser_that_fails_leaves_the_frame_to_opengl_and_those_after_it() {
+fn failing_rasterizer_falls_back_to_opengl() {
     let scene = yard(Some(Shadow { size: 128, ..Shadow::default() }), 1).scene();
     let want = show(&scene, from_above(), By::OpenGl);
     let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
@@ -323,7 +329,7 @@ fn a_rasteriser_that_fails_leaves_the_frame_to_opengl_and_those_after_it() {
     }
 }
 
-/// A rasteriser without a compiler, which keeps in mind what it was to compile.
+/// A rasterizer without a compiler. It records the pipelines that it was asked to compile.
 #[derive(Debug)]
 struct Unready(std::rc::Rc<std::cell::Cell<[bool; 2]>>);
 
@@ -338,8 +344,9 @@ impl Rasteriser for Unready {
     }
 }
 
+/// Only the pipelines that the scene can use are compiled. OpenGL draws the scene if compilation fails.
 #[test]
-fn what_a_scene_may_have_drawn_is_compiled_when_it_is_loaded_and_opengl_draws_where_that_fails() {
+fn rasterizer_is_compiled_when_the_scene_is_loaded() {
     let shadow = Some(Shadow { size: 128, ..Shadow::default() });
     for (shadow, samples, want) in [(shadow, 1, [true; 2]), (shadow, 4, [true, false]), (None, 1, [false, true])] {
         let scene = yard(shadow, samples).scene();

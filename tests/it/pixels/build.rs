@@ -1,4 +1,4 @@
-//! Small scenes made in code, and their pictures.
+//! Builder for small scenes, and helpers that render them.
 
 use std::sync::Arc;
 
@@ -8,10 +8,10 @@ use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Te
 use modalcast_model::scene::{Camera, Lens, Parts, Scene, State, View};
 use modalcast_render::{Allocation, Image, Prefer, Ran, Renderer, Shot, plan};
 
-/// A scene under construction: no shadow, no ground, a black sky, the sun behind the camera.
+/// A scene under construction: no shadow, no ground, a black sky, and the sun behind the camera.
 pub(super) struct Stage(pub(super) Parts);
 
-/// A picture and what making it took.
+/// A picture, the statistics of its frame and the allocations of its scene.
 pub(super) struct Picture {
     pub(super) image: Image,
     pub(super) ran: Ran,
@@ -60,13 +60,13 @@ impl Stage {
     }
 }
 
-/// A rectangle facing +Z: from (left, bottom) to (right, top) at depth z.
+/// A rectangle that faces +Z, from (left, bottom) to (right, top) at depth z.
 pub(super) fn facing(left: f32, bottom: f32, right: f32, top: f32, z: f32) -> Mesh {
     let rest = vec![[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]];
     rectangle(rest, [0.0, 0.0, 1.0])
 }
 
-/// A square facing +Y at height y, `half` to each side of the origin.
+/// A square that faces +Y at height y and extends `half` to each side of the origin.
 pub(super) fn lying(half: f32, y: f32) -> Mesh {
     let rest = vec![[-half, y, half], [half, y, half], [half, y, -half], [-half, y, -half]];
     rectangle(rest, [0.0, 1.0, 0.0])
@@ -77,7 +77,7 @@ fn rectangle(rest: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
     Mesh::indexed(rest, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a rectangle")
 }
 
-/// Ten pixels a unit in the plane z = 0, the origin in the middle.
+/// A camera with ten pixels per unit in the plane z = 0 and the origin at the center of the picture.
 pub(super) fn camera(size: u32) -> Camera {
     let middle = f64::from(size) / 2.0;
     Camera {
@@ -92,12 +92,12 @@ pub(super) fn open() -> Renderer {
     Renderer::open(Prefer::Any).expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)")
 }
 
-/// The scene at rest in a square picture.
+/// Renders the scene at rest in a square picture.
 pub(super) fn draw(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, size: u32) -> Picture {
     draw_sized(renderer, scene, camera, [size, size])
 }
 
-/// The scene at rest.
+/// Renders the scene at rest.
 pub(super) fn draw_sized(
     renderer: &mut Renderer,
     scene: &Arc<Scene>,
@@ -115,13 +115,13 @@ pub(super) fn draw_sized(
     Picture { image, ran, allocated }
 }
 
-/// The scene at rest in a 64 x 64 picture of the usual camera.
+/// Renders the scene at rest in a 64 x 64 picture of [`camera`].
 pub(super) fn picture(scene: &Arc<Scene>) -> Picture {
     draw(&mut open(), scene, camera(64), 64)
 }
 
 impl Picture {
-    /// Red, green and blue; (0, 0) is the top left.
+    /// Red, green and blue of a pixel; (0, 0) is the top left.
     pub(super) fn at(&self, x: u32, y: u32) -> [u8; 3] {
         let first = 4 * (y * self.image.width + x) as usize;
         let [r, g, b, a] = [0, 1, 2, 3].map(|channel| self.image.rgba[first + channel]);
@@ -129,7 +129,7 @@ impl Picture {
         [r, g, b]
     }
 
-    /// How many pixels satisfy a claim.
+    /// Number of pixels that satisfy a predicate.
     pub(super) fn count(&self, claim: impl Fn([u8; 3]) -> bool) -> usize {
         (0..self.image.height)
             .flat_map(|y| (0..self.image.width).map(move |x| (x, y)))
@@ -138,18 +138,18 @@ impl Picture {
     }
 }
 
-/// The planned passes of a scene with nothing below its ground, which is not drawn then.
+/// Planned passes of a scene with no geometry below its ground; the ground pass is skipped in this case.
 pub(super) fn planned_above(scene: &Scene) -> Vec<&'static str> {
     plan(scene).passes.into_iter().filter(|pass| *pass != "ground").collect()
 }
 
-/// sRGB byte of a linear value.
+/// sRGB value in 0 to 255 of a linear value.
 pub(super) fn srgb(linear: f64) -> f64 {
     let linear = linear.clamp(0.0, 1.0);
     255.0 * if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Whether a pixel is within `slack` bytes of linear colours.
+/// Whether a pixel is within `slack` levels of linear colors.
 pub(super) fn close(pixel: [u8; 3], linear: [f64; 3], slack: f64) -> bool {
     pixel.iter().zip(linear).all(|(byte, value)| (f64::from(*byte) - srgb(value)).abs() <= slack)
 }

@@ -1,4 +1,5 @@
-//! A culled picture is the picture to the bit, whatever was drawn before; and what was left out is what arithmetic says.
+//! Culled frames have the bits of frames without culling, whatever was drawn before, and the counts of culled triangles
+//! match arithmetic.
 
 use std::sync::{Arc, OnceLock};
 
@@ -14,7 +15,7 @@ use super::build::{Stage, camera, facing, open};
 const ALL: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Depth];
 const SIZE: u32 = 96;
 
-/// One frame: its bytes, what its samples see, and what ran.
+/// One frame: its pixels, the visibility of its samples, and its statistics.
 struct Frame {
     rgba: Vec<u8>,
     seen: Vec<Seen>,
@@ -27,7 +28,7 @@ impl Frame {
     }
 }
 
-/// A scene under one way of culling, and where its vertices are.
+/// A scene with one culling mode, and its renderer.
 struct Show {
     renderer: Renderer,
     buffers: SceneBuffers,
@@ -44,7 +45,7 @@ impl Show {
         show
     }
 
-    /// Puts every vertex where a function of its place at rest says.
+    /// Moves every vertex to a function of its rest position.
     fn place(&mut self, to: impl Fn([f32; 3]) -> [f32; 3]) {
         let mut surface = Surface::default();
         for domain in &self.scene.domains {
@@ -68,7 +69,7 @@ fn at(eye: [f64; 3], target: [f64; 3]) -> Camera {
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 48.0, cy: 48.0 }, near: 0.0, far: 0.0 }
 }
 
-/// Triangles of one mesh, each with corners of its own.
+/// A mesh of separate triangles that share no vertices.
 fn loose(triangles: &[[[f32; 3]; 3]]) -> Mesh {
     let rest = triangles.as_flattened().to_vec();
     let count = rest.len() as u32;
@@ -77,7 +78,7 @@ fn loose(triangles: &[[[f32; 3]; 3]]) -> Mesh {
     Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("triangles")
 }
 
-/// Triangles of all sizes, some without area, about the origin.
+/// Triangles of many sizes around the origin; some have no area.
 fn soup(seed: u64, count: usize, spread: f32) -> Mesh {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut triangles = Vec::new();
@@ -96,13 +97,13 @@ fn material(alpha_mode: AlphaMode, double_sided: bool, colour: [f32; 3]) -> Mate
     Material { alpha_mode, double_sided, diffuse: colour, ambient: colour, ..Material::default() }
 }
 
-/// Whether the CPU draws.
+/// Whether the OpenGL driver is a software renderer.
 fn is_software() -> bool {
     static SOFTWARE: OnceLock<bool> = OnceLock::new();
     *SOFTWARE.get_or_init(|| open().info().software)
 }
 
-/// Every kind of material with one side and with two, and a closed ball's worth of coplanar twins.
+/// Every kind of material, single-sided and double-sided. The opaque triangles exist twice, so depths tie.
 fn mixed(samples: u32, transparency: Transparency) -> Stage {
     let mut stage = Stage::new();
     (stage.0.look.samples, stage.0.look.transparency) = (samples, transparency);
@@ -111,7 +112,8 @@ fn mixed(samples: u32, transparency: Transparency) -> Stage {
     let leaf = stage.texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
     let mask = AlphaMode::Mask { cutoff: 0.5 };
     for (seed, double_sided) in [(1, false), (2, true)] {
-        // With several samples software reads images where what is hidden says: see `Culling::Depth`.
+        // With several samples, a software renderer reads cut-out images at centroids that depend on hidden triangles;
+        // see `Culling::Depth`.
         let image = (samples == 1 || !is_software()).then_some(leaf);
         let leaves = Material { colour_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
@@ -119,13 +121,13 @@ fn mixed(samples: u32, transparency: Transparency) -> Stage {
             .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
             .add(soup(seed + 2, 400, 3.0), leaves)
             .add(soup(seed + 4, 60, 3.0), glass)
-            // The same again in other colours: every depth is there twice.
+            // The same triangles again in another color: every depth exists twice.
             .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
     }
     stage
 }
 
-/// Frames of all ways of culling that must not differ; those of the deepest are returned.
+/// Frames of all culling modes, which must be identical. Returns those with [`Culling::Depth`].
 fn same(stage: &dyn Fn() -> Stage, frames: &dyn Fn(&mut Show) -> Vec<Frame>) -> Vec<Frame> {
     let [none, triangles, depth] = ALL.map(|culling| frames(&mut Show::new(stage(), culling)));
     for (index, plain) in none.iter().enumerate() {
@@ -142,14 +144,15 @@ fn same(stage: &dyn Fn() -> Stage, frames: &dyn Fn(&mut Show) -> Vec<Frame>) -> 
 const CAMERAS: [([f64; 3], [f64; 3]); 5] = [
     ([0.0, 1.0, 9.0], [0.0; 3]),
     ([0.0, 1.2, 9.0], [0.1, 0.0, 0.0]),
-    // A jump to the other side, one into the middle, and one up close.
+    // A jump to the other side, one into the middle of the scene, and one up close.
     ([-1.0, 2.0, -9.0], [0.0; 3]),
     ([0.1, 0.0, 0.2], [1.0, 0.2, -3.0]),
     ([2.0, 2.0, 2.0], [2.4, 2.0, 1.0]),
 ];
 
+/// Every triangle has exactly one verdict: listed, or culled for one reason.
 #[test]
-fn a_culled_picture_is_the_picture_to_the_bit_whatever_the_camera_saw_before() {
+fn culled_frames_are_bit_identical_after_camera_moves() {
     for (samples, transparency) in [(1, Transparency::Exact), (4, Transparency::Exact), (4, Transparency::TwoPass)] {
         let frames = same(&|| mixed(samples, transparency), &|show| {
             let there = CAMERAS.into_iter().chain([CAMERAS[0]]);
@@ -167,8 +170,9 @@ fn a_culled_picture_is_the_picture_to_the_bit_whatever_the_camera_saw_before() {
     }
 }
 
+/// The lists span many blocks and super blocks of the prefix sum.
 #[test]
-fn lists_of_many_blocks_and_super_blocks_keep_the_order_of_their_triangles() {
+fn long_triangle_lists_keep_their_order() {
     let field = || {
         let mut stage = Stage::new();
         stage.0.look.samples = 1;
@@ -187,7 +191,7 @@ fn lists_of_many_blocks_and_super_blocks_keep_the_order_of_their_triangles() {
 }
 
 #[test]
-fn a_culled_scene_that_moves_is_the_scene_that_moves() {
+fn culled_frames_of_moving_scenes_are_bit_identical() {
     let moved = |step: usize| {
         move |[x, y, z]: [f32; 3]| {
             let (sin, cos) = (0.2 * step as f32).sin_cos();
@@ -205,7 +209,7 @@ fn a_culled_scene_that_moves_is_the_scene_that_moves() {
 }
 
 #[test]
-fn places_that_are_none_or_overflow_or_are_far_apart_are_culled_without_a_trace() {
+fn culling_handles_non_finite_and_huge_positions() {
     let spoil = |what: f32, every: u32| {
         move |[x, y, z]: [f32; 3]| if (x.to_bits() / 8).is_multiple_of(every) { [x, what, z] } else { [x, y, z] }
     };
@@ -222,7 +226,7 @@ fn places_that_are_none_or_overflow_or_are_far_apart_are_culled_without_a_trace(
 }
 
 #[test]
-fn scenes_far_from_the_origin_or_within_strange_planes_are_culled_without_a_trace() {
+fn culling_handles_far_scenes_and_extreme_clip_planes() {
     for (shift, near, far) in [(1e4, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
         same(&|| mixed(4, Transparency::Exact), &|show| {
             show.place(|[x, y, z]| [x + shift as f32, y, z]);
@@ -233,7 +237,7 @@ fn scenes_far_from_the_origin_or_within_strange_planes_are_culled_without_a_trac
 }
 
 #[test]
-fn huge_triangles_across_every_plane_and_one_alone_are_drawn() {
+fn culling_keeps_huge_triangles_and_single_ones() {
     let huge = || {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
         let crossing = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
@@ -251,7 +255,7 @@ fn huge_triangles_across_every_plane_and_one_alone_are_drawn() {
     }
 }
 
-/// A square before a grid of 32 x 32 small ones behind it, half of them in its shade.
+/// A square in front of a grid of 32 x 32 small triangles; it hides half of them.
 fn curtain(culling: Culling) -> Stage {
     let small = |index: usize| {
         let (x, y) = ((index % 32) as f32 * 0.25 - 4.0, (index / 32) as f32 * 0.25 - 4.0);
@@ -266,28 +270,29 @@ fn curtain(culling: Culling) -> Stage {
 }
 
 #[test]
-fn as_many_triangles_are_hidden_as_stand_behind_the_square() {
+fn hidden_count_equals_triangles_behind_the_square() {
     let mut show = Show::new(curtain(Culling::Depth), Culling::Depth);
     let first = show.frame(camera(128), [128, 128]).culled().camera;
     assert_eq!((first.hidden, first.listed), (0, 1024 + 2));
     let second = show.frame(camera(128), [128, 128]).culled().camera;
-    // At a tenth deeper the square hides what lies left of x = 0; the column beside its edge shares a pixel with what is
-    // not hidden.
+    // The grid is a tenth farther from the eye than the square, which hides everything left of x = 0. The column next
+    // to its edge shares a pixel with visible triangles.
     assert_eq!((second.outside, second.facing, second.no_sample), (0, 0, 0));
     assert!((15 * 32..=16 * 32).contains(&second.hidden), "{second:?}");
     assert_eq!(second.listed + second.hidden, 1024 + 2);
-    // From behind: nothing hides, and the square turns its back.
+    // From behind, nothing is hidden, and the square faces away.
     let behind = show.frame(at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
     assert_eq!((behind.facing, behind.hidden), (2, 0));
-    // Aside: all is outside.
+    // A camera that looks away: everything is outside of the frustum.
     let aside = show.frame(at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
     assert_eq!((aside.outside, aside.listed), (1026, 0));
 }
 
+/// A triangle between the samples is culled; a triangle of the same size that contains a sample is drawn.
 #[test]
-fn what_is_smaller_than_the_gaps_between_samples_is_left_out_and_what_holds_one_is_not() {
+fn triangles_without_a_sample_are_culled() {
     let dot = |x: f32, y: f32| [[x, y, 0.0], [x + 0.002, y, 0.0], [x, y + 0.002, 0.0]];
-    // Ten pixels a unit: pixel middles lie at 0.05 + 0.1 i; the second holds one, the first none.
+    // Ten pixels per unit: pixel centers lie at 0.05 + 0.1 i. The second triangle contains one, the first none.
     let mesh = loose(&[dot(0.0, 0.0), dot(0.0492, 0.0492)]);
     let mut stage = Stage::new().add(mesh, Material::default());
     stage.0.look.samples = 1;
@@ -298,7 +303,7 @@ fn what_is_smaller_than_the_gaps_between_samples_is_left_out_and_what_holds_one_
 }
 
 #[test]
-fn shadows_of_listed_casters_are_those_of_all_and_splits_too() {
+fn shadows_of_culled_casters_are_bit_identical() {
     for (method, splits) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
         let stage = || {
             let mut stage = mixed(1, Transparency::Exact);
@@ -314,8 +319,10 @@ fn shadows_of_listed_casters_are_those_of_all_and_splits_too() {
     }
 }
 
+/// On software renderers, hidden triangles move the centroids at which multisampled cut-outs read their images.
+/// Occlusion culling is off for such scenes.
 #[test]
-fn software_leaves_hidden_triangles_in_where_they_move_the_centroids_of_cut_outs() {
+fn software_renderers_draw_hidden_multisampled_cut_outs() {
     for (samples, alpha_mode, falls) in [
         (4, AlphaMode::Mask { cutoff: 0.5 }, true),
         (1, AlphaMode::Mask { cutoff: 0.5 }, false),
@@ -332,7 +339,7 @@ fn software_leaves_hidden_triangles_in_where_they_move_the_centroids_of_cut_outs
 }
 
 #[test]
-fn picks_and_pictures_of_numbers_do_not_know_of_culling_and_neither_do_places_of_another_origin() {
+fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
     let shown = ALL.map(|culling| {
         let mut show = Show::new(mixed(4, Transparency::Exact), culling);
         let camera = at([0.0, 1.0, 9.0], [0.0; 3]);
@@ -342,7 +349,7 @@ fn picks_and_pictures_of_numbers_do_not_know_of_culling_and_neither_do_places_of
         let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("picks");
         let hits = show.renderer.finish_pick(pick).expect("hits");
         let depth = show.renderer.survey(&show.buffers, &shot, Field::Depth).expect("surveys").bytes;
-        // Everything a little aside, with an origin of its own.
+        // Rebased positions: everything is shifted and has an origin of its own.
         let rest = show.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
         let aside: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
         show.renderer.upload_apart(&mut show.buffers, &aside, [0.25, 0.0, 0.0]).expect("uploads");
@@ -353,8 +360,9 @@ fn picks_and_pictures_of_numbers_do_not_know_of_culling_and_neither_do_places_of
     assert!(shown[1] == shown[0] && shown[2] == shown[0]);
 }
 
+/// A small scene with the default culling allocates no culling buffers.
 #[test]
-fn culled_draws_do_not_grow_with_domains_and_a_small_scene_makes_nothing_for_it() {
+fn culled_draw_calls_do_not_grow_with_domains() {
     let plain = Show::new(curtain(Culling::Fitting), Culling::Fitting);
     assert!(plain.buffers.allocated().iter().all(|part| !part.name.contains("cull") && !part.name.contains("listed")));
     let draws = |domains: usize| {

@@ -1,4 +1,4 @@
-//! The almond tree, culled: the same picture, and what that takes.
+//! The almond tree with culling: the same picture, and the times of its passes.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -13,12 +13,12 @@ use super::build::open;
 const SIZE: [u32; 2] = [1920, 1080];
 const FRAMES: usize = 9;
 
-/// The same scene under another look.
+/// The same scene with another look.
 fn under(scene: &Scene, look: Look) -> Arc<Scene> {
     Scene::new(Parts { look, ..scene.parts() }).expect("a good scene")
 }
 
-/// The picture, the median milliseconds of some passes, and what was culled.
+/// The picture, the median times of some passes in milliseconds, and the culling statistics.
 fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<Culled>) {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
@@ -42,7 +42,7 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_almond_culled_is_the_same_picture() {
+fn real_almond_with_culling_is_the_same_picture() {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
     let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond");
     let mut renderer = open();

@@ -1,4 +1,4 @@
-//! Pictures ten thousand kilometres from the scene's origin are those at the origin.
+//! Pictures ten thousand kilometers from the scene origin equal those at the origin.
 
 use std::sync::Arc;
 
@@ -12,14 +12,14 @@ use modalcast_render::Image;
 
 use super::build::{Stage, facing, lying};
 
-/// Where a scene goes: off the grid of its cells, and not a number that f32 holds.
+/// Far position: not on the grid of origin cells, and not representable in f32.
 const AWAY: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
 fn bench() -> Workbench {
     Workbench::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("a renderer")
 }
 
-/// The state with some domains moved from where they rest, in f64.
+/// The rest state with some domains moved by an f64 translation.
 fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> State {
     let one = || {
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
@@ -36,7 +36,7 @@ fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> State {
     state
 }
 
-/// A camera from above and aside at a square around `at`.
+/// A camera that looks obliquely from above at a square around `at`.
 fn camera(at: [f64; 3]) -> Camera {
     let eye = [at[0] + 1.7, at[1] + 2.1, at[2] + 3.3];
     let view = View::LookAt { eye, target: [at[0], at[1] + 0.2, at[2]], up: [0.0, 1.0, 0.0] };
@@ -51,27 +51,29 @@ fn picture(bench: &mut Workbench, scene: &Arc<Scene>, state: &State, camera: &Ca
     image
 }
 
-/// The largest difference of two pictures in levels, and how many pixels differ by more than one level.
+/// Largest difference of two pictures in levels, and number of pixels that differ by more than one level.
 fn difference(one: &Image, other: &Image) -> (u8, usize) {
     let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
     let levels = |(a, b): (&[u8], &[u8])| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
     pairs.map(levels).fold((0, 0), |(most, count), levels| (most.max(levels), count + usize::from(levels > 1)))
 }
 
-/// A table over the ground, with everything that a look has.
+/// A table over the ground, with the default look and the given shadow.
 fn table(shadow: Option<Shadow>) -> Arc<Scene> {
     let mut stage = Stage::new();
     stage.0.look = Look { shadow, ..Look::default() };
     stage.add(lying(0.8, 0.5), Material::default()).add(lying(0.4, 0.0), Material::default()).scene()
 }
 
+/// With ground and every kind of shadow map.
 #[test]
-fn a_scene_that_has_gone_far_looks_as_it_did_with_its_ground_and_its_shadow() {
+fn far_scene_renders_like_the_scene_at_the_origin() {
     let mut bench = bench();
-    // The texels of a shadow map keep to a grid, so a shadow's edge looks the same only where the grid does.
+    // Texels of a shadow map are aligned to a grid, so the edge of a shadow looks the same only after a move by
+    // multiples of the grid.
     let on_grid = [9766.0 * GRID, 0.0, -9767.0 * GRID];
-    // Off the grid positions are rounded elsewhere, by a five-hundredth of a pixel: a sample that an edge passes by less
-    // may change sides, in one pixel of a thousand at most.
+    // Off the grid, positions round differently, by 1/500 pixel. A sample closer than that to an edge may change sides,
+    // which affects at most one pixel in a thousand.
     let base = Shadow::default();
     let kinds = [
         (Some(base), on_grid, 0),
@@ -92,14 +94,15 @@ fn a_scene_that_has_gone_far_looks_as_it_did_with_its_ground_and_its_shadow() {
     let scene = table(None);
     let home = picture(&mut bench, &scene, &State::rest(&scene), &camera([0.0; 3]));
     let away = moved(&scene, &[0, 1], AWAY);
-    // The controls: a camera that f32 rounds sees something else, and so does one that stands a decimetre aside.
+    // Controls: a camera position rounded to f32 gives another picture, and so does a camera moved by 0.1 units.
     let rounded = AWAY.map(|number| f64::from(number as f32));
     assert!(difference(&home, &picture(&mut bench, &scene, &away, &camera(rounded))).0 > 8);
     assert!(difference(&home, &picture(&mut bench, &scene, &away, &camera([AWAY[0] + 0.1, 0.0, AWAY[2]]))).0 > 8);
 }
 
+/// Two domains are far apart. A camera near either one sees that domain alone.
 #[test]
-fn a_domain_far_from_all_others_is_seen_from_beside_it_and_the_others_from_beside_them() {
+fn distant_domains_are_seen_by_nearby_cameras() {
     let mut bench = bench();
     let square = |z: f32| facing(-0.7, -0.3, 0.6, 0.9, z);
     let red = Material { diffuse: [1.0, 0.1, 0.1], ambient: [1.0, 0.1, 0.1], ..Material::default() };
@@ -117,7 +120,7 @@ fn a_domain_far_from_all_others_is_seen_from_beside_it_and_the_others_from_besid
         [&grey, &red, &both].map(|want| difference(&image, want).0)
     };
     let is_only = |levels: [u8; 3], which: usize| (0..3).all(|at| (levels[at] <= 1) == (at == which));
-    // To and fro, because what was drawn in one frame must not be left over in another.
+    // Twice, because no frame may contain remains of an earlier one.
     for _ in 0..2 {
         let levels = [seen(&apart, AWAY), seen(&apart, [0.0; 3]), seen(&State::rest(&scene), [0.0; 3])];
         assert!(is_only(levels[0], 1) && is_only(levels[1], 0) && is_only(levels[2], 2), "{levels:?}");

@@ -1,4 +1,4 @@
-//! The ground that is found where nothing else is seen, against the ground that is drawn.
+//! The ground that is found analytically in samples without a triangle, compared with the ground drawn by its pass.
 
 use std::sync::Arc;
 
@@ -41,7 +41,7 @@ struct Frame {
 }
 
 impl Frame {
-    /// The scene at rest, all `sunk` lower, when it is told that its lowest point is at `lowest`.
+    /// Renders the scene at rest, lowered by `sunk`, with bounds whose lowest point is at `lowest`.
     fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, (sunk, lowest): (f32, f64)) -> Self {
         let buffers = renderer.load(scene).expect("loads");
         let of_all = |part: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
@@ -69,7 +69,7 @@ impl Frame {
         self.passes.contains(&"ground")
     }
 
-    /// Pixels of another colour, by more than two levels; and that see something else.
+    /// Number of pixels whose colors differ by more than two levels, and number of samples that see something else.
     fn against(&self, other: &Self) -> [usize; 2] {
         let pixels = self.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
         let far = |(own, other): &(&[u8], &[u8])| own.iter().zip(*other).any(|(a, b)| a.abs_diff(*b) > 2);
@@ -77,11 +77,11 @@ impl Frame {
     }
 }
 
-/// Below the ground by more than rounding, and by less than is seen in a shadow map or in the range of depth.
+/// Far enough below the ground to exceed rounding, but too little to affect the shadow map or the depth range.
 const BELOW: f64 = -1e-5;
 
 #[test]
-fn ground_that_is_not_drawn_makes_the_picture_that_it_makes_when_drawn() {
+fn analytic_ground_equals_drawn_ground() {
     let looks: [fn(&mut Look); 6] = [
         |_| {},
         |look| look.samples = 1,
@@ -97,7 +97,8 @@ fn ground_that_is_not_drawn_makes_the_picture_that_it_makes_when_drawn() {
             let mut frame = |lowest: f64| Frame::new(&mut renderer, &scene, from(eye), (0.0, lowest));
             let (found, drawn) = (frame(0.0), frame(BELOW));
             assert_eq!([found.draws_ground(), drawn.draws_ground()], [false, true]);
-            // Samples at the horizon, where the far edge of the ground is the sky to the last bit, may round otherwise.
+            // The far edge of the ground has exactly the color of the sky at the horizon. Samples there may round
+            // differently.
             let [colours, ids] = found.against(&drawn);
             assert!(
                 colours == 0 && ids <= 2,
@@ -110,8 +111,9 @@ fn ground_that_is_not_drawn_makes_the_picture_that_it_makes_when_drawn() {
     }
 }
 
+/// Bounds that overflowed need the ground pass, because they say nothing about geometry below the ground.
 #[test]
-fn ground_hides_what_lies_below_it_and_is_not_there_from_below() {
+fn ground_hides_geometry_below_and_is_one_sided() {
     let (scene, mut renderer) = (stage(|_| {}), open());
     let camera = from([0.5, 1.0, 7.0]);
     let mut frame = |eye: Camera, sunk: f32, lowest: f64| Frame::new(&mut renderer, &scene, eye, (sunk, lowest));
@@ -126,7 +128,7 @@ fn ground_hides_what_lies_below_it_and_is_not_there_from_below() {
 }
 
 #[test]
-fn what_lies_on_the_ground_is_seen_and_rounding_does_not_put_it_below() {
+fn geometry_on_the_ground_is_visible_despite_rounding() {
     let (scene, mut renderer) = (stage(|_| {}), open());
     let camera = from([1.0, 5.0, 4.0]);
     let rounded = Bounds { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];

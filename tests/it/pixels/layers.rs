@@ -1,4 +1,4 @@
-//! Blended triangles over each other: exact, whatever order they come in, and in two passes.
+//! Overlapping blended triangles: order-independent with exact transparency, and in scene order with two passes.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use modalcast_render::Lists;
 
 use super::build::{Picture, Stage, camera, close, draw, facing, open, picture};
 
-/// Seen by ambient light alone: colours show as they are.
+/// A material lit by ambient light alone, so that colors appear unchanged.
 fn painted(ambient: [f32; 3]) -> Material {
     Material { ambient, diffuse: [0.0; 3], ..Material::default() }
 }
@@ -24,14 +24,14 @@ fn stage(transparency: Transparency, samples: u32) -> Stage {
     stage
 }
 
-/// 40 x 40 pixels, at depth z.
+/// A pane of 40 x 40 pixels at depth z.
 fn pane(z: f32) -> Mesh {
-    // Farther ones are larger, so that all cover the same pixels.
+    // Farther panes are larger, so that all cover the same pixels.
     let half = 2.0 * (10.0 - z) / 10.0;
     facing(-half, -half, half, half, z)
 }
 
-/// The layers from the farthest to the nearest, over black.
+/// Blends layers from the farthest to the nearest over black.
 fn over(layers: &[([f32; 3], f32)]) -> [f64; 3] {
     layers.iter().fold([0.0; 3], |under, (colour, alpha)| {
         let mix = |channel: usize| {
@@ -49,8 +49,9 @@ const RED: [f32; 3] = [1.0, 0.1, 0.0];
 const GREEN: [f32; 3] = [0.0, 0.8, 0.2];
 const BLUE: [f32; 3] = [0.1, 0.3, 1.0];
 
+/// Control: two passes are correct only for layers in back-to-front order.
 #[test]
-fn two_layers_equal_the_arithmetic_in_either_order_and_two_passes_in_the_right_one_alone() {
+fn two_layers_blend_exactly_in_either_order() {
     let expected = over(&[(GREEN, 0.5), (RED, 0.25)]);
     for samples in [1, 4] {
         let shown = |transparency, near_first: bool| {
@@ -70,7 +71,7 @@ fn two_layers_equal_the_arithmetic_in_either_order_and_two_passes_in_the_right_o
     }
 }
 
-/// Three planes that cross each other, in an order.
+/// Three planes that intersect each other, added in the given order.
 fn crossing(transparency: Transparency, order: [usize; 3]) -> Vec<u8> {
     let tilted = |x: f32, y: f32| {
         let corner = |[u, v]: [f32; 2]| [2.0 * u, 2.0 * v, x * u + y * v + 0.013 * x];
@@ -82,8 +83,9 @@ fn crossing(transparency: Transparency, order: [usize; 3]) -> Vec<u8> {
     picture(&order.into_iter().fold(stage(transparency, 4), add).scene()).image.rgba
 }
 
+/// Control: with two passes the picture depends on the order.
 #[test]
-fn three_crossing_layers_give_the_same_bytes_in_every_order_and_two_passes_do_not() {
+fn crossing_layers_do_not_depend_on_the_order() {
     let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
     let first = crossing(Transparency::Exact, orders[0]);
     for order in &orders[1..] {
@@ -95,7 +97,7 @@ fn three_crossing_layers_give_the_same_bytes_in_every_order_and_two_passes_do_no
 }
 
 #[test]
-fn of_layers_in_one_plane_the_later_lies_in_front() {
+fn later_of_coplanar_layers_is_in_front() {
     for (first, second) in [(RED, BLUE), (BLUE, RED)] {
         let scene = stage(Transparency::Exact, 4).add(pane(0.0), glass(first, 0.5)).add(pane(0.0), glass(second, 0.5));
         let pixel = picture(&scene.scene()).at(30, 25);
@@ -104,7 +106,7 @@ fn of_layers_in_one_plane_the_later_lies_in_front() {
 }
 
 #[test]
-fn what_is_opaque_hides_glass_behind_it_and_shows_through_glass_before_it() {
+fn opaque_hides_glass_behind_and_shows_through_in_front() {
     let shown = |z: f32| {
         picture(&stage(Transparency::Exact, 4).add(pane(0.0), painted(BLUE)).add(pane(z), glass(RED, 0.5)).scene())
     };
@@ -116,9 +118,9 @@ fn what_is_opaque_hides_glass_behind_it_and_shows_through_glass_before_it() {
 }
 
 #[test]
-fn cut_outs_and_glass_keep_their_places() {
+fn cut_outs_and_glass_keep_their_depth_order() {
     for transparency in [Transparency::Exact, Transparency::TwoPass] {
-        // Cut away on the left, solid on the right; glass before and behind it.
+        // The leaf is cut away on the left and solid on the right, with glass in front of it and behind it.
         let mut stage = stage(transparency, 4);
         let image = stage.texture(2, 1, |x, _| if x == 0 { [255, 255, 255, 0] } else { [255; 4] });
         let mask = AlphaMode::Mask { cutoff: 0.5 };
@@ -132,7 +134,7 @@ fn cut_outs_and_glass_keep_their_places() {
 }
 
 #[test]
-fn the_edge_of_glass_covers_its_samples_and_so_does_an_opaque_edge_before_it() {
+fn edges_of_glass_and_opaque_surfaces_are_multisampled() {
     for (edge, share) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
         let strip = || facing(-1.0, -1.0, 0.1 * edge, 1.0, 0.0);
         let shown = |stage: Stage| picture(&stage.scene()).at(32, 30);
@@ -155,7 +157,8 @@ fn triangles_of_one_pane_show_no_seam() {
     assert_eq!(lists(&shown).deepest, 2, "pixels on the diagonal see both triangles");
 }
 
-/// Layers of many colours, nearer ones brighter; `order` says which place each has in the scene.
+/// A stack of layers with different colors and opacities. `order` maps the position of a layer in the scene to its
+/// place in depth, counted from the farthest.
 fn stack(count: u32, order: impl Fn(u32) -> u32, set: impl Fn(&mut Stage)) -> Arc<Scene> {
     let mut stage = stage(Transparency::Exact, 1);
     set(&mut stage);
@@ -172,14 +175,14 @@ fn layer(place: u32, count: u32) -> ([f32; 3], f32) {
     ([shade, 1.0 - shade, 0.5], 0.1 + 0.2 * shade)
 }
 
-/// The same where all but the nearest are wholly transparent.
+/// The same stack, with all but the `kept` nearest layers fully transparent.
 fn nearest(count: u32, kept: u32) -> Arc<Scene> {
     let share = |place: u32| if place >= count - kept { 1.0 } else { 0.0 };
     (0..count).fold(stage(Transparency::Exact, 1), |stage, place| layered(stage, place, count, share(place))).scene()
 }
 
 #[test]
-fn long_lists_are_sorted_too() {
+fn long_fragment_lists_are_sorted() {
     for count in [31, 32, 33, 34, 61, 97] {
         let sorted = picture(&stack(count, |index| index, |_| ()));
         let mixed = picture(&stack(count, |index| index * 7 % count, |_| ()));
@@ -192,8 +195,9 @@ fn long_lists_are_sorted_too() {
     }
 }
 
+/// Each pixel keeps its nearest fragments, and the statistics count the dropped ones.
 #[test]
-fn over_the_budget_each_pixel_keeps_its_nearest_and_the_rest_is_counted() {
+fn fragments_over_budget_keep_the_nearest() {
     let limited = |budget: Option<u32>, order: fn(u32) -> u32| {
         picture(&stack(10, order, |stage| stage.0.look.fragments = budget))
     };
@@ -214,7 +218,7 @@ fn over_the_budget_each_pixel_keeps_its_nearest_and_the_rest_is_counted() {
 }
 
 #[test]
-fn of_layers_in_one_plane_that_do_not_fit_the_latest_are_kept() {
+fn latest_of_coplanar_layers_are_kept_over_budget() {
     let colours = [RED, GREEN, BLUE, RED, GREEN];
     let mut stage = stage(Transparency::Exact, 1);
     stage.0.look.fragments = Some(3200);
@@ -225,7 +229,7 @@ fn of_layers_in_one_plane_that_do_not_fit_the_latest_are_kept() {
 }
 
 #[test]
-fn a_scene_over_its_budget_gives_the_same_bytes_each_time() {
+fn scene_over_budget_is_deterministic() {
     let scene = stack(
         40,
         |index| index * 7 % 40,
@@ -243,20 +247,20 @@ fn a_scene_over_its_budget_gives_the_same_bytes_each_time() {
 }
 
 #[test]
-fn two_passes_draw_what_reaches_the_threshold_as_opaque() {
+fn two_passes_draw_alpha_above_threshold_as_opaque() {
     let shown = |opaque_alpha: f32| {
         let mut stage = stage(Transparency::TwoPass, 4);
         stage.0.look.opaque_alpha = opaque_alpha;
         let image = stage.texture(2, 1, |x, _| if x == 0 { [255, 255, 255, 128] } else { [255; 4] });
         let leaf = Material { colour_texture: Some(image), ..glass(GREEN, 1.0) };
-        // The farther pane comes later in the scene: only depth keeps it behind.
+        // The farther pane comes later in the scene, so only the depth test keeps it behind.
         picture(&stage.add(pane(0.0), leaf).add(pane(-1.0), glass(RED, 0.5)).scene())
     };
     let (parts, none) = (shown(0.95), shown(1.5));
     assert!(close(parts.at(42, 30), GREEN.map(f64::from), 1.0), "{:?}", parts.at(42, 30));
     assert!(close(none.at(42, 30), over(&[(GREEN, 1.0), (RED, 0.5)]), 2.0), "control: {:?}", none.at(42, 30));
     let wrong = over(&[(GREEN, 128.0 / 255.0), (RED, 0.5)]);
-    // Near the middle of the texel that is half there; the other one is opaque about its middle.
+    // Near the center of the half-transparent texel; the other texel is opaque around its center.
     assert!(close(parts.at(22, 30), wrong, 2.0), "blended in the order of the scene: {:?}", parts.at(22, 30));
     assert_eq!((parts.ran.draws, none.ran.draws), (2, 1));
     assert_eq!(none.ran.passes, ["blended", "backdrop", "encode"]);

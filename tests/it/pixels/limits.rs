@@ -1,4 +1,4 @@
-//! What a scene does not need is not made; extreme sizes, cameras and vertices; the same input gives the same bytes.
+//! Unused features allocate and run nothing; extreme sizes, cameras and vertices; determinism.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Deformer as _, Surface};
@@ -14,8 +14,9 @@ fn full() -> Stage {
     stage
 }
 
+/// Allocated buffers and executed passes equal the plan of the scene.
 #[test]
-fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_no_blended_pass() {
+fn unused_features_allocate_and_run_nothing() {
     let plain = picture(&full().add(lying(1.0, -0.5), Material::default()).scene());
     let names = |list: &[modalcast_render::Allocation]| {
         list.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
@@ -49,7 +50,7 @@ fn a_scene_without_normal_maps_allocates_no_tangents_and_one_without_blend_runs_
 }
 
 #[test]
-fn the_draw_calls_are_two_of_a_kind_at_most_whatever_the_domains_and_materials() {
+fn draw_calls_do_not_grow_with_domains_and_materials() {
     let draws = |domains: usize| {
         let mut stage = Stage::new();
         for index in 0..domains {
@@ -65,7 +66,7 @@ fn the_draw_calls_are_two_of_a_kind_at_most_whatever_the_domains_and_materials()
 }
 
 #[test]
-fn frames_of_no_size_and_above_the_limit_are_refused_with_the_numbers() {
+fn empty_and_oversized_frames_are_refused() {
     let scene = Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
     let mut renderer = open();
     let buffers = renderer.load(&scene).expect("loads");
@@ -80,8 +81,9 @@ fn frames_of_no_size_and_above_the_limit_are_refused_with_the_numbers() {
     assert_eq!(renderer.draw(&buffers, &shot).expect("one pixel is a frame").rgba.len(), 4);
 }
 
+/// Cut-outs stay cut out.
 #[test]
-fn a_frame_too_large_for_four_samples_is_drawn_with_one_and_keeps_its_cut_outs() {
+fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
     let mut stage = Stage::new();
     let image = stage.texture(2, 1, |x, _| [255, 255, 255, 255 * x as u8]);
     let alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
@@ -97,7 +99,7 @@ fn a_frame_too_large_for_four_samples_is_drawn_with_one_and_keeps_its_cut_outs()
 }
 
 #[test]
-fn the_same_input_gives_the_same_bytes_and_another_does_not() {
+fn frames_are_deterministic() {
     let scene = full().add(lying(1.0, 0.5), Material::default()).add(lying(0.5, 1.0), Material::default()).scene();
     let mut renderer = open();
     let first = draw(&mut renderer, &scene, Camera::framing(&scene, 64, 64), 96);
@@ -111,8 +113,9 @@ fn the_same_input_gives_the_same_bytes_and_another_does_not() {
     assert!(first.image.rgba != draw(&mut renderer, &scene, moved, 96).image.rgba, "control");
 }
 
+/// Triangles without area, a sun straight above, and a camera inside the mesh.
 #[test]
-fn degenerate_triangles_light_from_straight_up_and_a_camera_inside_the_mesh_are_drawn() {
+fn degenerate_scenes_suns_and_cameras_are_drawn() {
     let line = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
     let triangles = vec![[0, 1, 2], [0, 0, 0], [0, 3, 1]];
     let flat = Mesh::indexed(line, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("degenerate, yet a mesh");
@@ -127,7 +130,7 @@ fn degenerate_triangles_light_from_straight_up_and_a_camera_inside_the_mesh_are_
 }
 
 #[test]
-fn vertices_that_overflowed_spoil_no_other_pixel_and_blacken_none() {
+fn overflowed_vertices_leave_no_black_pixels() {
     let mut stage = full();
     stage.0.look.horizon = [0.5; 3];
     let scene = stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).scene();
@@ -149,7 +152,7 @@ fn vertices_that_overflowed_spoil_no_other_pixel_and_blacken_none() {
 }
 
 #[test]
-fn a_scene_far_from_the_origin_still_shows() {
+fn scene_far_from_the_origin_is_rendered() {
     let mut parts = full().add(lying(1.0, 1.0), Material::default()).add(lying(0.5, 0.0), Material::default()).0;
     for domain in &mut parts.domains {
         let mut place = Transform::IDENTITY;
@@ -162,7 +165,7 @@ fn a_scene_far_from_the_origin_still_shows() {
 }
 
 #[test]
-fn renderers_come_and_go_on_many_threads_and_on_one() {
+fn renderers_work_on_many_threads_and_two_on_one() {
     let draw_one = || {
         let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
         draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 32).image.rgba
@@ -185,7 +188,7 @@ fn renderers_come_and_go_on_many_threads_and_on_one() {
 }
 
 #[test]
-fn every_device_says_what_it_is_and_a_missing_one_is_refused_by_name() {
+fn devices_are_listed_and_missing_ones_refused() {
     let found = devices().expect("EGL");
     assert!(found.iter().any(|device| device.renderer.is_some()), "{found:?}");
     for device in &found {

@@ -1,4 +1,4 @@
-//! Picks against arithmetic: which triangle, where on it, and what is no hit.
+//! Picks compared with arithmetic: triangle, barycentric coordinates, position, and pixels without a hit.
 
 use std::sync::Arc;
 
@@ -11,8 +11,8 @@ use nalgebra::Vector3;
 
 use super::build::{Stage, camera, facing, lying, open};
 
-/// Ids are those of the frame unless an edge passes a sample by less than the rasteriser's 1/256 pixel; the point is met in
-/// f64 on the f32 triangle, so that in these scenes it is right to a millionth of a unit.
+/// Ids are those of the frame unless an edge passes a sample by less than the rasterizer's 1/256 pixel. The hit
+/// position is computed in f64 on the f32 triangle, so in these scenes it is correct to a millionth of a unit.
 const NEAR: f64 = 1e-6;
 
 struct Board {
@@ -39,7 +39,7 @@ impl Board {
         Shot { camera, width: size, height: size, bounds: self.bounds, light: None }
     }
 
-    /// In a square picture: the hits of a rectangle, by its corner and size.
+    /// Hits of a rectangle of a square picture, given by its corner and size.
     fn pick(&mut self, camera: Camera, picture: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<Hit> {
         let rectangle = Rectangle::within([picture; 2], corner, size).expect("inside");
         let shot = self.shot(camera, picture);
@@ -52,13 +52,13 @@ fn off(got: [f64; 3], want: [f64; 3]) -> f64 {
     (Vector3::from(got) - Vector3::from(want)).abs().max()
 }
 
-/// Where the middle of a pixel of [`camera`]`(64)` meets the plane z = 0.
+/// Intersection of the ray through the center of a pixel of [`camera`]`(64)` with the plane z = 0.
 fn at(x: u32, y: u32) -> [f64; 3] {
     [(f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0]
 }
 
 #[test]
-fn a_pick_tells_domain_triangle_shares_position_normal_and_depth() {
+fn pick_has_domain_triangle_position_normal_and_depth() {
     let stage = Stage::new().add(facing(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
     let scene = stage.add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), Material::default()).scene();
     let hits = Board::rest(&scene).pick(camera(64), 64, [40, 30], [1, 1]);
@@ -67,20 +67,21 @@ fn a_pick_tells_domain_triangle_shares_position_normal_and_depth() {
     assert_eq!((hit.pixel, hit.domain, hit.triangle, hit.vertices), ([40, 30], 1, 0, [0, 1, 2]));
     assert!(off(hit.position, [x, y, 0.0]) < NEAR && off(hit.normal, [0.0, 0.0, 1.0]) < NEAR, "{hit:?}");
     assert!((hit.depth - 10.0).abs() < NEAR);
-    // (-2, -1), (2, -1), (2, 1): the second share is what is left of the others.
+    // Corners (-2, -1), (2, -1), (2, 1); the second barycentric coordinate is the remainder.
     let [first, third] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
     assert!(off(hit.shares, [first, 1.0 - first - third, third]) < NEAR, "{hit:?}");
 }
 
+/// A hit on the back side has a flipped normal.
 #[test]
-fn a_mirrored_domain_keeps_the_order_of_its_mesh_and_a_back_side_turns_its_normal() {
+fn mirrored_domains_keep_vertex_order_in_picks() {
     let double_sided = Material { double_sided: true, ..Material::default() };
     let mut stage = Stage::new().add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), double_sided);
     stage.0.domains[0].placement.0[0] = -1.0;
     let scene = stage.scene();
     let mut board = Board::rest(&scene);
     let hit = board.pick(camera(64), 64, [24, 34], [1, 1]).remove(0);
-    // The mesh's point is mirrored in x.
+    // The point on the mesh is mirrored in x.
     let [x, y, _] = at(24, 34);
     assert_eq!(hit.vertices, [0, 1, 2]);
     assert!(off(hit.shares, [(2.0 + x) / 4.0, 1.0 - (2.0 + x) / 4.0 - (y + 1.0) / 2.0, (y + 1.0) / 2.0]) < NEAR);
@@ -92,7 +93,7 @@ fn a_mirrored_domain_keeps_the_order_of_its_mesh_and_a_back_side_turns_its_norma
 }
 
 #[test]
-fn after_a_step_the_pick_moves_with_the_surface() {
+fn pick_follows_the_deformed_surface() {
     let mesh = facing(-1.0, -1.0, 1.0, 1.0, 0.0);
     let columns = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
     let mut stage = Stage::new().add(mesh.clone(), Material::default());
@@ -103,14 +104,15 @@ fn after_a_step_the_pick_moves_with_the_surface() {
         state.q[0] = q;
         let hit = Board::of(&scene, &state).pick(camera(64), 64, [36, 27], [1, 1]).remove(0);
         let (z, [x, y, _]) = (f64::from(q), at(36, 27));
-        // The ray from (0, 0, 10) meets the plane at z a little nearer or farther.
+        // The ray from (0, 0, 10) meets the plane at this z instead of the plane z = 0.
         let want = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
         assert!(off(hit.position, want) < NEAR && (hit.depth - 10.0 + z).abs() < NEAR, "{q}: {hit:?}");
     }
 }
 
+/// For rectangles of the largest size and at the border of the picture.
 #[test]
-fn every_pixel_of_the_largest_rectangle_and_at_the_border_sees_what_the_frame_sees() {
+fn picks_agree_with_the_visibility_of_the_frame() {
     let mut stage = Stage::new();
     stage.0.look.samples = 1;
     stage.0.look.ground = Some(Ground::default());
@@ -145,20 +147,21 @@ fn every_pixel_of_the_largest_rectangle_and_at_the_border_sees_what_the_frame_se
                 }
             }
         }
-        // An edge may pass a sample by less than the rasteriser tells.
+        // An edge may pass a sample by less than the rasterizer's precision.
         assert!(differ <= 5, "{differ} of 10000 pixels");
         assert!(holes > 500 && seen.iter().all(|count| *count > 100), "control: {holes} {seen:?}");
     }
 }
 
+/// A surface behind a hole is hit.
 #[test]
-fn holes_blended_surfaces_sky_and_ground_are_no_hit_and_what_stands_behind_a_hole_is() {
+fn holes_glass_sky_and_ground_are_not_hit() {
     let mut stage = Stage::new();
     let image = stage.texture(2, 1, |x, _| [200, 200, 200, if x == 0 { 255 } else { 0 }]);
     let leaf =
         Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(image), ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
-    // The leaf is whole on its left half and open on its right one; the glass stands before its upper right.
+    // The leaf is solid on its left half and open on its right half. The glass covers the upper half, in front of it.
     let scene = stage
         .add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), leaf)
         .add(facing(-2.0, -2.0, 2.0, 0.0, -1.0), Material::default())
@@ -178,7 +181,7 @@ fn holes_blended_surfaces_sky_and_ground_are_no_hit_and_what_stands_behind_a_hol
 }
 
 #[test]
-fn picks_begun_together_end_in_any_order_each_with_its_own_rectangle() {
+fn concurrent_picks_finish_in_any_order() {
     let scene = Stage::new().add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), Material::default()).scene();
     let mut board = Board::rest(&scene);
     let shot = board.shot(camera(64), 64);
@@ -195,8 +198,9 @@ fn picks_begun_together_end_in_any_order_each_with_its_own_rectangle() {
     }
 }
 
+/// Normals that are zero or NaN give a zero normal.
 #[test]
-fn a_triangle_far_from_the_origin_of_its_positions_or_without_area_gives_finite_numbers() {
+fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
     let scene = Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
     let mut board = Board::rest(&scene);
     let away = [1e7, 0.0, -1e7];
@@ -216,7 +220,7 @@ fn a_triangle_far_from_the_origin_of_its_positions_or_without_area_gives_finite_
 }
 
 #[test]
-fn a_scene_of_one_triangle_before_a_near_camera_is_picked_at_its_corners_pixel() {
+fn tiny_triangle_near_the_camera_is_picked() {
     let mesh = Mesh::indexed(
         vec![[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0]],
         vec![[0.0, 0.0, 1.0]; 3],

@@ -1,4 +1,4 @@
-//! Tone curves, glow, smoothed edges and mixed levels against arithmetic.
+//! Tone curves, bloom, antialiasing and dithering, compared with arithmetic.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Deformer as _, Surface};
@@ -8,7 +8,7 @@ use modalcast_render::Shot;
 
 use super::build::{Picture, Stage, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb};
 
-/// A stage whose white surfaces give this light, with one sample a pixel.
+/// A stage with one sample per pixel whose white surfaces emit this linear light.
 fn glowing(light: [f32; 3], change: impl FnOnce(Look) -> Look) -> Stage {
     let mut stage = Stage::new();
     stage.0.look.skylight = light;
@@ -35,11 +35,11 @@ fn aces(light: f64) -> f64 {
 }
 
 #[test]
-fn a_tone_curve_has_its_known_values_before_and_after_a_glow() {
+fn tone_curves_have_their_known_values() {
     let shown = |light: [f32; 3], look: &dyn Fn(Look) -> Look| {
         picture(&glowing(light, look).add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), white()).scene()).at(32, 32)
     };
-    // Too high a threshold for anything to glow: the curve is gone through there and back.
+    // A threshold that only the light of 1e30 exceeds. The bloom pass inverts the tone curve and applies it again.
     let idle = Some(Bloom { threshold: 1000.0, ..Bloom::default() });
     for light in [[0.01, 0.18, 0.5], [1.0, 2.0, 8.0], [0.0, 30.0, 1e30]] {
         let wide = light.map(f64::from);
@@ -58,7 +58,7 @@ fn a_tone_curve_has_its_known_values_before_and_after_a_glow() {
     assert!(!close(got, [0.18, 0.5, 2.0].map(reinhard), 10.0), "control: the curves differ");
 }
 
-/// Sum and centroid of the red light, in pixels from the top left.
+/// Sum and centroid of the red light; the centroid is in pixels from the top left.
 fn sum_and_centroid(shown: &Picture) -> (f64, [f64; 2]) {
     let (mut sum, mut moment) = (0.0, [0.0; 2]);
     for y in 0..shown.image.height {
@@ -72,15 +72,15 @@ fn sum_and_centroid(shown: &Picture) -> (f64, [f64; 2]) {
 }
 
 #[test]
-fn one_bright_pixel_glows_around_its_middle_with_the_light_that_it_had() {
+fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     let shown = |light: f32, bloom: Option<Bloom>, size: [u32; 2]| {
-        // One pixel, the second from the middle: x 33, and y 30 from the top.
+        // One pixel, the second from the center: x = 33, and y = 30 from the top.
         let pixel = facing(0.1, 0.1, 0.2, 0.2, 0.0);
         let scene = glowing([light; 3], |look| Look { bloom, ..look }).add(pixel, white()).scene();
         draw_sized(&mut open(), &scene, camera(64), size)
     };
     let all = |threshold: f32, levels: u32| Some(Bloom { threshold, strength: 1.0, levels });
-    // Pixels that end below white, so that all of their light is in the picture.
+    // The blurred pixels end below white, so that the picture contains all of their light.
     for (size, levels, light, above) in
         [([64, 64], 3, 8.0, 0.0), ([61, 67], 3, 8.0, 0.0), ([64, 64], 1, 8.0, 0.0), ([64, 64], 2, 1.2, 0.6)]
     {
@@ -97,7 +97,7 @@ fn one_bright_pixel_glows_around_its_middle_with_the_light_that_it_had() {
 }
 
 #[test]
-fn a_glow_in_the_middle_is_the_same_in_every_mirror_and_leaves_what_is_below_the_threshold() {
+fn bloom_is_symmetric_and_respects_its_threshold() {
     let four = facing(-0.1, -0.1, 0.1, 0.1, 0.0);
     let bloom =
         |threshold| Look { bloom: Some(Bloom { threshold, strength: 0.8, levels: 4 }), ..Look::default() }.bloom;
@@ -119,12 +119,14 @@ fn a_glow_in_the_middle_is_the_same_in_every_mirror_and_leaves_what_is_below_the
     assert!(shown.image.rgba != plain.image.rgba, "control");
 }
 
+/// Each sample goes through the tone curve, a clamp here, before the samples of a pixel are averaged. The light for the
+/// bloom is extracted from each sample before that.
 #[test]
-fn the_rim_of_a_bright_surface_stays_smooth_when_light_above_white_is_kept_for_a_glow() {
+fn bright_edges_stay_antialiased_with_bloom() {
     let shown = |bloom: Option<Bloom>| {
         let stage = glowing([50.0; 3], |look| Look { bloom, samples: 4, ..look });
         let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white() };
-        // The lamp covers the right half of the pixels of column 32; half of it is behind dark glass.
+        // The lamp covers the right half of the pixels of column 32. Its upper half is behind dark glass.
         let scene = stage.add(facing(0.05, -2.0, 2.0, 2.0, 0.0), white()).add(facing(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
         picture(&scene.scene())
     };
@@ -138,7 +140,7 @@ fn the_rim_of_a_bright_surface_stays_smooth_when_light_above_white_is_kept_for_a
     assert!(plain.image.rgba != shown(Some(Bloom::default())).image.rgba, "control");
 }
 
-/// A white rhomb with slanted edges before grey, `scale` times 64 pixels a side.
+/// A white rhombus with slanted edges on gray, `scale` times 64 pixels per side.
 fn slanted(antialias: Antialias, samples: u32, scale: u32) -> Picture {
     let rest = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
     let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a rhomb");
@@ -150,7 +152,7 @@ fn slanted(antialias: Antialias, samples: u32, scale: u32) -> Picture {
     draw(&mut open(), &stage.add(mesh, white()).scene(), Camera { lens, ..camera(64) }, 64 * scale)
 }
 
-/// Mean difference from the mean light of 8 x 8 pixels, in levels.
+/// Mean difference from the average light of 8 x 8 fine pixels, in levels.
 fn error(shown: &Picture, fine: &Picture) -> f64 {
     let exact = |x: u32, y: u32| {
         let light = |i: u32| linear(fine.at(8 * x + i % 8, 8 * y + i / 8)[0]);
@@ -161,7 +163,7 @@ fn error(shown: &Picture, fine: &Picture) -> f64 {
 }
 
 #[test]
-fn fxaa_brings_slanted_edges_nearer_to_64_samples_and_leaves_flat_areas_as_they_are() {
+fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     let fine = slanted(Antialias::None, 1, 8);
     let (none, fxaa) = (slanted(Antialias::None, 1, 1), slanted(Antialias::Fxaa, 4, 1));
     let [one, smoothed, four] = [&none, &fxaa, &slanted(Antialias::Samples, 4, 1)].map(|shown| error(shown, &fine));
@@ -179,14 +181,14 @@ fn fxaa_brings_slanted_edges_nearer_to_64_samples_and_leaves_flat_areas_as_they_
     assert!(changed > 100, "control: {changed} pixels were smoothed");
 }
 
-/// A sky that lies between two levels in each channel.
+/// A sky whose values lie between two levels in each channel.
 fn sky(dither: bool) -> Picture {
     let mut stage = glowing([0.0; 3], |look| Look { dither, ..look });
     (stage.0.look.zenith, stage.0.look.horizon) = ([0.2985, 0.06, 0.41], [0.2988, 0.0601, 0.4103]);
     picture(&stage.add(facing(-0.1, -3.2, 0.1, -3.1, 0.0), white()).scene())
 }
 
-/// The exact level of a channel of that sky.
+/// Exact level of a channel of that sky.
 fn exact(x: u32, y: u32, channel: usize) -> f64 {
     let away = nalgebra::Vector3::new((f64::from(x) - 31.5) / 100.0, (31.5 - f64::from(y)) / 100.0, -1.0).normalize();
     let sine = away.y.max(0.0);
@@ -196,14 +198,14 @@ fn exact(x: u32, y: u32, channel: usize) -> f64 {
 }
 
 #[test]
-fn dithering_stays_within_a_level_and_keeps_the_mean_that_rounding_loses() {
+fn dithering_stays_within_one_level_and_keeps_the_mean() {
     let (rounded, mixed) = (sky(false), sky(true));
     let pixels = || (0..64).flat_map(|y| (0..64).map(move |x| (x, y)));
     for (x, y) in pixels() {
         let (one, other) = (rounded.at(x, y), mixed.at(x, y));
         assert!((0..3).all(|channel| one[channel].abs_diff(other[channel]) <= 1), "({x}, {y})");
     }
-    // The upper half alone: below the horizon the sky is one colour.
+    // Only the upper half, because the sky has one color below the horizon.
     let bias = |shown: &Picture, channel: usize| {
         let block = |corner: (u32, u32)| {
             let off = |i: u32| {
@@ -230,8 +232,9 @@ fn everything(look: Look) -> Look {
     Look { bloom, tone: Tone::Aces, exposure: 1.3, antialias: Antialias::Fxaa, dither: true, ..look }
 }
 
+/// Only the post-processing passes that the scene names run.
 #[test]
-fn the_same_input_gives_the_same_bytes_whatever_is_named_and_only_the_named_passes_run() {
+fn post_processing_is_deterministic() {
     let scene = |look: Look| {
         let mut stage = Stage::new();
         stage.0.look = look;
@@ -250,7 +253,7 @@ fn the_same_input_gives_the_same_bytes_whatever_is_named_and_only_the_named_pass
 }
 
 #[test]
-fn light_that_is_no_number_or_infinite_spoils_no_other_pixel() {
+fn nan_and_infinite_light_affect_no_other_pixel() {
     for tone in [Tone::None, Tone::Reinhard, Tone::Aces] {
         for bloom in [None, Some(Bloom { threshold: 0.9, strength: 1.0, levels: 8 })] {
             let mut stage = glowing([0.25; 3], |look| Look { tone, bloom, ..look });

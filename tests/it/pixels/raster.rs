@@ -1,4 +1,5 @@
-//! The rasteriser's definition beside OpenGL: ids differ only where depths tie, or where the sample lies on an edge.
+//! The definition of the compute rasterizer compared with OpenGL: ids differ only where depths tie or where a sample
+//! lies on an edge.
 
 use std::sync::Arc;
 
@@ -15,9 +16,9 @@ use crate::both::exact::{Exact, compare};
 use crate::scenes::Random;
 
 const SIZE: [u32; 2] = [320, 240];
-/// Depth precision: 24 bits of the window's range from each side.
+/// Depth precision: 24 bits of the depth range of the window, for each of the two rasterizers.
 const TIE: f64 = 2.0 / (1 << 24) as f64;
-/// Triangles of many sizes in one domain, all around and behind the eye.
+/// Triangles of many sizes in one domain, around and behind the eye.
 fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
     let mut rest = Vec::new();
@@ -39,7 +40,7 @@ fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
 }
 
 #[test]
-fn ids_are_those_of_opengl_but_on_edges_and_where_depths_tie() {
+fn ids_equal_opengl_except_on_edges_and_depth_ties() {
     let mut renderer = open();
     for (seed, eye) in [(1, [0.0, 0.5, 9.0]), (2, [0.3, 0.2, 0.5]), (3, [-6.0, 4.0, 2.0])] {
         let (scene, triangles) = scene(seed);

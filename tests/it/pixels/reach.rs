@@ -1,4 +1,5 @@
-//! Frames draw and clear no more than their scene can take up: what an earlier frame left elsewhere is never seen.
+//! Frames draw and clear only the region that their scene can cover. Remains of earlier frames outside of it never
+//! become visible.
 
 use std::sync::Arc;
 
@@ -10,7 +11,7 @@ use super::build::{Stage, camera, facing, open};
 
 const SIZE: u32 = 96;
 
-/// An opaque square, a leaf with holes before it and a pane before that.
+/// An opaque square, a leaf with holes in front of it, and a pane in front of the leaf.
 fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
     let mut stage = Stage::new();
     look(&mut stage.0.look);
@@ -23,7 +24,7 @@ fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
     stage.add(facing(-0.4, -0.6, 0.9, 0.7, 0.0), leaf).add(facing(0.0, 0.0, 1.0, 1.0, 0.5), glass).scene()
 }
 
-/// The scene at rest, where every vertex is where its mesh says.
+/// Loads the scene with every vertex at its rest position.
 fn loaded(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
     let buffers = renderer.load(scene).expect("loads");
     let mut surface = modalcast_model::deform::Surface::default();
@@ -36,7 +37,7 @@ fn loaded(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
     buffers
 }
 
-/// The camera so many pixels aside.
+/// The camera with its principal point shifted by this many pixels.
 fn aside([x, y]: [f64; 2]) -> Camera {
     let mut moved = camera(SIZE);
     if let modalcast_model::scene::Lens::Intrinsics { cx, cy, .. } = &mut moved.lens {
@@ -54,7 +55,7 @@ fn frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, bounds
 }
 
 #[test]
-fn a_frame_after_others_elsewhere_is_that_of_a_fresh_renderer() {
+fn reused_targets_render_like_a_fresh_renderer() {
     let looks: [fn(&mut Look); 6] = [
         |look| look.samples = 1,
         |_| {},
@@ -83,7 +84,7 @@ fn a_frame_after_others_elsewhere_is_that_of_a_fresh_renderer() {
 }
 
 #[test]
-fn scenes_that_share_a_target_do_not_see_each_other() {
+fn scenes_sharing_a_target_do_not_affect_each_other() {
     let mut other = Stage::new();
     other.0.look.sunlight = [0.9, 0.3, 0.2];
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.6, double_sided: true, ..Material::default() };
@@ -103,12 +104,12 @@ fn scenes_that_share_a_target_do_not_see_each_other() {
 }
 
 #[test]
-fn what_reaches_beyond_the_bounds_of_its_shot_leaves_nothing_behind() {
+fn geometry_outside_the_bounds_leaves_no_remains() {
     for transparency in [Transparency::TwoPass, Transparency::Exact] {
         let scene = stage(|look| look.transparency = transparency);
         let mut renderer = open();
         let buffers = loaded(&mut renderer, &scene);
-        // Cut on all sides, between two pixels that are shaded together or beside them.
+        // Bounds smaller than the scene: they cut it on all sides, between two pixels of one quad or next to a quad.
         let told = Bounds { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
         let mut draw = |place: [f64; 2]| frame(&mut renderer, &buffers, aside(place), told);
         for place in [[0.0; 2], [1.0; 2]] {
@@ -120,7 +121,7 @@ fn what_reaches_beyond_the_bounds_of_its_shot_leaves_nothing_behind() {
 }
 
 #[test]
-fn nothing_is_drawn_outside_of_the_bounds_of_a_shot() {
+fn nothing_is_drawn_outside_the_given_bounds() {
     let (scene, mut renderer) = (stage(|_| {}), open());
     let buffers = loaded(&mut renderer, &scene);
     let mut ids = |bounds: Bounds| {

@@ -1,4 +1,4 @@
-//! Area, Phong, normal maps, cut-outs, blending, sky, and which way is up.
+//! Coverage, Phong shading, normal maps, cut-outs, blending, the sky, and image orientation.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Lens, Transparency, View};
@@ -11,14 +11,14 @@ fn plain(diffuse: [f32; 3]) -> Material {
 }
 
 #[test]
-fn a_judge_of_pixels_can_say_no() {
+fn pixel_comparison_can_fail() {
     assert!(close([188, 188, 188], [0.5; 3], 1.0));
     assert!(!close([186, 188, 188], [0.5; 3], 1.0));
     assert!(!close([0, 0, 0], [f64::NAN; 3], 1.0));
 }
 
 #[test]
-fn a_square_covers_exactly_its_pixels() {
+fn square_covers_exactly_its_pixels() {
     let shown = picture(&Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene());
     assert_eq!(shown.count(|pixel| pixel != [0; 3]), 400);
     assert_eq!((shown.at(21, 32), shown.at(42, 32)), ([0; 3], [0; 3]));
@@ -29,7 +29,7 @@ fn a_square_covers_exactly_its_pixels() {
 }
 
 #[test]
-fn the_top_row_comes_first_and_left_is_left() {
+fn top_row_comes_first_and_left_is_left() {
     let red = facing(-3.2, 2.2, -2.2, 3.2, 0.0);
     let green = facing(2.2, -3.2, 3.2, -2.2, 0.0);
     let shown = picture(&Stage::new().add(red, plain([1.0, 0.0, 0.0])).add(green, plain([0.0, 1.0, 0.0])).scene());
@@ -39,12 +39,12 @@ fn the_top_row_comes_first_and_left_is_left() {
 }
 
 #[test]
-fn the_first_row_of_an_image_is_the_top_of_the_surface() {
+fn first_image_row_is_the_top_of_the_surface() {
     let mut stage = Stage::new();
     let image = stage.texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
     let material = Material { colour_texture: Some(image), ..Material::default() };
     let shown = picture(&stage.add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), material).scene());
-    // Half a texel from the edge the texels' own colours stand.
+    // Half a texel from the edge of the image, each texel has its own color.
     for (x, y, colour) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
         let [r, g, b] = shown.at(x, y);
         assert!(b == 0, "{x} {y}");
@@ -52,7 +52,7 @@ fn the_first_row_of_an_image_is_the_top_of_the_surface() {
     }
 }
 
-/// Equation 3.12 with clamped dots and unshadowed ambient, in f64, for a surface that faces +Z seen along it.
+/// Equation 3.12 in f64 with clamped dot products and unshadowed ambient light, for a surface that faces +Z.
 fn phong(stage: &Stage, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
     let look = &stage.0.look;
     let sun = Vector3::from(look.sun).cast::<f64>().normalize();
@@ -69,7 +69,7 @@ fn phong(stage: &Stage, material: &Material, point: Vector3<f64>, eye: Vector3<f
 }
 
 #[test]
-fn phong_at_a_pixel_equals_the_arithmetic_in_f64() {
+fn phong_shading_equals_f64_arithmetic() {
     let material = Material {
         ambient: [0.9, 0.2, 0.1],
         diffuse: [0.1, 0.5, 0.3],
@@ -98,7 +98,7 @@ fn phong_at_a_pixel_equals_the_arithmetic_in_f64() {
 }
 
 #[test]
-fn the_sky_goes_from_horizon_to_zenith_by_its_formula() {
+fn sky_gradient_equals_its_formula() {
     let mut stage = Stage::new();
     stage.0.look.zenith = [0.1, 0.3, 0.8];
     stage.0.look.horizon = [0.7, 0.8, 0.9];
@@ -114,7 +114,7 @@ fn the_sky_goes_from_horizon_to_zenith_by_its_formula() {
 }
 
 #[test]
-fn a_normal_map_changes_the_shading_and_a_flat_one_does_not() {
+fn normal_map_changes_shading_and_a_flat_one_does_not() {
     let with = |pixel: Option<[u8; 4]>| {
         let mut stage = Stage::new();
         stage.0.look.sun = [0.6, 0.0, 0.8];
@@ -125,7 +125,7 @@ fn a_normal_map_changes_the_shading_and_a_flat_one_does_not() {
     let lit = |facing: f64| [0.25 + 0.5 * facing; 3];
     assert!(close(with(None).at(32, 32), lit(0.8), 1.0));
     assert!(close(with(Some([128, 128, 255, 255])).at(32, 32), lit(0.8), 1.0), "a flat map is no map");
-    // Tangent space: x along u, y against v, z along the normal; 0.6 and 0.8 of 127 steps.
+    // Tangent space: x along u, y against v, z along the normal. 0.6 and 0.8 are encoded in steps of 1/127.
     assert!(close(with(Some([204, 128, 230, 255])).at(32, 32), lit(1.0), 1.0), "turned to the sun");
     assert!(close(with(Some([52, 128, 230, 255])).at(32, 32), lit(0.28), 2.0), "turned away");
     let up = with(Some([128, 204, 230, 255]));
@@ -144,7 +144,7 @@ fn plus_y_of_a_normal_map_points_up_the_image() {
     assert!(close(with(204), [0.75; 3], 1.0) && close(with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
 }
 
-/// A red leaf whose middle half is cut away, before nothing.
+/// A red leaf in front of an empty background; the middle half of each of its axes is cut away.
 fn leaf(alpha_mode: AlphaMode) -> super::build::Picture {
     let mut stage = Stage::new();
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
@@ -154,7 +154,7 @@ fn leaf(alpha_mode: AlphaMode) -> super::build::Picture {
 }
 
 #[test]
-fn a_cut_out_shows_what_is_behind_and_an_opaque_leaf_does_not() {
+fn cut_out_shows_the_background_and_opaque_does_not() {
     let cut = leaf(AlphaMode::Mask { cutoff: 0.5 });
     assert_eq!(cut.at(32, 32), [0; 3]);
     assert!(close(cut.at(15, 15), [0.75, 0.0, 0.0], 1.0));
@@ -166,10 +166,10 @@ fn a_cut_out_shows_what_is_behind_and_an_opaque_leaf_does_not() {
 }
 
 #[test]
-fn two_blended_layers_equal_the_arithmetic() {
+fn two_blended_layers_equal_arithmetic() {
     let layers = |near: f32, far: f32, alpha_mode: AlphaMode| {
         let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..plain(diffuse) };
-        // Blended in the order of the scene: the farther one first.
+        // Blended in the order of the scene, the farther layer first.
         let scene = Stage::new()
             .add(facing(-3.0, -3.0, 3.0, 3.0, -2.0), plain([0.2, 0.2, 1.0]))
             .add(facing(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far))
@@ -190,7 +190,7 @@ fn two_blended_layers_equal_the_arithmetic() {
 }
 
 #[test]
-fn with_two_passes_a_blended_layer_hides_none_behind_it_that_comes_later() {
+fn two_pass_blending_writes_no_depth() {
     let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..plain(diffuse) };
     let shown = |second: f32| {
         let first = facing(-2.0, -2.0, 2.0, 2.0, 0.0);
@@ -202,14 +202,15 @@ fn with_two_passes_a_blended_layer_hides_none_behind_it_that_comes_later() {
             .scene();
         picture(&scene).at(32, 32)
     };
-    // No depth is written, so that the later layer is blended over the earlier one wherever it is.
+    // The pass writes no depth, so the later layer is blended over the earlier one at any distance.
     for second in [-1.0, 1.0] {
         assert!(close(shown(second), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0), "{second}: {:?}", shown(second));
     }
 }
 
+/// The normal of a back face points to the viewer.
 #[test]
-fn a_back_is_drawn_only_of_what_has_two_sides_and_its_normal_turns_to_the_viewer() {
+fn only_double_sided_back_faces_are_drawn() {
     let from_behind = |double_sided: bool| {
         let mut stage = Stage::new();
         stage.0.look.sun = [0.0, 0.0, -1.0];
@@ -242,7 +243,7 @@ fn images_of_many_sizes_keep_their_materials() {
 }
 
 #[test]
-fn intrinsics_place_the_principal_point_and_scale_both_axes_apart() {
+fn intrinsics_set_principal_point_and_scale_per_axis() {
     let scene = Stage::new().add(facing(0.0, 0.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene();
     let lens = Lens::Intrinsics { fx: 200.0, fy: 100.0, cx: 10.0, cy: 50.0 };
     let shown = draw(&mut open(), &scene, Camera { lens, ..camera(64) }, 64);

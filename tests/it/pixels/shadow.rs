@@ -1,17 +1,18 @@
-//! The variance shadow map, seen on the ground.
+//! The variance shadow map, as it appears on the ground.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
 
 use super::build::{Picture, Stage, close, draw, facing, lying, open};
 
-/// Looking down on the ground from a height of 20, ten pixels a unit there; the sun straight up unless it is moved.
+/// A stage for a camera at height 20 that looks down, with ten pixels per unit on the ground. The sun is straight above
+/// unless a test moves it.
 pub(super) fn stage() -> Stage {
     let mut stage = Stage::new();
     stage.0.look.sun = [0.0, 1.0, 0.0];
     stage.0.look.ground = Some(Ground { colour: [0.8; 3] });
     stage.0.look.shadow = Some(Shadow { size: 512, bleeding: 0.0, ..Shadow::default() });
-    // Two pegs hold the ground at height 0 and the bounds wide, out of the picture.
+    // Two pegs outside of the picture keep the ground at height 0 and widen the bounds.
     stage
         .add(facing(5.0, 0.0, 5.1, 0.1, 5.0), Material::default())
         .add(facing(-5.1, 0.0, -5.0, 0.1, -5.0), Material::default())
@@ -27,12 +28,13 @@ fn from_above(stage: Stage) -> Picture {
     draw(&mut open(), &stage.scene(), camera, 64)
 }
 
-/// A square of two units that floats where the camera does not see it cover its shadow: the sun comes from the side.
+/// A picture from above of a floating square of two units and its shadow. The sun comes from the side, so the square
+/// does not hide its shadow.
 fn aside(stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
     from_above(with_square(stage, alpha_mode, alpha))
 }
 
-/// Its shadow on the ground is x and z of -1 to 1.
+/// Adds the square, whose shadow on the ground covers x and z of -1 to 1.
 pub(super) fn with_square(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Stage {
     stage.0.look.sun = [3.0, 4.0, 0.0];
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
@@ -47,13 +49,14 @@ pub(super) fn with_square(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -
     stage.add(mesh.expect("a square"), material)
 }
 
-/// The ground near the middle, where the haze has hardly begun: the horizon is black here.
+/// Linear color of the ground near the center, where the haze is negligible; the horizon is black here.
 fn ground(sun: f64, facing: f64) -> [f64; 3] {
     [0.8 * (0.25 + 0.5 * sun * facing); 3]
 }
 
+/// Controls: without the caster, or without a shadow map, the ground is lit.
 #[test]
-fn the_shadow_of_a_floating_square_is_ambient_only_and_goes_with_caster_or_shadows() {
+fn shadow_of_a_floating_square_has_only_ambient_light() {
     let shaded = aside(stage(), AlphaMode::Opaque, 1.0);
     assert!(close(shaded.at(32, 32), ground(0.0, 0.8), 2.0), "umbra: {:?}", shaded.at(32, 32));
     assert!(close(shaded.at(32, 12), ground(1.0, 0.8), 2.0), "beside it: {:?}", shaded.at(32, 12));
@@ -72,7 +75,7 @@ fn the_shadow_of_a_floating_square_is_ambient_only_and_goes_with_caster_or_shado
 }
 
 #[test]
-fn a_surface_in_the_shadow_keeps_its_ambient_light_and_loses_the_rest() {
+fn shadow_removes_everything_but_ambient_light() {
     let floor = Material { ambient: [0.9, 0.5, 0.2], specular: [0.5; 3], shininess: 1.0, ..Material::default() };
     let shaded = aside(stage().add(lying(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
     assert!(close(shaded.at(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", shaded.at(32, 32));
@@ -80,10 +83,12 @@ fn a_surface_in_the_shadow_keeps_its_ambient_light_and_loses_the_rest() {
     assert!(r > 190 && g > 190 && b > 190, "control: lit beside the shadow, {:?}", [r, g, b]);
 }
 
+/// The printed ambient term equals this one only in sunlight that has the color of the sky; in the shadow the printed
+/// term is black.
 #[test]
-fn the_printed_ambient_term_equals_ours_in_sunlight_of_the_skys_colour_and_is_black_in_the_shadow() {
-    // Without a highlight, equation 3.12 prints s_f I_l (C_a + (n . v_l) C_d): the sun lights C_a too, and the shadow takes
-    // it away. Here the sky lights C_a, and the shadow leaves it.
+fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
+    // Without a highlight, equation 3.12 as printed is s_f I_l (C_a + (n . v_l) C_d): the sun also lights C_a, and the
+    // shadow removes that light. In this renderer the sky lights C_a, and the shadow does not remove it.
     let (ambient, diffuse, facing) = ([0.4, 0.2, 0.1], [0.3_f32, 0.5, 0.7], 0.8);
     let colour = |ambient_light: f64, sunlight: f64| {
         std::array::from_fn(|channel| {
@@ -106,7 +111,7 @@ fn the_printed_ambient_term_equals_ours_in_sunlight_of_the_skys_colour_and_is_bl
 }
 
 #[test]
-fn the_shadow_of_a_cut_out_has_the_hole_too_and_an_opaque_one_has_not() {
+fn shadow_of_a_cut_out_has_its_hole() {
     let cut = aside(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     assert!(close(cut.at(32, 32), ground(1.0, 0.8), 4.0), "the hole: {:?}", cut.at(32, 32));
     assert!(close(cut.at(24, 32), ground(0.0, 0.8), 4.0), "the rim: {:?}", cut.at(24, 32));
@@ -115,17 +120,18 @@ fn the_shadow_of_a_cut_out_has_the_hole_too_and_an_opaque_one_has_not() {
 }
 
 #[test]
-fn a_blended_square_casts_from_the_threshold_on() {
+fn blended_surface_casts_above_the_alpha_threshold() {
     let dense = aside(stage(), AlphaMode::Blend, 0.6);
     assert!(close(dense.at(24, 32), ground(0.0, 0.8), 4.0) && close(dense.at(32, 32), ground(1.0, 0.8), 4.0));
     let thin = aside(stage(), AlphaMode::Blend, 0.4);
     assert!(close(thin.at(24, 32), ground(1.0, 0.8), 4.0), "{:?}", thin.at(24, 32));
 }
 
+/// Light bleeding reduction is applied to the bound.
 #[test]
-fn one_texel_without_blur_gives_chebyshevs_bound_and_bleeding_is_taken_off() {
-    // A square at height 4 that covers the whole map. The planes nearest to the sun and farthest from it lie 1 % of the
-    // diagonal, 14.97, beyond square and ground, rounded outwards to multiples of 1/8.
+fn unblurred_texel_gives_the_chebyshev_bound() {
+    // A square at height 4 that covers the whole map. The near and far planes of the light lie 1 % of the diagonal of
+    // 14.97 beyond square and ground, rounded outwards to multiples of 1/8.
     let shown = |least_variance: f32, bleeding: f32| {
         let mut stage = stage();
         stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, ..Shadow::default() });
@@ -146,7 +152,7 @@ fn one_texel_without_blur_gives_chebyshevs_bound_and_bleeding_is_taken_off() {
 }
 
 #[test]
-fn the_edge_of_a_shadow_is_soft_by_the_blur_and_half_dark_where_the_caster_ends() {
+fn blur_widens_the_edge_of_a_shadow() {
     let penumbra = |blur: f32| {
         let mut stage = stage();
         stage.0.look.shadow = Some(Shadow { size: 256, blur, bleeding: 0.0, ..Shadow::default() });
@@ -162,7 +168,7 @@ fn the_edge_of_a_shadow_is_soft_by_the_blur_and_half_dark_where_the_caster_ends(
 }
 
 #[test]
-fn a_lit_surface_does_not_shadow_itself() {
+fn lit_surface_does_not_shadow_itself() {
     for sun in [[0.0, 1.0, 0.0], [3.0, 4.0, 0.0], [1.0, 0.4, 0.6]] {
         let mut stage = stage();
         stage.0.look.sun = sun;
@@ -176,7 +182,7 @@ fn a_lit_surface_does_not_shadow_itself() {
 }
 
 #[test]
-fn a_floor_in_the_plane_of_the_ground_covers_it() {
+fn floor_in_the_plane_of_the_ground_covers_it() {
     for height in [0.0, 1e-7] {
         let shown = from_above(stage().add(lying(1.5, height), Material { ambient: [1.0, 0.0, 0.0], ..paint() }));
         let floor = shown.count(|[r, g, b]| r > 100 && g < 10 && b < 10);
@@ -184,7 +190,7 @@ fn a_floor_in_the_plane_of_the_ground_covers_it() {
     }
 }
 
-/// Seen by ambient light alone.
+/// A material lit by ambient light alone.
 fn paint() -> Material {
     Material { diffuse: [0.0; 3], ..Material::default() }
 }

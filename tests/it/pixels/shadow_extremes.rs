@@ -1,4 +1,4 @@
-//! Suns, cameras and scenes at the ends of what is possible, with every kind of shadow map; and shadows that stay still.
+//! Extreme suns, cameras and scenes with every kind of shadow map, and temporal stability of shadows.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
@@ -23,7 +23,8 @@ fn triangle(corners: [[f32; 3]; 3]) -> Mesh {
     Mesh::indexed(corners.to_vec(), vec![[0.0, 1.0, 0.0]; 3], vec![], vec![[0, 1, 2]]).expect("a triangle")
 }
 
-/// The picture of a scene with this sun and map. The sky is bright and all is lit by it, so that black is not a colour.
+/// A picture of a scene with this sun and shadow map. The sky is bright and lights everything, so no valid pixel is
+/// black.
 fn picture(meshes: &[Mesh], sun: [f32; 3], shadow: Shadow, camera: Option<(f64, f64)>) -> Image {
     let mut stage = Stage::new();
     stage.0.look = Look { sun, shadow: Some(shadow), ..Look::default() };
@@ -48,7 +49,7 @@ fn black(image: &Image) -> usize {
 }
 
 #[test]
-fn no_sun_camera_or_scene_leaves_a_pixel_without_a_number() {
+fn extreme_suns_cameras_and_scenes_have_no_nan_pixel() {
     let one = [triangle([[0.0, 0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 1.0, 1.0]])];
     let point = [triangle([[5.0, 2.0, 5.0]; 3])];
     let upright = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
@@ -77,7 +78,7 @@ fn no_sun_camera_or_scene_leaves_a_pixel_without_a_number() {
 }
 
 #[test]
-fn a_still_shadow_does_not_flicker_while_the_bounds_grow_out_of_sight() {
+fn static_shadow_does_not_flicker_while_bounds_grow() {
     let table = |shadow: Shadow| {
         let mut stage = Stage::new();
         stage.0.look = Look { shadow: Some(shadow), ..Look::default() };
@@ -90,15 +91,16 @@ fn a_still_shadow_does_not_flicker_while_the_bounds_grow_out_of_sight() {
             let steps = frames(&scene, is_lit);
             let changes: Vec<usize> = steps.windows(2).map(|pair| differing(&pair[0], &pair[1])).collect();
             let jumps = changes.iter().filter(|change| **change > 0).count();
-            // Over 60 steps the bounds grow by a quarter along x and an eighth along z: each side of the map takes two rungs,
-            // and so does its depth. A box fitted tightly would change the picture in all steps.
+            // Over 60 steps the bounds grow by 1/4 along x and 1/8 along z. Each side of the map crosses two
+            // quantization steps, and so does its depth range. A tightly fitted box would change the picture in every
+            // step.
             assert!(jumps <= 10, "{method:?}: the picture changed in {jumps} of 59 steps, {changes:?}");
             assert!(differing(&steps[0], &steps[59]) > 0, "control: another texel size is seen");
         }
     }
 }
 
-/// 60 frames of a scene at rest whose bounds grow; with `is_lit` what it takes up in light space is said too.
+/// Renders 60 frames of a scene at rest whose bounds grow. With `is_lit`, the shots contain light bounds too.
 fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<Image> {
     let mut deformer = ReferenceDeformer::new(scene);
     let rest = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
@@ -114,7 +116,7 @@ fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<Image> {
     let axes = scene.light_axes().expect("a shadow");
     let mut frame = |step: u32| {
         let bounds = grown(step);
-        // A little more than there is.
+        // Slightly more than the box itself.
         let light = LightBounds::of_box(&axes, &bounds).widened(0.02 * bounds.diagonal());
         let shot = Shot { camera, width: 96, height: 96, bounds, light: is_lit.then_some(light) };
         renderer.draw(&buffers, &shot).expect("draws")
@@ -122,7 +124,7 @@ fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<Image> {
     (0..60).map(&mut frame).collect()
 }
 
-/// Pixels that differ by more than a level.
+/// Number of pixels that differ by more than one level.
 fn differing(one: &Image, other: &Image) -> usize {
     let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
     pairs.filter(|(a, b)| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > 1)).count()

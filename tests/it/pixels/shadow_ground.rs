@@ -1,4 +1,5 @@
-//! The ground in the shadow map: it receives and never casts, where the map ends and where a wall stands on it.
+//! The ground and the shadow map: the ground receives shadows but never casts. Tests cover the border of the map and
+//! the contact line of a wall.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Blurring, Camera, Lens, Shadow, ShadowMethod, View};
@@ -6,7 +7,7 @@ use modalcast_model::scene::{Blurring, Camera, Lens, Shadow, ShadowMethod, View}
 use super::build::{Picture, close, draw, facing, open};
 use super::shadow::{stage, with_square};
 
-/// All of the map's ground from above, seen with a map of this kind; or with none.
+/// The part of the ground that the map covers, seen from above, with the given shadow map or none.
 fn from_high_above(shadow: Option<Shadow>, caster: bool) -> Picture {
     let mut stage = stage();
     stage.0.look.sun = [3.0, 4.0, 0.0];
@@ -18,7 +19,7 @@ fn from_high_above(shadow: Option<Shadow>, caster: bool) -> Picture {
 }
 
 #[test]
-fn the_ground_is_lit_where_the_map_ends() {
+fn ground_is_lit_at_the_border_of_the_map() {
     let base = Shadow { size: 64, blur: 4.0, bleeding: 0.2, ..Shadow::default() };
     let kinds = [
         Shadow { blurring: Blurring::Rows, ..base },
@@ -38,27 +39,29 @@ fn the_ground_is_lit_where_the_map_ends() {
     assert!(darker(&from_high_above(Some(base), true)) > 300, "control: a caster is seen");
 }
 
-/// How many pixels of a wall that stands on the ground are not lit as the sun lights it; and not dark.
+/// Number of pixels of a wall on the ground that are not fully lit, and number that are not fully dark.
 fn on_the_wall(shadow: Shadow, shaded: bool) -> [usize; 2] {
     let mut stage = stage();
     stage.0.look.sun = [0.0, 3.0, 4.0];
     stage.0.look.shadow = Some(shadow);
     let mut stage = stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default());
     if shaded {
-        // Above what the camera sees; its shadow on the wall reaches from the ground to half a unit over the top.
+        // Above the view of the camera. Its shadow on the wall extends from the ground to half a unit above the top of
+        // the wall.
         stage = stage.add(facing(-3.0, 1.8, 3.0, 4.5, 4.0), Material::default());
     }
     let lens = Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: 32.0, cy: 32.0 };
     let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
     let shown = draw(&mut open(), &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 64);
-    // The wall is 20 x 20 pixels in the middle, without those of its rim.
+    // The wall covers 20 x 20 pixels at the center; its rim is excluded.
     let wall = || (23..41).flat_map(|y| (23..41).map(move |x| (x, y)));
     let differing = |light: f64| wall().filter(|(x, y)| !close(shown.at(*x, *y), [light; 3], 2.0)).count();
     [differing(0.25 + 0.5 * 0.8), differing(0.25)]
 }
 
+/// Control: a wall in the shadow is dark.
 #[test]
-fn a_lit_wall_is_lit_down_to_its_foot_and_one_in_the_shadow_is_dark_there() {
+fn lit_wall_is_fully_lit_down_to_the_ground() {
     for blur in [0.0, 2.0, 4.0] {
         for size in [128, 512] {
             let base = Shadow { size, blur, bleeding: 0.2, ..Shadow::default() };

@@ -1,4 +1,4 @@
-//! Every kind of shadow map against the same arithmetic: the shadow of a straight edge on the ground.
+//! Every kind of shadow map compared with the same arithmetic: the shadow of a straight edge on the ground.
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Blurring, Camera, Lens, Moments, Scene, Shadow, ShadowMethod, View};
@@ -7,16 +7,17 @@ use modalcast_render::plan;
 use super::build::{Picture, close, draw, lying, open, planned_above};
 use super::shadow::{stage, with_square};
 
-/// Pixels a unit of the ground, in the picture of the edge.
+/// Pixels per unit of the ground in the picture of the edge.
 const SCALE: f64 = 100.0;
-/// Half the side of the sun's box across the edge: 5, the reach of the bounds, on the next sixteenth of 4.
+/// Half the extent of the light box across the edge: the bounds reach 5 there, rounded up to the next larger multiple
+/// of 4 / 16.
 const HALF: f64 = 5.25;
 
 fn variance() -> Shadow {
     Shadow { size: 256, blur: 2.0, bleeding: 0.0, ..Shadow::default() }
 }
 
-/// Texels to each side that no caster reaches, and the side of a texel across the edge.
+/// Side of a texel across the edge, in units. `rim` texels at each border of the map contain no caster.
 fn texel(shadow: &Shadow) -> f64 {
     let rim = f64::from(shadow.reach()) + 1.0;
     2.0 * HALF / (f64::from(shadow.size) - 2.0 * rim)
@@ -28,19 +29,19 @@ fn scene(shadow: Shadow) -> std::sync::Arc<Scene> {
     with_square(stage, AlphaMode::Opaque, 1.0).scene()
 }
 
-/// The edge at z = 1 of the shadow of the square, seen from straight above.
+/// Picture from straight above of the edge at z = 1 of the shadow of the square.
 fn edge(shadow: Shadow) -> Picture {
     let view = View::LookAt { eye: [0.0, 20.0, 1.0], target: [0.0, 0.0, 1.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 20.0 * SCALE, fy: 20.0 * SCALE, cx: 32.0, cy: 32.0 };
     draw(&mut open(), &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
 }
 
-/// z of the ground in the middle of a row.
+/// z of the ground at the center of a row.
 fn z_of(row: u32) -> f64 {
     1.0 + (f64::from(row) + 0.5 - 32.0) / SCALE
 }
 
-/// The share of the sun that reaches the ground in a pixel.
+/// Fraction of the sun's light that reaches the ground in a pixel.
 fn share([byte, ..]: [u8; 3]) -> f64 {
     let encoded = f64::from(byte) / 255.0;
     let linear = if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) };
@@ -51,13 +52,13 @@ fn profile(picture: &Picture, column: u32) -> Vec<f64> {
     (0..64).map(|row| share(picture.at(column, row))).collect()
 }
 
-/// What arrives at z when every texel whose centre the square covers is dark, weighed by the Gaussian and taken linearly
-/// between texels.
+/// Expected fraction of sunlight at z: texels whose center the square covers are dark. The result is blurred with the
+/// Gaussian and interpolated linearly between texels.
 fn expected(shadow: &Shadow, z: f64) -> f64 {
     let (texel, reach) = (texel(shadow), shadow.reach() as i64);
     let bell = |step: i64| if step == 0 { 1.0 } else { (-0.5 * (step as f64 / f64::from(shadow.blur)).powi(2)).exp() };
     let sum: f64 = (-reach..=reach).map(bell).sum();
-    // The grid is laid from the middle, texel edges at multiples of a texel.
+    // The grid starts at the center; texel edges are at multiples of a texel.
     let open = |index: i64| f64::from(u8::from((index as f64 + 0.5) * texel > 1.0));
     let blurred = |index: i64| (-reach..=reach).map(|step| bell(step) / sum * open(index + step)).sum::<f64>();
     let place = z / texel - 0.5;
@@ -65,8 +66,9 @@ fn expected(shadow: &Shadow, z: f64) -> f64 {
     (1.0 - past) * blurred(place.floor() as i64) + past * blurred(place.floor() as i64 + 1)
 }
 
+/// The fraction of sunlight is correct to about a hundredth, for every way of blurring.
 #[test]
-fn filtered_and_variance_maps_give_the_blurred_edge_to_a_hundredth_however_it_is_blurred() {
+fn filtered_and_variance_maps_give_the_blurred_edge() {
     let base = variance();
     let kinds = [
         Shadow { method: ShadowMethod::Filtered, ..base },
@@ -89,8 +91,8 @@ fn filtered_and_variance_maps_give_the_blurred_edge_to_a_hundredth_however_it_is
 }
 
 #[test]
-fn tiles_rows_and_fragments_blur_alike_whatever_the_blur() {
-    // Up to 8 texels in strips, which are taller in larger maps; then in tiles.
+fn all_blur_implementations_agree() {
+    // Blurs of up to 8 texels use strips, which are taller in larger maps; wider blurs use tiles.
     for (blur, size) in [(0.0, 200), (1.5, 200), (4.0, 200), (8.0, 200), (9.0, 200), (16.0, 200), (2.3, 1100)] {
         let [tiles, rows, fragments] = [Blurring::Tiles, Blurring::Rows, Blurring::Fragments]
             .map(|blurring| edge(Shadow { size, blur, blurring, ..variance() }).image.rgba);
@@ -101,7 +103,7 @@ fn tiles_rows_and_fragments_blur_alike_whatever_the_blur() {
     }
 }
 
-/// z where half of the sun arrives.
+/// z where half of the sunlight arrives.
 fn crossing(profile: &[f64]) -> f64 {
     let row = profile.iter().position(|share| *share > 0.5).expect("the picture has a lit side");
     let (dark, light) = (profile[row - 1], profile[row]);
@@ -109,9 +111,10 @@ fn crossing(profile: &[f64]) -> f64 {
 }
 
 #[test]
-fn the_edge_of_every_kind_is_within_its_stated_distance_of_the_true_one() {
+fn shadow_edges_are_within_their_stated_distance() {
     let base = variance();
-    // Half a texel for where the caster is sampled; bleeding moves the edge outwards by 0.2533 deviations.
+    // The tolerance is half a texel, for the sampling of the caster. Bleeding reduction moves the edge outwards by
+    // 0.2533 standard deviations of the blur.
     let kinds = [
         (Shadow { method: ShadowMethod::Standard, ..base }, 0.0),
         (Shadow { method: ShadowMethod::Filtered, ..base }, 0.0),
@@ -132,7 +135,7 @@ fn the_edge_of_every_kind_is_within_its_stated_distance_of_the_true_one() {
 }
 
 #[test]
-fn a_standard_map_is_all_or_nothing_and_the_others_are_not() {
+fn only_standard_maps_have_hard_edges() {
     let between = |shadow: Shadow| {
         let picture = edge(shadow);
         (0..64).flat_map(|column| profile(&picture, column)).filter(|share| (0.05..0.95).contains(share)).count()
@@ -143,7 +146,8 @@ fn a_standard_map_is_all_or_nothing_and_the_others_are_not() {
     }
 }
 
-/// How many pixels of a lit square of three units, which casts and receives, are not as bright as the sun makes them.
+/// Number of pixels of a lit square of six units per side that are darker than the sun makes them; the square casts and
+/// receives.
 fn self_shadowed(over: &[Mesh], shadow: Shadow, sun: [f32; 3]) -> usize {
     let mut stage = stage();
     (stage.0.look.shadow, stage.0.look.sun) = (Some(shadow), sun);
@@ -158,7 +162,7 @@ fn self_shadowed(over: &[Mesh], shadow: Shadow, sun: [f32; 3]) -> usize {
 }
 
 #[test]
-fn no_kind_shadows_a_lit_surface() {
+fn no_method_shadows_a_lit_surface() {
     let base = Shadow { size: 512, ..Shadow::default() };
     for sun in [[0.0, 1.0, 0.0], [3.0, 4.0, 0.0], [1.0, 0.4, 0.6], [1.0, 0.15, 0.3]] {
         let kinds = [
@@ -176,12 +180,12 @@ fn no_kind_shadows_a_lit_surface() {
     assert!(over > 20, "control: a caster over it darkens {over} pixels only");
 }
 
-/// How many pixels are lit of a strip of the ground that lies wholly in the shadow of a square just above it.
+/// Number of lit pixels in a strip of ground that is fully in the shadow of a square just above it.
 fn lit_in_the_umbra(moments: Moments) -> usize {
     let mut stage = stage();
     stage.0.look.shadow = Some(Shadow { size: 2048, blur: 0.5, moments, ..Shadow::default() });
     stage.0.look.sun = [3.0, 1.0, 0.0];
-    // Far from the middle of the range of depths, where f16 is coarse. The shadow reaches 0.09 beyond the square.
+    // Far from the center of the depth range, where f16 is coarse. The shadow extends 0.09 beyond the square.
     let mut rest = lying(1.0, 0.03).rest().to_vec();
     rest.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
     let mesh = Mesh::indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
@@ -193,14 +197,15 @@ fn lit_in_the_umbra(moments: Moments) -> usize {
     (0..64 * 64).filter(|pixel| !close(shown.at(pixel % 64, pixel / 64), dark, 3.0)).count()
 }
 
+/// Moments in f32 leak none.
 #[test]
-fn moments_of_f16_let_light_into_a_shadow_near_its_caster_and_those_of_f32_do_not() {
+fn f16_moments_leak_light_near_the_caster() {
     assert_eq!(lit_in_the_umbra(Moments::F32), 0);
     let failed = lit_in_the_umbra(Moments::F16);
     assert!(failed > 400, "f16 spoils {failed} of 4096 pixels only");
 }
 
-/// The shadow's edge on the ground from nearby: how many pixels of the middle column are half lit.
+/// Number of half-lit pixels in the middle column of a close-up of the edge of the shadow.
 fn half_lit(splits: u32) -> usize {
     let view = View::LookAt { eye: [0.0, 2.0, 4.0], target: [0.0, 0.0, 1.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 400.0, fy: 400.0, cx: 64.0, cy: 64.0 };
@@ -212,13 +217,13 @@ fn half_lit(splits: u32) -> usize {
 }
 
 #[test]
-fn splits_give_the_near_shadow_finer_texels() {
+fn splits_give_near_shadows_finer_texels() {
     let (one, four) = (half_lit(1), half_lit(4));
     assert!(one > 30 && four > 0 && 3 * four <= one, "{one} pixels with one map, {four} with four");
 }
 
 #[test]
-fn what_the_scene_does_not_name_is_not_made() {
+fn unused_shadow_resources_are_not_allocated() {
     let made = |shadow: Shadow| {
         let scene = scene(shadow);
         let (shown, plan) = (edge(shadow), plan(&scene));

@@ -1,4 +1,4 @@
-//! Frames of several cameras share the shadow of their step, and are the same as those of cameras alone.
+//! Frames of several cameras share the shadow map of their step, and equal frames rendered separately.
 
 use std::sync::Arc;
 
@@ -13,14 +13,14 @@ use modalcast_render::{Renderer, SceneBuffers, Shot};
 use super::build::open;
 use super::shadow::{stage, with_square};
 
-/// A square that floats over the ground, and its cut-out.
+/// A cut-out square and an opaque square that float above the ground.
 fn scene(splits: u32) -> Arc<Scene> {
     let mut stage = with_square(stage(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     stage.0.look.shadow = Some(Shadow { size: 256, splits, ..Shadow::default() });
     stage.add(super::build::lying(0.5, 2.0), Material::default()).scene()
 }
 
-/// The scene at rest, all of it shifted along x.
+/// The scene at rest, shifted along x.
 fn surface(scene: &Arc<Scene>, by: f32) -> (Surface, Bounds) {
     let mut deformer = ReferenceDeformer::new(scene);
     let mut bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
@@ -30,7 +30,7 @@ fn surface(scene: &Arc<Scene>, by: f32) -> (Surface, Bounds) {
     (surface, bounds)
 }
 
-/// Two views of the same thing.
+/// Two cameras that differ in their field of view.
 fn cameras(scene: &Scene) -> [Camera; 2] {
     let first = Camera::framing(scene, 64, 64);
     [first, Camera { lens: Lens::FieldOfView(25.0), ..first }]
@@ -44,7 +44,7 @@ fn shadows(renderer: &Renderer) -> usize {
     renderer.ran().passes.iter().filter(|pass| ["shadow", "blur"].contains(pass)).count()
 }
 
-/// By a renderer of its own.
+/// The picture of a renderer of its own.
 fn alone(scene: &Arc<Scene>, by: f32, camera: Camera) -> Vec<u8> {
     let mut renderer = open();
     let buffers = renderer.load(scene).expect("loads");
@@ -53,7 +53,7 @@ fn alone(scene: &Arc<Scene>, by: f32, camera: Camera) -> Vec<u8> {
     renderer.draw(&buffers, &shot(camera, bounds)).expect("draws").rgba
 }
 
-/// Pictures of both cameras of two steps, and how many shadow passes each took.
+/// Pictures of both cameras at two steps, and the number of shadow passes of each.
 fn two_steps(scene: &Arc<Scene>, name: impl Fn(&SceneBuffers, u64)) -> Vec<(Vec<u8>, usize)> {
     let mut renderer = open();
     let buffers = renderer.load(scene).expect("loads");
@@ -75,7 +75,7 @@ fn counts(frames: &[(Vec<u8>, usize)]) -> Vec<usize> {
 }
 
 #[test]
-fn cameras_of_one_step_share_its_shadow_and_their_pictures_are_those_of_renderers_of_their_own() {
+fn cameras_of_one_step_share_its_shadow() {
     let scene = scene(1);
     let frames = two_steps(&scene, SceneBuffers::hold_step);
     assert_eq!(counts(&frames), [2, 0, 2, 0], "shadow and blur, once a step");
@@ -86,8 +86,10 @@ fn cameras_of_one_step_share_its_shadow_and_their_pictures_are_those_of_renderer
     assert!(frames[0].0 != frames[1].0 && frames[1].0 != frames[3].0, "control: they differ");
 }
 
+/// So are shadows of vertices without a step number. Shadows are redrawn when the bounds change under the same step
+/// number.
 #[test]
-fn a_shadow_that_hangs_on_the_camera_or_on_vertices_without_a_name_is_drawn_for_each_frame() {
+fn view_dependent_shadows_are_drawn_for_each_frame() {
     assert_eq!(counts(&two_steps(&scene(1), |_, _| ())), [2; 4], "no name");
     assert_eq!(counts(&two_steps(&scene(2), SceneBuffers::hold_step)), [2; 4], "split by the view");
     let frames = two_steps(&scene(1), |buffers, _| buffers.hold_step(7));
@@ -95,7 +97,7 @@ fn a_shadow_that_hangs_on_the_camera_or_on_vertices_without_a_name_is_drawn_for_
 }
 
 #[test]
-fn an_upload_forgets_the_name_and_other_bounds_or_another_origin_have_another_shadow() {
+fn upload_bounds_or_origin_invalidate_the_shadow() {
     let scene = scene(1);
     let mut renderer = open();
     let mut buffers = renderer.load(&scene).expect("loads");
@@ -125,7 +127,7 @@ fn an_upload_forgets_the_name_and_other_bounds_or_another_origin_have_another_sh
 }
 
 #[test]
-fn a_step_of_the_engine_has_one_shadow_for_all_cameras_and_a_refused_one_leaves_no_shadow_behind() {
+fn engine_steps_share_a_shadow_and_refused_ones_have_none() {
     let scene = scene(1);
     let mut bench = Workbench::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("opens");
     let mut staged = bench.stage(&scene).expect("stages");

@@ -1,4 +1,4 @@
-//! Kept pictures, looked at when they were drawn. `tests/snapshots/tree.png`:
+//! Reference pictures that were checked by eye when they were recorded. `tests/snapshots/tree.png`:
 //! `modalcast render tree --size 104x78 --eye 1.5,1.9,2.5 --target 0,1.8,0 --field-of-view 45` on llvmpipe.
 
 use modalcast_model::load;
@@ -7,7 +7,8 @@ use modalcast_render::Image;
 
 use super::build::{draw_sized, open};
 
-/// Mean, 99th percentile and largest of the differences of two pictures, each the worst channel of a pixel, in levels.
+/// Mean, 99th percentile and maximum of the per-pixel difference of two pictures, in levels. The difference of a pixel
+/// is that of its worst channel.
 fn difference(one: &[u8], other: &[u8]) -> (f64, u8, u8) {
     assert_eq!(one.len(), other.len(), "pictures of one size");
     let worst = |(a, b): (&[u8], &[u8])| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
@@ -17,7 +18,7 @@ fn difference(one: &[u8], other: &[u8]) -> (f64, u8, u8) {
     (mean, levels[levels.len() * 99 / 100], levels[levels.len() - 1])
 }
 
-/// The bark's normal map, cut-out leaves, shadow, ground and sky, from beside the trunk.
+/// The tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky.
 fn tree(eye: [f64; 3]) -> Image {
     let scene = load::open("tree").expect("built in");
     let view = View::LookAt { eye, target: [0.0, 1.8, 0.0], up: [0.0, 1.0, 0.0] };
@@ -26,7 +27,7 @@ fn tree(eye: [f64; 3]) -> Image {
 }
 
 #[test]
-fn the_tree_looks_as_it_did() {
+fn tree_matches_its_snapshot() {
     let kept = image::load_from_memory(include_bytes!("../../snapshots/tree.png")).expect("a PNG").into_rgba8();
     let (mean, high, most) = difference(&tree([1.5, 1.9, 2.5]).rgba, &kept);
     assert!(mean < MEAN && high < HIGH, "mean {mean}, 99 of 100 within {high}, at most {most} levels");
@@ -34,8 +35,8 @@ fn the_tree_looks_as_it_did() {
     assert!(mean > 2.0 * MEAN && high > HIGH, "control: two decimetres aside, mean {mean}, 99 of 100 within {high}");
 }
 
-/// Stated tolerance, in levels of 255, between renderers: in a picture so small most pixels of the leaves are edges, and
-/// drivers round slopes of texture coordinates and samples of edges differently. An NVIDIA H200 (driver 580.159.04) is 5.6 off
-/// llvmpipe on average, and 97 at the 99th percentile.
+/// Tolerance between renderers, in levels of 255. In so small a picture most pixels of the leaves are edges, and
+/// drivers round texture derivatives and edge samples differently. An NVIDIA H200 (driver 580.159.04) differs from
+/// llvmpipe by 5.6 on average, and by 97 at the 99th percentile.
 const MEAN: f64 = 7.0;
 const HIGH: u8 = 128;

@@ -1,4 +1,4 @@
-//! Pictures of numbers against arithmetic.
+//! AOV readbacks (depth, domains, normals, values) compared with arithmetic.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, View};
@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 
 use super::build::{Stage, camera, facing, lying, open};
 
-/// A field of a scene at rest in a square picture.
+/// Reads an AOV of a scene at rest in a square picture.
 fn survey(stage: Stage, camera: Camera, size: u32, field: Field) -> Survey {
     let scene = stage.scene();
     let mut renderer = open();
@@ -39,7 +39,7 @@ fn oblique() -> Camera {
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 }, near: 0.0, far: 0.0 }
 }
 
-/// Depth along the view axis where the ray of a pixel meets the plane y = 0, if it goes down.
+/// Depth along the view axis where the ray of a pixel meets the plane y = 0; `None` for rays that do not go down.
 fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
     let forward = Vector3::new(-3.0, -5.0, -10.0_f64).normalize();
     let right = forward.cross(&Vector3::y()).normalize();
@@ -48,13 +48,14 @@ fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
     (ray.y < 0.0).then(|| -5.0 / ray.y)
 }
 
+/// Depth is infinite in pixels without a surface.
 #[test]
-fn depth_of_a_plane_and_of_the_ground_is_in_metres_along_the_view_axis_and_infinite_where_nothing_is() {
+fn depth_is_in_meters_along_the_view_axis() {
     for (ground, unit) in [(false, 1.0), (true, 0.5)] {
         let mut stage = Stage::new();
         stage.0.unit = unit;
         stage.0.look.ground = ground.then(Ground::default);
-        // With a ground the square is small, so that most of what is seen is ground.
+        // With a ground the square is small, so that most pixels show the ground.
         let half = if ground { 1.0 } else { 40.0 };
         let depth = survey(stage.add(lying(half, 0.0), Material::default()), oblique(), 64, Field::Depth);
         assert_eq!((depth.width, depth.height, depth.samples), (64, 64, 1));
@@ -73,7 +74,7 @@ fn depth_of_a_plane_and_of_the_ground_is_in_metres_along_the_view_axis_and_infin
 }
 
 #[test]
-fn domains_are_told_by_index_whatever_the_order_of_drawing() {
+fn domain_indices_do_not_depend_on_the_drawing_order() {
     let leaf = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
     let stage = Stage::new()
@@ -86,7 +87,7 @@ fn domains_are_told_by_index_whatever_the_order_of_drawing() {
 }
 
 #[test]
-fn normals_are_unit_on_the_side_that_is_seen_and_zeros_where_nothing_is() {
+fn normals_face_the_viewer_and_are_zero_elsewhere() {
     let double_sided = Material { double_sided: true, ..Material::default() };
     let stage = Stage::new().add(facing(-2.0, -2.0, 0.0, 2.0, 0.0), double_sided);
     let behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
@@ -100,8 +101,8 @@ fn normals_are_unit_on_the_side_that_is_seen_and_zeros_where_nothing_is() {
 }
 
 #[test]
-fn values_run_linearly_over_a_triangle_and_are_clamped_and_nothing_is_zero() {
-    // The value of a vertex is its x.
+fn values_are_interpolated_linearly_and_clamped() {
+    // The value of each vertex is its x.
     for (samples, largest) in [(1, 2.0), (4, 1.0)] {
         let mut stage = Stage::new();
         stage.0.look.samples = samples;
@@ -117,7 +118,7 @@ fn values_run_linearly_over_a_triangle_and_are_clamped_and_nothing_is_zero() {
             let of_pixel = &words[samples as usize * (64 * 30 + x)..][..samples as usize];
             let mean = of_pixel.iter().map(|word| f64::from(word & 0xFFFF) / 65535.0).sum::<f64>() / f64::from(samples);
             let want = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
-            // One pixel is the most that a clamped end may mix in.
+            // Near the clamped ends, the samples of one pixel may mix clamped and linear values.
             let slack = if (0.05..0.95).contains(&want) { 1e-4 } else { 0.1 };
             assert!((mean - want).abs() < slack, "{x}: {mean} is not {want}");
             assert!(of_pixel.iter().all(|word| word >> 16 > 60000), "seen from before");
@@ -127,7 +128,7 @@ fn values_run_linearly_over_a_triangle_and_are_clamped_and_nothing_is_zero() {
 }
 
 #[test]
-fn numbers_cost_nothing_until_they_are_asked_for_and_leave_the_frame_as_it_was() {
+fn aovs_allocate_on_demand_and_do_not_change_frames() {
     let scene = Stage::new().add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).scene();
     let mut renderer = open();
     let mut buffers = renderer.load(&scene).expect("loads");

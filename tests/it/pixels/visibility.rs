@@ -1,4 +1,4 @@
-//! What the visibility image adds to a picture: coverage by samples, slopes of images, ids, and hostile triangles.
+//! The visibility buffer: sample coverage, texture derivatives, ids, and degenerate triangles.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use nalgebra::Vector3;
 
 use super::build::{Picture, Stage, camera, close, draw, facing, open, picture, srgb};
 
-/// Seen by ambient light alone: a texel of value v shows as v.
+/// A material lit by ambient light alone, so that a texel of value v appears as v.
 fn painted(colour_texture: Option<usize>) -> Material {
     Material { ambient: [1.0; 3], diffuse: [0.0; 3], colour_texture, ..Material::default() }
 }
@@ -21,15 +21,15 @@ fn stage() -> Stage {
     stage
 }
 
-/// Linear light of a byte that encodes a grey.
+/// Linear light of an sRGB byte.
 fn linear(byte: u8) -> f64 {
     let encoded = f64::from(byte) / 255.0;
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
 #[test]
-fn an_edge_through_a_pixel_covers_the_samples_on_its_side_and_with_one_sample_all_or_nothing() {
-    // Four samples lie at 1/8, 3/8, 5/8 and 7/8 across a pixel, in some order.
+fn edge_covers_the_samples_on_its_side() {
+    // The four samples lie at 1/8, 3/8, 5/8 and 7/8 across a pixel, in some order.
     for (edge, share) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
         let shown = |samples: u32| {
             let mut stage = stage();
@@ -46,8 +46,8 @@ fn an_edge_through_a_pixel_covers_the_samples_on_its_side_and_with_one_sample_al
 }
 
 #[test]
-fn the_edge_of_a_cut_out_covers_the_samples_where_alpha_reaches_the_cutoff() {
-    // Alpha rises by 1/40 a pixel from left to right, so that 40 pixels across it passes each cutoff once.
+fn cut_out_edge_is_resolved_per_sample() {
+    // Alpha rises by 1/40 per pixel from left to right, so that each of the 40 rows crosses each cutoff once.
     let shown = |cutoff: f32, samples: u32| {
         let mut stage = stage();
         stage.0.look.samples = samples;
@@ -58,7 +58,7 @@ fn the_edge_of_a_cut_out_covers_the_samples_where_alpha_reaches_the_cutoff() {
     };
     let sum = |shown: &Picture| (14..50).map(|x| linear(shown.at(x, 30)[0])).sum::<f64>();
     for quarter in 0..4 {
-        // The edge lies `quarter` quarters of a pixel, and an eighth, into pixel 32.
+        // The edge lies `quarter` quarters of a pixel plus 0.01 into a pixel.
         let across = f64::from(20 + 12 - 12) + 0.25 * f64::from(quarter) + 0.01;
         let cutoff = ((across / 40.0 * 256.0 - 0.5) / 255.0) as f32;
         let (four, one) = (shown(cutoff, 4), shown(cutoff, 1));
@@ -70,7 +70,7 @@ fn the_edge_of_a_cut_out_covers_the_samples_where_alpha_reaches_the_cutoff() {
     assert!((sum(&shown(0.25, 4)) - sum(&shown(0.75, 4))).abs() > 15.0, "control: the judge sees the cutoff");
 }
 
-/// Stripes of two texels on a square of 40 x 40 pixels, whose texture coordinates run from 0 to `turns`.
+/// Stripes of two texels on a square of 40 x 40 pixels, with texture coordinates from 0 to `turns`.
 fn stripes(size: u32, turns: f32) -> Picture {
     let mut stage = stage();
     let image = stage.texture(size, size, |x, _| if x % 4 < 2 { [255; 4] } else { [0, 0, 0, 255] });
@@ -80,13 +80,14 @@ fn stripes(size: u32, turns: f32) -> Picture {
     picture(&stage.add(mesh, painted(Some(image))).scene())
 }
 
-/// Pixels of the square away from its rim and diagonal, where one triangle fills the pixel.
+/// Pixels of the square that are not on its rim or diagonal, so that one triangle fills each pixel.
 fn inner() -> impl Iterator<Item = (u32, u32)> {
     (13..51_u32).flat_map(|y| (13..51_u32).map(move |x| (x, y))).filter(|(x, y)| (x + y).abs_diff(63) > 1)
 }
 
+/// One texel per pixel reads level 0; four texels per pixel read level 2, their mean.
 #[test]
-fn a_texel_a_pixel_is_read_from_the_finest_level_and_four_from_their_mean() {
+fn mip_level_follows_texels_per_pixel() {
     let fine = stripes(40, 1.0);
     for (x, y) in inner() {
         let white = (x - 12) % 4 < 2;
@@ -102,8 +103,8 @@ fn a_texel_a_pixel_is_read_from_the_finest_level_and_four_from_their_mean() {
 }
 
 #[test]
-fn an_image_that_repeats_has_no_seam_of_a_coarser_level() {
-    // Two turns of 20 texels: slopes of wrapped coordinates would jump at the middle, and blur a line there.
+fn repeating_image_has_no_mip_seam() {
+    // Two repeats of 20 texels: derivatives of wrapped coordinates would jump at the middle and blur a line there.
     let shown = stripes(20, 2.0);
     for (x, y) in inner() {
         let white = (x - 12) % 4 < 2;
@@ -112,7 +113,7 @@ fn an_image_that_repeats_has_no_seam_of_a_coarser_level() {
 }
 
 #[test]
-fn coordinates_are_perspective_on_a_floor_that_reaches_behind_the_camera() {
+fn coordinates_are_perspective_correct_behind_the_camera() {
     let mut stage = stage();
     let image = stage.texture(64, 64, |x, y| [4 * x as u8, 4 * y as u8, 0, 255]);
     let half = 40.0_f32;
@@ -131,7 +132,8 @@ fn coordinates_are_perspective_on_a_floor_that_reaches_behind_the_camera() {
         let above = (32.0 - f64::from(y) - 0.5) / 60.0;
         let ray = forward + aside * right + above * up;
         let point = eye - ray * (eye.y / ray.y);
-        // Texel i is centred at (i + 1/2) / 64; between centres light is mixed, nearly as bytes are on so gentle a ramp.
+        // Texel i is centered at (i + 1/2) / 64. Filtering mixes linear light, but on so gentle a ramp the result is
+        // close to mixing bytes.
         let [u, v] = [point.x, point.z].map(|number| (number + 40.0) / 80.0 * 64.0 - 0.5);
         let want = [4.0 * u, 4.0 * v, 0.0];
         let seen = shown.at(x, y).map(f64::from);
@@ -140,9 +142,10 @@ fn coordinates_are_perspective_on_a_floor_that_reaches_behind_the_camera() {
     }
 }
 
+/// The signs and cases of the corrected equations hold; those printed in the source do not.
 #[test]
-fn equations_hold_as_written_here_and_not_as_printed() {
-    // Equation 3.12: with the sun from the left and the eye in the middle the mirror direction is met on the left.
+fn equations_3_12_and_3_14_hold_as_corrected() {
+    // Equation 3.12: with the sun from the left and the eye at the center, the highlight is on the left.
     let sun = Vector3::new(-0.3, 0.0, 1.0).normalize();
     let mut shiny = Stage::new();
     shiny.0.look.sun = sun.cast::<f32>().into();
@@ -156,12 +159,12 @@ fn equations_hold_as_written_here_and_not_as_printed() {
         let mirrored = |toward: Vector3<f64>| 2.0 * toward.dot(&normal) * normal - toward;
         let light = |toward: Vector3<f64>| [0.5 * mirrored(toward).dot(&sun).max(0.0).powi(60); 3];
         assert!(close(shown.at(x, 32), light(to_eye), 1.0), "{x}: {:?}", shown.at(x, 32));
-        // Printed, v_e comes from the camera.
+        // As printed, v_e points away from the camera.
         differ += usize::from(!close(shown.at(x, 32), light(-to_eye), 1.0));
     }
     assert!(differ > 2, "the printed sign of v_e is told from ours");
 
-    // Equation 3.14: s_tex = 1 means an image, whose colour is taken; printed, the material's own would be.
+    // Equation 3.14: s_tex = 1 selects the color of the image; as printed, it would select the material's own color.
     let shown = |textured: bool| {
         let mut stage = stage();
         let image = stage.texture(1, 1, |_, _| [188, 10, 90, 255]);
@@ -171,10 +174,10 @@ fn equations_hold_as_written_here_and_not_as_printed() {
 }
 
 #[test]
-fn every_pixel_knows_its_triangle_the_ground_or_nothing() {
+fn every_pixel_sees_its_triangle_the_ground_or_nothing() {
     let mut stage = stage();
     stage.0.look.ground = Some(Ground::default());
-    // The second domain is opaque and the first cut out: the renderer draws them the other way round.
+    // The first domain is a cut-out and the second is opaque. The renderer draws the opaque one first.
     let leaf = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..painted(None) };
     let scene =
         stage.add(facing(-2.0, 0.0, -1.0, 1.0, 0.0), leaf).add(facing(1.0, 0.0, 2.0, 1.0, 0.0), painted(None)).scene();
@@ -189,7 +192,7 @@ fn every_pixel_knows_its_triangle_the_ground_or_nothing() {
         Seen::Triangle(place) => buffers.triangle(place),
         _ => None,
     };
-    // Of each square the first triangle lies right of and below the diagonal.
+    // The first triangle of each square is right of and below the diagonal.
     assert_eq!((at(19, 34), at(15, 29)), (Some((0, 0)), Some((0, 1))));
     assert_eq!((at(49, 34), at(45, 29)), (Some((1, 0)), Some((1, 1))));
     assert_eq!((seen[64 * 5 + 32], seen[64 * 60 + 32]), (Seen::Nothing, Seen::Ground));
@@ -215,13 +218,13 @@ fn five_hundred_and_twelve_images_are_drawn_in_one_call() {
     }
 }
 
-/// One square with an image and a normal map, whose corners' numbers are replaced.
+/// Renders one square with an image and a normal map, with these normals and tangents at its corners.
 fn spoiled(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], flat: bool) -> Vec<u8> {
     let mut renderer = open();
     let buffers = renderer.load(scene).expect("loads");
     let mut positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
     if flat {
-        // Seen edge on and shrunk to less than a float tells: no area on the screen.
+        // Shrunk along x below the resolution of f32, so that the square has no area on the screen.
         positions.chunks_exact_mut(3).for_each(|vertex| vertex[0] *= 1e-30);
     }
     let surface = Surface { positions, normals: normals.repeat(4), tangents: tangents.repeat(4), ..Surface::default() };
@@ -231,7 +234,7 @@ fn spoiled(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], flat: bool
 }
 
 #[test]
-fn normals_and_tangents_that_are_none_and_triangles_without_area_blacken_no_pixel() {
+fn degenerate_normals_and_triangles_leave_no_black_pixel() {
     let mut stage = stage();
     stage.0.look.zenith = [0.3; 3];
     stage.0.look.horizon = [0.3; 3];

@@ -11,7 +11,7 @@
 //! | `batch_mma` | many vectors q of one U at once by tensor cores, with an order and a rounding of its own |
 //! | `ingest` | the way of a step's values to the device |
 //! | `overlap` | steps that the host reads, one after the other and side by side |
-//! | `cublas`, `plain_update` | a library's products, and the vertex update behind them |
+//! | `cublas`, [`plain_update`] | a library's products, and the vertex update behind them |
 //! | `raster` | the rasteriser on positions and samples of its own |
 //! | `thesis` | the kernels of the thesis |
 
