@@ -18,7 +18,7 @@ use crate::frames::{Stages, stages};
 use crate::step::Step;
 
 /// The most acknowledgements, and the most refusals, that are kept until the caller takes them. Older ones are dropped;
-/// the totals still count them.
+/// [`Finished::refused`] counts all refusals.
 const KEPT: usize = 1024;
 
 /// How the server handles steps that arrive faster than it processes them.
