@@ -1,11 +1,11 @@
-# Shared by deploy/demo and deploy/check: what a machine must have, installed or named. To be sourced from the root.
+# Functions of deploy/demo and deploy/check that install or name missing dependencies. Source it from the root folder.
 
 say() { printf '\033[1m== %s\033[0m\n' "$*" >&2; }
 refuse() { printf 'modalcast: %s\n' "$*" >&2; exit 1; }
-# Without -q, so that grep reads to the end: a pipe closed early would look like a failure under pipefail.
+# No `grep -q`: it closes the pipe at the first match, and pipefail reports the broken pipe of ldconfig as a failure.
 has_library() { /sbin/ldconfig -p 2>/dev/null | grep -F "$1" >/dev/null; }
 
-# Debian packages by name: installed when we are root, else named.
+# Installs Debian packages as root; otherwise stops and names them.
 need_packages() {
     local missing=()
     for package in "$@"; do
@@ -19,12 +19,13 @@ need_packages() {
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 }
 
-# The Rust toolchain is the user's own: a missing or old one is refused with the line that installs one.
+# Stops if the Rust toolchain is missing or too old, and prints the command that installs it. The toolchain belongs to
+# the user, so it is not installed here.
 need_rust() {
     local wanted found
     wanted=$(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)
     local remedy="curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs | sh -s -- -y --default-toolchain stable"
-    # A toolchain that was installed a minute ago is not on the PATH of an older shell.
+    # A shell that was started before the installation does not have the toolchain in its PATH.
     command -v cargo >/dev/null || PATH="$HOME/.cargo/bin:$PATH"
     command -v cargo >/dev/null && command -v rustc >/dev/null ||
         refuse "Rust $wanted or newer is needed and none was found. Install it with:
@@ -36,17 +37,17 @@ need_rust() {
     command -v cc >/dev/null || need_packages gcc libc6-dev
 }
 
-# OpenGL through EGL: NVIDIA's driver brings its own vendor library, Mesa's renders on the CPU.
+# OpenGL through EGL: NVIDIA's driver includes its vendor library; Mesa's library renders on the CPU.
 need_egl() {
     has_library 'libEGL.so.1' || need_packages libegl1
     has_library 'libEGL_nvidia.so.0' && return 0
     has_library 'libEGL_mesa.so.0' || need_packages libegl-mesa0
-    # Where Mesa keeps its drivers differs; Debian's package is asked for only where none is found.
+    # The folder of Mesa's drivers differs between systems; require Debian's package only if no driver is found.
     compgen -G '/usr/lib/*/dri/swrast_dri.so' >/dev/null || compgen -G '/usr/lib*/dri/swrast_dri.so' >/dev/null ||
         need_packages libgl1-mesa-dri
 }
 
-# NVRTC from the PyPI wheel, into an ignored folder that the server searches.
+# Installs NVRTC from its PyPI wheel into a git-ignored folder that the server searches.
 need_nvrtc() {
     compgen -G '.tools/nvrtc/nvidia/*/lib/libnvrtc.so.13' >/dev/null && return
     command -v python3 >/dev/null && python3 -m pip --version >/dev/null 2>&1 || need_packages python3 python3-pip
@@ -55,7 +56,7 @@ need_nvrtc() {
         --target .tools/nvrtc 'nvidia-cuda-nvrtc==13.0.88'
 }
 
-# A machine with an NVIDIA driver but without NVRTC gets the wheel; one without a driver needs neither.
+# Installs NVRTC only if the machine has an NVIDIA driver and no NVRTC; without a driver it is not needed.
 need_nvrtc_for_driver() {
     has_library 'libcuda.so.1' || return 0
     has_library 'libnvrtc.so.13' && return 0

@@ -1,5 +1,5 @@
-//! Frames in f64, 3x4 row-major on the wire, named by their ends (`world_from_domain`), and the rigid motion that best
-//! carries some points to others.
+//! Affine transforms in f64 and the rigid motion that best fits moved points. Transforms are 3x4 row-major on the wire
+//! and are named by target and source frame (`world_from_domain`).
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -16,13 +16,13 @@ impl Affine {
         Self { linear: Matrix3::identity(), translation: Vector3::zeros() }
     }
 
-    /// From twelve numbers, row-major 3x4.
+    /// Converts from twelve numbers, row-major 3x4.
     pub fn from_entries(entries: &[f32; 12]) -> Self {
         let at = |row: usize, column: usize| f64::from(entries[4 * row + column]);
         Self { linear: Matrix3::from_fn(at), translation: Vector3::from_fn(|row, _| at(row, 3)) }
     }
 
-    /// Rounded to twelve numbers, row-major 3x4.
+    /// Rounds to twelve f32, row-major 3x4.
     pub fn entries(&self) -> [f32; 12] {
         std::array::from_fn(|at| {
             let (row, column) = (at / 4, at % 4);
@@ -30,26 +30,26 @@ impl Affine {
         })
     }
 
-    /// `a_from_c = a_from_b.then(b_from_c)`.
+    /// Composes transforms: `a_from_c = a_from_b.then(b_from_c)`.
     #[must_use]
     pub fn then(&self, b_from_c: &Self) -> Self {
         Self { linear: self.linear * b_from_c.linear, translation: self.apply(&b_from_c.translation) }
     }
 
-    /// Where a point goes.
+    /// Transforms a point.
     pub fn apply(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.linear * point + self.translation
     }
 
-    /// A rotation about an axis (unit) through a point.
+    /// A rotation by `angle` radians about an axis through the point `about`. The axis is normalized.
     pub fn turn(axis: &Vector3<f64>, angle: f64, about: &Vector3<f64>) -> Self {
         let turn = nalgebra::Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(*axis), angle).into_inner();
         Self { linear: turn, translation: about - turn * about }
     }
 }
 
-/// The proper rotation and translation that carry `rest` to `now` with the least squared error (Kabsch 1976). Fewer
-/// than three points, or points on a line, leave the rotation open: then only the mean moves.
+/// The proper rotation and translation that map `rest` to `now` with the least squared error (Kabsch 1976). Fewer than
+/// three points, or collinear points, do not determine the rotation: then the result is the translation of the mean.
 pub fn rigid_motion(rest: &[Vector3<f64>], now: &[Vector3<f64>]) -> Affine {
     let count = rest.len().min(now.len());
     if count == 0 {
@@ -62,7 +62,7 @@ pub fn rigid_motion(rest: &[Vector3<f64>], now: &[Vector3<f64>]) -> Affine {
     Affine { linear: turn, translation: to - turn * from }
 }
 
-/// The proper rotation nearest to a 3x3 correlation; the identity when two of its singular values vanish.
+/// The proper rotation nearest to a 3x3 correlation matrix; the identity if two of its singular values vanish.
 fn rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     let parts = correlation.svd(true, true);
     let (Some(left), Some(right)) = (parts.u, parts.v_t) else { return Matrix3::identity() };
@@ -73,7 +73,7 @@ fn rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     }
     let mirrored = (left * right).determinant() < 0.0;
     let mut signs = Matrix3::identity();
-    // A planar ring has a third singular value of zero: its direction may be flipped to keep the rotation proper.
+    // The third singular value of a planar ring is zero, so its direction can be flipped to make the rotation proper.
     signs[(2, 2)] = if mirrored { -1.0 } else { 1.0 };
     left * signs * right
 }
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_planar_ring_gives_back_the_motion_that_moved_it() {
+    fn rigid_motion_recovers_the_motion_of_a_planar_ring() {
         for angle in [0.0, 1e-9, 0.3, 1.5, 3.0] {
             let motion = Affine::turn(&Vector3::new(1.0, 2.0, -0.5), angle, &Vector3::new(0.3, -1.0, 4.0));
             let rest = ring(8);
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rotation_is_proper_also_when_the_points_are_mirrored() {
+    fn rotation_of_mirrored_points_is_proper() {
         let rest: [Vector3<f64>; 4] = [Vector3::x(), Vector3::y(), Vector3::z(), Vector3::zeros()];
         let now = rest.map(|point| Vector3::new(-point.x, point.y, point.z));
         let got = rigid_motion(&rest, &now);
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_points_or_points_on_a_line_only_move() {
+    fn too_few_or_collinear_points_only_translate() {
         let by = Vector3::new(1.0, -2.0, 3.0);
         let line: Vec<_> = (0..5).map(|at| Vector3::new(f64::from(at), 0.0, 0.0)).collect();
         let same = vec![Vector3::x(); 4];
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn entries_go_there_and_back_and_frames_compose() {
+    fn entries_round_trip_and_transforms_compose() {
         let turn = Affine::turn(&Vector3::z(), std::f64::consts::FRAC_PI_2, &Vector3::new(1.0, 0.0, 0.0));
         let there = turn.apply(&Vector3::new(2.0, 0.0, 0.0));
         assert!((there - Vector3::new(1.0, 1.0, 0.0)).norm() <= 1e-15);

@@ -1,8 +1,8 @@
-//! A span under a pulsating load to its coordinates: reduced StVK forces under implicit Newmark.
+//! A span under a pulsating load: reduced StVK forces, integrated by implicit Newmark.
 //!
-//! The load pushes the middle of the span, spread evenly over the vertices there; its strength is calibrated so that
-//! the equilibrium under it deflects by a wanted share of the diagonal. The run begins in that equilibrium and the
-//! load then goes up and down as (1 + cos) / 2.
+//! The load acts on the middle of the span and is spread evenly over the samples there. Its strength is calibrated so
+//! that the deflection at equilibrium is a given share of the diagonal. The run starts at that equilibrium, and the
+//! load then pulsates as (1 + cos) / 2.
 
 use std::f64::consts::TAU;
 
@@ -17,36 +17,36 @@ use crate::newmark::{Motion as Reduced, System};
 use crate::run::{Motion, Report, Scenario};
 use crate::vega::Settings;
 
-/// What the load does.
+/// Settings of the load.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
     /// Seconds per step.
     pub dt: f64,
-    /// Deflection in equilibrium as a share of the diagonal.
+    /// Deflection at equilibrium as a share of the diagonal.
     pub deflection: f64,
-    /// Seconds per pulse.
+    /// Period of the load in seconds.
     pub period: f64,
     pub toward: Toward,
 }
 
-/// Where the load pushes.
+/// Direction of the load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Toward {
-    /// Like a wind: across the span, with a lift of 0.3 of it.
+    /// Like a wind: across the span, with an upward component of 0.3 times the horizontal one.
     Across,
-    /// Like a weight. A span near the ground then dips below the ground plane of a picture.
+    /// Like a weight. A span close to the ground then moves below the ground plane of a picture.
     Down,
     Up,
 }
 
-/// The span.
+/// The bridge scenario.
 pub struct Bridge {
     model: Model,
     system: System,
     options: Options,
-    /// Which part bends.
+    /// Index of the deforming part.
     part: usize,
-    /// The full load, and the coordinates that it holds.
+    /// The full reduced load.
     load: DVector<f64>,
     motion: Reduced,
     next: u64,
@@ -56,10 +56,11 @@ pub struct Bridge {
 }
 
 impl Bridge {
-    /// Calibrates the load to the span.
+    /// Calibrates the load for the span.
     ///
     /// # Errors
-    /// `Invalid` when no part has the rank of the forces, or the load cannot move it.
+    /// `Invalid` if no part has the rank of the forces, the stiffness is not positive definite, or the load cannot
+    /// deform the part.
     pub fn new(model: Model, force: ReducedForce, settings: &Settings, options: Options) -> Result<Self> {
         let rank = force.rank();
         let part = model.parts.iter().position(|part| part.owner && part.rank == rank);
@@ -75,7 +76,7 @@ impl Bridge {
         Ok(Self { model, system, options, part, load, motion, next: 0, strength, still, peak: 0.0 })
     }
 
-    /// The load at a step.
+    /// The reduced load at a step.
     fn load(&self, step: u64) -> DVector<f64> {
         let time = step as f64 * self.options.dt;
         &self.load * (0.5 + 0.5 * (TAU * time / self.options.period).cos())
@@ -141,8 +142,8 @@ impl Toward {
     }
 }
 
-/// U^T of a unit force, spread over the middle tenth of the longer horizontal axis (or over the whole
-/// part, when nothing there can move).
+/// U^T times a unit force, spread over the middle tenth of the longer horizontal axis, or over the whole part if the
+/// middle tenth cannot move.
 fn pull(model: &Model, part: &Part, toward: Toward) -> Result<DVector<f64>> {
     let (axis, _) = model.ground_axes();
     let along = |rest: &Vector3<f64>| part.placement.apply(rest).dot(&axis);
@@ -159,16 +160,16 @@ fn pull(model: &Model, part: &Part, toward: Toward) -> Result<DVector<f64>> {
     if force.norm() > 0.0 { Ok(force) } else { Err(invalid("scene", "a part that a load can bend", &part.name)) }
 }
 
-/// The largest displacement of a part's watched vertices.
+/// The largest displacement of a part's samples, in scene units.
 fn deflection(part: &Part, q: &DVector<f64>) -> f64 {
     part.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
 }
 
-/// The strength of a load whose equilibrium deflects as wanted, and that equilibrium. The load grows step by step, each
-/// solved from the last.
+/// The strength of a load with the deflection `wanted` at equilibrium, and that equilibrium. The load is increased in
+/// steps, each solved from the previous equilibrium, and then bisected.
 fn calibrate(system: &System, part: &Part, direction: &DVector<f64>, wanted: f64) -> Result<(f64, DVector<f64>)> {
     let rest = DVector::zeros(system.rank());
-    // A thousandth of the way is linear enough to know how strong to begin.
+    // The response to a tiny load is linear; extrapolate from it to a tenth of the wanted deflection.
     let tiny = 1e-6 * direction.norm().recip();
     let answer = deflection(part, &system.equilibrium(&(direction * tiny), &rest));
     if !(answer > 0.0 && answer.is_finite()) {
@@ -198,7 +199,7 @@ mod tests {
     use crate::cubic::tests::chain;
     use crate::hierarchy::tests::plant;
 
-    /// A part of two modes and a force of two coordinates.
+    /// A bridge with a part of two modes and a force of two coordinates.
     fn span(options: Options) -> Bridge {
         Bridge::new(plant(), chain(&[40.0, 90.0], 30.0, 4.0), &Settings::default(), options).expect("valid")
     }
@@ -206,7 +207,7 @@ mod tests {
     const OPTIONS: Options = Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0, toward: Toward::Across };
 
     #[test]
-    fn the_run_begins_at_the_wanted_deflection_and_moves() {
+    fn run_starts_at_the_requested_deflection_and_moves() {
         let mut bridge = span(OPTIONS);
         assert!((bridge.still - 0.03).abs() <= 1e-6, "{}", bridge.still);
         let (mut first, mut later) = (Motion::default(), Motion::default());
@@ -218,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_force_of_another_rank_is_refused_with_the_ranks_that_are_there() {
+    fn force_of_another_rank_is_refused_with_the_available_ranks() {
         let force = chain(&[1.0, 2.0, 3.0], 0.0, 0.0);
         let refusal = Bridge::new(plant(), force, &Settings::default(), OPTIONS).err().expect("refused").to_string();
         assert!(refusal.contains("rank 3") && refusal.contains("[2, 2, 2, 0]"), "{refusal}");

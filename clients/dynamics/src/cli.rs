@@ -16,7 +16,7 @@ Examples:
 Exit codes: 0 done; 1 the server refused (no such scene, or another writer holds it); 2 bad command line;
 3 no connection, or lost; 4 a local file; 5 a file, a scene or a reply does not fit; 6 done, but steps were rejected.";
 
-/// Moves a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
+/// Drives a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-sim", version, after_help = EXAMPLES)]
 pub(crate) struct Arguments {
@@ -26,7 +26,7 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Wind, by modal superposition: exact for every mode. The scene must state eigenvalues.
+    /// Wind on a tree by modal superposition, exact for every mode. The scene must state eigenvalues.
     #[command(after_help = EXAMPLES)]
     Tree {
         #[command(flatten)]
@@ -34,7 +34,7 @@ pub(crate) enum Command {
         #[command(flatten)]
         wind: Wind,
     },
-    /// A pulsating load in the middle, by Vega's reduced cubic forces under implicit Newmark.
+    /// A pulsating load on the middle of a span, by Vega's reduced cubic forces under implicit Newmark.
     #[command(after_help = EXAMPLES)]
     Bridge {
         #[command(flatten)]
@@ -44,16 +44,16 @@ pub(crate) enum Command {
         #[command(flatten)]
         load: Load,
     },
-    /// Every coordinate in its turn; a rigid scene rocks.
+    /// Every coordinate in turn; a rigid scene rocks.
     #[command(after_help = EXAMPLES)]
     Sweep {
         #[command(flatten)]
         common: Common,
-        /// The largest displacement as a share of the diagonal.
+        /// Largest displacement as a share of the diagonal.
         #[arg(long, default_value_t = 0.06, value_parser = share)]
         share: f64,
     },
-    /// The bridge when cubic forces are there, else the tree when eigenvalues are, else the sweep.
+    /// The bridge if cubic forces are available, else the tree if the scene has eigenvalues, else the sweep.
     #[command(after_help = EXAMPLES)]
     Auto {
         #[command(flatten)]
@@ -64,7 +64,7 @@ pub(crate) enum Command {
         load: Load,
         #[command(flatten)]
         wind: Wind,
-        /// The sweep's largest displacement as a share of the diagonal.
+        /// Largest displacement of the sweep as a share of the diagonal.
         #[arg(long, default_value_t = 0.06, value_parser = share)]
         share: f64,
     },
@@ -72,34 +72,34 @@ pub(crate) enum Command {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Common {
-    /// The server.
+    /// URL of the server.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
-    /// Seconds to keep trying until the server answers.
+    /// How long to retry until the server answers, in seconds.
     #[arg(long, default_value_t = 0.0, value_parser = number)]
     pub(crate) wait: f64,
     /// The scene's name on the server.
     #[arg(long, default_value = "tree")]
     pub(crate) scene: String,
-    /// Open this source of the server's repository under that name first.
+    /// First open this source of the server's repository under the name of --scene.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
-    /// Seconds of simulation; 0 runs until interrupted.
+    /// Simulated time in seconds; 0 runs until interrupted.
     #[arg(long, default_value_t = 10.0, value_parser = number)]
     pub(crate) seconds: f64,
-    /// Steps of simulation instead; 0 runs until interrupted.
+    /// Number of steps, in place of --seconds; 0 runs until interrupted.
     #[arg(long, conflicts_with = "seconds")]
     pub(crate) steps: Option<u64>,
     /// Seconds per step.
     #[arg(long, default_value_t = 1.0 / 60.0, value_parser = positive)]
     pub(crate) dt: f64,
-    /// Every step is shown, or the newest.
+    /// Process every step (lossless), or only the newest (latest).
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) policy: PolicyOption,
-    /// Steps without acknowledgement; 0 leaves it to the server.
+    /// Most steps in flight; 0 selects the server's default.
     #[arg(long, default_value_t = 0)]
     pub(crate) window: u32,
-    /// Keep pace with the clock instead of going as fast as possible.
+    /// Run in real time instead of as fast as possible.
     #[arg(long)]
     pub(crate) realtime: bool,
     /// Write q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), float32, into this folder.
@@ -127,17 +127,17 @@ impl From<PolicyOption> for Policy {
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct Wind {
-    /// Strength: 1 sways the crown by `--sway`.
+    /// Strength of the wind; at 1 the crown sways by `--sway`.
     #[arg(long, default_value_t = 1.0, value_parser = number)]
     pub(crate) wind: f64,
-    /// The crown's peak displacement at wind 1, as a share of the height.
+    /// Peak displacement of the crown at wind 1, as a share of the height.
     #[arg(long, default_value_t = 0.05, value_parser = share)]
     pub(crate) sway: f64,
-    /// Where the wind blows to, in degrees about up from the first horizontal axis; at 25 the default camera sees the
-    /// sway from the side.
+    /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis; at 25 the default
+    /// camera sees the sway from the side.
     #[arg(long, default_value_t = 25.0, value_parser = angle, allow_hyphen_values = true)]
     pub(crate) direction: f64,
-    /// Seed of the turbulence.
+    /// Random seed of the turbulence.
     #[arg(long, default_value_t = 7)]
     pub(crate) seed: u64,
 }
@@ -147,23 +147,23 @@ pub(crate) struct Files {
     /// Vega's file of reduced cubic forces.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
-    /// Vega's settings; without it the file beside the forces, if there is one.
+    /// Vega's settings; default is the .config file next to the forces, if it exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
-    /// A folder in which to look for the cubic forces.
+    /// Folder to search for the cubic forces.
     #[arg(long, value_name = "DIR")]
     pub(crate) files: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct Load {
-    /// Deflection in equilibrium, as a share of the diagonal.
+    /// Deflection at equilibrium, as a share of the diagonal.
     #[arg(long, default_value_t = 0.03, value_parser = share)]
     pub(crate) deflection: f64,
-    /// Seconds per pulse.
+    /// Period of the load in seconds.
     #[arg(long, default_value_t = 2.0, value_parser = positive)]
     pub(crate) period: f64,
-    /// Where it pushes: across the span with some lift (a wind), down (a weight), or up.
+    /// Direction of the load: across the span with some lift (a wind), down (a weight), or up.
     #[arg(long, value_enum, default_value = "across")]
     pub(crate) toward: TowardOption,
 }
@@ -228,13 +228,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_line_is_sound() {
+    fn command_line_is_valid() {
         use clap::CommandFactory as _;
         Arguments::command().debug_assert();
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn invalid_numbers_are_refused() {
         for wrong in ["nan", "-1", "inf", "x", ""] {
             assert!(number(wrong).is_err(), "{wrong}");
         }

@@ -1,8 +1,9 @@
-//! Reduced StVK forces: a `.cub` file to f(q) = L q + quadratic + cubic monomials, Jacobian and potential, r coordinates.
+//! Reduced StVK forces of r coordinates, read from a `.cub` file: f(q) = L q + quadratic + cubic monomials, with
+//! Jacobian and potential.
 //!
-//! The file: four little-endian i32 (r, then r, r(r+1)/2 and r(r+1)(r+2)/6 monomials of degree one, two and three),
-//! then per degree an f64 block, row-major per force component; monomials q_i q_j (i <= j) and q_i q_j q_k (i <= j <= k)
-//! in lexicographic order.
+//! File format: four little-endian i32 (r, then the numbers of monomials of degree one, two and three: r, r(r+1)/2 and
+//! r(r+1)(r+2)/6), followed by one f64 block per degree, row-major per force component. The monomials q_i q_j (i <= j)
+//! and q_i q_j q_k (i <= j <= k) are in lexicographic order.
 
 use std::path::Path;
 
@@ -11,7 +12,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::error::{Result, invalid};
 
-/// Coefficients of a polynomial force that is the gradient of a quartic potential.
+/// Coefficients of a polynomial force, which is the gradient of a quartic potential.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReducedForce {
     rank: usize,
@@ -22,10 +23,10 @@ pub struct ReducedForce {
 }
 
 impl ReducedForce {
-    /// From its blocks, each row-major per force component.
+    /// Creates a force from its blocks, each row-major per force component.
     ///
     /// # Errors
-    /// `Invalid` when a block has the wrong length or an entry is not finite.
+    /// `Invalid` if r is not 1 to 512, a block has the wrong length, or an entry is not finite.
     pub fn new(rank: usize, linear: &[f64], quadratic: Vec<f64>, cubic: Vec<f64>) -> Result<Self> {
         let monomials = counts(rank).ok_or_else(|| invalid("cub.r", "1 to 512", rank))?;
         for (field, given, count) in [
@@ -48,7 +49,7 @@ impl ReducedForce {
     /// Reads a file.
     ///
     /// # Errors
-    /// `Client` when it cannot be read; `Invalid` as [`Self::parse`].
+    /// `Client` if it cannot be read; `Invalid` as for [`Self::parse`].
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(&std::fs::read(path).map_err(|fault| ClientError::file(path, fault))?)
     }
@@ -56,7 +57,7 @@ impl ReducedForce {
     /// Parses the bytes of a file.
     ///
     /// # Errors
-    /// `Invalid` when the counts do not belong to r, the size is not what they say, or a number is not finite.
+    /// `Invalid` if the counts do not match r, the size does not match the counts, or a number is not finite.
     pub fn parse(bytes: &[u8]) -> Result<Self> {
         let Some((head, body)) = bytes.split_at_checked(16) else {
             return Err(invalid("cub.size", "at least 16 bytes", bytes.len()));
@@ -74,7 +75,7 @@ impl ReducedForce {
                 return Err(invalid(field, format!("{count} monomials for r = {rank}"), given));
             }
         }
-        // With r at most 512 this is below 2^37 bytes.
+        // Cannot overflow: with r at most 512 the size is below 2^37 bytes.
         let expected = 8 * rank * monomials.iter().sum::<usize>();
         if body.len() != expected {
             return Err(invalid("cub.size", format!("{} bytes", 16 + expected), bytes.len()));
@@ -87,7 +88,7 @@ impl ReducedForce {
         Self::new(rank, &linear, quadratic, cubic)
     }
 
-    /// r.
+    /// The number of coordinates r.
     pub const fn rank(&self) -> usize {
         self.rank
     }
@@ -97,19 +98,20 @@ impl ReducedForce {
         &self.linear
     }
 
-    /// f(q).
+    /// The force f(q), r entries.
     pub fn force(&self, q: &DVector<f64>) -> DVector<f64> {
         let [first, second, third] = self.by_degree(q);
         first + second + third
     }
 
-    /// V(q), whose gradient is f. A part of degree d has the potential q . f_d / (d + 1) (Euler's theorem).
+    /// The potential V(q), whose gradient is f. The part f_d of degree d has the potential q . f_d / (d + 1) (Euler's
+    /// theorem on homogeneous functions).
     pub fn potential(&self, q: &DVector<f64>) -> f64 {
         let [first, second, third] = self.by_degree(q);
         q.dot(&first) / 2.0 + q.dot(&second) / 3.0 + q.dot(&third) / 4.0
     }
 
-    /// df/dq, r x r.
+    /// The Jacobian df/dq, r x r.
     pub fn jacobian(&self, q: &DVector<f64>) -> DMatrix<f64> {
         let mut matrix = self.linear.clone();
         let [_, pairs, triples] = counts(self.rank).unwrap_or_default();
@@ -156,7 +158,7 @@ impl ReducedForce {
     }
 }
 
-/// How many monomials of degree one, two and three r coordinates have; none for an r that is not 1 to 512.
+/// The numbers of monomials of degree one, two and three in r coordinates; `None` unless r is 1 to 512.
 fn counts(rank: usize) -> Option<[usize; 3]> {
     let fits = (1..=512).contains(&rank);
     fits.then(|| [rank, rank * (rank + 1) / 2, rank * (rank + 1) * (rank + 2) / 6])
@@ -166,7 +168,7 @@ fn counts(rank: usize) -> Option<[usize; 3]> {
 pub(crate) mod tests {
     use super::*;
 
-    /// Numbers from -1 to 1 that repeat for a seed.
+    /// Pseudorandom numbers from -1 to 1, the same for the same seed.
     pub(crate) fn noise(seed: u64, count: usize) -> DVector<f64> {
         let mut state = seed;
         DVector::from_fn(count, |_, _| {
@@ -175,7 +177,8 @@ pub(crate) mod tests {
         })
     }
 
-    /// Springs of eigenvalues `stiff`, and between neighbours a potential of (q_i - q_{i+1})^4 and of q_i^2 q_{i+1}.
+    /// Springs with eigenvalues `stiff`, and between neighbors the potentials `fourth` (q_i - q_{i+1})^4 and
+    /// `third` q_i^2 q_{i+1}.
     pub(crate) fn chain(stiff: &[f64], fourth: f64, third: f64) -> ReducedForce {
         let rank = stiff.len();
         let [_, pairs, triples] = counts(rank).expect("small");
@@ -194,7 +197,7 @@ pub(crate) mod tests {
             let triple = |a, b, c| names.1.iter().position(|name| *name == [a, b, c]).expect("named");
             quadratic[i * pairs + pair(i, j)] += 2.0 * third;
             quadratic[j * pairs + pair(i, i)] += third;
-            // 4 (q_i - q_j)^3 on i, its negative on j.
+            // The force is 4 (q_i - q_j)^3 on i, and its negative on j.
             for (row, sign) in [(i, 4.0 * fourth), (j, -4.0 * fourth)] {
                 cubic[row * triples + triple(i, i, i)] += sign;
                 cubic[row * triples + triple(i, i, j)] -= 3.0 * sign;
@@ -217,7 +220,7 @@ pub(crate) mod tests {
         bytes
     }
 
-    /// Largest differences of the Jacobian from central differences and from its own transpose, relative.
+    /// The largest relative differences of the Jacobian from central differences, and from its transpose.
     fn wrongness(force: &ReducedForce, q: &DVector<f64>) -> (f64, f64) {
         let jacobian = force.jacobian(q);
         let step = 1e-5 * q.abs().max();
@@ -234,7 +237,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_file_gives_back_the_force_and_its_derivatives_agree() {
+    fn file_round_trips_and_derivatives_agree() {
         let force = chain(&[3.0, 5.0, 11.0, 400.0], 0.7, 0.4);
         assert_eq!(ReducedForce::parse(&encode(&force)).expect("parses"), force);
         for seed in 0..8 {
@@ -251,7 +254,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn truncated_oversized_and_senseless_files_are_refused_by_field() {
+    fn truncated_oversized_and_invalid_files_are_refused() {
         let whole = encode(&chain(&[1.0, 2.0], 0.1, 0.1));
         let with = |at: usize, byte: u8| {
             let mut bytes = whole.clone();
@@ -278,7 +281,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// The folder of real inputs.
+    /// The folder of real input data.
     pub(crate) fn data() -> std::path::PathBuf {
         let beside = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data");
         std::env::var_os("MODALCAST_DATA").map_or_else(|| beside.into(), Into::into)
@@ -299,7 +302,7 @@ pub(crate) mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn real_bridge_begins_at_one_hertz() {
+    fn real_bridge_has_a_lowest_frequency_of_one_hertz() {
         let force = ReducedForce::read(&data().join("vega/simpleBridge/simpleBridge.cub")).expect("reads");
         let lowest = force.linear().clone().symmetric_eigenvalues().min();
         let hertz = lowest.sqrt() / (2.0 * std::f64::consts::PI);

@@ -1,20 +1,20 @@
-//! What can go wrong in the physics process: the connection, or what it was given.
+//! Errors of the physics process: the client reports one, or an input is invalid.
 
-/// Shorthand of every fallible function in the crate.
+/// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// The one error of the physics process.
+/// The error type of this crate.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum Error {
-    /// The server refused, or the connection is gone, or a local file cannot be used.
+    /// The server refused a request, the connection was lost, or a local file cannot be used.
     #[error(transparent)]
     Client(#[from] modalcast_client::Error),
-    /// A file, a flag or a scene does not fit.
+    /// A file, an option or a scene is not valid here.
     #[error("{field}: expected {expected}, given {given}")]
     Invalid { field: String, expected: String, given: String },
 }
 
-/// A refusal that names the field, what was expected and what was given.
+/// An `Invalid` error with the field, the expected and the given value.
 pub fn invalid(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
     Error::Invalid { field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }

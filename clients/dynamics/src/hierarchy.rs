@@ -1,13 +1,14 @@
-//! Coordinates to transforms that keep every joint closed: a child's T is its parent's T, times the rigid motion that
-//! best carries the parent's ring of attachment vertices from rest to where U q puts it, times the frame at rest.
+//! Transforms of a hierarchy of parts that keep every joint closed. The transform T of a child is the product of its
+//! parent's T, the rigid motion that best fits the displacement U q of the parent's ring of attachment vertices, and
+//! the attachment frame at rest.
 
 use nalgebra::Vector3;
 
 use crate::affine::{Affine, rigid_motion};
 use crate::model::{Joint, Model, Part};
 
-/// `world_from_domain` of every part at coordinates `q`. `local` moves a part within its own frame (a leaf that turns
-/// about its stalk); parts without an entry do not.
+/// `world_from_domain` of every part at coordinates `q`. `local` moves a part within its own frame, for example a leaf
+/// that rotates about its stalk; parts without an entry do not move in their frame.
 pub fn transforms(model: &Model, q: &[f64], local: &[Option<Affine>]) -> Vec<Affine> {
     let mut world: Vec<Affine> = Vec::with_capacity(model.parts.len());
     for (index, part) in model.parts.iter().enumerate() {
@@ -21,7 +22,7 @@ pub fn transforms(model: &Model, q: &[f64], local: &[Option<Affine>]) -> Vec<Aff
     world
 }
 
-/// `parent_from_child`, displaced and rotated with the parent's ring.
+/// `parent_from_child` after the rigid motion of the parent's ring.
 fn carried(parent: &Part, joint: &Joint, q: &[f64]) -> Affine {
     if parent.rank == 0 || joint.ring.is_empty() {
         return joint.frame;
@@ -32,15 +33,15 @@ fn carried(parent: &Part, joint: &Joint, q: &[f64]) -> Affine {
     rigid_motion(&rest, &now).then(&joint.frame)
 }
 
-/// Measures how far joints have opened: the distances between the vertex at which a child hangs and the vertices of
-/// its parent's ring, now against at rest. It knows nothing of how the transforms were made.
+/// Measures how far joints open: compares the distances between a child's base vertex and the vertices of its parent's
+/// ring with those at rest. The measurement is independent of how the transforms are computed.
 #[derive(Debug, Clone)]
 pub struct Gauge {
     rest: Vec<Vec<f64>>,
 }
 
 impl Gauge {
-    /// Remembers the distances at rest, in the transforms that the scene was placed with.
+    /// Computes the distances at rest, with the placement of each part.
     pub fn new(model: &Model) -> Self {
         let world: Vec<_> = model.parts.iter().map(|part| part.placement).collect();
         let q = vec![0.0; model.coordinates];
@@ -55,7 +56,8 @@ impl Gauge {
     }
 }
 
-/// Per part: distances between its base and its parent's ring, or, without ring, the place where the parent has it.
+/// Per part: the distances between its base and its parent's ring. Without a ring: the distance between its base and
+/// the place given by its attachment frame.
 fn spans(model: &Model, q: &[f64], world: &[Affine]) -> Vec<Vec<f64>> {
     let of = |(part, pose): (&Part, &Affine)| {
         let Some(joint) = &part.joint else { return vec![] };
@@ -79,7 +81,7 @@ pub(crate) mod tests {
     use nalgebra::Matrix3;
     use std::collections::BTreeMap;
 
-    /// A part along y of length 1 with two modes: bending along x and z, as beams bend (section turns with its slope).
+    /// A part of length 1 along y with two modes: beam bending along x and z, with sections that rotate with the slope.
     fn stem(radius: f64, joint: Option<Joint>, placement: Affine, first: usize) -> Part {
         let mut samples = vec![];
         for level in 0..5 {
@@ -111,7 +113,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// A trunk, a branch askew at its top ring, a twig at the branch's top ring, and a rigid leaf on the twig.
+    /// A trunk, a tilted branch at its top ring, a twig at the branch's top ring, and a rigid leaf on the twig.
     pub(crate) fn plant() -> Model {
         let tilt = Affine::turn(&Vector3::z(), -0.9, &Vector3::zeros());
         let frame = Affine { translation: Vector3::y(), ..tilt };
@@ -132,7 +134,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn at_rest_every_part_is_where_the_scene_placed_it() {
+    fn parts_at_rest_have_their_placement() {
         let model = plant();
         for (part, pose) in model.parts.iter().zip(transforms(&model, &[0.0; 6], &[])) {
             assert!((pose.linear - part.placement.linear).abs().max() <= 1e-12);
@@ -141,7 +143,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn children_ride_on_their_parents_and_joints_stay_closed() {
+    fn children_follow_their_parents_and_joints_stay_closed() {
         let model = plant();
         let gauge = Gauge::new(&model);
         for q in [[0.1, 0.05, -0.08, 0.1, 0.1, -0.1], [-0.12, 0.0, 0.1, 0.1, -0.05, 0.1]] {
@@ -153,14 +155,14 @@ pub(crate) mod tests {
             }
             let tip = model.peak(&q, &world);
             assert!(tip > 0.05, "the plant hardly moves: {tip}");
-            // Negative control: children that do not follow leave a gap that is seen.
+            // Negative control: children that do not follow leave a gap that the gauge detects.
             let still: Vec<_> = model.parts.iter().map(|part| part.placement).collect();
             assert!(gauge.gap(&model, &q, &still) > 1e-2 * model.diagonal());
         }
     }
 
     #[test]
-    fn a_rigid_part_that_turns_about_its_base_stays_joined() {
+    fn rigid_part_that_rotates_about_its_base_stays_attached() {
         let model = plant();
         let gauge = Gauge::new(&model);
         let turn = Affine::turn(&Vector3::x(), 0.3, &Vector3::zeros());

@@ -1,20 +1,20 @@
-//! A physics process that drives a modalcast server: reduced coordinates q and transforms T of every step, computed
-//! from nothing but what the server describes (and, for a Vega model, its files of reduced forces).
+//! A physics process that drives a modalcast server. It computes reduced coordinates q and transforms T of every step
+//! from the server's description of the scene and, for a Vega model, from its files of reduced forces.
 //!
-//! | module | what it turns into what |
+//! | module | what it does |
 //! |---|---|
-//! | `model` | a described scene to parts: rank, joints, chosen rows of U |
-//! | `affine` | frames: compose, apply, round; the rigid motion of some points |
-//! | `hierarchy` | coordinates to transforms that keep every joint closed, and the gap that is left |
-//! | `oscillator` | one mode's state and force to its state a step later, exactly |
-//! | `wind` | time and place to a wind pressure |
-//! | `tree` | wind to the coordinates and transforms of a tree |
-//! | `cubic` | a `.cub` file to reduced StVK forces, their Jacobian and potential |
-//! | `vega` | a `.config` file to frequencies and damping |
-//! | `newmark` | reduced forces and a load to motion, implicitly |
-//! | `bridge` | a span under a load to its coordinates |
-//! | `sweep` | any scene to motion that shows every coordinate, or rocks what is rigid |
-//! | `run` | any of these to a step stream, with records and a summary |
+//! | `model` | converts a scene description into parts: rank, joints, selected rows of U |
+//! | `affine` | affine transforms, and the rigid motion that best fits moved points |
+//! | `hierarchy` | computes transforms that keep every joint closed, and measures the remaining gap |
+//! | `oscillator` | integrates one linear mode over a step, exactly |
+//! | `wind` | wind pressure by time and place |
+//! | `tree` | a tree in the wind, by modal superposition |
+//! | `cubic` | reduced StVK forces from a `.cub` file, with Jacobian and potential |
+//! | `vega` | base frequency and damping from a `.config` file |
+//! | `newmark` | implicit time integration of reduced forces under a load |
+//! | `bridge` | a span under a pulsating load |
+//! | `sweep` | motion for any scene: shows every coordinate in turn, or rocks a rigid scene |
+//! | `run` | sends a scenario as a step stream, with records and a summary |
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

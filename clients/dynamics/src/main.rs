@@ -1,4 +1,5 @@
-//! `modalcast-sim`: the physics process. It learns a scene from its server, moves it, and says what came of it.
+//! `modalcast-sim` is the physics process. It reads the description of a scene from its server, drives the scene, and
+//! prints a summary.
 
 mod cli;
 
@@ -20,7 +21,7 @@ use tokio::sync::watch;
 
 use cli::{Arguments, Command, Common, Files};
 
-/// Vertices that are watched of each part of a tree, and of any other scene.
+/// The most sampled vertices per part, of a tree and of other scenes.
 const WATCHED_TREE: usize = 24;
 const WATCHED: usize = 1 << 16;
 
@@ -67,7 +68,7 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
     tokio::spawn(async move {
         told_to_stop().await;
         stopper.send_replace(true);
-        // The first interrupt ends the run in order; a second one does not wait for a server that has stalled.
+        // The first signal ends the run in order. A later interrupt exits at once, also if the server has stalled.
         if tokio::signal::ctrl_c().await.is_ok() {
             std::process::exit(130);
         }
@@ -83,11 +84,11 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
     run(&client, scenario.as_mut(), &options, &stop).await
 }
 
-/// Ctrl-C or SIGTERM.
+/// Waits for Ctrl-C or SIGTERM.
 async fn told_to_stop() {
     use tokio::signal::unix::{SignalKind, signal};
     let Ok(mut terminate) = signal(SignalKind::terminate()) else {
-        tokio::signal::ctrl_c().await.ok(); // Without a signal to wait for the run ends by itself.
+        tokio::signal::ctrl_c().await.ok(); // Without a SIGTERM handler, wait for Ctrl-C only.
         return;
     };
     tokio::select! {
@@ -117,7 +118,7 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
             Ok(Box::new(Sweep::new(model, SweepOptions { dt, steps, share: *share })))
         }
         Command::Auto { files, load, wind, share, .. } => {
-            // A first look at few vertices tells which physics is known.
+            // A model with few samples is enough to choose the scenario.
             let model = Model::learn(client, scene, WATCHED_TREE).await?;
             let command = if cubic(&model, files).is_some() {
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
@@ -141,8 +142,8 @@ fn bridge(model: Model, files: &Files, options: BridgeOptions) -> Result<Box<dyn
     Ok(Box::new(Bridge::new(model, ReducedForce::read(&cubic)?, &settings, options)?))
 }
 
-/// The file of cubic forces: as the command line says, or the one in `--files` that the scene's note names, or the only
-/// one there.
+/// The file of cubic forces: the one of `--cubic`, or the one in `--files` that a note of the scene names, or the only
+/// one in `--files`.
 fn cubic(model: &Model, files: &Files) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());
@@ -158,7 +159,7 @@ fn cubic(model: &Model, files: &Files) -> Option<PathBuf> {
     if found.len() == 1 { found.pop() } else { None }
 }
 
-/// The summary: one line of JSON, or a line per fact.
+/// Prints the summary as one line of JSON, or with one line per value.
 fn print(summary: &Summary, json: bool) {
     if json {
         println!("{}", summary.value);
@@ -170,7 +171,7 @@ fn print(summary: &Summary, json: bool) {
 }
 
 impl Common {
-    /// How many steps; none without end.
+    /// The number of steps; `None` for an unlimited run.
     fn count(&self) -> Option<u64> {
         match (self.steps, self.seconds) {
             (Some(0), _) => None,

@@ -1,6 +1,7 @@
-//! A described scene to what the dynamics needs: per part rank, joint, chosen vertices with their rows of U, and area.
+//! Model of a scene for the dynamics, built from the server's description: per part rank, joint, sampled vertices with
+//! their rows of U, and area.
 //!
-//! Points and rows are in the part's own frame, lengths in scene units. Parents come before their children.
+//! Points and rows are in the frame of their part, lengths in scene units. Parents precede their children.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,10 +11,10 @@ use nalgebra::Vector3;
 use crate::affine::Affine;
 use crate::error::{Result, invalid};
 
-/// How many numbers of U are read at most, over all parts.
+/// The most numbers of U that are read, over all parts.
 const BUDGET: usize = 8 << 20;
 
-/// A vertex that the dynamics watches or loads.
+/// A vertex at which the dynamics measures displacements or applies loads.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     pub rest: Vector3<f64>,
@@ -21,13 +22,13 @@ pub struct Sample {
     pub rows: Vec<f64>,
 }
 
-/// How a part hangs on its parent.
+/// The attachment of a part to its parent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Joint {
     pub parent: usize,
     /// `parent_from_child` at rest.
     pub frame: Affine,
-    /// Which samples of the parent carry the frame; none on a rigid parent.
+    /// Indices of the parent's samples that carry the frame; empty for a rigid parent.
     pub ring: Vec<usize>,
 }
 
@@ -36,9 +37,10 @@ pub struct Joint {
 pub struct Part {
     pub name: String,
     pub rank: usize,
-    /// Where its coordinates are among all. Parts that share coordinates have the same.
+    /// Index of its first coordinate in the vector of all coordinates. Parts that share coordinates have the same
+    /// index.
     pub first: usize,
-    /// Whether steps carry its coordinates, not those of the part that it shares them with.
+    /// Whether steps carry the coordinates of this part. False if the part shares those of an earlier part.
     pub owner: bool,
     /// `world_from_domain` at rest.
     pub placement: Affine,
@@ -46,13 +48,13 @@ pub struct Part {
     /// (rad/s)^2; empty when unknown.
     pub eigenvalues: Vec<f64>,
     pub notes: BTreeMap<String, String>,
-    /// Surface, and diagonal of the bounds; 0 when the mesh was not asked for.
+    /// Surface area, and diagonal of the bounds; 0 if the mesh was not requested.
     pub area: f64,
     pub extent: f64,
-    /// The first `skin` are spread evenly over the vertices; then come joints' rings.
+    /// The first `skin` samples are spread evenly over the vertices; the other vertices of joint rings follow.
     pub samples: Vec<Sample>,
     pub skin: usize,
-    /// The sample nearest to the part's origin, where it hangs on its parent.
+    /// Index of the sample nearest to the part's origin, where the part is attached to its parent.
     pub base: Option<usize>,
 }
 
@@ -61,7 +63,7 @@ pub struct Part {
 pub struct Model {
     pub scene: String,
     pub parts: Vec<Part>,
-    /// Coordinates of all parts together.
+    /// Number of coordinates of all parts.
     pub coordinates: usize,
     pub up: Vector3<f64>,
     pub low: Vector3<f64>,
@@ -84,30 +86,30 @@ impl Sample {
         Vector3::from_fn(|component, _| self.rows[component * rank + mode])
     }
 
-    /// Where the vertex is, in the part's frame.
+    /// Displaced position of the vertex, in the frame of its part.
     pub fn moved(&self, q: &[f64]) -> Vector3<f64> {
         self.rest + self.displacement(q)
     }
 }
 
 impl Part {
-    /// This part's coordinates among all.
+    /// The coordinates of this part, from the vector of all coordinates.
     pub fn q<'a>(&self, all: &'a [f64]) -> &'a [f64] {
         &all[self.first..][..self.rank]
     }
 
-    /// A number that a note states.
+    /// The value of a note, if it is a finite number.
     pub fn note(&self, name: &str) -> Option<f64> {
         self.notes.get(name).and_then(|text| text.trim().parse().ok()).filter(|number: &f64| number.is_finite())
     }
 }
 
 impl Model {
-    /// Learns a scene from its server. `watched` is the most vertices that are watched of one part; the whole stays
-    /// within 8 Mi numbers of U.
+    /// Reads a scene from its server. `watched` is the most evenly spread samples per part; it is reduced, to no less
+    /// than 8, so that these samples of all parts together have at most 8 Mi numbers of U.
     ///
     /// # Errors
-    /// `Client` as the calls; `Invalid` when the description contradicts itself.
+    /// `Client` as for the calls; `Invalid` if the description contradicts itself.
     pub async fn learn(client: &Client, scene: &str, watched: usize) -> Result<Self> {
         let bare = client.describe(scene, &[]).await?;
         let bends = bare.domains.iter().any(|domain| domain.rank > 0);
@@ -168,30 +170,32 @@ impl Model {
         Ok(Self { scene: info.scene.clone(), parts, coordinates, up, low, high })
     }
 
-    /// Diagonal of the bounds at rest.
+    /// Diagonal of the bounds at rest, in scene units.
     pub fn diagonal(&self) -> f64 {
         (self.high - self.low).norm().max(f64::MIN_POSITIVE)
     }
 
-    /// Extent along up at rest.
+    /// Extent along the up axis at rest, in scene units.
     pub fn height(&self) -> f64 {
         (self.high - self.low).dot(&self.up).max(f64::MIN_POSITIVE)
     }
 
-    /// The horizontal direction at an angle about up, in radians, from the first horizontal axis (x, or y when x is up).
+    /// The horizontal direction at an angle about the up axis, in radians, from the first horizontal axis (x, or y if x
+    /// is up).
     pub fn horizontal(&self, angle: f64) -> Vector3<f64> {
         let first = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
         first * angle.cos() + self.up.cross(&first) * angle.sin()
     }
 
-    /// The longer horizontal axis, and the other one, so that the three are right-handed with up.
+    /// The longer horizontal axis and the other one. The two and the up axis form a right-handed system.
     pub fn ground_axes(&self) -> (Vector3<f64>, Vector3<f64>) {
         let (first, second) = (self.horizontal(0.0), self.horizontal(std::f64::consts::FRAC_PI_2));
         let size = |axis: &Vector3<f64>| (self.high - self.low).dot(&axis.abs());
         if size(&second) > size(&first) { (second, -first) } else { (first, second) }
     }
 
-    /// The largest displacement of a watched vertex from its place at rest, in scene units.
+    /// The largest displacement of a part's origin or of a sample from rest, in scene units. Considers evenly spread
+    /// samples only.
     pub fn peak(&self, q: &[f64], world: &[Affine]) -> f64 {
         let parts = self.parts.iter().zip(world);
         let of = |(part, pose): (&Part, &Affine)| {
@@ -204,7 +208,7 @@ impl Model {
     }
 }
 
-/// Which vertices of a domain are read: first `skin` evenly spread ones, then the others that joints need.
+/// The vertices of a domain to read: first `skin` evenly spread ones, then the others that joints need.
 struct Choice {
     vertices: Vec<u32>,
     skin: usize,
@@ -239,7 +243,7 @@ fn choose(description: &SceneDescription, watched: usize) -> Result<Vec<Choice>>
     Ok(domains.iter().zip(rings).map(choice).collect())
 }
 
-/// The vertex nearest to the domain's origin.
+/// Index of the vertex nearest to the domain's origin.
 fn base(domain: &Domain) -> u32 {
     let size = |at: u32| domain.rest_positions[3 * at as usize..][..3].iter().map(|x| x * x).sum::<f32>();
     (0..domain.vertices as u32).min_by(|a, b| size(*a).total_cmp(&size(*b))).unwrap_or(0)
@@ -282,7 +286,7 @@ fn joint(domain: &Domain, choices: &[Choice]) -> Result<Option<Joint>> {
     Ok(Some(Joint { parent: attachment.parent, frame, ring }))
 }
 
-/// The surface of a domain's mesh.
+/// The surface area of a domain's mesh.
 fn area(domain: &Domain) -> f64 {
     if domain.corner_vertices.is_empty() {
         return 0.0;

@@ -1,16 +1,19 @@
-//! Reduced forces under a load to motion: q'' + D q' + s f(q) = load by Newmark's method with average acceleration
-//! (beta 1/4, gamma 1/2; Newmark 1959), every step solved by Newton's method with the analytic Jacobian.
+//! Implicit time integration of reduced forces under a load: q'' + D q' + s f(q) = load, by Newmark's method with
+//! average acceleration (beta 1/4, gamma 1/2; Newmark 1959). Newton's method with the analytic Jacobian solves each
+//! step.
 //!
-//! The reduced mass is the identity. Each step minimises
+//! The reduced mass is the identity. Each step minimizes
 //!
 //! ```text
 //! c/2 |q - q_p|^2 + 1/(2 d) v(q)^T D v(q) + s V(q) - load . q,    v(q) = v_p + d (q - q_p)
 //! ```
 //!
-//! whose gradient is Newmark's equation; Newton's step is searched along until this falls, so it cannot diverge. Average
-//! acceleration keeps the energy of a linear system exactly, of a nonlinear one nearly. What it makes from nothing is
-//! counted, and a step that would exceed a small allowance is repeated by backward Euler and slowed down to the energy
-//! that it may have: the motion stays bounded at any step size.
+//! The gradient of this expression is Newmark's equation. A line search along Newton's direction ensures that the value
+//! decreases, so the iteration cannot diverge.
+//!
+//! Average acceleration conserves the energy of a linear system exactly and that of a nonlinear system approximately.
+//! The spurious energy gain is summed up. A step that would exceed a small allowance is repeated with backward Euler,
+//! and its velocity is scaled down to the available energy. The motion therefore stays bounded at any step size.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 
@@ -18,37 +21,37 @@ use crate::cubic::ReducedForce;
 use crate::error::{Result, invalid};
 use crate::vega::Settings;
 
-/// Newton steps per solve, and halvings per line search.
+/// The most Newton steps per solve, and the most halvings per line search.
 const NEWTON: usize = 60;
 const HALVINGS: usize = 50;
 
-/// The largest share of the highest energy so far that rounding and the method may make from nothing.
+/// The allowed spurious energy gain of rounding and the method, as a share of the highest energy so far.
 const ALLOWANCE: f64 = 0.02;
 
 /// A reduced model: r coordinates, unit mass.
 #[derive(Debug, Clone)]
 pub struct System {
     force: ReducedForce,
-    /// s: the square of Vega's base frequency.
+    /// s, the square of Vega's base frequency.
     scale: f64,
-    /// D = mass coefficient + stiffness coefficient times the scaled stiffness at rest.
+    /// D = mass coefficient * I + stiffness coefficient * scaled stiffness at rest; r x r.
     damping: DMatrix<f64>,
 }
 
-/// Coordinates and their rates at one time.
+/// Coordinates, velocities and accelerations at one time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
     pub q: DVector<f64>,
     pub v: DVector<f64>,
     a: DVector<f64>,
-    /// Energy made from nothing so far, and the highest energy so far.
+    /// Spurious energy gain so far, and the highest energy so far.
     surplus: f64,
     highest: f64,
 }
 
-/// One minimisation: the constants of the expression in the module's head.
+/// One minimization problem: the constants of the expression in the module documentation.
 struct Problem<'a> {
-    /// c and d; both 0 for a static answer.
+    /// c (1/s^2) and d (1/s); both 0 for a static solution.
     inertia: f64,
     rate: f64,
     q: DVector<f64>,
@@ -57,10 +60,10 @@ struct Problem<'a> {
 }
 
 impl System {
-    /// A model with Vega's scaling and Rayleigh damping.
+    /// Creates a model with Vega's frequency scaling and Rayleigh damping.
     ///
     /// # Errors
-    /// `Invalid` when the stiffness at rest is not positive definite.
+    /// `Invalid` if the stiffness at rest is not positive definite.
     pub fn new(force: ReducedForce, settings: &Settings) -> Result<Self> {
         let scale = settings.base_frequency * settings.base_frequency;
         let stiffness = (force.linear() + force.linear().transpose()) * (0.5 * scale);
@@ -72,7 +75,7 @@ impl System {
         Ok(Self { force, scale, damping })
     }
 
-    /// r.
+    /// The number of coordinates r.
     pub const fn rank(&self) -> usize {
         self.force.rank()
     }
@@ -86,30 +89,30 @@ impl System {
         hertz
     }
 
-    /// At rest, without load.
+    /// The motion at rest, without load.
     pub fn at_rest(&self) -> Motion {
         self.still(DVector::zeros(self.rank()))
     }
 
-    /// Standing still at `q`, held by a load that balances it.
+    /// The motion at `q` with zero velocity and acceleration, in equilibrium with a load.
     pub fn still(&self, q: DVector<f64>) -> Motion {
         let zero = DVector::zeros(self.rank());
         let highest = self.scale * self.force.potential(&q);
         Motion { q, v: zero.clone(), a: zero, surplus: 0.0, highest }
     }
 
-    /// Kinetic and elastic energy.
+    /// The sum of kinetic and elastic energy.
     pub fn energy(&self, motion: &Motion) -> f64 {
         0.5 * motion.v.norm_squared() + self.scale * self.force.potential(&motion.q)
     }
 
-    /// Where the model stands still under a load, searched from `near`.
+    /// The equilibrium under a load, searched from `near`.
     pub fn equilibrium(&self, load: &DVector<f64>, near: &DVector<f64>) -> DVector<f64> {
         let zero = DVector::zeros(self.rank());
         self.minimise(&Problem { inertia: 0.0, rate: 0.0, q: near.clone(), v: zero, load }, near)
     }
 
-    /// The motion `dt` seconds later, under a load that was `before` and is `after`.
+    /// The motion `dt` seconds later, under a load that changes from `before` to `after`.
     #[must_use]
     pub fn step(&self, motion: &Motion, dt: f64, (before, after): (&DVector<f64>, &DVector<f64>)) -> Motion {
         let next = self.newmark(motion, dt, after);
@@ -125,7 +128,7 @@ impl System {
             return Motion { surplus: surplus.max(-ALLOWANCE * highest), highest, ..next };
         }
         let mut next = self.backward_euler(motion, dt, after);
-        // Backward Euler holds still what it cannot follow; what is left of the velocity must fit the energy.
+        // Backward Euler damps fast modes; the kinetic energy of the result must not exceed the available energy.
         let room = (self.energy(motion) + after.dot(&(&next.q - &motion.q))).max(0.0);
         let kinetic = room - self.scale * self.force.potential(&next.q);
         let speed = next.v.norm();
@@ -136,7 +139,7 @@ impl System {
         Motion { surplus: motion.surplus.min(0.0), highest: motion.highest.max(self.energy(&next)), ..next }
     }
 
-    /// Average acceleration.
+    /// One step of average acceleration.
     fn newmark(&self, motion: &Motion, dt: f64, load: &DVector<f64>) -> Motion {
         let (inertia, rate) = (4.0 / (dt * dt), 2.0 / dt);
         let q = &motion.q + &motion.v * dt + &motion.a * (0.25 * dt * dt);
@@ -155,8 +158,8 @@ impl System {
         Motion { q, v, ..motion.clone() }
     }
 
-    /// Newton's method with a line search on what is minimised. Returns the best point found, never a worse one than
-    /// the start.
+    /// Newton's method with a line search on the minimized value. Returns the last accepted point, which is no worse
+    /// than the start up to rounding.
     fn minimise(&self, problem: &Problem<'_>, start: &DVector<f64>) -> DVector<f64> {
         let mut q = start.clone();
         let mut value = self.value(problem, &q);
@@ -168,7 +171,7 @@ impl System {
             if !descends {
                 return q;
             }
-            // Near the minimum the fall is lost in rounding: there the gradient decides.
+            // Near the minimum the decrease is below rounding; there the norm of the gradient decides.
             let noise = 1e-13 * (value.abs() + problem.inertia * (&q - &problem.q).norm_squared());
             let mut share = 1.0;
             let accepted = (0..HALVINGS).find_map(|_| {
@@ -204,7 +207,8 @@ impl System {
         ahead * problem.inertia + if problem.rate > 0.0 { damped + elastic } else { elastic }
     }
 
-    /// Newton's direction. Where the model is buckling the Jacobian is not definite: then it is stiffened until it is.
+    /// Newton's direction. The Hessian of a buckling model can be indefinite; a growing diagonal shift makes it
+    /// positive definite.
     fn newton(&self, problem: &Problem<'_>, q: &DVector<f64>, gradient: &DVector<f64>) -> DVector<f64> {
         let unit = DMatrix::<f64>::identity(self.rank(), self.rank());
         let jacobian = self.force.jacobian(q);
@@ -234,13 +238,13 @@ mod tests {
         System::new(force, &Settings::default()).expect("definite")
     }
 
-    /// Two coupled hardening springs, pulled and released, `count` steps in one second.
+    /// Two coupled hardening springs, deflected and released; `count` steps in one second.
     fn released(count: u32) -> (System, Motion) {
         let system = undamped(chain(&[40.0, 90.0], 30.0, 4.0));
         let none = DVector::zeros(2);
         let dt = 1.0 / f64::from(count);
         let mut motion = system.still(DVector::from_column_slice(&[0.8, -0.3]));
-        // Released: what held it is gone, so the acceleration begins at once.
+        // The holding load is removed, so the initial acceleration is not 0.
         motion.a = -system.force.force(&motion.q);
         let end = (0..count).fold(motion, |motion, _| system.step(&motion, dt, (&none, &none)));
         (system, end)
@@ -256,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn energy_is_kept_without_damping_and_lost_with_it() {
+    fn energy_is_conserved_without_damping_and_lost_with_it() {
         let (system, end) = released(1000);
         let start = system.scale * system.force.potential(&DVector::from_column_slice(&[0.8, -0.3]));
         assert!((system.energy(&end) / start - 1.0).abs() <= 1e-3, "{}", system.energy(&end) / start);
@@ -273,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_load_ends_in_the_equilibrium() {
+    fn steady_load_converges_to_the_equilibrium() {
         let settings = Settings { damping_mass: 4.0, ..Settings::default() };
         let system = System::new(chain(&[40.0, 90.0], 30.0, 4.0), &settings).expect("definite");
         let load = DVector::from_column_slice(&[12.0, -3.0]);
@@ -287,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_far_beyond_the_explicit_limit_stay_bounded_from_a_tenth_of_a_hertz_to_a_hundred_kilohertz() {
+    fn stays_bounded_far_beyond_the_explicit_step_limit() {
         let hertz = [0.1, 1.0, 10.0, 1e3, 1e5];
         let stiff: Vec<f64> = hertz.iter().map(|hertz| omega2(*hertz)).collect();
         let system = undamped(chain(&stiff, 1e3, 0.2));
@@ -308,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn a_violent_start_gains_no_energy_at_any_step_size() {
+    fn high_initial_velocity_gains_no_energy_at_any_step() {
         let system = undamped(chain(&[1.0, 7.0, 1e6], 50.0, 3.0));
         let none = DVector::zeros(3);
         for dt in [1e-3, 0.1, 1.0, 30.0] {
@@ -326,13 +330,13 @@ mod tests {
     }
 
     #[test]
-    fn a_stiffness_that_is_not_positive_definite_is_refused() {
+    fn indefinite_stiffness_is_refused() {
         assert!(System::new(chain(&[1.0, -1.0], 0.1, 0.0), &Settings::default()).is_err());
     }
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn real_bridge_falls_to_a_quarter_hertz_and_stays_bounded_at_any_step() {
+    fn real_bridge_has_a_quarter_hertz_and_stays_bounded() {
         let folder = data().join("vega/simpleBridge");
         let force = ReducedForce::read(&folder.join("simpleBridge.cub")).expect("reads");
         let settings = Settings::read(&folder.join("simpleBridge.config")).expect("reads");

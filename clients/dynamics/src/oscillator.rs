@@ -1,10 +1,10 @@
-//! One mode, q'' + 2 zeta omega q' + omega^2 q = f: state and force (linear within the step) to the state a step later,
-//! exactly.
+//! Exact time integration of one mode, q'' + 2 zeta omega q' + omega^2 q = f, with a force that is linear within a
+//! step.
 //!
-//! With p = h q' the step h is 1 long and the mode is the 2 x 2 system y' = M y + h^2 e2 f with w = omega h and
-//! M = [[0, 1], [-w^2, -2 zeta w]]. Everything follows from the response S(t) to a unit kick: the free motion is
-//! exp(M) = [[C, S], [-w^2 S, S']], the step response G1 = integral of S, the ramp response G2 = integral of G1. Which
-//! formula gives them to full precision depends on w and zeta alone.
+//! With time in units of the step h and p = h q', the mode is the 2 x 2 system y' = M y + h^2 e2 f with w = omega h and
+//! M = [[0, 1], [-w^2, -2 zeta w]]. All coefficients follow from the impulse response S(t): the free motion is exp(M) =
+//! [[C, S], [-w^2 S, S']], the step response is G1 = integral of S, and the ramp response is G2 = integral of G1. The
+//! formula that gives full precision depends only on w and zeta.
 
 use crate::error::{Result, invalid};
 
@@ -23,24 +23,25 @@ pub struct State {
     pub v: f64,
 }
 
-/// Responses after one step of length 1.
+/// Responses after one step, with time in units of the step.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Response {
-    /// Displacement left of a unit displacement.
+    /// C: displacement after a unit initial displacement.
     cosine: f64,
-    /// Displacement and velocity after a unit kick.
+    /// S and S': displacement and velocity after a unit impulse.
     kick: f64,
     kick_rate: f64,
-    /// Displacement under a unit force, and under one that grows from 0 to 1.
+    /// G1 and G2: displacement under a unit force, and under a force that increases from 0 to 1.
     constant: f64,
     ramp: f64,
 }
 
 impl Oscillator {
-    /// A mode of eigenvalue omega^2, (rad/s)^2, and damping ratio zeta, advanced by steps of `step` seconds.
+    /// A mode with eigenvalue omega^2 in (rad/s)^2 and damping ratio zeta, integrated in steps of `step` seconds.
     ///
     /// # Errors
-    /// `Invalid` unless the eigenvalue is finite and not negative, zeta from 0 to 1000, the step positive.
+    /// `Invalid` unless the eigenvalue is finite and not negative, zeta is 0 to 1000, and the step is finite and
+    /// positive.
     pub fn new(eigenvalue: f64, damping_ratio: f64, step: f64) -> Result<Self> {
         if !(eigenvalue.is_finite() && eigenvalue >= 0.0) {
             return Err(invalid("eigenvalue", "a finite number >= 0", eigenvalue));
@@ -55,12 +56,12 @@ impl Oscillator {
         Ok(Self { step, response: Response::of(w, damping_ratio), w_squared: w * w })
     }
 
-    /// A mode that never moves; for a mode without stiffness, which any steady force would carry away.
+    /// A mode that never moves. Used for modes without stiffness, which would drift without bound under a steady force.
     pub fn held() -> Self {
         Self { step: 1.0, response: Response::default(), w_squared: 0.0 }
     }
 
-    /// The state one step later under a force that goes linearly from `before` to `after`.
+    /// The state one step later, under a force that changes linearly from `before` to `after`.
     #[must_use]
     pub fn advance(&self, state: State, before: f64, after: f64) -> State {
         let (h, r) = (self.step, &self.response);
@@ -80,7 +81,7 @@ impl Response {
         if zeta > 1.15 { Self::overdamped(w, sigma) } else { Self::ringing(w, sigma) }
     }
 
-    /// The power series of S, for short steps, where the closed forms cancel: s_0 = 0, s_1 = 1 and
+    /// The power series of S, for short steps, where the closed forms suffer from cancellation: s_0 = 0, s_1 = 1 and
     /// (k + 1)(k + 2) s_{k+2} = -2 sigma (k + 1) s_{k+1} - w^2 s_k.
     fn series(w: f64, sigma: f64) -> Self {
         let mut sum = Self::default();
@@ -98,18 +99,18 @@ impl Response {
         sum
     }
 
-    /// Underdamped, critical, and a little more: e^-sigma times cosine and sine, or their hyperbolic kin.
+    /// Underdamped, critically damped and slightly overdamped modes: e^-sigma times cosine and sine, or cosh and sinh.
     fn ringing(w: f64, sigma: f64) -> Self {
         let square = (w - sigma) * (w + sigma);
         let d = square.abs().sqrt();
         let fade = (-sigma).exp();
         let (even, odd) = if d < 1e-4 {
-            // cos and sin(d)/d, or cosh and sinh(d)/d, to fourth order.
+            // Taylor expansion of cos and sin(d)/d, or of cosh and sinh(d)/d; the error is of fourth order in d.
             (fade * (1.0 - square / 2.0), fade * (1.0 - square / 6.0))
         } else if square > 0.0 {
             (fade * d.cos(), fade * d.sin() / d)
         } else {
-            // Products of exponentials would overflow where their sum does not.
+            // cosh and sinh would overflow for large d, while these exponents stay negative.
             let (slow, fast) = ((d - sigma).exp(), (-d - sigma).exp());
             (0.5 * (slow + fast), 0.5 * (slow - fast) / d)
         };
@@ -119,7 +120,7 @@ impl Response {
         Self { cosine, kick, kick_rate: even - sigma * odd, constant, ramp }
     }
 
-    /// Two real roots, well apart: every response is a divided difference of e^z, (e^z - 1)/z and (e^z - 1 - z)/z^2.
+    /// Two well separated real roots: the responses are divided differences of e^z, (e^z - 1)/z and (e^z - 1 - z)/z^2.
     fn overdamped(w: f64, sigma: f64) -> Self {
         let apart = ((sigma - w) * (sigma + w)).sqrt();
         let fast = -(sigma + apart);
@@ -145,7 +146,7 @@ fn second(z: f64) -> f64 {
     if z.abs() > 0.5 {
         return (z.exp_m1() - z) / (z * z);
     }
-    // Horner's scheme of sum of z^k / (k + 2)!.
+    // Horner's scheme for the sum of z^k / (k + 2)!, without cancellation near 0.
     (0..16).rev().fold(0.0, |sum, k| if k == 0 { (1.0 + sum) / 2.0 } else { (1.0 + sum) * z / f64::from(k + 2) })
 }
 
@@ -159,14 +160,14 @@ mod tests {
         2.0 * std::f64::consts::PI * hertz
     }
 
-    /// Frequencies from 0.1 Hz to 100 kHz, steps from 1 microsecond to 10 seconds.
+    /// Frequencies from 0.1 Hz to 100 kHz, steps from 1 microsecond to 10 seconds, and all damping ratios.
     fn extremes() -> impl Iterator<Item = (f64, f64, f64)> {
         let steps = [1e-6, 1e-4, 1.0 / 60.0, 0.3, 10.0];
         let hertz = [0.1, 1.0, 7.3, 440.0, 2e4, 1e5];
         hertz.into_iter().flat_map(move |f| steps.into_iter().flat_map(move |h| ZETAS.map(|zeta| (f, h, zeta))))
     }
 
-    /// Fourth-order Runge-Kutta in many small steps: an independent solution.
+    /// An independent solution: fourth-order Runge-Kutta in 20,000 small steps.
     fn reference(w2: f64, damping: f64, start: State, (before, after): (f64, f64), h: f64) -> State {
         let count = 20_000;
         let dt = h / f64::from(count);
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_agrees_with_a_finely_integrated_one() {
+    fn step_agrees_with_fine_runge_kutta_integration() {
         let start = State { q: 0.3, v: -0.2 };
         for w in [1e-4, 0.02, 0.5, 0.9, 1.1, 3.0, 20.0] {
             for zeta in ZETAS {
@@ -204,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn one_long_step_equals_many_short_ones_at_every_frequency_step_and_damping() {
+    fn one_long_step_equals_many_short_steps() {
         for (hertz, h, zeta) in extremes() {
             let (eigenvalue, parts) = (omega(hertz).powi(2), 64_u32);
             let start = State { q: 1.0, v: 0.5 * omega(hertz) };
@@ -212,7 +213,7 @@ mod tests {
             let long = Oscillator::new(eigenvalue, zeta, h).expect("valid").advance(start, force(0), force(parts));
             let short = Oscillator::new(eigenvalue, zeta, h / f64::from(parts)).expect("valid");
             let many = (0..parts).fold(start, |state, at| short.advance(state, force(at), force(at + 1)));
-            // The phase of a fast mode is rounded in proportion to the angle that it turns in the step.
+            // The rounding error of the phase is proportional to the phase angle of the step.
             let tolerance = 1e-9 + 1e-14 * omega(hertz) * h;
             let close = (long.q - many.q).abs() <= tolerance && (long.v - many.v).abs() <= tolerance * omega(hertz);
             assert!(close, "{hertz} Hz, {h} s, zeta {zeta}: {long:?} is not {many:?}");
@@ -220,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn without_force_energy_never_grows_and_the_motion_stays_bounded() {
+    fn free_motion_gains_no_energy_and_stays_bounded() {
         for (hertz, h, zeta) in extremes() {
             let eigenvalue = omega(hertz).powi(2);
             let mode = Oscillator::new(eigenvalue, zeta, h).expect("valid");
@@ -236,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn an_undamped_mode_keeps_its_energy_over_a_million_steps() {
+    fn undamped_mode_conserves_energy_over_a_million_steps() {
         for (hertz, h) in [(0.1, 1e-3), (1.7, 1.0 / 60.0), (300.0, 1.0 / 60.0), (1e5, 1.0)] {
             let eigenvalue = omega(hertz).powi(2);
             let mode = Oscillator::new(eigenvalue, 0.0, h).expect("valid");
@@ -249,14 +250,14 @@ mod tests {
     }
 
     #[test]
-    fn a_steady_force_ends_in_the_static_answer() {
+    fn steady_force_converges_to_the_static_solution() {
         let mode = Oscillator::new(50.0, 0.3, 0.1).expect("valid");
         let end = (0..1000).fold(State::default(), |state, _| mode.advance(state, 2.0, 2.0));
         assert!((end.q - 2.0 / 50.0).abs() <= 1e-14 && end.v.abs() <= 1e-13, "{end:?}");
     }
 
     #[test]
-    fn nonsense_is_refused_and_a_held_mode_stays() {
+    fn invalid_parameters_are_refused_and_held_modes_stay() {
         for (eigenvalue, zeta, step) in [(-1.0, 0.0, 1.0), (f64::NAN, 0.0, 1.0), (1.0, -0.1, 1.0), (1.0, 0.1, 0.0)] {
             assert!(Oscillator::new(eigenvalue, zeta, step).is_err(), "{eigenvalue} {zeta} {step}");
         }

@@ -1,4 +1,5 @@
-//! A scenario to a step stream: only what changed is sent; records, pace and a summary.
+//! Drives a scene with a scenario: sends changed values as a step stream, optionally in real time and with records, and
+//! summarizes the run.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,52 +14,52 @@ use tokio::sync::watch;
 use crate::error::{Error, Result};
 use crate::model::Model;
 
-/// What a scenario says of itself at the end, by name.
+/// Named results of a scenario or a run.
 pub type Report = serde_json::Map<String, Value>;
 
-/// How many times per stage, and refusals, are kept for the summary.
+/// The most times per stage, and the most refusals, that are kept for the summary.
 const KEPT: usize = 1 << 16;
 const REFUSALS: usize = 16;
 
-/// All coordinates, and `world_from_domain` of every part, row-major 3x4.
+/// The state at one step: all coordinates, and `world_from_domain` of every part, row-major 3x4.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Motion {
     pub q: Vec<f32>,
     pub transforms: Vec<[f32; 12]>,
 }
 
-/// Something that moves.
+/// A source of motion for a scene.
 pub trait Scenario {
-    /// What is moved.
+    /// The model of the scene.
     fn model(&self) -> &Model;
 
-    /// The motion at a step; called with 0, 1, 2 and so on.
+    /// Computes the motion at a step. The steps of consecutive calls are 0, 1, 2 and so on.
     ///
     /// # Errors
-    /// When the motion cannot go on.
+    /// If the motion cannot be continued.
     fn at(&mut self, number: u64, motion: &mut Motion) -> Result<()>;
 
-    /// Load, peaks and gaps up to now.
+    /// Load, peak displacements and joint gaps up to now.
     fn report(&self) -> Report;
 }
 
-/// How to run.
+/// Settings of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// None runs until it is stopped.
+    /// Number of steps; `None` runs until it is stopped.
     pub steps: Option<u64>,
     /// Seconds per step.
     pub dt: f64,
     pub policy: Policy,
-    /// Steps without acknowledgement; 0 leaves it to the server.
+    /// The most steps in flight; 0 selects the server's default.
     pub window: u32,
-    /// Keep pace with the clock.
+    /// Whether to run in real time.
     pub realtime: bool,
-    /// A folder for q.npy (steps x coordinates) and transforms.npy (steps x domains x 12).
+    /// Folder for q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), f32.
     pub record: Option<PathBuf>,
 }
 
-/// What a run came to.
+/// Results of a run.
 #[derive(Debug, Clone)]
 pub struct Summary {
     pub sent: u64,
@@ -66,7 +67,7 @@ pub struct Summary {
     pub value: Value,
 }
 
-/// What the acknowledgements said.
+/// Statistics of a run: acknowledgements, refusals and sent bytes.
 #[derive(Default)]
 struct Tally {
     stages: BTreeMap<String, Vec<f32>>,
@@ -75,10 +76,10 @@ struct Tally {
     bytes: u64,
 }
 
-/// Drives a scene until the steps are done or `stop` turns true.
+/// Drives a scene until all steps are done or `stop` becomes true.
 ///
 /// # Errors
-/// `Client` when the scene is taken, the stream ends or a record cannot be written.
+/// `Client` if the scene has another writer, the stream ends, or a record cannot be written; errors of the scenario.
 pub async fn run(
     client: &Client,
     scenario: &mut dyn Scenario,
@@ -104,7 +105,7 @@ pub async fn run(
         if let Some(record) = &mut record {
             record.add(&motion)?;
         }
-        // After a refusal the server lacks what that step carried: everything is sent again.
+        // After a refusal the server does not have the values of that step, so the next step sends everything.
         last = if refused { None } else { Some(std::mem::take(&mut motion)) };
         number += 1;
         bar.inc(1);
@@ -134,7 +135,7 @@ pub async fn run(
     Ok(Summary { sent: end.sent, refused: end.refused, value: Value::Object(value) })
 }
 
-/// The step with what differs from the last one, bit by bit; all of it the first time.
+/// A step with the values whose bits differ from the last motion; with all values if there is none.
 fn changed(model: &Model, number: u64, time: f64, (last, now): (Option<&Motion>, &Motion)) -> Step {
     let mut step = Step::new(number, time);
     let same = |old: &[f32], new: &[f32]| old.iter().map(|x| x.to_bits()).eq(new.iter().map(|x| x.to_bits()));
@@ -152,7 +153,7 @@ fn changed(model: &Model, number: u64, time: f64, (last, now): (Option<&Motion>,
 }
 
 impl Tally {
-    /// Notes a refusal and goes on; whether there was one. Any other error is the end.
+    /// Records a refusal and returns whether there was one. Any other error is returned.
     fn note(&mut self, sent: modalcast_client::Result<()>) -> Result<bool> {
         match sent {
             Ok(()) => Ok(false),
@@ -190,13 +191,13 @@ impl Tally {
     }
 }
 
-/// The middle of some times; 0 of none.
+/// The median of some times; 0 for none.
 fn median(times: &mut [f32]) -> f32 {
     times.sort_by(f32::total_cmp);
     times.get(times.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// A bar (or, without end, a counter) on standard error; hidden when that is no terminal.
+/// A progress bar, or a counter for an unlimited run, on standard error; hidden unless standard error is a terminal.
 fn progress(steps: Option<u64>) -> ProgressBar {
     let template = match steps {
         Some(_) => "steps [{bar:32}] {pos}/{len} {per_sec} eta {eta}",
@@ -206,7 +207,7 @@ fn progress(steps: Option<u64>) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// Every step's coordinates and transforms, for whoever checks what came of them.
+/// Records the coordinates and transforms of every step, so that results can be checked.
 struct Record {
     q: Writer,
     transforms: Writer,
@@ -238,7 +239,7 @@ mod tests {
     use crate::hierarchy::tests::plant;
 
     #[test]
-    fn only_what_changed_is_sent_and_everything_the_first_time() {
+    fn first_step_sends_everything_and_later_ones_changes() {
         let model = plant();
         let still = Motion { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
         let wire = |last, now| changed(&model, 3, 0.5, (last, now)).to_wire();

@@ -1,5 +1,5 @@
-//! Motion for scenes of which no physics is known: every coordinate in its turn as a sine whose crest displaces some
-//! vertex by a stated share of the diagonal; a scene without coordinates rocks about the middle of its base.
+//! Kinematic motion for scenes without known physics. Each coordinate in turn follows a sine whose crest displaces a
+//! sample by a given share of the diagonal. A scene without coordinates rocks about the center of its base.
 
 use std::f64::consts::TAU;
 
@@ -11,34 +11,34 @@ use crate::error::Result;
 use crate::model::{Model, Part};
 use crate::run::{Motion, Report, Scenario};
 
-/// How far a scene rocks, in radians, and how long that takes, in seconds.
+/// Amplitude, in radians, and period, in seconds, of a rocking scene.
 const ROCK: f64 = 0.05;
 const PERIOD: f64 = 2.0;
 
-/// What the sweep does.
+/// Settings of the sweep.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
     /// Seconds per step.
     pub dt: f64,
-    /// Steps of the run, when it ends.
+    /// Number of steps; `None` for an unlimited run.
     pub steps: Option<u64>,
     /// The largest displacement as a share of the diagonal.
     pub share: f64,
 }
 
-/// The sweep.
+/// The sweep scenario.
 pub struct Sweep {
     model: Model,
     options: Options,
-    /// Steps per turn of one coordinate.
+    /// Number of steps that each coordinate moves before the next one.
     turn: u64,
-    /// Per coordinate: what displaces some vertex by the wanted share.
+    /// Per coordinate: the value that displaces a sample by the requested share.
     amplitudes: Vec<f64>,
     peak: f64,
 }
 
 impl Sweep {
-    /// Finds the amplitudes.
+    /// Computes the amplitudes.
     pub fn new(model: Model, options: Options) -> Self {
         let wanted = options.share * model.diagonal();
         let mut largest = vec![0.0_f64; model.coordinates];
@@ -55,7 +55,7 @@ impl Sweep {
         Self { model, options, turn, amplitudes, peak: 0.0 }
     }
 
-    /// Height of the sine within a turn, scaled so that the highest of its steps is 1.
+    /// The sine at a step within a turn, scaled so that its largest value at a step is 1.
     fn wave(&self, step: u64) -> f64 {
         let at = |step: u64| (TAU * (step as f64 + 0.5) / self.turn as f64).sin();
         let crest = (0..self.turn).map(at).fold(0.0, f64::max);
@@ -72,7 +72,7 @@ impl Sweep {
         q
     }
 
-    /// The whole scene's motion: none when it has coordinates to show.
+    /// The rigid motion of the whole scene; the identity if the scene has coordinates.
     fn rocking(&self, time: f64) -> Affine {
         if self.model.coordinates > 0 {
             return Affine::identity();
@@ -109,7 +109,7 @@ impl Scenario for Sweep {
     }
 }
 
-/// The largest displacement of a watched vertex per unit of a coordinate, in the world.
+/// The largest displacement of a sample per unit of a coordinate, in world axes.
 fn reach(part: &Part, mode: usize) -> f64 {
     let world = |column: Vector3<f64>| (part.placement.linear * column).norm();
     part.samples.iter().map(|sample| world(sample.column(mode, part.rank))).fold(0.0, f64::max)
@@ -121,7 +121,7 @@ mod tests {
     use crate::hierarchy::tests::plant;
 
     #[test]
-    fn every_coordinate_reaches_the_wanted_share_once_per_round() {
+    fn every_coordinate_reaches_its_amplitude_once_per_round() {
         let options = Options { dt: 1.0 / 60.0, steps: Some(60), share: 0.06 };
         let mut sweep = Sweep::new(plant(), options);
         let mut shown = [0.0_f32; 6];
@@ -137,14 +137,14 @@ mod tests {
     }
 
     #[test]
-    fn fewer_steps_than_coordinates_still_show_the_full_share() {
+    fn fewer_steps_than_coordinates_still_reach_the_full_share() {
         let mut sweep = Sweep::new(plant(), Options { dt: 1.0, steps: Some(1), share: 0.06 });
         sweep.at(0, &mut Motion::default()).expect("moves");
         assert!((sweep.peak / sweep.model.diagonal() - 0.06).abs() <= 1e-6, "{}", sweep.peak);
     }
 
     #[test]
-    fn a_rigid_scene_rocks_about_its_base() {
+    fn rigid_scene_rocks_about_its_base() {
         let mut model = plant();
         model.parts.iter_mut().for_each(|part| (part.rank, part.first) = (0, 0));
         model.coordinates = 0;

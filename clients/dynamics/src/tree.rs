@@ -1,10 +1,10 @@
-//! Wind to a swaying tree: every mode an exact oscillator, its force U^T of the wind on sampled vertices plus what its
-//! children pass down through their joints; transforms from the hierarchy.
+//! A tree that sways in the wind. Each mode is an exact oscillator. Its force is U^T times the wind pressure on sampled
+//! vertices, plus the forces of child parts at their joints. The hierarchy gives the transforms.
 //!
-//! The load is calibrated to a sway: the same wind is first blown at unit strength in a rehearsal; as the modes are
-//! linear, their answer scales. The strength is then chosen so that the crown's mean displacement peaks at the wanted
-//! share of the height, while no branch bends by more than a stated share of its own length (foliage gives way in a
-//! strong wind), because large bending is beyond linear modes.
+//! The load is calibrated to a given sway. A calibration run first applies the same wind at unit strength; the modes
+//! are linear, so their response scales with the strength. The strength is then chosen so that the peak of the crown's
+//! mean displacement is the requested share of the height. The bending of each branch is limited to a share of its
+//! extent, because linear modes do not represent large bending.
 
 use nalgebra::Vector3;
 use serde_json::json;
@@ -17,43 +17,44 @@ use crate::oscillator::{Oscillator, State};
 use crate::run::{Motion, Report, Scenario};
 use crate::wind::Wind;
 
-/// Bending of a branch, and of the trunk, at most, as shares of their own extents.
+/// The largest bending of a branch, and of the trunk, as a share of its extent.
 const BRANCH: f64 = 0.05;
 const TRUNK: f64 = 0.2;
 
-/// How far a rigid leaf turns about its base, in radians.
+/// Scale of the rotation of a rigid leaf about its base, in radians.
 const FLUTTER: f64 = 0.15;
 
-/// Damping ratio of parts that state none.
+/// Damping ratio of parts without a note `damping_ratio`.
 const DAMPING: f64 = 0.03;
 
-/// What the wind does.
+/// Settings of the wind.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
     /// Seconds per step.
     pub dt: f64,
-    /// Steps of the run, when it ends.
+    /// Number of steps; `None` for an unlimited run.
     pub steps: Option<u64>,
-    /// The crown's peak displacement as a share of the height, at wind 1.
+    /// Peak displacement of the crown at wind 1, as a share of the height.
     pub sway: f64,
     pub wind: f64,
-    /// Where the wind blows to, in radians about up from the first horizontal axis (x, or y when x is up).
+    /// Direction that the wind blows to, in radians about the up axis from the first horizontal axis (x, or y if x is
+    /// up).
     pub direction: f64,
     pub seed: u64,
 }
 
-/// How wind and children push one part, per unit of pressure and force.
+/// Reduced loads of one part, per unit of wind pressure and of force of its children.
 struct Load {
-    /// Per mode: U^T of a unit pressure along and across the wind.
+    /// Per mode: U^T times a unit pressure along and across the wind.
     along: Vec<f64>,
     across: Vec<f64>,
-    /// 3 x r: mean rows of U where it carries its child, in world directions; empty without parent.
+    /// 3 x r of the parent: the mean rows of the parent's U at the joint, in world axes; empty without a parent.
     passed: Vec<f64>,
-    /// Downwind place of the part.
+    /// Downwind distance of the part, in scene units.
     distance: f64,
 }
 
-/// The tree in the wind.
+/// The tree scenario.
 pub struct Sway {
     model: Model,
     wind: Wind,
@@ -64,7 +65,7 @@ pub struct Sway {
     states: Vec<State>,
     forces: Vec<f64>,
     next: u64,
-    /// Parts whose highest sample is in the crown.
+    /// Part and sample index of the highest sample of each part that reaches the crown.
     crown: Vec<(usize, usize)>,
     gauge: Gauge,
     calibrated: f64,
@@ -74,10 +75,10 @@ pub struct Sway {
 }
 
 impl Sway {
-    /// Calibrates the wind to the tree.
+    /// Calibrates the wind for the tree.
     ///
     /// # Errors
-    /// `Invalid` when there is no eigenvalue, or one or a damping ratio cannot be used.
+    /// `Invalid` if the scene has no eigenvalues, or an eigenvalue, a damping ratio or the step is out of range.
     pub fn new(model: Model, options: Options) -> Result<Self> {
         if model.parts.iter().all(|part| part.eigenvalues.is_empty()) {
             let given = format!("{} domains without any; try the sweep", model.parts.len());
@@ -118,7 +119,8 @@ impl Sway {
         self.next += 1;
     }
 
-    /// Generalised forces at a time. Children come after their parents, so going backwards sums what they pass down.
+    /// Generalized forces at a time in seconds. Children follow their parents, so the reverse order accumulates the
+    /// forces of all descendants.
     fn force(&self, time: f64) -> Vec<f64> {
         let mut force = vec![0.0; self.model.coordinates];
         let mut pull = vec![Vector3::zeros(); self.model.parts.len()];
@@ -141,7 +143,7 @@ impl Sway {
         force
     }
 
-    /// Coordinates now: the answer to a unit wind times each part's gain.
+    /// Coordinates: the response to unit wind times the gain of each part, rounded to f32.
     fn coordinates(&self, states: &[f64], gains: &[f64]) -> Vec<f64> {
         let mut q = vec![0.0; self.model.coordinates];
         for (part, gain) in self.model.parts.iter().zip(gains) {
@@ -152,11 +154,11 @@ impl Sway {
         q
     }
 
-    /// Blows at unit strength, then sets the gains and begins anew.
+    /// Runs at unit strength, sets the gains from the response, and resets the state.
     fn calibrate(&mut self) {
         let most = (20.0 / self.options.dt).clamp(60.0, 1200.0) as u64;
         let steps = self.options.steps.map_or(most, |steps| steps.saturating_sub(1).clamp(1, most));
-        // Rehearsed states are kept within 64 MiB.
+        // Limit the stored states of this run to 64 MiB.
         let stride = (steps * self.model.coordinates as u64 * 8).div_ceil(64 << 20).max(1);
         let mut bending = vec![0.0_f64; self.model.parts.len()];
         let mut rehearsed = vec![];
@@ -180,7 +182,8 @@ impl Sway {
         self.next = 0;
     }
 
-    /// The gains at which the crown peaks at the wanted share, or the largest that the limits allow; and that share.
+    /// The gains with which the crown peaks at the requested share of the height, or the largest that the limits allow,
+    /// and the share that they reach.
     fn search(&self, bending: &[f64], states: &[Vec<f64>]) -> (Vec<f64>, f64) {
         let gains = |strength: f64| -> Vec<f64> { self.limited(strength, bending) };
         let reached = |strength: f64| {
@@ -204,7 +207,7 @@ impl Sway {
         (gains(high), reached(high))
     }
 
-    /// One strength for all parts, less for those that would bend too far.
+    /// The gain of each part: `strength`, reduced for branches that would exceed their bending limit.
     fn limited(&self, strength: f64, bending: &[f64]) -> Vec<f64> {
         let limit = |(part, bending): (&Part, &f64)| match (&part.joint, *bending > 0.0) {
             (Some(_), true) => strength.min(self.share(BRANCH) * part.extent / bending),
@@ -213,7 +216,8 @@ impl Sway {
         self.model.parts.iter().zip(bending).map(limit).collect()
     }
 
-    /// The strength at which the trunk reaches its limit; without a trunk that bends, all branches theirs.
+    /// The strength at which the trunk reaches its bending limit; without a deforming trunk, the strength at which all
+    /// branches have reached theirs.
     fn strongest(&self, bending: &[f64]) -> f64 {
         let parts = || self.model.parts.iter().zip(bending).filter(|(_, bending)| **bending > 0.0);
         let roots = parts().filter(|(part, _)| part.joint.is_none());
@@ -224,12 +228,13 @@ impl Sway {
         parts().map(|(part, bending)| self.share(BRANCH) * part.extent / bending).fold(0.0, f64::max)
     }
 
-    /// A limit at this wind; a storm does not bend the modes beyond what they can show.
+    /// A bending limit scaled by the wind. The scale is at most 2.5, because linear modes do not represent larger
+    /// bending.
     fn share(&self, limit: f64) -> f64 {
         limit * self.options.wind.clamp(0.0, 2.5)
     }
 
-    /// The crown's mean displacement as a share of the height.
+    /// The mean displacement of the crown as a share of the height.
     fn crown_at(&self, q: &[f64]) -> f64 {
         self.crown_in(q, &transforms(&self.model, q, &[]))
     }
@@ -244,7 +249,7 @@ impl Sway {
         sum.norm() / (self.crown.len().max(1) as f64 * self.model.height())
     }
 
-    /// Rigid leaves turn a little about their bases.
+    /// Small rotations of rigid leaves about their bases, at a time in seconds.
     fn flutter(&self, time: f64) -> Vec<Option<Affine>> {
         let mut carries = vec![false; self.model.parts.len()];
         self.model.parts.iter().filter_map(|part| part.joint.as_ref()).for_each(|joint| carries[joint.parent] = true);
@@ -279,7 +284,7 @@ impl Scenario for Sway {
         }
         motion.q = q.iter().map(|number| *number as f32).collect();
         motion.transforms = world.iter().map(Affine::entries).collect();
-        // What is reported is measured on what is sent.
+        // Measure the reported values on the transforms as sent, rounded to f32.
         let sent: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
         self.sway = self.sway.max(self.crown_in(&q, &sent));
         self.peak = self.peak.max(self.model.peak(&q, &sent));
@@ -306,7 +311,7 @@ impl Scenario for Sway {
     }
 }
 
-/// One oscillator per coordinate. A mode without stiffness would be carried away by any wind: it is held.
+/// One oscillator per coordinate. Modes without stiffness would drift in any wind, so they are held.
 fn oscillators(model: &Model, dt: f64) -> Result<Vec<Oscillator>> {
     let mut modes = vec![Oscillator::held(); model.coordinates];
     for part in model.parts.iter().filter(|part| part.owner) {
@@ -340,12 +345,12 @@ fn load(model: &Model, part: &Part, wind: &Wind) -> Load {
     Load { along: push(&wind.along), across: push(&wind.across), passed, distance }
 }
 
-/// The largest elastic displacement of a part's watched vertices.
+/// The largest elastic displacement of a part's evenly spread samples, in scene units.
 fn elastic(part: &Part, q: &[f64]) -> f64 {
     part.samples[..part.skin].iter().map(|sample| sample.displacement(q).norm()).fold(0.0, f64::max)
 }
 
-/// Per part the highest watched vertex, when it is in the uppermost quarter.
+/// Per part the highest of its evenly spread samples, if it is in the top quarter of the scene.
 fn crown(model: &Model) -> Vec<(usize, usize)> {
     let level = model.low.dot(&model.up) + 0.75 * model.height();
     let highest = |(index, part): (usize, &Part)| {
@@ -375,7 +380,7 @@ mod tests {
     const CALM: Options = Options { dt: 1.0 / 60.0, steps: Some(60), sway: 0.05, wind: 1.0, direction: 0.4, seed: 7 };
 
     #[test]
-    fn the_crown_sways_as_calibrated_and_joints_stay_closed() {
+    fn crown_sways_as_calibrated_and_joints_stay_closed() {
         for (dt, steps) in [(1.0 / 60.0, 60), (1.0 / 60.0, 600), (1.0 / 30.0, 90), (0.5, 40)] {
             let (sway, motions) = blown(Options { dt, steps: Some(steps), ..CALM });
             assert!((0.03..=0.08).contains(&sway.sway), "dt {dt}, {steps} steps: {}", sway.sway);
@@ -395,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_far_beyond_the_explicit_limit_from_a_tenth_of_a_hertz_to_a_hundred_kilohertz_stays_bounded() {
+    fn stays_bounded_far_beyond_the_explicit_step_limit() {
         let mut model = plant();
         let square = |hertz: f64| (2.0 * std::f64::consts::PI * hertz).powi(2);
         for (part, hertz) in model.parts.iter_mut().zip([[0.1, 1.0], [30.0, 1e3], [1e4, 1e5], [0.0, 0.0]]) {

@@ -1,4 +1,4 @@
-//! Vega's `.config` text (a line `*name`, a line with its value) to what the dynamics needs of it.
+//! Settings from Vega's `.config` text: a line `*name`, then a line with its value.
 
 use std::path::Path;
 
@@ -9,11 +9,11 @@ use crate::error::{Result, invalid};
 /// Frequencies and Rayleigh damping of a reduced model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Frequencies are multiplied by it: the internal force is scaled by its square.
+    /// Factor of all frequencies: the internal force is scaled by its square.
     pub base_frequency: f64,
-    /// 1/s.
+    /// Mass coefficient of Rayleigh damping, 1/s.
     pub damping_mass: f64,
-    /// Seconds.
+    /// Stiffness coefficient of Rayleigh damping, seconds.
     pub damping_stiffness: f64,
 }
 
@@ -27,15 +27,15 @@ impl Settings {
     /// Reads a file.
     ///
     /// # Errors
-    /// `Client` when it cannot be read; `Invalid` as [`Self::parse`].
+    /// `Client` if it cannot be read; `Invalid` as for [`Self::parse`].
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(&std::fs::read_to_string(path).map_err(|fault| ClientError::file(path, fault))?)
     }
 
-    /// Parses the text; what it does not state keeps its default, what is not needed here is passed over.
+    /// Parses the text. Missing settings keep their defaults; unknown settings are ignored.
     ///
     /// # Errors
-    /// `Invalid` when a value is no finite number >= 0, or the base frequency is zero.
+    /// `Invalid` if a value is not a finite number >= 0, or the base frequency is zero.
     pub fn parse(text: &str) -> Result<Self> {
         let mut settings = Self::default();
         let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_settings_are_found_among_others_and_the_rest_keeps_its_default() {
+    fn known_settings_are_read_and_the_rest_keep_defaults() {
         let text = "*modesFilename\nx.URendering.float\n\n*baseFrequency\n0.25\n\n*dampingStiffnessCoef\n0.003\n";
         let settings = Settings { base_frequency: 0.25, damping_mass: 0.0, damping_stiffness: 0.003 };
         assert_eq!(Settings::parse(text).expect("parses"), settings);
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_are_no_numbers_are_refused_by_name() {
+    fn invalid_values_are_refused_by_name() {
         for value in ["x", "nan", "-1", "inf", ""] {
             let refusal = Settings::parse(&format!("*dampingMassCoef\n{value}")).expect_err("refused").to_string();
             assert!(refusal.starts_with("dampingMassCoef"), "{refusal}");

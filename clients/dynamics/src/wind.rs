@@ -1,14 +1,14 @@
-//! Time and place to wind: a steady part, gusts that travel downwind, and turbulence of each part's own. Pressures are
-//! relative (the tree scales them); everything is deterministic for a seed.
+//! Wind pressure by time and place: a steady component, gusts that travel downwind, and turbulence per part. Pressures
+//! are relative, and the tree scales them. The same seed gives the same wind.
 
 use std::f64::consts::TAU;
 
 use nalgebra::Vector3;
 
-/// Periods in seconds (no two commensurate) and strengths of the gusts.
+/// Periods in seconds, without simple ratios between them, and strengths of the gusts.
 const GUSTS: [(f64, f64); 5] = [(0.83, 0.30), (1.31, 0.30), (2.17, 0.22), (3.71, 0.12), (6.43, 0.06)];
 
-/// When all gusts of the first front peak together, in seconds, and how long the wind takes to rise.
+/// Time at which all gusts peak together at distance 0, and rise time of the wind, in seconds.
 const FRONT: f64 = 0.55;
 const RISE: f64 = 0.35;
 
@@ -16,15 +16,15 @@ const RISE: f64 = 0.35;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wind {
     pub seed: u64,
-    /// Downwind, and across, unit vectors.
+    /// Downwind and crosswind unit vectors.
     pub along: Vector3<f64>,
     pub across: Vector3<f64>,
-    /// Seconds that a gust takes per unit of length.
+    /// Travel time of a gust, in seconds per scene unit.
     pub delay: f64,
 }
 
 impl Wind {
-    /// Pressures along and across at `time` for a part, at `distance` downwind. They begin at zero.
+    /// Pressures along and across the wind at `time` (seconds) on a part at `distance` downwind. Both are 0 at time 0.
     pub fn pressure(&self, time: f64, part: usize, distance: f64) -> (f64, f64) {
         let rise = smooth(time / RISE);
         let here = time - FRONT - self.delay * distance;
@@ -33,7 +33,7 @@ impl Wind {
         (rise * (0.55 + 0.45 * gust + 0.15 * own), rise * 0.25 * side)
     }
 
-    /// A sum of three sines of the part's own frequencies (0.3 to 2 Hz) and phases, between -1 and 1.
+    /// The mean of three sines with random frequencies (0.3 to 2 Hz) and phases per part, between -1 and 1.
     pub fn turbulence(&self, time: f64, part: usize, channel: u64) -> f64 {
         let wave = |index: u64| {
             let name = (part as u64) * 16 + channel * 8 + 2 * index;
@@ -44,13 +44,13 @@ impl Wind {
     }
 }
 
-/// 0 below 0, 1 above 1, smooth between.
+/// Smoothstep: 0 below 0, 1 above 1.
 fn smooth(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * (3.0 - 2.0 * x)
 }
 
-/// A number from 0 to 1 that belongs to a seed and a name (the finaliser of splitmix64).
+/// A pseudorandom number in [0, 1) for a seed and a name (the finalizer of splitmix64).
 pub fn random(seed: u64, name: u64) -> f64 {
     let mut x = seed.wrapping_add(name.wrapping_mul(0x9e37_79b9_7f4a_7c15)).wrapping_add(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_wind_begins_at_zero_repeats_for_its_seed_and_varies_from_part_to_part() {
+    fn wind_starts_at_zero_and_depends_on_seed_and_part() {
         let wind = Wind { seed: 1, along: Vector3::x(), across: Vector3::z(), delay: 0.1 };
         assert_eq!(wind.pressure(0.0, 3, 0.5), (0.0, 0.0));
         let other = Wind { seed: 2, ..wind };
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gust_arrives_later_downwind() {
+    fn gust_arrives_later_downwind() {
         let wind = Wind { seed: 1, along: Vector3::x(), across: Vector3::z(), delay: 0.2 };
         let peak = |distance: f64| {
             let steps = 40..300;

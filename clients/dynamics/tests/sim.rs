@@ -1,5 +1,5 @@
-//! The physics process against a small server: what it learns is what the server describes, and what the server's
-//! subscribers receive is what the physics meant.
+//! Tests of the physics process against a fake server: its model matches the server's description, and subscribers of
+//! the server receive the motion that it computes.
 
 #[path = "../../rust/tests/fake/mod.rs"]
 #[allow(dead_code, reason = "shared with the tests of the client")]
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use fake::{FakeDomain, IDENTITY, World, pack, serve};
 use modalcast_client::{Client, VertexStreamRequest};
 
-/// Sections along y, six vertices each: a beam of length 1 with two bending modes.
+/// A beam of length 1 along y with two bending modes. Each of its sections has six vertices.
 fn beam(index: u32, radius: f32) -> FakeDomain {
     let (mut rest, mut modes) = (vec![], vec![]);
     for level in 0..9 {
@@ -26,7 +26,7 @@ fn beam(index: u32, radius: f32) -> FakeDomain {
     FakeDomain::new(index, rest, 2, modes)
 }
 
-/// A trunk, two generations of branches, each at the tip ring of the one before and askew, and a rigid leaf.
+/// A trunk, two generations of tilted branches, each at the tip ring of the previous part, and a rigid leaf.
 fn plant() -> World {
     let (sine, cosine) = (0.6_f32, 0.8_f32);
     let frame = [cosine, sine, 0.0, 0.0, -sine, cosine, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0];
@@ -63,7 +63,7 @@ fn product(a: &[f32; 12], b: &[f32; 12]) -> [f32; 12] {
     })
 }
 
-/// Runs `modalcast-sim`; its exit code, what it printed, and its complaints.
+/// Runs `modalcast-sim`. Returns its exit code, standard output and standard error.
 async fn sim(url: &str, arguments: &[&str]) -> (i32, String, String) {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalcast-sim"));
     command.args(arguments).args(["--server", url]);
@@ -76,7 +76,7 @@ fn summary(out: &str) -> serde_json::Value {
     serde_json::from_str(out).expect("one line of JSON")
 }
 
-/// The numbers of a `.npy` file with the header of 128 bytes that the recorder writes.
+/// The numbers of a `.npy` file with the 128-byte header that the recorder writes.
 fn numbers(path: &Path) -> Vec<f32> {
     fake::floats(&std::fs::read(path).expect("a record")[128..])
 }
@@ -87,7 +87,7 @@ fn distance(positions: &[f32], a: usize, b: usize) -> f64 {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_tree_sways_and_its_subscribers_see_every_joint_closed() {
+async fn tree_sways_and_subscribers_receive_closed_joints() {
     let world = Arc::new(plant());
     let url = serve(Arc::clone(&world)).await;
     let client = Client::connect(&url).await.expect("connects");
@@ -105,7 +105,7 @@ async fn the_tree_sways_and_its_subscribers_see_every_joint_closed() {
     assert!((0.03..0.1).contains(&sway), "{sway}");
     assert!(summary["joint_gap_of_diagonal"].as_f64().expect("a number") <= 1e-3);
     assert_eq!(summary["stages_ms"]["deform"].as_f64(), Some(1.5));
-    // Each beam has 54 vertices; a child's first section begins where its parent's last section is.
+    // Each beam has 54 vertices; the first section of a child is at the last section of its parent.
     let (q, poses) = (numbers(&folder.path().join("q.npy")), numbers(&folder.path().join("transforms.npy")));
     assert_eq!((q.len(), poses.len()), (90 * 6, 90 * 4 * 12));
     let diagonal = (0..3).map(|c| (world.bounds[c + 3] - world.bounds[c]).powi(2)).sum::<f64>().sqrt();
@@ -132,7 +132,7 @@ async fn the_tree_sways_and_its_subscribers_see_every_joint_closed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn auto_finds_the_tree_sweeps_what_has_no_eigenvalues_and_rocks_what_is_rigid() {
+async fn auto_selects_tree_sweep_or_rocking_by_scene() {
     let mut bare = plant();
     bare.domains.iter_mut().for_each(|domain| domain.wire.eigenvalues.clear());
     let stone = vec![-1.0, 0.0, -1.0, 1.0, 2.0, 1.0, 0.0, 1.0, 0.0];
@@ -150,7 +150,7 @@ async fn auto_finds_the_tree_sweeps_what_has_no_eigenvalues_and_rocks_what_is_ri
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn exit_codes_say_what_went_wrong() {
+async fn errors_exit_with_documented_codes() {
     let url = serve(Arc::new(plant())).await;
     assert_eq!(sim(&url, &["tree", "--scene", "none"]).await.0, 1);
     assert_eq!(sim(&url, &["tree", "--dt", "0"]).await.0, 2);
@@ -167,7 +167,7 @@ fn vega(name: &str) -> PathBuf {
     data.join("vega").join(name)
 }
 
-/// Rest positions by the file's v index, and U of the renderer's file, row-major.
+/// A domain with the `v` positions of the OBJ file in file order, and U of the `.URendering.float` file, row-major.
 fn rendered(name: &str) -> FakeDomain {
     let text = std::fs::read_to_string(vega(name).join(format!("{name}.obj"))).expect("reads");
     let positions = text.lines().filter_map(|line| line.strip_prefix("v "));
@@ -184,7 +184,7 @@ fn rendered(name: &str) -> FakeDomain {
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-async fn real_models_deflect_by_two_hundredths_of_the_diagonal_and_stay_bounded() {
+async fn real_models_deflect_as_requested_and_stay_bounded() {
     for (name, first) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
         let world = Arc::new(World::new(vec![rendered(name)]));
         let url = serve(Arc::clone(&world)).await;

@@ -1,5 +1,5 @@
-//! Chunks to whole replies: every reply states its total, every chunk its offset; both are checked, and the total is
-//! bounded before a byte is kept.
+//! Assembles chunks into complete replies. A reply states its total size and a chunk its offset; both are checked, and
+//! the total is bounded before any byte is stored.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -9,9 +9,9 @@ use tokio_stream::Stream;
 
 use crate::error::{Error, Result, malformed};
 
-/// One message of a chunked reply, taken apart.
+/// One message of a chunked reply.
 pub(crate) struct Piece<H> {
-    /// On the first chunk: the head and the total in bytes.
+    /// Head and total size in bytes; on the first chunk only.
     pub(crate) head: Option<(H, u64)>,
     pub(crate) offset: u64,
     pub(crate) data: Bytes,
@@ -26,7 +26,7 @@ pub(crate) trait Part: Sized {
     fn whole(head: Self::Head, bytes: Bytes) -> Result<Self::Whole>;
 }
 
-/// Collects the chunks of one reply after the other.
+/// Collects the chunks of consecutive replies.
 pub(crate) struct Assembler<H> {
     what: &'static str,
     limit: u64,
@@ -44,7 +44,7 @@ impl<H> Assembler<H> {
         self.open.is_some()
     }
 
-    /// Adds a chunk; the whole reply when this was its last.
+    /// Adds a chunk. Returns the complete reply after its last chunk.
     pub(crate) fn push(&mut self, piece: Piece<H>) -> Result<Option<(H, Bytes)>> {
         let field = |name: &str| format!("{}.{name}", self.what);
         match (piece.head, self.open.is_some()) {
@@ -72,7 +72,7 @@ impl<H> Assembler<H> {
         Ok(self.close(piece.data))
     }
 
-    /// Ends the reply; one that fits a single chunk is handed on without a copy.
+    /// Completes the reply. A reply of a single chunk is returned without a copy.
     fn close(&mut self, last: Bytes) -> Option<(H, Bytes)> {
         let (head, _) = self.open.take()?;
         if self.bytes.is_empty() {
@@ -84,7 +84,7 @@ impl<H> Assembler<H> {
     }
 }
 
-/// A server stream of chunked replies as a stream of whole ones. After an error it has ended.
+/// Turns a server stream of chunks into a stream of complete replies. An error ends the stream.
 pub(crate) struct Replies<M: Part> {
     inner: tonic::Streaming<M>,
     assembler: Assembler<M::Head>,
@@ -96,7 +96,7 @@ impl<M: Part> Replies<M> {
         Self { inner, assembler: Assembler::new(M::WHAT, limit), ended: false }
     }
 
-    /// Polls for the next whole reply.
+    /// Polls for the next complete reply.
     pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M::Whole>>> {
         while !self.ended {
             let whole = match ready!(Pin::new(&mut self.inner).poll_next(context)) {
@@ -116,7 +116,7 @@ impl<M: Part> Replies<M> {
         Poll::Ready(None)
     }
 
-    /// The next whole reply.
+    /// The next complete reply.
     pub(crate) async fn next(&mut self) -> Option<Result<M::Whole>> {
         std::future::poll_fn(|context| self.poll(context)).await
     }
@@ -129,12 +129,12 @@ impl<M: Part> Replies<M> {
     }
 }
 
-/// Little-endian f32 at any alignment.
+/// Decodes little-endian f32 at any alignment.
 pub(crate) fn floats(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(4).map(|word| f32::from_le_bytes([word[0], word[1], word[2], word[3]])).collect()
 }
 
-/// Little-endian u32 at any alignment.
+/// Decodes little-endian u32 at any alignment.
 pub(crate) fn words(bytes: &[u8]) -> Vec<u32> {
     bytes.chunks_exact(4).map(|word| u32::from_le_bytes([word[0], word[1], word[2], word[3]])).collect()
 }
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn chunks_become_replies_in_order_also_empty_ones() {
+    fn chunks_become_replies_in_order() {
         let whole = all(vec![
             piece(Some(5), 0, b"ab"),
             piece(None, 2, b""),

@@ -1,4 +1,4 @@
-//! One connection to a server: unary calls to values, streams to handles. Cloning shares the connection.
+//! The connection to a server. Unary calls return values, streams return handles; clones share the connection.
 
 use std::time::{Duration, Instant};
 
@@ -8,14 +8,14 @@ use tonic::transport::{Channel, Endpoint};
 use crate::error::{Error, Result, malformed};
 use crate::scene::ServerInfo;
 
-/// The largest reply that is put together from chunks, in bytes, unless the caller says otherwise.
+/// The default limit of one reply assembled from chunks, in bytes.
 pub const REPLY_LIMIT: u64 = 1 << 30;
 
-/// Flow-control windows in bytes. A stream that nobody reads fills its own window; sixteen of them fill the connection's,
-/// and every other call then waits.
+/// HTTP/2 flow-control windows in bytes. A stream that is not read fills its own window. Sixteen such streams fill the
+/// window of the connection, and every other call then waits.
 const STREAM_WINDOW: u32 = 4 << 20;
 const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
-/// The largest HTTP/2 frame that the server may send, in bytes: a whole chunk of a reply. The default of 16 KiB halves the
+/// The largest HTTP/2 frame that the server may send, in bytes: one chunk of a reply. The default of 16 KiB halves the
 /// rate of large replies.
 const FRAME_SIZE: u32 = 1 << 20;
 
@@ -27,10 +27,10 @@ pub struct Client {
 }
 
 impl Client {
-    /// Connects, or says why not within five seconds. `url` is `http://host:port`, or `host:port`.
+    /// Connects, with a timeout of five seconds. `url` is `http://host:port` or `host:port`.
     ///
     /// # Errors
-    /// `Connect` when the URL is none or nobody answers.
+    /// `Connect` if the URL is invalid or no server answers.
     pub async fn connect(url: &str) -> Result<Self> {
         let refused = |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: chain(&fault) };
         let whole = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
@@ -46,10 +46,10 @@ impl Client {
         Ok(Self { channel, reply_limit: REPLY_LIMIT })
     }
 
-    /// Connects, trying again until a server answers or `patience` is over.
+    /// Connects, and retries until a server answers or `patience` has passed.
     ///
     /// # Errors
-    /// `Connect` with the reason of the last try.
+    /// `Connect` with the reason of the last attempt.
     pub async fn connect_within(url: &str, patience: Duration) -> Result<Self> {
         let start = Instant::now();
         loop {
@@ -60,7 +60,7 @@ impl Client {
         }
     }
 
-    /// The same connection with another bound on one reply, in bytes.
+    /// Sets the limit of one reply, in bytes, on the same connection.
     #[must_use]
     pub fn with_reply_limit(mut self, bytes: u64) -> Self {
         self.reply_limit = bytes;
@@ -70,7 +70,7 @@ impl Client {
     /// Backend, renderer and limits of the server.
     ///
     /// # Errors
-    /// As every call: `Refused`, `Connect` or `Malformed`.
+    /// `Refused`, `Connect` or `Malformed`, as for every call.
     pub async fn server_info(&self) -> Result<ServerInfo> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
         let wire = service.get_server_info(v1::GetServerInfoRequest {}).await?.into_inner();
@@ -84,18 +84,18 @@ impl Client {
         })
     }
 
-    /// Opens a scene of the server's repository, or answers with what is open under that name already. An empty `name`
-    /// takes the source's own.
+    /// Opens a scene of the server's repository, or returns the scene that is already open under that name. With an
+    /// empty `name`, the scene has the name of its source.
     ///
     /// # Errors
-    /// `Refused` when there is no such source; `Connect`; `Malformed`.
+    /// `Refused` if the source does not exist; `Connect`; `Malformed`.
     pub async fn open_scene(&self, source: &str, name: &str) -> Result<v1::SceneInfo> {
         let request = v1::OpenSceneRequest { source: source.to_owned(), scene: name.to_owned() };
         let reply = self.scenes().open_scene(request).await?.into_inner();
         reply.scene.ok_or_else(|| malformed("open_scene.scene", "a scene", "none"))
     }
 
-    /// The open scenes, and what [`Self::open_scene`] would accept as a source.
+    /// The open scenes, and the sources that [`Self::open_scene`] accepts.
     ///
     /// # Errors
     /// `Refused` or `Connect`.
@@ -104,10 +104,10 @@ impl Client {
         Ok((reply.scenes, reply.sources))
     }
 
-    /// Closes a scene; an uploaded one's files are removed.
+    /// Closes a scene. The server deletes the files of an uploaded scene.
     ///
     /// # Errors
-    /// `Refused` when there is no such scene; `Connect`.
+    /// `Refused` if the scene does not exist; `Connect`.
     pub async fn delete_scene(&self, scene: &str) -> Result<()> {
         self.scenes().delete_scene(v1::DeleteSceneRequest { scene: scene.to_owned() }).await?;
         Ok(())
@@ -118,7 +118,7 @@ impl Client {
     }
 }
 
-/// An error with its causes in one line; tonic's own says only "transport error".
+/// An error with its causes in one line, because the message of tonic's error is only "transport error".
 fn chain(fault: &dyn std::error::Error) -> String {
     let causes = std::iter::successors(Some(fault), |error| error.source());
     causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")

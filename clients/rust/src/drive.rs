@@ -1,6 +1,6 @@
-//! A step stream: steps out, acknowledgements and refusals in, never more steps in flight than the window allows.
+//! A step stream: sends steps, receives acknowledgements and refusals, and limits the steps in flight to the window.
 //!
-//! A task of its own always reads the replies: a stalled reader of many small messages would lose its connection.
+//! A separate task always reads the replies, because a stalled reader of many small messages would lose its connection.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -17,40 +17,41 @@ use crate::error::{Error, Refusal, Result, malformed};
 use crate::frames::{Stages, stages};
 use crate::step::Step;
 
-/// How many acknowledgements and refusals are kept until somebody takes them; older ones are dropped and counted.
+/// The most acknowledgements, and the most refusals, that are kept until the caller takes them. Older ones are dropped;
+/// [`Finished::refused`] counts all refusals.
 const KEPT: usize = 1024;
 
-/// What the server does with steps that come faster than it works.
+/// How the server handles steps that arrive faster than it processes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Policy {
     /// Every step is deformed, in order, and rendered for each lossless subscriber.
     Lossless,
-    /// The newest state wins; steps in between are merged and counted.
+    /// Only the newest state is processed; steps in between are merged into it and counted.
     Latest,
 }
 
-/// One acknowledgement: all steps up to this one are done or superseded.
+/// One acknowledgement: all steps up to this one are done or merged into a newer one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ack {
     pub step: u64,
-    /// Steps merged into a newer one since the stream began.
+    /// Number of steps merged into a newer one since the stream began.
     pub skipped: u64,
     pub stages: Stages,
 }
 
-/// What a finished stream came to.
+/// Totals of a stream.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finished {
-    /// The last step that was acknowledged.
+    /// The last acknowledged step.
     pub acknowledged: Option<u64>,
-    /// Steps that were sent, and those of them that were refused.
+    /// Number of steps sent, and how many of them the server refused.
     pub sent: u64,
     pub refused: u64,
-    /// Steps merged into a newer one.
+    /// Number of steps merged into a newer one.
     pub skipped: u64,
 }
 
-/// What the reading task knows.
+/// State shared between the reading task and the [`Drive`].
 #[derive(Default)]
 struct Progress {
     outstanding: VecDeque<u64>,
@@ -64,11 +65,11 @@ struct Progress {
 
 /// A step stream to one scene. Dropping it ends the stream and releases the scene.
 pub struct Drive {
-    /// Counts the writers that the scene has had.
+    /// The number of this run; every new writer of the scene increments it.
     pub run: u64,
-    /// How many steps may be without acknowledgement.
+    /// The most steps in flight: sent and not yet acknowledged.
     pub window: usize,
-    /// The scene as it was when the stream opened.
+    /// The scene at the time the stream opened.
     pub scene: v1::SceneInfo,
     requests: Option<mpsc::Sender<v1::DriveSceneRequest>>,
     progress: Arc<Mutex<Progress>>,
@@ -78,10 +79,11 @@ pub struct Drive {
 }
 
 impl Client {
-    /// Becomes the writer of a scene. A `window` of 0 leaves it to the server; [`Drive::window`] says what holds.
+    /// Becomes the writer of a scene. A `window` of 0 selects the server's default; [`Drive::window`] is the granted
+    /// window.
     ///
     /// # Errors
-    /// `Rejected` or `Refused` when there is no such scene or another writer holds it.
+    /// `Rejected` or `Refused` if the scene does not exist or has another writer.
     pub async fn drive(&self, scene: &str, policy: Policy, window: u32) -> Result<Drive> {
         let policy = match policy {
             Policy::Lossless => v1::Policy::Lossless,
@@ -116,12 +118,12 @@ impl Client {
 }
 
 impl Drive {
-    /// Sends a step as soon as the window has room.
+    /// Sends a step as soon as the window has capacity.
     ///
     /// # Errors
-    /// `Rejected` reports the oldest refusal not reported yet. It names the step that was refused, usually an earlier
-    /// one; the step at hand has been sent and the stream goes on. `Step` says that the step at hand was not sent, and
-    /// the stream goes on, too. Every other error is the end of the stream.
+    /// `Rejected` reports the oldest unreported refusal. It names the refused step, usually an earlier one; the step
+    /// passed to this call has been sent and the stream stays open. `Step` means that the step passed to this call was
+    /// not sent; the stream stays open. Every other error ends the stream.
     pub async fn step(&mut self, step: &Step) -> Result<()> {
         step.check()?;
         self.wait(|progress, window| progress.outstanding.len() < window).await?;
@@ -129,7 +131,7 @@ impl Drive {
         let message = v1::DriveSceneRequest { kind: Some(Ask::Step(step.to_wire())) };
         let requests = self.requests.as_ref().ok_or(Error::Ended { what: "this step" })?;
         if requests.send(message).await.is_err() {
-            // The stream is gone; the reader knows why in a moment.
+            // The stream has ended; the reading task receives the reason.
             self.wait(|_, _| false).await?;
         }
         self.sent += 1;
@@ -142,7 +144,7 @@ impl Drive {
     /// Waits until every step sent so far is acknowledged or refused.
     ///
     /// # Errors
-    /// `Rejected` with the oldest refusal not reported yet; every other error is the end of the stream.
+    /// `Rejected` with the oldest unreported refusal; every other error ends the stream.
     pub async fn settle(&mut self) -> Result<()> {
         self.wait(|progress, _| progress.outstanding.is_empty()).await?;
         match lock(&self.progress).refusals.pop_front() {
@@ -151,22 +153,22 @@ impl Drive {
         }
     }
 
-    /// Takes the acknowledgements that came since the last call, oldest first; at most 1024 are kept.
+    /// Takes the acknowledgements received since the last call, oldest first; at most 1024 are kept.
     pub fn take_acks(&self) -> Vec<Ack> {
         lock(&self.progress).acks.drain(..).collect()
     }
 
-    /// Takes the refusals that no call has reported yet, oldest first; at most 1024 are kept.
+    /// Takes the unreported refusals, oldest first; at most 1024 are kept.
     pub fn take_refusals(&self) -> Vec<Refusal> {
         lock(&self.progress).refusals.drain(..).collect()
     }
 
-    /// Steps without acknowledgement.
+    /// Number of steps in flight.
     pub fn outstanding(&self) -> usize {
         lock(&self.progress).outstanding.len()
     }
 
-    /// What the stream came to up to now.
+    /// Totals of the stream up to now.
     pub fn so_far(&self) -> Finished {
         let progress = lock(&self.progress);
         Finished {
@@ -177,14 +179,14 @@ impl Drive {
         }
     }
 
-    /// Waits for all acknowledgements, then ends the stream. Refusals are counted, not errors.
+    /// Waits for all acknowledgements, then ends the stream. Refusals are counted and are not errors.
     ///
     /// # Errors
-    /// Whatever ended the stream before all was acknowledged.
+    /// The error that ended the stream before all steps were acknowledged.
     pub async fn finish(mut self) -> Result<Finished> {
         self.wait(|progress, _| progress.outstanding.is_empty()).await?;
         self.requests = None;
-        // The server ends its side when it has released the scene; one that forgets to is not waited for.
+        // The server closes its side after it has released the scene. The timeout covers a server that does not.
         let closing = async { while self.changed.changed().await.is_ok() {} };
         tokio::time::timeout(Duration::from_secs(5), closing).await.ok();
         Ok(self.so_far())
@@ -193,7 +195,7 @@ impl Drive {
     /// Waits until `enough` holds, or the stream has ended.
     async fn wait(&mut self, enough: impl Fn(&Progress, usize) -> bool) -> Result<()> {
         loop {
-            // Marking as seen before looking: a change in between wakes the wait below at once.
+            // Mark the value as seen before reading it, so that a change in between wakes the wait below.
             self.changed.borrow_and_update();
             {
                 let progress = lock(&self.progress);
@@ -250,7 +252,7 @@ impl Progress {
         keep(&mut self.acks, Ack { step: ack.step, skipped: ack.skipped, stages: stages(ack.stages) });
     }
 
-    /// A refused step is answered. Several may bear its number: the oldest was meant.
+    /// Removes the refused step from the steps in flight. If several have its number, the oldest one is meant.
     fn refuse(&mut self, refusal: Refusal) {
         if let Some(at) = self.outstanding.iter().position(|step| Some(*step) == refusal.step) {
             self.outstanding.remove(at);
@@ -260,7 +262,7 @@ impl Progress {
     }
 }
 
-/// Adds to a bounded list; the oldest makes room.
+/// Appends to a bounded list and drops the oldest item of a full one.
 fn keep<T>(list: &mut VecDeque<T>, item: T) {
     if list.len() == KEPT {
         list.pop_front();
@@ -268,7 +270,7 @@ fn keep<T>(list: &mut VecDeque<T>, item: T) {
     list.push_back(item);
 }
 
-/// The lock. Nobody panics while holding it, and a half-told story is still the best there is.
+/// Locks the progress. No holder panics; if one did, the last written state would still be usable.
 fn lock(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
     progress.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -282,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn an_acknowledgement_covers_all_steps_before_it_and_a_refusal_one() {
+    fn an_ack_covers_all_earlier_steps_and_a_refusal_covers_one() {
         let mut progress = Progress { outstanding: (0..6).collect(), ..Progress::default() };
         progress.refuse(refusal(4));
         assert_eq!(progress.outstanding, [0, 1, 2, 3, 5]);
@@ -293,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_takes_is_bounded() {
+    fn untaken_refusals_are_bounded() {
         let mut progress = Progress::default();
         for step in 0..2 * KEPT as u64 {
             progress.refuse(refusal(step));

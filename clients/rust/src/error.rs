@@ -1,15 +1,15 @@
-//! What can go wrong in a client, sorted by who can act on it; a server's refusal keeps its field, expected and given.
+//! Errors of the client, by who can act on them. A refusal of the server has its field, expected and given value.
 
 use modalcast_proto::v1;
 use prost::Message as _;
 
-/// Shorthand of every fallible function in the crate.
+/// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Why the server refused a request or a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refusal {
-    /// The step that was refused, when it was a step.
+    /// The number of the refused step; `None` for other requests.
     pub step: Option<u64>,
     pub field: String,
     pub expected: String,
@@ -31,28 +31,28 @@ impl std::fmt::Display for Refusal {
     }
 }
 
-/// The one error of the client.
+/// The error type of this crate.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum Error {
     /// No connection, or the connection was lost.
     #[error("{url}: no connection: {reason}")]
     Connect { url: String, reason: String },
-    /// The server refused a call. The refusal is there when the server sent details.
+    /// The server refused a call. `refusal` is present if the server sent details.
     #[error("refused ({code:?}): {message}")]
     Refused { code: tonic::Code, message: String, refusal: Option<Box<Refusal>> },
     /// The server refused a step, or the opening of a step stream; a refused step does not end its stream.
     #[error("rejected: {0}")]
     Rejected(Box<Refusal>),
-    /// The server's reply contradicts itself or the contract.
+    /// The reply of the server contradicts itself or the contract.
     #[error("malformed reply: {field}: expected {expected}, given {given}")]
     Malformed { field: String, expected: String, given: String },
     /// A stream ended too early.
     #[error("the stream ended before {what}")]
     Ended { what: &'static str },
-    /// Something did not come in time.
+    /// A reply did not arrive in time.
     #[error("{what} did not come within {ms} ms")]
     Deadline { what: &'static str, ms: u64 },
-    /// A step that no message can carry; nothing was sent.
+    /// A step that cannot be encoded as one message; nothing was sent.
     #[error("step {step} cannot be sent: {reason}")]
     Step { step: u64, reason: &'static str },
     /// A local file could not be read or written.
@@ -61,12 +61,12 @@ pub enum Error {
 }
 
 impl Error {
-    /// A fault of a local file.
+    /// An error of a local file.
     pub fn file(path: impl AsRef<std::path::Path>, fault: impl std::fmt::Display) -> Self {
         Self::File { path: path.as_ref().display().to_string(), reason: fault.to_string() }
     }
 
-    /// The server's own words about what was wrong, if it sent them.
+    /// The refusal of the server, if it sent details.
     pub fn refusal(&self) -> Option<&Refusal> {
         match self {
             Self::Rejected(refusal) => Some(refusal),
@@ -76,14 +76,15 @@ impl Error {
     }
 }
 
-/// A reply that breaks the contract.
+/// A reply that violates the contract.
 pub(crate) fn malformed(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
     Error::Malformed { field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }
 
 impl From<tonic::Status> for Error {
     fn from(status: tonic::Status) -> Self {
-        // A transport fault has a source and no details; a refusal of the server has neither or has details.
+        // The transport reports a lost connection as `Unavailable` without details; a refusal with that code has
+        // details.
         let lost = status.code() == tonic::Code::Unavailable && status.details().is_empty();
         if lost {
             return Self::Connect { url: "server".into(), reason: status.message().to_owned() };
@@ -102,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_details_of_a_status_become_the_refusal_and_garbage_does_not() {
+    fn only_valid_status_details_become_a_refusal() {
         let wire = v1::Rejection { step: Some(4), field: "q".into(), expected: "80".into(), given: "79".into() };
         let with = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
         let error = Error::from(with(wire.encode_to_vec()));

@@ -1,4 +1,4 @@
-//! Pictures: a request with camera and size in, whole PNG or RGBA8 frames with their step and stage times out.
+//! Frame requests and streams: each reply is a complete frame with its step and stage times.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -11,51 +11,51 @@ use crate::assemble::{Part, Piece, Replies};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed};
 
-/// Milliseconds per stage of the work, by the server's stage names, in its order.
+/// Milliseconds per processing stage, under the server's stage names and in its order.
 pub type Stages = Vec<(String, f32)>;
 
-/// How the bytes of a frame are encoded, top row first: 8-bit sRGB, or numbers.
+/// Encoding of the bytes of a frame, top row first: 8-bit sRGB, or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Format {
     #[default]
     Png,
     Rgba,
-    /// Little-endian f32, one a pixel: depth in metres. The frame says so; a request need not.
+    /// Little-endian f32, one per pixel: depth in meters. A request need not name this format; the frame states it.
     F32,
-    /// Little-endian u32, one a pixel: domains.
+    /// Little-endian u32, one per pixel: domain indices.
     U32,
-    /// Little-endian f32, three a pixel: normals.
+    /// Little-endian f32, three per pixel: normals.
     F32x3,
 }
 
-/// What a picture shows; `frames.proto` says what each means to the last detail.
+/// The quantity that a picture shows; `frames.proto` defines each in detail.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Output {
     #[default]
     Colour,
-    /// Metres along the view axis, infinite where nothing is.
+    /// Meters along the view axis; infinity in the background.
     Depth,
-    /// Index of the domain, `u32::MAX` where none is.
+    /// Index of the domain; `u32::MAX` in the background.
     Domains,
-    /// Unit normals, zeros where nothing is.
+    /// Unit normals; zeros in the background.
     Normals,
-    /// |u| as a colour map with a legend; `largest` metres at its bright end, 0: fitted to each frame.
+    /// |u| as a color map with a legend. `largest` is the value at the bright end in meters; 0 fits it to each frame.
     Displacement { largest: f64 },
-    /// One column of U as a colour map with a legend.
+    /// One column of U as a color map with a legend.
     ModeShape { mode: u32, largest: f64 },
 }
 
-/// Which steps a subscriber gets.
+/// Which steps a subscriber receives.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Delivery {
-    /// Every step, in order; a slow reader holds back the writer.
+    /// Every step, in order; back-pressure from a slow reader slows the writer.
     #[default]
     Lossless,
-    /// The newest; what was passed over is counted.
+    /// The newest step; skipped steps are counted.
     Latest,
 }
 
-/// Where the camera is.
+/// The pose of the camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum View {
     LookAt {
@@ -67,16 +67,16 @@ pub enum View {
     Pose([f64; 12]),
 }
 
-/// How the camera sees.
+/// The projection of the camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lens {
     /// Vertical field of view in degrees.
     FieldOfView(f64),
-    /// Pinhole in pixels; (0, 0) is the top left corner.
+    /// Pinhole model in pixels; (0, 0) is the top left corner.
     Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
 }
 
-/// A camera. `clip` is near and far in scene units; `None` is fitted to the scene.
+/// A camera. `clip` is the near and far distance in scene units; `None` fits them to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     pub view: View,
@@ -84,7 +84,7 @@ pub struct Camera {
     pub clip: Option<(f64, f64)>,
 }
 
-/// What a picture looks like. Without a camera the server frames the scene; 0 x 0 is 1280 x 720.
+/// Size, format, camera and output of a picture. Without a camera the server frames the scene; 0 x 0 means 1280 x 720.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Picture {
     pub width: u32,
@@ -94,7 +94,7 @@ pub struct Picture {
     pub output: Output,
 }
 
-/// Which step a single reply shows.
+/// Which step a single reply must show.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) enum Wanted {
     #[default]
@@ -113,19 +113,19 @@ pub struct FrameRequest {
 }
 
 impl FrameRequest {
-    /// The newest state of a scene, 1280 x 720, PNG.
+    /// A PNG of the newest state of a scene, 1280 x 720.
     pub fn of(scene: &str) -> Self {
         Self { scene: scene.to_owned(), ..Self::default() }
     }
 
-    /// Another size in pixels.
+    /// Sets the size in pixels.
     #[must_use]
     pub const fn size(mut self, width: u32, height: u32) -> Self {
         (self.picture.width, self.picture.height) = (width, height);
         self
     }
 
-    /// Exactly this step of the current run; refused when it is gone.
+    /// Exactly this step of the current run. The server refuses a step that it no longer has.
     #[must_use]
     pub const fn exactly(mut self, step: u64) -> Self {
         self.at = Wanted::Exactly(step);
@@ -139,7 +139,7 @@ impl FrameRequest {
         self
     }
 
-    /// How long the server may wait for the step and the picture; 0 is its own default.
+    /// How long the server may wait for the step and the picture, in milliseconds; 0 selects the server's default.
     #[must_use]
     pub const fn within_ms(mut self, milliseconds: u32) -> Self {
         self.deadline_ms = milliseconds;
@@ -147,7 +147,7 @@ impl FrameRequest {
     }
 }
 
-/// A subscription to frames; `frames` of 0 never ends.
+/// A subscription to frames; with `frames` = 0 it never ends.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FramesRequest {
     pub scene: String,
@@ -159,22 +159,23 @@ pub struct FramesRequest {
 /// One frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
-    /// The step that it shows.
+    /// The step that the frame shows.
     pub step: v1::StepId,
     pub width: u32,
     pub height: u32,
     pub format: Format,
-    /// The file (PNG), or every pixel's 4 or 12 bytes.
+    /// A PNG file, or 4 or 12 bytes per pixel.
     pub bytes: Bytes,
-    /// Steps passed over since the last frame of the stream.
+    /// Number of steps skipped since the previous frame of the stream.
     pub skipped: u64,
     pub stages: Stages,
-    /// Of colour: what drew the shadow map, unless another frame of the step shares it, and what the camera sees.
+    /// For color frames: the rasterizer of the shadow map (`None` if the map is shared with another frame of the step)
+    /// and of the visible triangles.
     pub shadow_drawn_by: Option<DrawnBy>,
     pub visibility_drawn_by: Option<DrawnBy>,
 }
 
-/// What turned triangles into samples.
+/// The rasterizer of a pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DrawnBy {
     OpenGl,
@@ -185,7 +186,7 @@ impl Client {
     /// Renders one frame.
     ///
     /// # Errors
-    /// `Refused` when scene or step do not exist or the deadline passed; `Malformed`; `Connect`.
+    /// `Refused` if the scene or the step does not exist or the deadline passed; `Malformed`; `Connect`.
     pub async fn frame(&self, request: &FrameRequest) -> Result<Frame> {
         use v1::render_frame_request::Step;
         let wire = v1::RenderFrameRequest {
@@ -203,10 +204,11 @@ impl Client {
         frame.unwrap_or(Err(Error::Ended { what: "the frame" }))
     }
 
-    /// Subscribes to frames. When this returns, the server has accepted: no later step is missed.
+    /// Subscribes to frames. When this returns, the server has accepted the subscription, so that no later step is
+    /// missed.
     ///
     /// # Errors
-    /// `Refused` when there is no such scene; `Connect`.
+    /// `Refused` if the scene does not exist; `Connect`.
     pub async fn frames(&self, request: &FramesRequest) -> Result<Frames> {
         let wire = v1::StreamFramesRequest {
             scene: request.scene.clone(),
@@ -223,7 +225,7 @@ impl Client {
 pub struct Frames(Replies<v1::StreamFramesResponse>);
 
 impl Frames {
-    /// The next frame, or `None` when the server has sent as many as asked for.
+    /// The next frame, or `None` after the requested number of frames.
     pub async fn next(&mut self) -> Option<Result<Frame>> {
         self.0.next().await
     }
@@ -329,7 +331,7 @@ impl From<Picture> for v1::Picture {
             Output::Displacement { largest } => (v1::Output::Displacement, 0, largest),
             Output::ModeShape { mode, largest } => (v1::Output::ModeShape, mode, largest),
         };
-        // What is no colour has one format only, which the server knows.
+        // Depth, domains and normals have a single format each, which the server chooses.
         let format = match (picture.output, picture.format) {
             (Output::Depth | Output::Domains | Output::Normals, _) | (_, Format::Png) => v1::Format::Unspecified,
             (_, Format::Rgba) => v1::Format::Rgba,

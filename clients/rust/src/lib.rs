@@ -27,7 +27,7 @@ pub use step::{Step, Transforms};
 pub use tonic::Code;
 pub use vertices::{Readings, VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
 
-/// The project's README shows a client; here it is compiled.
+/// Compiles the client code in the project's README as a doctest.
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]
 struct ProjectReadme;

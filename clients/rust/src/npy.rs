@@ -1,4 +1,5 @@
-//! NumPy files of f32 rows written as they come: the header leaves room and is written again when the rows are counted.
+//! Writes NumPy files of f32 rows incrementally. The header is padded and is rewritten when the number of rows is
+//! known.
 
 use std::fs::File;
 use std::io::{BufWriter, Seek as _, SeekFrom, Write as _};
@@ -6,10 +7,10 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result, malformed};
 
-/// Bytes of the header, its padding included: any shape fits, and data stays aligned to 64.
+/// Bytes of the header with its padding: enough for the shapes in use, and a multiple of 64 for alignment.
 const HEADER: usize = 128;
 
-/// A `.npy` file of shape rows x `shape`, little-endian f32, C order.
+/// Writer of a `.npy` file of shape rows x `shape`, little-endian f32, C order.
 pub struct Writer {
     path: PathBuf,
     file: BufWriter<File>,
@@ -18,10 +19,10 @@ pub struct Writer {
 }
 
 impl Writer {
-    /// Creates the file; `shape` is that of one row.
+    /// Creates the file; `shape` is the shape of one row.
     ///
     /// # Errors
-    /// `File` when it cannot be written.
+    /// `File` if it cannot be written.
     pub fn create(path: &Path, shape: &[usize]) -> Result<Self> {
         let file = File::create(path).map_err(|fault| Error::file(path, fault))?;
         let mut writer = Self { path: path.to_owned(), file: BufWriter::new(file), shape: shape.to_vec(), rows: 0 };
@@ -32,7 +33,7 @@ impl Writer {
     /// Adds one row.
     ///
     /// # Errors
-    /// `Malformed` when its length is not that of the shape; `File` when it cannot be written.
+    /// `Malformed` if its length does not match the shape; `File` if it cannot be written.
     pub fn row(&mut self, numbers: &[f32]) -> Result<()> {
         let expected: usize = self.shape.iter().product();
         if numbers.len() != expected {
@@ -46,7 +47,7 @@ impl Writer {
     /// Writes the number of rows into the header and closes the file.
     ///
     /// # Errors
-    /// `File` when it cannot be written.
+    /// `File` if it cannot be written.
     pub fn finish(mut self) -> Result<u64> {
         let head = header(self.rows, &self.shape);
         self.file.seek(SeekFrom::Start(0)).map_err(|fault| Error::file(&self.path, fault))?;
@@ -78,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_states_the_rows_that_were_written_and_holds_their_numbers() {
+    fn file_has_row_count_and_numbers() {
         let folder = tempfile::tempdir().expect("folder");
         let path = folder.path().join("rows.npy");
         let mut writer = Writer::create(&path, &[2, 3]).expect("creates");

@@ -1,4 +1,4 @@
-//! Picking: the point of the deformed surface that a pixel shows, and what it takes to push there.
+//! Picking: the surface point at a pixel of a picture, and the rows of U that map a force at that point to the modes.
 
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
@@ -8,11 +8,11 @@ use crate::client::Client;
 use crate::error::{Result, malformed};
 use crate::frames::{Picture, Stages, Wanted, stages};
 
-/// A request for what a small rectangle of a picture shows.
+/// A request for the surface points in a small rectangle of a picture.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PickRequest {
     pub scene: String,
-    /// The picture in which the pixels are counted: its size and camera.
+    /// Size and camera of the picture to which the pixel coordinates refer.
     pub picture: Picture,
     corner: [u32; 2],
     size: [u32; 2],
@@ -27,21 +27,21 @@ impl PickRequest {
         Self { scene: scene.to_owned(), picture, corner: [x, y], size: [1, 1], ..Self::default() }
     }
 
-    /// A rectangle whose top left pixel is that one; at most 64 pixels a side.
+    /// Extends the pick to a rectangle with the pixel as its top left corner; at most 64 pixels a side.
     #[must_use]
     pub const fn rectangle(mut self, width: u32, height: u32) -> Self {
         self.size = [width, height];
         self
     }
 
-    /// Hits without [`Hit::modes`].
+    /// Omits [`Hit::modes`].
     #[must_use]
     pub const fn without_modes(mut self) -> Self {
         self.without_modes = true;
         self
     }
 
-    /// Exactly this step of the current run; refused when it is gone.
+    /// Exactly this step of the current run. The server refuses a step that it no longer has.
     #[must_use]
     pub const fn exactly(mut self, step: u64) -> Self {
         self.at = Wanted::Exactly(step);
@@ -55,7 +55,7 @@ impl PickRequest {
         self
     }
 
-    /// How long the server may wait for the step; 0 is its own default.
+    /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
     #[must_use]
     pub const fn within_ms(mut self, milliseconds: u32) -> Self {
         self.deadline_ms = milliseconds;
@@ -82,7 +82,7 @@ impl PickRequest {
     }
 }
 
-/// What the pixels show, row by row; one that shows no triangle has no hit.
+/// The hits in a rectangle of pixels, row by row. A pixel that shows no triangle has no hit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picks {
     pub step: v1::StepId,
@@ -90,31 +90,31 @@ pub struct Picks {
     pub stages: Stages,
 }
 
-/// The surface at the middle of a pixel; `frames.proto` says more of each field.
+/// The surface at the center of a pixel; `frames.proto` documents each field.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hit {
     pub pixel: [u32; 2],
     pub domain: u32,
     pub triangle: u32,
-    /// Rows of U over three.
+    /// Vertex indices; vertex v has the rows 3v, 3v + 1 and 3v + 2 of U.
     pub vertices: [u32; 3],
-    /// In the order of `vertices`.
+    /// Weights in the order of `vertices`.
     pub barycentric: [f64; 3],
-    /// Scene units from the scene's origin.
+    /// In scene units, relative to the scene's origin.
     pub position: [f64; 3],
-    /// Unit, on the side that is seen.
+    /// Unit length, on the visible side.
     pub normal: [f64; 3],
-    /// Metres along the view axis.
+    /// In meters along the view axis.
     pub depth: f64,
-    /// A, row-major.
+    /// A, the linear part of the domain's transform, row-major 3x3.
     pub linear: [f32; 9],
     pub rank: usize,
-    /// 3 x `rank`, row-major: U at the point; empty when it was left out.
+    /// 3 x `rank`, row-major: U interpolated at the point; empty if the request omits it.
     pub modes: Vec<f32>,
 }
 
 impl Hit {
-    /// f_q = U^T A^T f: what a force at the point, in world axes, is on the domain's coordinates. Empty without modes.
+    /// The reduced force f_q = U^T A^T f of a force f at the point, in world axes. Empty without modes.
     pub fn reduced_force(&self, force: [f64; 3]) -> Vec<f64> {
         let turned: [f64; 3] =
             std::array::from_fn(|row| (0..3).map(|axis| f64::from(self.linear[3 * axis + row]) * force[axis]).sum());
@@ -128,8 +128,8 @@ impl Client {
     /// Picks in a rectangle of a picture.
     ///
     /// # Errors
-    /// `Refused` when scene or step do not exist, the rectangle is not in the picture or the deadline passed; `Malformed`;
-    /// `Connect`.
+    /// `Refused` if the scene or the step does not exist, the rectangle is outside the picture, or the deadline passed;
+    /// `Malformed`; `Connect`.
     pub async fn pick(&self, request: &PickRequest) -> Result<Picks> {
         let wire = request.wire();
         let mut stream = FrameServiceClient::new(self.channel.clone()).pick(wire).await?.into_inner();
@@ -140,7 +140,7 @@ impl Client {
             for wire in response.hits {
                 hits.push(hit(wire)?);
             }
-            // The server's limit; a stream without end must not fill the memory.
+            // The server's limit. It bounds memory if a stream never ends.
             if hits.len() > 64 * 64 {
                 return Err(malformed("pick.hits", "at most 4096", hits.len()));
             }
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_force_is_turned_into_the_domains_axes_and_onto_its_modes() {
+    fn reduced_force_is_projected_onto_the_modes() {
         let hit = hit(wire()).expect("fits");
         // A^T f = (2 f_y, -2 f_x, f_z), and the columns of U are (1, 3, 5) and (2, 4, 6).
         assert_eq!(hit.reduced_force([1.0, 0.0, 0.0]), [-6.0, -8.0]);
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn hits_that_do_not_fit_are_refused_by_field() {
+    fn malformed_hits_are_refused_by_field() {
         for (wrong, field) in [
             (v1::Hit { rank: 3, ..wire() }, "hit.modes"),
             (v1::Hit { vertices: vec![1], ..wire() }, "hit.vertices"),

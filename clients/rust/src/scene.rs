@@ -1,4 +1,4 @@
-//! Descriptions of scenes and rows of U as owned values: arrays put together from chunks and checked against counts.
+//! Scene descriptions and rows of U as owned values. Arrays are assembled from chunks and checked against the counts.
 
 use std::collections::BTreeMap;
 
@@ -9,15 +9,15 @@ use crate::assemble::{Assembler, Piece, floats, words};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed};
 
-/// What to know of a server before sending anything.
+/// Version, devices and limits of a server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ServerInfo {
     pub version: String,
     /// The deformer in use: `cpu`, `cuda` or `reference`.
     pub backend: String,
-    /// The CUDA device, or why there is none.
+    /// The CUDA device, or the reason why there is none.
     pub device: String,
-    /// The OpenGL renderer's own name.
+    /// The name that the OpenGL renderer reports.
     pub renderer: String,
     /// Whether that renderer runs on the CPU.
     pub software: bool,
@@ -27,7 +27,7 @@ pub struct ServerInfo {
 /// The arrays that [`Client::describe`] can fetch.
 pub use modalcast_proto::v1::Array;
 
-/// How a domain hangs on its parent.
+/// The attachment of a domain to its parent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Attachment {
     pub parent: usize,
@@ -37,7 +37,7 @@ pub struct Attachment {
     pub rows: Vec<u32>,
 }
 
-/// One domain: n vertices, r modes, and the arrays that were asked for (the others are empty).
+/// One domain: n vertices, r modes, and the requested arrays (the others are empty).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Domain {
     pub index: usize,
@@ -51,9 +51,9 @@ pub struct Domain {
     pub attachment: Option<Attachment>,
     /// `world_from_domain` at rest, row-major 3x4.
     pub placement: [f32; 12],
-    /// A domain with a smaller index whose coordinates this one shares.
+    /// A domain with a smaller index, with which this domain shares its coordinates.
     pub shares_q_with: Option<usize>,
-    /// Instances of each other have the same.
+    /// Identifies the mesh and U; instances of one shape have the same value.
     pub shape: usize,
     /// (rad/s)^2, one per mode; empty when unknown.
     pub eigenvalues: Vec<f64>,
@@ -77,7 +77,7 @@ pub struct SceneDescription {
     pub domains: Vec<Domain>,
 }
 
-/// Chosen rows of U: for each vertex asked for, three rows of r entries.
+/// Selected rows of U: three rows of r entries for each requested vertex.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModeRows {
     pub rank: usize,
@@ -85,22 +85,22 @@ pub struct ModeRows {
 }
 
 impl ModeRows {
-    /// The 3 x r rows of the `place`-th vertex asked for, row-major.
+    /// The 3 x r rows of the `place`-th requested vertex, row-major.
     pub fn of(&self, place: usize) -> &[f32] {
         &self.rows[3 * self.rank * place..][..3 * self.rank]
     }
 }
 
 impl Client {
-    /// Describes all domains of a scene, with the arrays asked for.
+    /// Describes all domains of a scene, with the requested arrays.
     ///
     /// # Errors
-    /// `Refused` when there is no such scene; `Malformed` when lengths and counts contradict each other.
+    /// `Refused` if the scene does not exist; `Malformed` if lengths and counts contradict each other.
     pub async fn describe(&self, scene: &str, arrays: &[Array]) -> Result<SceneDescription> {
         self.describe_domains(scene, &[], arrays).await
     }
 
-    /// As [`Self::describe`], for the domains named; none means all.
+    /// As [`Self::describe`], for the given domain indices; an empty list selects all.
     ///
     /// # Errors
     /// As [`Self::describe`].
@@ -118,10 +118,11 @@ impl Client {
         collected.finish(arrays)
     }
 
-    /// The rows of U of chosen vertices of a domain; none chosen means all.
+    /// The rows of U of selected vertices of a domain; an empty list selects all.
     ///
     /// # Errors
-    /// `Refused` when scene, domain or vertex do not exist; `Malformed` when the reply has not 3 r numbers per vertex.
+    /// `Refused` if the scene, the domain or a vertex does not exist; `Malformed` if the reply does not have 3 r
+    /// numbers per vertex.
     pub async fn modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
         let domain = u32::try_from(domain).map_err(|_| malformed("modes.domain", "a 32-bit index", domain))?;
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
@@ -136,7 +137,7 @@ impl Client {
         if assembler.is_open() {
             return Err(Error::Ended { what: "the last chunk of the modes" });
         }
-        // A rigid domain has no rows; a server may answer that with no message at all.
+        // A rigid domain has no rows; a server may answer without any message.
         let (rank, bytes) = whole.unwrap_or((0, Bytes::new()));
         let rows = ModeRows { rank: rank as usize, rows: floats(&bytes) };
         let expected = 12_u64.saturating_mul(u64::from(rank)).saturating_mul(vertices.len() as u64);
@@ -147,7 +148,7 @@ impl Client {
     }
 }
 
-/// The parts of a description as they come in.
+/// The parts of a description received so far.
 struct Collected {
     limit: u64,
     kept: u64,
@@ -178,7 +179,7 @@ impl Collected {
         Ok(())
     }
 
-    /// Adds a chunk of an array; chunks of one array follow each other.
+    /// Adds a chunk of an array. The chunks of one array are consecutive.
     fn chunk(&mut self, chunk: v1::ArrayChunk) -> Result<()> {
         let key = (chunk.domain, chunk.array);
         let mut assembler = match self.open.take() {
@@ -231,14 +232,14 @@ impl Collected {
 }
 
 impl Domain {
-    /// Whether an array that was asked for has the length that the counts say, and indices within them.
+    /// Checks that a requested array has the length given by the counts, and that its indices are within range.
     fn check(&self, array: Array) -> Result<()> {
         let (got, wanted) = match array {
             Array::Indices => (self.indices.len(), 3 * self.triangles),
             Array::CornerVertices => (self.corner_vertices.len(), self.corners),
             Array::RestPositions => (self.rest_positions.len(), 3 * self.vertices),
             Array::RestNormals => (self.rest_normals.len(), 3 * self.corners),
-            // A mesh without texture coordinates has none.
+            // Texture coordinates are optional.
             Array::Uvs if self.uvs.is_empty() => (0, 0),
             Array::Uvs => (self.uvs.len(), 2 * self.corners),
             Array::Unspecified => (0, 0),
@@ -258,7 +259,7 @@ impl Domain {
     }
 }
 
-/// A domain off the wire.
+/// Converts a domain from its wire format.
 fn domain(wire: v1::DomainDescription) -> Result<Domain> {
     let place = |field: &str, bytes: &[u8]| match <[f32; 12]>::try_from(floats(bytes)) {
         Ok(entries) if bytes.len() == 48 => Ok(entries),

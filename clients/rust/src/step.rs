@@ -1,28 +1,28 @@
-//! One step as a physics process builds it: per domain r coordinates and a transform, packed little-endian.
+//! One step of a physics process: r coordinates and a transform per domain, packed little-endian.
 
 use bytes::{BufMut as _, BytesMut};
 use modalcast_proto::v1;
 
 use crate::error::{Error, Result};
 
-/// Where a domain is: `world_from_domain`, in scene units. A rotation is a quaternion x, y, z, w (w is the real part) whose
-/// norm is 1 within 0.001; the server normalises it in f64.
+/// The transform `world_from_domain` of a domain, in scene units. A rotation is a quaternion x, y, z, w (w is the real
+/// part) with a norm of 1 within 0.001; the server normalizes it in f64.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Transforms {
-    /// 48 bytes: row-major 3x4, the translation relative to the scene's origin. May shear and scale where the scene allows
-    /// it.
+    /// 48 bytes: row-major 3x4, with a translation relative to the scene's origin. May shear and scale if the scene
+    /// allows it.
     Affine([f32; 12]),
     /// 28 bytes: a translation relative to the scene's origin.
     RigidF32 { rotation: [f32; 4], translation: [f32; 3] },
-    /// 40 bytes: a translation from the world's origin; the server takes the scene's origin off in f64. Keeps
-    /// millimetres at 10,000 km.
+    /// 40 bytes: a translation relative to the world's origin; the server subtracts the scene's origin in f64. Resolves
+    /// millimeters at 10,000 km.
     RigidF64 { rotation: [f32; 4], translation: [f64; 3] },
 }
 
 impl Transforms {
     const fn format(&self) -> v1::TransformFormat {
         match self {
-            // What servers without the other formats understand, too.
+            // Servers without the other formats also accept this one.
             Self::Affine(_) => v1::TransformFormat::Unspecified,
             Self::RigidF32 { .. } => v1::TransformFormat::RigidF32,
             Self::RigidF64 { .. } => v1::TransformFormat::RigidF64,
@@ -45,7 +45,7 @@ impl Transforms {
     }
 }
 
-/// A step under construction. What is not set keeps its value on the server.
+/// Builds a step. Values that are not set keep their value on the server.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Step {
     number: u64,
@@ -54,14 +54,14 @@ pub struct Step {
     q: BytesMut,
     transform_domains: Vec<u32>,
     transforms: BytesMut,
-    /// That of the first transform.
+    /// The format of the first transform.
     format: v1::TransformFormat,
-    /// A later transform had another one.
+    /// Whether a later transform has another format.
     mixed: bool,
 }
 
 impl Step {
-    /// An empty step. Numbers grow within one stream; `time` is simulation time in seconds.
+    /// An empty step. Step numbers increase within one stream; `time` is the simulation time in seconds.
     pub fn new(number: u64, time: f64) -> Self {
         Self { number, time, ..Self::default() }
     }
@@ -80,7 +80,8 @@ impl Step {
         self
     }
 
-    /// Sets where a domain is, in any of the three formats. All transforms of one step have the same.
+    /// Sets the transform of a domain, in any of the three formats. All transforms of one step must have the same
+    /// format.
     #[must_use]
     pub fn place(mut self, domain: u32, place: &Transforms) -> Self {
         self.set_place(domain, place);
@@ -108,7 +109,7 @@ impl Step {
         place.put(&mut self.transforms);
     }
 
-    /// Refuses a step whose transforms have several formats: no message can carry it.
+    /// Refuses a step with transforms of several formats, because one message has one format.
     pub(crate) fn check(&self) -> Result<()> {
         match self.mixed {
             false => Ok(()),
@@ -126,7 +127,7 @@ impl Step {
         self.q.len() + self.transforms.len()
     }
 
-    /// The step as the wire carries it.
+    /// The step in its wire format.
     pub fn to_wire(&self) -> v1::Step {
         v1::Step {
             number: self.number,
@@ -145,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_packed_little_endian_in_the_order_of_their_domains() {
+    fn numbers_are_packed_little_endian_in_domain_order() {
         let pose = [1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 6.0, 0.0, 0.0, 1.0, 7.0];
         let wire = Step::new(3, 0.5).q(2, &[1.0, -2.0]).q(0, &[0.25]).transform(1, &pose).to_wire();
         assert_eq!((wire.number, wire.time), (3, 0.5));
@@ -158,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn rigid_transforms_are_28_or_40_bytes_rotation_first_and_formats_do_not_mix() {
+    fn rigid_transforms_put_rotation_first_and_formats_do_not_mix() {
         let rotation = [0.0, 0.6, 0.0, 0.8];
         let narrow = Transforms::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
         let wide = Transforms::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };

@@ -1,4 +1,5 @@
-//! Uploads: a folder (or one file) with relative paths, sizes and SHA-256, in chunks, to be opened as a scene.
+//! Uploads a folder or a single file to the server and opens it as a scene. Each file is sent in chunks, with its
+//! relative path, size and SHA-256.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -14,10 +15,10 @@ use v1::upload_scene_request::Part;
 use crate::client::Client;
 use crate::error::{Error, Result, malformed};
 
-/// Bytes per message: far below the 4 MiB that a server with default limits reads.
+/// Bytes per message: far below 4 MiB, the default limit of gRPC.
 const CHUNK: usize = 512 << 10;
 
-/// Links and folders below this are not followed: a folder that contains itself would never end.
+/// The most nested folders. Deeper ones are an error, so that a cyclic link ends.
 const DEPTH: usize = 16;
 
 /// One file to upload.
@@ -27,11 +28,11 @@ struct Entry {
 }
 
 impl Client {
-    /// Uploads a folder, or a single file, and opens it under `scene`. `entry` is the uploaded path to open; empty is
-    /// the folder itself, or the single file.
+    /// Uploads a folder or a single file and opens it under the name `scene`. `entry` is the uploaded path to open; if
+    /// it is empty, the folder itself or the single file is opened.
     ///
     /// # Errors
-    /// `File` when something cannot be read; `Refused` when the server refuses the upload or cannot open the scene.
+    /// `File` if a file cannot be read; `Refused` if the server refuses the upload or cannot open the scene.
     pub async fn upload_scene(&self, path: &Path, scene: &str, entry: &str) -> Result<v1::SceneInfo> {
         let (root, listing) = (
             path.to_owned(),
@@ -51,7 +52,7 @@ impl Client {
         let (sender, queue) = mpsc::channel(4);
         let reading = tokio::task::spawn_blocking(move || send_all(&sender, header, &entries));
         let reply = self.scenes().upload_scene(ReceiverStream::new(queue)).await;
-        // A file that could not be read cut the upload short: that is the cause, the server's refusal its effect.
+        // A read error truncates the upload, and the server refuses it. Report the read error, which is the cause.
         reading.await.map_err(|fault| Error::file(&root, fault))??;
         reply?.into_inner().scene.ok_or_else(|| malformed("upload.scene", "a scene", "none"))
     }
@@ -100,7 +101,7 @@ fn describe(base: &Path, disk: PathBuf) -> Result<Entry> {
     Ok(Entry { disk, file: v1::UploadFile { path, bytes, sha256: hash.finalize().to_vec().into() } })
 }
 
-/// Sends the header, then each file and its chunks; stops quietly when the server has stopped listening.
+/// Sends the header, then each file and its chunks. Stops without error if the server has closed the stream.
 fn send_all(sender: &mpsc::Sender<v1::UploadSceneRequest>, header: v1::UploadHeader, entries: &[Entry]) -> Result<()> {
     let send = |part| sender.blocking_send(v1::UploadSceneRequest { part: Some(part) }).is_ok();
     let mut listening = send(Part::Header(header));
@@ -117,7 +118,7 @@ fn send_all(sender: &mpsc::Sender<v1::UploadSceneRequest>, header: v1::UploadHea
     Ok(())
 }
 
-/// Reads a file chunk by chunk while `more` says so.
+/// Reads a file chunk by chunk while `more` returns true.
 fn read(path: &Path, mut more: impl FnMut(&[u8]) -> bool) -> Result<()> {
     let fail = |fault: std::io::Error| Error::file(path, fault);
     let mut file = File::open(path).map_err(fail)?;

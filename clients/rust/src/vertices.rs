@@ -1,5 +1,5 @@
-//! Deformed vertices: positions per row of U and normals per corner, world relative to an origin that the set names, one
-//! set per step; and what else a reader wants of them.
+//! Deformed vertices of a step: positions per vertex and normals per corner in world axes, relative to an origin that
+//! the set states. On request also displacements and bounding boxes.
 
 use std::ops::Range;
 use std::pin::Pin;
@@ -14,15 +14,15 @@ use crate::client::Client;
 use crate::error::{Error, Result, malformed};
 use crate::frames::{Delivery, Stages, Wanted, stages};
 
-/// What a reader, for example one that looks for collisions, wants of a step besides its vertices. The server refuses what
-/// the scene does not keep.
+/// Additional attributes to read back with a step, for example for collision detection. The server refuses attributes
+/// that the scene does not keep.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Readings {
-    /// u = U q of each vertex; of a scene with `deform.displacements`.
+    /// u = U q of each vertex; requires `deform.displacements` in the scene.
     pub displacements: bool,
-    /// A box of each chosen domain; of a scene with `deform.boxes`.
+    /// A bounding box of each selected domain; requires `deform.boxes` in the scene.
     pub boxes: bool,
-    /// Leave out positions and normals.
+    /// Omits positions and normals.
     pub alone: bool,
 }
 
@@ -30,7 +30,7 @@ pub struct Readings {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct VertexRequest {
     pub scene: String,
-    /// Domains by index; empty means all.
+    /// Domain indices; empty selects all.
     pub domains: Vec<u32>,
     pub positions_only: bool,
     pub readings: Readings,
@@ -44,7 +44,7 @@ impl VertexRequest {
         Self { scene: scene.to_owned(), ..Self::default() }
     }
 
-    /// Exactly this step of the current run; refused when it is gone.
+    /// Exactly this step of the current run. The server refuses a step that it no longer has.
     #[must_use]
     pub const fn exactly(mut self, step: u64) -> Self {
         self.at = Wanted::Exactly(step);
@@ -58,7 +58,7 @@ impl VertexRequest {
         self
     }
 
-    /// How long the server may wait for the step; 0 is its own default.
+    /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
     #[must_use]
     pub const fn within_ms(mut self, milliseconds: u32) -> Self {
         self.deadline_ms = milliseconds;
@@ -66,7 +66,7 @@ impl VertexRequest {
     }
 }
 
-/// A subscription to vertices; `steps` of 0 never ends.
+/// A subscription to vertices; with `steps` = 0 it never ends.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct VertexStreamRequest {
     pub scene: String,
@@ -81,33 +81,33 @@ pub struct VertexStreamRequest {
 #[derive(Debug, Clone, PartialEq)]
 pub struct VertexSet {
     pub step: v1::StepId,
-    /// The origin of all positions in the world, metres. It is the scene's until steps with f64 translations take domains
-    /// far from it, so it may differ from step to step.
+    /// World position of the origin of all positions, in meters. This is the scene's origin unless steps with f64
+    /// translations move domains far from it; it may change from step to step.
     pub origin: Vec<f64>,
-    /// Per chosen domain: the origin of its own positions, when they are not all the same; else empty.
+    /// The origin of each selected domain if the origins differ; otherwise empty.
     pub origins: Vec<[f64; 3]>,
-    /// Per chosen domain: its index, its vertices and its corners.
+    /// Per selected domain: its index, its number of vertices and its number of corners.
     pub domains: Vec<(u32, u32, u32)>,
-    /// Three per vertex, all chosen domains after each other; empty when they were left out.
+    /// Three per vertex, selected domains concatenated; empty if omitted.
     pub positions: Vec<f32>,
-    /// Three per corner; empty when they were left out.
+    /// Three per corner; empty if omitted.
     pub normals: Vec<f32>,
-    /// u = U q, three per vertex in the frame of its domain; empty unless asked for.
+    /// u = U q, three per vertex in the frame of its domain; empty unless requested.
     pub displacements: Vec<f32>,
-    /// Per chosen domain the smallest and the largest x, y, z of its positions; empty unless asked for.
+    /// Per selected domain the minimum and the maximum x, y, z of its positions; empty unless requested.
     pub boxes: Vec<[[f32; 3]; 2]>,
     pub skipped: u64,
     pub stages: Stages,
 }
 
 impl VertexSet {
-    /// Where the positions of the `place`-th chosen domain are, and its displacements.
+    /// The range of the `place`-th selected domain in `positions` and in `displacements`.
     pub fn range(&self, place: usize) -> Range<usize> {
         let before: usize = self.domains[..place].iter().map(|(_, vertices, _)| 3 * *vertices as usize).sum();
         before..before + 3 * self.domains[place].1 as usize
     }
 
-    /// World position in metres of what the positions of the `place`-th chosen domain are relative to: a vertex is at
+    /// World position of the origin of the `place`-th selected domain, in meters. A vertex is at
     /// `origin_of(place) + unit * position`, with the unit of the scene's info.
     pub fn origin_of(&self, place: usize) -> [f64; 3] {
         let all = || std::array::from_fn(|axis| self.origin.get(axis).copied().unwrap_or(0.0));
@@ -119,8 +119,8 @@ impl Client {
     /// The vertices of one step.
     ///
     /// # Errors
-    /// `Refused` when scene, domain or step do not exist, the scene does not keep what is wanted or the deadline passed;
-    /// `Malformed`; `Connect`.
+    /// `Refused` if the scene, a domain or the step does not exist, the scene does not keep a requested attribute, or
+    /// the deadline passed; `Malformed`; `Connect`.
     pub async fn vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
         use v1::get_vertices_request::Step;
         let wire = v1::GetVerticesRequest {
@@ -138,10 +138,10 @@ impl Client {
         set.unwrap_or(Err(Error::Ended { what: "the vertices" }))
     }
 
-    /// Subscribes to the vertices of every step. When this returns, the server has accepted.
+    /// Subscribes to vertices. When this returns, the server has accepted the subscription.
     ///
     /// # Errors
-    /// `Refused` when scene or domain do not exist or the scene does not keep what is wanted; `Connect`.
+    /// `Refused` if the scene or a domain does not exist, or the scene does not keep a requested attribute; `Connect`.
     pub async fn vertex_sets(&self, request: &VertexStreamRequest) -> Result<VertexSets> {
         let wire = v1::StreamVerticesRequest {
             scene: request.scene.clone(),
@@ -158,7 +158,7 @@ impl Client {
 pub struct VertexSets(Replies<v1::StreamVerticesResponse>);
 
 impl VertexSets {
-    /// The next step's vertices, or `None` when the server has sent as many as asked for.
+    /// The vertices of the next step, or `None` after the requested number of steps.
     pub async fn next(&mut self) -> Option<Result<VertexSet>> {
         self.0.next().await
     }
@@ -232,7 +232,7 @@ fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
     })
 }
 
-/// The bytes of a reply, cut as its head says.
+/// The bytes of a reply, split by the sizes in its head.
 struct Parts<'a> {
     positions: &'a [u8],
     normals: &'a [u8],
@@ -267,7 +267,7 @@ fn parts<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<Parts<'a>> {
     Ok(Parts { positions, normals, displacements, boxes, origins })
 }
 
-/// Six numbers a box.
+/// Six numbers per box.
 fn boxes(numbers: &[f32]) -> Vec<[[f32; 3]; 2]> {
     let corner = |six: &[f32], first: usize| [0, 1, 2].map(|axis| six[first + axis]);
     numbers.chunks_exact(6).map(|six| [corner(six, 0), corner(six, 3)]).collect()
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_knows_the_origin_of_each_of_its_domains() {
+    fn a_set_reports_the_origin_of_each_domain() {
         let floats = [1.5_f32, 2.5, 3.5, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
         let origins = [1e7_f64, 0.0, -1.0, 8.0, 9.0, 1e300].into_iter().flat_map(f64::to_le_bytes);
         let whole: Vec<u8> = floats.clone().chain(origins).collect();
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn origins_that_do_not_fit_are_refused_by_field() {
+    fn malformed_origins_are_refused_by_field() {
         for (origin_bytes, length, field) in
             [(24, 48, "origin_bytes"), (u64::MAX, 72, "origin_bytes"), (48, 24, "total"), (0, 72, "total")]
         {
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn displacements_and_boxes_are_found_behind_what_is_there_or_left_out() {
+    fn displacements_and_boxes_follow_optional_vertices() {
         let bytes = |from: u16, count: u16| (from..from + count).flat_map(|at| f32::from(at).to_le_bytes());
         let readings = |positions: bool| v1::VertexHead {
             position_bytes: if positions { 12 } else { 0 },

@@ -1,4 +1,4 @@
-//! The client against a small server of its own, over a real socket, with the default limits of gRPC.
+//! Tests of the client against a fake server, over a real socket, with the default limits of gRPC.
 
 mod fake;
 
@@ -10,7 +10,7 @@ use modalcast_client::{Array, Client, DrawnBy, Error, Format, FrameRequest, Fram
 use modalcast_client::{VertexRequest, VertexStreamRequest};
 use tokio::sync::Semaphore;
 
-/// One domain of n vertices and two modes whose entries say where they are.
+/// One domain of n vertices and two modes. Each entry encodes its own index.
 fn world(vertices: usize) -> World {
     let rest = (0..3 * vertices).map(|at| at as f32).collect();
     let modes = (0..6 * vertices).map(|at| (at % 1000) as f32).collect();
@@ -24,7 +24,7 @@ async fn connected(world: World) -> (Arc<World>, Client) {
 }
 
 #[tokio::test]
-async fn arrays_and_modes_above_four_mebibytes_come_whole() {
+async fn arrays_and_modes_above_4_mib_arrive_complete() {
     let (world, client) = connected(world(300_000)).await;
     let described =
         client.describe("toy", &[Array::RestPositions, Array::Indices, Array::Uvs]).await.expect("describes");
@@ -40,7 +40,7 @@ async fn arrays_and_modes_above_four_mebibytes_come_whole() {
 }
 
 #[tokio::test]
-async fn a_frame_above_four_mebibytes_comes_whole_and_names_its_step() {
+async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let (_, client) = connected(world(4)).await;
     let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
     drive.step(&Step::new(5, 0.1).q(0, &[1.0, 2.0])).await.expect("sent");
@@ -55,7 +55,7 @@ async fn a_frame_above_four_mebibytes_comes_whole_and_names_its_step() {
 }
 
 #[tokio::test]
-async fn a_subscription_made_before_the_first_step_gets_every_step() {
+async fn subscription_before_the_first_step_receives_every_step() {
     let (world, client) = connected(world(4)).await;
     let picture = Picture { width: 600, height: 600, format: Format::Rgba, ..Picture::default() };
     let request = FramesRequest { scene: "toy".into(), picture, frames: 20, ..FramesRequest::default() };
@@ -81,7 +81,7 @@ async fn a_subscription_made_before_the_first_step_gets_every_step() {
 }
 
 #[tokio::test]
-async fn a_step_beyond_the_window_waits_for_an_acknowledgement() {
+async fn step_beyond_the_window_waits_for_an_acknowledgement() {
     let mut slow = world(4);
     (slow.window, slow.permits) = (2, Semaphore::new(0));
     let (world, client) = connected(slow).await;
@@ -98,7 +98,7 @@ async fn a_step_beyond_the_window_waits_for_an_acknowledgement() {
 }
 
 #[tokio::test]
-async fn a_refused_step_is_a_typed_error_and_the_stream_goes_on() {
+async fn refused_step_is_a_typed_error_and_stream_stays_open() {
     let (world, client) = connected(world(4)).await;
     let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
     drive.step(&Step::new(0, 0.0).q(0, &[1.0])).await.ok();
@@ -113,7 +113,7 @@ async fn a_refused_step_is_a_typed_error_and_the_stream_goes_on() {
 }
 
 #[tokio::test]
-async fn a_second_writer_is_refused_until_the_first_has_gone() {
+async fn second_writer_is_refused_until_the_first_is_dropped() {
     let (_, client) = connected(world(4)).await;
     let first = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
     let refusal = client.drive("toy", Policy::Latest, 0).await.err().expect("taken");
@@ -127,7 +127,7 @@ async fn a_second_writer_is_refused_until_the_first_has_gone() {
 }
 
 #[tokio::test]
-async fn refusals_of_calls_carry_what_the_server_said() {
+async fn refused_calls_report_the_details_of_the_server() {
     let (_, client) = connected(world(4)).await;
     for error in [
         client.describe("none", &[]).await.expect_err("unknown"),
@@ -145,7 +145,7 @@ async fn refusals_of_calls_carry_what_the_server_said() {
 }
 
 #[tokio::test]
-async fn an_upload_sends_every_file_of_a_folder_under_its_relative_path() {
+async fn upload_sends_every_file_under_its_relative_path() {
     let (world, client) = connected(world(4)).await;
     let folder = tempfile::tempdir().expect("folder");
     std::fs::create_dir(folder.path().join("maps")).expect("folder");
@@ -159,7 +159,7 @@ async fn an_upload_sends_every_file_of_a_folder_under_its_relative_path() {
     assert!(matches!(client.upload_scene("/none".as_ref(), "mine", "").await, Err(Error::File { .. })));
 }
 
-/// Every package that `package` needs, by the lock file of the workspace.
+/// All transitive dependencies of `package`, from the lock file of the workspace.
 fn tree(package: &str) -> Vec<String> {
     let lock = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../Cargo.lock")).expect("a lock file");
     let mut found = vec![package.to_owned()];
@@ -177,7 +177,7 @@ fn tree(package: &str) -> Vec<String> {
 }
 
 #[test]
-fn the_library_needs_neither_cuda_nor_opengl() {
+fn client_depends_on_neither_cuda_nor_opengl() {
     let drawing = ["cudarc", "glow", "khronos-egl", "modalcast"];
     let of = |package| tree(package).into_iter().filter(|name| drawing.contains(&name.as_str())).count();
     assert_eq!(of("modalcast-client"), 0);
@@ -185,7 +185,7 @@ fn the_library_needs_neither_cuda_nor_opengl() {
     assert_eq!(of("modalcast"), drawing.len(), "the walk finds what the server needs");
 }
 
-/// Runs `modalcast-fetch`; its exit code and what it printed.
+/// Runs `modalcast-fetch`. Returns its exit code, standard output and standard error.
 async fn fetch(url: &str, arguments: &[&str]) -> (i32, String, String) {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalcast-fetch"));
     command.args(arguments).args(["--server", url]);
@@ -195,14 +195,14 @@ async fn fetch(url: &str, arguments: &[&str]) -> (i32, String, String) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_program_saves_frames_and_vertices_and_its_exit_code_says_what_went_wrong() {
+async fn fetch_saves_files_and_exits_with_documented_codes() {
     let world = Arc::new(world(4));
     let url = serve(Arc::clone(&world)).await;
     let client = Client::connect(&url).await.expect("connects");
     let folder = tempfile::tempdir().expect("folder");
     let path = |name: &str| folder.path().join(name).display().to_string();
     let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
-    // Steps flow until the program has what it wants: it subscribes at a time of its own.
+    // Send steps until the program ends, because its subscription starts at an unknown time.
     let flow = tokio::spawn(async move {
         for number in 0.. {
             drive.step(&Step::new(number, 0.0).q(0, &[number as f32, 0.0])).await.expect("sent");

@@ -1,4 +1,4 @@
-//! A small server for the tests of the clients: the wire contract in memory, x = T (x0 + U q) in f64, no engine.
+//! A fake server for tests of the clients. It implements the wire contract in memory with x = T (x0 + U q) in f64.
 
 mod serve;
 
@@ -23,7 +23,7 @@ pub(crate) struct FakeDomain {
 pub(crate) const IDENTITY: [f32; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
 
 impl FakeDomain {
-    /// A domain at the origin whose corners are its vertices.
+    /// A domain at the origin with one corner per vertex.
     pub(crate) fn new(index: u32, rest: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
         let vertices = (rest.len() / 3) as u32;
         assert_eq!(modes.len(), rest.len() * rank as usize, "U has 3n rows");
@@ -55,19 +55,19 @@ impl FakeDomain {
     }
 }
 
-/// The state after a step, as subscribers get it.
+/// The state after a step, as sent to subscribers.
 #[derive(Debug, Clone)]
 pub(crate) struct Shown {
     pub(crate) step: v1::StepId,
     pub(crate) positions: Vec<f32>,
 }
 
-/// A server's only scene, `toy`, and what it has seen.
+/// The only scene of the fake server, `toy`, and the requests that it received.
 pub(crate) struct World {
     pub(crate) domains: Vec<FakeDomain>,
     pub(crate) bounds: [f64; 6],
     pub(crate) window: u32,
-    /// Acknowledgements that may still be given; many unless a test holds them back.
+    /// Acknowledgements that may still be sent; practically unlimited unless a test restricts them.
     pub(crate) permits: Semaphore,
     pub(crate) steps: Mutex<Vec<v1::Step>>,
     pub(crate) uploads: Mutex<Vec<(String, Vec<u8>)>>,
@@ -129,7 +129,7 @@ impl World {
         }
     }
 
-    /// Takes the writer's place, or says who has it.
+    /// Acquires the writer lease. Fails if another run has it.
     fn take(&self) -> Result<u64, v1::Rejection> {
         let mut state = self.state.lock().unwrap();
         if std::mem::replace(&mut state.taken, true) {
@@ -143,7 +143,7 @@ impl World {
         self.state.lock().unwrap().taken = false;
     }
 
-    /// Applies a step as a whole, or says what is wrong with it.
+    /// Applies a step atomically, or returns the rejection.
     fn apply(&self, step: &v1::Step) -> Result<(), v1::Rejection> {
         let wrong = |field, expected: String, given| Err(rejection(Some(step.number), field, expected, given));
         let expected: usize = step.q_domains.iter().map(|index| self.rank(*index)).sum();

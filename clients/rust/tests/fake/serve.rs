@@ -1,4 +1,4 @@
-//! The services of the fake server, and the router between them.
+//! The gRPC services of the fake server and their router.
 
 use std::convert::Infallible;
 use std::pin::Pin;
@@ -23,7 +23,7 @@ const CHUNK: usize = 1 << 20;
 
 type Replies<T> = Pin<Box<dyn tokio_stream::Stream<Item = Result<T, Status>> + Send>>;
 
-/// Serves a world on a free loopback port; its URL.
+/// Serves a world on a free loopback port. Returns its URL.
 pub(crate) async fn serve(world: Arc<World>) -> String {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a free port");
     let url = format!("http://{}", listener.local_addr().expect("bound"));
@@ -337,7 +337,7 @@ impl Fake {
     }
 }
 
-/// A raw picture whose every byte is the step's number, in chunks.
+/// A raw picture in chunks. Every byte is the number of the step.
 fn frame(shown: &Shown, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
     let (width, height) = (picture.width.max(1), picture.height.max(1));
     let bytes = vec![shown.step.number as u8; 4 * (width * height) as usize];
@@ -355,7 +355,7 @@ fn frame(shown: &Shown, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
     chunks(bytes).into_iter().map(|(offset, (data, _))| v1::FrameChunk { head: head.take(), offset, data }).collect()
 }
 
-/// Bytes in pieces of at most 1 MiB: offset, piece, total. Nothing is one empty piece.
+/// Splits bytes into pieces of at most 1 MiB: offset, piece, total. Empty input gives one empty piece.
 fn chunks(bytes: Vec<u8>) -> Vec<(u64, (Bytes, u64))> {
     let (bytes, total) = (Bytes::from(bytes), 0);
     let total = total + bytes.len() as u64;

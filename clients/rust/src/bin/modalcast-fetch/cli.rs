@@ -22,10 +22,10 @@ Exit codes: 0 done; 1 the server refused; 2 bad command line; 3 no connection, o
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
 pub(crate) struct Arguments {
-    /// The server.
+    /// URL of the server.
     #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
-    /// Seconds to keep trying until the server answers.
+    /// How long to retry until the server answers, in seconds.
     #[arg(long, global = true, default_value_t = 0.0, value_parser = seconds)]
     pub(crate) wait: f64,
     /// Print a machine-readable summary on standard output.
@@ -37,20 +37,20 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Save a frame per step.
+    /// Save one frame per step.
     #[command(after_help = EXAMPLES)]
     Frames(FramesOptions),
     /// Save one frame.
     #[command(after_help = EXAMPLES)]
     Frame(FrameOptions),
-    /// Save deformed vertices as a NumPy file: steps x vertices x 3.
+    /// Save deformed vertices as a NumPy file, steps x vertices x 3.
     #[command(after_help = EXAMPLES)]
     Vertices(VerticesOptions),
-    /// What the server is: backend, renderer, limits.
+    /// Print backend, renderer and limits of the server.
     Info,
-    /// Open scenes, and what could be opened.
+    /// List the open scenes and the sources that can be opened.
     List,
-    /// Close a scene; the files of an uploaded one are removed.
+    /// Close a scene; the server deletes the files of an uploaded scene.
     Close {
         /// The scene's name on the server.
         #[arg(long)]
@@ -58,45 +58,45 @@ pub(crate) enum Command {
     },
 }
 
-/// Which scene.
+/// Options that select the scene.
 #[derive(Debug, Args)]
 pub(crate) struct SceneOptions {
     /// The scene's name on the server.
     #[arg(long)]
     pub(crate) scene: String,
-    /// Open this source of the server's repository under that name first.
+    /// First open this source of the server's repository under the name of --scene.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
 }
 
-/// What the picture looks like.
+/// Options of the picture.
 #[derive(Debug, Args)]
 pub(crate) struct PictureOptions {
     /// Size in pixels.
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = size)]
     size: (u32, u32),
-    /// What it shows: colour, raw depth (f32 metres), domains (u32) or normals (3 f32), or a colour map with a legend.
+    /// What the picture shows: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map with legend.
     #[arg(long, value_enum, default_value = "colour")]
     output: OutputOption,
-    /// The column of U for `--output mode-shape`.
+    /// Column of U for `--output mode-shape`.
     #[arg(long, default_value_t = 0)]
     mode: u32,
-    /// The value at the bright end of a colour map; 0: fitted to each frame.
+    /// Value at the bright end of a color map; 0 fits it to each frame.
     #[arg(long, default_value_t = 0.0)]
     largest: f64,
-    /// How the bytes of colours are encoded: PNG, or raw RGBA8 (top row first, sRGB).
+    /// Encoding of color pictures: PNG, or raw RGBA8 (top row first, sRGB).
     #[arg(long, value_enum, default_value = "png")]
     pub(crate) format: FormatOption,
-    /// Where the camera is; without it the server frames the scene.
+    /// Position of the camera; the default camera frames the scene.
     #[arg(long, value_name = "X,Y,Z", value_parser = triple, requires = "target", allow_hyphen_values = true)]
     camera_eye: Option<[f64; 3]>,
-    /// What the camera looks at.
+    /// Point that the camera looks at.
     #[arg(long, value_name = "X,Y,Z", value_parser = triple, requires = "camera_eye", allow_hyphen_values = true)]
     target: Option<[f64; 3]>,
-    /// Which way is up for the camera.
+    /// Up direction of the camera.
     #[arg(long, value_name = "X,Y,Z", value_parser = triple, default_value = "0,1,0", allow_hyphen_values = true)]
     up: [f64; 3],
-    /// Vertical field of view in degrees; 35 without it.
+    /// Vertical field of view in degrees; default 35.
     #[arg(long, requires = "camera_eye")]
     fov: Option<f64>,
 }
@@ -159,21 +159,21 @@ pub(crate) struct FramesOptions {
     pub(crate) scene: SceneOptions,
     #[command(flatten)]
     pub(crate) picture: PictureOptions,
-    /// How many frames.
+    /// Number of frames.
     #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: u64,
-    /// The folder for frame_00000.png and so on; it is made if missing.
+    /// Folder for frame_00000.png and so on; created if it does not exist.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Every step, or the newest.
+    /// Receive every step, or the newest.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
-    /// Seconds to wait for the next frame before giving up.
+    /// How long to wait for the next frame, in seconds.
     #[arg(long, default_value_t = 120.0, value_parser = seconds)]
     pub(crate) timeout: f64,
 }
 
-/// Which step.
+/// Options that select the step.
 #[derive(Debug, Args)]
 pub(crate) struct StepOptions {
     /// Exactly this step of the current run.
@@ -182,7 +182,7 @@ pub(crate) struct StepOptions {
     /// This step of the current run or a later one.
     #[arg(long)]
     pub(crate) min_step: Option<u64>,
-    /// Milliseconds that the server may wait for it; 0 is its own default.
+    /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
     #[arg(long, default_value_t = 0)]
     pub(crate) deadline_ms: u32,
 }
@@ -195,7 +195,7 @@ pub(crate) struct FrameOptions {
     pub(crate) picture: PictureOptions,
     #[command(flatten)]
     pub(crate) step: StepOptions,
-    /// The file to write.
+    /// File to write.
     #[arg(long, value_name = "FILE")]
     pub(crate) out: PathBuf,
 }
@@ -206,28 +206,28 @@ pub(crate) struct VerticesOptions {
     pub(crate) scene: SceneOptions,
     #[command(flatten)]
     pub(crate) step: StepOptions,
-    /// The NumPy file for positions, float32, steps x vertices x 3.
+    /// NumPy file for positions, float32, steps x vertices x 3.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) out: PathBuf,
-    /// A NumPy file for the normals, float32, steps x corners x 3.
+    /// NumPy file for normals, float32, steps x corners x 3.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) normals: Option<PathBuf>,
-    /// A NumPy file for u = U q, float32, steps x vertices x 3; of scenes that keep displacements.
+    /// NumPy file for u = U q, float32, steps x vertices x 3; for scenes that keep displacements.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) displacements: Option<PathBuf>,
-    /// A NumPy file for the boxes of domains, float32, steps x domains x 2 x 3; of scenes that keep boxes.
+    /// NumPy file for bounding boxes, float32, steps x domains x 2 x 3; for scenes that keep boxes.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) boxes: Option<PathBuf>,
-    /// Domains by index, separated by commas; all without it.
+    /// Domain indices, separated by commas; default all.
     #[arg(long, value_delimiter = ',')]
     pub(crate) domains: Vec<u32>,
-    /// Subscribe, and save so many steps.
+    /// Subscribe, and save this number of steps.
     #[arg(long, conflicts_with_all = ["step", "min_step"], value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: Option<u64>,
-    /// Every step, or the newest.
+    /// Receive every step, or the newest.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
-    /// Seconds to wait for the next step before giving up.
+    /// How long to wait for the next step, in seconds.
     #[arg(long, default_value_t = 120.0, value_parser = seconds)]
     pub(crate) timeout: f64,
 }
@@ -253,13 +253,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_line_is_sound() {
+    fn command_line_is_valid() {
         use clap::CommandFactory as _;
         Arguments::command().debug_assert();
     }
 
     #[test]
-    fn sizes_and_triples_are_read_and_nonsense_is_refused() {
+    fn sizes_and_triples_are_parsed_and_invalid_ones_refused() {
         assert_eq!(size("1280x720"), Ok((1280, 720)));
         assert_eq!(triple("1, -2,.5"), Ok([1.0, -2.0, 0.5]));
         for wrong in ["", "1280", "0x5", "-1x5", "axb", "5x5x5"] {

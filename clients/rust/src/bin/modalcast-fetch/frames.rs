@@ -1,4 +1,4 @@
-//! Frames to files: frame_00000.png (or .rgba) in the order in which they came.
+//! Saves frames as `frame_00000.png` (or another extension) in the order of their arrival.
 
 use std::path::Path;
 use std::time::Duration;

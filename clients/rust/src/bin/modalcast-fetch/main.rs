@@ -1,5 +1,5 @@
-//! `modalcast-fetch`: frames and vertices of a server to files. Progress goes to standard error, results to standard
-//! output.
+//! `modalcast-fetch` saves frames and vertices of a server as files. It prints progress on standard error and results
+//! on standard output.
 
 mod cli;
 mod frames;

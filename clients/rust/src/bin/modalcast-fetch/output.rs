@@ -1,4 +1,4 @@
-//! Summaries on standard output: for people, or one line of JSON.
+//! Prints summaries on standard output, as text or as one line of JSON.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -9,10 +9,10 @@ use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
 
-/// What a run of frames or vertices came to.
+/// Totals of the received frames or vertices.
 pub(crate) struct Summary {
     start: Instant,
-    /// When the first and the newest reply were complete.
+    /// The times at which the first and the newest reply were complete.
     replies: Option<(Instant, Instant)>,
     steps: Vec<u64>,
     runs: Vec<u64>,
@@ -47,13 +47,13 @@ impl Summary {
         }
     }
 
-    /// Replies per second from the first to the last, so that waiting for the first does not count; 0 of fewer than two.
+    /// Replies per second from the first to the last, which excludes the wait for the first; 0 for fewer than two.
     fn rate(&self) -> f64 {
         let seconds = self.replies.map_or(0.0, |(first, last)| (last - first).as_secs_f64());
         if seconds > 0.0 { (self.steps.len() - 1) as f64 / seconds } else { 0.0 }
     }
 
-    /// Prints `what` (frames, steps), where they went, and the origin of vertices in metres.
+    /// Prints the number of `what` (frames, steps), the output path, and the origin of vertices in meters.
     pub(crate) fn print(mut self, what: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
         let rate = self.rate();
         let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
@@ -79,19 +79,19 @@ impl Summary {
     }
 }
 
-/// The middle of some times; 0 of none.
+/// The median of some times; 0 for none.
 fn median(times: &mut [f32]) -> f32 {
     times.sort_by(f32::total_cmp);
     times.get(times.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// A bar on standard error; hidden when that is no terminal.
+/// A progress bar on standard error; hidden unless standard error is a terminal.
 pub(crate) fn bar(count: u64, what: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} [{bar:32}] {pos}/{len} {per_sec} eta {eta}");
     ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(what)
 }
 
-/// Opens the scene first when the command line says so; the name that other calls use.
+/// Opens the scene first if `--open` is given. Returns the name for other calls.
 pub(crate) async fn scene(client: &Client, options: &SceneOptions) -> Result<String> {
     match &options.open {
         None => Ok(options.scene.clone()),
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn the_median_is_the_middle_and_none_is_zero() {
+    fn median_of_none_is_zero() {
         assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
         assert_eq!(median(&mut []), 0.0);
     }

@@ -1,4 +1,4 @@
-//! Vertices to NumPy files: one row of vertices x 3 per step.
+//! Saves vertices as NumPy files, with one row of vertices x 3 per step.
 
 use std::path::Path;
 use std::time::Duration;
@@ -58,7 +58,7 @@ fn readings(options: &VerticesOptions) -> Readings {
     Readings { displacements, boxes, alone: false }
 }
 
-/// A file of one array, the shape of its rows, and the row of a step.
+/// The file of one array, the shape of its rows, and the row of one step.
 type Array<'a> = (&'a Path, Vec<usize>, &'a [f32]);
 
 fn arrays<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<Array<'a>> {
@@ -74,11 +74,11 @@ fn arrays<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<Array<'a>
     named.collect()
 }
 
-/// The files, created when the first step says how many vertices there are.
+/// The output files. They are created with the first step, which has the number of vertices.
 struct Files<'a> {
     options: &'a VerticesOptions,
     open: Vec<Writer>,
-    /// That of the first step. Rows of one array have one.
+    /// The origin of the first step. All rows of one array must have the same origin.
     origin: Vec<f64>,
     summary: Summary,
 }
