@@ -1,12 +1,13 @@
-// What the memory of the device can do, and the helpers of the stopwatch. None of it deforms anything.
-//   fill     a buffer with numbers that look random                                          `to`: [words] u32   (out)
-//   copy     `from` to `to`; one copy reads and writes the bytes of the buffer
-//   read     `from`, all of it; writes to `to` only if the bits of every word that a thread read combine to ones, which
-//            nothing here ever does, but the compiler cannot know
-//   hold     the stream, for a time
-//   nothing  at all
-// Launch of copy and read: BLOCK threads a block, LOADS words of 16 bytes a thread, as many blocks as the buffer has
-// tiles of BLOCK * LOADS words; buffers are whole tiles.
+// Kernels that measure the memory rates of the device, and helpers for timing. None of them deforms anything.
+//   fill     writes pseudo-random numbers                                                    `to`: [words] u32   (out)
+//   copy     copies `from` to `to`; one copy reads and writes the bytes of the buffer
+//   read     reads all of `from`; writes to `to` only if the AND of all words that a thread read is all ones, which
+//            never happens with these buffers, but the compiler cannot know
+//   hold     blocks the stream for a time
+//   nothing  does nothing
+// Launch of copy and read: BLOCK threads per block, LOADS words of 16 bytes per thread, one block per tile of BLOCK *
+// LOADS words; buffers are whole tiles.
+//
 // CPU twins: the tests of tests/bench/src/kernels/roof.rs.
 #ifndef LOADS
 #define LOADS 1
@@ -30,7 +31,7 @@ __device__ void store(uint4* to, uint4 word) {
 #endif
 }
 
-// The first word of a thread; its others follow, a block's width apart.
+// The first word of a thread; its other words follow at a distance of one block.
 __device__ size_t first_word() {
     return (size_t)blockIdx.x * (BLOCK * LOADS) + threadIdx.x;
 }
@@ -65,7 +66,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) read(const uint4* from, uint
     }
 }
 
-// The finaliser of MurmurHash3 with its top bit cleared, so that no word is all ones.
+// The finalizer of MurmurHash3 with the top bit cleared, so that no word is all ones.
 extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* to, unsigned long long words) {
     const size_t index = (size_t)blockIdx.x * BLOCK + threadIdx.x;
     if (index < words) {

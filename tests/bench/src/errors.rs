@@ -153,7 +153,7 @@ impl Tally {
         }
     }
 
-    /// What was collected.
+    /// The accumulated position errors in the units of [`Errors`].
     pub fn errors(&self, yardstick: &Yardstick) -> Errors {
         let metres = self.length.spread(yardstick.unit).unwrap_or_default();
         let share = |length: f64| if yardstick.diagonal > 0.0 { length / yardstick.diagonal } else { 0.0 };
@@ -286,7 +286,7 @@ impl Turned {
         }
     }
 
-    /// What was collected.
+    /// The accumulated errors of directions.
     pub fn orientation(&self) -> Orientation {
         Orientation {
             normals_degrees: self.normals.spread(1.0),

@@ -174,7 +174,7 @@ pub enum Progress<'a> {
 }
 
 /// Measures all requested loads and returns the report. `progress` is called when a load starts and after each load.
-/// 
+///
 /// # Errors
 /// Errors of loading a scene and of `progress`. Failures of a variant are recorded in the report instead.
 pub fn deform(

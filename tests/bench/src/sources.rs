@@ -52,7 +52,7 @@ pub(super) struct Origin {
 #[derive(Debug)]
 struct Stored {
     alone: Collect,
-    ///  Positions with q and T rounded to f32.
+    /// Positions with q and T rounded to f32.
     own: Vec<[f64; 3]>,
 }
 
