@@ -28,7 +28,7 @@ use modalcast_render::{FRAMES_UNDER_WAY, Image, Shot};
 /// Rounds per method.
 const ROUNDS: usize = 5;
 
-/// Frames a second of one load.
+/// Frames per second of one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Readback {
     pub load: String,
