@@ -1,25 +1,25 @@
-// x = T_b (x0 + U q_b) for up to VECTORS domains b of one shape, by tensor cores. Only for benchmarks.
-//   words      U with 16 bits per entry, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)      (in)
+// x = T_b (x0 + U q_b) for up to VECTORS domains b of one shape, by tensor cores. Only benchmarks use it.
+//   words      U in 16 bits per entry, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)        (in)
 //   rest       x0, [quads][12] f32: 4 x, 4 y, 4 z                                                       (in)
-//   transforms [VECTORS][3] float4: the rows of T; zeros for missing domains                            (in)
+//   transforms [VECTORS][3] float4: the rows of T; zeros where there is no domain                       (in)
 //   shrinks    [VECTORS] f32: powers of two that undo the scaling of q                                  (in)
-//   halves     q split into two numbers of 16 bits each, [steps][VECTORS / 8][32 lanes] words of 16
-//              bytes: of vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first
-//              the rounded q, then the rounded remainder                                                (in)
+//   halves     q as two 16-bit numbers each, [steps][VECTORS / 8][32 lanes] words of 16 bytes: for
+//              vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first the
+//              rounded q, then the remainder, rounded likewise                                          (in)
 //   positions  [vertices][3] f32; domain b begins at vertex `first[b]`                                  (out)
-// Launch: a block of WARPS warps for each tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
+// Launch: one block of WARPS warps per tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
 //
-// The bits differ from those of `deform`: q keeps 22 bits (f16) or 16 (bf16), and a tensor core sums the 16 products of
-// a step in an order and with a rounding of its own. The launcher's error bound covers both. Results that overflow are
-// not computed again.
+// The result is not bit-identical to `deform`: q keeps 22 bits (f16) or 16 (bf16), and a tensor core sums the 16
+// products of a step in its own order and with its own rounding. The launcher's bound covers both. Overflowing values
+// are not recomputed.
 //
 // Design. The U of a quad and a chunk is 12 rows (axis, vertex) of two modes. The fragment that mma.m16n8k16 takes from
 // a lane is rows g and g + 8 at columns 2 t + {0, 1} and 2 t + {8, 9}, with g = lane / 4 and t = lane % 4. The
-// assignment of rows and modes is free: a lane takes quad g and chunks t and t + 4, by six loads of 16 bytes in whole
-// lines of 128, and gets the fragments of six products by two byte permutations per register. U does not pass through
-// shared memory. The result of a lane is all 12 sums of quad g for a quarter of the domains, so a lane transforms whole
-// vertices. The sums of 16 vectors and two steps of U and q take 160 registers: 12 warps per multiprocessor, with 72 KB
-// in flight.
+// assignment of rows and modes to these indices is free: a lane takes quad g and chunks t and t + 4, which are six
+// loads of 16 bytes in whole lines of 128, and has the fragments of six products after two byte permutations per
+// register. U does not pass through shared memory. The result is all 12 sums of quad g for a quarter of the domains, so
+// a lane places whole vertices. The sums of 16 vectors, two steps of U and q take 160 registers: 12 warps per
+// multiprocessor, with 72 KB in flight.
 #if defined(STORE_BF16)
 #define OPERANDS "bf16.bf16"
 #else
@@ -39,13 +39,13 @@ constexpr unsigned RESIDENT = 3;
 constexpr unsigned MOST = 32;
 constexpr unsigned EIGHTS = VECTORS / 8;
 
-// A warp has eight quads of a tile of 32; a step has eight chunks of two modes.
+// A warp covers eight quads of a tile of 32; a step is eight chunks of two modes.
 constexpr unsigned WARPS = 4;
 constexpr unsigned QUADS = 8;
 constexpr unsigned TILE = WARPS * QUADS;
 constexpr unsigned STEP_CHUNKS = 8;
-// Words of 16 bytes of a domain's eight quads of x, and stride between domains: the two extra words put the lanes of a
-// quarter warp into different banks.
+// Per domain: float4 words of its eight quads of x, and the stride between domains. The two extra words keep the lanes
+// of a quarter warp in different banks.
 constexpr unsigned FOURS = 3 * QUADS;
 constexpr unsigned STRIDE = FOURS + 2;
 
@@ -70,7 +70,7 @@ __device__ __forceinline__ unsigned lane_of() {
     return threadIdx.x % 32;
 }
 
-// A warp's part of a tile.
+// The part of a tile that a warp covers.
 struct Part {
     const uint4* words; // of the lane's quad
     unsigned width;     // quads of the tile
@@ -79,7 +79,7 @@ struct Part {
     unsigned numbers;   // of the warp's vertices, three each; 0 if it has none
 };
 
-// A lane beyond the last quad reads that quad; its results are not stored.
+// A lane beyond the last quad reads that quad again; its results are not stored.
 __device__ __forceinline__ Part part_of(const BatchMmaArgs& args) {
     const unsigned tile = TILE * blockIdx.x, before = QUADS * (threadIdx.x / 32);
     Part part;
@@ -92,12 +92,12 @@ __device__ __forceinline__ Part part_of(const BatchMmaArgs& args) {
     return part;
 }
 
-// Two modes of a quad: words 2 axis + {0, 1} of the first mode, then of the second; a word has two vertices.
+// Two modes of a quad: words 2 axis + {0, 1} of the first mode, then of the second, each word with two vertices.
 struct Chunk {
     unsigned words[12];
 };
 
-// Zeros beyond the last chunk: memory there could contain NaNs, which a zero q would not cancel.
+// Zeros beyond the last chunk, because NaN or infinity times a zero coordinate is not zero.
 __device__ __forceinline__ void load(Chunk& chunk, const BatchMmaArgs& args, const Part& part, unsigned index) {
 #pragma unroll
     for (unsigned plane = 0; plane < 3; ++plane) {
@@ -131,7 +131,7 @@ __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4]
         : "r"(u[0]), "r"(u[1]), "r"(u[2]), "r"(u[3]), "r"(q0), "r"(q1));
 }
 
-// Adds the modes of a step, first the products of the remainders of q, which are small.
+// Adds the modes of a step. The rounding remainders of q come first, while the sums are small.
 __device__ __forceinline__ void add(Sums& sums, const Step& step, const uint4* halves) {
     uint4 q[EIGHTS];
 #pragma unroll
@@ -155,7 +155,7 @@ __device__ __forceinline__ void add(Sums& sums, const Step& step, const uint4* h
     }
 }
 
-// Sums all modes, with the loads of two steps in flight.
+// Sums all modes with the loads of two steps in flight.
 __device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const Part& part, Sums& sums) {
     const unsigned steps = (args.chunks + STEP_CHUNKS - 1) / STEP_CHUNKS;
     const uint4* halves = args.halves;
@@ -178,7 +178,7 @@ __device__ __forceinline__ float placed(const float4& row, float x, float y, flo
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
-// Writes x of the lane's quad for one domain to the stage, 48 bytes.
+// Computes x of the lane's quad for one domain and writes it to the staging buffer, 48 bytes.
 __device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
                                       unsigned domain, float4* staged) {
     const float4 *rows = args.transforms + 3 * domain, a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
@@ -201,7 +201,8 @@ __device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&r
     }
 }
 
-// Writes four staged domains, every second one from `domain` on: eight lanes per domain, 128 contiguous bytes.
+// Writes the staged positions of four domains, every second one from `domain` on: eight lanes per domain, coalesced
+// into 128 bytes.
 __device__ __forceinline__ void store(const BatchMmaArgs& args, const Part& part, unsigned domain,
                                       const float4* staged) {
     const unsigned own = lane_of() / 8;

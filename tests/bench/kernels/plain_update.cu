@@ -1,17 +1,17 @@
-// x = T (x0 + u) of every packed vertex, after a library has computed the product u. Only for benchmarks.
+// x = T (x0 + u) of every packed vertex, after a library computed u. Only benchmarks use it.
 //   slots       [domains] PlainSlot                                                                              (in)
 //   domains     [vertices] u32: the domain of each packed vertex; not read with SINGLE                           (in)
 //   rest        [vertices][3] f32                                                                                (in)
 //   transforms  [domains][3] float4: rows of T                                                                   (in)
 //   u           f32, three per vertex of a domain with modes                                                     (in)
 //   positions   [vertices][3] f32                                                                                (out)
-// Launch: 256 threads per block, a thread per vertex.
-// CPU twin: the tests of src/compute/gpu/trials/plain_update.rs.
+// Launch: 256 threads per block, one thread per vertex.
+// CPU twin: the tests of tests/bench/src/kernels/plain_update.rs.
 constexpr unsigned BLOCK = 256;
 constexpr unsigned long long RIGID = 0xffffffffffffffffull;
 
 struct PlainSlot {
-    unsigned long long first_u; // float of `u`, or RIGID
+    unsigned long long first_u; // index into `u` in floats, or RIGID
     unsigned first;             // packed vertex
     unsigned reserved;
 };

@@ -1,12 +1,14 @@
-// Benchmark kernels that measure the memory bandwidth of the device, and helpers of the timer. They deform nothing.
-//   fill     fills a buffer with pseudorandom numbers                                        `to`: [words] u32   (out)
+// Kernels that measure the memory rates of the device, and helpers for timing. None of them deforms anything.
+//   fill     writes pseudo-random numbers                                                    `to`: [words] u32   (out)
 //   copy     copies `from` to `to`; one copy reads and writes the bytes of the buffer
-//   read     reads all of `from`; writes to `to` only if the bits of every word that a thread read combine to ones.
-//            That never happens here, but the compiler cannot know it
+//   read     reads all of `from`; writes to `to` only if the AND of all words that a thread read is all ones, which
+//            never happens with these buffers, but the compiler cannot know
 //   hold     blocks the stream for a time
-//   nothing  empty
-// Launch of copy and read: BLOCK threads per block, LOADS words of 16 bytes per thread, a block per tile of BLOCK *
-// LOADS words; buffers consist of whole tiles. CPU twins: the tests of src/compute/gpu/trials/roof.rs.
+//   nothing  does nothing
+// Launch of copy and read: BLOCK threads per block, LOADS words of 16 bytes per thread, one block per tile of BLOCK *
+// LOADS words; buffers are whole tiles.
+//
+// CPU twins: the tests of tests/bench/src/kernels/roof.rs.
 #ifndef LOADS
 #define LOADS 1
 #endif
@@ -29,7 +31,7 @@ __device__ void store(uint4* to, uint4 word) {
 #endif
 }
 
-// The first word of a thread; its next words follow at a stride of one block.
+// The first word of a thread; its other words follow at a distance of one block.
 __device__ size_t first_word() {
     return (size_t)blockIdx.x * (BLOCK * LOADS) + threadIdx.x;
 }
@@ -64,7 +66,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) read(const uint4* from, uint
     }
 }
 
-// The finalizer of MurmurHash3 with its top bit cleared, so that no word is all ones.
+// The finalizer of MurmurHash3 with the top bit cleared, so that no word is all ones.
 extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* to, unsigned long long words) {
     const size_t index = (size_t)blockIdx.x * BLOCK + threadIdx.x;
     if (index < words) {

@@ -1,10 +1,10 @@
-// BASELINE, only for benchmarks: u = U q of many domains with the group concept of chapter 3.2.2 of the thesis.
+// BASELINE: u = U q of many domains with the group concept of chapter 3.2.2 of the thesis. For comparison only.
 //   entries  [lanes] float4: U'' of all domains of one group width, 32 per warp                                  (in)
-//   meta     [lanes] uint4: offset in u (floats) or IDLE, offset in q (float4), n_vr, unused                     (in)
+//   meta     [lanes] uint4: output index in u (floats) or IDLE, input index in q (float4), n_vr, unused          (in)
 //   q        float4 of coordinates of each domain                                                                (in)
-//   u        [vertices with modes] float4, the fourth number never written                                       (out)
-// Launch: 256 threads per block, a thread per lane; the lanes fill whole blocks. WIDTH is w_g.
-// CPU twin: the tests of src/compute/gpu/trials/thesis/thesis_multi.rs.
+//   u        [vertices with modes] float4, the fourth number is not written                                      (out)
+// Launch: 256 threads per block, one thread per lane; the lanes fill whole blocks. WIDTH is w_g. CPU twin: the tests of
+// tests/bench/src/kernels/thesis/thesis_multi.rs.
 #ifndef WIDTH
 #define WIDTH 8
 #endif

@@ -1,10 +1,12 @@
-// BASELINE, only for benchmarks: u = U q of one domain as chapter 3.2.1 of the thesis computes it.
-//   lines   [lines][passes][32] float4: rows of U in float4 of modes, as many whole rows as 32 lanes hold        (in)
+// BASELINE: u = U q of one domain as in chapter 3.2.1 of the thesis. For comparison only.
+//   lines   [lines][passes][32] float4: rows of U in groups of four modes; each line holds as many whole rows
+//           as fit into 32 lanes                                                                                 (in)
 //   q       [rank] f32                                                                                           (in)
-//   u       [vertices] float4, the fourth number never written                                                   (out)
-// Launch: 256 threads per block, a warp per line, ceil(lines / 8) blocks. Rows of more than 32 float4 (rank above 128,
-// which the text does not cover) take several passes, and so does equation 3.3.
-// CPU twin: the tests of src/compute/gpu/trials/thesis/thesis_single.rs.
+//   u       [vertices] float4, the fourth number is not written                                                  (out)
+// Launch: 256 threads per block, one warp per line, ceil(lines / 8) blocks. The text does not cover rows of more than
+// 32 float4 (rank above 128): here they take several passes, and so does equation 3.3.
+//
+// CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_single.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
 constexpr unsigned LARGEST_RANK = 512;
@@ -17,7 +19,7 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES)
     const unsigned width = min(fours, LANES);                   // lanes per row
     const unsigned rows_of_line = LANES / width;                // n_g
     const unsigned passes = (fours + LANES - 1) / LANES;
-    // Thread (i, j) loads q[4 j + i] to its index in equation 3.3, which is i * 32 + j.
+    // Thread (i, j) loads q[4 j + i] to the index of equation 3.3, which is i * 32 + j.
     for (unsigned place = threadIdx.x; place < passes * 4 * LANES; place += WARPS * LANES) {
         const unsigned mode = place / 128 * 128 + 4 * (place % LANES) + place / LANES % 4;
         shared_q[place] = mode < rank ? q[mode] : 0.0f;

@@ -1,14 +1,14 @@
-// BASELINE, only for benchmarks: the vertex update of chapter 3.2.3 of the thesis: x = T (x0 + u), with normals and
-// tangents transformed by T, for the vertices of unindexed triangles.
-//   warps       [ceil(vertices / 64) * 8] uint4: the two domains of a warp's vertices, and which of its eight vertices
-//               is the first of the second domain; 8 when there is only one                                      (in)
-//   sources     [vertices] u32: the vertex of u, or RIGID                                                        (in)
+// BASELINE: the vertex update of chapter 3.2.3 of the thesis, x = T (x0 + u) and T applied to normals and tangents, for
+// the vertices of unfolded triangles. For comparison only.
+//   warps       [ceil(vertices / 64) * 8] uint4: the two domains whose vertices a warp covers, and the index of the
+//               first of its eight vertices that belongs to the second one; 8 when there is only one             (in)
+//   sources     [vertices] u32: index into u, or RIGID                                                           (in)
 //   rest_*      [vertices] float4; the fourth number of a position is 1, of a direction 0; tangents with TANGENTS (in)
 //   transforms  [domains][4] float4: rows of T                                                                   (in)
 //   u           float4                                                                                           (in)
 //   positions, normals, tangents  [vertices] float4                                                              (out)
 // Launch: 256 threads per block, four threads per vertex, one number each; ceil(vertices / 64) blocks.
-// CPU twin: the tests of src/compute/gpu/trials/thesis/thesis_update.rs.
+// CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_update.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
 constexpr unsigned VERTICES = WARPS * LANES / 4; // per block: n_vb

@@ -1,4 +1,4 @@
-//! Which variants this machine has, and the rates that they are held against.
+//! The variants that this machine can run, and the memory rates that they are compared with.
 
 use std::sync::Arc;
 
@@ -17,64 +17,65 @@ use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Deformation, Normals, Scene, State, Storage};
 
-/// Rates measured in the same run, in 10^9 bytes a second; `None` where nothing measured them.
+/// Memory rates measured in the same run, in 10^9 bytes per second; `None` where they were not measured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Roofs {
-    /// The best copy, bytes read and written.
+    /// Best copy rate: bytes read plus bytes written.
     pub copy_gbs: Option<f64>,
-    /// The best pure read.
+    /// Best rate of a pure read.
     pub read_gbs: Option<f64>,
-    /// A graph that does nothing, microseconds.
+    /// Replay of a graph with one empty kernel, microseconds.
     pub empty_us: Option<f64>,
-    /// Copies from page-locked host memory and back.
+    /// Copies from page-locked host memory to the device.
     pub pinned_h2d_gbs: Option<f64>,
     pub pinned_d2h_gbs: Option<f64>,
 }
 
-/// Whether a variant of that name is asked for.
+/// Predicate: whether the request selects a variant of this name.
 pub type Wanted<'a> = &'a dyn Fn(&str) -> bool;
 
-/// A variant, or why it could not be made.
+/// A variant, or the reason why it could not be created.
 pub type Offer = (Label, Result<Box<dyn Variant>>);
 
-/// What can be measured.
+/// Source of variants and of reference rates; the tests have one of their own.
 pub trait Bench {
-    /// The variants for a load; those that are not wanted need not be made.
+    /// The variants for a load. A variant that `wanted` rejects need not be created.
     fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer>;
 
-    /// The rates of a backend's memory.
+    /// Memory rates of a backend.
     fn roofs(&self, _backend: Backend) -> Roofs {
         Roofs::default()
     }
 
-    /// How long a step's values take to the device.
+    /// Upload of a step's values to the device; `None` without a device.
     fn ingest(&self, _load: &Load, _replays: usize) -> Option<Ingest> {
         None
     }
 
-    /// Steps whose vertices the host reads, one after the other and side by side; an error says why there is no answer.
+    /// Runs steps with readback of the vertices, serially and overlapped. `None` without a device; the error is that of
+    /// a failed run.
     fn overlap(&self, _load: &Load, _states: &[State], _steps: usize) -> Option<Result<kernels::Overlap>> {
         None
     }
 
-    /// How fast this machine's cores write what goes to the CUDA device.
+    /// Rates at which this machine's cores write the memory that is uploaded to the CUDA device.
     fn host_writes(&self, _replays: usize) -> Vec<kernels::HostWrite> {
         Vec::new()
     }
 
-    /// What is missing here and why, in words.
+    /// Missing capabilities and the reasons, for the reader.
     fn remarks(&self) -> Vec<String> {
         Vec::new()
     }
 }
 
-/// A deformer, or why it could not be made.
+/// A deformer, or the reason why it could not be created.
 type Made = Result<Box<dyn Deformer>>;
 
-/// Entries of U and x0 above which the reference is left out: its single thread would take minutes.
+/// Scenes with more entries of U and x0 than this skip the reference: its single thread would take minutes.
 const MOST_OF_REFERENCE: usize = 1 << 23;
 
-/// The deformers of this machine: CPU, the reference as its slow peer, and CUDA if a device opens.
+/// The deformers of this machine: the CPU, the slow f64 reference, and CUDA if a device opens.
 #[derive(Debug)]
 pub struct Machine {
     device: Result<Arc<Device>>,
@@ -82,12 +83,12 @@ pub struct Machine {
     cpu: Roofs,
 }
 
-/// What the read rate of all cores is measured on: larger than the caches of any one socket.
+/// Bytes over which the read rate of all cores is measured: more than the caches of any one socket hold.
 const READ: usize = 1 << 29;
 const READS: usize = 5;
 
 impl Machine {
-    /// Looks for a CUDA device and a compiler that fits it, and measures what the memory of device and CPU can do.
+    /// Looks for a CUDA device with a working compiler, and measures the memory rates of device and CPU.
     pub fn open() -> Self {
         let usable = |device: Arc<Device>| {
             device.check_compiler()?;
@@ -127,7 +128,7 @@ impl Bench for Machine {
             offers.push(driven("reference f64", Backend::Reference, plain, &reference));
         }
         if let Ok(device) = &self.device {
-            // A whole step as the server makes it: q and T to the device, kernels, bounds back.
+            // A whole step as the server runs it: upload of q and T, kernels, readback of the bounds.
             let cuda = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CudaDeformer::new(device, scene, None)?)) };
             offers.push(driven("cuda f32 step", Backend::Cuda, plain, &cuda));
             if let Some(exact) = exact_normals(scene) {
@@ -168,10 +169,11 @@ impl Bench for Machine {
     }
 }
 
-/// Budgets of mode truncation, as shares of the scene's diagonal.
+/// Error budgets of mode truncation, as fractions of the scene's diagonal.
 const BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4)];
 
-/// The choices between error and time that a scene of modes has, by name.
+/// The approximate or compensated deformations that a scene with modes can choose, by name; empty when the scene itself
+/// already chooses.
 fn shortcuts(scene: &Scene) -> Vec<(String, Deformation)> {
     let plain = scene.deformation;
     if !scene.needs.modes || plain != Deformation::default() {
@@ -188,13 +190,14 @@ fn shortcuts(scene: &Scene) -> Vec<(String, Deformation)> {
     stored.chain(BUDGETS.iter().map(truncate)).chain([compensated]).chain(exact).collect()
 }
 
-/// The deformation with normals of the deformed surface, where that bends, has normals and is given rigid ones.
+/// The deformation with exact normals of the deformed surface, for scenes with modes and normals that use rigid
+/// normals.
 fn exact_normals(scene: &Scene) -> Option<Deformation> {
     let rigid = scene.needs.modes && offers::has_normals(scene) && scene.deformation.normals == Normals::Rigid;
     rigid.then_some(Deformation { normals: Normals::Exact, ..scene.deformation })
 }
 
-/// Makes a variant if it is wanted, or keeps why it could not be made.
+/// Creates a variant if it is wanted; otherwise, and on failure, keeps the reason.
 pub fn offer<V: Variant + 'static>(wanted: Wanted<'_>, label: Label, make: impl FnOnce(Label) -> Result<V>) -> Offer {
     if !wanted(&label.name) {
         let given = label.name.clone();
@@ -213,7 +216,7 @@ mod tests {
     use crate::loads::{Kind, Size};
 
     #[test]
-    fn every_machine_offers_the_cpu_and_says_why_it_has_no_cuda() {
+    fn offers_cpu_variants_and_explains_missing_cuda() {
         let machine = Machine::open();
         let load = Kind::C.build(Size::Quick).expect("built");
         let names: Vec<String> = machine.variants(&load, &|_| true).into_iter().map(|(label, _)| label.name).collect();
@@ -229,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn the_reference_is_left_out_where_it_would_take_minutes() {
+    fn skips_reference_on_large_scenes() {
         let large = Kind::Single { power: 18, rank: 20 }.build(Size::Full).expect("built");
         assert!(Machine::open().variants(&large, &|_| true).iter().all(|(label, _)| label.name != "reference f64"));
     }

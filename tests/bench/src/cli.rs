@@ -1,4 +1,4 @@
-//! The command line of `modalcast-report`, which `modalcast report` starts.
+//! Command line of `modalcast-report`, the program that `modalcast report` starts.
 
 mod render;
 
@@ -17,7 +17,7 @@ use modalcast_model::error::Result;
 #[derive(Debug, Parser)]
 #[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
 struct Cli {
-    /// Print the build that this program belongs to, and end.
+    /// Print the build that this program belongs to, then exit.
     #[arg(long)]
     build: bool,
     #[command(subcommand)]
@@ -52,38 +52,37 @@ const LOADS: &str = "Loads:
 
 /// Error against run time of the deformation: validates every variant, then times it.
 ///
-/// Writes report.json, report.csv, report.md, report.svg and report.png, anew after each load: a run that is stopped
-/// keeps what was done, and names what is missing. Exit code 1 when a variant exceeds its
-/// a-priori error bound.
+/// Writes report.json, report.csv, report.md, report.svg and report.png again after each load: an interrupted run keeps
+/// the finished loads and names the missing ones. Exit code 1 when a variant exceeds its a-priori error bound.
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("{LOADS}\n\n{EXAMPLES}"))]
 struct DeformArgs {
-    /// The folder to write to; files of an earlier report there are replaced.
+    /// Output folder; files of an earlier report there are replaced.
     #[arg(long)]
     out: PathBuf,
     /// A scene: a built-in name, or a path to a model or a scene folder.
     #[arg(long)]
     scene: Option<String>,
-    /// Its trajectory: a .csv of time,q0,q1,..., or a folder with q.npy as modalcast-sim --record writes it. Without it,
-    /// the only .q.csv beside the scene is taken.
+    /// Trajectory of the scene: a .csv of time,q0,q1,..., or a folder with q.npy as modalcast-sim --record writes it.
+    /// Default: the only .q.csv next to the scene.
     #[arg(long, requires = "scene")]
     trajectory: Option<PathBuf>,
-    /// A synthetic scene; may be repeated. Without any, and without --scene: all.
+    /// A synthetic scene; repeatable. Default: all, unless --scene is given.
     #[arg(long = "load", value_name = "NAME")]
     loads: Vec<String>,
-    /// Random states per load; 100 without it, 10 with --quick.
+    /// Random states per load [default: 100, 10 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     seeds: Option<u32>,
-    /// Repetitions per median, at least 20; 100 without it, 20 with --quick.
+    /// Repetitions per median, at least 20 [default: 100, 20 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
-    /// The most steps of a trajectory to look at; all without it.
+    /// Upper limit of trajectory steps to validate [default: all].
     #[arg(long)]
     steps: Option<usize>,
-    /// Only this variant, or all whose names begin so: "cuda*"; may be repeated.
+    /// Measure only this variant, or all variants with this prefix: "cuda*"; repeatable.
     #[arg(long = "variant", value_name = "NAME")]
     variants: Vec<String>,
-    /// Build every load at a fraction of its size, for machines without a GPU; the report says which.
+    /// Build every load at a fraction of its size, for machines without a GPU; the report marks these loads.
     #[arg(long)]
     quick: bool,
 }
@@ -100,7 +99,7 @@ pub fn run() -> u8 {
         Some(What::Deform(args)) => run_deform(args),
         Some(What::Render(args)) => render::run(args),
         None => {
-            Cli::command().print_help().ok(); // Nobody reads it.
+            Cli::command().print_help().ok(); // A closed stdout is no error.
             return 2;
         }
     })
@@ -113,7 +112,6 @@ fn run_deform(args: &DeformArgs) -> Outcome {
             tracing::info!(load = what, "measuring");
             Ok(())
         }
-        // After each load, so that a run that is stopped keeps what was done.
         Progress::Measured(report) => report.write(&args.out),
     };
     let report = working("measuring", || deform(&request, &Machine::open(), hear))?;
@@ -195,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_named_means_every_load_and_quick_means_fewer_states() {
+    fn defaults_to_all_loads_and_quick_to_fewer_states() {
         let all = request(&args()).expect("fits");
         assert_eq!((all.sources.len(), all.seeds, all.replays, all.size), (Kind::all().len(), 100, 100, Size::Full));
         let quick = request(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("fits");
@@ -203,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_and_loads_are_taken_together_and_a_wrong_name_is_refused() {
+    fn combines_scene_and_loads_and_rejects_unknown_load() {
         let both = DeformArgs { scene: Some("tree".into()), loads: vec!["plants".into(), "c".into()], ..args() };
         assert_eq!(request(&both).expect("fits").sources.len(), 14);
         let wrong = request(&DeformArgs { loads: vec!["d".into()], ..args() }).expect_err("no such load");

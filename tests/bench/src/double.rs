@@ -1,4 +1,4 @@
-//! Sums of products in twice the precision of f64, for sums that cancel.
+//! Sums of products in twice the precision of f64 (double-double), for sums that cancel.
 //!
 //! Error-free transformations after Ogita, Rump and Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26
 //! (2005): the result is as if computed with 106 bits and rounded once.
@@ -16,7 +16,7 @@ pub(super) fn two_prod(a: f64, b: f64) -> (f64, f64) {
     (product, a.mul_add(b, -product))
 }
 
-/// A running sum of products.
+/// A running sum of products in double-double.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Double {
     high: f64,
@@ -24,7 +24,7 @@ pub(super) struct Double {
 }
 
 impl Double {
-    /// Adds a b.
+    /// Adds the product a b.
     pub(super) fn add(&mut self, a: f64, b: f64) {
         let (product, product_error) = two_prod(a, b);
         let (high, sum_error) = two_sum(self.high, product);
@@ -49,7 +49,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cancelling_sum_that_f64_loses_is_exact() {
+    fn cancelling_sum_is_exact() {
         let (double, plain) = sum(&[(1e20, 1.0), (3.0, 1.0), (-1e20, 1.0)]);
         assert_eq!((double, plain), (3.0, 0.0));
         // (1 + e)(1 - e) - 1 is -e^2, which the rounded product has lost.
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn the_parts_of_a_sum_and_of_a_product_add_up() {
+    fn rounded_part_and_error_add_up() {
         assert_eq!(two_sum(1.0, 2f64.powi(-60)), (1.0, 2f64.powi(-60)));
         let (product, error) = two_prod(1.0 + f64::EPSILON, 1.0 + f64::EPSILON);
         assert_eq!((product, error), (1.0 + 2.0 * f64::EPSILON, f64::EPSILON * f64::EPSILON));

@@ -1,4 +1,4 @@
-//! How far a surface in f32 is from what it should be: metres, fractions of the diagonal, pixels, degrees.
+//! Error metrics of an f32 surface against its reference: meters, fractions of the diagonal, pixels, degrees.
 
 use nalgebra::{Matrix4, Point3, Vector3};
 use rayon::prelude::*;
@@ -7,21 +7,21 @@ use serde::Serialize;
 use super::exact::Judged;
 use modalcast_model::scene::{Camera, Scene};
 
-/// The image in which pixels are counted.
+/// Image size in which pixel errors are measured: width, height.
 pub const IMAGE: (u32, u32) = (1920, 1080);
 
-/// Metres and pixels of a scene.
+/// Conversion of errors in scene units into meters and pixels.
 #[derive(Debug, Clone)]
 pub struct Yardstick {
     /// Metres per scene unit.
     unit: f64,
-    /// Metres.
+    /// Diagonal of the scene at rest, meters.
     diagonal: f64,
     clip_from_world: Matrix4<f64>,
 }
 
 impl Yardstick {
-    /// The yardstick of a scene, seen by a camera in an image of [`IMAGE`] pixels.
+    /// Conversion for a scene seen by a camera in an image of [`IMAGE`] pixels.
     pub fn new(scene: &Scene, camera: &Camera) -> Self {
         let clip = camera.clip_from_camera(IMAGE.0, IMAGE.1, &scene.rest_bounds) * camera.camera_from_world();
         Self { unit: scene.unit, diagonal: scene.unit * scene.rest_bounds.diagonal(), clip_from_world: clip }
@@ -32,7 +32,7 @@ impl Yardstick {
         self.unit
     }
 
-    /// Pixels between two points; `None` when one is not before the camera.
+    /// Pixels between the projections of two points; `None` when one is not in front of the camera.
     fn pixels(&self, one: [f64; 3], other: [f64; 3]) -> Option<f64> {
         let place = |point: [f64; 3]| {
             let clip = self.clip_from_world * Point3::from(point).to_homogeneous();
@@ -44,14 +44,14 @@ impl Yardstick {
     }
 }
 
-/// Largest and root of the mean square of something.
+/// Maximum and root mean square of a quantity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Spread {
     pub largest: f64,
     pub rms: f64,
 }
 
-/// A [`Spread`] while it is collected.
+/// Accumulator for a [`Spread`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Collect {
     largest: f64,
@@ -74,35 +74,35 @@ impl Collect {
         }
     }
 
-    /// What was collected, times `scale`; `None` when nothing was.
+    /// The result, times `scale`; `None` when no value was added.
     pub(super) fn spread(self, scale: f64) -> Option<Spread> {
         let rms = (self.squares / self.count).sqrt();
         (self.count > 0.0).then_some(Spread { largest: self.largest * scale, rms: rms * scale })
     }
 }
 
-/// Errors of positions over all vertices and all states that were looked at.
+/// Position errors over all vertices and all validated states.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Errors {
     /// Lengths of the error vectors.
     pub metres: Spread,
-    /// The same in fractions of the diagonal of the scene at rest.
+    /// The same as fractions of the diagonal of the scene at rest.
     pub of_diagonal: Spread,
-    /// In an image of [`IMAGE`] pixels that frames the scene.
+    /// The same in pixels of an image of [`IMAGE`] pixels that frames the scene.
     pub pixels: Option<Spread>,
-    /// Mean signed error along each axis, metres.
+    /// Mean signed error along each axis, meters.
     pub bias_metres: [f64; 3],
-    /// The largest a-priori bound, metres.
+    /// Largest a-priori bound, meters.
     pub bound_metres: f64,
-    /// The largest quotient of an error and the bound of its own vertex: at most 1, or the variant fails.
+    /// Largest quotient of a vertex's error and its own bound; the variant fails if it exceeds 1.
     pub of_bound: f64,
-    /// Coordinates that are no finite number.
+    /// Coordinates that are not finite.
     pub not_finite: u64,
-    /// States that were looked at.
+    /// Validated states.
     pub states: usize,
 }
 
-/// [`Errors`] while they are collected, in scene units.
+/// Accumulator for [`Errors`], in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Tally {
     length: Collect,
@@ -115,7 +115,7 @@ pub struct Tally {
 }
 
 impl Tally {
-    /// Adds one state: three f32 per vertex, and what they should be.
+    /// Adds one state. `got`: three f32 per vertex; `want`: reference and bound per vertex.
     pub fn add(&mut self, yardstick: &Yardstick, got: &[f32], want: &[Judged]) {
         let got = got.as_chunks::<3>().0;
         let vertex = |at: usize, tally: &mut Self| tally.vertex(yardstick, got[at], &want[at]);
@@ -153,7 +153,7 @@ impl Tally {
         }
     }
 
-    /// What was collected.
+    /// The accumulated position errors in the units of [`Errors`].
     pub fn errors(&self, yardstick: &Yardstick) -> Errors {
         let metres = self.length.spread(yardstick.unit).unwrap_or_default();
         let share = |length: f64| if yardstick.diagonal > 0.0 { length / yardstick.diagonal } else { 0.0 };
@@ -171,13 +171,13 @@ impl Tally {
 }
 
 impl Errors {
-    /// Whether every number is finite and no error is above its own bound.
+    /// Whether every number is finite and every error is within its vertex's own bound.
     pub fn passed(&self) -> bool {
         self.not_finite == 0 && self.of_bound <= 1.0
     }
 }
 
-/// Error of the step from one state to the next: that of x(k + 1) - x(k), scene units.
+/// Error of the displacement x(k + 1) - x(k) between consecutive states, scene units.
 pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
     let [before, after] = got.map(|got| got.as_chunks::<3>().0);
     let [from, to] = want;
@@ -191,7 +191,8 @@ pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
     in_pieces(count, |at, collect: &mut Collect| collect.add(error(at)), Collect::join)
 }
 
-/// Items 0 to `count` added on all cores, piece by piece; pieces are joined in their order, so that a sum has one order.
+/// Parallel reduction of items 0 to `count`. Pieces have a fixed size and are joined in order, so that the result does
+/// not depend on the thread count.
 pub(super) fn in_pieces<T: Default + Send>(
     count: usize,
     add: impl Fn(usize, &mut T) + Sync,
@@ -206,24 +207,24 @@ pub(super) fn in_pieces<T: Default + Send>(
     pieces.into_iter().fold(T::default(), join)
 }
 
-/// Items of a piece of a sum.
+/// Items per piece of a reduction.
 const PIECE: usize = 4096;
 
-/// Errors of directions, in degrees.
+/// Errors of normals and tangents, in degrees.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Orientation {
-    /// From the normals that the variant means to give: by T, or of the deformed surface.
+    /// Against the normals that the variant's deformation defines: rigid ones (by T), or those of the deformed surface.
     pub normals_degrees: Option<Spread>,
-    /// From the normals of the deformed surface, whatever the variant means to give.
+    /// Against the normals of the deformed surface, whichever normals the variant defines.
     pub normals_to_surface_degrees: Option<Spread>,
     pub tangents_degrees: Option<Spread>,
-    /// |n . t|: 0 when they are orthogonal.
+    /// |n . t|, which is 0 when they are orthogonal.
     pub normal_dot_tangent: Option<Spread>,
-    /// Directions that are no finite numbers, and bitangent signs that are wrong.
+    /// Directions that are not finite or have a length of at most 0.5, and bitangent signs that are wrong.
     pub broken: u64,
 }
 
-/// [`Orientation`] while it is collected.
+/// Accumulator for [`Orientation`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Turned {
     normals: Collect,
@@ -234,7 +235,7 @@ pub struct Turned {
 }
 
 impl Turned {
-    /// Adds normals, three f32 per corner. Does nothing when the variant gives none.
+    /// Adds normals, three f32 per corner. Does nothing when `got` is empty.
     pub fn add_normals(&mut self, got: &[f32], want: &[[f64; 3]]) {
         let got = got.as_chunks::<3>().0;
         let corner = |at: usize, sum: &mut Self| match degrees(got[at].map(f64::from), want[at]) {
@@ -244,7 +245,7 @@ impl Turned {
         *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
     }
 
-    /// Adds how far normals are from those of the deformed surface.
+    /// Adds the angles between normals and those of the deformed surface.
     pub fn add_to_surface(&mut self, got: &[f32], want: &[[f64; 3]]) {
         let got = got.as_chunks::<3>().0;
         let corner = |at: usize, sum: &mut Self| {
@@ -253,7 +254,8 @@ impl Turned {
         *self = self.join(in_pieces(got.len().min(want.len()), corner, Self::join));
     }
 
-    /// Adds tangents, four f32 per corner, and what they make with the normals. Shapes without tangents have zeros.
+    /// Adds tangents, four f32 per corner, and their dot products with the normals. Reference tangents of shapes
+    /// without tangents are zero; these corners are skipped.
     pub fn add_tangents(&mut self, got: &[f32], want: &[[f64; 4]], normals: &[f32]) {
         let (got, normals) = (got.as_chunks::<4>().0, normals.as_chunks::<3>().0);
         let corner = |at: usize, sum: &mut Self| {
@@ -284,7 +286,7 @@ impl Turned {
         }
     }
 
-    /// What was collected.
+    /// The accumulated errors of directions.
     pub fn orientation(&self) -> Orientation {
         Orientation {
             normals_degrees: self.normals.spread(1.0),
@@ -296,7 +298,8 @@ impl Turned {
     }
 }
 
-/// The angle between two directions; `None` when one is none. Exact for small angles, where the cosine is not.
+/// The angle between two directions; `None` when it is not finite or either is no longer than 0.5. Uses atan2, which is
+/// accurate for small angles, where the arc cosine loses precision.
 fn degrees(one: [f64; 3], other: [f64; 3]) -> Option<f64> {
     let (one, other) = (Vector3::from(one), Vector3::from(other));
     let angle = one.cross(&other).norm().atan2(one.dot(&other)).to_degrees();
@@ -312,7 +315,7 @@ mod tests {
     use super::*;
     use modalcast_model::scene::{Lens, View};
 
-    /// One pixel is a hundredth of a unit at the target.
+    /// A yardstick for which one pixel is a hundredth of a unit at the target.
     fn yardstick() -> Yardstick {
         let scene = modalcast_model::load::open("tree").expect("the tree");
         let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
@@ -330,7 +333,7 @@ mod tests {
     fn errors_of_a_hand_made_surface_are_exact() {
         let yardstick = yardstick();
         let mut tally = Tally::default();
-        // Off by (3, 4, 0) and by nothing: lengths 5 and 0.
+        // The error vectors are (3, 4, 0) and zero: lengths 5 and 0.
         tally.add(&yardstick, &[3.0, 4.0, 0.0, 1.0, 1.0, 1.0], &[judged([0.0; 3], 10.0), judged([1.0; 3], 1.0)]);
         let errors = tally.errors(&yardstick);
         assert_eq!((errors.metres.largest, errors.metres.rms), (10.0, 2.0 * 12.5_f64.sqrt()));
@@ -339,14 +342,14 @@ mod tests {
         assert_eq!((errors.bound_metres, errors.of_bound, errors.states), (20.0, 0.5, 1));
         assert!((errors.pixels.expect("in sight").largest - 500.0).abs() < 1e-9, "{errors:?}");
         assert!(errors.passed());
-        // The mirror image takes the bias away, and keeps the rest.
+        // The mirrored error cancels the bias and changes nothing else.
         tally.add(&yardstick, &[-3.0, -4.0, 0.0, 1.0, 1.0, 1.0], &[judged([0.0; 3], 10.0), judged([1.0; 3], 1.0)]);
         let both = tally.errors(&yardstick);
         assert_eq!((both.bias_metres, both.metres, both.states), ([0.0; 3], errors.metres, 2));
     }
 
     #[test]
-    fn an_error_above_its_own_bound_fails_even_when_another_bound_is_larger() {
+    fn error_above_its_own_bound_fails_despite_larger_bounds() {
         let yardstick = yardstick();
         let mut tally = Tally::default();
         let want = [judged([0.0; 3], 1.0), judged([0.0; 3], 100.0)];
@@ -358,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_behind_the_camera_has_no_pixels() {
+    fn point_behind_camera_has_no_pixel_error() {
         let yardstick = yardstick();
         assert_eq!(yardstick.pixels([0.0, 0.0, 11.0], [0.0; 3]), None);
         let apart = yardstick.pixels([0.01, 0.0, 0.0], [0.0; 3]).expect("before it");
@@ -366,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn a_constant_offset_is_no_error_of_a_step() {
+    fn constant_offset_gives_no_step_error() {
         let want = [[judged([0.0; 3], 1.0)], [judged([1.0, 0.0, 0.0], 1.0)]];
         let steps = |got: [[f32; 3]; 2]| step_errors([&got[0], &got[1]], [&want[0], &want[1]]).spread(1.0);
         assert_eq!(steps([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]]), Some(Spread::default()));
@@ -374,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn directions_are_compared_in_degrees_down_to_the_smallest() {
+    fn measures_tiny_angles_in_degrees() {
         let mut turned = Turned::default();
         turned.add_normals(&[0.0, 1.0, 0.0, 1.0, 1e-7, 0.0], &[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]);
         let normals = turned.orientation().normals_degrees.expect("two");
@@ -386,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_signs_and_missing_directions_are_counted_and_shapes_without_tangents_are_not() {
+    fn counts_broken_directions_but_not_absent_tangents() {
         let mut turned = Turned::default();
         let want = [[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0; 4]];
         let got = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0];

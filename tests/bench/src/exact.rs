@@ -1,7 +1,9 @@
-//! x = T (x0 + U q) in f64 with any ingredient exchanged, and the bound on what f32 makes of it.
+//! Reference evaluation of x = T (x0 + U q) in f64, with any term of the error model exchanged, and the a-priori bound
+//! on the f32 error.
 //!
-//! Where the modes cancel, u = U q is summed in double-double. Tiles of vertices go over all cores, so that scenes of
-//! millions of vertices can be judged hundreds of times; `reference::deform` is the definition that a test holds it to.
+//! Where the modes cancel, u = U q is summed in double-double. Tiles of vertices are distributed over all cores, so
+//! that scenes of millions of vertices can be evaluated hundreds of times. A test compares the results with
+//! `reference::deform`, the definition.
 
 use std::ops::Range;
 
@@ -14,40 +16,40 @@ use modalcast_compute::storage::Tiles;
 use modalcast_model::domain::Modes;
 use modalcast_model::scene::{Scene, State};
 
-/// A vertex as it should be, and what f32 may make of it.
+/// Reference of one vertex: exact position, f32 error bound and condition number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Judged {
     /// Exact position, scene units.
     pub at: [f64; 3],
-    /// No sum in f32, in whatever order, errs by more than this; scene units.
+    /// A-priori bound on the error of an f32 sum in any order, scene units.
     pub bound: f64,
-    /// sum |U q| / |u|: infinite where u vanishes, 0 where every term does.
+    /// Condition number sum |U q| / |u|: infinite where only u vanishes, 0 where every term does.
     pub condition: f64,
 }
 
-/// The place of a vertex that is still to be judged.
+/// Initial value of vertices that are not evaluated yet.
 const NOTHING: Judged = Judged { at: [0.0; 3], bound: 0.0, condition: 0.0 };
-/// Roundings of a sum in f32 beyond one per mode: of x0, and of products and sums of their own in other orders.
+/// Roundings of an f32 sum beyond one per mode: adding x0, and separate products and sums in other orders.
 const EXTRA: usize = 3;
 /// Vertices per tile.
 const TILE: usize = 512;
-/// Above this quotient sum |U q| / |u| a sum in f64 is repeated in double-double.
+/// Condition number above which an f64 sum is repeated in double-double.
 const CANCELS: f64 = 1e6;
 /// Unit roundoff of f32.
 const ROUND: f64 = 1.0 / (1 << 24) as f64;
-/// No result below the normal numbers of f32 errs by more in one operation: half the smallest f32.
+/// Largest absolute error of one operation with a subnormal f32 result: half the smallest f32.
 const TINY: f64 = 7.1e-46;
 
-/// Which of a deformer's replacements to take.
+/// Selects the replacements of a deformer to apply.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Take<'a> {
-    /// U as it is stored.
+    /// Use U as this model stores it.
     pub storage: Option<&'a Ingredients>,
-    /// No more modes than are kept.
+    /// Use only the modes that this model keeps.
     pub truncation: Option<&'a Ingredients>,
 }
 
-/// Exact positions of a truth, but for what is taken from a deformer.
+/// World positions of a truth in f64, three per vertex, scene units. Only the replacements in `take` are applied.
 pub fn positions(scene: &Scene, truth: &Truth, take: Take<'_>) -> Vec<[f64; 3]> {
     each_tile(scene, [0.0; 3], |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
@@ -84,7 +86,7 @@ pub fn judge(scene: &Scene, state: &State) -> Vec<Judged> {
     })
 }
 
-/// What [`judge`] said of a state, with the bounds of a deformer that has these ingredients: no sum is computed again.
+/// The results of [`judge`] with the bounds widened for a deformer with this error model. No sum is computed again.
 pub fn widen(scene: &Scene, state: &State, judged: &[Judged], ingredients: &Ingredients) -> Vec<Judged> {
     each_tile(scene, NOTHING, |domain, vertices, out| {
         let first = scene.layout.slots[domain].first_vertex + vertices.start;
@@ -93,14 +95,14 @@ pub fn widen(scene: &Scene, state: &State, judged: &[Judged], ingredients: &Ingr
     })
 }
 
-/// u and sum |U q| of one vertex.
+/// u and sum |U q| of one vertex, per axis.
 #[derive(Debug, Clone, Copy, Default)]
 struct Sum {
     u: [f64; 3],
     magnitude: [f64; 3],
 }
 
-/// Where entries of U come from.
+/// Source of the entries of U.
 #[derive(Clone, Copy)]
 enum Entries<'a> {
     Exact(&'a Modes),
@@ -115,7 +117,7 @@ impl Entries<'_> {
         }
     }
 
-    /// Adds the terms of a mode to u and sum |U q| of each row of these vertices.
+    /// Adds the terms of one mode to u and sum |U q| of each row of these vertices.
     fn add(&self, vertices: &Range<usize>, (mode, q): (usize, f64), rows: &mut [(f64, f64)]) {
         let add = |row: &mut (f64, f64), entry: f64| {
             let term = entry * q;
@@ -136,7 +138,7 @@ impl Entries<'_> {
     }
 }
 
-/// Coordinates of a domain.
+/// Modal coordinates of a domain.
 fn own<'a>(scene: &Scene, domain: usize, truth: &'a Truth) -> &'a [f64] {
     let slot = scene.layout.slots[domain];
     &truth.q[slot.first_q..][..slot.rank]
@@ -173,7 +175,8 @@ fn gamma(roundings: usize) -> f64 {
     sum / (1.0 - sum)
 }
 
-/// `size`: that of T; the entries of a follower's are products, which rounds each three times more.
+/// Error bound of T (x0 + u), scene units. `size` holds the absolute values of T; for a follower, T itself is a product
+/// of two transforms, which adds three roundings per entry.
 fn bound((size, follows): (&[f64; 12], bool), rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
     let of_t = if follows { 3 } else { 0 };
     let bent: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis]);
@@ -196,10 +199,10 @@ fn condition(sum: &Sum) -> f64 {
     }
 }
 
-/// One tile of vertices: the domain, its vertices there, and where their values go.
+/// One tile of vertices: its domain, its vertices in that domain, and the output slice.
 type Tile<'a, T> = (usize, Range<usize>, &'a mut [T]);
 
-/// Values of all vertices in packed order, computed tile by tile on all cores. `nothing` holds their places until then.
+/// Values of all vertices in packed order, computed tile by tile on all cores. `nothing` is the initial value.
 fn each_tile<T: Copy + Send + Sync>(
     scene: &Scene,
     nothing: T,
@@ -215,7 +218,7 @@ fn each_tile<T: Copy + Send + Sync>(
             left = rest;
         }
     }
-    // Small domains share a task: their own would cost more than their vertices.
+    // Several tiles share a task, because scheduling a task per small domain would cost more than its vertices.
     let each = |(domain, vertices, own): &mut Tile<'_, T>| work(*domain, vertices.clone(), own);
     tiles.par_chunks_mut(32).for_each(|tiles| tiles.iter_mut().for_each(each));
     all
@@ -233,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn positions_are_those_of_the_reference() {
+    fn positions_match_the_reference_deformer() {
         for load in loads() {
             let state = Motion::new(&load, None).seed(0).state();
             let want = modalcast_compute::reference::deform(&load.scene, &state);
@@ -245,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn f32_stays_within_the_bound_and_a_hundredth_of_it_would_be_too_little() {
+    fn f32_error_stays_within_bound_and_bound_is_not_loose() {
         for load in loads() {
             let motion = Motion::new(&load, None);
             let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&load.scene);
@@ -264,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn cancelling_coordinates_have_a_large_condition_number_and_a_vanishing_sum_an_infinite_one() {
+    fn cancelling_sums_have_large_or_infinite_condition() {
         let load = Kind::Cancelling.build(Size::Quick).expect("built");
         let motion = Motion::new(&load, None);
         let median = |seed: usize| {
@@ -279,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sum_that_f64_loses_is_summed_again() {
+    fn repeats_cancelling_sum_in_double_double() {
         let columns = vec![1.0, 1.0, 1.0, 2f32.powi(-30), 0.0, 0.0, -1.0, -1.0, -1.0];
         let modes = Modes::from_columns(3, 3, columns).expect("modes");
         // 1e10 + 2^-30 - 1e10: f64 has 53 bits and 2^-30 lies 63 below.

@@ -1,4 +1,5 @@
-//! What a deformer replaces in x = T (x0 + U q) before it computes, and how far off that may be.
+//! Error model of a deformer: what it replaces in x = T (x0 + U q) before it computes (storage of U, truncation of
+//! modes, 16-bit coordinates), and a-priori bounds on the resulting error.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -10,35 +11,35 @@ use modalcast_compute::storage::{Amounts, Halves, Products, QUAD, TILE_QUADS, Ti
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Deformation, Scene, Slot, State, Storage};
 
-/// Vertices of a tile of U as it is stored.
+/// Vertices per tile of stored U.
 const TILE: usize = QUAD * TILE_QUADS;
 
-/// The replacements of one scene, as its deformation says.
+/// The error model of one scene, derived from its deformation.
 #[derive(Debug)]
 pub struct Ingredients {
     scene: Arc<Scene>,
-    /// Per shape; empty when U is stored in f32.
+    /// Stored U per shape; empty when U is stored in f32.
     stored: Arc<Vec<Stored>>,
     truncation: Option<Budget>,
-    /// Whether tensor cores multiply: q is then two numbers of 16 bits.
+    /// Whether tensor cores multiply, in which case each coordinate is split into two 16-bit numbers.
     halves: bool,
 }
 
-/// U of one shape as it is stored, and what its bounds need to know.
+/// Stored U of one shape, and the data that its error bounds need.
 type Stored = (Tiles, Reaches);
 
 #[derive(Debug)]
 struct Budget {
-    /// Scene units.
+    /// Error budget, scene units.
     most: f64,
-    /// Per shape.
+    /// Per shape and mode: the farthest that a unit coordinate moves a vertex.
     reaches: Vec<Vec<f64>>,
-    /// Per domain.
+    /// Truncation state per domain.
     domains: Vec<Truncation>,
 }
 
 impl Ingredients {
-    /// What a deformer of this scene replaces that does as its deformation says.
+    /// The error model of a deformer that follows this scene's deformation.
     pub fn of(scene: &Arc<Scene>) -> Self {
         Self::with(scene, Arc::new(store(scene)))
     }
@@ -52,34 +53,34 @@ impl Ingredients {
         Self { scene: Arc::clone(scene), stored, truncation, halves: false }
     }
 
-    /// The same with sums from tensor cores. U is stored in 16 bits.
+    /// The same for sums by tensor cores. U must be stored in 16 bits.
     pub fn with_products(self) -> Self {
         Self { halves: true, ..self }
     }
 
-    /// Whether nothing is replaced, so that all such deformers share their bounds.
+    /// Whether nothing is replaced. All such deformers share their bounds.
     pub fn is_exact(&self) -> bool {
         !self.stores() && !self.truncates()
     }
 
-    /// Whether U is not stored as it is.
+    /// Whether U is stored in another type than f32.
     pub fn stores(&self) -> bool {
         !self.stored.is_empty()
     }
 
-    /// Whether modes may be left out.
+    /// Whether modes may be truncated.
     pub fn truncates(&self) -> bool {
         self.truncation.is_some()
     }
 
-    /// Forgets the states before, so that the next is decided on its own.
+    /// Resets the truncation history, so that the next state is decided independently.
     pub fn forget(&mut self) {
         if let Some(Budget { domains, .. }) = &mut self.truncation {
             domains.iter_mut().for_each(Truncation::forget);
         }
     }
 
-    /// Decides which modes are left out at a state, from those of the state before, as a deformer does.
+    /// Advances truncation to a state: decides which modes are left out, given the previous states, as a deformer does.
     pub fn follow(&mut self, state: &State) {
         let Self { scene, truncation, .. } = self;
         if let Some(Budget { most, reaches, domains }) = truncation {
@@ -91,12 +92,12 @@ impl Ingredients {
         }
     }
 
-    /// U of a shape as it is stored; `None` when that is U.
+    /// Stored U of a shape; `None` when it is stored in f32.
     pub(super) fn tiles(&self, shape: usize) -> Option<&Tiles> {
         self.stored.get(shape).map(|(tiles, _)| tiles)
     }
 
-    /// Zeroes the coordinates of the modes that a domain leaves out.
+    /// Zeroes the coordinates of a domain's truncated modes.
     pub(super) fn truncate<T: Default + Copy>(&self, domain: usize, q: &mut [T]) {
         if let Some(budget) = &self.truncation {
             let mut kept = vec![false; q.len()];
@@ -105,7 +106,7 @@ impl Ingredients {
         }
     }
 
-    /// Bounds of a domain at a state.
+    /// Error bounds of a domain at a state.
     pub(super) fn bounds(&self, domain: usize, state: &State) -> Bounds<'_> {
         let mut q = state.q_of(&self.scene, domain).to_vec();
         self.truncate(domain, &mut q);
@@ -121,7 +122,8 @@ impl Ingredients {
         }
     }
 
-    /// Coordinates, packed as the scene says, as tensor cores take them; `None` when they are taken as they are.
+    /// The packed coordinates as tensor cores read them, rounded to a pair of 16-bit numbers each; `None` when they are
+    /// read in f32.
     pub(super) fn halved(&self, q: &[f64]) -> Option<Vec<f64>> {
         let own = |(domain, slot): (usize, &Slot)| -> Vec<f64> {
             let factors = self.stored[self.scene.domains[domain].shape].0.factors();
@@ -137,7 +139,7 @@ impl Ingredients {
     }
 }
 
-/// The shapes of a scene as its storage type says; none when that is f32.
+/// The shapes of a scene in its storage type; empty for f32.
 fn store(scene: &Scene) -> Vec<Stored> {
     let storage = scene.deformation.storage;
     let one = |shape| {
@@ -151,8 +153,8 @@ fn store(scene: &Scene) -> Vec<Stored> {
     }
 }
 
-/// One scene deformed in several ways: the variants that store U alike share what is stored, and those that deform
-/// alike share their scene.
+/// Cache of one scene under several deformations: variants with the same storage type share the stored U, and variants
+/// with the same deformation share their scene.
 #[derive(Debug)]
 pub struct Stock {
     scene: Arc<Scene>,
@@ -161,16 +163,16 @@ pub struct Stock {
 }
 
 impl Stock {
-    /// With nothing in it but the scene.
+    /// A cache that holds only the given scene.
     pub fn new(scene: &Arc<Scene>) -> Self {
         let scenes = Mutex::new(vec![(scene.deformation, Arc::clone(scene))]);
         Self { scene: Arc::clone(scene), scenes, stored: Mutex::default() }
     }
 
-    /// The scene, deformed in another way.
+    /// The scene with another deformation.
     ///
     /// # Errors
-    /// `Invalid` when the choices make no sense.
+    /// `Invalid` when the deformation's options contradict each other.
     pub fn scene(&self, deformation: Deformation) -> Result<Arc<Scene>> {
         let mut scenes = self.scenes.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, known)) = scenes.iter().find(|(known, _)| *known == deformation) {
@@ -181,7 +183,7 @@ impl Stock {
         Ok(made)
     }
 
-    /// What a deformer of one of these scenes replaces.
+    /// The error model of a deformer of one of these scenes.
     pub fn ingredients(&self, scene: &Arc<Scene>) -> Ingredients {
         let storage = scene.deformation.storage;
         let mut known = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
@@ -195,7 +197,7 @@ impl Stock {
     }
 }
 
-/// What the replacements may move the vertices of one domain by, in scene units.
+/// A-priori bounds of one domain on the displacement caused by the replacements, in scene units.
 pub(super) struct Bounds<'a> {
     reaches: Option<&'a Reaches>,
     q: Vec<f32>,
@@ -206,7 +208,8 @@ pub(super) struct Bounds<'a> {
 }
 
 impl Bounds<'_> {
-    /// The bound of one vertex after another, from `arithmetic`: that of a sum of all modes in f32.
+    /// Widens the bounds of consecutive vertices, from vertex `first` of the shape. On entry they hold `arithmetic`,
+    /// the bound of a sum of all modes in f32.
     pub(super) fn widen<'b>(&self, first: usize, arithmetic: impl Iterator<Item = &'b mut f64>) {
         let step = Step { q: &self.q, transform: self.transform, compensated: self.compensated };
         let mut known: Option<(usize, Bound, f64)> = None;
@@ -219,7 +222,7 @@ impl Bounds<'_> {
                 };
                 let (_, own, products) = known.filter(|(at, ..)| *at == tile).unwrap_or_else(look);
                 known = Some((tile, own, products));
-                // Sums of stored entries are longer by what storing them added, and round that much more.
+                // Stored entries differ from U, so sums of them may be larger and round correspondingly more.
                 let stored = (own.storage + own.coordinates) * (1.0 + 1e-4);
                 *bound = (*bound + stored).min(own.total()) + products;
             }
@@ -241,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn the_default_replaces_nothing() {
+    fn default_deformation_replaces_nothing() {
         let (exact, state) = ingredients(Deformation::default());
         assert!(exact.is_exact() && exact.tiles(0).is_none());
         let mut bounds = [1.0, 2.0];
@@ -250,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn variants_that_store_alike_share_what_is_stored_and_others_do_not() {
+    fn variants_share_stored_u_by_storage_type() {
         let load = Kind::Single { power: 8, rank: 4 }.build(Size::Full).expect("built");
         let stock = Stock::new(&load.scene);
         let half = Deformation { storage: Storage::F16, ..Deformation::default() };
@@ -265,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn stored_entries_widen_bounds_by_what_their_type_loses() {
+    fn coarser_storage_widens_bounds_more() {
         let widened = |storage| {
             let (stored, state) = ingredients(Deformation { storage, ..Deformation::default() });
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
@@ -278,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn tensor_cores_widen_bounds_a_little_and_round_q_as_they_say() {
+    fn tensor_cores_widen_bounds_and_round_q_to_two_halves() {
         let (stored, state) = ingredients(Deformation { storage: Storage::Bf16, ..Deformation::default() });
         let widened = |ingredients: &Ingredients| {
             let mut bounds = [1e-6];
@@ -301,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn small_modes_are_left_out_within_the_budget_and_none_before_the_first_state() {
+    fn truncates_small_modes_within_budget_after_first_state() {
         let (mut truncated, state) = ingredients(Deformation { truncation: Some(0.01), ..Deformation::default() });
         let count = |ingredients: &Ingredients| {
             let mut q = state.q.clone();

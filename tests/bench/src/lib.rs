@@ -1,15 +1,16 @@
-//! Error against run time: every variant of the deformation, on scenes of known sizes or one of the user's; and in
-//! [`render`] the same of the renderer.
+//! Benchmarks of error against run time for every variant of the deformation, on synthetic scenes or on a scene of the
+//! user. [`render`] does the same for the renderer.
 //!
-//! Validate first, then time: a variant whose error exceeds its a-priori bound on any vertex of any state is not timed,
-//! is named, and fails the report.
+//! Validation comes before timing: a variant whose error exceeds its a-priori bound at any vertex of any state is not
+//! timed. The report names the variant and fails.
 //!
-//! - [`loads`] and [`motion`]: seeded scenes, coordinates and transforms; [`record`]: recorded ones.
-//! - [`exact`], [`ingredients`] and `double`: positions in f64 with any ingredient exchanged, and bounds; [`errors`] and
-//!   [`sources`] measure against them.
-//! - [`variant`] and [`mod@bench`]: what is measured. A new variant implements [`variant::Variant`] and is offered by a
-//!   [`bench::Bench`].
-//! - [`table`], [`peers`], [`plot`]: what comes out.
+//! - [`loads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms; [`record`]: recorded
+//!   trajectories.
+//! - [`exact`], [`ingredients`] and `double`: reference positions in f64 with single terms of the error model
+//!   exchanged, and a-priori bounds. [`errors`] and [`sources`] measure variants against them.
+//! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and a
+//!   [`bench::Bench`] offers it.
+//! - [`table`], [`peers`], [`plot`]: the output.
 
 pub mod bench;
 pub mod cli;
@@ -56,13 +57,14 @@ use timing::Cache;
 use validate::Condition;
 use variant::Variant;
 
-/// What the request calls steps that the host reads beside the next.
+/// Name under which [`Request::variants`] selects the overlap benchmark: device-to-host readback of a step while the
+/// next step runs.
 const OVERLAP: &str = "cuda overlap";
 
-/// States over which timed steps rotate.
+/// Number of states that timed steps rotate through.
 const ROTATING: usize = 8;
 
-/// What to report on.
+/// Settings of a report: scenes, sample counts and variants.
 #[derive(Debug, Clone)]
 pub struct Request {
     pub sources: Vec<Source>,
@@ -70,9 +72,9 @@ pub struct Request {
     pub seeds: usize,
     /// Repetitions per median.
     pub replays: usize,
-    /// The most steps of a trajectory.
+    /// Upper limit of the steps taken from a trajectory.
     pub steps: usize,
-    /// Which variants, by name or by its beginning and a `*`; empty: all.
+    /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
     pub size: Size,
 }
@@ -83,17 +85,18 @@ impl Request {
     }
 }
 
-/// Whether a list of names, some of them beginnings with a `*`, has this one; an empty list has all.
+/// Whether `name` is selected by a list of full names and prefixes that end in `*`; an empty list selects everything.
 fn wants(list: &[String], name: &str) -> bool {
     let fits = |wanted: &String| wanted.strip_suffix('*').map_or(name == wanted, |begin| name.starts_with(begin));
     list.is_empty() || list.iter().any(fits)
 }
 
-/// Where a scene comes from.
+/// Source of a scene.
 #[derive(Debug, Clone)]
 pub enum Source {
     Synthetic(Kind),
-    /// A scene of the command line, and what was recorded of it; without that, what lies beside it.
+    /// A scene given on the command line and its recorded trajectory. Without `record`, a recording next to the scene
+    /// is used if there is one.
     Scene {
         source: String,
         record: Option<PathBuf>,
@@ -101,7 +104,7 @@ pub enum Source {
 }
 
 impl Source {
-    /// What was asked for, in words.
+    /// Name for messages.
     fn name(&self) -> String {
         match self {
             Self::Synthetic(kind) => kind.name(),
@@ -110,11 +113,11 @@ impl Source {
     }
 }
 
-/// One load of a report.
+/// Facts of one load in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Entry {
     pub name: String,
-    /// Whether it has the size that its name promises.
+    /// Whether the load has the full size that its name states; false for `--quick` builds and for scenes of the user.
     pub full: bool,
     pub remarks: Vec<String>,
     pub vertices: usize,
@@ -123,57 +126,57 @@ pub struct Entry {
     pub domains: usize,
     pub coordinates: usize,
     pub diagonal_metres: f64,
-    /// Steps of the trajectory, and whether they were recorded.
+    /// Steps of the trajectory.
     pub steps: usize,
     pub recorded: bool,
     pub condition: Condition,
-    /// What a whole step brings to the CUDA device, and how long that takes.
+    /// Upload of one whole step to the CUDA device: bytes and time.
     pub ingest: Option<Ingest>,
-    /// Steps whose vertices the host reads, on the CUDA device.
+    /// Steps with readback of the vertices on the CUDA device, serial against overlapped.
     pub overlap: Option<Overlap>,
 }
 
-/// The way in of a step, by itself.
+/// Host-to-device upload of one step, timed alone.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Ingest {
     pub bytes: u64,
     pub median_us: f64,
-    /// Of the time that the bytes take at the pinned copy rate of this run.
+    /// Measured time divided by the time that the same bytes take at this run's pinned host-to-device rate.
     pub of_pinned: f64,
 }
 
-/// A whole report.
+/// All results of one run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Report {
     pub made: Provenance,
-    /// What is missing and why.
+    /// Missing capabilities and the reasons, for the reader.
     pub remarks: Vec<String>,
     pub seeds: usize,
     pub roofs: Vec<(Backend, Roofs)>,
-    /// Copies to the pinned memory from which the CUDA device takes a step's values.
+    /// Host write rates into the pinned memory from which the CUDA device reads a step's values.
     pub host_writes: Vec<HostWrite>,
     pub loads: Vec<Entry>,
-    /// Loads that were asked for and are not measured yet; empty when the report is whole.
+    /// Requested loads that are not measured yet; empty when the report is complete.
     pub missing: Vec<String>,
     pub rows: Vec<Row>,
     pub thesis: Peers,
-    /// Variants that did not pass, as load: variant: why.
+    /// Failed variants, each as `load: variant: reason`.
     pub failed: Vec<String>,
 }
 
-/// What a report tells while it is made.
+/// Progress events of a running report.
 #[derive(Debug)]
 pub enum Progress<'a> {
-    /// What is measured next, in words.
+    /// Description of the measurement that starts now.
     Begins(&'a str),
-    /// All that is measured so far: a load more than the last time.
+    /// All results so far: one load more than in the previous event.
     Measured(&'a Report),
 }
 
-/// Makes a report; `progress` hears what is being done, and what is done after each load.
+/// Measures all requested loads and returns the report. `progress` is called when a load starts and after each load.
 ///
 /// # Errors
-/// Those of loading a scene and of `progress`. What a variant does wrong is in the report.
+/// Errors of loading a scene and of `progress`. Failures of a variant are recorded in the report instead.
 pub fn deform(
     request: &Request,
     bench: &dyn Bench,
@@ -200,17 +203,17 @@ pub fn deform(
     Ok(report)
 }
 
-/// What is measured so far.
+/// Results so far.
 #[derive(Default)]
 struct Made {
     host_writes: Vec<HostWrite>,
     loads: Vec<Entry>,
     rows: Vec<Row>,
-    /// What is no row's fault.
+    /// Failures that belong to no row, such as those of the overlap benchmark.
     failed: Vec<String>,
 }
 
-/// The report of some loads and their rows, the first of those that were asked for.
+/// Assembles the report from the loads measured so far. They are the first ones of `request.sources`.
 fn gathered(request: &Request, bench: &dyn Bench, made: &Made) -> Report {
     let Made { loads, rows, .. } = made;
     let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
@@ -218,7 +221,7 @@ fn gathered(request: &Request, bench: &dyn Bench, made: &Made) -> Report {
     let name = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
     let mut failed = made.failed.clone();
     failed.extend(rows.iter().filter(|row| !row.passed && !row.left_out).map(name));
-    // The rows of warm and cold caches say the same of one variant.
+    // The rows for warm and cold caches repeat the same failure of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
     Report {
@@ -235,7 +238,7 @@ fn gathered(request: &Request, bench: &dyn Bench, made: &Made) -> Report {
     }
 }
 
-/// Measures the overlap if it is asked for. Vertices that differ from those of the serial way fail the report.
+/// Runs the overlap benchmark if it is requested. The report fails if its vertices differ from those of serial steps.
 fn overlap(
     request: &Request,
     bench: &dyn Bench,
@@ -302,7 +305,7 @@ fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entr
     }
 }
 
-/// Validates all variants of a load together, then times those that passed, one after the other.
+/// Validates all variants of a load together, then times the passing ones one after the other.
 fn measure(request: &Request, bench: &dyn Bench, load: &Load, motion: &Motion) -> (Condition, Vec<Row>) {
     let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<Row>) = (Vec::new(), Vec::new());
     let wanted = |name: &str| request.wants(name);
@@ -340,11 +343,9 @@ impl Report {
         self.failed.is_empty()
     }
 
-    /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is made. Each
-    /// file is written beside its place and renamed, so that whoever stops the run finds whole files.
-    ///
-    /// # Errors
-    /// `Fault` when a file cannot be written.
+    /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is created.
+    /// Each file is written under a temporary name and then renamed, so that an interrupted run leaves only complete
+    /// files.
     pub fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(during("report"))?;
         let svg = plot::svg(self);

@@ -1,4 +1,4 @@
-//! Where and from what a report was made.
+//! Provenance of a report: machine, build and command.
 
 use std::process::Command;
 
@@ -11,21 +11,21 @@ use modalcast_compute::gpu;
 pub struct Provenance {
     pub cpu: String,
     pub threads: usize,
-    /// CUDA devices with their memory, driver, CUDA and NVRTC versions; what is missing is said in words.
+    /// CUDA devices with their memory, driver, CUDA and NVRTC versions, and descriptions of what is missing.
     pub cuda: gpu::Probe,
     pub version: &'static str,
-    /// `MODALCAST_COMMIT`, else what git says of the current folder.
+    /// `MODALCAST_COMMIT`, otherwise git's HEAD in the current folder.
     pub commit: Option<String>,
     pub command: Vec<String>,
-    /// The compiler of this machine, if it has one.
+    /// Version of this machine's Rust compiler, if there is one.
     pub toolchain: Option<String>,
-    /// Whether the program was built with optimisation; without it the times mean little.
+    /// Whether the build is optimized; times of other builds are not meaningful.
     pub release: bool,
     pub os: &'static str,
 }
 
 impl Provenance {
-    /// Looks at this machine and this process.
+    /// Collects the data of this machine and process.
     pub fn here() -> Self {
         let commit = std::env::var("MODALCAST_COMMIT").ok().filter(|commit| !commit.is_empty());
         Self {
@@ -50,7 +50,7 @@ impl Provenance {
     }
 }
 
-/// What a program prints, in one line; none when it is not there or fails.
+/// A program's trimmed standard output; `None` when it cannot be started or fails.
 fn output(program: &str, arguments: &[&str]) -> Option<String> {
     let output = Command::new(program).args(arguments).output().ok().filter(|output| output.status.success())?;
     String::from_utf8(output.stdout).ok().map(|text| text.trim().to_owned())
@@ -67,14 +67,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_program_that_is_not_there_or_fails_says_nothing() {
+    fn missing_or_failing_program_gives_no_output() {
         assert_eq!(output("no-such-program", &[]), None);
         assert_eq!(output("false", &[]), None);
         assert_eq!(output("echo", &["x"]).as_deref(), Some("x"));
     }
 
     #[test]
-    fn the_line_names_cpu_threads_and_device_or_its_absence() {
+    fn line_names_cpu_threads_and_device() {
         let here = Provenance::here();
         assert!(here.threads >= 1 && !here.cpu.is_empty() && !here.command.is_empty());
         let device = here.cuda.devices.first().map_or("no CUDA device", |device| &device.name);

@@ -1,4 +1,4 @@
-//! Seeded coordinates and transforms of a scene, and what was recorded of a real one.
+//! Motions of a scene: seeded random states, synthetic trajectories, and recorded ones.
 //!
 //! A physics process computes in f64 and sends f32, so the truth here is f64 and a state is its rounding.
 
@@ -14,17 +14,17 @@ use super::record::Record;
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{Changed, Scene, State};
 
-/// The largest displacement by the first mode alone, as a share of the diagonal of its domain.
+/// Standard deviation of the first mode's largest displacement component, as a fraction of its domain's diagonal.
 const SHARE: f64 = 0.05;
-/// The largest turn and shift of a domain about its placement: radians, and shares of its diagonal.
+/// Limits of a domain's random rotation and translation about its placement: radians, and a fraction of its diagonal.
 const TURN: f64 = 0.2;
 const SHIFT: f64 = 0.05;
-/// Steps of a made-up trajectory, their distance in seconds, and the frequency of the slowest mode in hertz.
+/// Number of steps of a synthetic trajectory, time between them in seconds, and frequency of the slowest mode in hertz.
 const STEPS: usize = 24;
 const DT: f64 = 1.0 / 60.0;
 const SLOWEST: f64 = 1.0;
 
-/// What a physics process means, before anything is rounded: relative to the scene's origin.
+/// A state in f64, as a physics process computes it before rounding; relative to the scene's origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truth {
     /// Packed coordinates.
@@ -34,7 +34,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// What of it reaches a deformer: every number rounded to f32.
+    /// The state that a deformer receives: every number rounded to f32.
     pub fn state(&self) -> State {
         let transforms = self.transforms.iter().map(|entries| Transform(entries.map(|entry| entry as f32)));
         let q = self.q.iter().map(|number| *number as f32).collect();
@@ -42,7 +42,7 @@ impl Truth {
         State { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
     }
 
-    /// A state as a truth of its own.
+    /// A truth that equals a state exactly.
     pub fn of(state: &State) -> Self {
         Self {
             q: state.q.iter().map(|number| f64::from(*number)).collect(),
@@ -50,7 +50,7 @@ impl Truth {
         }
     }
 
-    /// `world_from_domain` of a domain: of a follower the product of its mover's and its frame.
+    /// `world_from_domain` of a domain; for a follower the product of its mover's transform and its frame.
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let mover = &self.transforms[scene.movers.of(domain)];
         match scene.movers.frame_of(domain) {
@@ -59,7 +59,7 @@ impl Truth {
         }
     }
 
-    /// The same of absolute values: no entry of the product, however it is rounded, is larger by more than that.
+    /// The same with absolute values. Entries of the exact product do not exceed it in magnitude.
     pub(super) fn size_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let mover = self.transforms[scene.movers.of(domain)].map(f64::abs);
         match scene.movers.frame_of(domain) {
@@ -83,14 +83,14 @@ fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
 pub struct Motion {
     scene: Arc<Scene>,
     paired: bool,
-    /// Per packed coordinate: standard deviation, and frequency over that of the domain's slowest mode.
+    /// Per packed coordinate: standard deviation, and frequency relative to the domain's slowest mode.
     spread: Vec<(f64, f64)>,
     record: Option<Record>,
 }
 
 impl Motion {
-    /// Motions that fit a load. Amplitudes fall with the frequency as those of a stiff object do: from the eigenvalues
-    /// where the scene states them, else as 1 / j.
+    /// Motions for a load. Amplitudes decrease with frequency as those of a stiff object do: from the eigenvalues where
+    /// the scene has them, otherwise as 1 / j.
     pub fn new(load: &Load, record: Option<Record>) -> Self {
         let scene = &load.scene;
         let mut spread = vec![(0.0, 1.0); scene.layout.coordinates];
@@ -101,8 +101,9 @@ impl Motion {
         Self { scene: Arc::clone(scene), paired: load.paired, spread, record }
     }
 
-    /// Seed `seed`: Gaussian coordinates and small rigid moves. Odd seeds nearly cancel: in pairs where modes are paired,
-    /// else in one random row of every domain, whose largest entry takes the opposite of all others.
+    /// The random state of a seed: Gaussian coordinates and small rigid motions. Odd seeds nearly cancel: in pairs
+    /// where modes are paired, otherwise in one random row per domain, where the mode with the largest entry cancels
+    /// the sum of all others.
     pub fn seed(&self, seed: usize) -> Truth {
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let mut q: Vec<f64> = self.spread.iter().map(|(spread, _)| spread * gauss(&mut rng)).collect();
@@ -114,7 +115,7 @@ impl Motion {
         Truth { q, transforms }
     }
 
-    /// How many steps the trajectory has.
+    /// Number of steps of the trajectory.
     pub fn steps(&self) -> usize {
         self.record.as_ref().map_or(STEPS, Record::steps)
     }
@@ -124,7 +125,7 @@ impl Motion {
         self.record.is_some()
     }
 
-    /// Step `step` of the trajectory: the recorded one, else every mode in its own oscillation.
+    /// A step of the trajectory: the recorded one, otherwise independent oscillations of all modes.
     pub fn step(&self, step: usize) -> Truth {
         if let Some(record) = &self.record {
             return record.step(&self.scene, step);
@@ -162,7 +163,7 @@ impl Motion {
                 let largest = (0..slot.rank).max_by(|a, b| entry(*a).abs().total_cmp(&entry(*b).abs())).unwrap_or(0);
                 let others: f64 =
                     (0..slot.rank).filter(|mode| *mode != largest).map(|mode| entry(mode) * own[mode]).sum();
-                // A row of zeros, as of a clamped vertex, cancels by itself.
+                // A row of zeros, as of a clamped vertex, cancels already.
                 if entry(largest) != 0.0 {
                     own[largest] = -others / entry(largest);
                 }
@@ -179,7 +180,7 @@ fn spread_of(scene: &Scene, domain: usize) -> Vec<(f64, f64)> {
     let one = |mode: usize| {
         let ratio = slowest.map_or((mode + 1) as f64, |slowest| (known[mode] / slowest).max(1.0).sqrt());
         let largest = modes.column(mode).iter().fold(0.0_f32, |largest, entry| largest.max(entry.abs()));
-        // A mode that moves nothing may have any coordinate.
+        // The coordinate of a mode without displacement is arbitrary.
         let size = if largest > 0.0 { reach / f64::from(largest) } else { 1.0 };
         (size / ratio, ratio)
     };
@@ -193,7 +194,7 @@ fn diagonal(scene: &Scene, domain: usize) -> f64 {
     bounds.diagonal()
 }
 
-/// The placement of a domain, turned in its own frame and shifted in the world's.
+/// The placement of a domain, rotated in its own frame and translated in world space.
 fn place(scene: &Scene, domain: usize, turn: &Matrix3<f64>, shift: &Vector3<f64>) -> [f64; 12] {
     let placement = scene.domains[domain].placement;
     let (linear, translation) = (placement.linear() * turn, placement.translation() + shift);
@@ -218,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_have_the_mean_0_and_the_deviation_1() {
+    fn gaussians_have_mean_0_and_deviation_1() {
         let mut rng = Rng::with_seed(1);
         let draws: Vec<f64> = (0..20_000).map(|_| gauss(&mut rng)).collect();
         let mean = draws.iter().sum::<f64>() / 2e4;
@@ -227,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_repeats_itself_and_its_numbers_are_no_f32() {
+    fn seeds_are_deterministic_and_not_representable_in_f32() {
         let motion = motion(Kind::B);
         assert_eq!(motion.seed(3), motion.seed(3));
         assert_ne!(motion.seed(3), motion.seed(5));
@@ -237,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn odd_seeds_cancel_in_one_row_and_even_ones_do_not() {
+    fn only_odd_seeds_cancel_in_one_row() {
         let motion = motion(Kind::Single { power: 10, rank: 10 });
         let modes = &motion.scene.shapes[0].modes;
         let condition = |seed: usize| {
@@ -253,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn slow_modes_swing_far_and_neighbouring_steps_are_near() {
+    fn slow_modes_are_large_and_steps_are_close() {
         let motion = motion(Kind::A { dressed: false });
         assert!(motion.spread[0].0 > 10.0 * motion.spread[31].0);
         let [first, second] = [0, 1].map(|step| motion.step(step));

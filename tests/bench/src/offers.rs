@@ -1,4 +1,4 @@
-//! Trials on the CUDA device as variants, and the list of those that a load gets.
+//! CUDA benchmark kernels as variants, and the selection of variants for a load.
 
 use std::sync::Arc;
 
@@ -14,22 +14,22 @@ use modalcast_model::deform::{Backend, Surface};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Batches, Deformation, Scene, State, Storage};
 
-/// Makes a trial of a scene for some states.
+/// Creates a trial of a scene for the given states.
 type Make = Box<dyn Fn(&Device, &Arc<Scene>, &[State]) -> Result<Box<dyn Trial>>>;
 
-/// The parts of a step that peers launch, and how their names tell.
+/// The parts of a step that competing kernels launch, and the suffixes of their names.
 const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ), (kernels::Part::Whole, "")];
 
-/// How the names of variants end that do less than all vertices of a step: such a time is no rival of a whole one.
+/// Name suffixes of variants that compute only a part of a step; their times are not comparable with whole steps.
 const UQ: &str = " Uq";
 const CHANGED: &str = ", 1 % changed";
 
-/// Whether a variant of that name does only a part of the vertices' work.
+/// Whether a variant of this name computes only a part of a step.
 pub(super) fn is_partial(name: &str) -> bool {
     [UQ, CHANGED].iter().any(|ending| name.ends_with(ending))
 }
 
-/// A trial as a variant. It is made once, when its states are known.
+/// A trial as a variant. It is created in [`Variant::prepare`], when the states are known.
 struct Tried {
     label: Label,
     scene: Arc<Scene>,
@@ -40,10 +40,10 @@ struct Tried {
     surface: Surface,
 }
 
-/// All trials for a scene: ours in every storage type, and the thesis's kernels where they apply.
+/// All trials for a scene: our kernels in every storage type, and the competing kernels that support the scene.
 pub(super) fn trials(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let stored = |storage: Storage, extent: Extent| -> Offer {
-        // u alone comes from a kernel that batches do not have.
+        // The kernel that computes u alone does not support batches.
         let batches = if extent == Extent::Uq { Batches::Never } else { scene.deformation.batches };
         let deformation = Deformation { storage, batches, ..scene.deformation };
         let suffix = match extent {
@@ -74,7 +74,7 @@ pub(super) fn trials(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wa
     offers
 }
 
-/// What a scene may keep for readers, by name, where it keeps neither.
+/// Deformations that keep additional outputs for readers, by name; empty when the scene already keeps one of them.
 fn readers(scene: &Scene) -> Vec<(String, Deformation)> {
     let plain = scene.deformation;
     if plain.displacements || plain.boxes {
@@ -85,13 +85,13 @@ fn readers(scene: &Scene) -> Vec<(String, Deformation)> {
     vec![u, boxes]
 }
 
-/// Whether a deformation sums other modes than all, or in another way: its kernel then has its own rows.
+/// Whether a deformation truncates modes or sums with compensation, so that its kernel needs rows of its own.
 pub(super) fn is_summed_otherwise(deformation: &Deformation) -> bool {
     deformation.truncation.is_some() || deformation.compensated
 }
 
-/// The kernel of positions for a scene that is deformed so. Every state is decided on its own where modes are left out:
-/// no trial remembers the one before.
+/// The positions kernel of a scene with this deformation. With truncation every state is decided independently, because
+/// trials have no history.
 pub(super) fn positions(
     device: &Arc<Device>,
     stock: &Stock,
@@ -115,10 +115,10 @@ fn ours(
     })
 }
 
-/// Domains from which on a step that changes one in a hundred is measured.
+/// Minimum of domains for which a step that changes one domain in a hundred is measured.
 const MANY: usize = 400;
 
-/// A step that changes one domain in a hundred, spread over the list.
+/// A step that changes one domain in a hundred, evenly distributed over the domains.
 fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offer {
     let list: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
     let label = Label::new(format!("cuda f32 positions{CHANGED}"), Backend::Cuda, scene);
@@ -128,8 +128,8 @@ fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Offe
     offer(wanted, label, |label| Ok(Tried::new(label, scene, device, make)))
 }
 
-/// Many q of one shape at once, in every storage type; f32 one after the other, for comparison; and by tensor cores where
-/// U has 16 bits.
+/// Batched products of many q with one shape: in every storage type, in f32 without batches for comparison, and by
+/// tensor cores where U has 16 bits.
 fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     if scene.shapes.len() > 1 || scene.domains.len() < 2 {
         return Vec::new();
@@ -143,7 +143,7 @@ fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted
     let apart = (format!("cuda {count} apart f32"), of(Storage::F32, Batches::Never));
     let products = |storage: Storage| {
         let deformation = Deformation { storage, ..scene.deformation };
-        // Another order and rounding than the deformer's: its name says so.
+        // Summation order and rounding differ from the deformer's, so the name marks it.
         let name = format!("cuda batch of {count} {} mma", storage.name());
         offer(wanted, Label { name, backend: Backend::Cuda, deformation }, |label| {
             let scene = stock.scene(deformation)?;
@@ -155,7 +155,7 @@ fn batch(device: &Arc<Device>, stock: &Stock, scene: &Arc<Scene>, wanted: Wanted
     ours.chain([Storage::F16, Storage::Bf16].map(products)).collect()
 }
 
-/// cuBLAS as a peer: each of its ways to multiply that fits the scene, alone and with a plain vertex update.
+/// cuBLAS: each kind of product that fits the scene, alone and with a plain vertex update.
 fn cublas(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let shared = scene.domains.len() > 1 && scene.shapes.len() == 1;
     let fits = |peer: &Peer| match peer {
@@ -173,7 +173,7 @@ fn cublas(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<O
     Peer::ALL.into_iter().filter(fits).flat_map(both).collect()
 }
 
-/// The thesis's kernels: those for one domain, else the grouped ones in all their splits. They take up to 32 modes.
+/// The thesis's kernels: the single-domain kernel, or the grouped ones in all splits, which support up to 32 modes.
 fn thesis(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<Offer> {
     let made = |name: String, make: Make| {
         let label = Label::new(name, Backend::Cuda, scene);
@@ -190,7 +190,7 @@ fn thesis(device: &Arc<Device>, scene: &Arc<Scene>, wanted: Wanted<'_>) -> Vec<O
         made(format!("thesis {} kernels{suffix}", split.widths().len()), make)
     };
     let largest = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
-    // Unfolded triangles have no place for a vertex that no triangle names.
+    // Unfolded triangles do not contain a vertex that no triangle refers to.
     let parts = if names_all(scene) { &PARTS[..] } else { &PARTS[..1] };
     match (scene.domains.len(), largest) {
         (1, _) => parts.iter().copied().map(single).collect(),
@@ -214,12 +214,12 @@ fn names_all(scene: &Scene) -> bool {
     })
 }
 
-/// Whether some shape has more corners than the least that a mesh must have.
+/// Whether some shape has more than the minimum of three corners, and so real normals.
 pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
 
-/// The formula of a part of a trial's bytes, where its name says which.
+/// The formula of a part of a trial's bytes, by the part's name.
 fn formula(name: &str) -> &'static str {
     match name {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",

@@ -1,4 +1,4 @@
-//! `report.md`: the report as tables for people.
+//! Formats a report as Markdown tables (`report.md`).
 
 use super::peers::{dash, line, rule};
 use super::table::Row;
@@ -66,7 +66,7 @@ fn section<'a>(load: &Entry, rows: impl Iterator<Item = &'a Row>) -> String {
     text
 }
 
-/// What reading every step costs, serial and side by side.
+/// The paragraph on the cost of reading every step back, serial and overlapped.
 fn overlapped(overlap: &Overlap) -> String {
     let Overlap { write_one_core_us: one, write_us: all, cores, graph_us, copy_out_us, step_us, .. } = overlap;
     let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;

@@ -1,4 +1,4 @@
-//! The thesis's figures beside ours: values for `report.json`, tables for `report.md`.
+//! Compares our results with the thesis: values for `report.json`, tables for `report.md`.
 
 use serde::Serialize;
 
@@ -7,18 +7,18 @@ use super::thesis::{CPU_OVER_GPU, PLANTS, POWERS, RANKS, Species};
 use super::timing::Cache;
 use modalcast_model::deform::Backend;
 
-/// One cell of table 4.4 and ours.
+/// One cell of table 4.4 with our result.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Single {
     pub power: u32,
     pub rank: usize,
     /// Table 4.4: CPU time over GPU time.
     pub thesis: f64,
-    /// The fastest exact CPU variant over the fastest exact CUDA variant; none without both.
+    /// Time of the fastest exact CPU variant divided by that of the fastest exact CUDA variant; `None` without both.
     pub ours: Option<f64>,
 }
 
-/// One plant and ours.
+/// One plant of the thesis with our results.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Plant {
     pub thesis: Species,
@@ -26,7 +26,7 @@ pub struct Plant {
     pub ours: Vec<(String, f64)>,
 }
 
-/// All that the thesis printed of what was measured here.
+/// All comparisons with the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Peers {
     pub source: &'static str,
@@ -35,7 +35,7 @@ pub struct Peers {
 }
 
 impl Peers {
-    /// Puts the rows of full-sized loads beside the thesis. `full` tells which loads those are.
+    /// Selects the rows of full-size loads; `full` returns whether a load has its full size.
     pub fn of(rows: &[Row], full: impl Fn(&str) -> bool) -> Self {
         let warm = |load: &str| -> Vec<&Row> {
             let fits = |row: &&Row| row.load == load && row.cache == Cache::Warm && row.timing.is_some() && full(load);
@@ -124,12 +124,12 @@ pub(super) fn line(cells: impl IntoIterator<Item = String>) -> String {
     format!("| {} |\n", cells.join(" | "))
 }
 
-/// The line below the head of a Markdown table.
+/// The separator line below the header of a Markdown table.
 pub(super) fn rule(columns: usize) -> String {
     format!("|{}\n", "---|".repeat(columns))
 }
 
-/// What stands for a figure that is not there.
+/// Placeholder for a missing value.
 pub(super) fn dash() -> String {
     "-".into()
 }
@@ -140,7 +140,7 @@ mod tests {
     use crate::table::tests::row;
 
     #[test]
-    fn our_figures_stand_beside_the_thesis_only_where_the_load_has_full_size() {
+    fn compares_only_full_size_loads_with_the_thesis() {
         let mut cuda = row("single-22-30", "cuda", Cache::Warm, (10.0, 1e-7));
         cuda.backend = Backend::Cuda;
         let rows = [

@@ -1,4 +1,4 @@
-//! Trajectories that were recorded: coordinates over time, and transforms where there are some.
+//! Recorded trajectories: modal coordinates over time, and optionally transforms.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use modalcast_model::scene::Scene;
 pub struct Record {
     /// Packed coordinates of each step.
     q: Vec<Vec<f64>>,
-    /// `world_from_domain` of each domain, 12 numbers each, of each step; empty: all stay at their placements.
+    /// `world_from_domain` of each mover per step, 12 numbers each. Empty if all domains stay at their placements.
     transforms: Vec<Vec<f64>>,
 }
 
@@ -37,7 +37,8 @@ impl Record {
         record.checked(scene).map_err(|error| error.within(&name))
     }
 
-    /// The record that lies beside a scene: the only file in its folder that ends in `.q.csv`.
+    /// The recording next to a scene: the only file in its folder that ends in `.q.csv`. `None` when there is no such
+    /// file or several.
     ///
     /// # Errors
     /// As [`Self::read`].
@@ -85,7 +86,7 @@ impl Record {
     }
 }
 
-/// The rows of a `.npy` array of any dimension above one: all but the first are flattened.
+/// The rows of a `.npy` array of at least two dimensions; all but the first dimension are flattened.
 fn table(path: &Path) -> Result<Vec<Vec<f64>>> {
     let missing =
         |error: std::io::Error| Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) };
@@ -99,7 +100,7 @@ fn table(path: &Path) -> Result<Vec<Vec<f64>>> {
     Ok(array.entries.chunks_exact(width).map(row).collect())
 }
 
-/// All columns but the first of a CSV file with a header.
+/// All columns except the first of a CSV file with a header.
 fn columns(path: &Path) -> Result<Vec<Vec<f64>>> {
     let refuse = |error: csv::Error| match error.is_io_error() {
         true => Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) },
@@ -130,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn the_columns_after_the_time_are_the_coordinates() {
+    fn columns_after_time_are_coordinates() {
         let record = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a record");
         assert_eq!(record.steps(), 2);
         assert_eq!(record.step(&scene(), 1).q, [3.0, 4.0]);
@@ -138,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn records_that_do_not_fit_are_refused_with_what_is_wrong() {
+    fn rejects_bad_records_with_the_reason() {
         for (text, part) in [
             ("time,q0\n0,1\n", "q[0]: expected 2 numbers, given 1"),
             ("time,q0,q1\n", "steps: expected at least one"),
@@ -153,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_of_arrays_holds_transforms_too() {
+    fn reads_transforms_from_a_folder_of_arrays() {
         let folder = tempfile::tempdir().expect("a folder");
         let write = |name: &str, shape: &str, numbers: &[f32]| {
             let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");

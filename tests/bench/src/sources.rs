@@ -1,4 +1,5 @@
-//! Where an error comes from: each ingredient of x = T (x0 + U q) exchanged alone, all else exact in f64.
+//! Splits an error into its sources: each term of x = T (x0 + U q) is exchanged alone, with everything else exact in
+//! f64.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -11,28 +12,29 @@ use super::ingredients::Ingredients;
 use super::motion::Truth;
 use modalcast_model::scene::{Scene, State, Storage};
 
-/// What each source alone moves a vertex by, metres.
+/// Displacement of a vertex by each source alone, meters.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Sources {
-    /// U as it is stored, decoded, instead of U.
+    /// Storage of U: decoded stored entries instead of U.
     pub storage: Spread,
-    /// q rounded to f32 instead of the f64 of the physics process, and to what tensor cores take where they multiply.
+    /// q rounded to f32 instead of the f64 of the physics process, and to pairs of 16-bit numbers where tensor cores
+    /// multiply.
     pub q: Spread,
-    /// What the deformer's own arithmetic adds: the sum over the modes, x0 and T, all in f32, beyond one rounding.
+    /// The deformer's own f32 arithmetic: the sum over the modes, x0 and T, beyond one final rounding.
     pub accumulation: Spread,
     /// T rounded to f32.
     pub transform: Spread,
-    /// The one rounding of the position itself, which grows with its distance from the scene's origin.
+    /// The final rounding of the position itself, which grows with the distance from the scene's origin.
     pub origin: Spread,
-    /// The modes that are left out.
+    /// Truncated modes.
     pub truncation: Spread,
 }
 
-/// The six sources while they are collected, in the order of [`Sources`].
+/// Accumulators of the six sources, in the order of [`Sources`].
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Split([Collect; 6]);
 
-/// What the sources of one truth have in common, whatever the variant.
+/// Reference positions of one truth that all variants share.
 #[derive(Debug)]
 pub(super) struct Origin {
     truth: Truth,
@@ -40,22 +42,22 @@ pub(super) struct Origin {
     exact: Vec<[f64; 3]>,
     q: Collect,
     transform: Collect,
-    /// With q and T as given, U exact and no mode left out.
+    /// Positions with q and T rounded to f32, U exact and all modes.
     plain: Vec<[f64; 3]>,
-    /// Of the storage types that variants have asked for.
+    /// Per storage type that a variant has requested so far.
     stored: Mutex<Vec<(Storage, Arc<Stored>)>>,
 }
 
-/// What all variants have in common that store U in one type and leave out no mode.
+/// Positions that variants of one storage type without truncation share.
 #[derive(Debug)]
 struct Stored {
     alone: Collect,
-    /// With q and T as given.
+    /// Positions with q and T rounded to f32.
     own: Vec<[f64; 3]>,
 }
 
 impl Origin {
-    /// What a truth and its rounding give in f64.
+    /// Evaluates a truth and its rounding to f32 in f64.
     pub(super) fn new(scene: &Scene, truth: Truth, state: &State) -> Self {
         let given = Truth::of(state);
         let at = |q: &[f64], transforms: &[[f64; 12]]| {
@@ -81,15 +83,15 @@ impl Origin {
         stored
     }
 
-    /// Adds what a variant made of it.
+    /// Adds the sources of a variant's error at this truth. `got`: its positions, three f32 per vertex.
     pub(super) fn split(&self, scene: &Scene, ingredients: &Ingredients, got: &[f32], split: &mut Split) {
         let storage = Some(ingredients).filter(|ingredients| ingredients.stores());
         let truncation = Some(ingredients).filter(|ingredients| ingredients.truncates());
         let stored = storage.map(|ingredients| self.stored(scene, ingredients));
-        // Every source counts all vertices, also one that moves none.
+        // Every source counts all vertices, even if it moves none of them.
         let none = apart(&self.exact, &self.exact);
         let from_storage = stored.as_ref().map_or(none, |stored| stored.alone);
-        // Which modes are left out depends on what the deformer was given; their sizes hardly do.
+        // Truncation was decided from the rounded q; applying it to the unrounded q hardly changes the displacement.
         let cut = Take { storage: None, truncation };
         let from_truncation = truncation.map_or(none, |_| apart(&self.exact, &positions(scene, &self.truth, cut)));
         let halved = ingredients.halved(&self.given.q);
@@ -111,7 +113,7 @@ impl Origin {
 }
 
 impl Split {
-    /// What was collected, in metres.
+    /// The accumulated sources in meters; `unit` is meters per scene unit.
     pub(super) fn sources(&self, unit: f64) -> Sources {
         let [storage, q, accumulation, transform, origin, truncation] =
             self.0.map(|collect| collect.spread(unit).unwrap_or_default());
@@ -150,14 +152,14 @@ mod tests {
         split.sources(1.0)
     }
 
-    /// Numbers that f32 holds, so that rounding them moves nothing.
+    /// A truth whose numbers f32 represents exactly, so that rounding moves nothing.
     fn even() -> Truth {
         let identity = modalcast_model::domain::Transform::IDENTITY.0.map(f64::from);
         Truth { q: vec![1.0, 0.5], transforms: vec![identity] }
     }
 
     #[test]
-    fn each_source_is_seen_alone() {
+    fn measures_each_source_alone() {
         let plain = Deformation::default;
         let none = split(plain(), &even(), None);
         assert!([none.storage, none.q, none.accumulation, none.transform, none.truncation] == [Spread::default(); 5]);
@@ -178,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_other_source_explains_is_accumulation() {
+    fn counts_unexplained_error_as_accumulation() {
         let got = vec![1e3_f32; 3 * 256];
         let found = split(Deformation::default(), &Motion::new(&load(), None).seed(0), Some(&got));
         assert!(found.accumulation.largest > 1e3, "{found:?}");

@@ -1,4 +1,4 @@
-//! The table of the report: a row per variant, load and cache.
+//! The result table of a report: one row per variant, load and cache state.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -13,41 +13,44 @@ use modalcast_model::deform::Backend;
 use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::{Normals, Storage};
 
-/// One variant on one load with one state of the caches.
+/// Results of one variant on one load with one cache state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     pub load: String,
     pub name: String,
     pub backend: Backend,
     pub storage: Storage,
-    /// The budget of mode truncation, metres.
+    /// Error budget of mode truncation, meters.
     pub truncation_metres: Option<f64>,
     pub normals: Normals,
     pub compensated: bool,
     pub cache: Cache,
     pub passed: bool,
-    /// Why not, in words.
+    /// Reasons why it failed.
     pub faults: Vec<String>,
-    /// Whether something that it needs is not here, so that it did not fail by not passing.
+    /// Whether the variant was skipped because something that it needs is unavailable. It then does not count as
+    /// failed.
     pub left_out: bool,
-    /// None when it did not pass, or cannot be timed so.
+    /// `None` when it failed, or cannot be timed with this cache.
     pub timing: Option<Timing>,
     pub bytes: u64,
     pub traffic: Vec<Part>,
-    /// Bytes over the median time, 10^9 a second.
+    /// Bytes divided by the median time, 10^9 per second.
     pub gbs: Option<f64>,
-    /// The same over the rate of the best copy, and of the best pure read, of the same run.
+    /// `gbs` divided by the best copy rate of the same run.
     pub of_copy: Option<f64>,
+    /// `gbs` divided by the best read rate of the same run.
     pub of_read: Option<f64>,
-    /// Kernel launches of a step, and what the driver says of each kernel; nothing on the CPU.
+    /// Kernel launches per step; 0 on the CPU.
     pub launches: usize,
+    /// The driver's facts about each kernel; empty on the CPU.
     pub kernels: Vec<KernelFacts>,
-    /// None when the variant could not be made.
+    /// `None` when the variant could not be created.
     pub found: Option<Found>,
 }
 
 impl Row {
-    /// The row of a variant that was looked at.
+    /// The row of a validated variant.
     pub fn new(load: &str, label: &Label, found: Found, traffic: Vec<Part>, time: (Cache, Option<Timing>)) -> Self {
         let (cache, timing) = time;
         let bytes = traffic::total(&traffic);
@@ -65,7 +68,7 @@ impl Row {
         }
     }
 
-    /// The row of a variant that could not be made.
+    /// The row of a variant that could not be created.
     pub fn unmade(load: &str, label: &Label, error: &Error) -> Self {
         let left_out = matches!(error, Error::Unavailable { .. });
         Self { faults: vec![error.to_string()], left_out, ..Self::blank(load, label) }
@@ -96,21 +99,22 @@ impl Row {
         }
     }
 
-    /// The same row with its rate held against roofs.
+    /// The row with its rate divided by the rates of the machine.
     pub fn under(mut self, roofs: Roofs) -> Self {
         let share = |roof: Option<f64>| Some(self.gbs? / roof.filter(|roof| *roof > 0.0)?);
         (self.of_copy, self.of_read) = (share(roofs.copy_gbs), share(roofs.read_gbs));
         self
     }
 
-    /// Median time in microseconds and largest error as a fraction of the diagonal, of a row that has both.
+    /// Median time in microseconds and largest error as a fraction of the diagonal; `None` when the variant failed or
+    /// was not timed.
     pub fn point(&self) -> Option<(f64, f64)> {
         let found = self.found.as_ref().filter(|_| self.passed)?;
         Some((self.timing?.median_us, found.errors.of_diagonal.largest))
     }
 }
 
-/// The columns of `report.csv`: name, and where the value stands in a row of `report.json`.
+/// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`.
 const COLUMNS: [(&str, &str); 56] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -191,7 +195,7 @@ pub fn csv(rows: &[Row]) -> Result<Vec<u8>> {
     writer.into_inner().map_err(during("report"))
 }
 
-/// Indices of the points that no other point beats in both numbers, by ascending first number.
+/// Pareto front: indices of the points that no other point beats in both numbers, by ascending first number.
 pub fn pareto(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by(|a, b| points[*a].0.total_cmp(&points[*b].0).then(points[*a].1.total_cmp(&points[*b].1)));
@@ -211,7 +215,7 @@ pub(super) mod tests {
     use crate::errors::{Errors, Orientation, Spread};
     use crate::sources::Sources;
 
-    /// A row with these numbers and everything else at nought.
+    /// A row with these numbers; everything else is zero or empty.
     pub(crate) fn row(load: &str, name: &str, cache: Cache, (us, error): (f64, f64)) -> Row {
         let label = Label { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
         let spread = Spread { largest: error, rms: error / 2.0 };
@@ -240,7 +244,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_front_holds_what_no_other_point_beats() {
+    fn front_contains_exactly_the_undominated_points() {
         let points = [(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (3.0, 0.5), (4.0, 0.5), (0.5, 9.0)];
         assert_eq!(pareto(&points), [5, 0, 3]);
         assert_eq!(pareto(&[]), [0; 0]);
@@ -248,7 +252,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn rates_are_bytes_over_time_and_fractions_are_of_what_was_measured() {
+    fn rates_are_bytes_per_time_and_fractions_of_roofs() {
         let row = row("a", "x", Cache::Warm, (2.0, 0.1));
         assert_eq!((row.gbs, row.of_copy), (Some(1.0), None));
         let under = row.under(Roofs { copy_gbs: Some(4.0), ..Roofs::default() });
@@ -256,7 +260,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_csv_reads_back_with_every_column_and_quoted_texts() {
+    fn csv_reads_back_all_columns_and_quoted_text() {
         let mut odd = row("a", "odd, \"name\"", Cache::Cold, (3.0, 1e-9));
         odd.faults = vec!["one".into(), "two, three".into()];
         let rows = [row("a", "x", Cache::Warm, (2.0, 0.125)), odd];
@@ -279,7 +283,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn every_column_but_the_texts_names_a_place_that_a_full_row_has() {
+    fn every_column_pointer_resolves_in_a_full_row() {
         let mut full = row("a", "x", Cache::Warm, (2.0, 0.125)).under(Roofs {
             copy_gbs: Some(1.0),
             read_gbs: Some(1.0),

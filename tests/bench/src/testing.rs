@@ -1,4 +1,4 @@
-//! Variants for tests: one that is wrong on purpose, and one that does as its scene says, in f64.
+//! Variants for tests: a deliberately wrong one, and an f64 emulation of a scene's deformation.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use modalcast_model::deform::Surface;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, State};
 
-/// Another variant, with something added to one coordinate.
+/// Wraps another variant and adds an error to its last coordinate.
 pub(super) struct Damaged<V> {
     inner: V,
     damage: f32,
@@ -54,13 +54,13 @@ impl<V: Variant> Variant for Damaged<V> {
     }
 }
 
-/// Stores and leaves out what its scene says, and rounds only the positions.
+/// Emulates storage and truncation in f64 and rounds only the positions.
 pub(super) struct Emulated {
     pub(super) label: Label,
     pub(super) scene: Arc<Scene>,
-    /// What it does.
+    /// Error model that it applies.
     pub(super) does: Ingredients,
-    /// What it says that it does.
+    /// Error model that it declares, which gives its bounds.
     pub(super) says: Ingredients,
     pub(super) surface: Surface,
 }

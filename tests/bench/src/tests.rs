@@ -5,7 +5,7 @@ use modalcast_model::error::invalid;
 use testing::Damaged;
 use variant::{Driven, Label};
 
-/// The CPU, healthy and damaged, and a variant that cannot be made.
+/// A bench with the CPU deformer, intact and damaged, and a variant that cannot be created.
 struct Mixed {
     damage: f32,
 }
@@ -44,7 +44,7 @@ fn report(damage: f32) -> Report {
 }
 
 #[test]
-fn a_run_that_is_cut_short_has_written_what_it_had_and_says_what_is_missing() {
+fn interrupted_run_keeps_results_and_names_missing_loads() {
     let folder = tempfile::tempdir().expect("a folder");
     let absent = Source::Scene { source: "absent".into(), record: None };
     let request = request(vec![Source::Synthetic(Kind::C), absent]);
@@ -65,7 +65,7 @@ fn a_run_that_is_cut_short_has_written_what_it_had_and_says_what_is_missing() {
 }
 
 #[test]
-fn a_report_writes_all_files_and_they_read_back() {
+fn writes_all_report_files_and_reads_them_back() {
     let report = report(0.0);
     assert!(report.passed(), "{:?}", report.failed);
     let folder = tempfile::tempdir().expect("a folder");
@@ -87,7 +87,7 @@ fn a_report_writes_all_files_and_they_read_back() {
 }
 
 #[test]
-fn a_damaged_variant_fails_the_report_by_name_and_is_not_timed() {
+fn damaged_variant_fails_report_and_is_not_timed() {
     let report = report(0.01);
     assert!(!report.passed());
     assert_eq!(report.failed.len(), 2);
@@ -98,7 +98,7 @@ fn a_damaged_variant_fails_the_report_by_name_and_is_not_timed() {
 }
 
 #[test]
-fn a_variant_that_cannot_be_made_fails_the_report_by_name() {
+fn variant_that_cannot_be_created_fails_report() {
     struct Broken;
     impl Bench for Broken {
         fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
@@ -112,7 +112,7 @@ fn a_variant_that_cannot_be_made_fails_the_report_by_name() {
 }
 
 #[test]
-fn a_variant_that_lacks_what_is_not_here_is_left_out_with_the_reason_and_fails_nothing() {
+fn unavailable_variant_is_skipped_without_failing_report() {
     struct Lacking;
     impl Bench for Lacking {
         fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
@@ -127,7 +127,7 @@ fn a_variant_that_lacks_what_is_not_here_is_left_out_with_the_reason_and_fails_n
 }
 
 #[test]
-fn steps_that_differ_when_they_are_read_beside_the_next_fail_the_report_and_equal_ones_are_shown() {
+fn overlap_fails_report_only_when_vertices_differ() {
     struct Beside(usize);
     impl Bench for Beside {
         fn variants(&self, _load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
@@ -178,7 +178,7 @@ fn steps_that_differ_when_they_are_read_beside_the_next_fail_the_report_and_equa
 }
 
 #[test]
-fn a_scene_of_the_user_is_measured_under_its_own_name() {
+fn user_scene_is_measured_under_its_own_name() {
     let source = Source::Scene { source: "tree".into(), record: None };
     let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| Ok(())).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);

@@ -1,4 +1,4 @@
-//! What the thesis printed of its own runs: the figures that stand beside ours.
+//! Figures printed in the thesis, for comparison with ours.
 //!
 //! Source: chapter 4, tables 4.4 to 4.7. Its GPU was a GeForce GTX 680, its CPU code `OpenMP` with 16 threads.
 
@@ -48,7 +48,7 @@ pub struct Species {
     pub drawn: Drawn,
 }
 
-/// The columns of tables 4.6 and 4.7 that have to do with rendering.
+/// The rendering columns of tables 4.6 and 4.7.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Drawn {
     /// Table 4.6, FPS and `t_vbr` (vertex updating with rendering) of the CPU.

@@ -1,4 +1,4 @@
-//! Medians of run times, with caches warm or swept.
+//! Wall-clock timing of steps with warm or cold caches.
 
 use std::time::Instant;
 
@@ -7,13 +7,13 @@ use serde::Serialize;
 
 use modalcast_model::error::Result;
 
-/// What the caches hold when a step begins.
+/// State of the caches when a step begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Cache {
-    /// What the step before left there.
+    /// The previous step's data.
     Warm,
-    /// Nothing of use: something larger than the last level was swept through before.
+    /// No data of the step: a buffer larger than the last-level cache was written before.
     Cold,
 }
 
@@ -36,15 +36,15 @@ pub struct Timing {
     pub replays: usize,
 }
 
-/// The fewest repetitions that a median is taken of.
+/// Minimum of repetitions for a median.
 pub const FEWEST: usize = 20;
-/// After so many seconds no repetition beyond [`FEWEST`] begins.
+/// Time limit in seconds, after which no repetition beyond [`FEWEST`] starts.
 const PATIENCE: f64 = 5.0;
-/// The sweep of a machine that does not tell its caches.
+/// Minimum size of the sweep in bytes, also for machines that do not report their caches.
 const SWEEP: usize = 64 << 20;
 
 impl Timing {
-    /// Median and quartiles of some times; `None` of none.
+    /// Median and quartiles of times in microseconds; `None` when there are none.
     pub fn of(mut times: Vec<f64>) -> Option<Self> {
         times.sort_by(f64::total_cmp);
         let last = times.len().checked_sub(1)?;
@@ -56,10 +56,10 @@ impl Timing {
         Some(Self { median_us: at(0.5), q1_us: at(0.25), q3_us: at(0.75), replays: times.len() })
     }
 
-    /// Runs `step` with 0, 1, 2, ... by the wall clock: once for nothing, then [`FEWEST`] to `replays` times.
+    /// Times `step`, called with 0, 1, 2, ..., by the wall clock: one untimed run, then [`FEWEST`] to `replays` runs.
     ///
     /// # Errors
-    /// Those of `step`.
+    /// Errors of `step`.
     pub fn by_wall_clock(
         cache: Cache,
         replays: usize,
@@ -83,23 +83,23 @@ impl Timing {
     }
 }
 
-/// A buffer larger than all caches together.
+/// A buffer larger than the caches.
 struct Sweep(Vec<u64>);
 
 impl Sweep {
     fn new() -> Self {
-        // Each of several sockets has a last level; twice one of them and the usual minimum cover what machines have.
+        // Every socket has its own last-level cache; twice its size, but at least [`SWEEP`], is enough in practice.
         Self(vec![1; (2 * largest_cache()).max(SWEEP) / 8])
     }
 
-    /// Writes all of it from all cores.
+    /// Writes the whole buffer from all cores.
     fn run(&mut self) {
         let each = self.0.len().div_ceil(4 * rayon::current_num_threads()).max(1);
         self.0.par_chunks_mut(each).for_each(|part| part.iter_mut().for_each(|word| *word = word.wrapping_add(1)));
     }
 }
 
-/// Bytes of the last-level cache, as Linux tells; 0 elsewhere.
+/// Bytes of the last-level cache according to Linux; 0 on other systems.
 fn largest_cache() -> usize {
     let size = |index: usize| {
         let path = format!("/sys/devices/system/cpu/cpu0/cache/index{index}/size");
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_median_and_the_quartiles_of_five_numbers_are_its_second_third_and_fourth() {
+    fn median_and_quartiles_of_five_numbers_are_exact() {
         let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("five");
         assert_eq!((timing.q1_us, timing.median_us, timing.q3_us, timing.replays), (2.0, 3.0, 4.0, 5));
         assert_eq!(Timing::of(vec![1.0, 2.0]).map(|timing| timing.median_us), Some(1.5));
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn at_least_twenty_repetitions_are_timed_and_one_is_thrown_away() {
+    fn times_at_least_20_runs_after_one_warm_up() {
         for (cache, replays, want) in [(Cache::Warm, 3, 20), (Cache::Warm, 31, 31), (Cache::Cold, 1, 20)] {
             let mut runs = Vec::new();
             let timing = Timing::by_wall_clock(cache, replays, |run| {
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_that_fails_ends_it() {
+    fn failing_step_ends_timing() {
         let fault = modalcast_model::error::invalid("x", "y", "z");
         assert_eq!(Timing::by_wall_clock(Cache::Warm, 20, |_| Err(fault.clone())), Err(fault));
     }

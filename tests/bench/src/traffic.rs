@@ -1,4 +1,4 @@
-//! The bytes that a step must move, by formula.
+//! Minimum memory traffic of a step, by formula.
 
 use serde::Serialize;
 
@@ -14,8 +14,8 @@ pub struct Part {
     pub bytes: u64,
 }
 
-/// What a step moves at least, in the scene's storage type and with its normals: every operand once, shapes that
-/// instances share once, all modes also where some may be left out.
+/// Minimum of bytes that a step moves, for the scene's storage type and normals. Every operand counts once, shared
+/// shapes count once, and all modes count even with truncation.
 pub fn of_scene(scene: &Scene) -> Vec<Part> {
     let layout = &scene.layout;
     let [mut entries, mut stored, mut scales, mut vertices, mut corners, mut triangles, mut tangents] = [0; 7];
@@ -62,7 +62,7 @@ pub fn line(parts: &[Part]) -> String {
     parts.iter().map(part).collect::<Vec<_>>().join("; ")
 }
 
-/// All bytes.
+/// Sum of all parts.
 pub fn total(parts: &[Part]) -> u64 {
     parts.iter().map(|part| part.bytes).sum()
 }
@@ -74,7 +74,7 @@ mod tests {
     use modalcast_model::scene::{Deformation, Normals};
 
     #[test]
-    fn bytes_of_load_a_are_those_of_the_formulas() {
+    fn bytes_of_load_a_match_the_formulas() {
         let scene = Kind::A { dressed: true }.build(Size::Quick).expect("built").scene;
         let (n, r) = (30_000, 32);
         let want = 4 * 3 * n * r + 12 * n + 4 * r + 48 + 12 * n + 2 * 12 * n + 2 * 16 * n;

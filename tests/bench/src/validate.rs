@@ -1,4 +1,4 @@
-//! Errors of all variants of one load: over random seeds, and step by step along a trajectory.
+//! Validation: the errors of all variants of one load, over random seeds and step by step along a trajectory.
 
 use std::ops::Range;
 use std::sync::{Arc, OnceLock};
@@ -18,21 +18,21 @@ use modalcast_model::deform::Surface;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, Deformation, Normals, Scene, State};
 
-/// Of how many seeds the sources of error are split. Each costs five evaluations in f64.
+/// Number of seeds for which the error is split into its sources. Each split costs five evaluations in f64.
 const SPLIT: usize = 4;
 
-/// How well conditioned the sums of a load are: sum |U q| / |u| of its vertices.
+/// Condition numbers of the modal sums of a load: sum |U q| / |u| per vertex.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Condition {
-    /// The largest finite one.
+    /// Largest finite condition number.
     pub largest: f64,
-    /// The median over the states of the median over the vertices that have modes.
+    /// Median over the states of the median over the vertices that have modes.
     pub median: f64,
-    /// How many vertices of all states have terms that sum to exactly zero.
+    /// Number of vertices over all states whose nonzero terms sum to exactly zero.
     pub infinite: u64,
 }
 
-/// What was found of one variant.
+/// Validation result of one variant.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Found {
     pub errors: Errors,
@@ -40,22 +40,22 @@ pub struct Found {
     pub step_metres: Spread,
     pub sources: Sources,
     pub orientation: Orientation,
-    /// Whether the same state gives the same bits again.
+    /// Whether the same state gives bit-identical results when it is evaluated again.
     pub repeatable: bool,
-    /// Why it did not pass; empty when it did.
+    /// Reasons why the variant failed; empty when it passed.
     pub faults: Vec<String>,
-    /// Whether it was not looked at because something that it needs is not here.
+    /// Whether the variant was skipped because something that it needs is unavailable on this machine.
     pub left_out: bool,
 }
 
 impl Found {
-    /// Whether the variant may be timed.
+    /// Whether the variant passed validation, so that it may be timed.
     pub fn passed(&self) -> bool {
         self.faults.is_empty()
     }
 }
 
-/// [`Found`] while it is collected.
+/// Accumulator for the [`Found`] of one variant.
 struct Case<'a> {
     variant: &'a mut dyn Variant,
     tally: Tally,
@@ -63,7 +63,7 @@ struct Case<'a> {
     split: Split,
     steps: Collect,
     before: Option<(Vec<f32>, Arc<Vec<Judged>>)>,
-    /// What it gave last, in memory that is used again.
+    /// The variant's most recent surface. The buffers are reused.
     held: Surface,
     first: Surface,
     repeatable: bool,
@@ -71,31 +71,31 @@ struct Case<'a> {
     left_out: bool,
 }
 
-/// One state to look at: what is right there, the same for all variants.
+/// One state to validate, with the reference values that all variants share.
 struct Look<'a> {
     at: usize,
     scenes: &'a Scenes<'a>,
     state: &'a State,
-    /// What exact storage of all modes gives, and its bound.
+    /// Exact positions, with the bounds of a deformer that stores U exactly and sums all modes.
     judged: Arc<Vec<Judged>>,
     partial: Partial,
-    /// Of the states whose sources are split.
+    /// Present for the states whose error is split into its sources.
     origin: Option<Origin>,
     rigid: OnceLock<Directions>,
     exact: OnceLock<Directions>,
     along: bool,
 }
 
-/// Normals and tangents in f64.
+/// Reference normals and tangents in f64.
 struct Directions {
     normals: Vec<[f64; 3]>,
     tangents: Vec<[f64; 4]>,
 }
 
-/// Whose directions are right.
+/// The scenes that define the correct directions.
 struct Scenes<'a> {
     rigid: &'a Scene,
-    /// The scene whose normals are those of the deformed surface, where that bends and has any.
+    /// The same scene with exact normals of the deformed surface; `None` when it has no modes or no normals.
     bent: Option<Arc<Scene>>,
 }
 
@@ -115,7 +115,8 @@ impl<'a> Look<'a> {
         Self { at, scenes, state, partial: Partial::of(&judged), judged, origin: None, rigid, exact, along }
     }
 
-    /// The directions by T alone, or those of the deformed surface; computed once, whoever asks.
+    /// Reference directions: by T alone, or, if `exact`, of the deformed surface. Computed at the first call and
+    /// cached.
     fn directions(&self, exact: bool) -> &Directions {
         match exact {
             true => self.exact.get_or_init(|| {
@@ -135,11 +136,12 @@ impl<'a> Look<'a> {
     }
 }
 
-/// Vertices and corners of the states that are judged at once, at most: of 40 and up to 112 bytes.
+/// Upper limit of the vertices plus corners of the states that are evaluated together: 40 bytes per vertex and up to
+/// 112 per corner.
 const AT_ONCE: usize = 1 << 24;
 
-/// Looks at `seeds` random states and at most `steps` of the trajectory: at every vertex and corner of each. What is
-/// right is computed once for all variants, of several states at once on all cores.
+/// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every
+/// vertex and corner. The reference values are computed once for all variants, in parallel over several states.
 pub fn validate(
     load: &Load,
     motion: &Motion,
@@ -153,7 +155,8 @@ pub fn validate(
     let states: Vec<State> = (0..count).into_par_iter().map(|at| truth(at).state()).collect();
     let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut(), &states)).collect();
     let (scenes, mut conditions) = (Scenes::new(load), Conditions::default());
-    // Which directions the variants were held to at the first state: of the others they are computed beforehand.
+    // Which directions the variants needed at the first state. For the other states these are computed beforehand, in
+    // parallel.
     let mut asked = [false; 2];
     for group in groups(count, load.scene.layout.vertices + load.scene.layout.corners) {
         let look = |at: usize| {
@@ -178,7 +181,8 @@ pub fn validate(
     (cases.into_iter().map(|case| case.found(&yardstick)).collect(), conditions.condition())
 }
 
-/// States 0 to `count` in groups that are judged at once: the first alone, for it tells what the others need.
+/// Splits states 0 to `count` into groups that are evaluated together. The first state is its own group, because it
+/// shows which directions the others need.
 fn groups(count: usize, items: usize) -> impl Iterator<Item = Range<usize>> {
     let together = (AT_ONCE / items.max(1)).clamp(1, rayon::current_num_threads());
     let rest = (1..count).step_by(together).map(move |first| first..count.min(first + together));
@@ -235,7 +239,7 @@ impl<'a> Case<'a> {
         }
     }
 
-    /// Error of the step from the state before.
+    /// Error of the step from the previous state.
     fn step(&mut self, look: &Look<'_>) {
         if let Some((positions, before)) = &self.before {
             self.steps = self.steps.join(step_errors([positions, &self.held.positions], [before, &look.judged]));
@@ -245,13 +249,13 @@ impl<'a> Case<'a> {
         self.before = Some((positions, Arc::clone(&look.judged)));
     }
 
-    /// Whether the normals that it gives are to follow the surface.
+    /// Whether the variant outputs normals that must follow the deformed surface.
     fn is_held_to_surface(&self) -> bool {
         !self.held.normals.is_empty() && self.variant.scene().needs.exact_normals
     }
 
-    /// Asks for the first state again, after all others. A deformer that leaves out modes may remember what it was given
-    /// before, so that its answers may differ.
+    /// Evaluates the first state again, after all others. Variants with truncation are exempt: their choice of modes
+    /// may depend on earlier states.
     fn repeat(&mut self, states: &[State]) {
         if self.fault.is_none() && !self.variant.ingredients().truncates() {
             let again = self.variant.surface(0, &states[0]);
@@ -259,7 +263,7 @@ impl<'a> Case<'a> {
         }
     }
 
-    /// The exact positions with this variant's own bound.
+    /// The exact positions with this variant's own bounds.
     fn judged(&self, look: &Look<'_>) -> Arc<Vec<Judged>> {
         let ingredients = self.variant.ingredients();
         match ingredients.is_exact() {
@@ -303,7 +307,7 @@ impl<'a> Case<'a> {
     }
 }
 
-/// Copies a surface into the memory of another.
+/// Copies a surface into the buffers of another.
 fn copy(to: &mut Surface, from: &Surface) {
     to.positions.clone_from(&from.positions);
     to.normals.clone_from(&from.normals);
@@ -319,7 +323,7 @@ fn bits(surface: &Surface) -> impl Iterator<Item = u32> + '_ {
     lists.into_iter().flatten().map(|number| number.to_bits())
 }
 
-/// Of one state: the largest finite condition, the median, and how many are infinite.
+/// Condition numbers of one state: largest finite one, median, and number of infinite ones.
 #[derive(Debug, Default)]
 struct Partial {
     largest: f64,
@@ -338,7 +342,7 @@ impl Partial {
     }
 }
 
-/// [`Condition`] while it is collected.
+/// Accumulator for [`Condition`].
 #[derive(Debug, Default)]
 struct Conditions {
     largest: f64,
@@ -386,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cpu_passes_on_every_kind_of_load_with_all_figures_filled() {
+    fn cpu_passes_all_loads_and_fills_all_figures() {
         let (found, condition) = find(Kind::A { dressed: true }, 0.0);
         assert!(found.passed() && found.repeatable, "{:?}", found.faults);
         assert_eq!(found.errors.states, 4 + 24);
@@ -409,14 +413,15 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_variant_fails_with_its_fault_in_words() {
+    fn damaged_variant_fails_with_a_reason() {
         let (found, _) = find(Kind::B, 1e-3);
         assert!(!found.passed() && found.faults[0].contains("times its a-priori bound"), "{:?}", found.faults);
         let (found, _) = find(Kind::B, f32::NAN);
         assert!(found.faults[0].contains("not finite"), "{:?}", found.faults);
     }
 
-    /// A deformer that does as one deformation says, judged by another.
+    /// Validates an emulated deformer that computes by the deformation `does` but declares `says`, which gives its
+    /// bounds.
     fn emulate(does: Deformation, says: Deformation) -> Found {
         let load = Kind::B.build(Size::Quick).expect("built");
         let [done, said] = [does, says].map(|deformation| restated(&load.scene, deformation).expect("restated"));
@@ -428,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn stored_and_truncated_deformers_keep_their_own_bounds_and_not_those_of_exact_ones() {
+    fn approximate_deformers_meet_only_their_own_bounds() {
         let storage = |storage| Deformation { storage, ..Deformation::default() };
         let [half, brain, eighth] = [Storage::F16, Storage::Bf16, Storage::Int8].map(storage);
         let short = Deformation { truncation: Some(1e-4), ..Deformation::default() };

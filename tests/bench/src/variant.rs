@@ -1,4 +1,4 @@
-//! The seam between the report and what it reports on.
+//! The interface between the report and the variants that it measures.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use modalcast_model::deform::{Backend, Deformer, Surface};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Deformation, Scene, State};
 
-/// What a variant is.
+/// Identity of a variant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Label {
     /// Unique among the variants of a load.
@@ -26,47 +26,49 @@ impl Label {
     }
 }
 
-/// A way to deform one scene, which holds all it needs of it.
+/// A way to deform one scene. It owns all data that it needs of the scene.
 pub trait Variant {
-    /// What it is.
+    /// Name, backend and deformation.
     fn label(&self) -> &Label;
 
-    /// The scene as this variant deforms it: its deformation defines which normals are right.
+    /// The scene with this variant's deformation, which defines the correct normals.
     fn scene(&self) -> &Arc<Scene>;
 
-    /// What it replaces in x = T (x0 + U q): this gives its a-priori bound.
+    /// The error model: what the variant replaces in x = T (x0 + U q). It gives the a-priori bound.
     fn ingredients(&self) -> &Ingredients;
 
-    /// The bytes that a step moves at least.
+    /// The minimum of bytes that a step moves, by part.
     fn traffic(&self) -> Vec<Part>;
 
-    /// Takes all states that it will be asked for.
+    /// Receives all states that [`Self::surface`] will be called with.
     ///
     /// # Errors
-    /// `Fault` when the device failed, or what else keeps it from being made.
+    /// `Fault` when the device fails; `Unavailable` when something that the variant needs is missing; other errors of
+    /// its construction.
     fn prepare(&mut self, _states: &[State]) -> Result<()> {
         Ok(())
     }
 
-    /// The surface at state `at` of those, which is `state`. Normals and tangents are empty when it makes none.
+    /// The surface at `state`, which is number `at` of the prepared states. Normals and tangents are empty when the
+    /// variant computes none.
     ///
     /// # Errors
-    /// `Fault` when the device failed.
+    /// `Fault` when the device fails.
     fn surface(&mut self, at: usize, state: &State) -> Result<&Surface>;
 
-    /// Times steps over rotating states; `None` when it cannot be timed with this cache.
+    /// Times steps over rotating states; `None` when the variant cannot be timed with this cache.
     ///
     /// # Errors
-    /// `Fault` when the device failed.
+    /// `Fault` when the device fails.
     fn time(&mut self, states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>>;
 
-    /// Kernel launches of a step, and what the driver says of each kernel; nothing on the CPU.
+    /// Kernel launches per step, and the driver's facts about each kernel; 0 and none on the CPU.
     fn kernels(&self) -> (usize, Vec<KernelFacts>) {
         (0, Vec::new())
     }
 }
 
-/// A deformer of the server as a variant, timed by the wall clock from the call until it returns.
+/// A deformer of the server as a variant, timed by the wall clock from call to return.
 pub struct Driven {
     label: Label,
     scene: Arc<Scene>,
@@ -80,7 +82,7 @@ impl Driven {
         Self::sharing(label, scene, Ingredients::of(scene), deformer)
     }
 
-    /// The same, with what it replaces made already.
+    /// The same, with an existing error model.
     pub fn sharing(label: Label, scene: &Arc<Scene>, ingredients: Ingredients, deformer: Box<dyn Deformer>) -> Self {
         Self { label, scene: Arc::clone(scene), ingredients, deformer }
     }
@@ -110,7 +112,7 @@ impl Variant for Driven {
     }
 
     fn time(&mut self, states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>> {
-        // The sweep goes through the caches of the CPU, not through those of a device.
+        // The cold sweep evicts the caches of the CPU, not those of a device.
         if cache == Cache::Cold && self.label.backend == Backend::Cuda {
             return Ok(None);
         }

@@ -1,4 +1,4 @@
-//! `modalcast report render`: what every way to draw costs in error against brute force, and what it saves in time.
+//! `modalcast report render`: error of every rendering variant against brute-force references, and its run time.
 
 use std::path::PathBuf;
 
@@ -28,49 +28,51 @@ Examples:
   modalcast report render --out figures --figures
   modalcast report render --out figures --figures --scene path/to/plant --size 1280x960";
 
-/// Error against run time of the renderer: validates every variant against references by brute force, then times it.
+/// Error against run time of the renderer: validates every variant against brute-force references, then times it.
 ///
-/// Writes report.json, report.csv, report.md, report.svg, report.png and pictures/ with the references, and of every
-/// variant a strip of rendered, reference and difference. Exit code 1 when a variant exceeds its bounds.
+/// Writes report.json, report.csv, report.md, report.svg, report.png and a folder pictures/ with the references and,
+/// for every variant, a strip of rendered, reference and difference image. Exit code 1 when a variant exceeds its error
+/// bounds.
 #[derive(Debug, clap::Args)]
 #[command(after_help = LOADS)]
 pub(super) struct Args {
-    /// The folder to write to; files of an earlier report there are replaced.
+    /// Output folder; files of an earlier report there are replaced.
     #[arg(long)]
     out: PathBuf,
-    /// A scene; may be repeated. Without any: all.
+    /// A synthetic scene; repeatable. Default: all.
     #[arg(long = "load", value_name = "NAME")]
     loads: Vec<String>,
-    /// Only this variant, or all whose names begin so: "variance 512*"; may be repeated.
+    /// Measure only this variant, or all variants with this prefix: "variance 512*"; repeatable.
     #[arg(long = "variant", value_name = "GLOB")]
     variants: Vec<String>,
-    /// The size of still pictures in pixels, 640x360 without it; those of moving ones are a quarter of it on each side. Of
-    /// a figure's single pictures, 640x480 without it.
+    /// Size of still pictures in pixels [default: 640x360]; moving pictures have a quarter of it on each side. With
+    /// --figures the size of single pictures [default: 640x480].
     #[arg(long)]
     size: Option<Size>,
-    /// Frames per median, at least 20; 100 without it, 20 with --quick.
+    /// Frames per median, at least 20 [default: 100, 20 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
-    /// Fewer variants but for those named in full, 16 samples a pixel and a smaller field, for machines without a GPU.
+    /// Fewer variants (except those named in full), 16 samples per pixel and a smaller field, for machines without a
+    /// GPU.
     #[arg(long)]
     quick: bool,
-    /// Draws the figures of the thesis's chapter 4.2 instead, from our own scenes: nothing is measured.
+    /// Draw the figures of the thesis's chapter 4.2 from our own scenes; nothing is measured.
     #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
     figures: bool,
-    /// Only the rasteriser in CUDA beside OpenGL's bare passes, on the loads, a room and two triangles that fill the frame:
-    /// raster.json and raster.md. Needs an NVIDIA GPU.
+    /// Measure only the CUDA rasterizer against OpenGL's bare passes, on the loads, a room and two triangles that fill
+    /// the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
     #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
     raster: bool,
-    /// A scene of your own, a path to a model or a scene folder; may be repeated. With --figures a picture of it too;
-    /// alone its frame times and nothing else: times.json and a picture.
+    /// A scene of your own, a path to a model or a scene folder; repeatable. With --figures, also draws a picture of
+    /// it. Without --figures, only its frame times are measured: times.json and a picture.
     #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["loads", "variants", "quick"])]
     scenes: Vec<String>,
 }
 
-/// Sizes that nobody asked for: of the report, and of the figures' pictures.
+/// Default sizes: of the report, and of the figures' pictures.
 const USUAL: [Size; 2] = [Size { width: 640, height: 360 }, Size { width: 640, height: 480 }];
 
-/// The largest side of a picture: each of its pixels is traced by 64 rays and more.
+/// Upper limit of a picture's side in pixels: every pixel is traced by at least 64 rays.
 const LARGEST: u32 = 4096;
 
 pub(super) fn run(args: &Args) -> Outcome {
@@ -125,7 +127,10 @@ fn timed(args: &Args) -> Outcome {
     Ok(true)
 }
 
-/// The size that was asked for, in bounds.
+/// The requested or default size.
+///
+/// # Errors
+/// `Invalid` when a side is not in 1 to [`LARGEST`].
 fn size(args: &Args, usual: Size) -> Result<render::Size> {
     let Size { width, height } = args.size.unwrap_or(usual);
     match [width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
@@ -162,7 +167,7 @@ fn request(args: &Args) -> Result<Request> {
     }
 }
 
-/// The plants that a name stands for, counted from 0; none when it is another load's.
+/// Indices from 0 of the plants that a name selects; `None` when the name is no plant's.
 fn plants_named(name: &str) -> Option<Vec<usize>> {
     if name == "plants" {
         return Some((0..PLANTS.len()).collect());
@@ -243,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_named_means_every_load_and_wrong_names_and_sizes_are_refused() {
+    fn defaults_to_all_loads_and_rejects_bad_names_and_sizes() {
         let all = request(&args()).expect("fits");
         assert_eq!((all.loads.len(), all.plants.len(), all.replays), (Kind::all(true).len(), 12, 20));
         let plants = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
@@ -251,7 +256,7 @@ mod tests {
         assert_eq!((plants.loads.len(), plants.plants.len(), plants.plants[0]), (1, 13, 2));
         let named = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
         assert_eq!(request(&named).expect("fits").loads, [Kind::Square, Kind::Triangles(10)]);
-        // The frame that bare passes are held against, of a quick run too.
+        // A quick run also includes the frame that the bare passes are compared with, if it is named.
         let variants = ["variance 4096, blur 1.5", "culling*"].map(String::from).to_vec();
         let named = request(&Args { variants, ..args() }).expect("fits").wanted();
         let names: Vec<&str> = named.iter().map(|variant| variant.name.as_str()).collect();

@@ -1,5 +1,6 @@
-//! Launches `kernels/batch_mma.cu`: x = T_b (x0 + U q_b) of up to 32 domains b of one shape, by tensor cores. Only trials
-//! use it: it sums in another order than the deformer and takes q in two numbers of 16 bits.
+//! Launches `kernels/batch_mma.cu`: x = T_b (x0 + U q_b) for up to 32 domains b of one shape, by tensor cores. Only
+//! benchmarks use it, because its summation order differs from the deformer's and it rounds each coordinate to a pair
+//! of 16-bit numbers.
 
 use std::sync::Arc;
 
@@ -28,12 +29,12 @@ pub(super) const CODE: Code = Code {
     ],
 };
 
-/// The most domains of a launch.
+/// Upper limit of domains per launch.
 const MOST: usize = 32;
-/// Warps of a block, which has a tile, and modes of a product.
+/// Warps per block, which covers one tile, and modes per matrix product.
 const WARPS: usize = 4;
 const STEP: usize = 16;
-/// The first capability whose tensor cores multiply so.
+/// The first compute capability whose tensor cores support this product (m16n8k16).
 const AMPERE: (i32, i32) = (8, 0);
 
 /// Arguments of `batch_mma`; pointers are device addresses.
@@ -58,7 +59,7 @@ const _: () = assert!(size_of::<BatchMmaArgs>() == 192, "BatchMmaArgs differs fr
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for BatchMmaArgs {}
 
-/// All domains of a scene of one shape, multiplied by tensor cores, for several steps.
+/// All domains of a scene with one shape, multiplied by tensor cores, for several steps.
 #[derive(Debug)]
 pub struct BatchMma {
     name: String,
@@ -67,7 +68,7 @@ pub struct BatchMma {
     rest: CudaSlice<u8>,
     positions: CudaSlice<u8>,
     turns: Turns,
-    /// Without its addresses.
+    /// Kernel arguments with null addresses; [`Self::args`] fills them in.
     args: BatchMmaArgs,
     vectors: usize,
     tiles: u32,
@@ -75,12 +76,12 @@ pub struct BatchMma {
 }
 
 impl BatchMma {
-    /// Packs the shape and the values of each state onto the device; U is stored as the scene says, in 16 bits.
+    /// Packs and uploads the shape and the values of each state. U is stored in the scene's 16-bit type.
     ///
     /// # Errors
-    /// `Invalid` when the scene is not 1 to 32 domains of one shape, stores U in other than 16 bits or asks for
-    /// compensated sums, or there is no state; `Unavailable` when the device has no such tensor cores or NVRTC is
-    /// missing; `Fault` when the device refuses.
+    /// `Invalid` when the scene is not 1 to 32 domains of one shape, has followers, does not store U in 16 bits or
+    /// requests compensated sums, or when there is no state; `Unavailable` when the device has no such tensor cores or
+    /// NVRTC is missing; `Fault` when the device fails.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State]) -> Result<Self> {
         check(scene)?;
         let storage = scene.deformation.storage;
@@ -135,9 +136,9 @@ impl Trial for BatchMma {
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         let config =
             LaunchConfig { grid_dim: (self.tiles, 1, 1), block_dim: (32 * WARPS as u32, 1, 1), shared_mem_bytes: 0 };
-        // SAFETY: `BatchMmaArgs` is the kernel's only argument. Tiles and x0 are those of the scene's one shape, a block
-        // for each tile; halves, T and shrinks have as many vectors as the kernel was compiled for, and halves whole
-        // steps of modes; every domain has room for the shape's vertices from its first on.
+        // SAFETY: `BatchMmaArgs` is the kernel's only argument. Tiles and x0 are those of the scene's one shape, with
+        // one block per tile. Halves, T and shrinks hold as many vectors as the kernel was compiled for, and halves
+        // hold whole steps of modes. `positions` has room for the shape's vertices from each domain's first vertex on.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("batch_mma"))?;
         Ok(())
     }
@@ -162,7 +163,10 @@ impl Trial for BatchMma {
     }
 }
 
-/// Refuses scenes that are not one shape, used by at most [`MOST`] domains.
+/// Checks that the scene is one shape used by at most [`MOST`] domains, without compensated sums and followers.
+///
+/// # Errors
+/// `Invalid` otherwise.
 fn check(scene: &Scene) -> Result<()> {
     let (count, shape) = (scene.domains.len(), scene.domains[0].shape);
     if count > MOST {
@@ -193,7 +197,7 @@ fn check_device(device: &Device) -> Result<()> {
     Err(Error::Unavailable { what: "a batch by tensor cores", reason, remedy: "Use a device of 8.0 or above".into() })
 }
 
-/// The fewest vectors that the kernel is compiled for and that are enough, and the macro that says so.
+/// The smallest compiled number of vectors that is enough, and the macro that selects it.
 const fn vectors_for(domains: usize) -> (usize, Option<&'static str>) {
     match domains {
         0..=8 => (8, Some("BATCH_8")),
@@ -202,7 +206,7 @@ const fn vectors_for(domains: usize) -> (usize, Option<&'static str>) {
     }
 }
 
-/// q of each domain in halves, times the factors of the modes.
+/// q of each domain, times the factors of the modes, split into pairs of 16-bit numbers.
 fn halves(scene: &Scene, state: &State, tiles: &Tiles) -> Vec<Halves> {
     let own = |domain: usize| {
         let amounts = state.q_of(scene, domain).iter().zip(tiles.factors()).map(|(q, factor)| q * factor);
@@ -211,8 +215,8 @@ fn halves(scene: &Scene, state: &State, tiles: &Tiles) -> Vec<Halves> {
     (0..scene.domains.len()).map(own).collect()
 }
 
-/// What each lane hands to the products of each step and eight vectors: [step][vectors / 8][lane][4] words; zeros where
-/// there is no domain or mode.
+/// The fragments of q as each lane reads them: [step][vectors / 8][lane][4] words; zeros where there is no domain or
+/// mode.
 fn fragments(halves: &[Halves], rank: usize, vectors: usize) -> Vec<u32> {
     let mut words = Vec::with_capacity(rank.div_ceil(STEP) * vectors * 16);
     for (step, eight) in (0..rank.div_ceil(STEP)).flat_map(|step| (0..vectors / 8).map(move |eight| (step, eight))) {
@@ -229,7 +233,7 @@ fn fragments(halves: &[Halves], rank: usize, vectors: usize) -> Vec<u32> {
     words
 }
 
-/// The transforms, then what takes back the scaling of q; zeros where there is no domain.
+/// The transforms, then the scales that undo the scaling of q; zeros where there is no domain.
 fn placements(state: &State, halves: &[Halves], vectors: usize) -> Vec<f32> {
     let mut numbers: Vec<f32> = bytemuck::cast_slice(&state.transforms).to_vec();
     numbers.resize(12 * vectors, 0.0);
@@ -238,7 +242,7 @@ fn placements(state: &State, halves: &[Halves], vectors: usize) -> Vec<f32> {
     numbers
 }
 
-/// The arguments without their addresses.
+/// The arguments with null addresses.
 fn args(scene: &Scene, chunks: usize) -> BatchMmaArgs {
     let slots = &scene.layout.slots;
     let mut args = BatchMmaArgs {
@@ -252,7 +256,7 @@ fn args(scene: &Scene, chunks: usize) -> BatchMmaArgs {
     args
 }
 
-/// What a launch must move, but for scales, which 16 bits do without.
+/// The minimum of bytes that a launch moves. The few scales are not counted, because 16-bit storage needs none.
 fn bytes(scene: &Scene, tiles: &Tiles) -> Vec<(&'static str, u64)> {
     let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
     vec![
@@ -324,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn every_number_of_every_domain_is_written_once_from_its_own_entries_and_halves() {
+    fn writes_each_position_once_from_its_own_inputs() {
         for storage in [Storage::F16, Storage::Bf16] {
             for (vertices, rank, domains) in SIZES.into_iter().chain([(70, 31, 32), (33, 40, 17)]) {
                 let (scene, state) = ensemble(vertices, rank, domains, storage);
@@ -348,7 +352,7 @@ mod tests {
         }
     }
 
-    /// x of a vertex in f64, with U as it is stored.
+    /// x of a vertex in f64, with U as stored.
     fn exactly(scene: &Scene, state: &State, tiles: &Tiles, (domain, vertex): (usize, usize)) -> [f64; 3] {
         let (rest, q) = (scene.shape_of(domain).mesh.rest()[vertex], state.q_of(scene, domain));
         let bent = [0, 1, 2].map(|axis| {
@@ -360,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn as_many_vectors_are_multiplied_as_are_needed_and_more_than_32_are_refused() {
+    fn pads_to_compiled_vector_counts_and_rejects_over_32() {
         let vectors: Vec<usize> = [1, 8, 9, 16, 17, 32].map(|domains| vectors_for(domains).0).into();
         assert_eq!(vectors, [8, 8, 16, 16, 32, 32]);
         let (scene, _) = ensemble(9, 2, 33, Storage::F16);

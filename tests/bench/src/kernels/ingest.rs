@@ -1,4 +1,4 @@
-//! The way in by itself: how long a step's header, transforms and q take from pinned memory to the device.
+//! Times the upload of a step's header, transforms and q from pinned memory to the device, without any kernel.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use modalcast_compute::gpu::work::Coordinates;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, State};
 
-/// The copy of whole steps.
+/// The upload of whole steps as a trial.
 struct Ingest(Inputs, RefCell<Pinned>);
 
 impl Trial for Ingest {
@@ -33,13 +33,13 @@ impl Trial for Ingest {
     }
 }
 
-/// Bytes of a whole step's values of a scene, and how long their copy takes, as a graph of it alone.
+/// Bytes of a whole step's values, and the time of their upload as a graph of its own.
 ///
 /// # Errors
-/// `Fault` when the device refuses; `Invalid` when `replays` is 0.
+/// `Fault` when the device fails; `Invalid` when `replays` is 0.
 pub fn ingest(device: &Device, scene: &Arc<Scene>, state: &State, replays: usize) -> Result<(u64, Timing)> {
     let coordinates = Coordinates::new(scene);
-    // Only the amount counts here: factors and tiles are left empty.
+    // Only the number of bytes matters here, so factors and tiles are empty.
     let factors = vec![Vec::new(); scene.shapes.len()];
     let packing = Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() };
     let mut inputs = Inputs::new(device, &Arc::new(packing))?;

@@ -1,4 +1,4 @@
-//! The stopwatch: how long a step's kernels take on the device, as replays of CUDA graphs between two events.
+//! Times a step's kernels on the device: replays of CUDA graphs, each between two events.
 
 use std::time::{Duration, Instant};
 
@@ -12,30 +12,30 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::memory::{address, room};
 use modalcast_model::error::{Error, Result, during, invalid};
 
-/// Replays that are put into the stream at once, behind a kernel that holds it up meanwhile: the host's own pace stays
-/// out of the times. The stream takes about a thousand entries before it blocks the host.
+/// Replays that are enqueued together, behind a kernel that blocks the stream meanwhile, so that the host's launch
+/// overhead does not affect the times. The stream takes about a thousand entries before it blocks the host.
 const BATCH: usize = 25;
 
-/// How long the stream is held up for each replay of a batch, microseconds: longer than the host needs for its calls.
+/// Microseconds for which the stream is blocked per replay of a batch: longer than the host needs for its calls.
 const HOLD_US: u64 = 40;
 
-/// The most turns that are rotated: enough that no replay finds the q of the one before.
+/// Upper limit of turns to rotate through: enough that no replay finds the q of the previous one in a cache.
 pub(super) const MOST_GRAPHS: usize = 8;
 
-/// How long a trial runs before it is timed, so that the clocks are up.
+/// Warm-up time before timing, so that the device reaches its clock rates.
 const WARM_UP: Duration = Duration::from_millis(30);
 
-/// The cold sweep reads a buffer so many times as large as the L2.
+/// Size of the buffer that the cold sweep reads, in multiples of the L2 size.
 const SWEEPS: u64 = 4;
 
-/// What lies in the L2 cache when a replay begins.
+/// State of the L2 cache when a replay begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Cache {
-    /// What the replay before it left there.
+    /// The previous replay's data.
     Warm,
-    /// Nothing of the trial's: a buffer several times the L2 was read in between, outside the timed span. It is read
-    /// rather than written, so that the trial does not pay for writing back what the sweep left.
+    /// No data of the trial: between replays, outside the timed span, a buffer several times the size of the L2 is
+    /// read. It is read rather than written, so that the trial does not pay for writing back dirty lines.
     Cold,
 }
 
@@ -50,10 +50,10 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// Median and quartiles of times in any order, interpolated between neighbours.
+    /// Median and quartiles of times in any order, with linear interpolation between neighbors.
     ///
     /// # Errors
-    /// `Invalid` when there is none.
+    /// `Invalid` when `times_us` is empty.
     pub fn of(mut times_us: Vec<f64>) -> Result<Self> {
         if times_us.is_empty() {
             return Err(invalid("replays", "at least 1", 0));
@@ -79,8 +79,8 @@ pub fn time(device: &Device, trial: &dyn Trial, cache: Cache, replays: usize) ->
     }
     let hold = Hold::new(device)?;
     let sweep = matches!(cache, Cache::Cold).then(|| Sweep::new(device)).transpose()?;
-    // A launch outside any graph comes first: code is loaded and workspaces are made at the first call, and neither is
-    // allowed in a capture.
+    // The first launch is outside of a graph: it loads code and allocates workspaces, neither of which a capture
+    // allows.
     trial.launch(device, 0)?;
     let turns = trial.turns().min(MOST_GRAPHS);
     let graphs = (0..turns).map(|turn| capture(device, trial, turn)).collect::<Result<Vec<_>>>()?;
@@ -107,10 +107,7 @@ pub fn time(device: &Device, trial: &dyn Trial, cache: Cache, replays: usize) ->
     Timing::of(times)
 }
 
-/// Times a graph that does nothing but one launch: what no step can be faster than.
-///
-/// # Errors
-/// As [`time`].
+/// Times a graph with one empty kernel: the lower limit of any step's time.
 pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
     struct Nothing(CudaFunction);
     impl Trial for Nothing {
@@ -136,14 +133,14 @@ pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
 
 const SINGLE: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
 
-/// A graph of one step.
+/// Captures one step as a graph.
 fn capture(device: &Device, trial: &dyn Trial, turn: usize) -> Result<CudaGraph> {
     let fail = during("capture");
     let stream = device.stream();
-    // Relaxed: libraries may ask the driver things in their calls that a stricter mode refuses.
+    // Relaxed, because libraries may query the driver in their calls, which the stricter modes refuse.
     stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
     let launched = trial.launch(device, turn);
-    // The capture ends whatever happened, or the stream would stay in it.
+    // End the capture even if the launch failed; otherwise the stream stays in capture mode.
     let graph = stream.end_capture(CUgraphInstantiate_flags(0));
     launched?;
     let nothing = || Error::Fault { stage: "capture", reason: format!("{} launches nothing", trial.name()) };
@@ -152,7 +149,7 @@ fn capture(device: &Device, trial: &dyn Trial, turn: usize) -> Result<CudaGraph>
     Ok(graph)
 }
 
-/// Two events of the device's stream.
+/// Two events on the device's stream that enclose some work.
 pub(super) struct Span {
     begin: CudaEvent,
     end: CudaEvent,
@@ -164,20 +161,20 @@ impl Span {
         Ok(Self { begin: event()?, end: event()? })
     }
 
-    /// Puts the events around what `work` starts.
+    /// Records the events before and after the work that `work` enqueues.
     pub(super) fn around(&self, device: &Device, work: impl FnOnce() -> Result<()>) -> Result<()> {
         self.begin.record(device.stream()).map_err(during("event"))?;
         work()?;
         self.end.record(device.stream()).map_err(during("event"))
     }
 
-    /// The time between them; waits for it.
+    /// Time between the two events, microseconds. Both must have completed.
     pub(super) fn microseconds(&self) -> Result<f64> {
         self.begin.elapsed_ms(&self.end).map(|ms| 1e3 * f64::from(ms)).map_err(during("event"))
     }
 }
 
-/// Holds the stream up for a given time.
+/// Blocks the stream for a given time.
 struct Hold(CudaFunction);
 
 impl Hold {
@@ -194,7 +191,7 @@ impl Hold {
     }
 }
 
-/// Fills the L2 with lines that nobody else uses.
+/// Evicts the L2 by reading a buffer that nothing else uses.
 struct Sweep {
     function: CudaFunction,
     buffer: CudaSlice<u8>,
@@ -214,13 +211,14 @@ impl Sweep {
     }
 
     fn launch(&self, device: &Device) -> Result<()> {
-        // Zeros never make the kernel write, so that it may be given its own input to write to.
+        // The kernel writes only if all bits that it read are ones. The buffer holds zeros, so input and output may be
+        // the same.
         let from = address(device, &self.buffer);
         roof::launch(device, &self.function, self.blocks, [from, from])
     }
 }
 
-/// Rate of `bytes` in a time, GB/s (1e9 bytes).
+/// Rate of `bytes` in `us` microseconds, GB/s (1e9 bytes).
 pub fn gigabytes_per_second(bytes: u64, us: f64) -> f64 {
     bytes as f64 / (1e3 * us)
 }
@@ -230,7 +228,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quartiles_are_those_of_the_sorted_times_whatever_their_order() {
+    fn quartiles_do_not_depend_on_input_order() {
         let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("times");
         assert_eq!(timing, Timing { median_us: 3.0, q1_us: 2.0, q3_us: 4.0, replays: 5 });
         let even = Timing::of(vec![4.0, 1.0, 2.0, 3.0]).expect("times");
@@ -241,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_is_bytes_by_time() {
+    fn rate_is_bytes_per_time() {
         assert_eq!(gigabytes_per_second(4_000_000_000, 1e6), 4.0);
         assert_eq!(gigabytes_per_second(4_000, 1.0), 4.0);
     }

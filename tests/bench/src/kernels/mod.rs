@@ -1,18 +1,18 @@
-//! What only measures: no server runs any of it. A `Trial` is one way to deform, timed as kernels alone and judged by
-//! its positions.
+//! Benchmark kernels and their launchers; the server uses none of them. A `Trial` is one way to deform: its kernels are
+//! timed without copies, and its positions are validated.
 //!
-//! | file | what |
+//! | file | contents |
 //! |---|---|
-//! | `trial` | what a trial is, and what the driver says of its kernels |
-//! | `turns` | values of several steps that lie on the device before the clock starts |
-//! | `measure` | the stopwatch |
-//! | `roof` | the best rates of the device, to compare with |
+//! | `trial` | the `Trial` trait, and the driver's facts about kernels |
+//! | `turns` | inputs of several steps, uploaded before timing starts |
+//! | `measure` | timing by CUDA graphs and events |
+//! | `roof` | the best memory rates of the device, for comparison |
 //! | `ours` | the deformer's own kernels as a trial |
-//! | `batch_mma` | many vectors q of one U at once by tensor cores, with an order and a rounding of its own |
-//! | `ingest` | the way of a step's values to the device |
-//! | `overlap` | steps that the host reads, one after the other and side by side |
-//! | `cublas`, [`plain_update`] | a library's products, and the vertex update behind them |
-//! | `raster` | the rasteriser on positions and samples of its own |
+//! | `batch_mma` | many vectors q of one U at once by tensor cores, with their own summation order and rounding |
+//! | `ingest` | host-to-device upload of a step's values |
+//! | `overlap` | steps with readback by the host, serial and overlapped |
+//! | `cublas`, [`plain_update`] | products by cuBLAS, and the vertex update that follows them |
+//! | `raster` | the CUDA rasterizer on its own positions and samples |
 //! | `thesis` | the kernels of the thesis |
 
 mod batch_mma;

@@ -1,4 +1,4 @@
-//! The deformer's own kernels as a trial: the same launchers and tables, on values that lie on the device already.
+//! The deformer's own kernels as a trial: the same launchers and tables, on values that are uploaded beforehand.
 
 use std::sync::Arc;
 
@@ -21,15 +21,15 @@ use modalcast_compute::storage::modes_per_chunk;
 use modalcast_model::error::{Result, during, invalid};
 use modalcast_model::scene::{Scene, State};
 
-/// Which part of a step is launched.
+/// The part of a step to launch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Extent {
-    /// u = U q alone, of scenes without batches. For the judge, x = T (x0 + u) follows on the host, in f64.
+    /// u = U q alone, for scenes without batches. For validation, the host computes x = T (x0 + u) in f64.
     Uq,
-    /// Positions, and a box of each warp's.
+    /// Positions, and a bounding box per warp.
     Positions,
-    /// Positions, the bounds of all, normals, and tangents where the scene has normal maps.
+    /// Positions, the bounds of all vertices, normals, and tangents where the scene has normal maps.
     Whole,
 }
 
@@ -43,7 +43,7 @@ impl Extent {
     }
 }
 
-/// The deformer `cuda` over a scene, for several steps.
+/// The `cuda` deformer of a scene, with the inputs of several steps.
 #[derive(Debug)]
 pub struct Ours {
     name: String,
@@ -57,7 +57,7 @@ pub struct Ours {
     outputs: CudaSlice<u8>,
     turns: Turns,
     plan: Plan,
-    /// Vertices and coordinates that are computed, and what is read for them.
+    /// Vertices and coordinates that a step computes, and the data that it reads.
     counts: Counts,
 }
 
@@ -72,18 +72,20 @@ struct Counts {
 }
 
 impl Ours {
-    /// Packs the scene and the values of each state onto the device.
+    /// Packs and uploads the scene and the values of each state.
     ///
     /// # Errors
-    /// `Invalid` when there is no state, or u alone is asked of a scene with batches; `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
+    /// `Invalid` when there is no state, or [`Extent::Uq`] is requested for a scene with batches; `Unavailable` when
+    /// NVRTC is missing; `Fault` when the device fails.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], extent: Extent) -> Result<Self> {
         Self::of_changed(device, scene, states, (extent, None))
     }
 
-    /// The same, with all domains but these passed over as unchanged: they show what [`Trial::complete`] computed.
+    /// The same, for steps that change only the listed domains. The other domains keep the positions that
+    /// [`Trial::complete`] computed.
     ///
     /// # Errors
-    /// As [`Self::new`], and `Invalid` when the list is longer than a list of changes may be.
+    /// Those of [`Self::new`], and `Invalid` when the list of changes is too long for a partial step.
     pub fn of_changed(
         device: &Device,
         scene: &Arc<Scene>,
@@ -130,7 +132,7 @@ impl Ours {
         Ok(ours)
     }
 
-    /// Makes the values of each turn those of a step that changed these domains.
+    /// Turns the inputs of each turn into those of a step that changed these domains.
     fn apply(&mut self, device: &Device, states: &[State], changed: &[u32]) -> Result<()> {
         let allowed = "a quarter of the domains at most, no truncation, and less work than a whole step";
         let too_many = || invalid("changed", allowed, changed.len());
@@ -158,13 +160,14 @@ impl Ours {
             positions: begin,
             normals: begin + positions,
             tangents: begin + positions + normals,
-            // Alone, u lies where positions would.
+            // With u alone, u takes the place of the positions.
             displacements: if self.extent == Extent::Uq { begin } else { begin + positions + normals + tangents },
             ..Header::default()
         }
     }
 
-    /// Of the chunks of modes of all domains that have any, those that are summed, mean over the turns that are timed.
+    /// Fraction of the chunks of modes that are summed, weighted by vertices, as a mean over the timed turns; `None`
+    /// without truncation.
     fn kept(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
         let weigh = |chunks: &dyn Fn(usize) -> usize| -> f64 {
@@ -185,7 +188,7 @@ impl Ours {
     }
 }
 
-/// Removes the defines of features that this part of a step does not compute.
+/// Removes the macros of features that this part of a step does not compute.
 fn leave_out(kernel: &mut Kernel, extent: Extent) {
     if extent != Extent::Whole {
         kernel.defines.retain(|define| !["ORIENT", "SHIFTED", "NORMAL_MAPS", "SHEAR"].contains(define));
@@ -202,7 +205,7 @@ fn send(device: &Device, (inputs, pinned): (&mut Inputs, &mut Pinned), header: &
     device.stream().synchronize().map_err(during("upload"))
 }
 
-/// Bytes of positions, normals, tangents and displacements, each filled up so that the next begins where a float4 may.
+/// Bytes of positions, normals, tangents and displacements, each rounded up to the alignment of a float4.
 fn outputs_of(plan: &Plan) -> [u64; 4] {
     [Role::Positions, Role::Normals, Role::Tangents, Role::Displacements]
         .map(|role| plan.bytes(role).next_multiple_of(16))
@@ -210,7 +213,7 @@ fn outputs_of(plan: &Plan) -> [u64; 4] {
 
 fn counts(scene: &Scene, plan: &Plan, changed: Option<&[u32]>) -> Counts {
     let slots = &scene.layout.slots;
-    // With followers every domain reads whom it follows, and its own T or frame.
+    // With followers every domain reads the index of its mover in addition to its own T or frame.
     let transform = if scene.needs.followers { 56 } else { 48 };
     match changed {
         None => Counts {

@@ -1,8 +1,8 @@
-//! Figure 3.1 of the thesis, measured: steps whose vertices the host reads, one thing after the other and side by side.
+//! Measures figure 3.1 of the thesis: steps with readback of the vertices, serial and overlapped.
 //!
 //! ```text
 //! serial:      write k, [copy in][kernels], [copy out], write k+1, ...
-//! overlapped:  while the device computes k+1, the host writes k+2 and k is on its way out
+//! overlapped:  while the device computes k+1, the host writes k+2 and k is copied out
 //! ```
 
 use std::collections::VecDeque;
@@ -24,46 +24,47 @@ use modalcast_model::deform::{Deformer as _, Surface, Wanted};
 use modalcast_model::error::{Result, during, invalid};
 use modalcast_model::scene::{Scene, State};
 
-/// Times that each way runs through all steps; they take turns, and medians count.
+/// Rounds over all steps per method. The methods alternate; the median over the rounds is reported.
 const ROUNDS: usize = 5;
 
-/// Times of one step, microseconds, and what they are made of.
+/// Times of one step and of its parts, microseconds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Overlap {
-    /// Steps of a round.
+    /// Steps per round.
     pub steps: usize,
-    /// Threads that write.
+    /// Threads that write the inputs.
     pub cores: usize,
     pub bytes_in: u64,
-    /// Positions and normals.
+    /// Bytes of positions and normals.
     pub bytes_out: u64,
-    /// The host writes a step's values to pinned memory: on one core, and as the deformer does it.
+    /// Host write of a step's values to pinned memory on one core.
     pub write_one_core_us: f64,
+    /// The same write as the deformer does it, on several cores where that is faster.
     pub write_us: f64,
-    /// The device copies them in, computes, and copies the bounds out.
+    /// Device graph: upload, kernels, and readback of the bounds.
     pub graph_us: f64,
-    /// The vertices' way to the host.
+    /// Readback of the vertices.
     pub copy_out_us: f64,
-    /// A whole step that nobody reads.
+    /// A whole step without readback of the vertices.
     pub step_us: f64,
-    /// Every step is read before the next is written.
+    /// Every step is read back before the next is written.
     pub serial_us: f64,
-    /// Every step is fetched, and waited for behind the next, as the server does it.
+    /// The readback of every step is started at once and awaited after the next step, as the server does.
     pub fetched_us: f64,
-    /// Two steps are under way, so that the host writes too while the device works.
+    /// Two steps are in flight, so that the host also writes while the device works.
     pub overlapped_us: f64,
-    /// `serial_us` by `overlapped_us`.
+    /// `serial_us` divided by `overlapped_us`.
     pub gain: f64,
-    /// The longest of the three that run side by side: writing, the graph, and the way out.
+    /// Lower limit of an overlapped step: the longest of host write, graph and readback.
     pub ideal_us: f64,
-    /// Steps of the overlapped way whose vertices differ in a bit from those of the serial way: none, or it is wrong.
+    /// Steps of the fetched and overlapped methods whose vertices differ from the serial ones in any bit; must be 0.
     pub differing: usize,
 }
 
-/// Measures a scene over states in rotation.
+/// Measures a scene over rotating states.
 ///
 /// # Errors
-/// `Invalid` without states or steps; those of making a deformer; `Fault` when the device fails.
+/// `Invalid` without states or steps; errors of creating a deformer; `Fault` when the device fails.
 pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<Overlap> {
     if states.is_empty() || steps == 0 {
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
@@ -153,7 +154,7 @@ fn overlapped(deformer: &mut CudaDeformer, states: &[State], steps: usize, read:
     Ok(())
 }
 
-/// Steps whose vertices the other two ways get differently.
+/// Counts steps of the other two methods whose vertices differ from the serial ones.
 fn differing(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<usize> {
     let mut want = Vec::new();
     serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
@@ -175,7 +176,7 @@ fn same_bits(one: &Surface, other: &Surface) -> bool {
     same(&one.positions, &other.positions) && same(&one.normals, &other.normals)
 }
 
-/// A step that nobody reads, and the way out by itself.
+/// Median times of a step without readback, and of the readback alone.
 fn alone(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<[f64; 2]> {
     let [mut whole, mut out] = [Vec::new(), Vec::new()];
     for step in 0..steps {
@@ -190,9 +191,9 @@ fn alone(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<
     Ok([whole, out].map(median))
 }
 
-/// Bytes of a step's values, and the times of writing them on one core and on all.
+/// Bytes of a step's values, and median times of writing them on one core and on all.
 fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<(u64, [f64; 2])> {
-    // Only the amount counts here: factors and tiles are left empty.
+    // Only the number of bytes matters here, so factors and tiles are empty.
     let (coordinates, factors) = (Coordinates::new(scene), vec![Vec::new(); scene.shapes.len()]);
     let packing = Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() };
     let packing = Arc::new(packing);
@@ -213,7 +214,7 @@ fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -
     Ok((bytes, [one.install(&mut run), run()]))
 }
 
-/// The last step's graph by itself, between two events.
+/// Median time of the last step's graph alone, between two events.
 fn graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
     let mut times = Vec::with_capacity(steps);
     for _ in 0..steps {
@@ -232,20 +233,20 @@ fn median(times: Vec<f64>) -> f64 {
     Timing::of(times).map_or(f64::NAN, |timing| timing.median_us)
 }
 
-/// Copying so many bytes to pinned, write-combined memory, microseconds.
+/// Times of copying `bytes` to pinned, write-combined memory, microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct HostWrite {
     pub bytes: u64,
     pub one_core_us: f64,
     pub all_cores_us: f64,
-    /// Whether steps of this size are written on all cores.
+    /// Whether the deformer writes steps of this size on all cores.
     pub on_all_cores: bool,
 }
 
-/// Where several cores begin to pay: powers of two from 64 KiB to 64 MiB.
+/// Copy times for powers of two from 64 KiB to 64 MiB; they show from which size several cores are faster.
 ///
 /// # Errors
-/// `Invalid` when `replays` is 0; `Fault` when the driver gives no memory.
+/// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.
 pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
     const LARGEST: usize = 64 << 20;
     // SAFETY: the memory is only written here.

@@ -1,4 +1,4 @@
-//! Launches `kernels/plain_update.cu`: x = T (x0 + u) after a product that a library computed. Only trials use it.
+//! Launches `kernels/plain_update.cu`: x = T (x0 + u) after a library computed u. Only benchmarks use it.
 
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
@@ -17,10 +17,10 @@ pub(super) const CODE: Code = Code {
 
 const BLOCK: u32 = 256;
 
-/// `first_u` of a domain that has no u.
+/// Value of `first_u` for a domain without modes.
 const RIGID: u64 = u64::MAX;
 
-/// Where a domain's u and vertices lie.
+/// First float of a domain's u and its first packed vertex.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 struct PlainSlot {
@@ -49,7 +49,7 @@ const _: () = assert!(size_of::<PlainArgs>() == 56, "PlainArgs differs from kern
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for PlainArgs {}
 
-/// The kernel, what it reads of a scene and what it writes.
+/// The kernel with its inputs and outputs.
 #[derive(Debug)]
 pub(super) struct PlainUpdate {
     compiled: Compiled,
@@ -63,7 +63,7 @@ pub(super) struct PlainUpdate {
 }
 
 impl PlainUpdate {
-    /// `first_u` is the first float of each domain's u; only domains with modes have one.
+    /// `first_u` holds the first float of each domain's u; `None` for domains without modes.
     pub(super) fn new(device: &Device, scene: &Scene, first_u: &[Option<u64>]) -> Result<Self> {
         let (single, vertices) = (scene.domains.len() == 1, scene.layout.vertices);
         let defines: &[&str] = if single { &["SINGLE"] } else { &[] };
@@ -93,8 +93,8 @@ impl PlainUpdate {
         let blocks = args.vertices.div_ceil(BLOCK);
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
         let mut launch = device.stream().launch_builder(&self.compiled.function);
-        // SAFETY: `PlainArgs` is the kernel's only argument. Its tables are of one scene, and the caller placed three
-        // floats of u for each vertex of a domain that has a first one.
+        // SAFETY: `PlainArgs` is the kernel's only argument. Its tables belong to one scene, and the caller provides
+        // three floats of u for each vertex of a domain that has a `first_u`.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("plain_update"))?;
         Ok(())
     }
@@ -148,7 +148,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
-    /// `plain_update` of one vertex.
+    /// CPU twin of `plain_update`, for one vertex.
     fn twin_of_plain_update(tables: (&[PlainSlot], &[u32], &[f32]), t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
         let (slots, domains, rest) = tables;
         let domain = domains[vertex] as usize;
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn the_twin_puts_every_vertex_at_t_of_x0_plus_u_wherever_its_u_lies() {
+    fn twin_computes_positions_wherever_u_is_stored() {
         let (scene, state) = scene_and_state(&[(5, 2, 1), (9, 0, 2), (40, 7, 30)]);
         let first_u = [Some(200), None, Some(3)];
         let mut u = vec![f32::NAN; 215];

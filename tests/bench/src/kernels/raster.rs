@@ -1,4 +1,5 @@
-//! The rasteriser as a trial: positions and samples of its own on the device, to be timed without OpenGL and read back.
+//! The CUDA rasterizer as a trial: it has its own positions and samples on the device, so that it can be timed without
+//! OpenGL and read back.
 
 use cudarc::driver::CudaSlice;
 
@@ -10,36 +11,39 @@ use modalcast_model::error::Result;
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{Group, Window};
 
-/// What is drawn.
+/// The mesh to draw.
 #[derive(Debug, Clone, Copy)]
 pub struct RasterMesh<'a> {
-    /// World or relative positions, three numbers a vertex.
+    /// World or camera-relative positions, three f32 per vertex.
     pub positions: &'a [f32],
-    /// Vertices; a triangle's id is its place here.
+    /// Vertex indices; a triangle's id is its index here.
     pub triangles: &'a [[u32; 3]],
     pub groups: &'a [Group],
     pub cut_outs: Option<&'a CutOuts>,
 }
 
-/// Triangles by what became of them.
+/// Triangle counts by outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterCounts {
-    /// Drawn by a thread, a warp, or tile by tile.
+    /// Drawn by one thread.
     pub small: u32,
+    /// Drawn by one warp.
     pub medium: u32,
+    /// Drawn tile by tile.
     pub large: u32,
-    /// A corner is not finite in clip space.
+    /// Skipped: a corner is not finite in clip space.
     pub not_finite: u32,
-    /// Beyond a plane of the view.
+    /// Skipped: outside of a plane of the view frustum.
     pub outside: u32,
-    /// Without area at 1/256 pixel.
+    /// Skipped: no area at a resolution of 1/256 pixel.
     pub flat: u32,
+    /// Skipped: back face.
     pub back: u32,
-    /// Between the samples.
+    /// Skipped: no sample is covered.
     pub missed: u32,
 }
 
-/// A mesh and a window on the device, and the kernels that draw one in the other.
+/// A mesh and a window on the device, and the kernels that draw the mesh into the window.
 #[derive(Debug)]
 pub struct Raster {
     form: RasterForm,
@@ -54,11 +58,11 @@ pub struct Raster {
 }
 
 impl Raster {
-    /// Compiles the kernels and puts the mesh onto the device.
+    /// Compiles the kernels and uploads the mesh.
     ///
     /// # Errors
-    /// `Invalid` when there are 2^24 triangles or more, one names no vertex, or a group no triangle; `Unavailable` when
-    /// NVRTC is missing; `Fault` when the device refuses.
+    /// `Invalid` when there are 2^24 triangles or more, a triangle refers to no vertex, or a group to no triangle;
+    /// `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn new(device: &Device, mesh: RasterMesh<'_>, window: Window, form: RasterForm) -> Result<Self> {
         check(mesh.positions.len() as u64 / 3, mesh.triangles, mesh.groups)?;
         if let Some(cut_outs) = mesh.cut_outs {
@@ -81,30 +85,30 @@ impl Raster {
         })
     }
 
-    /// What the last launch left in each sample, row by row from the top: the bits of its depth, then the triangle; all
-    /// ones where there is nothing. Empty where depth is alone.
+    /// The samples of the last launch, row by row from the top: the bits of the depth, then the triangle; all ones
+    /// where nothing was drawn. Empty for depth-only targets.
     ///
     /// # Errors
     /// `Fault` when the device fails.
     pub fn keys(&self, device: &Device) -> Result<Vec<u64>> {
         let mut keys = vec![0; if self.form.depth_only { 0 } else { self.window.pixels() }];
-        // SAFETY: the buffer has a key for each sample when depth is not alone.
+        // SAFETY: the buffer has a key for each sample unless the target is depth-only.
         unsafe { download(device, address(device, &self.target), &mut keys) }?;
         Ok(keys)
     }
 
-    /// The depth of each sample where depth is alone, else nothing; 1 where there is nothing.
+    /// The depth of each sample of a depth-only target, 1 where nothing was drawn; otherwise empty.
     ///
     /// # Errors
     /// `Fault` when the device fails.
     pub fn depths(&self, device: &Device) -> Result<Vec<f32>> {
         let mut depths = vec![0.0; if self.form.depth_only { self.window.pixels() } else { 0 }];
-        // SAFETY: the buffer has a depth for each sample when depth is alone.
+        // SAFETY: the buffer has a depth for each sample when the target is depth-only.
         unsafe { download(device, address(device, &self.target), &mut depths) }?;
         Ok(depths)
     }
 
-    /// What became of the triangles of the last launch; zeros unless they were counted.
+    /// Triangle counts of the last launch; zeros unless counting is enabled.
     ///
     /// # Errors
     /// `Fault` when the device fails.

@@ -1,6 +1,7 @@
-//! Launches `kernels/roof.cu`: how fast the device's memory can be copied and read, and how fast the host reaches it.
+//! Launches `kernels/roof.cu`: measures copy and read rates of device memory and the transfer rates between host and
+//! device.
 //!
-//! A rate of a deformer means something only beside the best rate of the same run.
+//! The rate of a deformer is only meaningful relative to the best rate of the same run.
 
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PinnedHostSlice, PushKernelArg as _, result};
 use serde::Serialize;
@@ -11,20 +12,20 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::memory::{address, download, room};
 use modalcast_model::error::{Error, Result, during};
 
-/// Threads of a block, and bytes of a word.
+/// Threads per block, and bytes per word.
 const BLOCK: u64 = 256;
 const WORD: u64 = 16;
 
-/// The largest buffer of `copy` and `read`.
+/// Largest buffer of `copy` and `read`, bytes.
 const LARGEST: u64 = 4 << 30;
 
-/// Bytes of a pinned copy, and how many are timed.
+/// Bytes of a pinned copy, and the number of timed copies.
 const PINNED: usize = 64 << 20;
 const PINNED_COPIES: usize = 15;
 
 const REPLAYS: usize = 20;
 
-/// Macros of the `read` that clears the L2; it leaves its lines there, so it does not stream.
+/// Macros of the `read` that evicts the L2. It must leave its lines in the cache, so it does not use streaming loads.
 pub(super) const SWEEP: &[&str] = &["LOADS=8"];
 pub(super) const SWEEP_LOADS: u64 = 8;
 
@@ -46,24 +47,24 @@ pub(super) const CODE: Code = Code {
     ],
 };
 
-/// What the device's memory can do, measured.
+/// Measured memory rates of the device.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Roofs {
-    /// The best copy kernel, GB/s (1e9 bytes) read plus written.
+    /// Best copy kernel, GB/s (1e9 bytes), read plus written.
     pub copy_gbs: f64,
-    /// The best pure read.
+    /// Best pure read, GB/s.
     pub read_gbs: f64,
     /// A replay of a graph with one empty kernel, microseconds.
     pub empty_us: f64,
-    /// Copies from pinned host memory to the device and back, 64 MiB each.
+    /// Copies from pinned host memory to the device, 64 MiB each, GB/s.
     pub pinned_h2d_gbs: f64,
     pub pinned_d2h_gbs: f64,
 }
 
-/// Measures the roofs of a device. `copy` and `read` go over 4 GiB, or an eighth of the free memory if that is less.
+/// Measures the rates of a device. `copy` and `read` process 4 GiB, or an eighth of the free memory if that is less.
 ///
 /// # Errors
-/// `Unavailable` when NVRTC is missing; `Fault` when the device fails or a copy copied nothing.
+/// `Unavailable` when NVRTC is missing; `Fault` when the device fails or a copy did not copy.
 pub fn roofs(device: &Device) -> Result<Roofs> {
     let (free, _) = device.memory()?;
     let unit = tile(16);
@@ -93,10 +94,10 @@ pub(super) const fn tile(loads: u64) -> u64 {
     BLOCK * loads * WORD
 }
 
-/// Starts `copy` or `read` on two addresses.
+/// Launches `copy` or `read` on two addresses.
 pub(super) fn launch(device: &Device, function: &CudaFunction, blocks: u32, buffers: [u64; 2]) -> Result<()> {
     let mut launch = device.stream().launch_builder(function);
-    // SAFETY: the kernel's arguments are two addresses; both callers give buffers of `blocks` tiles.
+    // SAFETY: the kernel's arguments are two addresses; both callers pass buffers of `blocks` tiles.
     unsafe { launch.arg(&buffers[0]).arg(&buffers[1]).launch(config(blocks)) }.map_err(during("roof"))?;
     Ok(())
 }
@@ -105,20 +106,20 @@ fn config(blocks: u32) -> LaunchConfig {
     LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 }
 }
 
-/// Loads of a thread, and the macros, of all that are tried.
+/// Loads per thread and macros of all variants to try.
 fn variants() -> impl Iterator<Item = (u64, &'static [&'static str])> {
     let loads = |defines: &[&str]| defines.first()?.strip_prefix("LOADS=")?.parse().ok();
     CODE.variants.iter().filter_map(move |defines| Some((loads(defines)?, *defines)))
 }
 
-/// A buffer of numbers that look random: memory that holds zeros may be faster than memory in use.
+/// A buffer of pseudo-random numbers, because memory that holds zeros may be faster than memory in use.
 fn filled(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
     let buffer = room(device, bytes)?;
     let function = device.function("fill", CODE.source, &[])?;
     let (to, words) = (address(device, &buffer), bytes / 4);
     let mut launch = device.stream().launch_builder(&function);
     let config = config(words.div_ceil(BLOCK) as u32);
-    // SAFETY: the kernel's arguments are an address and how many words lie there.
+    // SAFETY: the kernel's arguments are the address of `buffer` and its number of words.
     unsafe { launch.arg(&to).arg(&words).launch(config) }.map_err(during("roof"))?;
     Ok(buffer)
 }
@@ -147,7 +148,7 @@ impl Stream {
         })
     }
 
-    /// Copies once and looks at both ends: a copy that did nothing would be fast.
+    /// Copies once and compares both ends, because a copy that does nothing would be fast.
     fn check(&self, device: &Device, from: &CudaSlice<u8>, to: &CudaSlice<u8>) -> Result<()> {
         const END: usize = 4096;
         let (last, fail) = (to.len() - END, during("roof"));
@@ -190,7 +191,7 @@ impl Trial for Stream {
     }
 }
 
-/// Rates of pinned copies to the device and from it, GB/s.
+/// Rates of pinned copies to and from the device, GB/s.
 fn pinned(device: &Device) -> Result<(f64, f64)> {
     let fail = during("pinned copy");
     // SAFETY: every byte is written just below before anything reads it.
@@ -202,7 +203,7 @@ fn pinned(device: &Device) -> Result<(f64, f64)> {
     let (there, stream) = (address(device, &buffer), device.stream().cu_stream());
     let mut rate = |copy: &mut dyn FnMut(&mut [u8]) -> Result<()>| -> Result<f64> {
         let mut times = Vec::with_capacity(PINNED_COPIES);
-        // The first shows how cold everything was; it does not count.
+        // The first copy is a warm-up and does not count.
         for count in 0..=PINNED_COPIES {
             let span = Span::new(device)?;
             span.around(device, || copy(host))?;
@@ -213,7 +214,8 @@ fn pinned(device: &Device) -> Result<(f64, f64)> {
         }
         Ok(gigabytes_per_second(PINNED as u64, Timing::of(times)?.median_us))
     };
-    // SAFETY: both sides have the bytes of `host`; each copy is waited for before the next, and before either goes away.
+    // SAFETY: both sides have the bytes of `host`. Reading the span waits for each copy, before the next one and before
+    // either side is dropped.
     let to = rate(&mut |host| unsafe { result::memcpy_htod_async(there, host, stream) }.map_err(&fail))?;
     // SAFETY: as above.
     let from = rate(&mut |host| unsafe { result::memcpy_dtoh_async(host, there, stream) }.map_err(&fail))?;
@@ -231,7 +233,7 @@ mod tests {
         threads.flat_map(|first| (0..loads).map(move |index| first + index * BLOCK)).collect()
     }
 
-    /// `fill`, word by word.
+    /// CPU twin of `fill`, for one word.
     fn twin_of_fill(index: u32) -> u32 {
         let mut key = index ^ index >> 16;
         key = key.wrapping_mul(0x85eb_ca6b);
@@ -241,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn every_word_is_copied_once_whatever_the_loads_of_a_thread() {
+    fn copies_every_word_once_for_any_loads_per_thread() {
         let loads: Vec<u64> = variants().map(|(loads, _)| loads).collect();
         assert!(loads.len() >= 6, "{loads:?}");
         for loads in loads {
@@ -253,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn filled_words_differ_and_never_make_a_read_write() {
+    fn filled_words_differ_and_never_trigger_the_write_of_read() {
         let words: std::collections::BTreeSet<u32> = (0..4096).map(twin_of_fill).collect();
         assert!(words.len() > 4090);
         assert!(words.iter().all(|word| *word != u32::MAX));

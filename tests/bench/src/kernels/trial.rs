@@ -1,4 +1,4 @@
-//! Ways to deform that can be measured: a step of theirs is kernels alone, on coordinates that lie on the device already.
+//! The interface of benchmark kernels: a step consists of kernels alone, on inputs that are uploaded beforehand.
 
 use cudarc::driver::CudaFunction;
 use serde::Serialize;
@@ -6,30 +6,30 @@ use serde::Serialize;
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::{Result, during};
 
-/// One way to deform on the device, prepared for measuring: the coordinates of several turns lie on the device.
+/// One way to deform on the device, with the inputs of several turns uploaded.
 pub trait Trial {
-    /// The name that reports give it.
+    /// Name in reports.
     fn name(&self) -> String;
 
-    /// How many different q are prepared, at least 1; a turn is taken modulo this.
+    /// Number of prepared turns (different q), at least 1. [`Self::launch`] takes a turn modulo this number.
     fn turns(&self) -> usize;
 
-    /// Starts one step's kernels on the device's stream: no copies and no waiting, so that a graph can capture it.
+    /// Enqueues one step's kernels on the device's stream, without copies or waiting, so that a graph can capture it.
     ///
     /// # Errors
-    /// `Fault` when the device refuses.
+    /// `Fault` when the device fails.
     fn launch(&self, device: &Device, turn: usize) -> Result<()>;
 
-    /// Brings up to date what a launch of this turn passes over; for the judge, before the launch.
+    /// Computes the domains that a launch of this turn skips. Validation calls it before the launch.
     ///
     /// # Errors
-    /// `Fault` when the device refuses.
+    /// `Fault` when the device fails.
     fn complete(&self, _device: &Device, _turn: usize) -> Result<()> {
         Ok(())
     }
 
-    /// World positions of the last launch, 3 f32 per vertex, packed as the scene's layout says, for the judge. Empty
-    /// when the trial deforms nothing.
+    /// World positions of the last launch for validation, three f32 per vertex, packed as in the scene's layout. Empty
+    /// when the trial does not deform.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -37,38 +37,38 @@ pub trait Trial {
         Ok(Vec::new())
     }
 
-    /// What one step must move, as (what, bytes); the sum is the numerator of a rate.
+    /// Bytes that one step must move, as (part, bytes). The sum is the numerator of a rate.
     fn bytes(&self) -> Vec<(&'static str, u64)> {
         Vec::new()
     }
 
-    /// Kernel launches of one step.
+    /// Kernel launches per step.
     fn launches(&self) -> usize;
 
-    /// What the driver says of each kernel; empty where the kernels are a library's.
+    /// The driver's facts about each kernel; empty for a library's kernels.
     fn kernels(&self) -> Vec<KernelFacts> {
         Vec::new()
     }
 }
 
-/// What the driver says of a loaded kernel (cuFuncGetAttribute).
+/// Facts about a loaded kernel from the driver (cuFuncGetAttribute).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct KernelFacts {
-    /// The kernel's name and the macros that it was compiled with.
+    /// The kernel's name and its macros.
     pub name: String,
-    /// Registers of a thread.
+    /// Registers per thread.
     pub registers: u32,
-    /// Bytes of local memory of a thread: what did not fit into registers, and arrays that are indexed at run time.
+    /// Bytes of local memory per thread: register spills, and arrays that are indexed at run time.
     pub spilled_bytes: u32,
-    /// Static shared memory of a block, bytes.
+    /// Static shared memory per block, bytes.
     pub shared_bytes: u32,
 }
 
 impl KernelFacts {
-    /// Asks the driver.
+    /// Queries the driver.
     ///
     /// # Errors
-    /// `Fault` when the driver reports one.
+    /// `Fault` when the driver reports an error.
     pub(super) fn of(name: &str, function: &CudaFunction) -> Result<Self> {
         let fail = during("kernel facts");
         let number = |value: i32| u32::try_from(value).unwrap_or(0);
@@ -81,13 +81,13 @@ impl KernelFacts {
     }
 }
 
-/// A kernel file that only trials use.
+/// A kernel source file that only benchmarks use.
 #[derive(Debug)]
 pub(super) struct Code {
     pub source: &'static str,
-    /// The functions in it; [`Compiled`] is the first.
+    /// Its functions; [`Compiled`] compiles the first one.
     pub functions: &'static [&'static str],
-    /// The lists of macros that it is ever compiled with.
+    /// All lists of macros that it is compiled with.
     pub variants: &'static [&'static [&'static str]],
 }
 
@@ -99,7 +99,7 @@ pub(super) struct Compiled {
 }
 
 impl Compiled {
-    /// Compiles the first function of a file with one of its lists of macros.
+    /// Compiles the first function of a file with one list of macros.
     pub(super) fn new(device: &Device, code: &Code, defines: &[&str]) -> Result<Self> {
         let function = code.functions[0];
         let compiled = device.function(function, code.source, defines)?;
@@ -113,14 +113,14 @@ pub(super) mod tests {
     use super::*;
     use modalcast_compute::testing::assert_compiles;
 
-    /// Compiles every function with every list of macros; nothing may spill.
+    /// Compiles every function with every list of macros; fails if a kernel spills registers.
     pub(in super::super) fn compile_all(code: &Code) {
         assert_compiles(code.source, code.functions, code.variants);
     }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_a_kernel_that_does_not_compile_fails_the_check() {
+    fn nvrtc_broken_kernel_fails_the_check() {
         let broken =
             Code { source: "extern \"C\" __global__ void f() { wrong; }", functions: &["f"], variants: &[&[]] };
         assert!(std::panic::catch_unwind(|| compile_all(&broken)).is_err());

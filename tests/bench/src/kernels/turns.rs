@@ -1,4 +1,4 @@
-//! What the trials share: the values of several steps on the device, and the end of a deformation on the host.
+//! Parts that the trials share: inputs of several steps on the device, and the rest of a deformation on the host.
 
 use std::cell::Cell;
 use std::sync::Arc;
@@ -12,13 +12,13 @@ use modalcast_compute::gpu::memory::{address, upload};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, State};
 
-/// Which part of a step a trial launches.
+/// The part of a step that a trial launches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Part {
-    /// u = U q alone. For the judge, x = T (x0 + u) follows on the host, in f64.
+    /// u = U q alone. For validation, the host computes x = T (x0 + u) in f64.
     Uq,
-    /// The vertex update too.
+    /// u = U q and the vertex update.
     Whole,
 }
 
@@ -32,33 +32,33 @@ impl Part {
     }
 }
 
-/// The fewest vertices that a core places on the host at a time.
+/// Minimum of vertices per parallel task on the host.
 const SHARE: usize = 4096;
 
-/// The values of one turn, as addresses on the device.
+/// Device addresses of the inputs of one turn.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Values {
     pub q: u64,
     pub transforms: u64,
 }
 
-/// The values of several steps of a scene, on the device and on the host.
+/// The inputs of several steps (turns) of a scene, on the device and on the host.
 #[derive(Debug)]
 pub(super) struct Turns {
     scene: Arc<Scene>,
     states: Vec<State>,
     q: CudaSlice<u8>,
     transforms: CudaSlice<u8>,
-    /// Bytes from one turn to the next: of q and of the transforms.
+    /// Bytes from one turn to the next, of q and of the transforms.
     strides: [u64; 2],
     last: Cell<usize>,
 }
 
 impl Turns {
-    /// Uploads q and transforms of each state as `pack` lays them out; each must give all states the same length.
+    /// Uploads q and transforms of each state as packed by `pack`, which must return equal lengths for all states.
     ///
     /// # Errors
-    /// `Invalid` when there is no state or one is not of this scene; `Fault` when the device refuses.
+    /// `Invalid` when there is no state or a state does not fit the scene; `Fault` when the device fails.
     pub(super) fn new(
         device: &Device,
         scene: &Arc<Scene>,
@@ -81,7 +81,7 @@ impl Turns {
             let packed = pack(state);
             for (all, one) in [&mut q, &mut transforms].into_iter().zip(packed) {
                 all.extend_from_slice(&one);
-                // Turns begin where a float4 may.
+                // Turns are aligned to float4.
                 all.resize(all.len().next_multiple_of(4), 0.0);
             }
         }
@@ -95,7 +95,7 @@ impl Turns {
         self.states.len()
     }
 
-    /// The values of a turn, which is remembered as the last.
+    /// The inputs of a turn. Records it as the last turn.
     pub(super) fn start(&self, device: &Device, turn: usize) -> Values {
         let turn = turn % self.states.len();
         self.last.set(turn);
@@ -103,7 +103,8 @@ impl Turns {
         Values { q: address(device, &self.q) + q, transforms: address(device, &self.transforms) + transforms }
     }
 
-    /// x = T (x0 + u) of the last turn, in f64 and rounded once, so that the error of u alone is left.
+    /// x = T (x0 + u) of the last turn, in f64 and rounded once, so that only the error of u remains. Three f32 per
+    /// vertex.
     pub(super) fn finish_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
         let state = &self.states[self.last.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);

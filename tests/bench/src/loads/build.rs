@@ -1,4 +1,4 @@
-//! Sheets of vertices with random modes, and the scenes made of them.
+//! Builds the synthetic loads: rectangular sheets of vertices with random modes, and scenes of them.
 
 use fastrand::Rng;
 use nalgebra::{Rotation3, Vector3};
@@ -11,31 +11,31 @@ use modalcast_model::domain::{
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Parts, Scene};
 
-/// By what the vertices (of one domain) or the domains (of many) are divided in a quick run.
+/// Divisor of the vertices (of one domain) or of the domains (of many) in a quick run.
 pub(super) const QUICK: usize = 50;
 
-/// One domain to make.
+/// Parameters of one domain.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Patch {
-    /// Rows of U divided by three.
+    /// Vertices with modes: rows of U divided by three.
     pub(super) vertices: usize,
     pub(super) rank: usize,
-    /// Render vertices; each hangs on one of `vertices`.
+    /// Render vertices; each refers to one of `vertices`.
     pub(super) corners: usize,
     pub(super) triangles: Triangles,
-    /// Length of an edge of the sheet, metres.
+    /// Edge length of the sheet, scene units.
     pub(super) size: f32,
     pub(super) seed: u64,
 }
 
-/// Which triangles a patch has.
+/// Triangles of a patch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Triangles {
-    /// The fewest that a mesh may have: one, on three corners.
+    /// The minimum of a mesh: one triangle with three corners.
     One,
-    /// Two for each cell of the sheet; a corner per vertex.
+    /// Two per cell of the sheet; one corner per vertex.
     Cells,
-    /// A strip of so many, over all corners and again from the start.
+    /// A strip with this number of triangles, over all corners and again from the start.
     Strip(usize),
 }
 
@@ -87,17 +87,17 @@ fn many(kind: Kind, count: usize, size_of: impl Fn(&mut Rng) -> (usize, usize)) 
     (0..count).map(patch).collect()
 }
 
-/// 0 to 64, 17 on average: 65 x^p has the mean 65 / (p + 1), and rounding down takes a half off.
+/// Rank 0 to 64, 17 on average: 65 x^p has the mean 65 / (p + 1), and rounding down subtracts one half.
 fn mixed_rank(rng: &mut Rng) -> usize {
     (65.0 * rng.f64().powf(65.0 / 17.5 - 1.0)) as usize
 }
 
-/// 0 for 95 of 100, else 1 to 16.
+/// Rank 0 with a probability of 95 %, else 1 to 16.
 fn rare_rank(rng: &mut Rng) -> usize {
     if rng.usize(0..100) < 95 { 0 } else { rng.usize(1..=16) }
 }
 
-/// A seed for part `index` of what has this name (FNV-1a, then fastrand's own mixing).
+/// A seed for part `index` of the load with this name (FNV-1a, then fastrand's mixing).
 pub(super) fn seed_of(name: &str, index: usize) -> u64 {
     let word = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
     let hash = name.bytes().chain(index.to_le_bytes()).fold(0xCBF2_9CE4_8422_2325, word);
@@ -115,7 +115,7 @@ pub(super) fn shape(patch: &Patch, paired: bool) -> Result<Shape> {
             [(at % columns) as f32 * step, (at / columns) as f32 * step, relief]
         })
         .collect();
-    // Render vertices are spread evenly over the rows of U.
+    // Corners are distributed evenly over the vertices.
     let row = |corner: usize| (corner * patch.vertices / patch.corners.max(1)).min(patch.vertices - 1) as u32;
     let vertices: Vec<u32> = (0..patch.corners).map(row).collect();
     let triangles = triangles(patch, columns);
@@ -152,7 +152,8 @@ fn triangles(patch: &Patch, columns: usize) -> Vec<[u32; 3]> {
     }
 }
 
-/// Entries uniform in [-1, 1); with `paired`, each odd column is its left neighbour but for a ten-thousandth.
+/// Entries uniform in [-1, 1). With `paired`, each odd column equals its left neighbor up to a relative difference of
+/// at most 5e-5.
 fn modes(patch: &Patch, paired: bool) -> Result<Modes> {
     let rows = 3 * patch.vertices;
     if patch.rank == 0 {
@@ -175,8 +176,8 @@ fn modes(patch: &Patch, paired: bool) -> Result<Modes> {
     Modes::from_columns(rows, patch.rank, entries)
 }
 
-/// A scene of `count` domains, which have the shapes in turn, each turned at random on a cubic lattice; with a normal map
-/// when `dressed`.
+/// A scene of `count` domains that cycle through the shapes, each randomly rotated on a cubic lattice; with a normal
+/// map if `dressed`.
 pub(super) fn scene(name: String, shapes: Vec<Shape>, count: usize, dressed: bool) -> Result<std::sync::Arc<Scene>> {
     let mut rng = Rng::with_seed(seed_of(&name, usize::MAX));
     let side = (count as f64).cbrt().ceil() as usize;
@@ -216,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn load_b_has_ranks_from_0_to_64_and_17_on_average() {
+    fn load_b_ranks_span_0_to_64_with_mean_17() {
         let patches = many(Kind::B, 1_000, |rng| (1_500, mixed_rank(rng)));
         let ranks: Vec<usize> = patches.iter().map(|patch| patch.rank).collect();
         let mean = ranks.iter().sum::<usize>() as f64 / 1e3;
@@ -225,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn load_c_has_seven_vertices_a_domain_and_95_in_100_are_rigid() {
+    fn load_c_has_7_vertices_per_domain_and_95_percent_rigid() {
         let patches = many(Kind::C, 200_000, |rng| (7, rare_rank(rng)));
         let rigid = patches.iter().filter(|patch| patch.rank == 0).count() as f64 / 2e5;
         assert!((rigid - 0.95).abs() < 0.002, "{rigid}");
@@ -233,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn load_a_has_tangents_only_when_dressed_and_single_domains_have_nothing_but_positions() {
+    fn only_dressed_load_a_has_normals_and_tangents() {
         let of = |kind: Kind| kind.build(Size::Quick).expect("built").scene;
         let dressed = of(Kind::A { dressed: true });
         assert!(dressed.needs.normal_maps && dressed.layout.corners == 30_000 && dressed.layout.vertices == 30_000);
@@ -245,19 +246,19 @@ mod tests {
     }
 
     #[test]
-    fn full_singles_have_the_size_of_their_name() {
+    fn full_single_loads_have_the_size_in_their_name() {
         let scene = Kind::Single { power: 14, rank: 10 }.build(Size::Full).expect("built").scene;
         assert_eq!((scene.layout.vertices, scene.rank_of(0)), (1 << 14, 10));
     }
 
     #[test]
-    fn a_batch_has_sixteen_domains_and_one_u() {
+    fn batch_has_16_domains_and_one_shape() {
         let scene = Kind::Batch.build(Size::Quick).expect("built").scene;
         assert_eq!((scene.domains.len(), scene.shapes.len(), scene.layout.coordinates), (16, 1, 16 * 32));
     }
 
     #[test]
-    fn paired_modes_are_nearly_equal_and_others_are_not() {
+    fn only_paired_modes_are_nearly_equal() {
         let near = |paired: bool| {
             let modes = modes(
                 &Patch { vertices: 50, rank: 3, corners: 3, triangles: Triangles::One, size: 1.0, seed: 5 },

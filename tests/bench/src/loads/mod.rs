@@ -1,17 +1,19 @@
-//! Synthetic scenes of known sizes, equal on every machine: seeded, and cheap to build even with millions of vertices.
+//! Synthetic scenes of known sizes, identical on every machine: seeded, and fast to build even with millions of
+//! vertices.
 //!
-//! | name | what it is |
+//! | name | contents |
 //! |---|---|
 //! | `single-P-R` | one domain of 2^P vertices and R modes, positions only (table 4.4 of the thesis) |
 //! | `a`, `a-positions` | one domain of 1.5 M vertices, r = 32, with normals and tangents, or without |
 //! | `b` | 1,000 domains of 1,500 vertices, r mixed 0 to 64, about 17 on average |
 //! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
 //! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
-//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q for one U, beside `single-18-32` |
+//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q per U; compare `single-18-32` |
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
-//! | `plant-1-follows` to `plant-12-follows` | the same, each leaf on a branch by a constant frame: T for branches alone |
+//! | `plant-1-follows` to `plant-12-follows` | the same, leaves follow branches: T for branches alone |
 //!
-//! `single`, `plants` and `follows` name whole groups, `all` everything, but of the last group the largest plant alone.
+//! `single`, `plants` and `follows` name whole groups. `all` names everything except that of the last group it includes
+//! only the plant with the most domains.
 
 mod build;
 mod plant;
@@ -22,15 +24,15 @@ use super::thesis::{PLANTS, POWERS, RANKS};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Deformation, Parts, Scene};
 
-/// How large a load is built.
+/// Size of a load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Size {
     Full,
-    /// A fraction of the vertices or domains, for machines without a GPU; the load says which.
+    /// A fraction of the vertices or domains, for machines without a GPU; the load's remarks state it.
     Quick,
 }
 
-/// Which synthetic scene.
+/// Identifies a synthetic scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// 2^power vertices, `rank` modes.
@@ -47,20 +49,20 @@ pub enum Kind {
     Batch,
     /// Index into the thesis's plants.
     Plant(usize),
-    /// The same, but its leaves follow its branches.
+    /// The same plant with leaves that follow its branches.
     Follows(usize),
 }
 
-/// A scene to measure on.
+/// A scene to measure.
 #[derive(Debug, Clone)]
 pub struct Load {
     pub name: String,
     pub scene: Arc<Scene>,
-    /// Modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
+    /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
     pub paired: bool,
-    /// Which plant of the thesis it is.
+    /// Index of the thesis's plant, if it is one.
     pub species: Option<usize>,
-    /// Every rounding and reduction of what its name promises.
+    /// Deviations from the size that the name states.
     pub remarks: Vec<String>,
 }
 
@@ -86,7 +88,7 @@ impl Kind {
         RANKS.iter().flat_map(|rank| POWERS.map(|power| Self::Single { power, rank: *rank })).collect()
     }
 
-    /// The loads that a name of the command line stands for.
+    /// The loads that a name on the command line selects.
     ///
     /// # Errors
     /// `Invalid` when there is no such load.
@@ -137,16 +139,16 @@ impl Kind {
     /// Builds the scene.
     ///
     /// # Errors
-    /// None that a scene of these sizes could cause; those of [`Scene::new`].
+    /// Errors of [`Scene::new`]; none are expected for these sizes.
     pub fn build(self, size: Size) -> Result<Load> {
         build::build(self, size)
     }
 }
 
-/// The same scene, deformed in another way.
+/// The scene with another deformation.
 ///
 /// # Errors
-/// `Invalid` when the choices make no sense.
+/// `Invalid` when the deformation's options contradict each other.
 pub fn restated(scene: &Scene, deformation: Deformation) -> Result<Arc<Scene>> {
     Scene::new(Parts { deformation, ..scene.parts() })
 }
@@ -157,7 +159,7 @@ mod tests {
     use modalcast_model::scene::Storage;
 
     #[test]
-    fn every_load_is_found_by_its_own_name_and_nothing_else_is() {
+    fn finds_every_load_by_name_and_rejects_others() {
         for kind in Kind::all() {
             assert_eq!(Kind::named(&kind.name()), Ok(vec![kind]));
         }
@@ -183,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_load_is_the_same_whenever_it_is_built() {
+    fn building_a_load_is_deterministic() {
         let [one, two] = [0, 1].map(|_| Kind::B.build(Size::Quick).expect("built").scene);
         assert_eq!(one.shapes[7].modes, two.shapes[7].modes);
         assert_eq!(one.shapes[7].mesh, two.shapes[7].mesh);
@@ -191,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_can_be_restated_with_another_storage() {
+    fn restates_a_scene_with_another_storage_type() {
         let scene = Kind::A { dressed: true }.build(Size::Quick).expect("built").scene;
         let other = restated(&scene, Deformation { storage: Storage::Int8, ..Deformation::default() }).expect("fits");
         assert_eq!((other.deformation.storage, &other.layout), (Storage::Int8, &scene.layout));

@@ -1,8 +1,8 @@
-//! The plants of table 4.5: the same v, f, d, d', modes and u, in shapes of no beauty.
+//! Builds the plants of table 4.5 with the same v, f, d, d', number of modes and u, but with arbitrary shapes.
 //!
-//! u counts the rows of all U, so the vertices that carry modes, and v the render vertices: they are different sets.
-//! Domains with modes have u / 3 vertices in all; their render vertices are corners, spread evenly over those. Domains
-//! without modes are leaves: small rigid meshes of their own, with a vertex per render vertex.
+//! u counts the rows of all U, so three per vertex that carries modes, and v the render vertices; these are different
+//! sets. Domains with modes have u / 3 vertices in total; their render vertices are corners, distributed evenly over
+//! these. Domains without modes are leaves: small rigid meshes with one vertex per render vertex.
 
 use fastrand::Rng;
 use rayon::prelude::*;
@@ -14,7 +14,7 @@ use modalcast_model::domain::Follow;
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 
-/// The most render vertices and triangles of a leaf; fewer where the table has too few of them.
+/// Upper limit of a leaf's render vertices and triangles; fewer where the table's totals are too small.
 const LEAF: (usize, usize) = (4, 2);
 
 /// Builds plant `index` of the thesis.
@@ -28,8 +28,8 @@ pub(super) fn grow(index: usize, size: Size) -> Result<Load> {
     Ok(Load { name, scene, paired: false, species: Some(index), remarks: remarks(&printed, &counts) })
 }
 
-/// The same plant with its leaves on its branches in turn, each by the frame that keeps it where it is: a step then brings
-/// transforms for the branches alone, and the device multiplies.
+/// The same plant with its leaves distributed over its branches. Each leaf follows its branch by the frame that keeps
+/// it in place, so a step has transforms for the branches alone and the device multiplies.
 pub(super) fn grow_on_branches(index: usize, size: Size) -> Result<Load> {
     let grown = grow(index, size)?;
     let branches =
@@ -46,11 +46,11 @@ pub(super) fn grow_on_branches(index: usize, size: Size) -> Result<Load> {
     let leaves = parts.domains.len() - branches;
     let mut remarks = grown.remarks;
     remarks.push(format!("{leaves} leaves follow {branches} branches: {} bytes of T a step", 48 * branches));
-    // Not a row of the thesis, which sends a transform for every leaf.
+    // Not comparable with the thesis, which sends a transform for every leaf.
     Ok(Load { name, scene: Scene::new(parts)?, species: None, remarks, ..grown })
 }
 
-/// All counts divided by [`QUICK`], but at least what the domains need.
+/// All counts divided by [`QUICK`], but not below the minimum for the domains.
 fn reduced(printed: &Species) -> Species {
     let cut = |number: usize, least: usize| number.div_ceil(QUICK).max(least);
     let deformable = cut(printed.deformable, 1);
@@ -66,7 +66,7 @@ fn reduced(printed: &Species) -> Species {
     }
 }
 
-/// What differs from the printed row, in words.
+/// Descriptions of the differences from the printed row.
 fn remarks(printed: &Species, counts: &Species) -> Vec<String> {
     let mut remarks = vec![format!("{} of table 4.5", printed.name)];
     if counts != printed {
@@ -88,7 +88,7 @@ fn remarks(printed: &Species, counts: &Species) -> Vec<String> {
     remarks
 }
 
-/// Render vertices and triangles of one leaf: at most four fifths of the plant's go into leaves.
+/// Render vertices and triangles of one leaf: all leaves together get at most four fifths of the plant's.
 fn leaf(counts: &Species) -> (usize, usize) {
     let leaves = counts.domains - counts.deformable;
     let share = |total: usize, most: usize| (4 * total / 5).checked_div(leaves).unwrap_or(0).clamp(1, most);
@@ -123,7 +123,7 @@ fn patches(counts: &Species) -> Vec<Patch> {
     (0..branches).map(branch).chain((0..leaves).map(leaf)).collect()
 }
 
-/// `total` in `parts` random parts of at least 1, the largest about three times the smallest.
+/// Splits `total` into `parts` random parts of at least 1, the largest about three times the smallest.
 fn share(total: usize, parts: usize, rng: &mut Rng) -> Vec<usize> {
     let weights: Vec<f64> = (0..parts).map(|_| 0.5 + rng.f64()).collect();
     let (free, whole) = (total - parts, weights.iter().sum::<f64>());
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn every_plant_has_the_counts_of_its_row_of_table_4_5() {
+    fn plants_have_the_counts_of_table_4_5() {
         for (index, plant) in PLANTS.iter().enumerate() {
             let load = grow(index, Size::Full).expect("grown");
             let Species { vertices, faces, domains, deformable, modes, rows, .. } = *plant;
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn leaves_that_follow_leave_the_plant_as_it_is_and_need_no_transforms() {
+    fn following_leaves_keep_placements_and_need_no_transforms() {
         for (index, plant) in PLANTS.iter().enumerate() {
             let (own, follows) = (grow(index, Size::Quick), grow_on_branches(index, Size::Quick));
             let (own, follows) = (own.expect("grown"), follows.expect("grown"));
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn quick_plants_are_smaller_in_every_count_and_say_so() {
+    fn quick_plants_are_smaller_and_have_a_remark() {
         for (index, plant) in PLANTS.iter().enumerate() {
             let load = grow(index, Size::Quick).expect("grown");
             assert!(census(&load).iter().all(|count| *count > 0), "{}", load.name);
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_sum_to_the_total_and_none_is_empty() {
+    fn shares_sum_to_the_total_and_are_not_empty() {
         for (total, parts) in [(7, 7), (1_000, 3), (524_640 / 3, 1_582), (5, 1)] {
             let shares = share(total, parts, &mut Rng::with_seed(1));
             assert_eq!((shares.len(), shares.iter().sum::<usize>()), (parts, total));

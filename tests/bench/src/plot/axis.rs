@@ -6,17 +6,18 @@ pub(super) struct Axis {
     /// Decimal logarithms of the ends.
     low: f64,
     high: f64,
-    /// Where the ends are drawn.
+    /// Pixel coordinates of the ends.
     from: f64,
     to: f64,
 }
 
-/// Room beyond the outermost values, in decades, and the least span.
+/// Margin beyond the outermost values, and minimum span, in decades.
 const ROOM: f64 = 0.25;
 const LEAST: f64 = 1.2;
 
 impl Axis {
-    /// An axis that holds all positive values; what is not positive is drawn at its lower end.
+    /// An axis that covers all positive values; other values are drawn at its lower end. `usual` is the range when
+    /// there are no values.
     pub(super) fn around(values: impl Iterator<Item = f64>, usual: (f64, f64), (from, to): (f64, f64)) -> Self {
         let logs = values.filter(|value| *value > 0.0 && value.is_finite()).map(f64::log10);
         let (low, high) =
@@ -26,13 +27,13 @@ impl Axis {
         Self { low: low - lacking, high: high + lacking, from, to }
     }
 
-    /// Where a value is drawn.
+    /// Pixel coordinate of a value.
     pub(super) fn place(&self, value: f64) -> f64 {
         let log = if value > 0.0 { value.log10().clamp(self.low, self.high) } else { self.low };
         self.from + (log - self.low) / (self.high - self.low) * (self.to - self.from)
     }
 
-    /// Values to label: decades, and twos and fives between them where there is room.
+    /// Tick values: decades, with twos and fives between them on short axes.
     pub(super) fn ticks(&self) -> Vec<f64> {
         let span = self.high - self.low;
         let steps: &[f64] = if span < 2.2 { &[1.0, 2.0, 5.0] } else { &[1.0] };
@@ -44,7 +45,7 @@ impl Axis {
     }
 }
 
-/// Microseconds in the unit that people would take.
+/// Formats microseconds with a suitable unit.
 pub(super) fn time(us: f64) -> String {
     let (value, unit) = match us {
         us if us < 0.999 => (us * 1e3, "ns"),
@@ -55,7 +56,7 @@ pub(super) fn time(us: f64) -> String {
     format!("{} {unit}", (value * 100.0).round() / 100.0)
 }
 
-/// A small number as one digit and a power of ten.
+/// Formats a number as one digit and a power of ten.
 pub(super) fn power(value: f64) -> String {
     format!("{value:.0e}")
 }
@@ -65,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_axis_holds_its_values_inside_and_draws_what_is_not_positive_at_its_end() {
+    fn axis_contains_values_and_clamps_non_positive_ones() {
         let axis = Axis::around([1e-7, 1e-3].into_iter(), (1.0, 10.0), (100.0, 0.0));
         let [small, large, zero] = [1e-7, 1e-3, 0.0].map(|value| axis.place(value));
         assert!(zero == 100.0 && small < 100.0 && large > 0.0 && large < small, "{zero} {small} {large}");
@@ -77,13 +78,13 @@ mod tests {
     }
 
     #[test]
-    fn many_decades_get_few_labels() {
+    fn many_decades_get_few_ticks() {
         let axis = Axis::around([1e-20, 1.0].into_iter(), (1.0, 10.0), (0.0, 1.0));
         assert!((4..=8).contains(&axis.ticks().len()), "{:?}", axis.ticks());
     }
 
     #[test]
-    fn times_have_the_unit_that_fits() {
+    fn times_get_a_suitable_unit() {
         let texts = [0.5, 1.0, 200.0, 1e3, 5e4, 1e6].map(time);
         assert_eq!(texts, ["500 ns", "1 µs", "200 µs", "1 ms", "50 ms", "1 s"]);
         assert_eq!(power(2e-7), "2e-7");

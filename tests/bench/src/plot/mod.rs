@@ -1,6 +1,6 @@
-//! Error against time as a picture: a log-log panel per load, the Pareto front marked.
+//! Plots error against time: one log-log panel per load, with the Pareto front marked.
 //!
-//! The SVG is written here; the PNG is the same drawing with the font that is built in, so both need nothing of the
+//! The SVG is generated here. The PNG is rendered from it with an embedded font, so that both are independent of the
 //! machine.
 
 mod axis;
@@ -18,7 +18,7 @@ use panel::{Look, Panel, Point};
 
 /// Pixels of the PNG per unit of the SVG.
 const SCALE: f32 = 2.0;
-/// Size of a panel, and the margin around everything.
+/// Size of a panel, and the outer margin.
 pub(super) const PANEL: (f64, f64) = (440.0, 320.0);
 pub(super) const MARGIN: f64 = 24.0;
 /// Height of title, subtitle and the explanation of the marks.
@@ -26,13 +26,13 @@ pub(super) const HEAD: f64 = 94.0;
 /// Height of a line of the legend.
 pub(super) const LEGEND: f64 = 22.0;
 
-/// Colours that differ for the colour-blind too, then a few more (Okabe and Ito; Tableau).
+/// Colors that color-blind readers can distinguish, followed by a few more (Okabe and Ito; Tableau).
 pub(super) const COLOURS: [&str; 12] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d9a", "#8c564b", "#7f7f7f", "#a6a800",
     "#17becf", "#b2182b",
 ];
 
-/// The drawing.
+/// Draws the plot as SVG.
 pub fn svg(report: &Report) -> String {
     let names = names(&report.rows);
     let loads: Vec<&str> = report.loads.iter().map(|load| load.name.as_str()).collect();
@@ -77,10 +77,10 @@ pub fn svg(report: &Report) -> String {
     out
 }
 
-/// The drawing as PNG.
+/// Renders an SVG as PNG.
 ///
 /// # Errors
-/// `Fault` when the SVG is none, or is too large for memory.
+/// `Fault` when the SVG is invalid, or too large for memory.
 pub fn png(svg: &str) -> Result<Vec<u8>> {
     let mut options = resvg::usvg::Options::default();
     let fonts = options.fontdb_mut();
@@ -91,20 +91,20 @@ pub fn png(svg: &str) -> Result<Vec<u8>> {
     let too_large = || during("plot")(format!("{width} x {height} pixels are too many"));
     let mut pixels = resvg::tiny_skia::Pixmap::new(width, height).ok_or_else(too_large)?;
     resvg::render(&tree, resvg::tiny_skia::Transform::from_scale(SCALE, SCALE), &mut pixels.as_mut());
-    // The background is opaque, so that premultiplied colours are the colours themselves.
+    // The background is opaque, so premultiplied colors equal straight ones.
     let image = image::RgbaImage::from_raw(width, height, pixels.take()).ok_or_else(too_large)?;
     let mut bytes = std::io::Cursor::new(Vec::new());
     image::DynamicImage::from(image).to_rgb8().write_to(&mut bytes, image::ImageFormat::Png).map_err(during("plot"))?;
     Ok(bytes.into_inner())
 }
 
-/// Warm rows are filled; what computes less than all vertices is no rival.
+/// Warm rows are filled. Variants that compute only a part of a step are excluded from the Pareto front.
 fn point(row: &Row) -> Option<Point<'_>> {
     let warm = row.cache == Cache::Warm;
     Some(Point { name: &row.name, at: row.point()?, filled: warm, rival: warm && !is_partial(&row.name) })
 }
 
-/// Each variant once, with its backend, in the order of the rows.
+/// Each variant once with its backend, in the order of the rows.
 fn names(rows: &[Row]) -> Vec<(&str, Backend)> {
     let mut names: Vec<(&str, Backend)> = Vec::new();
     for row in rows {
@@ -121,7 +121,7 @@ fn look(names: &[(&str, Backend)], name: &str) -> Look {
     Look { colour: COLOURS[index % COLOURS.len()], backend, round: index / COLOURS.len() }
 }
 
-/// The legend and its number of lines.
+/// The legend's SVG and its number of lines.
 fn legend(names: &[(&str, Backend)], width: f64) -> (String, usize) {
     let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
     for (name, _) in names {
@@ -150,7 +150,7 @@ mod tests {
     use crate::table::tests::row;
 
     #[test]
-    fn texts_are_escaped_and_the_font_is_built_in() {
+    fn escapes_text_and_renders_with_the_embedded_font() {
         let mut out = String::from(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"80\" height=\"20\" font-family=\"DejaVu Sans\">",
         );
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_variant_keeps_its_colour_in_every_panel() {
+    fn variant_has_the_same_color_in_every_panel() {
         let rows = [
             row("a", "x", Cache::Warm, (1.0, 1.0)),
             row("b", "y", Cache::Warm, (1.0, 1.0)),
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn thirty_six_variants_of_the_device_all_look_different() {
+    fn thirty_six_device_variants_have_distinct_marks() {
         let names: Vec<String> = (0..36).map(|index| index.to_string()).collect();
         let list: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
         let looks: Vec<Look> = names.iter().map(|name| look(&list, name)).collect();

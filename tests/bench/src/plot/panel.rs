@@ -1,4 +1,4 @@
-//! One panel: frame, grid, points, the Pareto front, and labels that stay out of each other's way.
+//! One panel of a plot: frame, grid, points, Pareto front, and labels that do not overlap.
 
 use std::fmt::Write as _;
 
@@ -18,15 +18,15 @@ const LETTERS: f64 = 11.0;
 /// x, y, width and height.
 type Area = (f64, f64, f64, f64);
 
-/// What a panel shows of one row.
+/// A point of a panel.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Point<'a> {
     pub(crate) name: &'a str,
     /// Median time in microseconds, and error.
     pub(crate) at: (f64, f64),
-    /// Whether its mark is filled, and drawn over those that are not.
+    /// Whether its mark is filled; filled marks are drawn on top.
     pub(crate) filled: bool,
-    /// Whether it may be on the Pareto front.
+    /// Whether it is a candidate for the Pareto front.
     pub(crate) rival: bool,
 }
 
@@ -34,7 +34,7 @@ pub(crate) struct Point<'a> {
 pub(crate) struct Panel<'a> {
     corner: (f64, f64),
     title: &'a str,
-    /// What is drawn along x and along y.
+    /// Labels of the x and y axes.
     words: [&'a str; 2],
     points: Vec<Point<'a>>,
     time: Axis,
@@ -70,7 +70,7 @@ impl<'a> Panel<'a> {
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"9\" fill=\"none\" stroke=\"#444444\" stroke-width=\"1.2\"/>"
             );
         }
-        // Hollow ones first, so that none hides a filled one.
+        // Hollow marks first, so that none covers a filled one.
         for full in [false, true] {
             for (point, place) in self.points.iter().zip(&places).filter(|(point, _)| point.filled == full) {
                 let look = look(point.name);
@@ -89,7 +89,7 @@ impl<'a> Panel<'a> {
         (self.time.place(us), self.error.place(error))
     }
 
-    /// Indices of the points on the Pareto front of those that may be on it.
+    /// Indices of the points on the Pareto front of the candidates.
     fn front(&self) -> Vec<usize> {
         let rivals: Vec<usize> = (0..self.points.len()).filter(|at| self.points[*at].rival).collect();
         let points: Vec<(f64, f64)> = rivals.iter().map(|at| self.points[*at].at).collect();
@@ -135,14 +135,14 @@ impl<'a> Panel<'a> {
         text(out, (x, y), &format!("{label} transform=\"rotate(-90 {x:.1} {y:.1})\""), self.words[1]);
     }
 
-    /// Names beside the points of the front, and beside all filled points when there are few.
+    /// Labels the points of the front, and all filled points when there are few.
     fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], look: &impl Fn(&str) -> Look) {
         let mut taken: Vec<Area> = places.iter().map(|(x, y)| (x - 7.0, y - 7.0, 14.0, 14.0)).collect();
         let few = self.points.len() <= 8;
         let named = |at: &usize| front.contains(at) || (few && self.points[*at].filled);
         for at in (0..self.points.len()).filter(named) {
             let name = self.points[at].name;
-            // A label that finds no room is left out: the legend names its point too.
+            // A label without free space is omitted; the legend names its point too.
             if let Some(area) = self.room(places[at], width_of(name, LETTERS), &taken) {
                 let fill = look(name).colour;
                 let style = format!(
@@ -154,7 +154,7 @@ impl<'a> Panel<'a> {
         }
     }
 
-    /// A free place for a label of this width around a point.
+    /// Finds free space for a label of this width around a point.
     fn room(&self, (x, y): (f64, f64), width: f64, taken: &[Area]) -> Option<Area> {
         let height = LETTERS + 3.0;
         let beside = [(x + 12.0, y - height / 2.0), (x - 12.0 - width, y - height / 2.0)];
@@ -177,7 +177,7 @@ fn overlap(one: Area, other: Area) -> bool {
     !apart(one.0, one.2, other.0, other.2) && !apart(one.1, one.3, other.1, other.3)
 }
 
-/// About the width of a text in `DejaVu Sans`.
+/// Approximate width of a text in `DejaVu Sans`.
 pub(crate) fn width_of(words: &str, size: f64) -> f64 {
     0.61 * size * words.chars().count() as f64
 }
@@ -190,16 +190,16 @@ fn hollow(colour: &str) -> String {
     format!("fill=\"#fafafa\" stroke=\"{colour}\" stroke-width=\"1.8\"")
 }
 
-/// A colour and a shape: no two variants of a report share both.
+/// Color and shape of a mark, unique per variant of a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Look {
     pub(crate) colour: &'static str,
     pub(crate) backend: Backend,
-    /// How many times all colours were used before.
+    /// Number of times that all colors were used before.
     pub(crate) round: usize,
 }
 
-/// The mark of a variant around a point.
+/// Draws the mark of a variant at a point.
 pub(crate) fn mark(out: &mut String, (x, y): (f64, f64), look: Look, style: &str) {
     let shape = match (look.backend, look.round % 3) {
         (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {style}/>"),
@@ -219,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_front_is_made_of_rivals_only_and_labels_do_not_overlap() {
+    fn front_contains_only_rivals_and_labels_do_not_overlap() {
         let point = |name, filled, rival, at| Point { name, at, filled, rival };
         let points = vec![
             point("cold and best", false, false, (0.1, 1e-9)),
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn areas_overlap_only_where_both_sides_do() {
+    fn areas_overlap_only_if_both_axes_do() {
         assert!(overlap((0.0, 0.0, 2.0, 2.0), (1.0, 1.0, 2.0, 2.0)));
         assert!(!overlap((0.0, 0.0, 2.0, 2.0), (2.0, 0.0, 2.0, 2.0)));
         assert!(!overlap((0.0, 0.0, 2.0, 2.0), (1.0, 3.0, 2.0, 2.0)));

@@ -1,6 +1,6 @@
-//! What drawing a mesh costs when there is nothing else: the same scene stripped to one opaque two-sided white material, so
-//! that the depth of the map is one draw without a fragment shader, and ids and depth of the frame are one draw more. No
-//! culling, no images, no holes, no moments, no ground: what a minimal program would issue, by the renderer's own commands.
+//! Lower limit of the cost of drawing a mesh: the scene stripped to one opaque two-sided white material, so that the
+//! depth of the map is one draw without a fragment shader, and ids and depth of the frame are one more draw. No
+//! culling, images, holes, moments or ground: the commands of a minimal program, issued by the renderer.
 
 use std::sync::Arc;
 
@@ -12,34 +12,36 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, Look, Parts, Scene, Shadow, ShadowMethod};
 use modalcast_render::Ran;
 
-/// Both passes on one load.
+/// Times of both passes on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Bare {
     pub load: String,
     pub triangles: usize,
-    /// Side of the map that depth is drawn into, and samples a pixel of ids and depth: those of the frames beside it.
+    /// Side of the depth map, texels.
     pub map: u32,
+    /// Samples per pixel of ids and depth, as in the compared frames.
     pub samples: u32,
     pub depth: Timing,
     pub visibility: Timing,
-    /// The frame that is as little culled as both passes: what it takes beyond them is what the renderer adds.
+    /// A frame without culling, like both passes. Its excess over both passes is the overhead of the renderer.
     pub unculled: Beside,
-    /// The frame as the load's own look culls it.
+    /// A frame with the culling of the load's own look.
     pub usual: Beside,
 }
 
-/// A frame of the renderer with the same map that both passes are held against.
+/// A frame of the renderer with the same map, for comparison with both passes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Beside {
-    /// What is drawn, in words.
+    /// Description of the variant.
     pub name: String,
-    /// Microseconds: its frame, and what that takes beyond both passes.
+    /// Time of the frame, microseconds.
     pub frame_us: f64,
+    /// Time in excess of both bare passes, microseconds.
     pub beyond_us: f64,
 }
 
 impl Bare {
-    /// The same with what each frame takes beyond both passes.
+    /// Fills in each frame's excess over both passes.
     pub(super) fn compared(mut self) -> Self {
         let both = self.depth.median_us + self.visibility.median_us;
         for frame in [&mut self.unculled, &mut self.usual] {
@@ -49,13 +51,14 @@ impl Bare {
     }
 }
 
-/// Microseconds beyond both passes that a frame without culling of three million triangles may take on an H200.
+/// Limit of the excess over both passes, microseconds, for a frame of three million triangles without culling on an
+/// H200.
 pub(super) const BEYOND_US: f64 = 600.0;
 
-/// The scene with one material and a plain depth map of this size.
+/// The scene with one material and a standard shadow map of this size.
 ///
 /// # Errors
-/// None that the scene itself would not have caused.
+/// Only those that the scene itself would cause.
 pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
     let shadow = Shadow { method: ShadowMethod::Standard, size: map, ..Shadow::default() };
     let look = Look { shadow: Some(shadow), ground: None, bloom: None, culling: Culling::None, ..scene.look };
@@ -68,7 +71,7 @@ pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-/// Whether a frame was one draw into ids, and one into a depth that nothing was made of.
+/// Whether a frame consisted of one draw of ids and one of depth, without a pass that uses the depth.
 pub(super) fn is_bare(ran: &Ran) -> bool {
     ran.draws == 1 && ran.passes.starts_with(&["shadow", "visibility"])
 }
@@ -80,7 +83,7 @@ mod tests {
     use crate::render::studio::{Size, Studio};
 
     #[test]
-    fn a_stripped_scene_has_all_triangles_in_one_draw_and_the_tree_itself_has_more() {
+    fn stripped_scene_is_one_draw_and_the_tree_is_not() {
         let mut studio = Studio::open().expect("OpenGL");
         let stage = Kind::Tree.stage().expect("built");
         let bare = stripped(&stage.scene, 64).expect("stripped");

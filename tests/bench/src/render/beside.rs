@@ -1,4 +1,5 @@
-//! The tables of `report.md` that stand beside the loads: bare passes, blurs both ways, and the plants of the thesis.
+//! Sections of `report.md` that do not belong to one load: bare passes, rasterizers, blurs, and the plants of the
+//! thesis.
 
 use super::Report;
 use super::bare::{BEYOND_US, Bare};
@@ -7,7 +8,7 @@ use super::plants::Plant;
 use super::raster::{Counts, MOST_DIFFERING, Pair, Rastered};
 use crate::peers::{dash, line, rule};
 
-/// All of them that the report has.
+/// All sections for which the report has data.
 pub(super) fn markdown(report: &Report) -> String {
     [bare(&report.bare), raster(&report.raster), blurs(&report.blurs), plants(&report.plants)].concat()
 }
@@ -55,7 +56,7 @@ fn bare(list: &[Bare]) -> String {
     text
 }
 
-/// CUDA beside OpenGL.
+/// The section that compares the CUDA rasterizer with OpenGL.
 pub(super) fn raster(list: &[Rastered]) -> String {
     if list.is_empty() {
         return String::new();

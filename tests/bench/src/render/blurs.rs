@@ -1,29 +1,32 @@
-//! What making the same map of blurred moments takes in compute shaders and, as the thesis draws it, in fragment shaders.
+//! Compares the time to compute the same blurred moment map in compute shaders and, as in the thesis, in fragment
+//! shaders.
 
 use serde::Serialize;
 
 use super::Row;
 use modalcast_model::scene::{Blurring, Shadow};
 
-/// One map, made both ways.
+/// Times of one map by both methods.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Blurs {
     pub load: String,
-    /// Side of the map, and depths that each direction of the blur weighs.
+    /// Side of the map, texels.
     pub size: u32,
+    /// Taps of the blur per direction.
     pub taps: u32,
-    /// Microseconds, medians: the faster of the ways in compute, and fragments.
+    /// Medians, microseconds: the fastest compute method, and fragments.
     pub compute_us: f64,
     pub fragments_us: f64,
     pub ratio: f64,
 }
 
-/// How many times as fast as fragments compute is to be at 4096 texels a side on an H200, and microseconds that it may take.
+/// Required speedup of compute over fragments at 4096 texels per side on an H200, and the time limit of compute in
+/// microseconds.
 pub(super) const TIMES_AS_FAST: f64 = 40.0;
 pub(super) const MOST_US: f64 = 200.0;
 
 impl Blurs {
-    /// Every map that was timed both ways.
+    /// Every map that was timed with both methods.
     pub(super) fn of(rows: &[Row]) -> Vec<Self> {
         let by = |row: &Row, wanted: fn(Blurring) -> bool| row.shadow.filter(|shadow| wanted(shadow.blurring));
         let fragments = rows.iter().filter_map(|row| Some((row, by(row, |way| way == Blurring::Fragments)?)));
@@ -85,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn fragments_stand_beside_the_fastest_compute_that_makes_the_same_map_and_no_other() {
+    fn compares_fragments_with_fastest_compute_of_same_map() {
         let map = |size: u32, blurring: Blurring| Shadow { size, blur: 2.3, blurring, ..Shadow::default() };
         let rows = [
             row("a", map(4096, Blurring::Tiles), 200.0),

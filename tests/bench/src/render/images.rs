@@ -1,4 +1,4 @@
-//! Panels with images of many sizes: upright ones near and a floor that reaches far, each repeating its image.
+//! The `images` scene: upright panels with images of many sizes, and a long floor; each repeats its image.
 
 use std::f32::consts::TAU;
 
@@ -7,18 +7,18 @@ use modalcast_model::domain::{Material, Mesh, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Look, Parts};
 
-/// Sizes of the images of the upright panels, from left to right, the lower row first: in a picture of usual size their
-/// texels are from four pixels to half a pixel wide.
+/// Image sizes of the upright panels, from left to right, lower row first. In a picture of default size their texels
+/// are between four pixels and half a pixel wide.
 const SIZES: [[u32; 2]; 6] = [[16, 16], [25, 15], [32, 32], [64, 64], [75, 50], [128, 128]];
 /// Repetitions along each side of an upright panel, and of the floor.
 const TURNS: (usize, usize) = (2, 24);
 /// Size of the floor's image.
 const FLOOR: [u32; 2] = [24, 24];
 
-/// The scene.
+/// Builds the scene.
 ///
 /// # Errors
-/// None: its sizes are constants.
+/// None in practice: its sizes are constants.
 pub(super) fn panels() -> Result<Parts> {
     let mut parts = Parts::named("images");
     for (at, size) in SIZES.iter().enumerate() {

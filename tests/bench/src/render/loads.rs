@@ -1,13 +1,14 @@
-//! What is drawn: small scenes of which everything is known, the built-in tree, and as many triangles as wanted.
+//! The scenes of the rendering benchmark: small scenes with known results, the built-in tree, and a field with any
+//! number of triangles.
 //!
-//! | name | what it is |
+//! | name | contents |
 //! |---|---|
-//! | `square` | a square that floats over the ground: umbra and penumbra are known |
+//! | `square` | a square that floats above the ground: umbra and penumbra are known |
 //! | `shelf` | the narrow shadow of a square just above the ground, from nearby and far from the middle of all depths |
-//! | `panes` | three translucent panes before each other and a solid one behind, listed in the wrong order |
+//! | `panes` | three translucent panes in front of each other and an opaque one behind, listed in the wrong order |
 //! | `images` | panels with images of many sizes, each repeated |
 //! | `tree` | the built-in tree |
-//! | `grove` | four of them |
+//! | `grove` | four built-in trees |
 //! | `triangles-N` | a rolling field of about N triangles with poles on it |
 
 use std::f64::consts::TAU;
@@ -24,7 +25,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, Look, Parts, Scene, State, View};
 
-/// Which scene.
+/// Identifies a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Square,
@@ -33,26 +34,26 @@ pub enum Kind {
     Images,
     Tree,
     Grove,
-    /// About so many.
+    /// Approximate number of triangles.
     Triangles(usize),
 }
 
-/// Triangles of the field when nobody says how many: in full, and in a quick run.
+/// Default triangle count of the field: in a full and in a quick run.
 const FIELD: (usize, usize) = (1_000_000, 50_000);
-/// The most that a name may ask for.
+/// Upper limit of triangles that a name may request.
 const MOST: usize = 8_000_000;
 
-/// A scene and how it moves.
+/// A scene and its motion.
 pub(super) struct Stage {
     pub(super) name: String,
     pub(super) kind: Kind,
     pub(super) scene: Arc<Scene>,
     motion: Motion,
-    /// The domain that slides when nothing bends.
+    /// The domain that moves on a circle; `None` when only modes move.
     slides: Option<usize>,
 }
 
-/// Seconds between steps, and how far everything goes: shares of the diagonal, and of the usual amplitude of the modes.
+/// Seconds between steps, radius of the circle as a fraction of the diagonal, and scale of the modal amplitudes.
 const DT: f64 = 1.0 / 60.0;
 const SLIDE: f64 = 0.02;
 const SWAY: f64 = 0.2;
@@ -64,7 +65,7 @@ impl Kind {
         vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
-    /// The load of this name.
+    /// The load with this name.
     ///
     /// # Errors
     /// `Invalid` when there is none.
@@ -101,7 +102,7 @@ impl Kind {
     /// Builds the scene.
     ///
     /// # Errors
-    /// Those of [`Scene::new`] and of growing the tree.
+    /// Errors of [`Scene::new`] and of generating the tree.
     pub(super) fn stage(self) -> Result<Stage> {
         let (scene, slides) = match self {
             Self::Square => (Scene::new(square()?)?, Some(1)),
@@ -123,11 +124,11 @@ impl Stage {
         Self { name: load.name, kind, scene: load.scene, motion, slides }
     }
 
-    /// What its pictures are seen through: all of the scene, but of the shelf the shadow alone.
+    /// The camera of its pictures. It frames the whole scene, except for `shelf` (the shadow alone) and `images`.
     pub(super) fn camera(&self, size: Size) -> Camera {
         match self.kind {
             Kind::Shelf => {}
-            // The panels fill the picture, and the floor goes out of it.
+            // The panels fill the picture, and the floor extends beyond it.
             Kind::Images => {
                 let view = View::LookAt { eye: [0.5, 1.5, 4.6], target: [0.0, 1.05, 0.0], up: [0.0, 1.0, 0.0] };
                 return Camera { view, lens: Lens::FieldOfView(34.0), near: 0.0, far: 0.0 };
@@ -139,8 +140,8 @@ impl Stage {
         Camera { view, lens: Lens::FieldOfView(2.9), near: 0.0, far: 0.0 }
     }
 
-    /// The state at step `step` of the moving scene: modes oscillate where there are any, all domains staying at their
-    /// placements; else one domain goes round a small circle.
+    /// The state at a step of the motion. Modes oscillate with all domains at their placements; in scenes with a
+    /// sliding domain, that domain moves on a small circle.
     pub(super) fn state(&self, step: usize) -> State {
         let mut state = State::rest(&self.scene);
         for (own, swing) in state.q.iter_mut().zip(self.motion.step(step).q) {
@@ -158,7 +159,7 @@ impl Stage {
     }
 }
 
-/// A scene as a light wind holds it.
+/// State of a scene in a light wind.
 pub(super) fn swaying(scene: &Arc<Scene>) -> State {
     let load =
         Load { name: scene.name.clone(), scene: Arc::clone(scene), paired: false, species: None, remarks: vec![] };
@@ -194,13 +195,13 @@ pub(super) fn quad(corners: [[f32; 3]; 4], normal: [f32; 3]) -> Result<Mesh> {
     Mesh::indexed(corners.to_vec(), vec![normal; 4], Vec::new(), vec![[0, 1, 2], [0, 2, 3]])
 }
 
-/// A square of one metre that faces up at this height.
+/// A square of side `2 * half` that faces up at this height.
 pub(super) fn lying(half: f32, height: f32) -> Result<Mesh> {
     let at = |x: f32, z: f32| [x * half, height, z * half];
     quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
 }
 
-/// A room of about 10,000 triangles, seen from inside: no load of its own, a mesh that fills the frame.
+/// A room of about 10,000 triangles seen from inside: not a load of its own, but a mesh that fills the frame.
 pub(super) fn room() -> Result<(Mesh, Camera)> {
     const CELLS: u32 = 29;
     let (mut rest, mut normals, mut triangles) = (Vec::new(), Vec::new(), Vec::new());
@@ -242,7 +243,7 @@ fn paint(diffuse: [f32; 3]) -> Material {
     }
 }
 
-/// A square of two metres, one above the ground, and a slab at the ground that keeps it there.
+/// A square of 1.4 units at height 1, and a slab that keeps the ground at height 0.
 fn square() -> Result<Parts> {
     let mut parts = Parts::named("square");
     add(&mut parts, "slab", lying(1.6, 0.0)?, paint([0.75, 0.72, 0.68]))?;
@@ -251,11 +252,11 @@ fn square() -> Result<Parts> {
     Ok(parts)
 }
 
-/// Where the shelf ends, and with it begins what is seen of its shadow.
+/// x of the shelf's edge, where the visible part of its shadow begins.
 const SHELF_EDGE: f32 = -3.5;
 
-/// A square of two metres three hundredths above the ground, its shadow nine hundredths long; and two slabs that hold the
-/// ground and widen the scene, so that the shadow lies near the end of all depths.
+/// A square of two units, 0.03 above the ground, with a shadow 0.09 long. Two slabs keep the ground at height 0 and
+/// widen the scene, so that the shadow lies near the end of the depth range.
 fn shelf() -> Result<Parts> {
     let mut parts = Parts::named("shelf");
     let moved = |half: f32, height: f32, x: f32, z: f32| {
@@ -269,7 +270,7 @@ fn shelf() -> Result<Parts> {
     Ok(parts)
 }
 
-/// Three panes of red, green and blue glass, from the nearest to the farthest, before a pale wall.
+/// Three panes of red, green and blue glass, listed from nearest to farthest, in front of a pale wall.
 fn panes() -> Result<Parts> {
     let mut parts = Parts::named("panes");
     let upright = |[left, bottom, right, top]: [f32; 4], z: f32| {
@@ -284,7 +285,7 @@ fn panes() -> Result<Parts> {
     Ok(parts)
 }
 
-/// Four of one tree, each turned and set aside; they share shapes, materials and textures.
+/// Four copies of one tree, each rotated and translated; they share shapes, materials and textures.
 fn grove(tree: &Scene) -> Parts {
     let mut parts = Parts::named("grove");
     parts.shapes.clone_from(&tree.shapes);
@@ -312,7 +313,7 @@ fn grove(tree: &Scene) -> Parts {
     parts
 }
 
-/// Rolling hills of about `count` triangles on a square of four metres, and a cross of four poles that casts on them.
+/// Rolling hills of about `count` triangles on a square of four units, and four poles that cast shadows on them.
 fn field(count: usize) -> Result<Parts> {
     let mut parts = Parts::named("field");
     let side = ((count as f64 / 2.0).sqrt().round() as usize).max(1);
@@ -350,7 +351,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_load_is_found_by_its_own_name_and_nothing_else_is() {
+    fn finds_every_load_by_name_and_rejects_others() {
         for kind in Kind::all(false).into_iter().chain(Kind::all(true)) {
             assert_eq!(Kind::named(&kind.name()), Ok(kind));
         }
@@ -360,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_has_about_the_triangles_that_it_promises_and_they_face_up() {
+    fn field_has_about_the_requested_triangles_facing_up() {
         let stage = Kind::Triangles(5_000).stage().expect("built");
         let own = &stage.scene.shapes[0].mesh;
         assert!((4_900..=5_100).contains(&own.triangles().len()), "{}", own.triangles().len());
@@ -368,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn what_slides_comes_back_and_the_rest_stays() {
+    fn only_the_sliding_domain_moves() {
         let stage = Kind::Square.stage().expect("built");
         let (rest, moved) = (State::rest(&stage.scene), stage.state(30));
         assert_eq!(stage.state(0).transforms, rest.transforms);

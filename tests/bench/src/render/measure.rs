@@ -1,4 +1,4 @@
-//! One load: its references, then every variant against them, then its times and its flicker.
+//! Measures one load: traces its references, compares every variant with them, then measures frame times and flicker.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -22,100 +22,103 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Culling, Look, Scene, Shadow};
 use modalcast_render::{Culled, Image, shadow_texel};
 
-/// The step of the motion that still pictures show.
+/// Step of the motion that still pictures show.
 pub(super) const STILL: usize = 10;
-/// Steps over which flicker is looked at.
+/// Steps over which flicker is measured.
 const STEPS: usize = 60;
-/// Pictures of moving scenes are smaller by this on each side.
+/// Factor per side by which pictures of moving scenes are smaller.
 const SMALLER: u32 = 4;
 
-/// One variant on one load.
+/// Results of one variant on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     pub load: String,
     pub name: String,
     pub method: Method,
     pub shadow: Option<Shadow>,
-    /// How images lie in arrays, where that is what is compared.
+    /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
-    /// What its look leaves out before it is drawn.
+    /// Culling of the variant's look.
     pub culling: Culling,
-    /// What it must keep against what it means to show, and whether it does.
+    /// Bounds on the error against the intended result.
     pub bounds: Bounds,
+    /// Whether the variant is within its bounds.
     pub passed: bool,
-    /// It is there to be seen to fail: the report fails if it passes.
+    /// Whether the variant is included to show a failure. The report fails if it passes.
     pub to_fail: bool,
-    /// Why it did not pass, in words.
+    /// Reasons why it failed.
     pub faults: Vec<String>,
-    /// Colours against one hard ray to the sun a sample: the truth of a sun that is a point.
+    /// Color errors against one ray per sample to the sun, which is exact for a point light.
     pub colour: Spread,
-    /// Colours against what the variant means to show.
+    /// Color errors against the intended result.
     pub colour_of_aim: Spread,
-    /// The light that arrives, against the hard rays and against what the variant means to show.
+    /// Sun visibility against the hard shadow.
     pub light: Light,
+    /// Sun visibility against the intended result.
     pub light_of_aim: Light,
-    /// None when the variant did not pass, or when it was left out.
+    /// `None` when the variant failed or flicker was skipped.
     pub flicker: Option<Spread>,
-    /// Why a variant that passed has no flicker.
+    /// Reason why a variant that passed has no flicker.
     pub no_flicker: Option<String>,
-    /// "frame" is all but reading back; none when the variant did not pass.
+    /// Times per pass; "frame" is the sum without readback. Empty when the variant failed.
     pub passes: Vec<Pass>,
-    /// Device memory of the scene, and of it what the shadow takes.
+    /// Device memory of the scene.
     pub bytes: u64,
+    /// Part of `bytes` that the shadow takes.
     pub shadow_bytes: u64,
-    /// And what its images take, with all levels.
+    /// Part of `bytes` that the images take, with all mip levels.
     pub image_bytes: u64,
     pub samples: u32,
     pub draws: usize,
-    /// What was left out of the last frame that was timed, where triangles are culled.
+    /// Culling counts of the last timed frame, where triangles are culled.
     pub culled: Option<Culled>,
 }
 
 impl Row {
-    /// Whether it passed or failed as it is stated to.
+    /// Whether it passed or failed as stated.
     pub const fn as_stated(&self) -> bool {
         self.passed != self.to_fail
     }
 
-    /// The median time of a frame in microseconds.
+    /// Median time of a frame in microseconds.
     pub fn median_us(&self) -> Option<f64> {
         self.passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us)
     }
 }
 
-/// The references of a load's still picture.
+/// References of a load's still picture.
 struct References {
     hard: Picture,
-    /// One per variant.
+    /// The intended result of each variant.
     aims: Vec<Picture>,
     texels: Option<Texels>,
 }
 
-/// What all variants of a load are measured with.
+/// Data that all variants of a load share.
 struct Job<'a> {
     request: &'a Request,
     stage: Stage,
     camera: Camera,
     variants: Vec<Variant>,
     references: References,
-    /// The light meter of the still picture without shadows.
+    /// Light-meter image of the still picture without shadows.
     bright: Image,
     moving: Moving,
 }
 
-/// References of the moving scene, unshadowed and hard; or why there are none.
+/// References of the moving scene per step, unshadowed and with hard shadows; or the reason why there are none.
 type Moving = std::result::Result<Vec<[Picture; 2]>, String>;
 
-/// All that came of one load.
+/// All results of one load.
 pub(super) struct Measured {
     pub(super) entry: Entry,
     pub(super) rows: Vec<Row>,
-    /// None when no row is there to be held against it.
+    /// `None` when there is no row to compare it with.
     pub(super) bare: Option<Bare>,
     pub(super) files: Vec<File>,
 }
 
-/// Measures every variant that is wanted on one load.
+/// Measures every requested variant on one load.
 pub(super) fn load(
     studio: &mut Studio,
     request: &Request,
@@ -189,7 +192,7 @@ fn small(size: Size) -> Size {
     Size { width: (size.width / SMALLER).max(1), height: (size.height / SMALLER).max(1) }
 }
 
-/// The references of every step, with a quarter of the samples of a still one.
+/// Traces the references of every step, with a quarter of a still picture's samples.
 fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Moving> {
     let size = small(request.size);
     let camera = stage.camera(size);
@@ -217,7 +220,7 @@ fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Movin
     Ok(too_long.map_or(Ok(all), Err))
 }
 
-/// The still picture of a scene.
+/// Draws the still picture of a scene.
 fn frame(studio: &mut Studio, scene: &Arc<Scene>, stage: &Stage, request: &Request) -> Result<Image> {
     let mut set = studio.set(scene)?;
     studio.pose(&mut set, &stage.state(STILL))?;
@@ -244,7 +247,8 @@ impl Job<'_> {
         }
     }
 
-    /// One variant: its still picture and its light against the references, then its times and its flicker if it passed.
+    /// Compares one variant's still picture and sun visibility with the references; if it passes, measures its times
+    /// and flicker.
     fn measure(&self, studio: &mut Studio, at: usize) -> Result<(Row, File)> {
         let (variant, aim) = (&self.variants[at], &self.references.aims[at]);
         let mut scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
@@ -279,7 +283,8 @@ impl Job<'_> {
         Ok((row, file))
     }
 
-    /// The passes of the scene stripped bare, beside frames with the largest usual variance map that was timed.
+    /// Times the passes of the stripped scene, for comparison with frames that use the largest timed variance map with
+    /// default settings.
     fn bare(&self, studio: &mut Studio, rows: &[Row]) -> Result<Option<Bare>> {
         let usual = |row: &Row| {
             let own = row.shadow.filter(|own| Shadow { size: own.size, ..Shadow::default() } == *own);
@@ -308,9 +313,9 @@ impl Job<'_> {
         Ok(Some(own.compared()))
     }
 
-    /// A frame with this map, culled so: its row's, or one that is timed now where there is no such row.
+    /// Time of a frame with this shadow map and culling: that of an existing row, or a new measurement.
     fn beside(&self, studio: &mut Studio, rows: &[Row], (shadow, culling): (Shadow, Culling)) -> Result<Beside> {
-        // A row under the load's own look may have culled nothing.
+        // A row with the load's own look may not have culled anything.
         let is = |row: &&Row| {
             let culls_so = row.culling == culling || culling == Culling::None && row.culled.is_none();
             row.shadow == Some(shadow) && culls_so
@@ -329,7 +334,7 @@ impl Job<'_> {
         Ok(Beside { name: format!("{name}: {way}"), frame_us, beyond_us: 0.0 })
     }
 
-    /// The passes of the still picture of a scene.
+    /// Times the passes of the still picture of a scene.
     fn timed(&self, studio: &mut Studio, scene: &Arc<Scene>) -> Result<Vec<Pass>> {
         let mut set = studio.set(scene)?;
         studio.pose(&mut set, &self.stage.state(STILL))?;
@@ -371,7 +376,7 @@ impl Job<'_> {
         }
     }
 
-    /// The flicker of a variant, or why there is none.
+    /// The flicker of a variant, or the reason why it was skipped.
     fn flicker(
         &self,
         studio: &mut Studio,
@@ -406,7 +411,7 @@ impl Job<'_> {
         pictures::picture(&self.file_name(what), self.request.size, &picture.colours)
     }
 
-    /// The light of the hard reference; what tells none is blue.
+    /// Sun visibility of the hard reference as a gray image; blue where it is undefined.
     fn light_file(&self) -> Result<File> {
         let shade = |light: &Option<f32>| light.map_or([60.0, 70.0, 110.0], |light| [255.0 * light; 3]);
         let colours: Vec<[f32; 3]> = self.references.hard.light.iter().map(shade).collect();
@@ -414,7 +419,7 @@ impl Job<'_> {
     }
 }
 
-/// Which bounds a variant does not keep, in words.
+/// Descriptions of the exceeded bounds.
 fn faults(colour: &Spread, light: &Light, bounds: &Bounds) -> Vec<String> {
     let found = [
         ("mean error of colour", Some(colour.mean), bounds.mean_colour),
@@ -435,7 +440,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_shadow_that_is_missing_too_dark_or_elsewhere_is_a_fault_however_small_it_is() {
+    fn detects_missing_dark_or_displaced_small_shadows() {
         let shadow = |first: usize| -> Vec<Option<f32>> {
             (0..1000).map(|at| Some(if (first..first + 10).contains(&at) { 0.0 } else { 1.0 })).collect()
         };

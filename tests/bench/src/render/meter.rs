@@ -1,5 +1,5 @@
-//! A scene as a light meter: white matt surfaces of the same shapes and holes, so that a frame with shadows over the same
-//! without tells the share of the sunlight that arrives.
+//! Light meter: the scene with white matte surfaces of the same shapes and holes, so that the ratio of a frame with
+//! shadows and one without is the sun visibility.
 
 use std::sync::Arc;
 
@@ -9,18 +9,19 @@ use modalcast_model::domain::{Material, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Ground, Look, Parts, Scene};
 
-/// A scene with another look, all else being equal.
+/// The scene with another look.
 ///
 /// # Errors
-/// `Invalid` when the look makes no sense.
+/// `Invalid` when the look's options contradict each other.
 pub(super) fn relit(scene: &Scene, look: Look) -> Result<Arc<Scene>> {
     Scene::new(Parts { look, ..scene.parts() })
 }
 
-/// The light meter of a scene. A blended surface keeps its alpha, a cut-out its holes; the sun is as bright as the display.
+/// The light meter of a scene. Blended surfaces keep their alpha and cut-outs their holes; the sunlight is 1, the
+/// maximum of the display.
 ///
 /// # Errors
-/// None that the scene itself would not have caused.
+/// Only those that the scene itself would cause.
 pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
     let look = Look {
         sunlight: [1.0; 3],
@@ -40,7 +41,7 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
         let texture = &parts.textures[index];
         let white = texture.rgba().chunks_exact(4).flat_map(|texel| [255, 255, 255, texel[3]]).collect();
         let white = Texture::new(texture.name.clone(), texture.width(), texture.height(), white)?;
-        // One image may be colours here and normals there: the normals keep theirs.
+        // An image may be used for colors and for normals; the normals keep the original.
         parts.textures.push(white);
         let last = parts.textures.len() - 1;
         for material in parts.materials.iter_mut().filter(|material| material.colour_texture == Some(index)) {
@@ -50,8 +51,8 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-/// The share of the light that arrives, per pixel, from frames of the light meter with and without shadows. Bytes tell it
-/// to one part in a hundred where least light falls, and better elsewhere.
+/// Sun visibility per pixel from light-meter frames with and without shadows, both RGBA. Bytes resolve it to one part
+/// in a hundred at [`LEAST_LIGHT`], and better in brighter places.
 pub(super) fn read(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
     let linear = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);
     let pairs = shadowed.chunks_exact(4).zip(unshadowed.chunks_exact(4));
@@ -67,7 +68,7 @@ mod tests {
     use crate::render::texels::srgb_from_linear;
 
     #[test]
-    fn a_meter_reads_the_share_that_arrives_and_nothing_where_too_little_falls() {
+    fn reads_visibility_only_where_enough_light_falls() {
         let byte = |linear: f64| (255.0 * srgb_from_linear(linear)).round() as u8;
         let pixel = |linear: f64| [byte(linear); 4];
         for (all, share) in [(1.0, 0.5), (0.5, 0.25), (0.11, 1.0), (0.8, 0.0)] {

@@ -1,14 +1,15 @@
-//! How far a picture is from its reference. Colours are compared as a display shows them: sRGB, 0 to 255, the largest
-//! difference of the three channels; light as the share of the unshadowed sunlight that arrives.
+//! Error metrics of a picture against its reference. Colors are compared as displayed: sRGB, 0 to 255, the largest
+//! difference of the three channels. Light is compared as sun visibility, the fraction of the unshadowed sunlight that
+//! arrives.
 
 use serde::Serialize;
 
-/// A pixel of a reference is in the penumbra when between this share and one minus it arrives.
+/// A reference pixel is in the penumbra when its sun visibility is between this and one minus this.
 const PENUMBRA: f32 = 0.02;
-/// It is in the umbra when less than this arrives.
+/// A reference pixel is in the umbra when its sun visibility is at most this.
 const UMBRA: f32 = 1e-6;
 
-/// Mean, 99th percentile and largest of some numbers; all 0 of none.
+/// Mean, 99th percentile and maximum of a set of numbers; all 0 for an empty set.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Spread {
     pub mean: f64,
@@ -23,13 +24,13 @@ impl Spread {
         let count = values.len();
         let Some(last) = values.last() else { return Self::default() };
         let mean = values.iter().map(|value| f64::from(*value)).sum::<f64>() / count as f64;
-        // The smallest number that 99 of a hundred do not exceed.
+        // Nearest-rank percentile: the smallest number that at least 99 % do not exceed.
         let rank = (99 * count).div_ceil(100).clamp(1, count);
         Self { mean, p99: f64::from(values[rank - 1]), largest: f64::from(*last), count }
     }
 }
 
-/// Errors of every pixel's colour, of 255.
+/// Color errors over all pixels, of 255. `rendered` is RGBA, `reference` sRGB of 255.
 pub fn colours(rendered: &[u8], reference: &[[f32; 3]]) -> Spread {
     Spread::of(differences(rendered, reference).collect())
 }
@@ -42,22 +43,22 @@ pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl It
     rendered.chunks_exact(4).zip(reference).map(largest)
 }
 
-/// Errors of the light that arrives, where both pictures can tell it.
+/// Errors of the sun visibility over the pixels where both pictures define it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Light {
     pub all: Spread,
-    /// On pixels that are in the reference's penumbra alone.
+    /// Over the pixels in the reference's penumbra alone.
     pub penumbra: Spread,
-    /// Mean light where the reference has none at all: light bleeding. None when it has no such pixel.
+    /// Light bleeding: mean sun visibility in the reference's umbra. `None` without such pixels.
     pub in_umbra: Option<f64>,
     pub umbra_pixels: usize,
-    /// Mean light that is missing where all of the reference's arrives. None when it has no such pixel.
+    /// Mean missing sun visibility where the reference is fully lit. `None` without such pixels.
     pub lost: Option<f64>,
-    /// Mean of rendered minus reference: what is too bright on the whole.
+    /// Mean of rendered minus reference; positive when the picture is too bright.
     pub bias: f64,
 }
 
-/// Compares the light that arrives, pixel by pixel; none in either is left out.
+/// Compares the sun visibility pixel by pixel; pixels where either is undefined are skipped.
 pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Light {
     let pairs: Vec<(f32, f32)> = rendered.iter().zip(reference).filter_map(|(own, wanted)| own.zip(*wanted)).collect();
     let error = |(own, wanted): &(f32, f32)| (own - wanted).abs();
@@ -77,8 +78,8 @@ pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Light {
     }
 }
 
-/// Flicker of a moving scene: how much the error changes from frame to frame. The change of the picture less that of the
-/// reference, the largest of the three channels, of 255; a still error is none.
+/// Flicker of a moving scene: the change of the error from frame to frame, as the largest of the three channels, of
+/// 255. A constant error does not flicker.
 #[derive(Debug, Default)]
 pub struct Flicker {
     before: Vec<[f32; 3]>,
@@ -86,7 +87,7 @@ pub struct Flicker {
 }
 
 impl Flicker {
-    /// Takes the next frame and its reference.
+    /// Adds the next frame and its reference.
     pub fn push(&mut self, rendered: &[u8], reference: &[[f32; 3]]) {
         let error = |(pixel, wanted): (&[u8], &[f32; 3])| {
             std::array::from_fn(|channel| f32::from(pixel[channel]) - wanted[channel])
@@ -99,7 +100,7 @@ impl Flicker {
         self.before = now;
     }
 
-    /// Over all pixels of all pairs of frames.
+    /// The result over all pixels of all pairs of consecutive frames.
     pub fn spread(self) -> Spread {
         Spread::of(self.changes)
     }
@@ -114,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_of_a_picture_with_one_wrong_pixel_in_a_hundred_is_known() {
+    fn one_wrong_pixel_in_a_hundred_gives_known_errors() {
         let reference = vec![[100.0; 3]; 100];
         assert_eq!(colours(&grey([100; 100]), &reference).largest, 0.0, "control: equal pictures");
         let one = grey((0..100).map(|at| if at == 7 { 150 } else { 100 }));
@@ -129,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ramp_that_is_shifted_errs_by_its_slope_and_only_on_the_ramp() {
+    fn shifted_ramp_errs_by_its_slope_only_on_the_ramp() {
         let ramp = |shift: i32| -> Vec<Option<f32>> {
             (0..100).map(|at| Some(((at - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
         };
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn light_in_the_umbra_is_bleeding_and_light_elsewhere_is_not() {
+    fn only_light_in_the_umbra_counts_as_bleeding() {
         let reference: Vec<Option<f32>> = (0..10).map(|at| Some(if at < 4 { 0.0 } else { 1.0 })).collect();
         let mut leaking = reference.clone();
         leaking[1] = Some(0.2);
@@ -159,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_changes_without_the_reference_flickers() {
+    fn only_changes_without_the_reference_flicker() {
         let flicker = |rendered: &dyn Fn(usize) -> u8, reference: &dyn Fn(usize) -> f32| {
             let mut flicker = Flicker::default();
             (0..60).for_each(|step| flicker.push(&grey([rendered(step); 4]), &[[reference(step); 3]; 4]));

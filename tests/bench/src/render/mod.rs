@@ -1,21 +1,25 @@
-//! Error against run time of the renderer: pictures by every variant against references that rays make by brute force.
+//! Benchmarks of error against run time for the renderer: pictures by every variant against brute-force ray-cast
+//! references.
 //!
-//! Validate first, then time: a variant whose error against what it means to show exceeds a stated bound is not timed, is
-//! named, and fails the report. A variant that is shown as a failure is stated so, and fails the report if it is none.
+//! Validation comes before timing: a variant whose error against its intended result exceeds a stated bound is not
+//! timed. The report names it and fails. Some variants are included to show a failure; the report also fails if such a
+//! variant passes.
 //!
-//! - [`loads`], [`variants`]: what is drawn, and how.
-//! - `soup`, `paint`, `texels`, `view`, `shade`, `pattern`, `picture`: the references. 64 samples a pixel, all in f64 but
-//!   the boxes of the tree; solid surfaces and cut-outs by their nearest point, transparent ones sorted by depth along
-//!   every sample; the shadow by one ray a sample to the sun, or by rays over the blur's own footprint.
-//! - `studio`, `meter`: frames of the renderer, and the light in them.
-//! - `readback`: frames a second when each is read.
+//! - [`loads`], [`variants`]: the scenes, and the ways to draw them.
+//! - `soup`, `paint`, `texels`, `view`, `shade`, `pattern`, `picture`: the references. 64 samples per pixel, in f64
+//!   except for the boxes of the BVH. Opaque surfaces and cut-outs by their nearest point, transparent ones sorted by
+//!   depth along every sample. Shadows by one ray per sample to the sun, or by rays distributed over the blur's
+//!   footprint.
+//! - `studio`, `meter`: frames of the renderer, and their sun visibility.
+//! - `readback`: frames per second when each frame is read back.
 //! - [`metrics`]: errors, light bleeding, flicker.
-//! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur in compute and in fragments.
-//! - `raster`: the same passes by CUDA beside OpenGL; `paths`: whole frames with either.
-//! - [`packing`]: images in one array as equation 3.13 packs them, against arrays by size.
-//! - [`plants`]: the plants of table 4.5 with rendering.
-//! - [`timed`]: frame times of a scene of the user, for programs that draw the same.
-//! - [`figures`]: pictures to be looked at, after those of the thesis.
+//! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur by compute
+//!   and by fragment shaders.
+//! - `raster`: the bare passes by the CUDA rasterizer and by OpenGL; `paths`: whole frames with either.
+//! - [`packing`]: images in one array as in equation 3.13, against arrays by size.
+//! - [`plants`]: the plants of table 4.5, deformed and drawn.
+//! - [`timed`]: frame times of a scene of the user, for comparison with other programs.
+//! - [`figures`]: figures like those of the thesis, for viewing.
 
 mod bare;
 mod beside;
@@ -68,23 +72,23 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 use modalcast_render::{Info, Shot, shadow_texel};
 
-/// What to report on.
+/// Settings of a report.
 #[derive(Debug, Clone)]
 pub struct Request {
     pub loads: Vec<Kind>,
-    /// Plants of table 4.5 to deform and draw, counted from 0.
+    /// Plants of table 4.5 to deform and draw, as indices from 0.
     pub plants: Vec<usize>,
-    /// Which variants, by name or by its beginning and a `*`; empty: all.
+    /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
     pub size: Size,
-    /// Fewer variants, samples and steps, for machines of few cores.
+    /// Fewer variants, samples and steps, for machines with few cores.
     pub quick: bool,
     /// Frames per median.
     pub replays: usize,
 }
 
 impl Request {
-    /// The variants to measure. A quick run has fewer, and those that are named in full whether or not they are of these.
+    /// The variants to measure. A quick run has fewer, but includes every variant that is named in full.
     pub fn wanted(&self) -> Vec<Variant> {
         let (few, mut all) = (variants::all(self.quick), variants::all(false));
         all.retain(|variant| {
@@ -95,29 +99,32 @@ impl Request {
     }
 }
 
-/// One load of a report.
+/// Facts of one load in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Entry {
     pub name: String,
     pub vertices: usize,
     pub triangles: usize,
     pub domains: usize,
-    /// Samples of a pixel of the reference, and rays to the sun of each where its light is filtered.
+    /// Samples per pixel of the references.
     pub samples: usize,
+    /// Rays to the sun per sample, where the light is filtered.
     pub taps: usize,
-    /// What tracing all references of its still picture took.
+    /// Time to trace all references of the still picture.
     pub reference_ms: f64,
-    /// Of the shadow map of its own look; none without one.
+    /// Texels of the shadow map of the load's own look; `None` without one.
     pub texels: Option<Texels>,
-    /// Steps over which flicker was looked at, and the size of their pictures.
+    /// Steps over which flicker was measured.
     pub steps: usize,
+    /// Size of the pictures of the moving scene.
     pub steps_size: Size,
-    /// Why flicker was not looked at.
+    /// Reason why flicker was not measured.
     pub no_flicker: Option<String>,
 }
 
-/// The longer sides of a texel of a shadow map of `size` texels a side, in scene units: of the map that is drawn, which is
-/// fitted to what the vertices take up in light space, and of one that is fitted to the corners of their bounds.
+/// Longer side of a texel of a shadow map of `size` texels per side, in scene units. `side`: of the map that is drawn,
+/// which is fitted to the vertices' extent in light space; `by_corners`: of a map that is fitted to the corners of
+/// their bounds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Texels {
     pub size: u32,
@@ -133,37 +140,38 @@ impl Texels {
     }
 }
 
-/// A whole report.
+/// All results of one run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     pub made: Provenance,
     pub renderer: Info,
     pub size: Size,
-    /// What bounds a variant must keep against what it means to show, where its row has no closer ones.
+    /// Error bounds against the intended result, for rows without tighter ones.
     pub bounds: variants::Bounds,
     pub loads: Vec<Entry>,
     pub rows: Vec<Row>,
-    /// One a load.
+    /// One entry per load.
     pub readback: Vec<Readback>,
-    /// What the bare passes take on each load.
+    /// Times of the bare passes on each load.
     pub bare: Vec<Bare>,
-    /// The passes by CUDA beside them, where there is a device.
+    /// The same passes by CUDA and by OpenGL, where there is a CUDA device.
     pub raster: Vec<Rastered>,
-    /// What the passes that make the same map of moments take, in compute and in fragments.
+    /// Times of the passes that compute the same moment map by compute and by fragment shaders.
     pub blurs: Vec<Blurs>,
     /// Plants of table 4.5, deformed and drawn.
     pub plants: Vec<Plant>,
-    /// Variants that did not pass though they should, or passed though they should not, as load: variant: why.
+    /// Unexpected results, as `load: variant: reason`: variants that failed, and variants that passed although they are
+    /// stated to fail.
     pub failed: Vec<String>,
-    /// Pictures to be looked at.
+    /// Pictures for viewing.
     #[serde(skip)]
     pub pictures: Vec<File>,
 }
 
-/// Makes a report; `progress` hears what is being done.
+/// Measures everything that is requested; `progress` receives a description of each stage.
 ///
 /// # Errors
-/// `Unavailable` without OpenGL; those of loading and drawing a scene.
+/// `Unavailable` without OpenGL; errors of loading and drawing a scene.
 pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Report> {
     let mut studio = Studio::open()?;
     let (mut loads, mut rows, mut bare, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
@@ -202,7 +210,7 @@ fn why(row: &Row) -> String {
 }
 
 impl Report {
-    /// Whether every variant passed, but for those that are there to be seen to fail: these must not have.
+    /// Whether every variant passed or failed as stated.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()
     }

@@ -1,4 +1,4 @@
-//! The files of a report: JSON, CSV, Markdown, the plot as SVG and PNG, and the pictures.
+//! Output files of a report: JSON, CSV, Markdown, the plot as SVG and PNG, and the pictures.
 
 use std::path::Path;
 
@@ -10,7 +10,8 @@ use crate::plot::png;
 use crate::timing::Timing;
 use modalcast_model::error::{Result, during};
 
-/// The columns of `report.csv`: name, and where the value stands in a row of `report.json`. Times are found by name.
+/// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`, or for times the name of the
+/// pass.
 const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -70,8 +71,8 @@ const COLUMNS: [(&str, &str); 55] = [
 ];
 
 impl Report {
-    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes, and raster and blurs both ways), `plants.csv`, `report.md`,
-    /// `report.svg`, `report.png` and `pictures/` into a folder, which is made.
+    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes; rasterizer and blur, both methods each),
+    /// `plants.csv`, `report.md`, `report.svg`, `report.png` and `pictures/` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -107,7 +108,7 @@ fn csv(rows: &[Row]) -> Result<Vec<u8>> {
     table(COLUMNS.map(|(name, _)| name.to_owned()), lines)
 }
 
-/// Bare passes and blurs: a line each, with the row that they stand beside.
+/// The CSV of bare passes, rasterizers and blurs: one line each, with the row that it is compared with.
 fn passes_csv(report: &Report) -> Result<Vec<u8>> {
     let head =
         ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
@@ -152,7 +153,7 @@ fn passes_csv(report: &Report) -> Result<Vec<u8>> {
     table(head.map(String::from), lines)
 }
 
-/// Ours and the thesis's, a plant a line.
+/// The CSV of plants, one per line: our figures and those of the thesis.
 fn plants_csv(plants: &[Plant]) -> Result<Vec<u8>> {
     let head =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
@@ -214,7 +215,7 @@ mod tests {
     use modalcast_model::scene::{Bloom, Culling, Look};
 
     #[test]
-    fn every_pass_of_a_frame_has_a_column_and_the_parts_of_drawing_add_up_to_it() {
+    fn every_pass_has_a_column_and_parts_add_up_to_draw() {
         let stage = Kind::Triangles(2_000).stage().expect("built");
         let look = Look { culling: Culling::Depth, bloom: Some(Bloom::default()), ..stage.scene.look };
         let mut studio = Studio::open().expect("OpenGL");

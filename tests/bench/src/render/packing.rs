@@ -1,17 +1,17 @@
-//! Images in arrays as the thesis packs them (equation 3.13, figure 3.12): all in one array of the largest width and height,
-//! smaller ones repeated until they fill their layer, texture coordinates wrapped and scaled:
+//! Packs images into arrays as in the thesis (equation 3.13, figure 3.12): all in one array of the largest width and
+//! height, smaller ones repeated until they fill their layer, texture coordinates wrapped and scaled:
 //!
 //!   uv' = (uv - floor uv) s,  s = ((w - 1) / (w_t - 1), (h - 1) / (h_t - 1))
 //!
-//! The renderer's own way is an array for each size, and so no scale. Here a scene is rebuilt so that the renderer does as
-//! the thesis does: every image is filled by repetition and the corners of every triangle have the coordinates that the
-//! equation gives. It wraps each fragment; the same comes of wrapping whole triangles, where none crosses the rim of its
-//! image.
+//! The renderer itself uses an array per size class, without a scale. To compare both, a scene is rebuilt so that the
+//! renderer reproduces the thesis's method: every image is filled by repetition, and the corners of every triangle have
+//! the coordinates of the equation. The equation wraps every fragment; wrapping whole triangles is equivalent where
+//! none crosses the edge of its image.
 //!
-//! On the load of images the right scale ends up a little nearer to the reference than arrays by size: 3.93 against 4.24 of
-//! 255 in software at 640 x 360. The load has seven sizes and the renderer six arrays, so the two smallest, 16 x 16 and
-//! 25 x 15, share one of 25 x 16 and are stretched to it: their panels, seen with several pixels a texel, are
-//! where it loses, by up to 7 of 255. On the floor arrays by size are nearer, by up to half a level.
+//! On the `images` load the corrected scale is slightly nearer to the reference than arrays by size: 3.93 against 4.24
+//! of 255 in software at 640 x 360. The load has seven sizes and the renderer six arrays, so the two smallest, 16 x 16
+//! and 25 x 15, share an array of 25 x 16 and are stretched to it. Arrays by size lose on their panels, which are seen
+//! with several pixels per texel, by up to 7 of 255. On the floor arrays by size are nearer, by up to half a level.
 
 use std::sync::Arc;
 
@@ -21,22 +21,22 @@ use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Texture};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Parts, Scene};
 
-/// How images lie in arrays.
+/// Packing of images in arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Packing {
-    /// An array for each size: the renderer's own way.
+    /// An array per size class, as the renderer does.
     Classes,
-    /// Equation 3.13 as it is printed: the last column and row of an image are not reached.
+    /// Equation 3.13 as printed: it does not reach the last column and row of an image.
     Repeated,
-    /// The same with s = (w / w_t, h / h_t), so that an image is seen whole.
+    /// The same with s = (w / w_t, h / h_t), which covers the whole image.
     RepeatedWhole,
 }
 
-/// A scene with its images packed so. For rigid scenes whose images are all colours.
+/// A scene with its images packed by this method. It must be rigid, and all its images must be colors.
 ///
 /// # Errors
-/// `Invalid` when a triangle crosses the rim of its image.
+/// `Invalid` when a triangle crosses the edge of its image.
 pub(super) fn packed(scene: &Scene, packing: Packing) -> Result<Arc<Scene>> {
     let mut parts = scene.parts();
     if packing != Packing::Classes {
@@ -60,7 +60,7 @@ fn repeat(parts: &mut Parts, packing: Packing) -> Result<()> {
     Ok(())
 }
 
-/// s of equation 3.13. An image of one texel, or an array of one, needs none.
+/// s of equation 3.13 per axis.
 fn scale(image: &Texture, size: [u32; 2], packing: Packing) -> [f32; 2] {
     let own = [image.width(), image.height()];
     std::array::from_fn(|axis| match packing {
@@ -69,7 +69,7 @@ fn scale(image: &Texture, size: [u32; 2], packing: Packing) -> [f32; 2] {
     } as f32)
 }
 
-/// The image again and again until it fills this size.
+/// The image repeated until it fills this size.
 fn filled(image: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
     let (own, rows) = (image.width() as usize, image.height() as usize);
     let pixel = |at: usize| {
@@ -81,7 +81,7 @@ fn filled(image: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
     Texture::new(image.name.clone(), width, height, rgba)
 }
 
-/// A mesh whose triangles have corners of their own, with coordinates wrapped and scaled.
+/// A mesh with separate corners per triangle and wrapped, scaled texture coordinates.
 fn wrapped(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
     let own = mesh.corners();
     let mut corners = Corners { vertices: Vec::new(), normals: Vec::new(), uvs: Vec::new() };
@@ -112,7 +112,7 @@ mod tests {
     use crate::render::loads::Kind;
 
     #[test]
-    fn small_images_fill_their_layer_by_repetition_and_coordinates_are_those_of_equation_3_13() {
+    fn repeats_small_images_and_scales_uvs_by_equation_3_13() {
         let scene = Kind::Images.stage().expect("built").scene;
         let [printed, whole] =
             [Packing::Repeated, Packing::RepeatedWhole].map(|packing| packed(&scene, packing).expect("packed"));
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_triangle_that_crosses_the_rim_of_its_image_is_refused() {
+    fn rejects_triangle_that_crosses_its_image_edge() {
         let mesh = |last: f32| {
             let rest = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
             let uvs = vec![[1.0, 0.0], [last, 0.0], [1.0, 1.0]];

@@ -1,4 +1,4 @@
-//! `report.md`: the report as tables for people.
+//! Formats a report as Markdown tables (`report.md`).
 
 use super::{Entry, Report, Row, Texels, beside};
 use crate::peers::{dash, line, rule};

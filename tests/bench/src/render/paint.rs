@@ -1,4 +1,4 @@
-//! Materials as the reference reads them: f64, with their decoded images.
+//! Materials of the ray-cast references in f64, with decoded images.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use super::texels::{Texels, Use};
 use modalcast_model::domain::AlphaMode;
 use modalcast_model::scene::Scene;
 
-/// What happens to alpha.
+/// Alpha mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Opaque,
@@ -17,7 +17,7 @@ pub(super) enum Kind {
     Blend,
 }
 
-/// One material. Colours are linear.
+/// One material. Colors are linear.
 #[derive(Debug, Clone)]
 pub(super) struct Paint {
     pub(super) kind: Kind,
@@ -27,16 +27,16 @@ pub(super) struct Paint {
     pub(super) specular: Vector3<f64>,
     pub(super) exponent: f64,
     pub(super) alpha: f64,
-    /// A mask shows from this alpha on.
+    /// A masked surface is visible where alpha is at least this.
     pub(super) cutoff: f64,
-    /// What is not opaque casts a shadow from this alpha on.
+    /// A surface that is not opaque casts a shadow where alpha is at least this.
     pub(super) caster: f64,
     pub(super) colour: Option<Arc<Texels>>,
     pub(super) normal: Option<Arc<Texels>>,
 }
 
 impl Paint {
-    /// The materials of a scene in their order; each image is decoded once per use.
+    /// The materials of a scene, in order. Each image is decoded once per use.
     pub(super) fn all(scene: &Scene) -> Vec<Self> {
         let mut decoded: BTreeMap<(usize, bool), Arc<Texels>> = BTreeMap::new();
         let mut image = |texture: Option<usize>, purpose: Use| {

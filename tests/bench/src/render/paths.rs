@@ -1,5 +1,5 @@
-//! Whole frames by OpenGL's rasteriser and by CUDA's, in one run: the same scene with its materials, a variance map and one
-//! sample a pixel, its edges smoothed after. What both saw and showed is compared before anything is timed.
+//! Compares whole frames of OpenGL's and the CUDA rasterizer in one run: the same scene with its materials, a variance
+//! map and one sample per pixel with FXAA. Ids and colors are compared before anything is timed.
 
 use std::sync::Arc;
 
@@ -17,36 +17,37 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Antialias, Camera, Culling, Look, Parts, Scene, Shadow, State};
 use modalcast_render::{Culled, Paths, Seen};
 
-/// One load by both ways.
+/// Results of one load with both rasterizers.
 #[derive(Debug, Clone, Serialize)]
 pub struct Frames {
     pub load: String,
     pub triangles: usize,
-    /// Side of the shadow map, and taps of its blur.
+    /// Side of the shadow map, texels.
     pub map: u32,
+    /// Taps of its blur per direction.
     pub taps: u32,
-    /// Who drew what where CUDA was given.
+    /// Rasterizer of each pass when CUDA is available.
     pub paths: Paths,
-    /// Pixels whose id is not OpenGL's, of all.
+    /// Pixels whose id differs from OpenGL's.
     pub differing: usize,
     pub pixels: usize,
-    /// How far the picture is from OpenGL's, of 255.
+    /// Color differences from OpenGL's picture, of 255.
     pub colours: Spread,
-    /// By OpenGL as the load is culled there; "frame" is all but reading back.
+    /// Times of OpenGL with the load's culling; "frame" is the sum without readback.
     pub opengl: Vec<Pass>,
     pub culled: Option<Culled>,
-    /// None where too many ids differ.
+    /// Times with CUDA; `None` where too many ids differ.
     pub cuda: Option<Vec<Pass>>,
 }
 
 impl Frames {
-    /// How many times as fast CUDA's frame is.
+    /// Speedup of the frame by CUDA.
     pub fn ratio(&self) -> Option<f64> {
         let frame = |passes: &[Pass]| passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us);
         Some(frame(&self.opengl)? / frame(self.cuda.as_deref()?)?)
     }
 
-    /// The figures as a line for people.
+    /// The results as one line of text.
     pub fn line(&self) -> String {
         let us = |passes: &[Pass]| {
             let one = |pass: &Pass| format!("{} {:.1}", pass.name, pass.timing.median_us);
@@ -66,7 +67,7 @@ impl Frames {
     }
 }
 
-/// A scene that is lit for this, how it stands and what sees it.
+/// A scene with the look of this benchmark, its state and camera.
 struct Job {
     name: String,
     scene: Arc<Scene>,
@@ -77,7 +78,7 @@ struct Job {
 /// Measures the loads of a request, a room and two triangles that fill the frame.
 ///
 /// # Errors
-/// Those of drawing, and of the device.
+/// Errors of drawing and of the device.
 pub(super) fn measure(
     studio: &mut Studio,
     device: &Arc<Device>,
@@ -144,14 +145,14 @@ impl Job {
         })
     }
 
-    /// The picture, and what each of its pixels sees.
+    /// The picture, and the id at each of its pixels.
     fn shown(&self, studio: &mut Studio, set: &Set, size: Size) -> Result<(Vec<u8>, Vec<Seen>)> {
         let image = studio.draw(set, self.camera, size)?;
         Ok((image.rgba, studio.renderer.seen()?))
     }
 }
 
-/// What of these frames is not as it should be.
+/// Descriptions of the frames that were not timed.
 pub(super) fn faults(list: &[Frames]) -> Vec<String> {
     let untimed = list.iter().filter(|own| own.cuda.is_none());
     untimed
@@ -159,7 +160,7 @@ pub(super) fn faults(list: &[Frames]) -> Vec<String> {
         .collect()
 }
 
-/// The table of `raster.md`.
+/// The section of whole frames in `raster.md`.
 pub(super) fn markdown(list: &[Frames]) -> String {
     use crate::peers::{dash, line, rule};
     let head = [

@@ -1,33 +1,33 @@
-//! How long the steps of a moving scene may take: after two of them it is known what all would.
+//! Time budget for the steps of a moving scene. The total is extrapolated after two steps.
 
 use std::time::{Duration, Instant};
 
-/// What all steps of a moving scene may take, their references and the frames of each variant by themselves.
+/// Time budget of all steps of a moving scene; references and the frames of each variant have one budget each.
 pub(super) const PATIENCE: Duration = Duration::from_secs(60);
 
-/// The steps of one stretch of work, timed as they are done.
+/// Timer of a sequence of steps with a budget.
 pub(super) struct Patience {
     budget: Duration,
     steps: usize,
     begin: Instant,
-    /// What the first step took, which prepares what the others use.
+    /// Time of the first step, which includes preparations that the other steps reuse.
     first: Option<Duration>,
     done: usize,
 }
 
 impl Patience {
-    /// Begins to count.
+    /// Starts the timer.
     pub(super) fn new(budget: Duration, steps: usize) -> Self {
         Self { budget, steps, begin: Instant::now(), first: None, done: 0 }
     }
 
-    /// Counts a step that was done. After the second, says why when all of them would take too long.
+    /// Counts a finished step. After the second one, returns a reason to stop if all steps would exceed the budget.
     pub(super) fn tick(&mut self, what: &str) -> Option<String> {
         let elapsed = self.begin.elapsed();
         self.done += 1;
         let first = *self.first.get_or_insert(elapsed);
         let rest = self.steps.saturating_sub(1) as u32;
-        // Only once: what has begun well is carried to its end.
+        // Decide only once, so that work that continues runs to its end.
         let all = (self.done == 2).then(|| first + (elapsed - first) * rest)?;
         (all > self.budget).then(|| {
             let (all, budget) = (all.as_secs_f64(), self.budget.as_secs_f64());
@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn work_that_fits_goes_on_and_work_that_does_not_is_told_after_two_steps_with_its_numbers() {
+    fn stops_after_two_steps_if_budget_would_be_exceeded() {
         let mut long = Patience::new(Duration::from_secs(1000), 60);
         assert!((0..60).all(|_| long.tick("frames").is_none()));
         let mut short = Patience::new(Duration::from_millis(50), 60);

@@ -1,4 +1,5 @@
-//! The reference pictures: every sample of every pixel traced, transparent layers sorted, shadows by rays.
+//! Reference pictures: every sample of every pixel is ray-cast, transparent layers are sorted, shadows are cast by
+//! rays.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -9,49 +10,48 @@ use super::soup::{Ray, Soup};
 use super::texels::srgb_from_linear;
 use super::view::View;
 
-/// What decides how much of the sun reaches a point.
+/// The shadow model: determines the sun visibility of a point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Term {
-    /// All of it, always.
+    /// No shadows: visibility 1.
     Unshadowed,
     /// One ray to the sun.
     Hard,
-    /// The share of rays that arrive under a bell in the plane across the light: two vectors of one deviation each. The
-    /// rays begin on the receiver's own tangent plane, where half their distance from its middle is free of casters: so
-    /// near, it is the receiver itself.
+    /// Fraction of unoccluded rays, distributed by a Gaussian in the plane perpendicular to the light; the two vectors
+    /// are one standard deviation each. The rays begin on the receiver's own tangent plane. Casters closer than half of
+    /// a ray's offset from the center are ignored, because at this distance they are the receiver itself.
     Filtered([Vector3<f64>; 2]),
 }
 
-/// A picture under one term.
+/// A picture with one shadow model.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Picture {
-    /// sRGB, 0 to 255 but not rounded, top row first.
+    /// sRGB, 0 to 255, not rounded, top row first.
     pub(super) colours: Vec<[f32; 3]>,
-    /// The share of the unshadowed sunlight that arrives at what a pixel sees; none where that is less than
-    /// [`LEAST_LIGHT`].
+    /// Sun visibility per pixel; `None` where the unshadowed sunlight is less than [`LEAST_LIGHT`].
     pub(super) light: Vec<Option<f32>>,
 }
 
-/// Sunlight below this, of all that there is, is too little to tell shares of it.
+/// Minimum of unshadowed sunlight, of 1, for which sun visibility is defined.
 pub(super) const LEAST_LIGHT: f64 = 0.1;
 
-/// How finely a reference is traced.
+/// Sample counts of a reference.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Detail {
     /// Samples along each side of a pixel.
     pub(super) side: usize,
-    /// Rays to the sun per sample of a filtered term.
+    /// Rays to the sun per sample of a filtered shadow.
     pub(super) taps: usize,
 }
 
 impl Detail {
-    /// The 64 samples of a reference.
+    /// 64 samples per pixel.
     pub(super) const FULL: Self = Self { side: 8, taps: 1 };
-    /// A quarter of that, for machines of few cores.
+    /// A quarter of the samples, for machines with few cores.
     pub(super) const QUICK: Self = Self { side: 4, taps: 4 };
 }
 
-/// Traces pictures under all of the terms at once: what the camera sees is the same for all.
+/// Traces pictures with all shadow models at once; camera rays are shared.
 pub(super) fn trace(soup: &Soup, view: &View, terms: &[Term], detail: Detail) -> Vec<Picture> {
     let samples = pattern::pixel(detail.side);
     let pixels: Vec<Vec<([f32; 3], Option<f32>)>> = (0..view.width * view.height)
@@ -65,11 +65,11 @@ pub(super) fn trace(soup: &Soup, view: &View, terms: &[Term], detail: Detail) ->
     (0..terms.len()).map(of_term).collect()
 }
 
-/// Sums over the samples of a pixel under one term.
+/// Sums over the samples of a pixel with one shadow model.
 #[derive(Debug, Clone, Copy, Default)]
 struct Sum {
     colour: Vector3<f64>,
-    /// Sunlight that arrives, and that would if nothing were in the way.
+    /// Sunlight that arrives, and below it the sunlight without any shadow.
     arrives: f64,
     whole: f64,
 }
@@ -87,7 +87,7 @@ fn trace_pixel(
     let mut sums = vec![Sum::default(); terms.len()];
     for (at, [dx, dy]) in samples.iter().enumerate() {
         let layers = layers(soup, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
-        // Any odd stride goes through all of the bell; this one leaves neighbours apart.
+        // Any odd stride visits all points; this one keeps neighboring samples far from each other.
         let own: Vec<[f64; 2]> = (0..taps).map(|tap| bell[((at * 37 + 11) % samples.len()) * taps + tap]).collect();
         for (sum, term) in sums.iter_mut().zip(terms) {
             add(sum, &layers, |seen| sunlit(soup, view, seen, *term, &own));
@@ -96,12 +96,12 @@ fn trace_pixel(
     sums.iter().map(|sum| sum.shown(samples.len())).collect()
 }
 
-/// What a ray sees, farthest first: something solid, then every transparent layer before it.
+/// The layers along a ray, farthest first: an opaque one, then every transparent layer in front of it.
 fn layers(soup: &Soup, view: &View, ray: &Ray) -> Vec<Seen> {
     let (near, far) = view.range;
     let mut solid = soup.nearest(ray, (near, far), |hit| soup.is_solid(hit));
     let ground = view.ground_at(ray);
-    // Triangles in the plane of the ground cover it.
+    // Triangles in the plane of the ground cover the ground.
     if let (Some(hit), Some(t)) = (solid, ground)
         && hit.t > t + 1e-6 * soup.radius
     {
@@ -120,7 +120,7 @@ fn layers(soup: &Soup, view: &View, ray: &Ray) -> Vec<Seen> {
     layers
 }
 
-/// Composes layers back to front: C = a C_layer + (1 - a) C_behind, and so for the light.
+/// Composes layers back to front: C = a C_layer + (1 - a) C_behind, and likewise for the light.
 fn add(sum: &mut Sum, layers: &[Seen], arrives: impl Fn(&Seen) -> f64) {
     let mut sample = Sum::default();
     for seen in layers {
@@ -130,7 +130,7 @@ fn add(sum: &mut Sum, layers: &[Seen], arrives: impl Fn(&Seen) -> f64) {
         sample.arrives = seen.facing * share * seen.alpha + sample.arrives * rest;
         sample.whole = seen.facing * seen.alpha + sample.whole * rest;
     }
-    // Each sample is clamped by itself: what is too bright for the display does not whiten its pixel's edge.
+    // Each sample is clamped separately, so that overexposed samples do not brighten the edges of their pixel.
     sum.colour += sample.colour.map(|channel| channel.clamp(0.0, 1.0));
     sum.arrives += sample.arrives;
     sum.whole += sample.whole;
@@ -145,7 +145,7 @@ impl Sum {
     }
 }
 
-/// How much of the sun reaches a point.
+/// Sun visibility of a point, 0 to 1.
 fn sunlit(soup: &Soup, view: &View, seen: &Seen, term: Term, bell: &[[f64; 2]]) -> f64 {
     let dark = |from: Vector3<f64>, least: f64| {
         soup.is_dark(&Ray { from, along: view.to_sun }, least + 1e-9 * soup.radius, seen.triangle)

@@ -1,27 +1,27 @@
-//! Pictures to look at: PNG files of references, and strips of rendered, reference and difference.
+//! Encodes pictures for viewing: references, strips of rendered, reference and difference image, and sheets.
 
 use super::metrics::differences;
 use super::studio::Size;
 use modalcast_model::error::{Result, during};
 
-/// A file below `pictures/`.
+/// An encoded picture file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct File {
-    /// With its ending.
+    /// File name with extension.
     pub name: String,
     pub png: Vec<u8>,
 }
 
-/// Differences are shown this many times as large.
+/// Amplification of differences.
 const LOUD: f32 = 4.0;
 
-/// A reference.
+/// A reference picture. `colours`: sRGB of 255, top row first.
 pub(super) fn picture(name: &str, size: Size, colours: &[[f32; 3]]) -> Result<File> {
     let rgb = colours.iter().flat_map(|colour| colour.map(byte)).collect();
     encode(name, (size.width, size.height), rgb)
 }
 
-/// Rendered, reference and difference (four times as large, on black) side by side.
+/// Rendered, reference and difference image (amplified by [`LOUD`], on black) side by side.
 pub(super) fn strip(name: &str, size: Size, (rendered, reference): (&[u8], &[[f32; 3]])) -> Result<File> {
     let width = size.width as usize;
     let loud: Vec<u8> = differences(rendered, reference).map(|difference| byte(LOUD * difference)).collect();
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sheet_has_its_pictures_in_rows_and_white_between_them() {
+    fn sheet_has_pictures_in_rows_with_white_gutters() {
         let size = Size { width: 2, height: 1 };
         let drawn = [10, 20, 30].map(|level| [level, level, level, 255].repeat(2));
         let file = sheet("three", size, 2, &drawn).expect("made");

@@ -1,10 +1,11 @@
-//! The plants of table 4.5 deformed and drawn: the columns of tables 4.6 and 4.7 that have to do with rendering, beside
-//! those that the thesis printed.
+//! The plants of table 4.5, deformed and drawn: the rendering columns of tables 4.6 and 4.7 next to those that the
+//! thesis printed.
 //!
-//! As the thesis defines them: `t_vbr` is updating the vertices and rendering, `O_vbr` its share of the whole frame, FPS whole
-//! frames a second, s the memory of the device. Ours: `t_vbr` is a step of the deformer with q and T on their way to it and
-//! U q, the upload where it does not write the renderer's buffers, and all passes but reading back; the frame is that, the
-//! waits between, and the pixels in host memory. The thesis's frame has its simulation in it, ours has none.
+//! Definitions of the thesis: `t_vbr` is the time to update the vertices and render, `O_vbr` its fraction of the whole
+//! frame, FPS are whole frames per second, s is device memory. Our `t_vbr` is a step of the deformer (upload of q and
+//! T, and U q), the upload of vertices where the deformer does not write the renderer's buffers, and all passes except
+//! the readback. Our frame consists of these, the waits in between, and the readback of the pixels. The thesis's frame
+//! includes the simulation, ours does not.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -24,49 +25,51 @@ use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Camera, Look, Scene, Shadow, State};
 use modalcast_render::{SceneBuffers, Shot};
 
-/// One plant, the thesis's figures and ours.
+/// Results of one plant, with the figures of the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Plant {
     pub load: String,
     pub thesis: Species,
-    /// Whether it has the size of its row of table 4.5; only then are the two comparable.
+    /// Whether the plant has the size of its row in table 4.5; only then are the figures comparable.
     pub full: bool,
     pub remarks: Vec<String>,
     pub backend: Backend,
-    /// Whether the deformer writes the renderer's buffers, so that no vertex passes through the host.
+    /// Whether the deformer writes the renderer's buffers, so that vertices do not pass through the host.
     pub shared: bool,
     pub triangles: usize,
     pub domains: usize,
-    /// Side of its variance shadow map.
+    /// Side of its variance shadow map, texels.
     pub map: u32,
-    /// A step of the deformer, the upload (0 where there is none), the passes of shadow and drawing.
+    /// A step of the deformer.
     pub deform: Timing,
+    /// Upload of the vertices; 0 with shared buffers.
     pub upload: Timing,
+    /// Shadow and draw passes.
     pub render: Timing,
-    /// `t_vbr`: the three together.
+    /// `t_vbr`: the sum of deform, upload and render.
     pub vbr: Timing,
     pub frame: Timing,
     pub fps: f64,
-    /// `O_vbr`: a share of the frame.
+    /// `O_vbr`: the fraction of the frame that is `t_vbr`.
     pub occupation: f64,
-    /// s: bytes of the scene on the device, of the renderer and of a deformer that runs there; what both use counts once.
+    /// s: device bytes of the renderer and of a deformer on the device; shared buffers count once.
     pub bytes: u64,
 }
 
-/// States over which frames rotate.
+/// Number of states that frames rotate through.
 const STATES: usize = 8;
-/// Sides of the shadow map, in full and in a quick run.
+/// Sides of the shadow map in a full and in a quick run.
 const MAPS: (u32, u32) = (4096, 1024);
 
-/// The CUDA device that deforms, where there is one and it is the one that draws or any other.
+/// The first CUDA device with a working compiler, if there is one.
 pub(super) fn device() -> Option<Arc<Device>> {
     Device::open(0).ok().filter(|device| device.check_compiler().is_ok())
 }
 
-/// What deforms a plant and what draws it. The deformer goes first: it may write the buffers.
+/// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
 struct Rig {
     deformer: Box<dyn Deformer>,
-    /// Device bytes that it has besides the buffers.
+    /// Device bytes of the deformer in addition to the buffers.
     bytes: u64,
     buffers: SceneBuffers,
 }
@@ -132,13 +135,13 @@ fn rig(studio: &mut Studio, device: Option<&Arc<Device>>, scene: &Arc<Scene>) ->
     Ok(Rig { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
 }
 
-/// Bytes of a deformer's plan without the outputs that lie in the renderer's buffers.
+/// Bytes of a deformer's plan, without outputs in shared buffers.
 fn beside(plan: &gpu::Plan, shared: bool) -> u64 {
     let outputs = [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role));
     plan.total_bytes() - if shared { outputs.iter().sum() } else { 0 }
 }
 
-/// Deforming, uploading, rendering, these together, and the whole frame.
+/// Times of deforming, uploading, rendering, their sum, and the whole frame.
 fn times(
     studio: &mut Studio,
     rig: &mut Rig,
@@ -149,7 +152,7 @@ fn times(
     let camera = Camera::framing(scene, size.width, size.height);
     let begin = Instant::now();
     let mut warm = 0;
-    // The first frames compile, allocate and let clocks rise.
+    // Warm-up: the first frames compile and allocate, and clock rates rise.
     while warm < 2 || (!studio.renderer.info().software && begin.elapsed() < super::studio::WARM_UP) {
         frame(studio, rig, (camera, size), &states[warm % states.len()])?;
         warm += 1;
@@ -164,7 +167,7 @@ fn times(
     Ok([timing(deform)?, timing(upload)?, timing(render)?, timing(vbr)?, timing(frame)?])
 }
 
-/// One frame; microseconds as [`times`] has them.
+/// One frame, microseconds, in the order of [`times`].
 fn frame(studio: &mut Studio, rig: &mut Rig, (camera, size): (Camera, Size), state: &State) -> Result<[f64; 5]> {
     let us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
     let whole = Instant::now();
@@ -189,7 +192,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_plant_is_deformed_and_drawn_and_its_shares_are_those_of_its_times() {
+    fn deforms_and_draws_a_plant_with_consistent_times() {
         let mut studio = Studio::open().expect("OpenGL");
         let request = Request {
             loads: vec![],
@@ -212,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn outputs_in_shared_buffers_count_once() {
+    fn shared_output_buffers_count_once() {
         let scene = Kind::Plant(0).build(Scale::Quick).expect("built").scene;
         let plan = gpu::plan(&scene);
         let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;

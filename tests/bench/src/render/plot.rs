@@ -1,4 +1,4 @@
-//! Error against time of every load: a panel each, the Pareto front marked.
+//! Plots error against frame time: one panel per load, with the Pareto front marked.
 
 use std::fmt::Write as _;
 
@@ -7,10 +7,10 @@ use crate::plot::panel::{Look, Panel, Point, filled, mark, width_of};
 use crate::plot::{COLOURS, HEAD, LEGEND, MARGIN, PANEL, text};
 use modalcast_model::deform::Backend;
 
-/// Panels side by side.
+/// Panels per row.
 const COLUMNS: usize = 3;
 
-/// The drawing.
+/// Draws the plot as SVG.
 pub(super) fn svg(report: &Report) -> String {
     let mut names: Vec<&str> = Vec::new();
     for row in &report.rows {
@@ -69,7 +69,7 @@ fn point(row: &Row) -> Option<Point<'_>> {
 
 fn look(names: &[&str], name: &str) -> Look {
     let index = names.iter().position(|own| *own == name).unwrap_or(0);
-    // Circles, then squares and triangles.
+    // Circles first, then squares and triangles.
     let (backend, round) = match index / COLOURS.len() {
         0 => (Backend::Cpu, 0),
         round => (Backend::Cuda, round - 1),
@@ -77,7 +77,7 @@ fn look(names: &[&str], name: &str) -> Look {
     Look { colour: COLOURS[index % COLOURS.len()], backend, round }
 }
 
-/// The legend and its number of lines.
+/// The legend's SVG and its number of lines.
 fn legend(names: &[&str], width: f64) -> (String, usize) {
     let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
     for name in names {

@@ -1,5 +1,5 @@
-//! Ids with depth, and depth alone, by CUDA beside the same by OpenGL: the scene stripped to its mesh, one sample a pixel,
-//! both in one run. Ids are compared before anything is timed.
+//! Compares the CUDA rasterizer with OpenGL on two passes, ids with depth and depth alone: the scene stripped to its
+//! mesh, one sample per pixel, both in one run. Ids are compared before anything is timed.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -21,26 +21,26 @@ use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Camera, Faces, Group, Look, Parts, Scene, State, Window};
 use modalcast_render::{Info, Seen, Shot, shadow_clip};
 
-/// Side of the depth map: in full, and in a quick run.
+/// Side of the depth map: in a full and in a quick run.
 pub(super) const MAPS: (u32, u32) = (4096, 1024);
 
-/// The largest share of samples whose ids may differ from OpenGL's: those on edges and where depths tie. What is beyond
-/// is not timed.
+/// Largest fraction of samples whose ids may differ from OpenGL's, because of edges and depth ties. Above it nothing is
+/// timed.
 pub(super) const MOST_DIFFERING: f64 = 0.01;
 
-/// Both passes by both ways on one load.
+/// Both passes by both rasterizers on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Rastered {
     pub load: String,
     pub triangles: usize,
-    /// Side of the depth map.
+    /// Side of the depth map, texels.
     pub map: u32,
-    /// Samples of the frame whose id is not OpenGL's, of all.
+    /// Samples of the frame whose id differs from OpenGL's.
     pub differing: usize,
     pub samples: usize,
-    /// None where too many differ.
+    /// `None` where too many ids differ.
     pub passes: Option<Passes>,
-    /// What became of the triangles in the frame and in the map.
+    /// Triangle counts in the frame, and below in the map.
     pub in_frame: Counts,
     pub in_map: Counts,
 }
@@ -52,7 +52,7 @@ pub struct Passes {
     pub visibility: Pair,
 }
 
-/// The same pass by both ways.
+/// The same pass by both rasterizers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Pair {
     pub opengl: Timing,
@@ -60,20 +60,20 @@ pub struct Pair {
 }
 
 impl Pair {
-    /// How many times as fast CUDA is.
+    /// Speedup of CUDA over OpenGL.
     pub fn ratio(&self) -> f64 {
         self.opengl.median_us / self.cuda.median_us
     }
 }
 
-/// Triangles by what became of them.
+/// Triangle counts by outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Counts {
     pub small: u32,
     pub medium: u32,
     pub large: u32,
     pub missed: u32,
-    /// For any other reason.
+    /// Not finite, outside of the view, without area, or back-facing.
     pub dropped: u32,
 }
 
@@ -85,7 +85,7 @@ impl From<RasterCounts> for Counts {
 }
 
 impl Rastered {
-    /// Why it is not timed.
+    /// Reason why the passes are not timed.
     pub(super) fn fault(&self) -> Option<String> {
         let Self { load, differing, samples, passes, .. } = self;
         passes.is_none().then(|| format!("{load}: raster: {differing} of {samples} samples see another triangle"))
@@ -93,7 +93,7 @@ impl Rastered {
 }
 
 impl Rastered {
-    /// The figures as a line for people.
+    /// The results as one line of text.
     pub fn line(&self) -> String {
         let pair = |pair: Pair| {
             format!(
@@ -110,7 +110,7 @@ impl Rastered {
     }
 }
 
-/// These passes alone, of several loads.
+/// Results of these passes alone, for several loads.
 #[derive(Debug, Clone, Serialize)]
 pub struct Rasters {
     pub made: Provenance,
@@ -122,7 +122,7 @@ pub struct Rasters {
 }
 
 impl Rasters {
-    /// Writes `raster.json` and `raster.md` into a folder, which is made.
+    /// Writes `raster.json` and `raster.md` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -150,10 +150,10 @@ impl Rasters {
     }
 }
 
-/// Measures these passes and nothing else; `progress` hears what is being done.
+/// Measures these passes and nothing else; `progress` receives a description of each stage.
 ///
 /// # Errors
-/// `Unavailable` without OpenGL, a CUDA device or NVRTC; those of loading and drawing a scene.
+/// `Unavailable` without OpenGL, a CUDA device or NVRTC; errors of loading and drawing a scene.
 pub fn rasters(request: &Request, mut progress: impl FnMut(&str)) -> Result<Rasters> {
     let device = Device::open(0)?;
     device.check_compiler()?;
@@ -164,7 +164,7 @@ pub fn rasters(request: &Request, mut progress: impl FnMut(&str)) -> Result<Rast
     Ok(Rasters { made: Provenance::here(), renderer, size: request.size, rows, frames })
 }
 
-/// A stripped scene, how it stands and what sees it.
+/// A stripped scene with its state and camera.
 struct Job {
     name: String,
     scene: Arc<Scene>,
@@ -178,7 +178,7 @@ struct Job {
 /// Measures the loads of a request, a room and two triangles that fill the frame.
 ///
 /// # Errors
-/// Those of drawing, and of the device.
+/// Errors of drawing and of the device.
 pub(super) fn measure(
     studio: &mut Studio,
     device: &Device,
@@ -253,7 +253,7 @@ impl Job {
         })
     }
 
-    /// What OpenGL saw, by the places of triangles in the scene's packing; all ones where it saw none.
+    /// Ids that OpenGL drew, as indices of packed triangles; all ones where it drew none.
     fn ids(&self, seen: &[Seen], set: &Set) -> Vec<u32> {
         let slots = &self.scene.layout.slots;
         let id = |seen: &Seen| match seen {
@@ -292,7 +292,7 @@ impl Job {
     }
 }
 
-/// One launch that counts; what is timed does not.
+/// Counts by a separate launch, because the timed kernels do not count.
 fn counts(device: &Device, mesh: RasterMesh<'_>, window: Window, depth_only: bool) -> Result<Counts> {
     let raster = Raster::new(device, mesh, window, RasterForm { depth_only, counted: true, ..RasterForm::default() })?;
     raster.launch(device, 0)?;
@@ -304,9 +304,9 @@ mod tests {
     use super::*;
     use modalcast_render::Renderer;
 
-    /// The box of the triangle that OpenGL saw at a sample holds the sample.
+    /// The bounding box of the triangle that OpenGL drew at a sample contains the sample.
     #[test]
-    fn windows_and_triangles_are_those_of_the_frame_that_opengl_draws() {
+    fn windows_and_triangles_match_the_opengl_frame() {
         let mut studio = Studio::open().expect("OpenGL");
         let (mesh, camera) = room().expect("a room");
         let mut parts = Parts::named("room");
@@ -335,7 +335,8 @@ mod tests {
         let clip = window.clip();
         let row =
             |row: usize, p: [f32; 3]| (0..3).map(|at| clip[4 * row + at] * p[at]).sum::<f32>() + clip[4 * row + 3];
-        // Seen triangles in front of the eye lie around their samples: their box holds each, but for half a pixel.
+        // Visible triangles in front of the eye surround their samples: each bounding box contains its sample, up to
+        // half a pixel.
         let mut held = 0;
         for (at, id) in ids.iter().enumerate() {
             let corners = list[*id as usize].map(|vertex| [0, 1, 2].map(|axis| positions[3 * vertex as usize + axis]));
@@ -363,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ratio_is_above_one_where_cuda_is_faster() {
+    fn ratio_exceeds_one_where_cuda_is_faster() {
         let of = |us: f64| Timing::of(vec![us]).expect("one");
         assert_eq!(Pair { opengl: of(10.0), cuda: of(2.0) }.ratio(), 5.0);
     }

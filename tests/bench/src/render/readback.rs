@@ -1,12 +1,12 @@
-//! What it costs to read every frame: frames drawn a second when none is read, when each is read before the next is begun,
-//! and when each is read through the ring while the next ones are drawn.
+//! Cost of reading every frame back: frames per second without readback, with a blocking readback after each frame, and
+//! with readbacks through the ring while the next frames are drawn.
 //!
-//! All three wait for a frame before as many others are under way as the ring has places, so that they differ in nothing but
-//! the reading. Rounds of the three take turns; the medians of their rounds are compared. Two more rounds, unread and through
-//! the ring, upload the vertices of another step before every frame, as a scene that moves does.
+//! All three methods wait for a frame before the ring has no free slot, so that they differ only in the readback.
+//! Rounds of the three methods alternate, and the medians over the rounds are compared. Two more methods, without
+//! readback and through the ring, upload the vertices of another step before every frame, as a moving scene does.
 //!
-//! Before that, frames of two cameras that take turns come back through the ring and must be, one by one, those that were
-//! drawn alone: with steps between them and without.
+//! Validation comes first: frames of two alternating cameras come back through the ring and must equal, in order, the
+//! frames that were drawn one by one, with steps between them and without.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::{self, SyncSender};
@@ -25,39 +25,39 @@ use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Camera, View};
 use modalcast_render::{FRAMES_UNDER_WAY, Image, Shot};
 
-/// Rounds of each way.
+/// Rounds per method.
 const ROUNDS: usize = 5;
 
-/// Frames a second of one load.
+/// Frames per second of one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Readback {
     pub load: String,
     pub size: Size,
-    /// Frames of a round.
+    /// Frames per round.
     pub frames: usize,
     pub unread_fps: f64,
     pub at_once_fps: f64,
     pub ring_fps: f64,
-    /// Percent of the frames a second that are lost by reading them.
+    /// Percentage of frames per second that is lost to the readback.
     pub at_once_loss: f64,
     pub ring_loss: f64,
-    /// The same where the vertices of another step are uploaded before every frame.
+    /// The same with the vertices of another step uploaded before every frame.
     pub stepped_unread_fps: f64,
     pub stepped_ring_fps: f64,
     pub stepped_ring_loss: f64,
 }
 
-/// What is drawn: frames of even and of odd numbers.
+/// The frames to draw: even and odd frame numbers alternate between two shots.
 struct Feed {
     shots: [Shot; 2],
-    /// What is uploaded before each of them, if anything is.
+    /// Vertices to upload before even and odd frames, if any.
     steps: Option<[Surface; 2]>,
 }
 
-/// Steps between the two that are uploaded in turns.
+/// Distance in steps between the two uploaded states.
 const APART: usize = 7;
 
-/// Who reads the frames.
+/// Readback method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
     Unread,
@@ -65,10 +65,10 @@ enum Way {
     Ring,
 }
 
-/// Measures one load under its own look.
+/// Measures one load with its own look.
 ///
 /// # Errors
-/// Those of drawing it; `Fault` when a frame that was read through the ring is not the one that was drawn alone.
+/// Errors of drawing; `Fault` when a frame that was read through the ring differs from the frame drawn alone.
 pub(super) fn measure(studio: &mut Studio, request: &Request, kind: Kind) -> Result<Readback> {
     let stage = kind.stage()?;
     let camera = stage.camera(request.size);
@@ -79,7 +79,7 @@ pub(super) fn measure(studio: &mut Studio, request: &Request, kind: Kind) -> Res
     // One camera, so that all rounds draw the same.
     let [still, stepped] = [still, stepped].map(|feed| Feed { shots: [feed.shots[0]; 2], ..feed });
     studio.warm_up(&set, camera, request.size)?;
-    // In software each takes as long as a thousand elsewhere.
+    // A software renderer takes as long for one frame as a GPU for a thousand.
     let frames = if studio.renderer.info().software { FEWEST } else { request.replays.max(FEWEST) };
     let ways = [Way::Unread, Way::AtOnce, Way::Ring].map(|way| (way, &still));
     let ways = ways.into_iter().chain([Way::Unread, Way::Ring].map(|way| (way, &stepped)));
@@ -107,7 +107,7 @@ pub(super) fn measure(studio: &mut Studio, request: &Request, kind: Kind) -> Res
 }
 
 impl Feed {
-    /// Two cameras, and the vertices of two steps; the shadow holds both.
+    /// Two cameras and the vertices of two steps; the shadow's bounds cover both.
     fn stepped(studio: &mut Studio, set: &mut Set, stage: &Stage, size: Size) -> Result<Self> {
         let mut pose = |step: usize| -> Result<_> {
             studio.pose(set, &stage.state(step))?;
@@ -120,20 +120,20 @@ impl Feed {
         Ok(Self { shots: [camera, farther(camera)].map(shot), steps: Some([first, later]) })
     }
 
-    /// Makes the device hold what the frame of this number shows.
+    /// Uploads the vertices of the frame with this number, if the feed has steps.
     fn step(&self, studio: &mut Studio, set: &Set, frame: usize) -> Result<()> {
         self.steps.as_ref().map_or(Ok(()), |steps| studio.renderer.upload(&set.buffers, &steps[frame % 2]))
     }
 }
 
-/// The same view from a quarter farther away.
+/// The same view from a 25 % larger distance.
 fn farther(camera: Camera) -> Camera {
     let View::LookAt { eye, target, up } = camera.view else { return camera };
     let eye = std::array::from_fn(|axis| target[axis] + 1.25 * (eye[axis] - target[axis]));
     Camera { view: View::LookAt { eye, target, up }, ..camera }
 }
 
-/// Percent of `all` that `left` lacks.
+/// Percentage of `all` that is missing in `left`.
 fn loss(all: f64, left: f64) -> f64 {
     100.0 * (1.0 - left / all)
 }
@@ -143,7 +143,7 @@ fn median(mut list: Vec<f64>) -> f64 {
     list[list.len() / 2]
 }
 
-/// Frames through the full ring are those that are drawn one by one, each in its place.
+/// Checks that frames through the full ring equal those that are drawn one by one, in order.
 fn validate(studio: &mut Studio, set: &Set, feed: &Feed) -> Result<()> {
     let mut alone = |frame: usize| {
         feed.step(studio, set, frame)?;
@@ -156,7 +156,7 @@ fn validate(studio: &mut Studio, set: &Set, feed: &Feed) -> Result<()> {
     check(&alone, &taken.iter().collect::<Vec<_>>(), frames)
 }
 
-/// Whether all frames came back, those of even numbers as the first that was drawn alone and those of odd ones as the
+/// Checks that all frames came back, with even frames equal to the first one drawn alone and odd frames equal to the
 /// second.
 fn check(alone: &[Image; 2], taken: &[(usize, Image)], frames: usize) -> Result<()> {
     if alone[0].rgba == alone[1].rgba {
@@ -171,9 +171,9 @@ fn check(alone: &[Image; 2], taken: &[(usize, Image)], frames: usize) -> Result<
     }
 }
 
-/// Frames a second of one round. Whoever takes the images drops them, on a thread of its own.
+/// Frames per second of one round. The images are dropped on a separate thread.
 fn round(studio: &mut Studio, set: &Set, feed: &Feed, (way, frames): (Way, usize)) -> Result<f64> {
-    // Room for all, so that nobody who copies pixels waits.
+    // Capacity for all frames, so that the copying threads do not wait.
     let (images, taken) = mpsc::sync_channel::<(usize, Image)>(frames);
     let begin = Instant::now();
     let taker = std::thread::spawn(move || taken.iter().filter(|(_, image)| !image.rgba.is_empty()).count());
@@ -197,8 +197,8 @@ fn round(studio: &mut Studio, set: &Set, feed: &Feed, (way, frames): (Way, usize
     }
 }
 
-/// Draws with as many frames under way as the ring has places. `to`: who gets their pixels, copied on other threads, with
-/// the number of the frame.
+/// Draws with as many frames in flight as the ring has slots. `to` receives each frame's number and pixels, which are
+/// copied on other threads.
 fn under_way(
     studio: &mut Studio,
     set: &Set,
@@ -211,7 +211,7 @@ fn under_way(
             let pixels = studio.renderer.retrieve(ticket)?;
             if let Some(to) = to.clone() {
                 rayon::spawn(move || {
-                    // Whoever takes them counts them.
+                    // The receiver counts the images, so a failed send is noticed there.
                     to.send((frame - FRAMES_UNDER_WAY, pixels.into_image())).ok();
                 });
             }
@@ -228,7 +228,7 @@ fn under_way(
     Ok(())
 }
 
-/// The table of a page.
+/// The Markdown section of the report.
 pub(super) fn section(list: &[Readback]) -> String {
     let head = ["load", "frames/s, none read", "each read at once", "loss", "each read through the ring", "loss"];
     let head = [&head[..], &["a step before each, none read", "a step before each, through the ring", "loss"]].concat();
@@ -260,7 +260,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_load_is_drawn_in_three_ways_and_its_table_has_a_row() {
+    fn measures_all_readback_methods_and_fills_the_table() {
         let request = Request {
             loads: vec![],
             plants: vec![],
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_came_back_wrong_swapped_or_not_at_all_are_noticed() {
+    fn detects_wrong_swapped_and_missing_frames() {
         let stage = Kind::Square.stage().expect("a load");
         let size = Size { width: 64, height: 36 };
         let mut studio = Studio::open().expect("EGL");
@@ -293,7 +293,7 @@ mod tests {
         });
         let (images, taken) = mpsc::sync_channel(6);
         under_way(&mut studio, &set, &feed, (6, Some(images))).expect("draws");
-        // Copied by several threads, so they arrive in any order: the swap below needs two that differ.
+        // Several threads copy, so the frames arrive in any order; the swap below needs two that differ.
         let mut frames: Vec<(usize, Image)> = taken.iter().collect();
         frames.sort_by_key(|(number, _)| *number);
         check(&alone, &frames, 6).expect("control: all are right");

@@ -1,5 +1,5 @@
-//! Phong after equation 3.12, as the shaders have it but in f64: what one point sends to the eye without the sun and by
-//! the sun alone.
+//! Phong shading by equation 3.12, as in the shaders but in f64. The light of a point towards the eye is split into the
+//! part without the sun and the part from the sun.
 //!
 //!   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e
 
@@ -8,29 +8,29 @@ use nalgebra::Vector3;
 use super::soup::{Hit, Ray, Soup};
 use super::view::View;
 
-/// One point that a ray sees.
+/// Shading of one point that a camera ray hits.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seen {
     pub(super) point: Vector3<f64>,
-    /// Normal of the flat surface there, on the sun's side.
+    /// Geometric normal, on the sun's side.
     pub(super) facet: Vector3<f64>,
-    /// The triangle that it lies on; none for the ground.
+    /// The triangle; `None` for ground and sky.
     pub(super) triangle: Option<usize>,
-    /// Linear light without the sun, and what the unshadowed sun adds.
+    /// Linear light without the sun; below it the contribution of the unshadowed sun.
     pub(super) ambient: Vector3<f64>,
     pub(super) sun: Vector3<f64>,
-    /// How much of the sunlight it would receive: the cosine, or 0 where it looks away.
+    /// Fraction of the sunlight that the point would receive: the cosine, or 0 when it faces away.
     pub(super) facing: f64,
     pub(super) alpha: f64,
 }
 
-/// A point of the sky, which no sun lights.
+/// A point of the sky, without sunlight.
 pub(super) fn sky(view: &View, ray: &Ray) -> Seen {
     let (point, zero) = (ray.from, Vector3::zeros());
     Seen { point, facet: zero, triangle: None, ambient: view.sky(&ray.along), sun: zero, facing: 0.0, alpha: 1.0 }
 }
 
-/// A point of the ground at `t`: Lambert's law, and the haze.
+/// A point of the ground at `t`: Lambertian, with haze.
 pub(super) fn ground(view: &View, ray: &Ray, t: f64) -> Seen {
     let point = ray.at(t);
     let (colour, haze) = view.ground_colours();
@@ -76,7 +76,7 @@ pub(super) fn surface(soup: &Soup, view: &View, ray: &Ray, hit: &Hit) -> Seen {
     }
 }
 
-/// The interpolated normal, bent by the normal map, turned to the side that is seen.
+/// The interpolated normal, perturbed by the normal map and flipped to the visible side.
 fn normal(soup: &Soup, hit: &Hit) -> Vector3<f64> {
     let corners = soup.triangles[hit.triangle].corners.map(|corner| corner as usize);
     let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];

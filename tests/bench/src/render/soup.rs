@@ -1,8 +1,8 @@
-//! The deformed triangles of a scene in a tree of boxes, and the rays that ask it.
+//! The ray-cast scene of the references: deformed triangles in a bounding volume hierarchy (BVH), and ray queries.
 //!
-//! Boxes are f32 and padded, the tests of triangles f64: a box lets too much through, never too little. Positions in the
-//! tree are relative to the middle of the scene and rays begin near it, so that the padding of two millionths of the
-//! scene's radius covers every rounding.
+//! Boxes are f32 and padded, triangle tests are f64, so a box may give false positives but no false negatives.
+//! Positions in the BVH are relative to the center of the scene and rays begin near it, so that the padding of two
+//! millionths of the scene's radius covers all rounding.
 
 use nalgebra::Vector3;
 use obvhs::aabb::Aabb;
@@ -17,10 +17,10 @@ use modalcast_model::deform::Surface;
 use modalcast_model::domain::Mesh;
 use modalcast_model::scene::{Bounds, Scene};
 
-/// What boxes are widened by, of the scene's radius.
+/// Padding of boxes as a fraction of the scene's radius.
 const PADDING: f64 = 2e-6;
 
-/// Triangles that one thread takes at a time.
+/// Minimum of triangles per parallel task.
 const LEAST: usize = 4096;
 
 /// Points `from + t along`.
@@ -36,31 +36,31 @@ impl Ray {
     }
 }
 
-/// One triangle: a corner and the two edges that leave it.
+/// One triangle: a corner and the two edges that start there.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Triangle {
     pub(super) corner: Vector3<f64>,
     pub(super) edges: [Vector3<f64>; 2],
-    /// Its corners in the packed normals, in the order of its winding.
+    /// Indices of its corners in the packed normals, in winding order.
     pub(super) corners: [u32; 3],
-    /// Its number in the packed triangles: what breaks ties.
+    /// Its index in the packed triangles, which breaks depth ties.
     pub(super) number: u32,
     pub(super) paint: u32,
 }
 
-/// Where a ray meets a triangle: weights 1 - u - v, u and v of its corners.
+/// Intersection of a ray and a triangle; the barycentric weights of the corners are 1 - u - v, u and v.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Hit {
     pub(super) t: f64,
     pub(super) u: f64,
     pub(super) v: f64,
-    /// Index among the triangles of the soup.
+    /// Index into [`Soup::triangles`].
     pub(super) triangle: usize,
-    /// Whether it is seen from where its corners go counter-clockwise.
+    /// Whether the ray hits the side on which the winding is counter-clockwise.
     pub(super) front: bool,
 }
 
-/// Everything that rays can meet.
+/// The ray-cast scene.
 pub(super) struct Soup {
     pub(super) triangles: Vec<Triangle>,
     pub(super) paints: Vec<Paint>,
@@ -69,7 +69,7 @@ pub(super) struct Soup {
     pub(super) uvs: Vec<[f64; 2]>,
     pub(super) centre: Vector3<f64>,
     pub(super) radius: f64,
-    /// Whether any triangle is blended at all.
+    /// Whether any triangle is blended.
     pub(super) has_blended: bool,
     boxes: Bvh2,
 }
@@ -91,12 +91,12 @@ impl Triangle {
         [self.corner, self.corner + self.edges[0], self.corner + self.edges[1]]
     }
 
-    /// Normal of the side from which it winds counter-clockwise; zero when it has no area.
+    /// Geometric normal of the counter-clockwise side; zero for triangles without area.
     pub(super) fn facet(&self) -> Vector3<f64> {
         self.edges[0].cross(&self.edges[1]).try_normalize(0.0).unwrap_or_default()
     }
 
-    /// Möller and Trumbore's test. Edges count as inside.
+    /// Möller and Trumbore's intersection test: (t, u, v, front). Edges count as inside.
     fn meet(&self, ray: &Ray) -> Option<(f64, f64, f64, bool)> {
         let across = ray.along.cross(&self.edges[1]);
         let volume = self.edges[0].dot(&across);
@@ -118,7 +118,8 @@ impl Triangle {
 }
 
 impl Soup {
-    /// The triangles of a surface. Those with a corner that is not finite are left out: nobody can see them.
+    /// Builds the BVH of a surface. Triangles with a corner that is not finite are skipped, because they are not
+    /// visible.
     pub(super) fn new(scene: &Scene, surface: &Surface) -> Self {
         let paints = Paint::all(scene);
         let triangles = triangles(scene, surface);
@@ -126,7 +127,7 @@ impl Soup {
         let padded: Vec<Padded<'_>> =
             triangles.iter().map(|triangle| Padded(triangle, &centre, PADDING * radius)).collect();
         let boxes = build_bvh2(&padded, BvhBuildParams::medium_build(), &mut std::time::Duration::default());
-        // In the order of the tree, so that a leaf's triangles lie side by side.
+        // In BVH order, so that the triangles of a leaf are contiguous.
         let ordered = boxes.primitive_indices.iter().map(|index| triangles[*index as usize]).collect();
         Self {
             triangles: ordered,
@@ -141,11 +142,11 @@ impl Soup {
         }
     }
 
-    /// The same scene after another step: the tree keeps its form and its boxes move along, images and texture coordinates
-    /// stay. What rays meet is the same as in a tree built anew; where triangles went far, they only take longer.
+    /// Updates the scene to another step by refitting the BVH; its topology, images and texture coordinates remain.
+    /// Queries give the same results as with a rebuilt BVH, but are slower where triangles moved far.
     pub(super) fn moved(self, scene: &Scene, surface: &Surface) -> Self {
         let triangles = triangles(scene, surface);
-        // One that overflowed is missing now, or one that had is back: another tree.
+        // The set of finite triangles changed, so the BVH must be rebuilt.
         if triangles.len() != self.triangles.len() {
             return Self::new(scene, surface);
         }
@@ -163,7 +164,7 @@ impl Soup {
         Self { triangles: ordered, normals, tangents, centre, radius, boxes, ..self }
     }
 
-    /// The ray as the tree sees it, and how far along it begins.
+    /// The ray relative to the BVH's center in f32, and the parameter t where it begins.
     fn boxed(&self, ray: &Ray, least: f64, most: f64) -> (BoxRay, f64) {
         let squared = ray.along.norm_squared();
         let nearest = ray.along.dot(&(self.centre - ray.from)) / squared;
@@ -173,7 +174,7 @@ impl Soup {
         (BoxRay::new(from.into(), along.into(), 0.0, (most - begin).max(0.0) as f32), begin)
     }
 
-    /// The nearest triangle between `least` and `most` that `sees` accepts.
+    /// The nearest hit with t between `least` and `most` that `sees` accepts.
     pub(super) fn nearest(&self, ray: &Ray, (least, most): (f64, f64), sees: impl Fn(&Hit) -> bool) -> Option<Hit> {
         let (boxed, begin) = self.boxed(ray, least, most);
         let mut best: Option<Hit> = None;
@@ -188,14 +189,14 @@ impl Soup {
                 return f32::INFINITY;
             }
             best = Some(hit);
-            // Rounded up, so that the tree leaves nothing out that is as near.
+            // Rounded up, so that the BVH does not skip hits at the same distance.
             ((t - begin) as f32).next_up()
         });
         best
     }
 
-    /// Every triangle in between that `sees` accepts, farthest first; equally far ones by descending number. A ray through
-    /// the edge that two triangles share meets their surface once.
+    /// All hits in between that `sees` accepts, farthest first; ties by descending number. A ray through a shared edge
+    /// of two triangles counts one hit.
     pub(super) fn every(&self, ray: &Ray, (least, most): (f64, f64), sees: impl Fn(&Hit) -> bool) -> Vec<Hit> {
         let (boxed, _) = self.boxed(ray, least, most);
         let mut hits = Vec::new();
@@ -212,7 +213,7 @@ impl Soup {
         hits
     }
 
-    /// Whether two hits lie on an edge that their triangles share.
+    /// Whether two hits lie on a shared edge of their triangles.
     fn are_one(&self, one: &Hit, other: &Hit) -> bool {
         let on_rim = |hit: &Hit| hit.u.min(hit.v).min(1.0 - hit.u - hit.v) < 1e-9;
         if (one.t - other.t).abs() > 1e-9 * one.t.abs() || !on_rim(one) || !on_rim(other) {
@@ -223,7 +224,7 @@ impl Soup {
         own.iter().filter(|point| theirs.iter().any(|other| near(point, other))).count() >= 2
     }
 
-    /// Whether anything beyond `least` that casts a shadow, other than the triangle itself, is in the way.
+    /// Whether any shadow caster other than triangle `own` lies beyond `least`.
     pub(super) fn is_dark(&self, ray: &Ray, least: f64, own: Option<usize>) -> bool {
         let (boxed, _) = self.boxed(ray, least, f64::MAX);
         let boxed = BoxRay { tmax: f32::MAX, ..boxed };
@@ -235,7 +236,7 @@ impl Soup {
         !self.boxes.ray_traverse_miss(boxed, |_, index| blocks(index).map_or(f32::INFINITY, |()| 0.0))
     }
 
-    /// Where a ray meets one triangle.
+    /// Intersection of a ray with one triangle.
     #[cfg(test)]
     pub(super) fn meet(&self, triangle: usize, ray: &Ray) -> Option<Hit> {
         let (t, u, v, front) = self.triangles[triangle].meet(ray).filter(|meets| meets.0 >= 0.0)?;
@@ -250,8 +251,7 @@ impl Soup {
         &self.paints[self.triangles[hit.triangle].paint as usize]
     }
 
-    /// Whether a point shows its colour and hides what is behind: not a back face that is culled, not cut away, not
-    /// blended.
+    /// Whether a hit is opaque: not a culled back face, not cut out, not blended.
     pub(super) fn is_solid(&self, hit: &Hit) -> bool {
         let paint = self.paint(hit);
         let faces = hit.front || paint.double_sided;
@@ -263,13 +263,13 @@ impl Soup {
             }
     }
 
-    /// Whether a point shows its colour over what is behind.
+    /// Whether a hit is blended over what is behind it.
     pub(super) fn is_blended(&self, hit: &Hit) -> bool {
         let paint = self.paint(hit);
         paint.kind == Kind::Blend && (hit.front || paint.double_sided)
     }
 
-    /// Both sides cast; what is cut away does not, nor what is more translucent than the threshold.
+    /// Whether a hit casts a shadow: both sides do, except where alpha is below the caster threshold.
     fn casts(&self, hit: &Hit) -> bool {
         let paint = self.paint(hit);
         paint.kind == Kind::Opaque || self.alpha(hit) >= paint.caster
@@ -286,7 +286,7 @@ impl Soup {
     }
 }
 
-/// Middle and radius of a ball around some triangles.
+/// Center and radius of a bounding sphere.
 fn ball(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
     let held = |mut bounds: Bounds, triangle: &Triangle| {
         triangle.points().iter().for_each(|point| bounds.include((*point).into()));
@@ -329,7 +329,7 @@ fn triangles(scene: &Scene, surface: &Surface) -> Vec<Triangle> {
         mesh.triangles().par_iter().with_min_len(LEAST).enumerate().filter_map(move |(at, corners)| {
             let run = domain.runs.iter().rev().find(|run| run.first_triangle <= at);
             let material = run.map_or(domain.material, |run| run.material);
-            // Which side of a double-sided triangle is seen follows its normals at rest.
+            // The front side of a double-sided triangle is the one that its rest normals point to.
             let turned = scene.materials[material].double_sided && disagrees(mesh, *corners);
             let [a, b, c] = *corners;
             let corners = if mirrored == turned { [a, b, c] } else { [a, c, b] };

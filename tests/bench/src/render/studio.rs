@@ -1,4 +1,4 @@
-//! Frames of the renderer: one scene under one look, deformed on the CPU, drawn and timed.
+//! Test harness around the renderer: one scene with one look, deformed on the CPU, drawn and timed.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -22,22 +22,22 @@ pub struct Size {
     pub height: u32,
 }
 
-/// The time of one pass, by the name of its stage.
+/// Time of one pass, by the name of its stage.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Pass {
     pub name: &'static str,
     pub timing: Timing,
 }
 
-/// How long a device draws before the stopwatch counts.
+/// Warm-up time before timing starts.
 pub(super) const WARM_UP: Duration = Duration::from_millis(500);
 
-/// Everything that draws.
+/// Owns the renderer and draws scenes with it.
 pub(super) struct Studio {
     pub(super) renderer: Renderer,
 }
 
-/// A scene on the device.
+/// A scene that is loaded on the device, with its deformer.
 pub(super) struct Set {
     scene: Arc<Scene>,
     pub(super) buffers: SceneBuffers,
@@ -57,19 +57,19 @@ impl Studio {
         Ok(Set { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, light: None })
     }
 
-    /// Lets CUDA draw what it may of a scene.
+    /// Lets the CUDA rasterizer draw the passes of a scene that it supports.
     ///
     /// # Errors
-    /// Those of the device.
+    /// Errors of the device.
     pub(super) fn draw_beside(&mut self, set: &mut Set, device: &Arc<Device>) -> Result<()> {
         let make = |mesh: Mesh| Ok(Box::new(GlRaster::new(device, mesh)?) as Box<dyn Rasteriser>);
         self.renderer.draw_beside(&mut set.buffers, make)
     }
 
-    /// Lets those draw a posed scene that its look names, as far as they are there.
+    /// Selects the rasterizers of a posed scene as its look requests, as far as they are available.
     ///
     /// # Errors
-    /// Those of the device, and of drawing.
+    /// Errors of the device and of drawing.
     pub(super) fn draw_as_named(&mut self, set: &mut Set, camera: Camera, size: Size) -> Result<()> {
         let wanted = set.scene.look.raster;
         let Some(device) = plants::device().filter(|_| wanted != Rastering::OpenGl) else { return Ok(()) };
@@ -81,7 +81,7 @@ impl Studio {
         Ok(())
     }
 
-    /// Deforms it and uploads what came of that.
+    /// Deforms the scene to a state and uploads the vertices.
     pub(super) fn pose(&mut self, set: &mut Set, state: &State) -> Result<()> {
         let deformed = set.deformer.deform(state)?;
         (set.bounds, set.light) = (deformed.bounds, deformed.light);
@@ -92,13 +92,14 @@ impl Studio {
         self.renderer.draw(&set.buffers, &set.shot(camera, size))
     }
 
-    /// Draws the same frame again and again; the passes of the stages, and of all but reading back together ("frame").
+    /// Draws the same frame repeatedly and returns the times per pass; "frame" is the sum of all passes except the
+    /// readback.
     pub(super) fn time(&mut self, set: &Set, camera: Camera, size: Size, replays: usize) -> Result<Vec<Pass>> {
         let mut times: Vec<(&'static str, Vec<f64>)> = vec![("frame", Vec::new())];
         self.warm_up(set, camera, size)?;
         for _ in 0..replays.max(FEWEST) {
             let image = self.draw(set, camera, size)?;
-            // The two stages whole: the other times are parts of them.
+            // "shadow" and "draw" are whole stages; the other times are parts of them.
             let frame = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));
             times[0].1.push(frame.map(|(_, ms)| 1e3 * ms).sum());
             for (name, ms) in &image.passes {
@@ -114,8 +115,8 @@ impl Studio {
         times.into_iter().map(pass).collect()
     }
 
-    /// The first frame of a size compiles and allocates, and the clock of a device that rested rises for a while: the same
-    /// pass took six times as long on an H200 at first.
+    /// Draws until times are stable. The first frame of a size compiles and allocates, and the clock rate of an idle
+    /// device rises for a while: the same pass took six times as long on an H200 at first.
     pub(super) fn warm_up(&mut self, set: &Set, camera: Camera, size: Size) -> Result<()> {
         let begin = Instant::now();
         loop {
@@ -136,7 +137,7 @@ impl Set {
         Shot { camera, width: size.width, height: size.height, bounds: self.bounds, light: self.light }
     }
 
-    /// Bounds of the vertices that were drawn last, and what they take up in light space.
+    /// Bounds of the last posed vertices, in world and in light space.
     pub(super) const fn extents(&self) -> (Bounds, Option<LightBounds>) {
         (self.bounds, self.light)
     }
@@ -145,7 +146,7 @@ impl Set {
         &self.scene
     }
 
-    /// The vertices that were drawn last.
+    /// The last posed vertices.
     pub(super) fn surface(&mut self) -> Result<&Surface> {
         self.deformer.surface()
     }

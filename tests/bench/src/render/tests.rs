@@ -1,4 +1,4 @@
-//! The references against what is known by hand, and the renderer against the references.
+//! Tests of the references against analytic results, and of the renderer against the references.
 
 use std::sync::Arc;
 
@@ -20,7 +20,7 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
 use modalcast_model::scene::{Bounds, Camera, Ground, Lens, Parts, Scene, State, View as Eye};
 use modalcast_render::Shot;
 
-/// No sky, no ground, the sun behind the camera.
+/// An empty scene without sky and ground, with the sun behind the camera.
 fn bare() -> Parts {
     let mut parts = Parts::named("test");
     (parts.look.shadow, parts.look.ground) = (None, None);
@@ -39,7 +39,8 @@ fn surface(scene: &Arc<Scene>) -> (Surface, Bounds) {
     (deformer.surface().expect("there").clone(), bounds)
 }
 
-/// Ten pixels a unit in the plane z = 0, or y = 0 when seen from above; the origin in the middle of `side` pixels.
+/// A shot with ten pixels per unit in the plane z = 0, or y = 0 when seen from above; the origin is in the center of
+/// `side` pixels.
 fn shot(bounds: Bounds, side: u32, above: bool) -> Shot {
     let middle = f64::from(side) / 2.0;
     let (eye, up) = if above { ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]) } else { ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]) };
@@ -64,10 +65,10 @@ fn linear(picture: &Picture, at: usize) -> Vector3<f64> {
 }
 
 #[test]
-fn a_square_covers_its_area_and_a_half_covered_pixel_is_half_as_bright() {
+fn pixels_are_as_bright_as_their_covered_area() {
     let mut parts = bare();
     let white = Material { ambient: [1.0; 3], diffuse: [0.0; 3], ..Material::default() };
-    // 10.35 by 7.8 pixels; the left edge halves a column of pixels.
+    // 10.35 by 7.8 pixels; the left edge bisects a column of pixels.
     add(&mut parts, "square", facing([-0.55, -0.38, 0.485, 0.4], 0.0), white).expect("added");
     parts.look.skylight = [1.0; 3];
     let picture = pictures(parts, false, &[Term::Unshadowed], 32).remove(0);
@@ -79,7 +80,7 @@ fn a_square_covers_its_area_and_a_half_covered_pixel_is_half_as_bright() {
 }
 
 #[test]
-fn one_pixel_is_shaded_as_equation_3_12_says() {
+fn shades_one_pixel_by_equation_3_12() {
     let mut parts = bare();
     let material = Material {
         ambient: [0.2, 0.4, 0.6],
@@ -91,7 +92,7 @@ fn one_pixel_is_shaded_as_equation_3_12_says() {
     add(&mut parts, "square", facing([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("added");
     parts.look.sun = [3.0, 0.0, 4.0];
     let picture = pictures(parts, false, &[Term::Unshadowed], 41).remove(0);
-    // The middle of the middle pixel is the origin: the eye is straight ahead, and v_e' is n.
+    // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n.
     let cosine: f64 = 0.8;
     let wanted = [(0.2, 0.5, 0.3), (0.4, 0.25, 0.2), (0.6, 0.1, 0.1)]
         .map(|(ambient, diffuse, gleam)| 0.25 * ambient + 0.5 * (cosine * diffuse + cosine.powi(3) * gleam));
@@ -102,7 +103,7 @@ fn one_pixel_is_shaded_as_equation_3_12_says() {
 }
 
 #[test]
-fn a_back_face_is_not_seen_unless_it_has_two_sides_and_then_turns_its_normal() {
+fn back_face_is_visible_only_if_double_sided() {
     let shown = |double_sided: bool| {
         let mut parts = bare();
         let turned = quad([[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0.0, 0.0, -1.0]);
@@ -114,7 +115,7 @@ fn a_back_face_is_not_seen_unless_it_has_two_sides_and_then_turns_its_normal() {
 }
 
 #[test]
-fn transparent_layers_are_sorted_whatever_their_order() {
+fn sorts_transparent_layers_in_any_order() {
     let shown = |depths: [f32; 2]| {
         let mut parts = bare();
         parts.look.skylight = [1.0; 3];
@@ -133,13 +134,13 @@ fn transparent_layers_are_sorted_whatever_their_order() {
     assert!((green_first - Vector3::new(0.25, 0.5, 0.25)).norm() < 1e-6, "{green_first}");
 }
 
-/// A ground seen from above with the edge of a caster's shadow at `x = 0.3`, out of the camera's sight, and a peg that
-/// keeps the ground at height 0.
+/// A ground seen from above with the edge of a shadow at `x = 0.3`. The caster is outside of the image; a peg keeps the
+/// ground at height 0.
 fn edge(caster: Material) -> Parts {
     let mut parts = bare();
     parts.look.ground = Some(Ground { colour: [1.0; 3] });
     parts.look.sun = [3.0, 4.0, 0.0];
-    // The sun comes from +x: a point at height 4 throws its shadow 3 to the left.
+    // The sun comes from +x: a point at height 4 casts its shadow 3 units to the left.
     let rest = [[3.3, 4.0, 9.0], [9.0, 4.0, 9.0], [9.0, 4.0, -9.0], [3.3, 4.0, -9.0]];
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh = Mesh::indexed(rest.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
@@ -149,8 +150,8 @@ fn edge(caster: Material) -> Parts {
 }
 
 #[test]
-fn the_edge_of_an_umbra_lies_where_it_must_and_a_filtered_one_falls_as_a_bell_does() {
-    // Deviations of half a unit along x in the plane across the light: 0.5 / 0.8 on the ground.
+fn hard_and_gaussian_shadow_edges_match_the_analytic_ones() {
+    // Deviations of 0.4 in the plane perpendicular to the light: 0.4 / 0.8 on the ground along x.
     let across = [Vector3::new(4.0, -3.0, 0.0) / 5.0 * 0.4, Vector3::z() * 0.4];
     let terms = [Term::Hard, Term::Filtered(across), Term::Unshadowed];
     let [hard, soft, all]: [Picture; 3] =
@@ -179,7 +180,7 @@ fn erf(x: f64) -> f64 {
 }
 
 #[test]
-fn a_cut_out_casts_its_holes_and_glass_casts_from_the_threshold_on() {
+fn cut_outs_and_glass_cast_from_their_alpha_threshold_on() {
     let dark = |alpha_mode: AlphaMode, alpha: f32, texel: u8| {
         let mut parts = edge(Material { alpha_mode, alpha, colour_texture: Some(0), ..Material::default() });
         parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel]).expect("fits"));
@@ -192,7 +193,7 @@ fn a_cut_out_casts_its_holes_and_glass_casts_from_the_threshold_on() {
 }
 
 #[test]
-fn rays_find_the_nearest_triangle_as_a_search_of_all_does_wherever_the_scene_is() {
+fn ray_queries_match_a_linear_search_at_any_position() {
     let stage = Kind::Triangles(800).stage().expect("built");
     let (mut surface, _) = surface(&stage.scene);
     for shift in [0.0_f32, 2048.0] {
@@ -215,7 +216,7 @@ fn rays_find_the_nearest_triangle_as_a_search_of_all_does_wherever_the_scene_is(
 }
 
 #[test]
-fn a_drawn_scene_is_near_its_reference_and_a_sun_in_another_place_is_noticed() {
+fn drawn_scene_matches_reference_unless_sun_moves() {
     let stage = Kind::Square.stage().expect("built");
     let size = Size { width: 160, height: 90 };
     let variant = variants::all(true).remove(1);
@@ -241,7 +242,7 @@ fn a_drawn_scene_is_near_its_reference_and_a_sun_in_another_place_is_noticed() {
 }
 
 #[test]
-fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
+fn report_measures_wanted_variants_and_files_read_back() {
     let request = Request {
         plants: vec![],
         loads: vec![Kind::Square],
@@ -277,7 +278,7 @@ fn a_report_measures_every_wanted_variant_and_its_files_read_back() {
 }
 
 #[test]
-fn bare_passes_stand_beside_a_frame_without_culling_even_where_the_only_row_has_another() {
+fn bare_passes_are_compared_with_a_frame_without_culling() {
     let request = Request {
         plants: vec![],
         loads: vec![Kind::Triangles(800)],
@@ -302,7 +303,7 @@ fn bare_passes_stand_beside_a_frame_without_culling_even_where_the_only_row_has_
 }
 
 #[test]
-fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farther_in_the_order_of_the_file() {
+fn exact_transparency_is_closer_to_reference_than_two_pass() {
     let request = Request {
         plants: vec![],
         loads: vec![Kind::Panes, Kind::Square],
@@ -319,7 +320,7 @@ fn panes_are_near_the_sorted_reference_where_they_are_blended_exactly_and_farthe
 }
 
 #[test]
-fn a_tree_of_boxes_that_moves_along_meets_what_one_built_anew_does() {
+fn refitted_bvh_gives_the_same_pictures_as_a_rebuilt_one() {
     let stage = Kind::Triangles(2_000).stage().expect("built");
     let at = |step: usize| {
         let mut deformer = ReferenceDeformer::new(&stage.scene);

@@ -1,13 +1,13 @@
-//! Images as the reference samples them: level 0, bilinear, repeating, in f32 after decoding.
+//! Image sampling of the references: mip level 0, bilinear, repeating, in f32 after decoding.
 
 use modalcast_model::domain::Texture;
 
-/// What an image holds.
+/// Content of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Use {
-    /// sRGB colours; wholly transparent texels have none.
+    /// sRGB colors; the color of fully transparent texels is ignored.
     Colour,
-    /// Tangent-space normals, as bytes over 255.
+    /// Tangent-space normals, bytes divided by 255.
     Normal,
 }
 
@@ -34,10 +34,10 @@ impl Texels {
         Self { width: texture.width() as usize, height: texture.height() as usize, purpose, rgba }
     }
 
-    /// The four texels around a point, with their weights.
+    /// The four texels around a point and their weights.
     fn around(&self, uv: [f64; 2]) -> [([f32; 4], f64); 4] {
         let along = |coordinate: f64, count: usize| {
-            // Wrapped first, so that large coordinates keep their fraction.
+            // Wrap first, so that large coordinates keep their fraction.
             let place = coordinate.rem_euclid(1.0) * count as f64 - 0.5;
             let low = place.floor();
             let wrap = |index: f64| (index as i64).rem_euclid(count as i64) as usize;
@@ -58,7 +58,7 @@ impl Texels {
         self.around(uv).iter().map(|(texel, weight)| f64::from(texel[3]) * weight).sum()
     }
 
-    /// All four channels. What is wholly transparent has no colour to give: the others around it are weighed alone.
+    /// All four channels. Fully transparent texels have no color, so the color weights of the others are renormalized.
     pub(super) fn at(&self, uv: [f64; 2]) -> [f64; 4] {
         let four = self.around(uv);
         let counts = |texel: &[f32; 4]| self.purpose == Use::Normal || texel[3] > 0.0;
@@ -74,12 +74,12 @@ impl Texels {
     }
 }
 
-/// IEC 61966-2-1, from 0 to 1.
+/// sRGB decoding by IEC 61966-2-1, 0 to 1.
 pub(super) fn linear_from_srgb(encoded: f64) -> f64 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
-/// Its inverse.
+/// sRGB encoding, the inverse of [`linear_from_srgb`].
 pub(super) fn srgb_from_linear(linear: f64) -> f64 {
     if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn texel_centres_are_exact_and_images_repeat() {
+    fn texel_centers_are_exact_and_images_repeat() {
         let texels = pair(Use::Normal);
         for turn in [-3.0, 0.0, 1e6] {
             assert_eq!(texels.at([0.25 + turn, 0.5]), [1.0, 0.0, 0.0, 1.0]);
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_away_tints_nothing() {
+    fn transparent_texels_do_not_affect_color() {
         let texels = pair(Use::Colour);
         assert_eq!(texels.at([0.5, 0.5]), [1.0, 0.0, 0.0, 0.5]);
         assert_eq!(texels.alpha([0.5, 0.5]), 0.5);
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn the_two_curves_undo_each_other() {
+    fn srgb_curves_are_inverse() {
         for value in [0.0, 0.001, 0.0031308, 0.2, 0.5, 1.0] {
             assert!((linear_from_srgb(srgb_from_linear(value)) - value).abs() < 1e-7, "{value}");
         }

@@ -1,4 +1,5 @@
-//! Frame times of scenes of the user: no references, no variants; and all that another program needs to draw the same view.
+//! Frame times of scenes of the user, without references or variants, and all data that another program needs to draw
+//! the same view.
 
 use std::path::Path;
 use std::time::Instant;
@@ -14,7 +15,7 @@ use modalcast_model::load;
 use modalcast_model::scene::{Camera, Look, State};
 use modalcast_render::{Info, Paths};
 
-/// What to time.
+/// Settings of the timing.
 #[derive(Debug, Clone)]
 pub struct Request {
     /// Scenes as the command line names them.
@@ -24,29 +25,29 @@ pub struct Request {
     pub replays: usize,
 }
 
-/// One scene at rest.
+/// Results of one scene at rest.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Sample {
     pub name: String,
     pub vertices: usize,
     pub triangles: usize,
     pub look: Look,
-    /// Samples a pixel.
+    /// Samples per pixel.
     pub samples: u32,
-    /// Who drew it.
+    /// Rasterizers that drew it.
     pub paths: Paths,
-    /// `clip_from_world`, column by column; the camera frames the scene.
+    /// `clip_from_world`, column-major; the camera frames the scene.
     pub clip_from_world: Vec<f64>,
     pub eye: [f64; 3],
     pub to_sun: [f64; 3],
-    /// "frame" is all passes but reading back.
+    /// Times per pass; "frame" is the sum without readback.
     pub passes: Vec<Pass>,
-    /// The wall clock around a whole frame, its pixels in host memory.
+    /// Wall-clock time of a whole frame, including readback.
     pub whole: Timing,
     pub picture: String,
 }
 
-/// All of them.
+/// Results of all scenes.
 #[derive(Debug, Clone, Serialize)]
 pub struct Timed {
     pub made: Provenance,
@@ -57,10 +58,10 @@ pub struct Timed {
     files: Vec<File>,
 }
 
-/// Times scenes; `progress` hears which.
+/// Times scenes; `progress` receives the name of each.
 ///
 /// # Errors
-/// `Unavailable` without OpenGL; those of loading and drawing a scene.
+/// `Unavailable` without OpenGL; errors of loading and drawing a scene.
 pub fn timed(request: &Request, mut progress: impl FnMut(&str)) -> Result<Timed> {
     let mut studio = Studio::open()?;
     let (mut scenes, mut files) = (Vec::new(), Vec::new());
@@ -110,7 +111,7 @@ fn sample(studio: &mut Studio, request: &Request, source: &str) -> Result<(Sampl
 }
 
 impl Timed {
-    /// Writes the pictures and `times.json` into a folder, which is made.
+    /// Writes the pictures and `times.json` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -127,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_scene_is_timed_and_its_matrix_brings_what_it_frames_into_the_picture() {
+    fn times_a_scene_and_its_matrix_centers_it() {
         let request = Request { scenes: vec!["tree".into()], size: Size { width: 32, height: 24 }, replays: 1 };
         let timed = timed(&request, |_| {}).expect("timed");
         let sample = &timed.scenes[0];

@@ -1,6 +1,6 @@
-//! What is measured: ways to draw the same scene, each as a change of its look.
+//! The rendering variants: ways to draw the same scene, each a change of its look.
 //!
-//! To add one, add it to [`all`]: its name, its method, the change, and what it is meant to look like.
+//! To add a variant, add it to [`all`]: its name, method, change of the look, and intended result.
 
 use serde::Serialize;
 
@@ -8,40 +8,41 @@ use super::loads::Kind;
 use super::packing::Packing;
 use modalcast_model::scene::{Blurring, Culling, Fit, Look, Moments, Shadow, ShadowMethod, Transparency};
 
-/// How shadows are made.
+/// Shadow technique.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Method {
-    /// There are none.
+    /// No shadows.
     None,
-    /// The standard shadow map.
+    /// Standard shadow map.
     Standard,
     /// Percentage-closer filtering.
     Filtered,
-    /// The variance shadow map.
+    /// Variance shadow map.
     Variance,
 }
 
-/// What a variant means to show: the reference that it must be near to.
+/// Intended result of a variant: the reference that it is compared with.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Aim {
     /// No shadow at all.
     Unshadowed,
-    /// The edge of a shadow as a sun without size makes it.
+    /// Hard shadow edges, as of a point light.
     Hard,
-    /// The edge of a shadow as soft as a bell of this deviation, in texels of its own map.
+    /// Shadow edges filtered by a Gaussian of this standard deviation, in texels of the variant's own map.
     Filtered { texels: f64 },
 }
 
-/// What a variant must keep against what it means to show.
+/// Error bounds of a variant against its intended result.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Bounds {
-    /// Mean error of a pixel, of 255.
+    /// Mean color error of a pixel, of 255.
     pub mean_colour: f64,
-    /// Mean error of the light that arrives, of 1.
+    /// Mean error of the sun visibility, of 1.
     pub mean_light: f64,
-    /// Mean light where none should be, and mean light that is missing where all should be, of 1.
+    /// Mean sun visibility inside the umbra (light bleeding), of 1.
     pub bleeding: f64,
+    /// Mean sun visibility that is missing outside of shadows, of 1.
     pub lost: f64,
 }
 
@@ -52,26 +53,27 @@ pub struct Variant {
     pub name: String,
     pub method: Method,
     pub shadow: Option<Shadow>,
-    /// How blended triangles are drawn, where that is what is compared; else as the look of the load says.
+    /// Transparency method, for variants that compare it; otherwise that of the load's look.
     pub transparency: Option<Transparency>,
-    /// How images lie in arrays, where that is what is compared.
+    /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
-    /// What is left out before it is drawn, where that is what is compared: the picture is the same.
+    /// Culling, for variants that compare it. It does not change the picture.
     pub culling: Option<Culling>,
     pub aim: Aim,
 }
 
-/// Twice what small pictures of many leaves are found at, where each leaf is a pixel or two; all others are far below. A
-/// shadow that is missing or lies elsewhere exceeds the last two however little of the picture it takes.
+/// Twice the errors of small pictures with many leaves, where each leaf covers a pixel or two; all other errors are far
+/// below. A missing or displaced shadow exceeds the last two bounds, however small its part of the picture is.
 pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
-/// The light that a filtered map may let into the umbra where no two casters overlap: the bound of Chebyshev is exact
-/// there, and only rounding is left.
+/// Bound on light bleeding of a filtered map where no two casters overlap: Chebyshev's bound is exact there, and only
+/// rounding remains.
 const EXACT: f64 = 0.01;
-/// The mean error of light on the shelf, whose shadow fills half of the picture and is narrower than the widest blur:
-/// the depths of the ground itself then vary as much as the shelf is above it, and most of the sun gets through.
+/// Bound on the mean light error of the shelf. Its shadow fills half of the picture and is narrower than the widest
+/// blur. The depths of the ground itself then vary as much as the shelf's height above it, and most of the sunlight
+/// leaks through.
 const NARROW: f64 = 0.4;
 
-/// Sides of shadow maps and deviations of their blur, texels.
+/// Sides of shadow maps, and standard deviations of their blur in texels.
 const SIZES: [u32; 4] = [512, 1024, 2048, 4096];
 const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
 
@@ -83,14 +85,14 @@ impl Variant {
         Look { shadow: self.shadow, transparency, culling, ..look }
     }
 
-    /// Whether a load has what it is about.
+    /// Whether a load has the features that the variant compares.
     pub fn suits(&self, load: Kind) -> bool {
         let is_large = matches!(load, Kind::Tree | Kind::Grove | Kind::Triangles(_));
         let has_images = self.packing.is_some() == (load == Kind::Images);
         has_images && (self.transparency.is_none() || load == Kind::Panes) && (self.culling.is_none() || is_large)
     }
 
-    /// What it must keep on a load.
+    /// Error bounds on a load.
     pub fn bounds(&self, load: Kind) -> Bounds {
         let bleeding = match (self.aim, load) {
             (Aim::Filtered { .. }, Kind::Square | Kind::Shelf) => EXACT,
@@ -100,8 +102,8 @@ impl Variant {
         Bounds { bleeding, mean_light, ..BOUNDS }
     }
 
-    /// Whether it is there to be seen to exceed its bounds: the second moment of f16 lets light into a shadow near its
-    /// caster.
+    /// Whether the variant is stated to exceed its bounds on a load: f16 second moments let light into a shadow near
+    /// its caster.
     pub fn is_to_fail(&self, load: Kind) -> bool {
         load == Kind::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == Moments::F16)
     }
@@ -118,7 +120,7 @@ impl Variant {
         }
     }
 
-    /// One map, hard: it means to show the hard shadow, whatever its texels.
+    /// One standard map. The intended result is the hard shadow, whatever the size of the texels.
     fn standard(size: u32) -> Self {
         let shadow = Shadow { method: ShadowMethod::Standard, size, ..Shadow::default() };
         Self {
@@ -132,13 +134,13 @@ impl Variant {
         }
     }
 
-    /// A map whose answers are weighed by a bell of `blur` texels that moves with the point.
+    /// A map whose comparisons are weighted by a Gaussian of `blur` texels around the shaded point (PCF).
     fn filtered(size: u32, blur: f32) -> Self {
         let shadow = Shadow { method: ShadowMethod::Filtered, size, blur, ..Shadow::default() };
         Self::soft(format!("filtered {size}, blur {blur}"), Method::Filtered, shadow)
     }
 
-    /// A variance map of this size, its moments blurred by a bell of `blur` texels and then read between texels.
+    /// A variance map whose moments are blurred by a Gaussian of `blur` texels and then interpolated.
     fn variance(size: u32, blur: f32) -> Self {
         let shadow = Shadow { size, blur, ..Shadow::default() };
         Self::soft(format!("variance {size}, blur {blur}"), Method::Variance, shadow)
@@ -149,25 +151,25 @@ impl Variant {
         Self::soft(format!("variance {size}, f16"), Method::Variance, shadow)
     }
 
-    /// A variance map without the cut that keeps light from bleeding.
+    /// A variance map without light-bleeding reduction.
     fn uncut(size: u32, blur: f32) -> Self {
         let shadow = Shadow { size, blur, bleeding: 0.0, ..Shadow::default() };
         Self::soft(format!("variance {size}, blur {blur}, bleeding uncut"), Method::Variance, shadow)
     }
 
-    /// A map that is fitted to the corners of a box, as the thesis has it.
+    /// A map that is fitted to the corners of the bounding box, as in the thesis.
     fn cornered(size: u32) -> Self {
         let shadow = Shadow { size, fit: Fit::Corners, ..Shadow::default() };
         Self::soft(format!("variance {size}, fitted to corners"), Method::Variance, shadow)
     }
 
-    /// The same picture, blurred by other passes: a baseline of time.
+    /// The same picture with the blur in other passes: a baseline for times.
     fn blurred((size, blur): (u32, f32), (name, blurring): (&str, Blurring)) -> Self {
         let shadow = Shadow { size, blur, blurring, ..Shadow::default() };
         Self::soft(format!("variance {size}, blur {blur}, {name}"), Method::Variance, shadow)
     }
 
-    /// Maps split by distance: the nearer the sharper, so that all of them mean to show the hard shadow.
+    /// Cascaded maps, sharper near the camera. The intended result is the hard shadow.
     fn split(size: u32, splits: u32) -> Self {
         let shadow = Shadow { size, splits, ..Shadow::default() };
         let name = format!("variance {size}, {splits} splits");
@@ -182,12 +184,12 @@ impl Variant {
         }
     }
 
-    /// Panes as this method blends them, without shadows.
+    /// Panes with this transparency method, without shadows.
     fn blended(name: &str, transparency: Transparency) -> Self {
         Self { name: name.into(), transparency: Some(transparency), ..Self::unshadowed() }
     }
 
-    /// Images packed so, without shadows.
+    /// Images with this packing, without shadows.
     fn packed(name: &str, packing: Packing) -> Self {
         Self { name: name.into(), packing: Some(packing), ..Self::unshadowed() }
     }
@@ -203,7 +205,7 @@ impl Variant {
     }
 }
 
-/// Every variant, or the few of a quick run.
+/// All variants, or the few of a quick run.
 pub fn all(quick: bool) -> Vec<Variant> {
     if quick {
         return few();
@@ -219,7 +221,7 @@ pub fn all(quick: bool) -> Vec<Variant> {
     all.extend((2..=4).map(|splits| Variant::split(1024, splits)));
     all.push(Variant::cornered(2048));
     let passes = [("tiles", Blurring::Tiles), ("rows", Blurring::Rows), ("fragments", Blurring::Fragments)];
-    // 25 depths in each direction, and 15.
+    // Blurs of 25 taps per direction, and of 15.
     for map in [(1024, 4.0), (4096, 4.0), (4096, 2.3)] {
         all.extend(passes.map(|pass| Variant::blurred(map, pass)));
     }
@@ -266,7 +268,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_differ_and_only_the_shadow_of_a_look_changes_or_how_it_blends() {
+    fn names_are_unique_and_variants_change_only_their_feature() {
         for quick in [false, true] {
             let all = all(quick);
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
@@ -286,7 +288,7 @@ mod tests {
         }
     }
     #[test]
-    fn f16_is_to_fail_beside_its_caster_alone_and_nothing_else_is() {
+    fn only_f16_on_the_shelf_is_stated_to_fail() {
         for variant in all(false) {
             let loads: Vec<Kind> = Kind::all(false).into_iter().filter(|load| variant.is_to_fail(*load)).collect();
             let wanted: &[Kind] = if variant.name.contains("f16") { &[Kind::Shelf] } else { &[] };
@@ -295,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn soft_maps_alone_are_held_to_the_exact_bound_where_it_is_exact() {
+    fn only_filtered_maps_get_the_exact_bleeding_bound() {
         let soft = Variant::variance(512, 1.5);
         assert!(soft.bounds(Kind::Square).bleeding < 0.02 && soft.bounds(Kind::Tree) == BOUNDS);
         assert_eq!(Variant::standard(512).bounds(Kind::Square), BOUNDS);

@@ -1,4 +1,4 @@
-//! The camera's rays, and what of a frame is no triangle: ground, sky and light.
+//! Camera rays, and the parts of a frame that are not triangles: ground, sky and light.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -6,13 +6,13 @@ use super::soup::Ray;
 use modalcast_model::scene::{Lens, Scene};
 use modalcast_render::Shot;
 
-/// Everything about one frame but its triangles. Colours are linear, lengths scene units.
+/// Parameters of one frame. Colors are linear, lengths are scene units.
 #[derive(Debug, Clone)]
 pub(super) struct View {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) eye: Vector3<f64>,
-    /// Depth along the camera's axis between which triangles are seen.
+    /// Depth range along the camera's axis in which triangles are visible.
     pub(super) range: (f64, f64),
     pub(super) to_sun: Vector3<f64>,
     pub(super) sunlight: Vector3<f64>,
@@ -36,7 +36,7 @@ pub(super) struct Plane {
 }
 
 impl View {
-    /// The numbers of a shot of a scene whose positions are relative to its origin.
+    /// The parameters of a shot of a scene. Positions are relative to the scene's origin.
     pub(super) fn new(scene: &Scene, shot: &Shot) -> Self {
         let look = &scene.look;
         let wide = |colour: [f32; 3]| Vector3::from(colour).cast::<f64>();
@@ -71,22 +71,22 @@ impl View {
         }
     }
 
-    /// The ray through a point of the image in pixels from its top left; t is the depth along the camera's axis.
+    /// The ray through a point of the image, in pixels from the top left. Its t is the depth along the camera's axis.
     pub(super) fn ray(&self, x: f64, y: f64) -> Ray {
         let [fx, fy, cx, cy] = self.lens;
         let along = Vector3::new((x - cx) / fx, (cy - y) / fy, -1.0);
         Ray { from: self.eye, along: self.world_from_camera * along }
     }
 
-    /// The sky in a direction: 1 - exp(-6 s s / (s + 0.06)) of the way from the horizon to the zenith, s the sine of its
-    /// elevation.
+    /// The sky color in a direction: interpolated from horizon to zenith by 1 - exp(-6 s s / (s + 0.06)), with s the
+    /// sine of the elevation.
     pub(super) fn sky(&self, along: &Vector3<f64>) -> Vector3<f64> {
         let sine = along.normalize().dot(&self.up).max(0.0);
         let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
         self.horizon.lerp(&self.zenith, share)
     }
 
-    /// Where a ray meets the ground ahead.
+    /// The t where a ray hits the ground in front of its origin.
     pub(super) fn ground_at(&self, ray: &Ray) -> Option<f64> {
         let plane = self.ground?;
         let fall = self.up.dot(&ray.along);
@@ -94,20 +94,21 @@ impl View {
         (fall < 0.0 && t > 0.0 && t.is_finite()).then_some(t)
     }
 
-    /// How much of the ground's own colour is left in the haze, from 1 under the scene to 0 far away.
+    /// Fraction of the ground's own color in the haze, from 1 under the scene to 0 far away.
     pub(super) fn clear(&self, point: &Vector3<f64>) -> f64 {
         let share = |plane: Plane| (point - plane.centre).norm_squared() / (plane.fade * plane.fade);
         self.ground.map_or(0.0, |plane| (-share(plane)).exp())
     }
 
-    /// The ground's colour, and that of the haze over it.
+    /// The color of the ground, and that of the haze.
     pub(super) fn ground_colours(&self) -> (Vector3<f64>, Vector3<f64>) {
         (self.ground.map_or(Vector3::zeros(), |plane| plane.colour), self.horizon)
     }
 }
 
 impl Plane {
-    /// It lies at the lowest rest position and fades over 3.5 times the scene's diagonal, or the eye's distance aside.
+    /// A plane at the lowest rest position. It fades over 3.5 times the scene's diagonal or the eye's horizontal
+    /// distance, whichever is larger.
     fn new(scene: &Scene, eye: Vector3<f64>, colour: Vector3<f64>) -> Self {
         let (rest, up) = (scene.rest_bounds, scene.up.index());
         let height = rest.min[up];

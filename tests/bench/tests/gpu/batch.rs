@@ -1,4 +1,4 @@
-//! Many coordinate vectors for one U: tensor cores against their bound, and what batches cost.
+//! Batches of coordinate vectors with one U: tensor cores against their error bound, and the cost of batches.
 
 use std::sync::Arc;
 
@@ -12,8 +12,8 @@ use crate::ensembles::{ensemble, made, states, stored};
 use crate::judge::same_bits;
 use crate::scenes;
 
-/// The largest error of a vertex over the bound of its tile: of U in 16 bits, of q in two numbers of 16 bits, and of the
-/// tensor cores' own sums.
+/// Largest quotient of a vertex's error and the bound of its tile. The bound covers U in 16 bits, q as pairs of 16-bit
+/// numbers, and the tensor cores' own sums.
 fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
     let tiles = Tiles::new(shape, storage);
@@ -33,7 +33,7 @@ fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_count() {
+fn gpu_tensor_core_batches_stay_within_their_bound() {
     let device = Device::open(0).expect("a CUDA device");
     for storage in [Storage::F16, Storage::Bf16] {
         for (vertices, rank, count) in [
@@ -73,7 +73,7 @@ fn gpu_a_batch_by_tensor_cores_stays_within_its_bound_at_every_size_rank_and_cou
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_sixteen_vectors_at_once_take_less_than_half_as_long_as_one_after_the_other() {
+fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     let device = Device::open(0).expect("a CUDA device");
     let measure = |trial: &dyn Trial| {
         let us = time(&device, trial, Cache::Warm, 200).expect("times").median_us;
@@ -104,7 +104,7 @@ fn gpu_sixteen_vectors_at_once_take_less_than_half_as_long_as_one_after_the_othe
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_scenes_that_choose_have_batches_where_they_pay() {
+fn gpu_auto_mode_batches_where_it_is_faster() {
     let device = Device::open(0).expect("a CUDA device");
     let mut slow = Vec::new();
     for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {

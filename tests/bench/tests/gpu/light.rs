@@ -1,4 +1,4 @@
-//! What measuring light space costs of a step.
+//! Cost of computing light-space bounds in a step.
 
 use modalcast_bench::kernels::{Cache, Extent, Ours, Trial, time};
 use modalcast_compute::gpu::Device;
@@ -6,7 +6,7 @@ use modalcast_model::scene::Scene;
 
 use crate::scenes::{self, Random};
 
-/// Microseconds of a whole step of a scene with a shadow and without.
+/// Times of a whole step with and without a shadow, microseconds.
 fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
     let device = Device::open(0).expect("a CUDA device");
     let with = [true, false].map(|is_lit| {
@@ -24,8 +24,8 @@ fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_light_space_costs_little_of_a_step() {
-    // Shapes are of so many vertices and modes.
+fn gpu_light_space_bounds_add_at_most_10_percent_and_5_us() {
+    // Shapes are (vertices, modes).
     for (name, shape, instances) in [
         ("one domain of 16,085", (16_085, 20), 1),
         ("a million vertices", (1_000_000, 32), 1),

@@ -1,5 +1,5 @@
-//! The benchmarks on a real device. Everything that needs one is ignored without it; run with
-//! `--include-ignored --test-threads=1`. The binary needs no build tree.
+//! GPU tests of the benchmarks. Tests that need a device are ignored by default; run them with `--include-ignored
+//! --test-threads=1`. The binary does not need the build tree.
 
 mod batch;
 #[path = "../../../both/cut_outs.rs"]

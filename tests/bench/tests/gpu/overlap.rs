@@ -1,4 +1,4 @@
-//! Steps that the host reads, one after the other and overlapped.
+//! Steps with readback of the vertices, serial and overlapped.
 
 use modalcast_bench::kernels::{host_writes, overlap};
 use modalcast_compute::gpu::Device;
@@ -8,7 +8,7 @@ use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_overlap_is_measured_and_its_vertices_are_those_of_the_serial_way() {
+fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
     let device = Device::open(0).expect("a CUDA device");
     let scene = scenes::scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
     let states: Vec<State> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();

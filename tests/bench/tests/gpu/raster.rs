@@ -1,4 +1,4 @@
-//! The rasteriser on the device, against its definition: the same bits whoever draws.
+//! The CUDA rasterizer against its definition: bit-identical samples on every path.
 
 use modalcast_bench::kernels::{Raster, RasterCounts, RasterMesh, Trial as _};
 use modalcast_bench::render::loads::Kind;
@@ -12,12 +12,12 @@ fn launched(device: &Device, soup: &Soup, form: RasterForm) -> Raster {
     let mesh =
         RasterMesh { positions: &soup.positions, triangles: &soup.triangles, groups: &soup.groups, cut_outs: None };
     let raster = Raster::new(device, mesh, soup.window, form).expect("a raster");
-    // Twice: queues and samples of the first launch are gone.
+    // Twice, to check that queues and samples of the first launch are cleared.
     (0..2).for_each(|_| raster.launch(device, 0).expect("launches"));
     raster
 }
 
-/// Triangles that the definition drops, by reason, and how many it draws.
+/// Triangles that the definition drops, by reason, and the number that it draws.
 fn dropped(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
@@ -37,7 +37,7 @@ fn dropped(soup: &Soup) -> ([u32; 5], u32) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_sample_has_the_bits_of_the_definition_whether_threads_warps_or_tiles_draw() {
+fn gpu_samples_match_the_definition_bitwise_on_every_path() {
     let device = Device::open(0).expect("a CUDA device");
     for soup in soups() {
         let want = soup.drawn();
@@ -58,7 +58,7 @@ fn gpu_every_sample_has_the_bits_of_the_definition_whether_threads_warps_or_tile
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_triangle_is_counted_once_and_each_path_is_taken() {
+fn gpu_counts_every_triangle_once_and_takes_every_path() {
     let device = Device::open(0).expect("a CUDA device");
     let mut all = [0; 3];
     for soup in soups() {
@@ -83,7 +83,7 @@ fn gpu_every_triangle_is_counted_once_and_each_path_is_taken() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_ids_of_whole_scenes_are_opengls_and_both_ways_are_timed() {
+fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
     let request = Request {
         loads: vec![Kind::Square, Kind::Triangles(50_000)],
         plants: vec![],

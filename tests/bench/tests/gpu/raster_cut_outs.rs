@@ -1,5 +1,5 @@
-//! Cut-outs on the device, whoever draws them, against the definition: the same bits where the filter has nothing to say,
-//! and away from the threshold where it has.
+//! Cut-outs on the device against the definition, on every path: bit-identical where filtering has no effect, and
+//! identical away from the alpha threshold where it has.
 
 use modalcast_bench::kernels::{Raster, RasterMesh, Trial as _};
 use modalcast_compute::gpu::{Device, RasterForm, Spread};
@@ -7,9 +7,9 @@ use modalcast_compute::gpu::{Device, RasterForm, Spread};
 use crate::cut_outs::{Holes, floor, image, plain_holes, sheet};
 use crate::scenes::Random;
 
-/// Hardware mixes texels and levels by weights of 8 bits (CUDA C++ programming guide, "Texture fetching"): three mixes are
-/// 3/256. It finds the level by a logarithm of its own, taken here to be right to a sixteenth of a level, where levels
-/// differ by half at most.
+/// Tolerance of the alpha threshold. Hardware interpolates texels and levels with weights of 8 bits (CUDA C++
+/// programming guide, "Texture fetching"): three interpolations give 3/256. It computes the level by its own logarithm,
+/// assumed here to be accurate to a sixteenth of a level, where levels differ by at most one half.
 const TOLERANCE: f32 = 1.0 / 16.0;
 
 const SPREADS: [Spread; 3] = [Spread::BySize, Spread::Warps, Spread::Tiles];
@@ -35,7 +35,7 @@ fn depths(device: &Device, holes: &Holes) -> Vec<u32> {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_images_that_say_the_same_everywhere_have_the_bits_of_the_definition_on_every_path() {
+fn gpu_uniform_images_match_the_definition_bitwise() {
     let device = Device::open(0).expect("a CUDA device");
     for holes in plain_holes() {
         let want = holes.drawn();
@@ -51,7 +51,7 @@ fn gpu_images_that_say_the_same_everywhere_have_the_bits_of_the_definition_on_ev
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_sheet_is_its_image_texel_by_texel_and_its_next_level_at_half_the_size() {
+fn gpu_sheet_samples_its_image_and_mip_level_exactly() {
     let device = Device::open(0).expect("a CUDA device");
     let mut random = Random(3);
     let own = image(64, 64, |_, _, _| if random.number() < 0.0 { 0 } else { 255 });
@@ -66,7 +66,7 @@ fn gpu_a_sheet_is_its_image_texel_by_texel_and_its_next_level_at_half_the_size()
     }
 }
 
-/// Samples that differ where nothing is in doubt, and those in doubt.
+/// Number of samples that differ outside of the tolerance, and number of samples within the tolerance.
 fn beyond_doubt(holes: &Holes, got: &[u64]) -> (usize, usize) {
     let (want, doubtful) = (holes.drawn().keys, holes.doubtful(TOLERANCE));
     let wrong = (0..got.len()).filter(|at| got[*at] != want[*at] && !doubtful[*at]).count();
@@ -75,7 +75,7 @@ fn beyond_doubt(holes: &Holes, got: &[u64]) -> (usize, usize) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_a_floor_in_perspective_that_goes_on_behind_the_eye_is_cut_out_as_the_definition_says() {
+fn gpu_perspective_floor_matches_the_definition() {
     let device = Device::open(0).expect("a CUDA device");
     let mut holes = floor(1);
     let got = keys(&device, &holes, Spread::BySize);
@@ -83,7 +83,7 @@ fn gpu_a_floor_in_perspective_that_goes_on_behind_the_eye_is_cut_out_as_the_defi
     eprintln!("a floor: {wrong} of {} samples differ, {doubtful} are in doubt", got.len());
     assert_eq!(wrong, 0, "{doubtful} of {} in doubt", got.len());
     assert!(doubtful < got.len() / 8, "{doubtful} of {} in doubt", got.len());
-    // Controls: another threshold, and coordinates that are off by a tenth.
+    // Controls: another threshold, and texture coordinates that are off by a tenth.
     holes.cut_outs.table[0].least += 4.0 * TOLERANCE;
     assert!(beyond_doubt(&holes, &got).0 > 100);
     holes.cut_outs.table[0].least -= 4.0 * TOLERANCE;
@@ -93,7 +93,7 @@ fn gpu_a_floor_in_perspective_that_goes_on_behind_the_eye_is_cut_out_as_the_defi
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_small_and_medium_pieces_of_a_floor_are_cut_out_as_the_definition_says() {
+fn gpu_split_floor_matches_the_definition_on_every_path() {
     let device = Device::open(0).expect("a CUDA device");
     for (cuts, spread) in [(60_u32, Spread::BySize), (12, Spread::BySize), (12, Spread::Warps), (12, Spread::Tiles)] {
         let holes = floor(cuts);
@@ -106,10 +106,10 @@ fn gpu_small_and_medium_pieces_of_a_floor_are_cut_out_as_the_definition_says() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_filtering_along_the_footprint_keeps_more_of_far_stripes_than_the_mean_of_all() {
+fn gpu_anisotropic_filtering_keeps_more_of_far_stripes() {
     let device = Device::open(0).expect("a CUDA device");
     let mut holes = floor(1);
-    // Stripes along the view: their levels are grey soon, which is below the threshold.
+    // Stripes along the view: their coarser levels are gray, which is below the threshold.
     holes.cut_outs.images[0] = image(64, 32, |level, column, _| match (level, column / 8 % 2) {
         (0, 0) => 255,
         (0, _) => 0,

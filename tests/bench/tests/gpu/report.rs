@@ -1,4 +1,4 @@
-//! The report with everything that a device has: every trial stays within its bound, and every load has timed ones.
+//! The full report on a device: every variant is within its bound, and every load has timed CUDA variants.
 
 use modalcast_bench::bench::Machine;
 use modalcast_bench::loads::{Kind, Size};
@@ -7,7 +7,7 @@ use modalcast_model::deform::Backend;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_variant_of_small_loads_stays_within_its_bound_and_is_timed() {
+fn gpu_all_variants_of_quick_loads_pass_and_are_timed() {
     let names = ["single-14-20", "a", "a-positions", "b", "c", "cancel", "batch", "plant-2", "plant-5"];
     let kinds = names.iter().flat_map(|name| Kind::named(name).expect("a load"));
     let sources = kinds.map(Source::Synthetic).collect();

@@ -1,4 +1,4 @@
-//! What is measured beside the deformer: the roofs of the device, and the trials, each judged by the f64 twin.
+//! Device memory rates and benchmark kernels; every kernel's positions are compared with the f64 reference.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_roofs_are_of_one_size_and_an_empty_replay_takes_time() {
+fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
     let device = Device::open(0).expect("a CUDA device");
     let roofs = roofs(&device).expect("roofs");
     eprintln!("{}: {roofs:?}", device.name());
@@ -25,7 +25,7 @@ fn gpu_the_roofs_are_of_one_size_and_an_empty_replay_takes_time() {
     assert!(empty_replay(&device, 0).is_err());
 }
 
-/// Whether a triangle names each packed vertex: those that none names are not computed from unfolded triangles.
+/// Per packed vertex, whether a triangle refers to it. Other vertices are not computed from unfolded triangles.
 fn named(scene: &Scene) -> Vec<bool> {
     let mut named = vec![false; scene.layout.vertices];
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
@@ -37,7 +37,7 @@ fn named(scene: &Scene) -> Vec<bool> {
     named
 }
 
-/// The largest error of a trial's positions where a triangle names the vertex, as a part of the diagonal.
+/// Largest error of a trial's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
 fn judge(scene: &Scene, state: &State, positions: &[f32]) -> Result<f64, String> {
     let (named, want) = (named(scene), modalcast_compute::reference::deform(scene, state));
     if positions.len() != 3 * named.len() {
@@ -45,7 +45,7 @@ fn judge(scene: &Scene, state: &State, positions: &[f32]) -> Result<f64, String>
     }
     let mut bounds = Bounds::EMPTY;
     want.iter().for_each(|position| bounds.include(*position));
-    // One vertex has no diagonal; shapes lie in a cube of side 2.
+    // One vertex has no diagonal; shapes fit into a cube of side 2.
     let diagonal = bounds.diagonal().max(1.0);
     let kept = |vertex: &usize| named[*vertex];
     let got: Vec<f32> = (0..named.len()).filter(kept).flat_map(|at| positions[3 * at..][..3].to_vec()).collect();
@@ -53,7 +53,7 @@ fn judge(scene: &Scene, state: &State, positions: &[f32]) -> Result<f64, String>
     largest_error(&got, &want, POSITION * diagonal).map(|error| error / diagonal)
 }
 
-/// Judges every turn of a trial, launched and replayed.
+/// Checks every turn of a trial, launched directly and replayed.
 fn check(device: &Device, scene: &Arc<Scene>, states: &[State], trial: &dyn Trial) {
     let name = trial.name();
     assert_eq!(trial.turns(), states.len(), "{name}");
@@ -64,7 +64,7 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[State], trial: &dyn Tria
         assert!(judge(scene, &states[(turn + 1) % states.len()], &positions).is_err(), "{name}: the judge can fail");
         eprintln!("{name} turn {turn}: {error:.2e} of the diagonal");
     }
-    // The last replay is of the last turn.
+    // The last replay runs the last turn.
     for cache in [Cache::Warm, Cache::Cold] {
         trial.launch(device, 0).expect("launches");
         let timing = time(device, trial, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -85,13 +85,13 @@ fn states(scene: &Scene) -> Vec<State> {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_thesis_s_single_domain_kernel_equals_the_twin_at_its_own_ranks() {
+fn gpu_thesis_single_matches_reference_at_a_few_ranks() {
     single(&[1, 10, 33]);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_thesis_s_single_domain_kernel_equals_the_twin_at_every_rank() {
+fn gpu_thesis_single_matches_reference_up_to_rank_512() {
     single(&[3, 20, 30, 32, 129, 512]);
 }
 
@@ -110,7 +110,7 @@ fn single(ranks: &[usize]) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_the_thesis_s_grouped_kernels_equal_the_twin_with_one_two_and_four_kernels() {
+fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
     let device = Device::open(0).expect("a CUDA device");
     let shapes: Vec<_> = (0..66).map(|index| (1 + index * 29 % 611, index % 33)).collect();
     let scene = scenes::scene(&shapes, 2, true, false);
@@ -128,7 +128,7 @@ fn gpu_the_thesis_s_grouped_kernels_equal_the_twin_with_one_two_and_four_kernels
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_cublas_gives_every_domain_its_u_however_domains_are_put_together() {
+fn gpu_cublas_matches_reference_with_every_product_kind() {
     let device = Device::open(0).expect("a CUDA device");
     let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
     let many = scenes::scene(&shapes, 2, false, false);
@@ -154,7 +154,7 @@ fn gpu_cublas_gives_every_domain_its_u_however_domains_are_put_together() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_trials_refuse_scenes_that_they_are_not_for() {
+fn gpu_trials_reject_unsupported_scenes() {
     let device = Device::open(0).expect("a CUDA device");
     let (large, two) = (scenes::scene(&[(40, 33)], 1, false, false), scenes::scene(&[(40, 3)], 2, false, false));
     let field = |refusal: Result<Thesis, Error>| match refusal {

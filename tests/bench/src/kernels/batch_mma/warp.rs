@@ -1,4 +1,4 @@
-//! A warp of `kernels/batch_mma.cu` in step, with its fragments, its stage and its way out; sums in f64.
+//! CPU twin of one warp of `kernels/batch_mma.cu` in lockstep: fragments, staging buffer and stores. Sums are f64.
 
 use super::{BatchMmaArgs, STEP, args, fragments, halves, placements, vectors_for};
 use modalcast_compute::storage::{Plane, Tiles};
@@ -8,7 +8,7 @@ use modalcast_model::scene::{Scene, State, Storage};
 pub(super) const QUADS: usize = 8;
 const STRIDE: usize = 3 * QUADS + 2;
 
-/// What the kernel reads.
+/// The kernel's inputs.
 pub(super) struct Tables {
     pub tiles: Tiles,
     pub args: BatchMmaArgs,
@@ -38,8 +38,8 @@ impl Tables {
     }
 }
 
-/// A product of fragments as the instruction set defines m16n8k16: rows g and g + 8 of A and columns 2 t and 2 t + 1
-/// of D belong to lane 4 g + t.
+/// A product of fragments as the PTX instruction set defines m16n8k16: rows g and g + 8 of A and columns 2 t and 2 t +
+/// 1 of D belong to lane 4 g + t.
 fn multiply(tables: &Tables, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
     let half = |word: u32, index: usize| tables.number(word >> (16 * (index % 2)) & 0xffff);
     let at = |row: usize, k: usize| half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
@@ -52,7 +52,7 @@ fn multiply(tables: &Tables, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f
     }
 }
 
-/// The twelve words of a lane's chunk.
+/// The twelve words of a lane's chunk; zeros beyond the last chunk.
 fn load(tables: &Tables, (first, width, quad): (usize, usize, usize), chunk: usize) -> [u32; 12] {
     let mut words = [0; 12];
     if chunk < tables.args.chunks as usize {
@@ -63,7 +63,7 @@ fn load(tables: &Tables, (first, width, quad): (usize, usize, usize), chunk: usi
     words
 }
 
-/// [row][eight][lane][4]
+/// Accumulators: [row][eight of domains][lane][4].
 pub(super) type Sums = Vec<Vec<[[f64; 4]; 32]>>;
 
 pub(super) fn sums(tables: &Tables, tile: usize, warp: usize) -> Sums {

@@ -1,4 +1,4 @@
-//! A scene to the products that cuBLAS is asked for: which domains go together, padded to what, and where all lies. Pure.
+//! Plans the cuBLAS products of a scene: which domains share a batch, their padding, and their memory layout. No I/O.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use super::library::Product;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, State};
 
-/// Ways to u = U q with cuBLAS.
+/// Ways to compute u = U q with cuBLAS.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Peer {
@@ -20,18 +20,18 @@ pub enum Peer {
     Padded,
     /// The same as one strided batched `sgemv`.
     PaddedGemv,
-    /// Domains of similar rank and size padded alike, a strided batched `sgemm` per bucket.
+    /// Domains of similar rank and size padded to a common size, with one strided batched `sgemm` per bucket.
     Bucketed,
     /// The same as strided batched `sgemv`.
     BucketedGemv,
-    /// Nothing padded: one grouped batched `sgemm`, a group per rank and size.
+    /// No padding: one grouped batched `sgemm`, with a group per rank and size.
     Grouped,
-    /// Domains that are instances of one shape: one `sgemm` with a column of q for each.
+    /// Domains that are instances of one shape: one `sgemm` with one column of q per domain.
     Instances,
 }
 
 impl Peer {
-    /// All of them.
+    /// All variants.
     pub const ALL: [Self; 8] = [
         Self::SgemvColumns,
         Self::SgemvRows,
@@ -43,7 +43,7 @@ impl Peer {
         Self::Instances,
     ];
 
-    /// The name of its trial.
+    /// Name of the trial.
     pub const fn name(self) -> &'static str {
         match self {
             Self::SgemvColumns => "cublas_sgemv_columns",
@@ -57,13 +57,13 @@ impl Peer {
         }
     }
 
-    /// Whether vectors are multiplied rather than matrices of one column.
+    /// Whether the product uses `sgemv` rather than `sgemm` with one column.
     pub(super) const fn as_vectors(self) -> bool {
         matches!(self, Self::PaddedGemv | Self::BucketedGemv)
     }
 
-    /// Domains of one key go into one batch. A bucket holds ranks up to the next multiple of 8 and sizes up to the next
-    /// power of two.
+    /// Domains with equal keys share a batch. A bucket holds ranks up to the next multiple of 8 and sizes up to the
+    /// next power of two.
     const fn key(self, rows: usize, rank: usize) -> (usize, usize) {
         match self {
             Self::Bucketed | Self::BucketedGemv => (rank.next_multiple_of(8), rows.next_power_of_two()),
@@ -73,12 +73,12 @@ impl Peer {
     }
 }
 
-/// Products of one kind, and whose they are.
+/// Products of one kind and their domains.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Batch {
     pub product: Product,
     pub domains: Vec<usize>,
-    /// First floats of U, q and u.
+    /// Offsets of U, q and u, in floats.
     pub first: [u64; 3],
 }
 
@@ -86,13 +86,13 @@ pub(super) struct Batch {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Batches {
     pub list: Vec<Batch>,
-    /// Floats of U, q and u.
+    /// Total floats of U, q and u.
     pub floats: [u64; 3],
 }
 
 impl Batches {
     /// # Errors
-    /// `Invalid` when the scene is not one that `peer` is for, or is too large for the library's integers.
+    /// `Invalid` when `peer` does not support the scene, or the scene is too large for the library's 32-bit integers.
     pub(super) fn of(scene: &Scene, peer: Peer) -> Result<Self> {
         check(scene, peer)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
@@ -106,7 +106,7 @@ impl Batches {
             let sizes = [matrices, domains.len() as u64, domains.len() as u64];
             let first = floats;
             for ((total, stride), count) in floats.iter_mut().zip(product.strides).zip(sizes) {
-                // Batches begin where a float4 may.
+                // Batches are aligned to float4.
                 *total = (*total + stride.unsigned_abs() * count).next_multiple_of(4);
             }
             list.push(Batch { product, domains, first });
@@ -114,7 +114,7 @@ impl Batches {
         Ok(Self { list, floats })
     }
 
-    /// Where u of each domain begins, in floats; only domains with modes have one.
+    /// First float of each domain's u; `None` for domains without modes.
     pub(super) fn places_of_u(&self, domains: usize) -> Vec<Option<u64>> {
         let mut places = vec![None; domains];
         for batch in &self.list {
@@ -125,7 +125,7 @@ impl Batches {
         places
     }
 
-    /// All q, padded with zeros.
+    /// The coordinates of all domains, padded with zeros.
     pub(super) fn pack_q(&self, scene: &Scene, state: &State) -> Vec<f32> {
         let mut packed = vec![0.0; self.floats[1] as usize];
         for batch in &self.list {
@@ -139,12 +139,12 @@ impl Batches {
 }
 
 impl Batch {
-    /// The first float of U (0), q (1) or u (2) of the domain at an index of this batch.
+    /// Offset in floats of U (`of` 0), q (1) or u (2) of the domain at `index` of this batch.
     pub(super) fn place(&self, index: usize, of: usize) -> u64 {
         self.first[of] + self.product.strides[of].unsigned_abs() * index as u64
     }
 
-    /// U of one domain as the product wants it, padded with zeros.
+    /// U of one domain in the product's layout, padded with zeros.
     pub(super) fn matrix(&self, scene: &Scene, domain: usize, by_rows: bool) -> Vec<f32> {
         let modes = &scene.shape_of(domain).modes;
         let (rows, rank) = (3 * modes.vertices(), modes.rank());
@@ -160,7 +160,7 @@ impl Batch {
     }
 }
 
-/// The product of a batch, as large as its largest domain.
+/// The product of a batch, sized by its largest domain.
 fn product(scene: &Scene, peer: Peer, domains: &[usize]) -> Result<Product> {
     let int = |number: usize| {
         i32::try_from(number).map_err(|_| invalid("scene.size", format!("at most {} for cuBLAS", i32::MAX), number))
@@ -168,7 +168,7 @@ fn product(scene: &Scene, peer: Peer, domains: &[usize]) -> Result<Product> {
     let slots = || domains.iter().map(|domain| scene.layout.slots[*domain]);
     let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
     let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
-    // Columns that begin at 16 bytes are what the library is fastest with; rows one after the other have no gaps.
+    // The library is fastest with columns aligned to 16 bytes; row-major storage has no gaps.
     let lead = if peer == Peer::SgemvRows { rows } else { rows.next_multiple_of(4) };
     let (columns, count) = if peer == Peer::Instances { (domains.len(), 1) } else { (1, domains.len()) };
     let strides = [lead as i64 * rank as i64, rank as i64, lead as i64];
@@ -203,7 +203,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// What cuBLAS computes of a batch: C = A B for column-major matrices at strides.
+    /// Emulates cuBLAS on a batch: C = A B for strided column-major matrices.
     fn multiply(batch: &Batch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
         let Product { rows, inner, columns, lead, count, strides } = batch.product;
         let at = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn every_way_to_put_domains_together_gives_each_its_own_u() {
+    fn every_batching_gives_each_domain_its_own_u() {
         let shapes: Vec<_> = (0..30).map(|index| (1 + index * 11 % 40, index % 13, 1)).collect();
         let (many, state) = scene_and_state(&shapes);
         let deformable = shapes.iter().filter(|(_, rank, _)| *rank > 0);
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn instances_share_one_matrix_and_have_a_column_each() {
+    fn instances_share_one_matrix_with_a_column_each() {
         use modalcast_model::scene::Parts;
         let (one, _) = scene_and_state(&[(23, 10, 1)]);
         let mut parts = Parts::named("instances");
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn scenes_that_a_peer_is_not_for_are_refused_by_name() {
+    fn rejects_unsupported_scenes_by_name() {
         let (two, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
         for peer in [Peer::SgemvColumns, Peer::SgemvRows, Peer::Instances] {
             let refusal = Batches::of(&two, peer).expect_err("two shapes").to_string();

@@ -1,4 +1,4 @@
-//! cuBLAS, found and bound at run time, and a handle on it. Only trials use it: a server without it misses nothing.
+//! Loads cuBLAS at run time and wraps its handle. Only benchmarks use it, so the server does not depend on it.
 
 use std::ffi::{CStr, c_char, c_int, c_void};
 use std::path::{Path, PathBuf};
@@ -11,17 +11,17 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::memory::{address, room};
 use modalcast_model::error::{Error, Result, during};
 
-/// What brings cuBLAS to a machine without it.
+/// Remedy in the error message when cuBLAS is missing.
 const REMEDY: &str = "Install the PyPI wheel nvidia-cublas==13.* and set MODALCAST_CUBLAS to the path of its \
                       libcublas.so.13, or leave its trials out";
 
-/// Memory for cuBLAS's own use: what its manual advises for Hopper. With it, calls can be captured in graphs.
+/// Workspace of cuBLAS, bytes, as its manual recommends for Hopper. With it, calls can be captured in graphs.
 const WORKSPACE: u64 = 32 << 20;
 
 type Handle = *mut c_void;
 
-/// The functions that are used, in the types of cublas_v2.h; device pointers are addresses. The last two are missing
-/// from old versions.
+/// The used functions, in the types of cublas_v2.h; device pointers are `u64` addresses. Old versions lack the two
+/// optional ones.
 #[allow(clippy::type_complexity, reason = "the types are those of a C header")]
 struct Functions {
     property: unsafe extern "C" fn(c_int, *mut c_int) -> c_int,
@@ -126,16 +126,16 @@ struct Functions {
 const NO_TRANSPOSE: c_int = 0;
 const TRANSPOSE: c_int = 1;
 
-/// The cuBLAS of this process, loaded at the first call.
+/// The cuBLAS functions of this process, loaded at the first call.
 fn functions() -> Result<&'static Functions> {
     static LOADED: OnceLock<Result<Functions>> = OnceLock::new();
     LOADED.get_or_init(|| Functions::find(&candidates())).as_ref().map_err(Clone::clone)
 }
 
-/// The version of cuBLAS: major, minor, patch.
+/// Version of cuBLAS: major, minor, patch.
 ///
 /// # Errors
-/// `Unavailable` naming what was tried when there is none.
+/// `Unavailable` when there is no cuBLAS; it lists the paths that were tried.
 pub fn cublas_version() -> Result<[i32; 3]> {
     let functions = functions()?;
     let mut version = [0; 3];
@@ -150,7 +150,7 @@ fn unavailable(reason: String) -> Error {
     Error::Unavailable { what: "cuBLAS", reason, remedy: REMEDY.into() }
 }
 
-/// Where cuBLAS may be, best first. A path in MODALCAST_CUBLAS is the only candidate.
+/// Candidate paths of cuBLAS in order of preference. A path in MODALCAST_CUBLAS is the only candidate.
 fn candidates() -> Vec<PathBuf> {
     if let Some(path) = std::env::var_os("MODALCAST_CUBLAS").filter(|path| !path.is_empty()) {
         return vec![path.into()];
@@ -173,13 +173,13 @@ impl Functions {
     }
 
     fn load(path: &Path) -> Result<Self, libloading::Error> {
-        // It needs a second library, which nobody finds in a folder off the search path unless it is loaded already.
+        // cuBLAS needs cublasLt. The loader does not find it off the search path unless it is loaded already.
         let beside = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
         let second = path.file_name().and_then(|name| beside(&name.to_string_lossy())).filter(|file| file.is_file());
-        // SAFETY: the libraries' initialisers only set them up; the name or path is the operator's choice.
+        // SAFETY: the libraries' initializers only set them up; the operator chooses the name or path.
         let (second, library) = unsafe { (second.and_then(|file| Library::new(file).ok()), Library::new(path)?) };
-        // SAFETY: the types are those of cublas_v2.h of CUDA 12 and 13 on 64 bit, where a device pointer is an address;
-        // the libraries are kept as long as the functions.
+        // SAFETY: the types are those of cublas_v2.h of CUDA 12 and 13 on 64-bit systems, where a device pointer is an
+        // address. The libraries are kept as long as the functions.
         unsafe {
             Ok(Self {
                 property: *library.get(b"cublasGetProperty\0")?,
@@ -202,27 +202,27 @@ impl Functions {
         if code == 0 {
             return Ok(());
         }
-        // SAFETY: cuBLAS answers any code with a NUL-terminated string of static lifetime.
+        // SAFETY: cuBLAS returns a NUL-terminated string of static lifetime for any code.
         let text = unsafe { CStr::from_ptr((self.status)(code)) }.to_string_lossy().into_owned();
         Err(during("cublas")(text))
     }
 }
 
-/// C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. With `count`, so many of them
-/// at regular strides.
+/// C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. `count` such products lie at
+/// regular strides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Product {
     pub rows: i32,
     pub inner: i32,
     pub columns: i32,
-    /// Floats from one column of A, and of C, to the next; B has none between.
+    /// Leading dimension of A and C in floats. The columns of B are contiguous.
     pub lead: i32,
-    /// How many, and floats from one A, B and C to the next.
+    /// Number of products.
     pub count: i32,
     pub strides: [i64; 3],
 }
 
-/// Host arrays of a grouped product, one number a group, and addresses of device arrays with one pointer a problem.
+/// Arguments of a grouped product: one entry per group on the host, and device arrays with one pointer per problem.
 #[derive(Debug)]
 pub(super) struct Grouped<'a> {
     pub groups: &'a [Product],
@@ -248,7 +248,7 @@ const ZERO: f32 = 0.0;
 
 impl Blas {
     /// # Errors
-    /// `Unavailable` when cuBLAS is not there or does not start; `Fault` when the device refuses.
+    /// `Unavailable` when cuBLAS is missing or does not start; `Fault` when the device fails.
     pub(super) fn new(device: &Device) -> Result<Self> {
         let functions = functions()?;
         device.context().bind_to_thread().map_err(during("device"))?;
@@ -258,8 +258,8 @@ impl Blas {
         functions.check(unsafe { (functions.create)(&mut handle) }).map_err(|error| unavailable(error.to_string()))?;
         let blas = Self { functions, handle, _workspace: workspace };
         let (stream, memory) = (device.stream().cu_stream().cast(), address(device, &blas._workspace));
-        // SAFETY: handle and stream are live, and the workspace has the size that is said. Setting a stream takes a
-        // workspace away, so that comes first.
+        // SAFETY: handle and stream are live, and the workspace has the stated size. The stream is set first because
+        // setting it resets the workspace.
         unsafe {
             functions.check((functions.set_stream)(handle, stream))?;
             functions.check((functions.set_workspace)(handle, memory, WORKSPACE as usize))?;
@@ -267,7 +267,7 @@ impl Blas {
         Ok(blas)
     }
 
-    /// Whether this version has grouped products, and vectors at strides.
+    /// Checks that this version has the grouped and strided functions, if required; otherwise `Unavailable`.
     pub(super) fn check_has(&self, grouped: bool, vectors: bool) -> Result<()> {
         let missing = |name: &str| Err(unavailable(format!("this version has no {name}")));
         match self.functions {
@@ -277,13 +277,13 @@ impl Blas {
         }
     }
 
-    /// y = A x with `sgemv`, A column-major, or stored by rows one after the other.
+    /// y = A x with `sgemv`, A column-major or, with `by_rows`, row-major.
     ///
     /// # Safety
-    /// The addresses are those of matrices on the device as `of` says; `columns` and `count` are 1.
+    /// The addresses are device addresses of matrices with the sizes in `of`; its `columns` and `count` are 1.
     pub(super) unsafe fn gemv(&self, of: Product, by_rows: bool, [a, x, y]: [u64; 3]) -> Result<()> {
         let (transpose, rows, columns, lead) = match by_rows {
-            // To cuBLAS a matrix by rows is its transpose by columns.
+            // A row-major matrix is the transpose of a column-major one.
             true => (TRANSPOSE, of.inner, of.rows, of.inner),
             false => (NO_TRANSPOSE, of.rows, of.inner, of.lead),
         };
@@ -296,7 +296,7 @@ impl Blas {
     /// C = A B with `sgemm`.
     ///
     /// # Safety
-    /// The addresses are those of matrices on the device as `of` says; `count` is 1.
+    /// The addresses are device addresses of matrices with the sizes in `of`; its `count` is 1.
     pub(super) unsafe fn gemm(&self, of: Product, [a, b, c]: [u64; 3]) -> Result<()> {
         let Product { rows, inner, columns, lead, .. } = of;
         let (handle, no) = (self.handle, NO_TRANSPOSE);
@@ -306,10 +306,10 @@ impl Blas {
         })
     }
 
-    /// Several products at strides, as matrices, or as vectors when B and C have one column.
+    /// Strided batched products: `sgemm`, or `sgemv` if `as_vectors`.
     ///
     /// # Safety
-    /// The addresses are those of `count` matrices on the device as `of` says.
+    /// The addresses are those of `count` matrices as `of` says; with `as_vectors`, its `columns` is 1.
     pub(super) unsafe fn strided(&self, of: Product, as_vectors: bool, [a, b, c]: [u64; 3]) -> Result<()> {
         let Product { rows, inner, columns, lead, count, strides: [to_a, to_b, to_c] } = of;
         let (handle, no) = (self.handle, NO_TRANSPOSE);
@@ -329,10 +329,10 @@ impl Blas {
         self.functions.check(code)
     }
 
-    /// Groups of products; the problems of each group are `count` of its kind.
+    /// Grouped products; each group has `count` problems of one size.
     ///
     /// # Safety
-    /// The device arrays hold an address of a matrix on the device for each problem, in the order of the groups.
+    /// The device arrays hold the device address of a matrix for each problem, in the order of the groups.
     pub(super) unsafe fn grouped(&self, of: &Grouped) -> Result<()> {
         let Some(grouped) = self.functions.sgemm_grouped else {
             return self.check_has(true, false);
@@ -342,7 +342,7 @@ impl Blas {
         let (lead, counts, no) = (list(|group| group.lead), list(|group| group.count), list(|_| NO_TRANSPOSE));
         let (ones, zeros) = (vec![ONE; of.groups.len()], vec![ZERO; of.groups.len()]);
         let [a, b, c] = of.pointers;
-        // SAFETY: the handle is live and every host array has a number for each group; the caller vouches for the rest.
+        // SAFETY: the handle is live and every host array has an entry per group; the caller vouches for the rest.
         self.functions.check(unsafe {
             grouped(
                 self.handle,
@@ -368,8 +368,8 @@ impl Blas {
 
 impl Drop for Blas {
     fn drop(&mut self) {
-        // SAFETY: the handle came from `create` and is destroyed once; destroying waits for its work. A failure leaves
-        // nothing to be done.
+        // SAFETY: the handle came from `create` and is destroyed once; destroying waits for its work. A failure here
+        // cannot be handled, so its code is ignored.
         let _ = unsafe { (self.functions.destroy)(self.handle) };
     }
 }
@@ -379,7 +379,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_missing_or_broken_cublas_is_refused_with_what_brings_it() {
+    fn missing_or_broken_cublas_gives_error_with_remedy() {
         let folder = tempfile::tempdir().expect("a folder");
         let broken = folder.path().join("libcublas.so.13");
         std::fs::write(&broken, b"no library").expect("a file");

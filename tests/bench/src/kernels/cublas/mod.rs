@@ -1,5 +1,5 @@
-//! cuBLAS as a peer: u = U q as its products, each followed by a plain vertex update. Loaded at run time; nothing but
-//! trials uses it.
+//! cuBLAS as a competitor: u = U q as its products, each followed by a plain vertex update. Loaded at run time; only
+//! benchmarks use it.
 
 mod batch;
 mod library;
@@ -21,10 +21,10 @@ use modalcast_compute::gpu::memory::{address, download, room, upload};
 use modalcast_model::error::{Error, Result, during};
 use modalcast_model::scene::{Scene, State};
 
-/// cuBLAS over a scene, for several steps.
+/// cuBLAS for a scene, with the inputs of several steps.
 #[derive(Debug)]
 pub struct Cublas {
-    // Declared first, so dropped first: it waits for its work on what follows.
+    // Declared first and therefore dropped first: dropping it waits for its work on the buffers below.
     blas: Blas,
     peer: Peer,
     part: Part,
@@ -32,13 +32,13 @@ pub struct Cublas {
     u_matrices: CudaSlice<u8>,
     u: CudaSlice<u8>,
     update: Option<PlainUpdate>,
-    /// Where u of each domain begins, in floats.
+    /// First float of each domain's u; `None` for domains without modes.
     places: Vec<Option<u64>>,
     turns: Turns,
     pointers: Option<Pointers>,
 }
 
-/// Device arrays of pointers, one a problem: to U, to u, and to q for each turn.
+/// Device arrays with one pointer per problem: to U, to u, and to q for each turn.
 #[derive(Debug)]
 struct Pointers {
     matrices: CudaSlice<u8>,
@@ -48,11 +48,11 @@ struct Pointers {
 }
 
 impl Cublas {
-    /// Packs a scene for one way to multiply.
+    /// Packs a scene for one kind of product.
     ///
     /// # Errors
-    /// `Invalid` when the scene is not one that `peer` is for, or there is no state; `Unavailable` when cuBLAS is
-    /// missing, too old or the device's memory too small; `Fault` when the device refuses.
+    /// `Invalid` when `peer` does not support the scene, or there is no state; `Unavailable` when cuBLAS is missing or
+    /// too old, or the device has too little memory; `Fault` when the device fails.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], (peer, part): (Peer, Part)) -> Result<Self> {
         let batches = Batches::of(scene, peer)?;
         check_memory(device, &batches)?;
@@ -73,15 +73,15 @@ impl Cublas {
             let groups: Vec<Product> = self.batches.list.iter().map(|batch| batch.product).collect();
             let q = address(device, &pointers.q) + 8 * pointers.problems * (turn % self.turns.count()) as u64;
             let pointers = [address(device, &pointers.matrices), q, address(device, &pointers.outputs)];
-            // SAFETY: the arrays have a pointer for each problem, in the order of the groups, each to memory of the size
-            // that `Batches` planned.
+            // SAFETY: the arrays have a pointer for each problem, in the order of the groups, each to memory of the
+            // size that `Batches` planned.
             return unsafe { self.blas.grouped(&Grouped { groups: &groups, pointers }) };
         }
         let bases = [address(device, &self.u_matrices), q, address(device, &self.u)];
         for batch in &self.batches.list {
             let at: [u64; 3] = std::array::from_fn(|of| bases[of] + 4 * batch.first[of]);
-            // SAFETY: the three buffers have the floats that `Batches` planned, and this batch lies inside them; the
-            // products of the first three kinds have a `count` of 1, and the first two one column.
+            // SAFETY: the three buffers have the sizes that `Batches` planned, and this batch lies inside them. The
+            // products of the first three kinds have a `count` of 1, and those of the first two have one column.
             unsafe {
                 match self.peer {
                     Peer::SgemvColumns | Peer::SgemvRows => {
@@ -117,7 +117,7 @@ impl Trial for Cublas {
             return update.positions(device);
         }
         let mut u = vec![0.0_f32; self.batches.floats[2] as usize];
-        // SAFETY: the buffer has as many floats.
+        // SAFETY: the buffer has as many floats as `u`.
         unsafe { download(device, address(device, &self.u), &mut u) }?;
         let places = &self.places;
         Ok(self.turns.finish_on_host(|domain, vertex| {
@@ -126,7 +126,7 @@ impl Trial for Cublas {
         }))
     }
 
-    /// U counts as it is stored, padding included.
+    /// U counts as stored, padding included.
     fn bytes(&self) -> Vec<(&'static str, u64)> {
         let [matrices, q, u] = self.batches.floats.map(|floats| 4 * floats);
         let mut bytes = vec![("U as stored", matrices), ("q", q), ("u written", u)];
@@ -135,13 +135,13 @@ impl Trial for Cublas {
         bytes
     }
 
-    /// Calls of the library, which may launch more than one kernel each, and the update.
+    /// Calls of the library, each of which may launch several kernels, plus the update.
     fn launches(&self) -> usize {
         let calls = if self.pointers.is_some() { 1 } else { self.batches.list.len() };
         calls + usize::from(self.update.is_some())
     }
 
-    /// Of the update alone: the library keeps its own kernels to itself.
+    /// Facts about the update alone, because the library's kernels are not accessible.
     fn kernels(&self) -> Vec<KernelFacts> {
         self.update.iter().map(|update| update.facts().clone()).collect()
     }
@@ -177,7 +177,10 @@ fn upload_matrices(device: &Device, scene: &Scene, batches: &Batches, peer: Peer
     Ok(buffer)
 }
 
-/// Refuses what padding makes too large, before half of it is there.
+/// Checks that the padded matrices fit into free device memory, before any of it is allocated.
+///
+/// # Errors
+/// `Unavailable` when they do not fit.
 fn check_memory(device: &Device, batches: &Batches) -> Result<()> {
     let (free, _) = device.memory()?;
     let bytes: u64 = batches.floats.iter().map(|floats| 4 * floats).sum();

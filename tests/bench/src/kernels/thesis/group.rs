@@ -1,37 +1,38 @@
-//! The group concept of chapter 3.2.2: domains of different ranks made uniform, so that one kernel does them all. Pure.
+//! The group concept of chapter 3.2.2: domains of different ranks are brought into one layout, so that one kernel
+//! computes all of them. No I/O.
 //!
-//! Names of the text: n_vr float4 are a row of U' ([`fours`]); a warp holds n_g groups of w_g lanes; a group holds
-//! n_gg rows of one domain at a time. U'' (equations 3.5 and 3.6) has w_g columns and n' = ceil(3n / n_gg) rows. The
-//! text prints floor(3n / n_gg), which leaves out up to n_gg - 1 rows of U.
+//! Notation of the text: n_vr is the number of float4 per row of U' ([`fours`]); a warp holds n_g groups of w_g lanes;
+//! a group holds n_gg rows of one domain at a time. U'' (equations 3.5 and 3.6) has w_g columns and n' = ceil(3n /
+//! n_gg) rows. The text prints floor(3n / n_gg), which omits up to n_gg - 1 rows of U.
 
 use serde::Serialize;
 
 use modalcast_model::scene::{Scene, State};
 
-/// Lanes of a warp, and threads of a block.
+/// Lanes per warp, and threads per block.
 pub(super) const WARP: usize = 32;
 pub(super) const BLOCK: usize = 256;
 
-/// The largest rank that the text groups.
+/// The largest rank that the text's groups support.
 pub(super) const LARGEST_RANK: usize = 32;
 
-/// The place of u that an idle lane has.
+/// Output index in the metadata of an idle lane.
 pub(super) const IDLE: u32 = u32::MAX;
 
-/// Into how many kernels domains are sorted by n_vr (figures 3.5 and 3.6).
+/// Number of kernels over which the domains are distributed by n_vr (figures 3.5 and 3.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
     /// All with w_g = 8.
     One,
-    /// n_vr of 3, 5 and 6 with w_g = 6, the others with 8: what the text found best.
+    /// n_vr of 3, 5 and 6 with w_g = 6, the others with 8: the fastest in the text.
     Two,
     /// n_vr of 3 and 6 with w_g = 6, 5 with 5, 7 with 7, the others with 8: no lane of a group is idle.
     Four,
 }
 
 impl Split {
-    /// All of them.
+    /// All variants.
     pub const ALL: [Self; 3] = [Self::One, Self::Two, Self::Four];
 
     /// The group widths w_g, one per kernel.
@@ -53,12 +54,12 @@ impl Split {
     }
 }
 
-/// n_vr: float4 of a row of U'.
+/// n_vr: float4 per row of U'.
 pub(super) const fn fours(rank: usize) -> usize {
     rank.div_ceil(4)
 }
 
-/// n_g: groups of a warp.
+/// n_g: groups per warp.
 const fn groups_of_warp(width: usize) -> usize {
     WARP / width
 }
@@ -73,12 +74,12 @@ const fn reshaped_rows(rows: usize, width: usize, fours: usize) -> usize {
     rows.div_ceil(rows_of_group(width, fours))
 }
 
-/// Lanes of a full warp that have nothing to do, for groups of `width` on rows of `fours` float4.
+/// Idle lanes of a full warp, for groups of `width` lanes on rows of `fours` float4.
 pub const fn idle_in_warp(width: usize, fours: usize) -> usize {
     WARP - groups_of_warp(width) * rows_of_group(width, fours) * fours
 }
 
-/// Lanes that one kernel launches, and how many of them do nothing.
+/// Lanes that one kernel launches, and the number of idle ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Lanes {
     /// w_g.
@@ -87,7 +88,7 @@ pub struct Lanes {
     pub idle: u64,
 }
 
-/// The lanes of each kernel of a split, counted from sizes alone.
+/// The lanes of each kernel of a split, computed from sizes alone.
 pub fn lanes(scene: &Scene, split: Split) -> Vec<Lanes> {
     let of_width = |width: &usize| {
         let (mut groups, mut busy) = (0, 0);
@@ -105,7 +106,7 @@ const fn is_of_width(split: Split, width: usize, rank: usize) -> bool {
     rank > 0 && split.width_of(fours(rank)) == width
 }
 
-/// Where the u of each domain begins, in vertices; only domains with modes have one. And the vertices of all.
+/// First vertex of each domain's u, `None` without modes, and the total of vertices with a u.
 pub(super) fn places_of_u(scene: &Scene) -> (Vec<Option<u32>>, usize) {
     let mut total = 0;
     let place = |slot: &modalcast_model::scene::Slot| {
@@ -117,7 +118,7 @@ pub(super) fn places_of_u(scene: &Scene) -> (Vec<Option<u32>>, usize) {
     (places, total)
 }
 
-/// q'': the coordinates of each domain, filled up to whole float4.
+/// q'': the coordinates of each domain, padded to whole float4.
 pub(super) fn packed_q(scene: &Scene, state: &State) -> Vec<f32> {
     let mut packed = Vec::with_capacity(scene.layout.coordinates + 3 * scene.domains.len());
     for domain in 0..scene.domains.len() {
@@ -127,7 +128,7 @@ pub(super) fn packed_q(scene: &Scene, state: &State) -> Vec<f32> {
     packed
 }
 
-/// The k-th float4 of a row of U.
+/// The k-th float4 of a row of U, padded with zeros.
 pub(super) fn entry(scene: &Scene, domain: usize, row: usize, k: usize) -> [f32; 4] {
     let modes = &scene.shape_of(domain).modes;
     [0, 1, 2, 3].map(|part| match 4 * k + part {
@@ -136,12 +137,12 @@ pub(super) fn entry(scene: &Scene, domain: usize, row: usize, k: usize) -> [f32;
     })
 }
 
-/// What one kernel reads: a float4 of U'' and the meta data of each lane.
+/// Inputs of one kernel: a float4 of U'' and the metadata of each lane.
 #[derive(Debug)]
 pub(super) struct Packed {
     pub width: usize,
     pub entries: Vec<[f32; 4]>,
-    /// Where u goes (floats), where q lies (float4), n_vr, nothing.
+    /// Per lane: output index in u (floats) or [`IDLE`], input index in q (float4), n_vr, unused.
     pub meta: Vec<[u32; 4]>,
 }
 
@@ -183,7 +184,7 @@ impl Packed {
         self.meta.push(meta);
     }
 
-    /// A group lies in one warp.
+    /// Pads so that the next group lies in one warp.
     fn begin_group(&mut self) {
         while self.meta.len() % WARP >= groups_of_warp(self.width) * self.width {
             self.push(None);
@@ -202,7 +203,7 @@ mod tests {
     use modalcast_compute::testing::scene_and_state;
 
     #[test]
-    fn widths_of_figure_3_6_leave_no_lane_of_a_group_idle_with_four_kernels_alone() {
+    fn only_four_kernels_leave_no_idle_lane_in_groups() {
         let idle_in_group = |split: Split, fours: usize| split.width_of(fours) % fours;
         for fours in 1..=8 {
             assert_eq!(idle_in_group(Split::Four, fours), 0, "n_vr {fours}");
@@ -210,8 +211,8 @@ mod tests {
         let idle = |split: Split| (1..=8).filter(|fours| idle_in_group(split, *fours) > 0).collect::<Vec<_>>();
         assert_eq!(idle(Split::Two), [5, 7]);
         assert_eq!(idle(Split::One), [3, 5, 6, 7]);
-        // Lanes outside of groups count too: two of a warp with w_g = 6, as the text says of widths that 32 is no
-        // multiple of.
+        // Lanes outside of groups count as idle too: with w_g = 6 two per warp, as the text says of widths that do not
+        // divide 32.
         assert_eq!([1, 2, 4, 8].map(|fours| idle_in_warp(8, fours)), [0; 4]);
         assert_eq!([3, 6].map(|fours| idle_in_warp(6, fours)), [2, 2]);
         assert_eq!([idle_in_warp(6, 5), idle_in_warp(8, 5), idle_in_warp(5, 5)], [7, 12, 2]);
@@ -219,14 +220,14 @@ mod tests {
     }
 
     #[test]
-    fn floor_drops_rows_of_u_where_ceil_keeps_all() {
+    fn floor_drops_rows_of_u_that_ceil_keeps() {
         let covered = |rows: usize, reshaped: usize, parts: usize| {
             (0..parts)
                 .flat_map(|part| (0..reshaped).map(move |row| part * reshaped + row))
                 .filter(|r| *r < rows)
                 .count()
         };
-        // Four vertices of rank 4 (n_vr = 1) in groups of eight: 12 rows are a row and a half of U''.
+        // Four vertices of rank 4 (n_vr = 1) in groups of eight: 12 rows of U fill one and a half rows of U''.
         let parts = rows_of_group(8, 1);
         assert_eq!((covered(12, 12 / parts, parts), covered(12, 12_usize.div_ceil(parts), parts)), (8, 12));
         assert_eq!(reshaped_rows(12, 8, 1), 2);
@@ -243,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn lanes_are_counted_as_they_are_packed() {
+    fn lane_counts_match_the_packing() {
         let shapes: Vec<_> = (0..40).map(|index| (1 + index * 7 % 50, index % 33, 1)).collect();
         let (scene, _) = scene_and_state(&shapes);
         for split in Split::ALL {

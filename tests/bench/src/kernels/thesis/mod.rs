@@ -1,13 +1,13 @@
-//! BASELINE. The kernels of the thesis's chapter 3.2, as the text describes them, to measure ours against. Nothing but
-//! trials uses them.
+//! BASELINE. The kernels of the thesis's chapter 3.2 as its text describes them, for comparison with ours. Only
+//! benchmarks use them.
 //!
-//! | file | chapter | what |
+//! | file | chapter | contents |
 //! |---|---|---|
-//! | [`thesis_single`] | 3.2.1 | u = U q of one domain, four multiplications a thread |
+//! | [`thesis_single`] | 3.2.1 | u = U q of one domain, four multiplications per thread |
 //! | [`group`], [`thesis_multi`] | 3.2.2 | u = U q of many domains, in groups of lanes |
 //! | [`thesis_update`] | 3.2.3 | x = T (x0 + u), normals and tangents, of unfolded triangles |
 //!
-//! u lies on the device here, where the text maps it into host memory: over a bus it would measure the bus.
+//! Here u stays in device memory. The text maps it into host memory, which over PCIe would measure the bus.
 
 mod group;
 mod thesis_multi;
@@ -31,44 +31,44 @@ use thesis_multi::Multi;
 use thesis_single::Single;
 use thesis_update::{Update, matrices};
 
-/// The two ways to u.
+/// The kernels that compute u.
 #[derive(Debug)]
 enum Uq {
     Single(Single),
     Multi(Multi),
 }
 
-/// The kernels of the thesis over a scene, for several steps.
+/// The kernels of the thesis for a scene, with the inputs of several steps.
 #[derive(Debug)]
 pub struct Thesis {
     name: String,
     uq: Uq,
     update: Option<Update>,
     u: CudaSlice<u8>,
-    /// Where the u of each domain begins, and how many vertices have one.
+    /// First vertex of each domain's u (`None` without modes), and the number of vertices that have a u.
     places: (Vec<Option<u32>>, usize),
     turns: Turns,
     vertices: usize,
-    /// Bytes of the packed q of a step.
+    /// Bytes of the packed q per step.
     q_bytes: u64,
 }
 
 impl Thesis {
-    /// The single-domain kernel, and the vertex update when the whole step is asked for.
+    /// The single-domain kernel, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when the scene is not one domain with modes, or there is no state; `Unavailable` when NVRTC is missing;
-    /// `Fault` when the device refuses.
+    /// `Invalid` when the scene is not one domain with modes, or there is no state; `Unavailable` when NVRTC is
+    /// missing; `Fault` when the device fails.
     pub fn single(device: &Device, scene: &Arc<Scene>, states: &[State], part: Part) -> Result<Self> {
         let uq = Uq::Single(Single::new(device, scene)?);
         Self::new(device, scene, states, (part.named("thesis_single"), uq, part))
     }
 
-    /// The grouped kernels, and the vertex update when the whole step is asked for.
+    /// The grouped kernels, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when a domain has more than 32 modes, u = U q alone is asked for and no domain has any, or there is no
-    /// state; `Unavailable` when NVRTC is missing; `Fault` when the device refuses.
+    /// `Invalid` when a domain has more than 32 modes, [`Part::Uq`] is requested and no domain has modes, or there is
+    /// no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn multi(device: &Device, scene: &Arc<Scene>, states: &[State], (split, part): (Split, Part)) -> Result<Self> {
         if part == Part::Uq && !scene.needs.modes {
             return Err(invalid("modes", "some, for u = U q alone", 0));
@@ -117,7 +117,7 @@ impl Trial for Thesis {
         self.update.as_ref().map_or(Ok(()), |update| update.launch(device, values.transforms, u))
     }
 
-    /// A vertex that no triangle names is NaN, as unfolded triangles leave it out; not so with u = U q alone.
+    /// For [`Part::Whole`], a vertex that no triangle refers to is NaN, because unfolded triangles do not contain it.
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         if let Some(update) = &self.update {
             return update.positions(device, self.vertices);

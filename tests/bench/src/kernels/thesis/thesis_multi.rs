@@ -1,6 +1,6 @@
 //! BASELINE. Launches `kernels/thesis_multi.cu`: u = U q of many domains in groups of lanes (chapter 3.2.2).
 //!
-//! The kernels of a split run one after the other; the text lets them overlap in streams (figure 3.5).
+//! The kernels of a split run one after the other. In the text they overlap in streams (figure 3.5).
 
 use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
 
@@ -17,7 +17,7 @@ pub(super) const CODE: Code = Code {
     variants: &[&["WIDTH=5"], &["WIDTH=6"], &["WIDTH=7"], &["WIDTH=8"]],
 };
 
-/// The kernel of one group width and what it reads.
+/// The kernel of one group width and its inputs.
 #[derive(Debug)]
 struct Kernel {
     compiled: Compiled,
@@ -71,9 +71,9 @@ impl Multi {
             let (entries, meta) = (address(device, &kernel.entries), address(device, &kernel.meta));
             let mut launch = device.stream().launch_builder(&kernel.compiled.function);
             launch.arg(&entries).arg(&meta).arg(&q).arg(&u);
-            // SAFETY: these are the kernel's arguments. Entries and meta data have a float4 and a uint4 for each thread
-            // of the whole blocks; the places in the meta data lie inside `u` and `q`, as `pack` made all of them of one
-            // scene.
+            // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread
+            // of the whole blocks. The indices in the metadata are inside of `u` and `q`, because `pack` made all of
+            // them from one scene.
             unsafe { launch.launch(config) }.map_err(during("thesis_multi"))?;
         }
         Ok(())
@@ -83,7 +83,7 @@ impl Multi {
         self.kernels.len()
     }
 
-    /// Bytes of a step; `q` is those of the packed coordinates.
+    /// Bytes of a step; `q`: bytes of the packed coordinates.
     pub(super) fn bytes(&self, q: u64) -> Vec<(&'static str, u64)> {
         let (busy, all) =
             self.kernels.iter().fold((0, 0), |(busy, all), kernel| (busy + kernel.busy, all + kernel.lanes as u64));
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// `thesis_multi` thread by thread; counts how often each number of u is written.
+    /// CPU twin of `thesis_multi`, thread by thread; counts the writes to each number of u.
     fn twin_of_thesis_multi(packed: &Packed, q: &[f32], u: &mut [f32], written: &mut [usize]) {
         for first in (0..packed.meta.len()).step_by(WARP) {
             let busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn the_twin_writes_every_row_of_every_domain_once_with_one_two_and_four_kernels() {
+    fn twin_writes_every_row_once_with_any_split() {
         let shapes: Vec<_> = (0..70).map(|index| (1 + index * 11 % 40, index % 33, 1)).collect();
         let (scene, state) = scene_and_state(&shapes);
         let (places, vertices) = places_of_u(&scene);

@@ -12,17 +12,17 @@ use modalcast_model::scene::Scene;
 pub(super) const CODE: Code =
     Code { source: include_str!("../../../kernels/thesis_single.cu"), functions: &["thesis_single"], variants: &[&[]] };
 
-/// How rows of U are laid out in lines of 32 float4 (figure 3.3).
+/// Layout of rows of U in lines of 32 float4 (figure 3.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Lines {
     /// Rows of U, 3n.
     rows: usize,
     rank: usize,
-    /// Lanes of a row: n_vr, at most a warp.
+    /// Lanes per row: n_vr, limited to a warp.
     width: usize,
-    /// Lines that a row longer than a warp takes.
+    /// Passes over a row that is longer than a warp.
     passes: usize,
-    /// Lines of rows; each is `passes` times 32 float4.
+    /// Number of lines; each has `passes` times 32 float4.
     lines: usize,
 }
 
@@ -32,7 +32,7 @@ impl Lines {
         Self { rows, rank, width, passes: fours(rank).div_ceil(WARP), lines: rows.div_ceil(WARP / width) }
     }
 
-    /// The lines, in order.
+    /// The packed lines, in order.
     fn pack(self, scene: &Scene) -> Vec<[f32; 4]> {
         let rows_of_line = WARP / self.width;
         let mut lines = Vec::with_capacity(self.lines * self.passes * WARP);
@@ -47,7 +47,7 @@ impl Lines {
     }
 }
 
-/// The kernel and the lines of U.
+/// The kernel and the uploaded lines of U.
 #[derive(Debug)]
 pub(super) struct Single {
     compiled: Compiled,
@@ -76,8 +76,8 @@ impl Single {
         let (lines, rank, rows) = (address(device, &self.buffer), self.lines.rank as u32, self.lines.rows as u32);
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         launch.arg(&lines).arg(&q).arg(&u).arg(&rank).arg(&rows);
-        // SAFETY: these are the kernel's arguments. `buffer` has every line of `lines`, `q` the rank of the scene's only
-        // domain, and `u` a float4 per vertex; warps beyond the last row touch none of them.
+        // SAFETY: these are the kernel's arguments. `buffer` has every line of `lines`, `q` as many floats as the rank
+        // of the scene's only domain, and `u` a float4 per vertex; warps beyond the last row access none of them.
         unsafe { launch.launch(config) }.map_err(during("thesis_single"))?;
         Ok(())
     }
@@ -102,12 +102,12 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// The place of q_i in shared memory, in floats (equation 3.3).
+    /// Index of q_i in shared memory, in floats (equation 3.3).
     const fn place_of_q(i: usize) -> usize {
         i % 4 * 32 + i / 4
     }
 
-    /// `thesis_single` thread by thread.
+    /// CPU twin of `thesis_single`, thread by thread.
     fn twin_of_thesis_single(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
         let (rank, width) = (q.len(), fours(q.len()).min(WARP));
         let (rows_of_line, passes) = (WARP / width, fours(rank).div_ceil(WARP));
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_twin_sums_every_row_whatever_the_rank_and_notices_another_q() {
+    fn twin_sums_every_row_for_any_rank() {
         for rank in [1, 3, 4, 5, 9, 10, 20, 30, 31, 32, 33, 127, 128, 129, 300, 512] {
             let (scene, state) = scene_and_state(&[(23, rank, 1)]);
             let lines = Lines::of(23, rank).pack(&scene);
@@ -157,11 +157,11 @@ mod tests {
     }
 
     #[test]
-    fn equation_3_3_keeps_the_lanes_of_a_warp_in_different_banks_and_holds_up_to_rank_128() {
+    fn equation_3_3_avoids_bank_conflicts_up_to_rank_128() {
         let places = |rank: usize| (0..rank).map(place_of_q).collect::<std::collections::BTreeSet<_>>().len();
         assert_eq!(places(128), 128, "no two coordinates share a place");
         assert!(places(129) < 129, "the 129th has the place of the second");
-        // In the kernel's loop, place i * 32 + j takes q[4 j + i]: the same map, from the other side.
+        // In the kernel's loop, index i * 32 + j takes q[4 j + i]: the inverse of the same map.
         assert!((0..128).all(|place| place_of_q(4 * (place % 32) + place / 32) == place));
         for part in 0..4 {
             let banks: std::collections::BTreeSet<usize> = (0..32).map(|k| place_of_q(4 * k + part) % 32).collect();
@@ -170,8 +170,8 @@ mod tests {
     }
 
     #[test]
-    fn a_line_holds_whole_rows_and_begins_at_128_bytes() {
-        // r = 30 of figure 3.2: eight lanes a row, four rows a warp.
+    fn line_holds_whole_rows_and_is_128_byte_aligned() {
+        // r = 30 of figure 3.2: eight lanes per row, four rows per warp.
         let lines = Lines::of(4, 30);
         assert_eq!((lines.width, lines.passes, lines.lines), (8, 1, 3));
         assert_eq!(WARP * size_of::<[f32; 4]>() % 128, 0);

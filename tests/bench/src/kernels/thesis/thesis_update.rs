@@ -16,14 +16,15 @@ pub(super) const CODE: Code = Code {
     variants: &[&[], &["TANGENTS"]],
 };
 
-/// Vertices of a warp and of a block.
+/// Vertices per warp and per block.
 const OF_WARP: usize = 8;
 const OF_BLOCK: usize = 64;
 
-/// The source of a vertex that has no u.
+/// Value of `sources` for a vertex without u.
 const RIGID: u32 = u32::MAX;
 
-/// The text assumes three triangles a domain: then eight vertices in a row meet at most two domains.
+/// The text assumes at least three triangles per domain, so that eight consecutive vertices belong to at most two
+/// domains.
 const FEWEST_TRIANGLES: usize = 3;
 
 /// Arguments of `thesis_update`; pointers are device addresses.
@@ -49,11 +50,11 @@ const _: () = assert!(size_of::<UpdateArgs>() == 88, "UpdateArgs differs from ke
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for UpdateArgs {}
 
-/// The vertices of unfolded triangles, three per triangle.
+/// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
 struct Unfolded {
     warps: Vec<[u32; 4]>,
-    /// The vertex of u, or RIGID.
+    /// Index of the vertex in u, or [`RIGID`].
     sources: Vec<u32>,
     /// The packed vertex of the scene's layout.
     targets: Vec<u32>,
@@ -63,7 +64,7 @@ struct Unfolded {
 }
 
 impl Unfolded {
-    /// A domain with fewer than three triangles repeats its last one.
+    /// Unfolds all triangles. A domain with fewer than three triangles repeats its last one.
     fn of(scene: &Scene) -> Self {
         let (places, _) = places_of_u(scene);
         let mut unfolded = Self::default();
@@ -92,7 +93,7 @@ impl Unfolded {
     }
 }
 
-/// The two domains of a warp and where the second begins.
+/// The two domains of a warp and the first vertex of the second one.
 fn warp(domains: &[u32]) -> [u32; 4] {
     let first = domains[0];
     let second = domains.iter().position(|domain| *domain != first);
@@ -103,13 +104,13 @@ const fn four([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
     [x, y, z, w]
 }
 
-/// T of every domain as four rows of four.
+/// T of every domain as a 4x4 row-major matrix.
 pub(super) fn matrices(scene: &Scene, state: &State) -> Vec<f32> {
     let transforms = state.world_transforms(scene);
     transforms.iter().flat_map(|transform| transform.0.into_iter().chain([0.0, 0.0, 0.0, 1.0])).collect()
 }
 
-/// The kernel, what it reads and what it writes.
+/// The kernel with its inputs and outputs.
 #[derive(Debug)]
 pub(super) struct Update {
     compiled: Compiled,
@@ -166,14 +167,15 @@ impl Update {
         let blocks = vertices.div_ceil(OF_BLOCK) as u32;
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
         let mut launch = device.stream().launch_builder(&self.compiled.function);
-        // SAFETY: `UpdateArgs` is the kernel's only argument. Its tables are of one scene, as `Unfolded::of` made them:
-        // sources lie inside `u`, domains inside `transforms`, and the outputs have a float4 for every vertex.
+        // SAFETY: `UpdateArgs` is the kernel's only argument. Its tables belong to one scene, as built by
+        // `Unfolded::of`: sources are inside of `u`, domains inside of `transforms`, and the outputs have a float4 for
+        // every vertex.
         unsafe { launch.arg(&args).launch(config) }.map_err(during("thesis_update"))?;
         Ok(())
     }
 
-    /// The positions of unfolded triangles folded back, three numbers for each of `vertices` packed vertices. A vertex
-    /// that no triangle names was not computed: it is NaN.
+    /// The positions folded back to packed vertices, three f32 for each of `vertices`. A vertex that no triangle refers
+    /// to was not computed and is NaN.
     pub(super) fn positions(&self, device: &Device, vertices: usize) -> Result<Vec<f32>> {
         let mut unfolded = vec![[0.0_f32; 4]; self.targets.len()];
         // SAFETY: the buffer has a float4 for each target.
@@ -212,7 +214,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
-    /// The positions of `thesis_update`, thread by thread.
+    /// CPU twin of `thesis_update` for positions, thread by thread.
     fn twin_of_thesis_update(unfolded: &Unfolded, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
         let count = unfolded.targets.len();
         let mut positions = vec![[f32::NAN; 4]; count];
@@ -233,8 +235,9 @@ mod tests {
     }
 
     #[test]
-    fn the_twin_puts_every_named_vertex_at_t_of_x0_plus_u_and_leaves_the_others_out() {
-        // The first domain names 3 of its 5 vertices, and has one triangle of the three that the text assumes.
+    fn twin_computes_all_vertices_of_triangles_and_no_others() {
+        // The triangles of the first domain refer to 3 of its 5 vertices. It has one triangle where the text assumes
+        // three.
         let shapes = [(5, 2, 1), (9, 0, 2), (40, 7, 30), (4, 0, 1), (6, 3, 2), (3, 1, 5)];
         let (scene, state) = scene_and_state(&shapes);
         let unfolded = Unfolded::of(&scene);
@@ -264,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn three_triangles_a_domain_are_what_two_matrices_a_warp_need() {
+    fn three_triangles_per_domain_fit_two_matrices_per_warp() {
         let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
         let unfolded = Unfolded::of(&scene);
         let domain = |vertex: usize| unfolded.targets[vertex] / 3;

@@ -1,6 +1,7 @@
-//! Conifers made in code: a trunk of rings, and whorls of boughs whose sprays are pictures of needles.
+//! Generates conifers: a trunk of rings, and whorls of boughs whose sprays are textured quads.
 //!
-//! One bough is modelled, one metre long; all others are it, turned and scaled. Y is up, lengths are metres.
+//! One bough is modeled, one meter long; all others are rotated and scaled instances of it. Y is up, lengths are
+//! meters.
 
 use std::f64::consts::TAU;
 
@@ -15,7 +16,7 @@ use modalcast_model::domain::{
 use modalcast_model::error::Result;
 use modalcast_model::scene::Parts;
 
-/// What tells one conifer from another.
+/// Parameters of a conifer species.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Habit {
     pub(super) name: &'static str,
@@ -26,7 +27,7 @@ pub(super) struct Habit {
     pub(super) reach: f64,
     pub(super) whorls: usize,
     pub(super) boughs: usize,
-    /// How much a bough rises at its base, and how far its tip hangs below that: shares of its length.
+    /// Rise of a bough at its base, and drop of its tip below that, as fractions of its length.
     pub(super) rise: f64,
     pub(super) hang: f64,
     /// sRGB, 0 to 255.
@@ -34,7 +35,7 @@ pub(super) struct Habit {
     pub(super) seed: u64,
 }
 
-/// Stiff, with boughs that rise.
+/// Stiff, with rising boughs.
 pub(super) const FIR: Habit = Habit {
     name: "fir",
     height: 7.5,
@@ -47,7 +48,7 @@ pub(super) const FIR: Habit = Habit {
     needles: [84.0, 126.0, 82.0],
     seed: 3,
 };
-/// Slender, with boughs that hang.
+/// Slender, with hanging boughs.
 pub(super) const HEMLOCK: Habit = Habit {
     name: "hemlock",
     height: 8.5,
@@ -60,7 +61,7 @@ pub(super) const HEMLOCK: Habit = Habit {
     needles: [108.0, 142.0, 70.0],
     seed: 11,
 };
-/// Dense and bluish; its lower boughs are cut.
+/// Dense and bluish, with the lower boughs cut off.
 pub(super) const SPRUCE: Habit = Habit {
     name: "spruce",
     height: 6.5,
@@ -78,10 +79,10 @@ const TRUNK_RADIUS: f64 = 0.13;
 const SIDES: usize = 20;
 const RINGS: usize = 24;
 
-/// Grows a conifer; `bark` are a colour image and its normal map, which repeat.
+/// Generates a conifer; `bark`: a color image and its normal map, both tiling.
 ///
 /// # Errors
-/// None that these sizes could cause.
+/// None in practice for the sizes in this module.
 pub(super) fn grow(habit: &Habit, bark: [&Texture; 2]) -> Result<Parts> {
     let mut parts = Parts::named(habit.name);
     parts.textures = vec![bark[0].clone(), bark[1].clone(), needles::texture(habit.needles, habit.seed)?];
@@ -110,7 +111,7 @@ pub(super) fn grow(habit: &Habit, bark: [&Texture; 2]) -> Result<Parts> {
             parts.domains.push(rigid(name, place(habit, [whorl, bough], &mut rng)));
         }
     }
-    // The leader: one bough that points to the sky.
+    // The leader: one bough that points up.
     let top = Translation3::new(0.0, habit.height - 0.42, 0.0).to_homogeneous();
     let upright = Rotation3::from_axis_angle(&Vector3::z_axis(), 0.25 * TAU).to_homogeneous();
     parts.domains.push(rigid("leader".into(), top * upright * Matrix4::new_scaling(0.45)));
@@ -132,15 +133,15 @@ fn rigid(name: String, place: Matrix4<f64>) -> Domain {
     }
 }
 
-/// Where a bough grows: whorls lie closer and boughs are shorter towards the top.
+/// Placement of a bough. Towards the top whorls are denser and boughs shorter.
 fn place(habit: &Habit, [whorl, bough]: [usize; 2], rng: &mut Rng) -> Matrix4<f64> {
     let mut any = |most: f64| most * (2.0 * rng.f64() - 1.0);
     let share = ((whorl as f64 + any(0.4)) / habit.whorls as f64).clamp(0.0, 1.0);
     let height = habit.bare + (habit.height - habit.bare - 0.25) * share;
-    // Full at the foot, pointed at the top.
+    // Long at the foot, short at the top.
     let length = habit.reach * (1.0 - share).powf(0.8) * (1.0 + any(0.16)) + 0.2;
     let around = TAU * (bough as f64 + any(0.32)) / habit.boughs as f64 + 2.4 * whorl as f64;
-    // The higher the steeper.
+    // Steeper towards the top.
     let steep = 0.55 * share * share + any(0.08);
     let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), around)
         * Rotation3::from_axis_angle(&Vector3::z_axis(), steep)
@@ -148,11 +149,11 @@ fn place(habit: &Habit, [whorl, bough]: [usize; 2], rng: &mut Rng) -> Matrix4<f6
     Translation3::new(0.0, height, 0.0).to_homogeneous() * turn.to_homogeneous() * Matrix4::new_scaling(length)
 }
 
-/// A tapering tube. Its image goes twice around and keeps its proportions upwards.
+/// A tapering tube. Its texture repeats twice around the trunk and keeps its proportions upwards.
 fn trunk(habit: &Habit) -> Result<Mesh> {
     let ring = |at: usize| {
         let share = at as f64 / RINGS as f64;
-        // The foot spreads into the roots.
+        // The foot widens towards the roots.
         let flare = 1.0 + 0.5 * (-9.0 * share).exp();
         (share * habit.height, TRUNK_RADIUS * flare * (1.0 - 0.96 * share), share)
     };
@@ -180,7 +181,7 @@ fn trunk(habit: &Habit) -> Result<Mesh> {
     Mesh::new(rest, corners, triangles)
 }
 
-/// One picture of needles: its base, the way it goes, the way it is wide, and its length and width.
+/// One textured quad of needles: base, direction, width direction, length and width.
 struct Spray {
     base: Vector3<f64>,
     along: Vector3<f64>,
@@ -189,7 +190,7 @@ struct Spray {
     width: f64,
 }
 
-/// Sprays to both sides of a stem along +X that rises, then hangs; and along the stem itself.
+/// Sprays on both sides of a stem along +X that rises and then hangs, and along the stem itself.
 fn bough(habit: &Habit) -> Result<Mesh> {
     let mut rng = Rng::with_seed(habit.seed ^ 0xB0);
     let mut any = |most: f64| most * (2.0 * rng.f64() - 1.0);
@@ -227,7 +228,8 @@ fn mesh(sprays: &[Spray]) -> Result<Mesh> {
         triangles.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
     }
     let vertices: Vec<u32> = (0..rest.len() as u32).collect();
-    // Rounded as the whole bough is, so that sprays are lit as one thing; flat ones would glitter.
+    // Normals follow the rounded shape of the whole bough, so that sprays are lit as one object; flat normals would
+    // flicker.
     let flat = smooth_normals(&rest, &vertices, &triangles);
     let soft = |(point, own): (&[f32; 3], &[f32; 3])| {
         let own = Vector3::from(*own);
@@ -245,7 +247,7 @@ mod tests {
     use modalcast_model::scene::Scene;
 
     #[test]
-    fn conifers_stand_on_the_ground_are_as_high_as_stated_and_leave_their_foot_bare() {
+    fn conifers_have_the_stated_height_and_bare_foot() {
         let grey = Texture::new("grey", 1, 1, vec![128, 128, 255, 255]).expect("fits");
         for habit in [FIR, HEMLOCK, SPRUCE] {
             let parts = grow(&habit, [&grey, &grey]).expect("grown");

@@ -1,4 +1,4 @@
-//! Several plants as one scene: each species brings its shapes, materials and images once.
+//! Combines several plants into one scene: the shapes, materials and images of each species are stored once.
 
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
@@ -6,10 +6,10 @@ use modalcast_model::domain::{Texture, Transform};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Look, Parts};
 
-/// Where one plant stands: to the right, towards the viewer, turned about its trunk, and how large.
+/// Placement of one plant: to the right, towards the viewer, rotation about its trunk in radians, and scale.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Stand {
-    /// Which species.
+    /// Index of the species.
     pub(super) species: usize,
     pub(super) right: f64,
     pub(super) near: f64,
@@ -17,7 +17,7 @@ pub(super) struct Stand {
     pub(super) scale: f64,
 }
 
-/// Plants of Y-up species in one scene, lit as `look` says.
+/// Combines plants of Y-up species into one scene with this look.
 pub(super) fn plant(name: &str, species: &[&Parts], stands: &[Stand], look: Look) -> Parts {
     let mut forest = Parts { look, ..Parts::named(name) };
     let firsts: Vec<[usize; 2]> = species.iter().map(|species| bring(&mut forest, species)).collect();
@@ -44,7 +44,7 @@ pub(super) fn plant(name: &str, species: &[&Parts], stands: &[Stand], look: Look
     forest
 }
 
-/// Adds what plants of a species share; the indices of its first shape and material.
+/// Adds the shared data of a species and returns the indices of its first shape and material.
 fn bring(forest: &mut Parts, species: &Parts) -> [usize; 2] {
     let [shape, material, texture] = [forest.shapes.len(), forest.materials.len(), forest.textures.len()];
     forest.shapes.extend_from_slice(&species.shapes);
@@ -58,10 +58,10 @@ fn bring(forest: &mut Parts, species: &Parts) -> [usize; 2] {
     [shape, material]
 }
 
-/// The same tree in blossom: leaves of the second kind are petals now, and those of the first a young green.
+/// The tree in blossom: leaves of the second kind become petals, and those of the first kind a young green.
 ///
 /// # Errors
-/// None that the tree's own images would not have caused.
+/// Only those that the tree's own images would cause.
 pub(super) fn in_blossom(tree: &Parts) -> Result<Parts> {
     let mut parts = Parts { name: "peach tree".into(), ..Parts::named("peach tree") };
     bring(&mut parts, tree);
@@ -74,7 +74,7 @@ pub(super) fn in_blossom(tree: &Parts) -> Result<Parts> {
     Ok(parts)
 }
 
-/// An image whose colours are multiplied, as far as a byte goes; alpha stays.
+/// An image with its colors multiplied by a tint and clamped to 255; alpha is unchanged.
 fn tinted(image: &Texture, tint: [f32; 3]) -> Result<Texture> {
     let texel = |texel: &[u8]| {
         let own = |channel: usize| (f32::from(texel[channel]) * tint[channel]).round().min(255.0) as u8;
@@ -91,7 +91,7 @@ mod tests {
     use modalcast_model::scene::Scene;
 
     #[test]
-    fn plants_share_what_their_species_has_and_keep_their_parents_among_themselves() {
+    fn plants_share_species_data_and_keep_parents_of_their_own() {
         let tree = load::open("tree").expect("built").parts();
         let blossom = in_blossom(&tree).expect("tinted");
         assert_ne!(blossom.textures, tree.textures);

@@ -1,8 +1,9 @@
-//! The figures of the thesis's chapter 4.2 remade from our own scenes: single trees (4.1), four and twenty of them (4.2),
-//! bump mapping (4.3), shadow maps of 4096 and 512 texels a side (4.4, 4.5), transparency (4.6); and plants of the user.
+//! Reproduces the figures of the thesis's chapter 4.2 with our own scenes: single trees (4.1), groups of four and
+//! twenty (4.2), bump mapping (4.3), shadow maps of 4096 and 512 texels per side (4.4, 4.5), transparency (4.6); also
+//! draws scenes of the user.
 //!
-//! The trees are the built-in one, the same in blossom, and conifers made here. All bend as in a light wind where they
-//! have modes.
+//! The trees are the built-in one, the same in blossom, and generated conifers. Trees with modes bend as in a light
+//! wind.
 
 mod fir;
 mod forest;
@@ -25,24 +26,24 @@ use modalcast_model::load;
 use modalcast_model::scene::{Camera, Look, Parts, Scene, Shadow, ShadowMethod};
 use modalcast_render::Info;
 
-/// What to draw.
+/// Settings of the figures.
 #[derive(Debug, Clone)]
 pub struct Request {
-    /// Of a single picture; most figures are several side by side.
+    /// Size of a single picture. Most figures consist of several pictures.
     pub size: Size,
-    /// Scenes of the user, as the command line names them, each a figure of its own.
+    /// Scenes of the user, as given on the command line; each becomes a figure.
     pub scenes: Vec<String>,
 }
 
 /// One figure.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Figure {
-    /// As the thesis numbers it; of a user's scene its name.
+    /// Number in the thesis, or the name of the user's scene.
     pub name: String,
-    /// What is seen, from left to right and from top to bottom.
+    /// Descriptions of the pictures, from left to right and top to bottom.
     pub shows: Vec<String>,
     pub file: String,
-    /// Of all pictures together.
+    /// Triangles of all pictures together.
     pub triangles: usize,
 }
 
@@ -51,17 +52,17 @@ pub struct Figure {
 pub struct Figures {
     pub made: Provenance,
     pub renderer: Info,
-    /// Of a single picture.
+    /// Size of a single picture.
     pub size: Size,
     pub figures: Vec<Figure>,
     #[serde(skip)]
     files: Vec<File>,
 }
 
-/// Draws all figures; `progress` hears which.
+/// Draws all figures; `progress` receives the name of each.
 ///
 /// # Errors
-/// `Unavailable` without OpenGL; those of loading and drawing a scene.
+/// `Unavailable` without OpenGL; errors of loading and drawing a scene.
 pub fn figures(request: &Request, mut progress: impl FnMut(&str)) -> Result<Figures> {
     let mut atelier = Atelier { studio: Studio::open()?, size: request.size, figures: Vec::new(), files: Vec::new() };
     progress("growing");
@@ -84,7 +85,7 @@ pub fn figures(request: &Request, mut progress: impl FnMut(&str)) -> Result<Figu
     Ok(Figures { made: Provenance::here(), renderer: studio.renderer.info().clone(), size, figures, files })
 }
 
-/// What draws, and what was drawn.
+/// The renderer and the figures drawn so far.
 struct Atelier {
     studio: Studio,
     size: Size,
@@ -111,14 +112,14 @@ impl Species {
     }
 }
 
-/// The images of the tree's bark, which the conifers wear too: colours and normals.
+/// Color and normal images of the tree's bark, which the conifers share.
 fn bark(tree: &Parts) -> Result<[&Texture; 2]> {
     let images = tree.materials.iter().find_map(|material| material.colour_texture.zip(material.normal_texture));
     let (colour, normal) = images.ok_or_else(|| during("figures")("the tree has no bark"))?;
     Ok([&tree.textures[colour], &tree.textures[normal]])
 }
 
-/// Sharp enough that leaves cast leaves.
+/// A look with a shadow map that is sharp enough for single leaves.
 fn fine(look: Look) -> Look {
     Look { shadow: Some(Shadow { size: 4096, ..Shadow::default() }), ..look }
 }
@@ -140,7 +141,7 @@ impl Atelier {
         image.map(|image| image.rgba)
     }
 
-    /// A figure of pictures of one size in rows of `columns`.
+    /// Draws a figure of equally sized pictures in rows of `columns`.
     fn figure(&mut self, name: &str, title: &str, columns: usize, pieces: &[Piece<'_>]) -> Result<()> {
         let drawn = pieces.iter().map(|piece| self.draw(piece)).collect::<Result<Vec<_>>>()?;
         let size = pieces.first().map_or(self.size, |piece| piece.size);
@@ -160,7 +161,7 @@ impl Atelier {
     }
 }
 
-/// One plant in the origin.
+/// One plant at the origin.
 fn alone(turn: f64) -> [Stand; 1] {
     [Stand { species: 0, right: 0.0, near: 0.0, turn, scale: 1.0 }]
 }
@@ -205,7 +206,7 @@ fn four((index, [right, near]): (usize, &[f64; 2])) -> Stand {
     Stand { species: 0, right: *right, near: *near, turn: 1.7 * index as f64, scale }
 }
 
-/// Four rows of five, each out of line.
+/// Four rows of five plants with irregular offsets.
 fn twenty(index: usize) -> Stand {
     let (row, column) = (index / 5, index % 5);
     let (wave, other) = ((2.3 * index as f64).sin(), (4.1 * index as f64).cos());
@@ -252,7 +253,7 @@ fn shadows(atelier: &mut Atelier, species: &Species) -> Result<()> {
     Ok(())
 }
 
-/// Figure 4.6: leaves with transparency, and their cards without.
+/// Figure 4.6: leaves with transparency, and their opaque cards.
 fn leaves(atelier: &mut Atelier, species: &Species) -> Result<()> {
     let drawn = |mode: AlphaMode| {
         let mut parts = forest::plant("leaves", &[&species.tree], &alone(0.6), fine(species.tree.look));
@@ -267,7 +268,7 @@ fn leaves(atelier: &mut Atelier, species: &Species) -> Result<()> {
     atelier.figure("4.6", "transparency", 2, &pieces)
 }
 
-/// A scene of the user, as it is lit there.
+/// A scene of the user with its own look, and default shadows if it has none.
 fn own(atelier: &mut Atelier, source: &str) -> Result<()> {
     let scene = load::open(source)?;
     let scene = meter::relit(&scene, Look { shadow: scene.look.shadow.or(Some(Shadow::default())), ..scene.look })?;
@@ -280,7 +281,7 @@ fn own(atelier: &mut Atelier, source: &str) -> Result<()> {
 }
 
 impl Figures {
-    /// Writes the pictures, `figures.json` and `figures.md` into a folder, which is made.
+    /// Writes the pictures, `figures.json` and `figures.md` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.

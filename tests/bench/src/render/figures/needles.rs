@@ -1,4 +1,4 @@
-//! The picture of a spray of needles: a twig from left to right, and needles that leave it to both sides.
+//! Generates the texture of a spray of needles: a twig from left to right with needles on both sides.
 
 use fastrand::Rng;
 use rayon::prelude::*;
@@ -8,28 +8,28 @@ use modalcast_model::error::Result;
 
 const WIDE: usize = 256;
 const TALL: usize = 128;
-/// Needles to each side, and half their thickness in pixels.
+/// Needles per side, and half their thickness in pixels.
 const NEEDLES: usize = 46;
 const THICK: f32 = 1.7;
 
-/// A needle: two points in pixels and its brightness.
+/// A needle: its end points in pixels, and its brightness.
 struct Needle {
     from: [f32; 2],
     to: [f32; 2],
     light: f32,
 }
 
-/// The image; `colour` is sRGB, 0 to 255, of a needle of usual brightness.
+/// Draws the texture; `colour`: sRGB, 0 to 255, of a needle of brightness 1.
 ///
 /// # Errors
-/// None: its size is a constant.
+/// None in practice: its size is a constant.
 pub(super) fn texture(colour: [f32; 3], seed: u64) -> Result<Texture> {
     let needles = needles(&mut Rng::with_seed(seed));
     let pixel = |at: usize| {
         let place = [(at % WIDE) as f32 + 0.5, (at / WIDE) as f32 + 0.5];
         let mut best = (0.0_f32, 1.0_f32);
         for needle in &needles {
-            // One pixel from what is covered to what is not.
+            // Edges are antialiased over one pixel.
             let cover = (THICK + 0.5 - distance(needle, place)).clamp(0.0, 1.0);
             if cover > best.0 {
                 best = (cover, needle.light);
@@ -56,17 +56,17 @@ fn needles(rng: &mut Rng) -> Vec<Needle> {
         let share = (at / 2) as f32 / NEEDLES as f32;
         let side = if at % 2 == 0 { 1.0 } else { -1.0 };
         let x = 4.0 + 0.88 * wide * share + any(2.0);
-        // Short at the tip, so that a spray ends round.
+        // Shorter at the tip, so that a spray has a round end.
         let long = (0.88 * middle) * (1.0 - share.powi(3)).sqrt() * (1.0 + any(0.1)) + 5.0;
         let slope = 0.55 + any(0.12);
         let to = [(x + slope * long).min(wide - 3.0), middle + side * long.min(middle - 3.0)];
-        // Young needles at the tip are lighter.
+        // Young needles at the tip are brighter.
         all.push(Needle { from: [x, middle], to, light: 0.82 + 0.35 * share + any(0.18) });
     }
     all
 }
 
-/// From a point to a segment.
+/// Distance from a point to a needle's segment, pixels.
 fn distance(needle: &Needle, [x, y]: [f32; 2]) -> f32 {
     let [ax, ay] = needle.from;
     let [dx, dy] = [needle.to[0] - ax, needle.to[1] - ay];
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_spray_is_part_needles_and_part_holes_and_a_seed_repeats_itself() {
+    fn spray_has_needles_and_holes_and_is_deterministic() {
         let image = texture([60.0, 100.0, 60.0], 3).expect("fits");
         let solid = image.rgba().chunks_exact(4).filter(|texel| texel[3] > 127).count() as f64;
         let share = solid / (WIDE * TALL) as f64;

@@ -1,4 +1,4 @@
-//! Where the figures are seen from. Scenes are Y up, in metres, the sun to the right of the viewer.
+//! Cameras of the figures. Scenes are Y up, in meters, with the sun to the viewer's right.
 
 use nalgebra::Vector3;
 
@@ -6,7 +6,7 @@ use crate::render::studio::Size;
 use modalcast_model::error::{Result, during};
 use modalcast_model::scene::{Camera, Lens, Scene, View};
 
-/// The part of the image's half that a scene may take; the rest is for shadows.
+/// Fraction of the half image that a scene may fill; the rest is for shadows.
 const MARGIN: f64 = 0.86;
 const DEGREES: f64 = 28.0;
 
@@ -15,7 +15,7 @@ fn looking(eye: Vector3<f64>, target: Vector3<f64>, degrees: f64) -> Camera {
     Camera { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
 }
 
-/// All of a scene, from a little aside and from above by a slope of `elevation`.
+/// Frames a whole scene, from slightly to the right and from above by a slope of `elevation`.
 pub(super) fn whole(scene: &Scene, size: Size, elevation: f64) -> Camera {
     let aside = Vector3::new(0.30, elevation, 0.95).normalize();
     let right = Vector3::y().cross(&aside).normalize();
@@ -23,7 +23,7 @@ pub(super) fn whole(scene: &Scene, size: Size, elevation: f64) -> Camera {
     let slope = MARGIN * (0.5 * DEGREES).to_radians().tan();
     let aspect = f64::from(size.width) / f64::from(size.height);
     let centre = scene.rest_bounds.centre().coords;
-    // Vertices, not the corners of their box: a tree has no leaves there.
+    // Use vertices rather than the corners of their bounding box, where a tree has no leaves.
     let distance = |point: Vector3<f64>| {
         let offset = point - centre;
         let wide = (offset.dot(&right) / (slope * aspect)).abs();
@@ -33,7 +33,7 @@ pub(super) fn whole(scene: &Scene, size: Size, elevation: f64) -> Camera {
     looking(centre + aside * distance, centre, DEGREES)
 }
 
-/// Every vertex at rest.
+/// Rest positions of all vertices.
 fn points(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
     scene.domains.iter().flat_map(|domain| {
         let place = domain.placement.to_matrix();
@@ -42,24 +42,24 @@ fn points(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
     })
 }
 
-/// A trunk that stands in the origin, from nearby.
+/// A trunk at the origin, from nearby.
 pub(super) fn trunk() -> Camera {
     looking(Vector3::new(0.25, 1.0, 0.72), Vector3::new(0.0, 0.92, 0.0), 34.0)
 }
 
-/// The shadow of a tree that stands in the origin, and the foot of its trunk.
+/// The shadow of a tree at the origin, and the foot of its trunk.
 pub(super) fn shadow(scene: &Scene) -> Camera {
     let to_sun = scene.look.to_sun(scene.up);
     let height = scene.rest_bounds.max[1];
-    // Where the middle of the crown throws its shadow.
+    // The shadow of the center of the crown on the ground.
     let middle = Vector3::new(-to_sun.x, 0.0, -to_sun.z) * (0.55 * height / to_sun.y);
     looking(middle + Vector3::new(1.2, 4.2, 6.4), middle + Vector3::new(0.3, 0.0, 0.4), 38.0)
 }
 
-/// The leaves that reach nearest to the viewer, from an arm's length.
+/// The leaves nearest to the viewer, from a distance of about 1.4 m.
 ///
 /// # Errors
-/// `Fault` when nothing of the scene is a leaf.
+/// `Fault` when the scene has no leaves.
 pub(super) fn bough(scene: &Scene) -> Result<Camera> {
     let towards = Vector3::new(0.30, -0.15, 0.95).normalize();
     let places = scene.domains.iter().filter(|domain| domain.name.starts_with("leaf"));
