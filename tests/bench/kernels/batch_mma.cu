@@ -61,7 +61,7 @@ struct BatchMmaArgs {
     unsigned domains;
     unsigned vertices; // of the shape
     unsigned chunks;
-    unsigned aligned; // whether every domain begins at 16 bytes
+    unsigned aligned; // whether every domain's positions are 16-byte aligned
 };
 static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
 
