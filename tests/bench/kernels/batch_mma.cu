@@ -57,11 +57,11 @@ struct BatchMmaArgs {
     const float* shrinks;
     const uint4* halves;
     float* positions;
-    unsigned first[MOST]; // first packed vertex of each domain
+    unsigned first[MOST]; // packed vertex of each domain
     unsigned domains;
     unsigned vertices; // of the shape
     unsigned chunks;
-    unsigned aligned; // whether every domain begins at a multiple of 16 bytes
+    unsigned aligned; // whether every domain's positions are 16-byte aligned
 };
 static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
 
@@ -76,7 +76,7 @@ struct Part {
     unsigned width;     // quads of the tile
     unsigned rest;      // the lane's quad of the shape
     unsigned first;     // the warp's first vertex in the shape
-    unsigned numbers;   // of the warp's vertices, three each; 0 if it has none
+    unsigned numbers;   // of the warp's vertices, three each; 0 without any
 };
 
 // A lane beyond the last quad reads that quad again; its results are not stored.
@@ -121,7 +121,7 @@ __device__ __forceinline__ void load(Step& step, const BatchMmaArgs& args, const
     load(step.high, args, part, chunk + 4);
 }
 
-// [2 axis + pair of vertices][group of eight domains][2 (vertex of the pair) + domain of the lane's two]
+// [2 axis + pair of vertices][eight of domains][2 (vertex of the pair) + domain of the lane's two]
 typedef float Sums[6][EIGHTS][4];
 
 __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4], unsigned q0, unsigned q1) {

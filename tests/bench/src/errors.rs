@@ -13,7 +13,7 @@ pub const IMAGE: (u32, u32) = (1920, 1080);
 /// Conversion of errors in scene units into meters and pixels.
 #[derive(Debug, Clone)]
 pub struct Yardstick {
-    /// Metres per scene unit.
+    /// Meters per scene unit.
     unit: f64,
     /// Diagonal of the scene at rest, meters.
     diagonal: f64,
@@ -27,7 +27,7 @@ impl Yardstick {
         Self { unit: scene.unit, diagonal: scene.unit * scene.rest_bounds.diagonal(), clip_from_world: clip }
     }
 
-    /// Metres per scene unit.
+    /// Meters per scene unit.
     pub const fn unit(&self) -> f64 {
         self.unit
     }
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_a_hand_made_surface_are_exact() {
+    fn hand_made_surface_has_the_expected_errors() {
         let yardstick = yardstick();
         let mut tally = Tally::default();
         // The error vectors are (3, 4, 0) and zero: lengths 5 and 0.

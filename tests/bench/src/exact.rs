@@ -285,7 +285,7 @@ mod tests {
     fn repeats_cancelling_sum_in_double_double() {
         let columns = vec![1.0, 1.0, 1.0, 2f32.powi(-30), 0.0, 0.0, -1.0, -1.0, -1.0];
         let modes = Modes::from_columns(3, 3, columns).expect("modes");
-        // 1e10 + 2^-30 - 1e10: f64 has 53 bits and 2^-30 lies 63 below.
+        // 1e10 + 2^-30 - 1e10: f64 has 53 bits, and 2^-30 is 63 binary places below 1e10.
         let sums = sum(0..1, Entries::Exact(&modes), &[1e10, 1.0, 1e10]);
         assert_eq!(sums[0].u, [2f64.powi(-30), 0.0, 0.0]);
     }

@@ -18,7 +18,8 @@ pub struct Record {
 
 impl Record {
     /// Reads a `.csv` file with a header and the columns time, q0, q1, ..., or a folder with `q.npy` (steps x
-    /// coordinates) and, if the domains move, `transforms.npy` (steps x domains x 12), as `modalcast-sim` writes it.
+    /// coordinates) and, if the domains move, `transforms.npy` (steps x movers x 12), as `modalcast-sim` writes it.
+    /// Movers are the domains with a transform of their own.
     ///
     /// # Errors
     /// `NotFound`, or `Invalid` when the numbers do not fit the scene.

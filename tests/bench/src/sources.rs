@@ -173,7 +173,7 @@ mod tests {
         // Half a step of 1/127 on each axis for coordinates of 1.5 together, at most.
         assert!(found.storage.largest > 1e-3 && found.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{found:?}");
         assert_eq!([found.accumulation, found.truncation], [Spread::default(); 2]);
-        // Mode 1 moves vertices by up to 0.5 sqrt(3); a mode goes when it moves none by half the budget.
+        // Mode 1 moves vertices by up to 0.5 sqrt(3). A mode is truncated if it moves no vertex by half the budget.
         let found = split(Deformation { truncation: Some(1.75), ..plain() }, &even(), None);
         assert!(found.truncation.largest > 0.5 && found.truncation.largest <= 0.87, "{found:?}");
         assert_eq!([found.accumulation, found.storage], [Spread::default(); 2]);

@@ -126,7 +126,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_printed_speed_ups_are_the_quotients_of_the_printed_times() {
+    fn printed_speedups_are_quotients_of_printed_times() {
         for plant in PLANTS {
             let quotient = plant.cpu_uq_ms / plant.gpu_uq_ms;
             assert!((quotient - plant.speedup_uq).abs() <= 0.011, "{}: {quotient}", plant.name);
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn the_printed_occupations_are_t_vbr_by_frames_a_second_and_k_vbr_is_their_quotient() {
+    fn printed_occupations_equal_t_vbr_times_fps() {
         let speedups = [1.16, 3.48, 40.40, 15.54, 11.41, 27.29, 16.23, 24.96, 19.34, 79.36, 47.58, 19.71];
         for (plant, speedup) in PLANTS.iter().zip(speedups) {
             let Drawn { cpu_vbr_ms, cpu_fps, cpu_vbr_occupation, .. } = plant.drawn;
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn unfolding_gives_three_vertices_a_triangle_but_for_the_one_misprint() {
+    fn unfolding_gives_3_vertices_per_face_except_one_misprint() {
         let odd: Vec<&str> =
             PLANTS.iter().filter(|plant| plant.unfolded != 3 * plant.faces).map(|plant| plant.name).collect();
         assert_eq!(odd, ["Pansy"]);

@@ -36,7 +36,7 @@ pub struct Condition {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Found {
     pub errors: Errors,
-    /// Error of x(k + 1) - x(k) along the trajectory, metres.
+    /// Error of x(k + 1) - x(k) along the trajectory, meters.
     pub step_metres: Spread,
     pub sources: Sources,
     pub orientation: Orientation,

@@ -20,7 +20,7 @@ pub struct Label {
 }
 
 impl Label {
-    /// The label of a variant that deforms this scene as the scene says.
+    /// The label of a variant that uses this scene's deformation.
     pub fn new(name: impl Into<String>, backend: Backend, scene: &Scene) -> Self {
         Self { name: name.into(), backend, deformation: scene.deformation }
     }
@@ -77,7 +77,7 @@ pub struct Driven {
 }
 
 impl Driven {
-    /// A deformer of this scene.
+    /// Wraps a deformer of this scene.
     pub fn new(label: Label, scene: &Arc<Scene>, deformer: Box<dyn Deformer>) -> Self {
         Self::sharing(label, scene, Ingredients::of(scene), deformer)
     }

@@ -72,7 +72,7 @@ pub(super) struct Args {
 /// Default sizes: of the report, and of the figures' pictures.
 const USUAL: [Size; 2] = [Size { width: 640, height: 360 }, Size { width: 640, height: 480 }];
 
-/// Upper limit of a picture's side in pixels: every pixel is traced by at least 64 rays.
+/// Upper limit of a picture's side in pixels, because the references trace 16 to 64 samples per pixel.
 const LARGEST: u32 = 4096;
 
 pub(super) fn run(args: &Args) -> Outcome {

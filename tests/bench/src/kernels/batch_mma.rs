@@ -309,7 +309,7 @@ mod tests {
         (320, 50, 13),
     ];
 
-    /// `batch_mma` warp by warp, with its fragments, its stage and its way out; sums in f64.
+    /// CPU twin of `batch_mma`, warp by warp, with fragments, staging buffer and stores; sums in f64.
     fn twin_of_batch_mma(tables: &Tables, numbers: usize) -> Vec<f32> {
         let mut positions = vec![f32::NAN; numbers];
         let vertices = tables.args.vertices as usize;
@@ -336,7 +336,7 @@ mod tests {
                 let got = twin_of_batch_mma(&tables, 3 * scene.layout.vertices);
                 for (packed, got) in got.chunks_exact(3).enumerate() {
                     let (domain, vertex) = (packed / vertices, packed % vertices);
-                    // The same on U as it is stored: what is left is the rounding of q and f32.
+                    // Compare with the result for stored U; only the rounding of q and f32 remains.
                     let want = exactly(&scene, &state, &tables.tiles, (domain, vertex));
                     let near = |tolerance: f64| {
                         got.iter().zip(want).all(|(got, want)| (f64::from(*got) - want).abs() < tolerance)

@@ -168,7 +168,7 @@ impl Span {
         self.end.record(device.stream()).map_err(during("event"))
     }
 
-    /// Time between the two events, microseconds. Both must have completed.
+    /// Time between the two events, microseconds. Waits until both are complete.
     pub(super) fn microseconds(&self) -> Result<f64> {
         self.begin.elapsed_ms(&self.end).map(|ms| 1e3 * f64::from(ms)).map_err(during("event"))
     }

@@ -227,7 +227,7 @@ mod tests {
     use super::super::trial::tests::compile_all;
     use super::*;
 
-    /// The words that `copy` and `read` touch, by their own arithmetic.
+    /// CPU twin of the addressing of `copy` and `read`: the words that they access.
     fn twin_of_words(blocks: u64, loads: u64) -> Vec<u64> {
         let threads = (0..blocks).flat_map(|block| (0..BLOCK).map(move |thread| block * BLOCK * loads + thread));
         threads.flat_map(|first| (0..loads).map(move |index| first + index * BLOCK)).collect()

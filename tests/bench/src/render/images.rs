@@ -39,7 +39,7 @@ fn hang(parts: &mut Parts, name: &str, mesh: Mesh, [width, height]: [u32; 2]) ->
     add(parts, name, mesh, Material { colour_texture, double_sided: true, ..Material::default() })
 }
 
-/// A parallelogram of `turns` x `turns` cells, each of which shows the image once and has corners of its own.
+/// A parallelogram of `turns` x `turns` cells. Each cell shows the image once and has its own corners.
 fn tiled(corner: [f32; 3], sides: [[f32; 3]; 2], turns: usize) -> Result<Mesh> {
     let point = |u: usize, v: usize| {
         let [u, v] = [u, v].map(|turn| turn as f32 / turns as f32);
@@ -59,7 +59,7 @@ fn tiled(corner: [f32; 3], sides: [[f32; 3]; 2], turns: usize) -> Result<Mesh> {
     Mesh::indexed(rest, normals, uvs, triangles)
 }
 
-/// An image without a seam: waves of whole periods in three colours, and a thin dark frame that shows where it ends.
+/// A seamless image: waves of whole periods in three colors, with a thin dark border that marks its edges.
 fn weave(name: &str, width: u32, height: u32) -> Result<Texture> {
     let wave = |place: f32| 0.5 + 0.5 * (TAU * place).sin();
     let pixel = |at: u32| {

@@ -1,9 +1,10 @@
 //! Cost of reading every frame back: frames per second without readback, with a blocking readback after each frame, and
 //! with readbacks through the ring while the next frames are drawn.
 //!
-//! All three methods wait for a frame before the ring has no free slot, so that they differ only in the readback.
-//! Rounds of the three methods alternate, and the medians over the rounds are compared. Two more methods, without
-//! readback and through the ring, upload the vertices of another step before every frame, as a moving scene does.
+//! All three methods keep at most as many frames in flight as the ring has slots, so that they differ only in the
+//! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. Two more methods,
+//! without readback and through the ring, upload the vertices of another step before every frame, as a moving scene
+//! does.
 //!
 //! Validation comes first: frames of two alternating cameras come back through the ring and must equal, in order, the
 //! frames that were drawn one by one, with steps between them and without.

@@ -217,7 +217,7 @@ pub(super) struct Product {
     pub columns: i32,
     /// Leading dimension of A and C in floats. The columns of B are contiguous.
     pub lead: i32,
-    /// Number of products.
+    /// Number of products, and floats from one A, B and C to the next.
     pub count: i32,
     pub strides: [i64; 3],
 }
