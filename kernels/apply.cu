@@ -8,8 +8,8 @@
 //   transforms, q   of all transform roots, and of all domains           (out)
 //   stale           [stale] u32: the tiles that contain a changed domain (in)
 //   stamps          [domains] u32: the step that last changed a domain   (out)
-//   list            [stale] u32: copy of `stale` in device memory        (out)
-// Launch: BLOCK threads per block, a warp per changed domain, any number of blocks. CPU twin: State::apply.
+//   list            [stale] u32: copy of `dirty_tiles` in device memory        (out)
+// Launch: BLOCK threads per block, a warp per changed domain, any number of blocks. CPU twin: SceneState::apply.
 #include "layout.cuh"
 
 extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant__ ApplyArgs args) {
@@ -19,25 +19,25 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
         const Change change = args.changes[index];
 #ifdef FOLLOWERS
         // A follower is in the list only for its coordinates or its stamp.
-        const Following own = args.following[change.domain];
-        const unsigned mover = own.mover;
+        const TransformLink own = args.transform_links[change.domain];
+        const unsigned root = own.root;
         const bool moves = own.frame == NO_FRAME;
 #else
-        const unsigned mover = change.domain;
+        const unsigned root = change.domain;
         const bool moves = true;
 #endif
         if (moves && lane < 3) {
-            args.transforms[3 * (size_t)mover + lane] = args.new_transforms[3 * (size_t)index + lane];
+            args.transforms[3 * (size_t)root + lane] = args.new_transforms[3 * (size_t)index + lane];
         }
         if (lane == 3) {
-            args.stamps[change.domain] = args.header->step;
+            args.change_steps[change.domain] = args.header->step;
         }
         for (unsigned i = lane; i < change.count; i += 32) {
             args.q[change.first_q + i] = args.new_q[change.source + i];
         }
     }
-    const unsigned stale = args.header->stale;
-    for (unsigned i = blockIdx.x * BLOCK + threadIdx.x; i < stale; i += gridDim.x * BLOCK) {
-        args.list[i] = args.stale[i];
+    const unsigned dirty_tiles = args.header->dirty_tiles;
+    for (unsigned i = blockIdx.x * BLOCK + threadIdx.x; i < dirty_tiles; i += gridDim.x * BLOCK) {
+        args.list[i] = args.dirty_tiles[i];
     }
 }

@@ -24,30 +24,30 @@
 // memory asynchronously, STAGES * 3 KB per warp ahead, 144 KB per multiprocessor, where a latency of 1 us at 5 TB/s
 // needs 38 KB.
 #include "batch_load.cuh"
-#include "ordered.cuh"
+#include "ordered_float.cuh"
 
 // Target number of resident blocks per multiprocessor: the register limit where shared memory is large enough.
 #if __CUDA_ARCH__ == 900
-constexpr unsigned RESIDENT = VECTORS == 16 ? 8 : 10;
+constexpr unsigned MIN_BLOCKS_PER_SM = BATCH_SIZE == 16 ? 8 : 10;
 #elif __CUDA_ARCH__ == 800 || __CUDA_ARCH__ == 1000
 // Three warps per scheduler: the compiler needs more registers for these architectures.
-constexpr unsigned RESIDENT = 6;
+constexpr unsigned MIN_BLOCKS_PER_SM = 6;
 #else
-constexpr unsigned RESIDENT = 4;
+constexpr unsigned MIN_BLOCKS_PER_SM = 4;
 #endif
 
 // Chunks whose loads and sums are interleaved: at least two modes.
-constexpr unsigned TOGETHER = CHUNK_MODES < 2 ? 2 : 1;
+constexpr unsigned CHUNK_UNROLL = CHUNK_MODES < 2 ? 2 : 1;
 
 // One axis of a lane's two vertices.
-struct Pair {
-    float of[2];
+struct VertexPair {
+    float values[2];
 };
 
 // The pair of group `group` (mode * 3 + axis) of a chunk. `chunk` is the lane's first byte in the chunk.
-__device__ __forceinline__ Pair pair_at(const char* chunk, unsigned group) {
+__device__ __forceinline__ VertexPair load_vertex_pair(const char* chunk, unsigned group) {
     const unsigned byte = 4 * ENTRY_BYTES * group;
-    const char* at = chunk + byte / 16 * (16 * QUADS) + byte % 16;
+    const char* at = chunk + byte / 16 * (16 * WARP_QUADS) + byte % 16;
     unsigned words[12] = {};
 #if defined(STORE_INT8)
     words[0] = *(const unsigned short*)at;
@@ -58,27 +58,27 @@ __device__ __forceinline__ Pair pair_at(const char* chunk, unsigned group) {
     words[0] = both.x;
     words[1] = both.y;
 #endif
-    Pair pair;
-    pair.of[0] = entry_of(words, 0);
+    VertexPair pair;
+    pair.values[0] = decode_entry(words, 0);
 #if defined(STORE_F16)
     // Convert the upper half directly, without a shift.
-    asm("{ .reg .b16 low, high; mov.b32 {low, high}, %1; cvt.f32.f16 %0, high; }" : "=f"(pair.of[1]) : "r"(words[0]));
+    asm("{ .reg .b16 low, high; mov.b32 {low, high}, %1; cvt.f32.f16 %0, high; }" : "=f"(pair.values[1]) : "r"(words[0]));
 #else
-    pair.of[1] = entry_of(words, 1);
+    pair.values[1] = decode_entry(words, 1);
 #endif
     return pair;
 }
 
 // [2 * axis + vertex][domain]
-typedef float Sums[6][VECTORS];
+typedef float Sums[6][BATCH_SIZE];
 
-__device__ __forceinline__ void add_four(Sums& sums, unsigned first, const Pair (&pairs)[3], const float4& q) {
+__device__ __forceinline__ void add_four(Sums& sums, unsigned first, const VertexPair (&pairs)[3], const float4& q) {
     const float amounts[4] = {q.x, q.y, q.z, q.w};
 #pragma unroll
     for (unsigned i = 0; i < 6; ++i) {
 #pragma unroll
         for (unsigned k = 0; k < 4; ++k) {
-            sums[i][first + k] = fmaf(pairs[i / 2].of[i % 2], amounts[k], sums[i][first + k]);
+            sums[i][first + k] = fmaf(pairs[i / 2].values[i % 2], amounts[k], sums[i][first + k]);
         }
     }
 }
@@ -86,60 +86,60 @@ __device__ __forceinline__ void add_four(Sums& sums, unsigned first, const Pair 
 __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const float4* q) {
 #pragma unroll
     for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
-        const Pair pairs[3] = {pair_at(chunk, 3 * mode), pair_at(chunk, 3 * mode + 1), pair_at(chunk, 3 * mode + 2)};
+        const VertexPair pairs[3] = {load_vertex_pair(chunk, 3 * mode), load_vertex_pair(chunk, 3 * mode + 1), load_vertex_pair(chunk, 3 * mode + 2)};
 #pragma unroll
-        for (unsigned four = 0; four < VECTORS / 4; ++four) {
-            add_four(sums, 4 * four, pairs, q[mode * (VECTORS / 4) + four]);
+        for (unsigned four = 0; four < BATCH_SIZE / 4; ++four) {
+            add_four(sums, 4 * four, pairs, q[mode * (BATCH_SIZE / 4) + four]);
         }
     }
 }
 
 // Sums all modes, stage by stage; the ring is full at the start. With 16-bit entries all registers are in use and the
 // stage counter spills to local memory: a few bytes, once per stage.
-__device__ __forceinline__ void sum_modes(const Part& part, Own& own, const float4* q, Sums& sums) {
-    const unsigned offset = 16 * (lane_of() / 2) + 2 * ENTRY_BYTES * (lane_of() % 2);
+__device__ __forceinline__ void sum_modes(const WarpSlice& part, WarpStorage& own, const float4* q, Sums& sums) {
+    const unsigned offset = 16 * (lane_id() / 2) + 2 * ENTRY_BYTES * (lane_id() % 2);
 #pragma unroll 1
     for (unsigned stage = 0; STAGE_CHUNKS * stage < part.chunks; ++stage) {
-        wait_for_all_but<STAGES - 1>();
+        cp_async_wait<STAGES - 1>();
         const char* chunk = (const char*)(own.ring + stage % STAGES * STAGE_WORDS) + offset;
         const unsigned count = min(STAGE_CHUNKS, part.chunks - STAGE_CHUNKS * stage);
-#pragma unroll TOGETHER
+#pragma unroll CHUNK_UNROLL
         for (unsigned i = 0; i < count; ++i) {
             add_chunk(sums, chunk, q);
-            chunk += 3 * 16 * QUADS;
-            q += CHUNK_MODES * (VECTORS / 4);
+            chunk += 3 * 16 * WARP_QUADS;
+            q += CHUNK_MODES * (BATCH_SIZE / 4);
         }
         __syncwarp();
         if (STAGE_CHUNKS * (stage + STAGES) < part.chunks) {
             copy_stage(part, own, stage + STAGES);
         }
-        end_group();
+        cp_async_commit();
     }
 }
 
 // x0 of a lane's two vertices.
-struct Base {
+struct RestPair {
     float2 x, y, z;
-    __device__ __forceinline__ void load(const Own& own) {
-        const float* from = (const float*)(own.rest + lane_of() / 2) + 2 * (lane_of() % 2);
+    __device__ __forceinline__ void load(const WarpStorage& own) {
+        const float* from = (const float*)(own.rest + lane_id() / 2) + 2 * (lane_id() % 2);
         x = *(const float2*)from;
-        y = *(const float2*)(from + 4 * QUADS);
-        z = *(const float2*)(from + 8 * QUADS);
+        y = *(const float2*)(from + 4 * WARP_QUADS);
+        z = *(const float2*)(from + 8 * WARP_QUADS);
     }
 };
 
 // Number of existing vertices among a lane's two.
-__device__ __forceinline__ unsigned count_of(const Part& part) {
-    return part.vertices > 2 * lane_of() ? min(2u, part.vertices - 2 * lane_of()) : 0;
+__device__ __forceinline__ unsigned lane_vertices(const WarpSlice& part) {
+    return part.vertices > 2 * lane_id() ? min(2u, part.vertices - 2 * lane_id()) : 0;
 }
 
 // Address of the two boxes of half a tile in the boxes of `deform`.
-__device__ __forceinline__ unsigned* boxes_of(const BatchArgs& args, const Part& part, const Member& member) {
+__device__ __forceinline__ unsigned* warp_boxes(const BatchArgs& args, const WarpSlice& part, const BatchMember& member) {
     return args.boxes + 24 * (size_t)(member.first_tile + part.tile) + 12 * (threadIdx.x / 32);
 }
 
 // Writes x of a lane's two vertices to the stage, [vertex][3].
-__device__ __forceinline__ void stage_domain(const Base& base, const Common& common, const Sums& sums, unsigned domain,
+__device__ __forceinline__ void stage_domain(const RestPair& base, const BlockStorage& common, const Sums& sums, unsigned domain,
                                              float* staged) {
     const Affine& t = common.transforms[domain];
     const float4 a = t.a, b = t.b, c = t.c;
@@ -148,39 +148,39 @@ __device__ __forceinline__ void stage_domain(const Base& base, const Common& com
     for (unsigned i = 0; i < 2; ++i) {
         const float px = (i ? base.x.y : base.x.x) + sums[i][domain], py = (i ? base.y.y : base.y.x) + sums[2 + i][domain],
                     pz = (i ? base.z.y : base.z.x) + sums[4 + i][domain];
-        world[3 * i] = placed(a, px, py, pz);
-        world[3 * i + 1] = placed(b, px, py, pz);
-        world[3 * i + 2] = placed(c, px, py, pz);
+        world[3 * i] = transform_row(a, px, py, pz);
+        world[3 * i + 1] = transform_row(b, px, py, pz);
+        world[3 * i + 2] = transform_row(c, px, py, pz);
     }
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
-        ((float2*)staged)[3 * lane_of() + i] = make_float2(world[2 * i], world[2 * i + 1]);
+        ((float2*)staged)[3 * lane_id() + i] = make_float2(world[2 * i], world[2 * i + 1]);
     }
 }
 
 // Computes the boxes of the two staged domains. Each half warp reduces one domain, with four vertices per lane. After
 // the first exchange a lane has either the lower or the upper sides, so later exchanges move three numbers. NaNs are
-// handled by `mend`.
-__device__ __forceinline__ void box_both(const BatchArgs& args, Part& part, const Common& common, unsigned domain,
+// handled by `repair_non_finite`.
+__device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& part, const BlockStorage& common, unsigned domain,
                                          const float4* staged) {
-    const float LEAST = __uint_as_float(0xff800000u); // minus infinity
-    const unsigned own = domain + lane_of() / 16, within = lane_of() % 16;
-    const float4* from = staged + 48 * (lane_of() / 16) + 3 * within;
+    const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u); // minus infinity
+    const unsigned own = domain + lane_id() / 16, within = lane_id() % 16;
+    const float4* from = staged + 48 * (lane_id() / 16) + 3 * within;
     const float4 first = from[0], second = from[1], third = from[2];
     const float numbers[12] = {first.x,  first.y,  first.z, first.w, second.x, second.y,
                                second.z, second.w, third.x, third.y, third.z,  third.w};
-    float low[3] = {LEAST, LEAST, LEAST}, high[3] = {LEAST, LEAST, LEAST}, total = 0.0f;
+    float low[3] = {NEGATIVE_INFINITY, NEGATIVE_INFINITY, NEGATIVE_INFINITY}, high[3] = {NEGATIVE_INFINITY, NEGATIVE_INFINITY, NEGATIVE_INFINITY}, total = 0.0f;
 #pragma unroll
     for (unsigned i = 0; i < 12; ++i) {
-        if (part.vertices == VERTICES || 4 * within + i / 3 < part.vertices) {
+        if (part.vertices == WARP_VERTICES || 4 * within + i / 3 < part.vertices) {
             low[i % 3] = fmaxf(low[i % 3], -numbers[i]);
             high[i % 3] = fmaxf(high[i % 3], numbers[i]);
         }
         // Remains zero unless a number is not finite.
         total = fmaf(0.0f, numbers[i], total);
     }
-    if (__any_sync(0xffffffffu, total != 0.0f) && lane_of() == 0) {
-        part.is_lost = 1;
+    if (__any_sync(0xffffffffu, total != 0.0f) && lane_id() == 0) {
+        part.has_non_finite = 1;
     }
     const bool is_upper = within >= 8;
     float sides[3];
@@ -200,63 +200,63 @@ __device__ __forceinline__ void box_both(const BatchArgs& args, Part& part, cons
     const unsigned axis = within % 8 % 3, copy = within % 8 / 3;
     if (copy < 2 && own < part.members) {
         const float side = axis == 0 ? sides[0] : axis == 1 ? sides[1] : sides[2];
-        boxes_of(args, part, common.members[own])[6 * copy + (is_upper ? 3 : 0) + axis] = ordered_number(side);
+        warp_boxes(args, part, common.members[own])[6 * copy + (is_upper ? 3 : 0) + axis] = non_nan_to_ordered(side);
     }
 }
 
 // Keeps the compiler from moving loads across: loads in parallel would need more registers than there are.
-__device__ __forceinline__ void part_loads() {
+__device__ __forceinline__ void fence_loads() {
     __syncwarp();
 }
 
 // Writes two staged domains, 48 words of 16 bytes each.
-__device__ __forceinline__ void store_both(float* first, float* second, const float4* staged) {
-    const unsigned lane = lane_of();
+__device__ __forceinline__ void store_two_domains(float* first, float* second, const float4* staged) {
+    const unsigned lane = lane_id();
     float4 *low = (float4*)first, *high = (float4*)second;
     __stcs(low + lane, staged[lane]);
-    part_loads();
+    fence_loads();
     __stcs(lane < 16 ? low + 32 + lane : high + lane - 16, staged[32 + lane]);
-    part_loads();
+    fence_loads();
     __stcs(high + 16 + lane, staged[64 + lane]);
 }
 
-__device__ __forceinline__ float* home_of(const Part& part, const Member& member) {
+__device__ __forceinline__ float* output_pointer(const WarpSlice& part, const BatchMember& member) {
     return part.positions + 3 * (size_t)member.first;
 }
 
 // Writes the staged domains number by number, for part tiles and unaligned domains.
-__device__ __forceinline__ void store_numbers(const Part& part, const Common& common, unsigned domain,
+__device__ __forceinline__ void store_numbers(const WarpSlice& part, const BlockStorage& common, unsigned domain,
                                               const float* staged) {
     const unsigned numbers = 3 * part.vertices;
 #pragma unroll 1
     for (unsigned i = 0; i < 2 && domain + i < part.members; ++i) {
-        float* to = home_of(part, common.members[domain + i]);
+        float* to = output_pointer(part, common.members[domain + i]);
 #pragma unroll 1
-        for (unsigned k = lane_of(); k < numbers; k += 32) {
-            __stcs(to + k, staged[i * 3 * VERTICES + k]);
+        for (unsigned k = lane_id(); k < numbers; k += 32) {
+            __stcs(to + k, staged[i * 3 * WARP_VERTICES + k]);
         }
     }
 }
 
 // Writes two domains at a time, alternating between two halves of the ring. The barrier separates the reads of one pair
 // from the writes to the same half.
-__device__ __forceinline__ void put(const BatchArgs& args, Part& part, Own& own, const Common& common,
+__device__ __forceinline__ void store_domains(const BatchArgs& args, WarpSlice& part, WarpStorage& own, const BlockStorage& common,
                                     const Sums& sums) {
 #pragma unroll
-    for (unsigned domain = 0; domain < VECTORS; domain += 2) {
+    for (unsigned domain = 0; domain < BATCH_SIZE; domain += 2) {
         if (domain < part.members) {
             const bool are_two = domain + 1 < part.members;
-            float* staged = (float*)own.ring + domain / 2 % 2 * (2 * 3 * VERTICES);
-            Base base;
+            float* staged = (float*)own.ring + domain / 2 % 2 * (2 * 3 * WARP_VERTICES);
+            RestPair base;
             base.load(own);
             stage_domain(base, common, sums, domain, staged);
             // Zeros if the domain does not exist.
-            stage_domain(base, common, sums, domain + 1, staged + 3 * VERTICES);
-            const Member &low = common.members[domain], &high = common.members[domain + 1];
+            stage_domain(base, common, sums, domain + 1, staged + 3 * WARP_VERTICES);
+            const BatchMember &low = common.members[domain], &high = common.members[domain + 1];
             __syncwarp();
-            box_both(args, part, common, domain, (const float4*)staged);
-            if (are_two && part.vertices == VERTICES && (low.first | high.first) % 4 == 0) {
-                store_both(home_of(part, low), home_of(part, high), (const float4*)staged);
+            write_two_boxes(args, part, common, domain, (const float4*)staged);
+            if (are_two && part.vertices == WARP_VERTICES && (low.first | high.first) % 4 == 0) {
+                store_two_domains(output_pointer(part, low), output_pointer(part, high), (const float4*)staged);
             } else {
                 store_numbers(part, common, domain, staged);
             }
@@ -265,51 +265,51 @@ __device__ __forceinline__ void put(const BatchArgs& args, Part& part, Own& own,
 }
 
 // x of one vertex of this lane in f64, rounded once.
-__device__ __forceinline__ float3 summed_exactly(const BatchArgs& args, const Part& part, const Member& member,
+__device__ __forceinline__ float3 position_f64(const BatchArgs& args, const WarpSlice& part, const BatchMember& member,
                                                  const float* q, unsigned vertex) {
-    const unsigned quad = lane_of() / 2, within = 2 * (lane_of() % 2) + vertex;
+    const unsigned quad = lane_id() / 2, within = 2 * (lane_id() % 2) + vertex;
     double bent[3];
     for (unsigned axis = 0; axis < 3; ++axis) {
         double sum = 0.0;
         for (unsigned chunk = 0; chunk < part.chunks; ++chunk) {
             const uint4* words = part.words + quad + chunk * 3 * (size_t)part.width;
             for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
-                const float amount = q[(chunk * CHUNK_MODES + mode) * VECTORS];
-                sum += (double)entry_at(words, part.width, mode, axis, within) * (double)amount;
+                const float amount = q[(chunk * CHUNK_MODES + mode) * BATCH_SIZE];
+                sum += (double)load_entry(words, part.width, mode, axis, within) * (double)amount;
             }
         }
         bent[axis] = (double)((const float*)(part.rest + axis * part.width + quad))[within] + sum;
     }
-    return placed_exactly(transforms_of(args), member.domain, bent);
+    return transform_domain_point_f64(transforms_of(args), member.domain, bent);
 }
 
-// Writes the box of one domain's vertices of this warp, for `mend`, to the same half of the tile as in `deform`.
-__device__ __forceinline__ void store_box(const BatchArgs& args, const Part& part, const Member& member,
+// Writes the box of one domain's vertices of this warp, for `repair_non_finite`, to the same half of the tile as in `deform`.
+__device__ __forceinline__ void store_box(const BatchArgs& args, const WarpSlice& part, const BatchMember& member,
                                           const unsigned (&keys)[6]) {
     const unsigned key = warp_box(keys);
-    if (lane_of() < 12) {
-        boxes_of(args, part, member)[lane_of()] = key;
+    if (lane_id() < 12) {
+        warp_boxes(args, part, member)[lane_id()] = key;
     }
 }
 
 // Recomputes the positions of a warp that are not finite, in the output, and the boxes of all its domains: a NaN wins.
-__device__ __noinline__ void mend(const BatchArgs& args, const Common& common, const float* q) {
-    const Part& part = common.parts[threadIdx.x / 32];
-    const unsigned count = count_of(part);
+__device__ __noinline__ void repair_non_finite(const BatchArgs& args, const BlockStorage& common, const float* q) {
+    const WarpSlice& part = common.parts[threadIdx.x / 32];
+    const unsigned count = lane_vertices(part);
     for (unsigned domain = 0; domain < part.members; ++domain) {
-        const Member& member = common.members[domain];
-        float* at = home_of(part, member) + 6 * lane_of();
+        const BatchMember& member = common.members[domain];
+        float* at = output_pointer(part, member) + 6 * lane_id();
         unsigned keys[6] = {};
         for (unsigned vertex = 0; vertex < count; ++vertex, at += 3) {
             if (!isfinite(at[0]) || !isfinite(at[1]) || !isfinite(at[2])) {
-                const float3 exact = summed_exactly(args, part, member, q + domain, vertex);
+                const float3 exact = position_f64(args, part, member, q + domain, vertex);
                 at[0] = exact.x;
                 at[1] = exact.y;
                 at[2] = exact.z;
             }
             for (unsigned axis = 0; axis < 3; ++axis) {
-                keys[axis] = max(keys[axis], ordered(-at[axis]));
-                keys[3 + axis] = max(keys[3 + axis], ordered(at[axis]));
+                keys[axis] = max(keys[axis], float_to_ordered(-at[axis]));
+                keys[3 + axis] = max(keys[3 + axis], float_to_ordered(at[axis]));
             }
         }
         store_box(args, part, member, keys);
@@ -317,38 +317,38 @@ __device__ __noinline__ void mend(const BatchArgs& args, const Common& common, c
 }
 
 // Computes a warp's part of a tile, whose copies are in flight.
-__device__ __forceinline__ void compute(const BatchArgs& args, uint4* shared) {
-    Own& own = own_of(shared);
-    Common& common = common_of(shared);
-    Part& part = common.parts[threadIdx.x / 32];
+__device__ __forceinline__ void compute_slice(const BatchArgs& args, uint4* shared) {
+    WarpStorage& own = warp_storage(shared);
+    BlockStorage& common = block_storage(shared);
+    WarpSlice& part = common.parts[threadIdx.x / 32];
     Sums sums;
 #pragma unroll
     for (unsigned i = 0; i < 6; ++i) {
 #pragma unroll
-        for (unsigned domain = 0; domain < VECTORS; ++domain) {
+        for (unsigned domain = 0; domain < BATCH_SIZE; ++domain) {
             sums[i][domain] = 0.0f;
         }
     }
-    sum_modes(part, own, q_of(shared), sums);
-    wait_for_all_but<0>();
-    put(args, part, own, common, sums);
+    sum_modes(part, own, shared_q(shared), sums);
+    cp_async_wait<0>();
+    store_domains(args, part, own, common, sums);
     // Lanes read what other lanes wrote, and the next tile overwrites what other lanes read.
     __syncwarp();
-    if (part.is_lost) {
-        mend(args, common, (const float*)q_of(shared));
+    if (part.has_non_finite) {
+        repair_non_finite(args, common, (const float*)shared_q(shared));
     }
 }
 
-extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch(const __grid_constant__ BatchArgs args) {
+extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) batch(const __grid_constant__ BatchArgs args) {
     extern __shared__ uint4 shared[];
-    const Part& last = common_of(shared).parts[threadIdx.x / 32];
+    const WarpSlice& last = block_storage(shared).parts[threadIdx.x / 32];
     uint4 block = __ldg((const uint4*)(args.blocks + blockIdx.x));
     bool is_first = true;
 #pragma unroll 1
     do {
-        prepare(args, part_of(args, block.x, block.y, block.z), shared, is_first);
+        load_tile_async(args, load_warp_slice(args, block.x, block.y, block.z), shared, is_first);
         if (last.quads > 0) {
-            compute(args, shared);
+            compute_slice(args, shared);
         }
         block = {last.group, last.tile + 1, last.end, 0};
         is_first = false;

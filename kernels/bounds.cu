@@ -1,36 +1,36 @@
 // Reduces the boxes that `deform` stored per tile to the bounds of all positions, including the tiles that this step
-// did not compute. With LIGHT, also the bounds along the axes of light space, from the same boxes. With BOXES, also a
+// did not compute. With LIGHT_BOUNDS, also the bounds along the axes of light space, from the same boxes. With DOMAIN_BOXES, also a
 // box of each domain, from its boxes, or from its positions if it shares a tile with other domains.
-//   boxes      [count][6] u32: `ordered` maxima of -x, -y, -z, x, y, z; four per tile             (in)
-//   light      with LIGHT: the axes of light space                                            (in)
+//   boxes      [count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile             (in)
+//   light      with LIGHT_BOUNDS: the axes of light space                                            (in)
 //   bounds     in the header: the maxima of all; zeros before the launch                      (in, out)
-//   pieces     with BOXES: the parts of domains that are reduced to one box each              (in)
-//   stamps     with BOXES: per domain, the step that last changed it                          (in)
-//   positions  with BOXES: address in the header                                              (in)
-//   piece_boxes  with BOXES: [pieces][6] u32, like `boxes`; only those of stale domains are written (out)
+//   pieces     with DOMAIN_BOXES: the parts of domains that are reduced to one box each              (in)
+//   stamps     with DOMAIN_BOXES: per domain, the step that last changed it                          (in)
+//   positions  with DOMAIN_BOXES: address in the header                                              (in)
+//   piece_boxes  with DOMAIN_BOXES: [pieces][6] u32, like `boxes`; only those of stale domains are written (out)
 // Launch: BLOCK threads per block, any number of blocks. CPU twin: Bounds::union.
 //
 // Light space: the farthest corner of a tile's box along an axis follows from the signs of the axis, so an end takes
 // three multiply-adds. They round outward, so that the bounds along the f32 axes contain every vertex. The box of a
 // tile of 128 vertices exceeds its vertices by less than its diagonal. Six dot products per vertex in `deform` would be
 // tight, but `deform` has no registers left.
-#include "chain.cuh"
+#include "dependent_launch.cuh"
 #include "layout.cuh"
-#include "ordered.cuh"
+#include "ordered_float.cuh"
 
-#ifdef BOXES
+#ifdef DOMAIN_BOXES
 // Threads that reduce one piece together.
-constexpr unsigned TEAM = 8;
+constexpr unsigned THREADS_PER_SEGMENT = 8;
 
 // Adds one box or vertex of a piece to the keys.
-__device__ __forceinline__ void add_item(const BoundsArgs& args, const Piece& piece, unsigned item, unsigned (&keys)[6]) {
-    if (piece.of_vertices) {
+__device__ __forceinline__ void add_item(const BoundsArgs& args, const BoxSegment& piece, unsigned item, unsigned (&keys)[6]) {
+    if (piece.from_vertices) {
         const float* at = args.header->positions + 3 * (size_t)(piece.first + item);
 #pragma unroll
         for (unsigned axis = 0; axis < 3; ++axis) {
             const float number = at[axis];
-            keys[axis] = max(keys[axis], ordered(-number));
-            keys[3 + axis] = max(keys[3 + axis], ordered(number));
+            keys[axis] = max(keys[axis], float_to_ordered(-number));
+            keys[3 + axis] = max(keys[3 + axis], float_to_ordered(number));
         }
     } else {
         const unsigned* box = args.boxes + 6 * (size_t)(piece.first + item);
@@ -42,42 +42,42 @@ __device__ __forceinline__ void add_item(const BoundsArgs& args, const Piece& pi
 }
 
 // All threads of a team have the same piece, so they stay converged in the loop.
-__device__ __forceinline__ void make_boxes(const BoundsArgs& args) {
-    const unsigned member = threadIdx.x % TEAM;
-    const unsigned team = 0xffu << threadIdx.x % 32 / TEAM * TEAM;
-    const unsigned teams = gridDim.x * (BLOCK / TEAM);
-    for (unsigned i = (blockIdx.x * BLOCK + threadIdx.x) / TEAM; i < args.piece_count; i += teams) {
-        const Piece piece = args.pieces[i];
-        if (!is_stale(args.header, args.stamps, piece.domain)) {
+__device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
+    const unsigned member = threadIdx.x % THREADS_PER_SEGMENT;
+    const unsigned team = 0xffu << threadIdx.x % 32 / THREADS_PER_SEGMENT * THREADS_PER_SEGMENT;
+    const unsigned teams = gridDim.x * (BLOCK / THREADS_PER_SEGMENT);
+    for (unsigned i = (blockIdx.x * BLOCK + threadIdx.x) / THREADS_PER_SEGMENT; i < args.segment_count; i += teams) {
+        const BoxSegment piece = args.segments[i];
+        if (!is_dirty(args.header, args.change_steps, piece.domain)) {
             continue;
         }
         unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-        for (unsigned item = member; item < piece.count; item += TEAM) {
+        for (unsigned item = member; item < piece.count; item += THREADS_PER_SEGMENT) {
             add_item(args, piece, item, keys);
         }
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
-            for (unsigned lanes = TEAM / 2; lanes > 0; lanes /= 2) {
+            for (unsigned lanes = THREADS_PER_SEGMENT / 2; lanes > 0; lanes /= 2) {
                 keys[side] = max(keys[side], __shfl_xor_sync(team, keys[side], lanes));
             }
             if (member == side) {
-                args.piece_boxes[6 * (size_t)i + side] = keys[side];
+                args.segment_boxes[6 * (size_t)i + side] = keys[side];
             }
         }
     }
 }
 #endif
 
-#ifdef LIGHT
-constexpr unsigned SIDES = 12;
+#ifdef LIGHT_BOUNDS
+constexpr unsigned KEY_COUNT = 12;
 #else
-constexpr unsigned SIDES = 6;
+constexpr unsigned KEY_COUNT = 6;
 #endif
 
-#ifdef LIGHT
+#ifdef LIGHT_BOUNDS
 // The maxima of -a x and of a x along an axis a, for one of the four lanes that hold a tile's boxes. Lane 3 duplicates
 // the axis of lane 2.
-struct Along {
+struct LightExtent {
     float axis[3];
     unsigned ends[2];
 
@@ -106,17 +106,17 @@ struct Along {
         float lower = 0.0f, upper = 0.0f;
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {
-            const float below = unordered(box[i]), above = unordered(box[3 + i]);
+            const float below = ordered_to_float(box[i]), above = ordered_to_float(box[3 + i]);
             const bool is_along = axis[i] >= 0.0f;
             lower = __fmaf_ru(fabsf(axis[i]), is_along ? below : above, lower);
             upper = __fmaf_ru(fabsf(axis[i]), is_along ? above : below, upper);
         }
-        ends[0] = max(ends[0], ordered(lower));
-        ends[1] = max(ends[1], ordered(upper));
+        ends[0] = max(ends[0], float_to_ordered(lower));
+        ends[1] = max(ends[1], float_to_ordered(upper));
     }
 
     // Reduces over the warp; all lanes must call this.
-    __device__ __forceinline__ void report(unsigned* most) {
+    __device__ __forceinline__ void reduce_into(unsigned* most) {
 #pragma unroll
         for (unsigned end = 0; end < 2; ++end) {
 #pragma unroll
@@ -132,20 +132,20 @@ struct Along {
 #endif
 
 extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant__ BoundsArgs args) {
-    await_previous();
-    admit_next();
-#ifdef BOXES
-    make_boxes(args);
+    wait_on_dependent_grids();
+    launch_dependent_grids();
+#ifdef DOMAIN_BOXES
+    compute_segment_boxes(args);
     __syncwarp();
 #endif
-    __shared__ unsigned most[SIDES];
-    if (threadIdx.x < SIDES) {
+    __shared__ unsigned most[KEY_COUNT];
+    if (threadIdx.x < KEY_COUNT) {
         most[threadIdx.x] = 0;
     }
     __syncthreads();
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-#ifdef LIGHT
-    Along along;
+#ifdef LIGHT_BOUNDS
+    LightExtent along;
     along.begin(args);
 #endif
     for (unsigned box = blockIdx.x * BLOCK + threadIdx.x; box < args.count; box += gridDim.x * BLOCK) {
@@ -161,7 +161,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
         for (unsigned side = 0; side < 6; ++side) {
             keys[side] = max(keys[side], own[side]);
         }
-#ifdef LIGHT
+#ifdef LIGHT_BOUNDS
         along.add(own);
 #endif
     }
@@ -172,13 +172,13 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
             atomicMax(&most[side], key);
         }
     }
-#ifdef LIGHT
-    along.report(most + 6);
+#ifdef LIGHT_BOUNDS
+    along.reduce_into(most + 6);
 #endif
     __syncthreads();
     // Read before the atomic: few blocks exceed what others have reported, so most atomics to the same addresses are
     // avoided. The value read may be stale, but it only grows, so no maximum is lost.
-    if (threadIdx.x < SIDES && most[threadIdx.x] > *(volatile unsigned*)(args.header->bounds + threadIdx.x)) {
+    if (threadIdx.x < KEY_COUNT && most[threadIdx.x] > *(volatile unsigned*)(args.header->bounds + threadIdx.x)) {
         atomicMax(args.header->bounds + threadIdx.x, most[threadIdx.x]);
     }
 }

@@ -22,13 +22,13 @@ struct Header {
     float* normals;
     float4* tangents;
     float* displacements;
-    unsigned since;      // this output contains all changes up to this step
-    unsigned everything; // the last step that changed all domains
+    unsigned output_step;      // this output contains all changes up to this step
+    unsigned last_full_step; // the last step that changed all domains
     unsigned step;       // this step; counts from 1
     unsigned changed;    // number of entries in the list of `apply`
-    unsigned stale;      // number of tiles in the tile list
+    unsigned dirty_tiles;      // number of tiles in the tile list
     unsigned reserved[3];
-    unsigned bounds[12]; // `ordered` maxima of -x, -y, -z, x, y, z; with LIGHT also in light space; sent as zeros
+    unsigned bounds[12]; // `float_to_ordered` maxima of -x, -y, -z, x, y, z; with LIGHT_BOUNDS also in light space; sent as zeros
 };
 static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/layout.rs");
 
@@ -40,9 +40,9 @@ constexpr unsigned TILE_VERTICES = 8;
 constexpr unsigned TILE_CORNERS = 16;
 
 // The work of one warp: up to 32 quads and their part of U, [chunk][3][width] words of 16 bytes.
-struct Tile {
+struct WarpTile {
     unsigned long long first_word; // of its U
-    unsigned first;                // first packed vertex or corner; of a mixed tile, first entry of `lanes`
+    unsigned first;                // first packed vertex or corner; of a mixed tile, first entry of `mixed_quads`
     unsigned rest;                 // first quad of x0, normals and tangents
     unsigned domain;
     unsigned first_q;
@@ -51,16 +51,16 @@ struct Tile {
     unsigned char width; // quads
     unsigned char kind;
 };
-static_assert(sizeof(Tile) == 32, "Tile differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/layout.rs");
 
 // A quad of a mixed tile.
-struct Lane {
+struct MixedQuad {
     unsigned item;   // first packed vertex or corner
     unsigned rest;   // quad of x0, normals and tangents
     unsigned domain; // 4 * index of the domain + items of the quad - 1
     unsigned first_q;
 };
-static_assert(sizeof(Lane) == 16, "Lane differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/layout.rs");
 
 // Offsets of a domain for `normals`. Instances share all but `first` and `first_vertex`.
 struct NormalSlot {
@@ -82,30 +82,30 @@ struct Change {
 static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/layout.rs");
 
 // The transform root of a domain, and its frame relative to that root; with FOLLOWERS.
-struct Following {
-    unsigned mover; // index in the transforms
+struct TransformLink {
+    unsigned root; // index in the transforms
     unsigned frame;
 };
-static_assert(sizeof(Following) == 8, "Following differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(TransformLink) == 8, "TransformLink differs from src/compute/gpu/layout.rs");
 
 struct DeformArgs {
     const Header* header;
-    const Tile* tiles;
-    const Lane* lanes;
+    const WarpTile* tiles;
+    const MixedQuad* mixed_quads;
     const uint4* words;
     const float4* rest;
     const float4* rest_normals;
     const float4* rest_tangents;
-    const unsigned* corner_shifts;
+    const unsigned* corner_offsets;
     const float* scales;
-    const unsigned* lane_scales;
+    const unsigned* mixed_quad_scales;
     const float4* transforms;
-    const Following* following;
+    const TransformLink* transform_links;
     const float4* frames;
     const float* q;
     const unsigned* list;
-    const unsigned* kept_counts;
-    const unsigned short* kept;
+    const unsigned* retained_counts;
+    const unsigned short* retained;
     unsigned* boxes;
     unsigned count; // of tiles
     unsigned reserved;
@@ -113,7 +113,7 @@ struct DeformArgs {
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/layout.rs");
 
 // Domains of one shape, for which `batch` reads U once.
-struct Group {
+struct BatchGroup {
     unsigned long long first_word;
     unsigned rest; // first quad of x0
     unsigned first_scale;
@@ -122,36 +122,36 @@ struct Group {
     unsigned chunks;
     unsigned members;
 };
-static_assert(sizeof(Group) == 32, "Group differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchGroup) == 32, "BatchGroup differs from src/compute/gpu/layout.rs");
 
 // A domain of a group.
-struct Member {
+struct BatchMember {
     unsigned first; // packed vertex
     unsigned first_q;
     unsigned domain;
     unsigned first_tile; // first tile of the domain in `deform`, for its boxes
 };
-static_assert(sizeof(Member) == 16, "Member differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/gpu/layout.rs");
 
 // The work of one block of `batch`.
-struct Block {
+struct BatchBlock {
     unsigned group;
     unsigned tile; // first tile of the block, in its shape
     unsigned end;  // tile after the last one
     unsigned reserved;
 };
-static_assert(sizeof(Block) == 16, "Block differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchBlock) == 16, "BatchBlock differs from src/compute/gpu/layout.rs");
 
 struct BatchArgs {
     const Header* header;
-    const Block* blocks;
-    const Group* groups;
-    const Member* members;
+    const BatchBlock* blocks;
+    const BatchGroup* groups;
+    const BatchMember* members;
     const uint4* words;
     const float4* rest;
     const float* scales;
     const float4* transforms;
-    const Following* following;
+    const TransformLink* transform_links;
     const float4* frames;
     const float* q;
     unsigned* boxes;
@@ -159,23 +159,23 @@ struct BatchArgs {
 static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/layout.rs");
 
 // A part of a domain that `bounds` reduces to one box.
-struct Piece {
+struct BoxSegment {
     unsigned first; // first packed vertex, or first box of `deform`
     unsigned count;
     unsigned domain;
-    unsigned of_vertices; // 1: a range of vertices, 0: a range of boxes
+    unsigned from_vertices; // 1: a range of vertices, 0: a range of boxes
 };
-static_assert(sizeof(Piece) == 16, "Piece differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BoxSegment) == 16, "BoxSegment differs from src/compute/gpu/layout.rs");
 
 struct BoundsArgs {
     Header* header;
     const unsigned* boxes;
-    const Piece* pieces;
-    const unsigned* stamps;
-    unsigned* piece_boxes;
+    const BoxSegment* segments;
+    const unsigned* change_steps;
+    unsigned* segment_boxes;
     unsigned count;
-    unsigned piece_count;
-    float light[9]; // with LIGHT: the three axes of light space
+    unsigned segment_count;
+    float light[9]; // with LIGHT_BOUNDS: the three axes of light space
     unsigned reserved;
 };
 static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/layout.rs");
@@ -185,11 +185,11 @@ struct ApplyArgs {
     const Change* changes;
     const float4* new_transforms;
     const float* new_q;
-    const unsigned* stale;
-    const Following* following;
+    const unsigned* dirty_tiles;
+    const TransformLink* transform_links;
     float4* transforms;
     float* q;
-    unsigned* stamps;
+    unsigned* change_steps;
     unsigned* list;
 };
 static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/compute/gpu/layout.rs");
@@ -201,11 +201,11 @@ struct NormalsArgs {
     const float* rest_normals;
     const float4* rest_tangents;
     const float4* transforms;
-    const Following* following;
+    const TransformLink* transform_links;
     const float4* frames;
-    const unsigned* stamps;
+    const unsigned* change_steps;
     const unsigned* members;
-    const unsigned* begins;
+    const unsigned* ring_offsets;
     const unsigned* rings;
     const float* group_normals;
     unsigned corners;
@@ -216,8 +216,8 @@ struct NormalsArgs {
 static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/layout.rs");
 
 // Whether a domain changed after this output was last written.
-__device__ inline bool is_stale(const Header* header, const unsigned* stamps, unsigned domain) {
-    return max(__ldg(&header->everything), __ldg(stamps + domain)) > __ldg(&header->since);
+__device__ inline bool is_dirty(const Header* header, const unsigned* change_steps, unsigned domain) {
+    return max(__ldg(&header->last_full_step), __ldg(change_steps + domain)) > __ldg(&header->output_step);
 }
 
 // The domain of a packed corner: the last slot that begins at or before it. `first_domains[b]` is the domain of the

@@ -4,7 +4,7 @@
 //   transforms     [movers][3] float4: the rows of world_from_domain; A is their first three columns   (in)
 //   following, frames  with FOLLOWERS, as for `deform`                                                  (in)
 //   members        [..] u32: the smoothing group of each corner of a shape that has groups              (in)
-//   begins, rings  [groups + 1] u32 offsets into the rings: src/model/domain/smoothing.rs               (in)
+//   begins, rings  [groups + 1] u32 offsets into the rings: src/model/domain/smoothing_groups.rs               (in)
 //   group_normals  [3][groups] f32: geometric unit normals at rest, zeros where there is none           (in)
 //   positions      [vertices][3] f32, world, of this step; address in the header                        (in)
 //   normals        [corners][3] f32, world; address in the header                                       (out)
@@ -22,17 +22,17 @@
 // Each thread gathers for itself, without atomics, in the order of the ring, so runs agree bit by bit. Sums are f64:
 // differences and products of two f32 are exact or nearly exact, and neither over- nor underflow, so no scaling is
 // needed for large, small or distant domains.
-#include "chain.cuh"
-#include "turn.cuh"
+#include "dependent_launch.cuh"
+#include "direction.cuh"
 
 // Part of B that an area must exceed, and minimum squared length of the sum of two unit vectors; as in the twin.
 constexpr double RESOLUTION = 1.0 / 262144.0;
 constexpr float OPPOSITE = 1e-10f;
 
 // The rotation of the surface around a corner, as its unit normals before and after, if it could be determined.
-struct Turn {
+struct ShortestArc {
     float3 from, to;
-    bool is_told;
+    bool is_defined;
 };
 
 __device__ float dot(const float3& v, const float3& w) {
@@ -53,7 +53,7 @@ __device__ double3 position_of(const float* positions, unsigned vertex) {
     return make_double3(__ldg(x), __ldg(x + 1), __ldg(x + 2));
 }
 
-__device__ double sum_of(const double3& v) {
+__device__ double l1_norm(const double3& v) {
     return fabs(v.x) + fabs(v.y) + fabs(v.z);
 }
 
@@ -66,14 +66,14 @@ struct Area {
 // The ring must have at least two entries.
 __device__ Area area_of(const unsigned* ring, const unsigned* end, const float* positions) {
     const double3 own = position_of(positions, __ldg(ring));
-    const double height = sum_of(own);
+    const double height = l1_norm(own);
     double3 sum = make_double3(0.0, 0.0, 0.0), before = sum;
     double rounding = 0.0, reach_before = 0.0;
     for (++ring; ring < end; ++ring) {
         const unsigned entry = __ldg(ring);
         const double3 there = position_of(positions, entry & ~RING_START);
         const double3 edge = make_double3(there.x - own.x, there.y - own.y, there.z - own.z);
-        const double length = sum_of(edge);
+        const double length = l1_norm(edge);
         const double reach = length * (length + height);
         if (!(entry & RING_START)) {
             sum.x += before.y * edge.z - before.z * edge.y;
@@ -87,8 +87,8 @@ __device__ Area area_of(const unsigned* ring, const unsigned* end, const float* 
     return {sum, rounding};
 }
 
-__device__ Turn turn_of(const NormalsArgs& args, const NormalSlot& slot, const Rows& linear, unsigned corner) {
-    Turn turn = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
+__device__ ShortestArc surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear, unsigned corner) {
+    ShortestArc turn = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
     if (slot.first_member == NO_GROUPS) {
         return turn;
     }
@@ -101,25 +101,25 @@ __device__ Turn turn_of(const NormalsArgs& args, const NormalSlot& slot, const R
     }
     const float* positions = args.header->positions + 3 * (size_t)slot.first_vertex;
     const unsigned* rings = args.rings;
-    const Area area = area_of(rings + __ldg(args.begins + group), rings + __ldg(args.begins + group + 1), positions);
+    const Area area = area_of(rings + __ldg(args.ring_offsets + group), rings + __ldg(args.ring_offsets + group + 1), positions);
     const double least = RESOLUTION * area.rounding;
     const double3 sum = area.sum;
     // Also false when a position is not finite.
-    turn.is_told = sum.x * sum.x + sum.y * sum.y + sum.z * sum.z > least * least;
-    if (!turn.is_told) {
+    turn.is_defined = sum.x * sum.x + sum.y * sum.y + sum.z * sum.z > least * least;
+    if (!turn.is_defined) {
         return turn;
     }
     // The sum transforms by the cofactors and the rest normal by the inverse transpose; they differ by the sign of the
     // determinant.
-    const double hand = hand_of(linear);
+    const double hand = determinant_sign(linear);
     turn.to = unit(make_double3(hand * sum.x, hand * sum.y, hand * sum.z));
-    turn.from = turn_normal(linear, normal);
+    turn.from = transform_normal(linear, normal);
     return turn;
 }
 
 // Applies the smallest rotation that takes `from` to `to`: the component along `from` is moved to `to`, the rest is
 // reflected at the plane perpendicular to their bisector.
-__device__ float3 carry(const Turn& turn, const float3& v) {
+__device__ float3 rotate(const ShortestArc& turn, const float3& v) {
     const float along = dot(turn.from, v);
     const float3 across = add(v, turn.from, -along);
     const float3 middle = add(turn.from, turn.to, 1.0f);
@@ -133,7 +133,7 @@ __device__ float3 unit_of(const float3& v) {
 }
 
 // A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
-__device__ float3 beside(const float3& tangent, const float3& normal) {
+__device__ float3 orthogonalize(const float3& tangent, const float3& normal) {
     const float3 flat = add(tangent, normal, -dot(normal, tangent));
     if (dot(flat, flat) > 1e-12f) {
         return unit_of(flat);
@@ -143,22 +143,22 @@ __device__ float3 beside(const float3& tangent, const float3& normal) {
 }
 
 extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constant__ NormalsArgs args) {
-    await_previous();
+    wait_on_dependent_grids();
     __shared__ float staged[3 * BLOCK];
     const unsigned corner = blockIdx.x * BLOCK + threadIdx.x;
     const unsigned domain = domain_of(args.slots, args.first_domains, min(corner, args.corners - 1));
-    if (!__syncthreads_or(is_stale(args.header, args.stamps, domain))) {
+    if (!__syncthreads_or(is_dirty(args.header, args.change_steps, domain))) {
         return;
     }
     if (corner < args.corners) {
         const NormalSlot slot = args.slots[domain];
-        const Rows linear = linear_of(transforms_of(args), domain);
-        const Turn followed = turn_of(args, slot, linear, corner);
+        const Mat3d linear = linear_part(transforms_of(args), domain);
+        const ShortestArc followed = surface_rotation(args, slot, linear, corner);
         const float* rest = args.rest_normals + slot.first_normal + (corner - slot.first);
         const size_t plane = args.rest_corners;
-        float3 normal = turn_normal(linear, make_double3(__ldg(rest), __ldg(rest + plane), __ldg(rest + 2 * plane)));
-        if (followed.is_told) {
-            normal = unit_of(carry(followed, normal));
+        float3 normal = transform_normal(linear, make_double3(__ldg(rest), __ldg(rest + plane), __ldg(rest + 2 * plane)));
+        if (followed.is_defined) {
+            normal = unit_of(rotate(followed, normal));
         }
         staged[3 * threadIdx.x] = normal.x;
         staged[3 * threadIdx.x + 1] = normal.y;
@@ -167,11 +167,11 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
         float4 world = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         if (slot.first_tangent != NO_TANGENTS) {
             const float4 tangent = __ldg(args.rest_tangents + slot.first_tangent + (corner - slot.first));
-            float3 along = turn(linear, make_double3(tangent.x, tangent.y, tangent.z));
-            if (followed.is_told) {
-                along = beside(carry(followed, along), normal);
+            float3 along = transform_direction(linear, make_double3(tangent.x, tangent.y, tangent.z));
+            if (followed.is_defined) {
+                along = orthogonalize(rotate(followed, along), normal);
             }
-            world = make_float4(along.x, along.y, along.z, tangent.w * (float)hand_of(linear));
+            world = make_float4(along.x, along.y, along.z, tangent.w * (float)determinant_sign(linear));
         }
         args.header->tangents[corner] = world;
 #endif

@@ -10,24 +10,24 @@ centroid in vec2 uv_image;
 #ifdef NORMAL_MAPS
 centroid in vec4 tangent_world;
 #endif
-layout(location = 0) out vec4 colour;
+layout(location = 0) out vec4 color;
 
 void main() {
-    Material material = material_of(own_triangle());
+    Material material = material_of(current_triangle());
     vec4 tint = vec4(1.0);
 #ifdef TEXTURES
-    vec4 texel = colour_texel(material.images.xy, uv_image);
+    vec4 texel = color_texel(material.images.xy, uv_image);
     if (material.images.x >= 0) tint = texel;
 #endif
-    vec3 unbumped = unit(normal_world), normal = unbumped;
+    vec3 geometric_normal = safe_normalize(normal_world), normal = geometric_normal;
 #ifdef NORMAL_MAPS
     vec3 bump = normal_texel(material.images.zw, uv_image).xyz;
-    if (material.images.z >= 0) normal = bumped(normal, tangent_world, bump);
+    if (material.images.z >= 0) normal = apply_normal_map(normal, tangent_world, bump);
 #endif
     normal = gl_FrontFacing ? normal : -normal;
 #ifdef OPAQUE_PARTS
     // Samples that reach the threshold were drawn as opaque.
-    cut_in(material.ambient.a * tint.a, material.diffuse.a);
+    keep_uncovered_samples(material.ambient.a * tint.a, material.diffuse.a);
 #endif
-    colour = vec4(phong(material, tint.rgb, normal, unbumped, world), material.ambient.a * tint.a);
+    color = vec4(phong(material, tint.rgb, normal, geometric_normal, world), material.ambient.a * tint.a);
 }

@@ -3,6 +3,6 @@ in vec2 image;
 layout(location = 0) out uint id;
 
 void main() {
-    if (!meets_ground(towards(image))) discard;
-    id = GROUND;
+    if (!ray_hits_ground(view_ray(image))) discard;
+    id = GROUND_ID;
 }

@@ -6,5 +6,5 @@ out vec2 image;
 void main() {
     image = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
     vec2 slope;
-    gl_Position = vec4(image, ground_depth(image, slope), 1.0);
+    gl_Position = vec4(image, ground_plane_depth(image, slope), 1.0);
 }

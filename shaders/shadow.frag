@@ -4,15 +4,15 @@ in vec2 uv_image;
 #endif
 
 void main() {
-    Material material = material_of(own_triangle());
+    Material material = material_of(current_triangle());
     float alpha = material.ambient.a;
 #ifdef TEXTURES
-    vec4 texel = colour_texel(material.images.xy, uv_image);
+    vec4 texel = color_texel(material.images.xy, uv_image);
     if (material.images.x >= 0) alpha *= texel.a;
 #endif
 #ifdef MASK
-    cast_or_not(alpha, material.diffuse.a);
+    discard_below(alpha, material.diffuse.a);
 #else
-    cast_or_not(alpha, frame.shadow.z);
+    discard_below(alpha, frame.shadow.z);
 #endif
 }

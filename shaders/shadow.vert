@@ -1,31 +1,31 @@
 // Projects a corner to the shadow map; for opaque triangles, a vertex.
-#ifdef SOLID
+#ifdef POSITION_ONLY
 layout(location = 0) in vec3 position;
 #else
 layout(location = 0) in uint vertex;
 layout(binding = 13) uniform samplerBuffer positions;
 #endif
-#if defined(UVS) && !defined(SOLID)
+#if defined(UVS) && !defined(POSITION_ONLY)
 layout(location = 2) in vec2 uv;
 out vec2 uv_image;
 #endif
-#ifdef SPLITS
+#ifdef CASCADES
 layout(location = 1) uniform int layer;
 #endif
 
 void main() {
-#ifdef SOLID
+#ifdef POSITION_ONLY
     vec3 world = position;
 #else
     vec3 world = texelFetch(positions, int(vertex)).xyz;
 #endif
-    vec3 at = (frame.map_from_world * vec4(world, 1.0)).xyz;
-#ifdef SPLITS
-    at.xy = in_layer(at.xy, layer);
+    vec3 at = (frame.shadow_from_world * vec4(world, 1.0)).xyz;
+#ifdef CASCADES
+    at.xy = to_cascade(at.xy, layer);
 #endif
     bool bad = any(isnan(at)) || any(isinf(at));
     gl_Position = bad ? vec4(0.0, 0.0, -2.0, 1.0) : vec4(2.0 * at - 1.0, 1.0);
-#if defined(UVS) && !defined(SOLID)
+#if defined(UVS) && !defined(POSITION_ONLY)
     uv_image = uv;
 #endif
 }

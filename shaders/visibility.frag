@@ -7,14 +7,14 @@ centroid in vec2 uv_image;
 layout(location = 0) out uint id;
 
 void main() {
-    id = uint(own_triangle()) + 1u;
+    id = uint(current_triangle()) + 1u;
 #ifdef MASK
-    Material material = material_of(own_triangle());
+    Material material = material_of(current_triangle());
     float alpha = material.ambient.a;
 #ifdef TEXTURES
-    vec4 texel = colour_texel(material.images.xy, uv_image);
+    vec4 texel = color_texel(material.images.xy, uv_image);
     if (material.images.x >= 0) alpha *= texel.a;
 #endif
-    cut_out(alpha, material.diffuse.a);
+    keep_covered_samples(alpha, material.diffuse.a);
 #endif
 }

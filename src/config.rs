@@ -56,26 +56,26 @@ pub struct Config {
     pub open_scenes: usize,
     /// Default and largest acknowledgment window of a step stream, in steps.
     pub window: u32,
-    pub largest_window: u32,
+    pub max_window: u32,
     /// Limits on one upload: total size in bytes and number of files.
     pub upload_bytes: u64,
     pub upload_files: u32,
     /// Default and largest deadline of a single request.
     pub deadline: Duration,
-    pub longest_deadline: Duration,
+    pub max_deadline: Duration,
     /// Limits per scene: frame and vertex streams, and single requests that wait for a step.
-    pub subscribers: usize,
-    pub waiting: usize,
+    pub max_subscribers: usize,
+    pub max_pending_requests: usize,
     /// How long a lossless subscriber may block the writer, and how long an upload may stall, before the server ends
     /// it.
-    pub stall: Duration,
+    pub stall_timeout: Duration,
     /// Time for streams to end when the server shuts down.
-    pub drain: Duration,
+    pub drain_timeout: Duration,
     /// Limit on open connections, and time within which a new connection must send its first byte.
     pub connections: usize,
-    pub first_byte: Duration,
+    pub first_byte_timeout: Duration,
     /// Interval of HTTP/2 keepalive pings, and time within which the peer must answer one.
-    pub keepalive: Duration,
+    pub keepalive_interval: Duration,
     pub keepalive_timeout: Duration,
 }
 
@@ -94,18 +94,18 @@ impl Default for Config {
             frame_side: 8192,
             open_scenes: 16,
             window: 8,
-            largest_window: 256,
+            max_window: 256,
             upload_bytes: 4 << 30,
             upload_files: 4096,
             deadline: Duration::from_secs(30),
-            longest_deadline: Duration::from_secs(600),
-            subscribers: 32,
-            waiting: 64,
-            stall: Duration::from_secs(30),
-            drain: Duration::from_secs(10),
+            max_deadline: Duration::from_secs(600),
+            max_subscribers: 32,
+            max_pending_requests: 64,
+            stall_timeout: Duration::from_secs(30),
+            drain_timeout: Duration::from_secs(10),
             connections: 1024,
-            first_byte: Duration::from_secs(5),
-            keepalive: Duration::from_secs(10),
+            first_byte_timeout: Duration::from_secs(5),
+            keepalive_interval: Duration::from_secs(10),
             keepalive_timeout: Duration::from_secs(5),
         }
     }
@@ -124,7 +124,7 @@ impl Config {
     ///
     /// # Errors
     /// `Invalid` naming the limit and its range.
-    pub fn checked(self) -> Result<Self> {
+    pub fn validated(self) -> Result<Self> {
         let number = |field: &str, given: u64, least: u64, most: u64| match (least..=most).contains(&given) {
             true => Ok(()),
             false => Err(invalid(format!("config.{field}"), format!("{least} to {most}"), given)),
@@ -135,19 +135,19 @@ impl Config {
         number("chunk_bytes", self.chunk_bytes as u64, 1 << 10, 1 << 20)?;
         number("frame_side", self.frame_side.into(), 1, 16384)?;
         number("open_scenes", self.open_scenes as u64, 1, 4096)?;
-        number("largest_window", self.largest_window.into(), 1, 65536)?;
-        number("window", self.window.into(), 1, self.largest_window.into())?;
+        number("largest_window", self.max_window.into(), 1, 65536)?;
+        number("window", self.window.into(), 1, self.max_window.into())?;
         number("upload_bytes", self.upload_bytes, 1, 1 << 40)?;
         number("upload_files", self.upload_files.into(), 1, 1 << 20)?;
-        number("subscribers", self.subscribers as u64, 1, 4096)?;
-        number("waiting", self.waiting as u64, 1, 65536)?;
+        number("subscribers", self.max_subscribers as u64, 1, 4096)?;
+        number("waiting", self.max_pending_requests as u64, 1, 65536)?;
         number("connections", self.connections as u64, 1, 65536)?;
-        number("longest_deadline (ms)", ms(self.longest_deadline), 1, HOUR)?;
-        number("deadline (ms)", ms(self.deadline), 1, ms(self.longest_deadline))?;
-        number("stall (ms)", ms(self.stall), 1, HOUR)?;
-        number("drain (ms)", ms(self.drain), 1, HOUR)?;
-        number("first_byte (ms)", ms(self.first_byte), 1, HOUR)?;
-        number("keepalive (ms)", ms(self.keepalive), 100, HOUR)?;
+        number("longest_deadline (ms)", ms(self.max_deadline), 1, HOUR)?;
+        number("deadline (ms)", ms(self.deadline), 1, ms(self.max_deadline))?;
+        number("stall (ms)", ms(self.stall_timeout), 1, HOUR)?;
+        number("drain (ms)", ms(self.drain_timeout), 1, HOUR)?;
+        number("first_byte (ms)", ms(self.first_byte_timeout), 1, HOUR)?;
+        number("keepalive (ms)", ms(self.keepalive_interval), 100, HOUR)?;
         number("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR)?;
         if self.state.as_os_str().is_empty() {
             return Err(invalid("config.state", "a folder", "nothing"));
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn the_defaults_pass_and_listen_on_loopback_only() {
-        let config = Config::default().checked().expect("the defaults fit");
+        let config = Config::default().validated().expect("the defaults fit");
         assert!(config.listen.ip().is_loopback());
     }
 
@@ -172,11 +172,11 @@ mod tests {
             ("config.chunk_bytes", Config { chunk_bytes: 2 << 20, ..Config::default() }),
             ("config.window", Config { window: 300, ..Config::default() }),
             ("config.frame_side", Config { frame_side: 0, ..Config::default() }),
-            ("config.stall (ms)", Config { stall: Duration::ZERO, ..Config::default() }),
+            ("config.stall (ms)", Config { stall_timeout: Duration::ZERO, ..Config::default() }),
             ("config.state", Config { state: PathBuf::new(), ..Config::default() }),
         ];
         for (field, config) in bad {
-            let refusal = config.checked().expect_err(field).to_string();
+            let refusal = config.validated().expect_err(field).to_string();
             assert!(refusal.starts_with(field), "{refusal}");
         }
     }

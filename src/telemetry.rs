@@ -31,7 +31,7 @@ impl Stage {
     ];
 
     /// The stage with this name.
-    pub fn named(name: &str) -> Option<Self> {
+    pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|stage| stage.name() == name)
     }
 
@@ -63,11 +63,11 @@ pub fn ms_since(begin: std::time::Instant) -> f64 {
 /// the debug messages of the OpenGL driver.
 ///
 /// Has no effect if a logger is already installed.
-pub fn log_to_stderr() {
+pub fn init_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    let colours = std::io::stderr().is_terminal();
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(colours);
+    let colors = std::io::stderr().is_terminal();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(colors);
     // Fails only if a logger is already installed, which is kept.
     log.try_init().ok();
 }
@@ -79,8 +79,8 @@ mod tests {
     #[test]
     fn every_stage_is_found_by_its_name_and_nothing_else_is() {
         for stage in Stage::ALL {
-            assert_eq!(Stage::named(stage.name()), Some(stage));
+            assert_eq!(Stage::from_name(stage.name()), Some(stage));
         }
-        assert_eq!(Stage::named("lunch"), None);
+        assert_eq!(Stage::from_name("lunch"), None);
     }
 }

@@ -13,15 +13,15 @@ struct Material {
 };
 
 layout(binding = 14) uniform samplerBuffer materials;
-#ifdef LOOK_UP
+#ifdef MATERIAL_TABLE
 layout(binding = 15) uniform usamplerBuffer triangle_materials;
 #endif
 
 Material material_of(int number) {
-#ifdef LOOK_UP
-    int first = STRIDE * int(texelFetch(triangle_materials, number).x);
+#ifdef MATERIAL_TABLE
+    int first = MATERIAL_STRIDE * int(texelFetch(triangle_materials, number).x);
 #else
-    const int first = STRIDE * ONLY_MATERIAL;
+    const int first = MATERIAL_STRIDE * SINGLE_MATERIAL;
 #endif
     vec4 ambient = texelFetch(materials, first), diffuse = texelFetch(materials, first + 1);
     vec4 specular = texelFetch(materials, first + 2), cut = texelFetch(materials, first + 3);

@@ -3,10 +3,10 @@
 
 use serde_json::{Value, json};
 
-use super::{Outcome, say};
+use super::{Outcome, print_line};
 use modalcast_compute::gpu;
-use modalcast_model::error::during;
-use modalcast_render::{Prefer, Renderer};
+use modalcast_model::error::fault_in;
+use modalcast_render::{DevicePreference, Renderer};
 
 /// Checks the driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 if no frame can be drawn.
 #[derive(Debug, clap::Args)]
@@ -20,18 +20,18 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let report = examine();
+    let report = diagnose();
     if args.json {
-        say(serde_json::to_string_pretty(&report).map_err(during("doctor"))?);
+        print_line(serde_json::to_string_pretty(&report).map_err(fault_in("doctor"))?);
     } else {
-        lines(&report).into_iter().for_each(say);
+        lines(&report).into_iter().for_each(print_line);
     }
     Ok(report["can_draw"] == true)
 }
 
 /// Collects the report as JSON.
-pub(super) fn examine() -> Value {
-    let renderer = Renderer::open(Prefer::Any).map(|renderer| renderer.info().clone());
+pub(super) fn diagnose() -> Value {
+    let renderer = Renderer::open(DevicePreference::Any).map(|renderer| renderer.info().clone());
     let devices = modalcast_render::devices();
     let cuda = gpu::probe();
     json!({

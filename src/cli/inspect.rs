@@ -3,15 +3,15 @@
 
 use serde_json::{Value, json};
 
-use super::options::working;
-use super::{Outcome, say};
+use super::options::with_spinner;
+use super::{Outcome, print_line};
 use modalcast_compute::gpu;
-use modalcast_model::error::during;
+use modalcast_model::error::fault_in;
 use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
 /// Number of domains that the text table lists; `--json` lists all.
-const LISTED: usize = 24;
+const MAX_LISTED_DOMAINS: usize = 24;
 
 /// Shows the size of each domain, the totals, the features that the scene needs, and the savings from unused features.
 #[derive(Debug, clap::Args)]
@@ -27,11 +27,11 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let scene = working("loading", || load::open(&args.scene))?;
+    let scene = with_spinner("loading", || load::open(&args.scene))?;
     if args.json {
-        say(serde_json::to_string_pretty(&json(&scene)).map_err(during("inspect"))?);
+        print_line(serde_json::to_string_pretty(&json(&scene)).map_err(fault_in("inspect"))?);
     } else {
-        lines(&scene).into_iter().for_each(say);
+        lines(&scene).into_iter().for_each(print_line);
     }
     Ok(true)
 }
@@ -104,7 +104,7 @@ fn totals(scene: &Scene) -> Value {
 
 fn lines(scene: &Scene) -> Vec<String> {
     let mut lines = vec![format!("{:<28}{:>10}{:>6}{:>12}{:>14}", "domain", "vertices", "r", "triangles", "bytes")];
-    for (index, domain) in scene.domains.iter().enumerate().take(LISTED) {
+    for (index, domain) in scene.domains.iter().enumerate().take(MAX_LISTED_DOMAINS) {
         let slot = scene.layout.slots[index];
         let bytes = bytes_of(scene, index);
         lines.push(format!(
@@ -112,8 +112,8 @@ fn lines(scene: &Scene) -> Vec<String> {
             domain.name, slot.vertices, slot.rank, slot.triangles, bytes
         ));
     }
-    if scene.domains.len() > LISTED {
-        lines.push(format!("... and {} more (--json lists all)", scene.domains.len() - LISTED));
+    if scene.domains.len() > MAX_LISTED_DOMAINS {
+        lines.push(format!("... and {} more (--json lists all)", scene.domains.len() - MAX_LISTED_DOMAINS));
     }
     let totals = totals(scene);
     let numbers = totals.as_object().into_iter().flatten();
@@ -138,15 +138,15 @@ fn plans(scene: &Scene) -> Vec<String> {
         format!(
             "passes: {}; {} draw calls; shaders [{}]",
             render.passes.join(", "),
-            render.draws,
+            render.draw_calls,
             render.defines.join(" ")
         ),
         format!("device memory: {} bytes to deform, {} to render", deform.total_bytes(), render.bytes()),
     ];
-    for part in &deform.left_out {
+    for part in &deform.omitted {
         lines.push(format!("left out of deforming, {}: {}; saved {} bytes", part.feature, part.what, part.bytes));
     }
-    for part in &render.left_out {
+    for part in &render.omitted {
         let passes = if part.passes.is_empty() { "no pass".into() } else { part.passes.join(" and ") };
         lines.push(format!(
             "left out of rendering, {}: {}; saved {} bytes and {passes}",

@@ -50,7 +50,7 @@ pub type Outcome = modalcast_model::error::Result<bool>;
 /// Runs the command line and returns the process's exit code.
 pub fn run() -> u8 {
     let cli = Cli::parse();
-    crate::telemetry::log_to_stderr();
+    crate::telemetry::init_logging();
     let outcome = match cli.command {
         Command::Serve(args) => serve::run(&args),
         Command::Demo(args) => demo::run(&args),
@@ -84,7 +84,7 @@ fn exit_code(error: &Error) -> u8 {
 }
 
 /// Prints a line of a command's result. Nothing else writes to standard output, so that logs never mix with results.
-pub fn say(line: impl std::fmt::Display) {
+pub fn print_line(line: impl std::fmt::Display) {
     if let Err(error) = writeln!(std::io::stdout(), "{line}")
         && error.kind() != std::io::ErrorKind::BrokenPipe
     {

@@ -4,14 +4,14 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::options::{Size, triple, working};
-use super::{Outcome, say};
+use super::options::{ImageSize, parse_point, with_spinner};
+use super::{Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::engine::{Showing, Staged, Workbench, checked_mode};
+use crate::engine::{DeviceContext, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
-use modalcast_model::error::{Error, Result, during, invalid};
+use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::load;
-use modalcast_model::scene::{Camera, Lens, Scene, State, View};
+use modalcast_model::scene::{Camera, Lens, Scene, SceneState, View};
 
 /// Renders one frame of a scene to a PNG file.
 #[derive(Debug, clap::Args)]
@@ -31,19 +31,19 @@ pub(super) struct Args {
     out: PathBuf,
     /// Image size in pixels.
     #[arg(long, default_value = "1280x720")]
-    size: Size,
+    size: ImageSize,
     /// Camera position in scene units. Default: a camera that frames the scene.
-    #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "target")]
+    #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "target")]
     eye: Option<[f64; 3]>,
     /// Point that the camera looks at, in scene units.
-    #[arg(long, value_parser = triple, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
+    #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
     target: Option<[f64; 3]>,
     /// Vertical field of view in degrees. Default: 35.
     #[arg(long, requires = "eye")]
     field_of_view: Option<f64>,
     /// Render a color map with a legend: `displacement`, or the index of a column of U, from 0.
     #[arg(long, value_parser = map, value_name = "MAP")]
-    map: Option<Showing>,
+    map: Option<FrameOutput>,
     /// Value at the bright end of the color map; 0 fits it to the frame.
     #[arg(long, requires = "map", default_value_t = 0.0)]
     largest: f64,
@@ -56,53 +56,61 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let scene = working("loading", || load::open(&args.scene))?;
-    let mut state = State::rest(&scene);
+    let scene = with_spinner("loading", || load::open(&args.scene))?;
+    let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
         state.q = coordinates(&scene, path)?;
     }
-    let mut bench = Workbench::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
-    let mut staged = bench.stage(&scene)?;
-    staged.deform(&Arc::new(state))?;
+    let mut bench =
+        DeviceContext::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
+    let mut loaded_scene = bench.load_scene(&scene)?;
+    loaded_scene.deform(&Arc::new(state))?;
     let bytes = match args.map {
         None => {
-            let image = bench.draw(&mut staged, &camera(args, &scene), args.size.width, args.size.height)?;
-            frame::png(image.width, image.height, &image.rgba)?
+            let image = bench.draw(&mut loaded_scene, &camera(args, &scene), args.size.width, args.size.height)?;
+            frame::encode_png(image.width, image.height, &image.rgba)?
         }
-        Some(showing) => mapped(args, &mut bench, &mut staged, showing)?,
+        Some(frame_output) => render_color_map(args, &mut bench, &mut loaded_scene, frame_output)?,
     };
     let place = format!("--out {}", args.out.display());
     fs::write(&args.out, bytes).map_err(|error| invalid(place, "a file that can be written", error))?;
-    bench.unstage(staged);
-    say(format!("{} ({}, {})", args.out.display(), args.size, bench.backend().name()));
+    bench.unload_scene(loaded_scene);
+    print_line(format!("{} ({}, {})", args.out.display(), args.size, bench.backend().name()));
     Ok(true)
 }
 
 /// Renders a color map to PNG.
-fn mapped(args: &Args, bench: &mut Workbench, staged: &mut Staged, showing: Showing) -> Result<Vec<u8>> {
-    let scene = Arc::clone(staged.scene());
-    let showing = match showing {
-        Showing::Mode { mode, .. } => Showing::Mode { mode: checked_mode(&scene, mode)?, largest: args.largest },
-        _ => Showing::Displacement { largest: args.largest },
+fn render_color_map(
+    args: &Args,
+    bench: &mut DeviceContext,
+    loaded_scene: &mut LoadedScene,
+    frame_output: FrameOutput,
+) -> Result<Vec<u8>> {
+    let scene = Arc::clone(loaded_scene.scene());
+    let frame_output = match frame_output {
+        FrameOutput::ModeShape { mode, .. } => {
+            FrameOutput::ModeShape { mode: validate_mode(&scene, mode)?, largest: args.largest }
+        }
+        _ => FrameOutput::Displacement { largest: args.largest },
     };
     let size = [args.size.width, args.size.height];
-    let (survey, legend) = bench.survey(staged, &camera(args, &scene), size, showing)?;
-    let legend = legend.ok_or_else(|| during("encode")("a colour map without legend"))?;
-    let rgba = frame::colour_map(&survey.bytes, survey.samples, size, &legend)?;
-    frame::png(size[0], size[1], &rgba)
+    let (survey, legend) = bench.render_aov(loaded_scene, &camera(args, &scene), size, frame_output)?;
+    let legend = legend.ok_or_else(|| fault_in("encode")("a colour map without legend"))?;
+    let rgba = frame::color_map(&survey.bytes, survey.samples, size, &legend)?;
+    frame::encode_png(size[0], size[1], &rgba)
 }
 
-fn map(text: &str) -> Result<Showing, String> {
+fn map(text: &str) -> Result<FrameOutput, String> {
     if text == "displacement" {
-        return Ok(Showing::Displacement { largest: 0.0 });
+        return Ok(FrameOutput::Displacement { largest: 0.0 });
     }
     let mode = text.parse().map_err(|_| "expected `displacement` or the number of a column of U".to_owned())?;
-    Ok(Showing::Mode { mode, largest: 0.0 })
+    Ok(FrameOutput::ModeShape { mode, largest: 0.0 })
 }
 
 fn camera(args: &Args, scene: &Scene) -> Camera {
     let (Some(eye), Some(target)) = (args.eye, args.target) else {
-        return Camera::framing(scene, args.size.width, args.size.height);
+        return Camera::fit_to_scene(scene, args.size.width, args.size.height);
     };
     let view = View::LookAt { eye, target, up: scene.up.vector().into() };
     Camera { view, lens: Lens::FieldOfView(args.field_of_view.unwrap_or(35.0)), near: 0.0, far: 0.0 }
@@ -122,7 +130,7 @@ fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
         return Err(invalid(&place, format!("{wanted}: at most {most} bytes"), format!("{bytes} bytes")));
     }
     let bytes = fs::read(path).map_err(|error| invalid(&place, "a readable file", error))?;
-    let array = load::parse_numpy(&bytes).map_err(|error| error.within(&place))?;
+    let array = load::parse_numpy(&bytes).map_err(|error| error.prefix_field(&place))?;
     // Axes of length one are accepted, because saving a single step of a trajectory leaves a leading one.
     let sides = array.shape.iter().filter(|side| **side != 1).count();
     if array.entries.len() != scene.layout.coordinates || sides > 1 {

@@ -5,7 +5,7 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::process::Command;
 
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 use super::Outcome;
 
@@ -27,10 +27,10 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let own = std::env::current_exe().map_err(during("report"))?;
+    let own = std::env::current_exe().map_err(fault_in("report"))?;
     let program = own.with_file_name(PROGRAM);
     check_build(&program)?;
-    let status = Command::new(&program).args(&args.arguments).status().map_err(during("report"))?;
+    let status = Command::new(&program).args(&args.arguments).status().map_err(fault_in("report"))?;
     // `modalcast-report` uses the same exit codes.
     std::process::exit(status.code().unwrap_or(6));
 }

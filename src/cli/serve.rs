@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{Outcome, say};
+use super::{Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::engine::{Engine, Info};
+use crate::engine::{Engine, EngineInfo};
 use crate::service;
-use modalcast_model::error::{Result, during};
-use modalcast_model::load::Repository;
+use modalcast_model::error::{Result, fault_in};
+use modalcast_model::load::SceneRepository;
 
 /// Serves scenes over gRPC until SIGTERM or Ctrl-C, then ends open streams and exits.
 #[derive(Debug, clap::Args)]
@@ -76,38 +76,38 @@ impl Args {
             frame_side: self.frame_side,
             open_scenes: self.open_scenes,
             window: self.window,
-            largest_window: defaults.largest_window.max(self.window),
+            max_window: defaults.max_window.max(self.window),
             upload_bytes: self.upload_bytes,
             deadline: Duration::from_millis(self.deadline_ms),
             ..Config::default()
         }
-        .checked()
+        .validated()
     }
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
     let config = args.config()?;
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(during("serve"))?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("serve"))?;
     runtime.block_on(serve(config))?;
     Ok(true)
 }
 
 async fn serve(config: Config) -> Result<()> {
-    let repository = Arc::new(Repository::new(config.scenes.as_deref())?);
+    let repository = Arc::new(SceneRepository::new(config.scenes.as_deref())?);
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
     let engine = Engine::start(config, repository).await?;
-    let address = listener.local_addr().map_err(during("serve"))?;
+    let address = listener.local_addr().map_err(fault_in("serve"))?;
     if !address.ip().is_loopback() {
         tracing::warn!("{address} is open to other machines, without authentication");
     }
     describe(engine.info());
-    say(format!("listening on http://{address}"));
-    service::serve(engine, listener, told_to_stop()).await
+    print_line(format!("listening on http://{address}"));
+    service::serve(engine, listener, shutdown_signal()).await
 }
 
 /// Logs the backend and the renderer; warns about a software renderer.
-fn describe(info: &Info) {
+fn describe(info: &EngineInfo) {
     tracing::info!("deforming on {} ({})", info.backend.name(), info.device);
     match &info.renderer {
         Ok(found) if found.software => tracing::warn!("drawing on the CPU: {}", found.renderer),
@@ -117,7 +117,7 @@ fn describe(info: &Info) {
 }
 
 /// Waits for Ctrl-C or SIGTERM.
-async fn told_to_stop() {
+async fn shutdown_signal() {
     let interrupt = tokio::signal::ctrl_c();
     match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
         Ok(mut terminate) => {

@@ -5,16 +5,16 @@
 
 use std::sync::Arc;
 
-pub use crate::gpu::{Assembled, assert_compiles};
+pub use crate::gpu::{CompiledVariant, assert_compiles};
 
 use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
-use modalcast_model::scene::{Deformation, Parts, Scene, State};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
 /// Deterministic numbers in -1 to 1.
 #[derive(Debug)]
-pub struct Noise(pub u64);
+pub struct TestRng(pub u64);
 
-impl Noise {
+impl TestRng {
     /// The next number. Not an iterator: it never ends.
     #[expect(clippy::should_implement_trait, reason = "an iterator would need an adapter at every use")]
     pub fn next(&mut self) -> f32 {
@@ -24,24 +24,24 @@ impl Noise {
 }
 
 /// Vertices in the unit cube with modes of noise.
-pub fn shape(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
+pub fn shape(vertices: usize, rank: usize, noise: &mut TestRng) -> Shape {
     let columns = (0..3 * vertices * rank).map(|_| noise.next()).collect();
     with_columns(vertices, rank, columns, noise)
 }
 
 /// Vertices in the unit cube with these columns.
-pub fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, noise: &mut Noise) -> Shape {
+pub fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, noise: &mut TestRng) -> Shape {
     let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; vertices];
-    let mesh = Mesh::indexed(rest, normals, vec![], vec![[0; 3]]).expect("a mesh");
+    let mesh = Mesh::from_indexed(rest, normals, vec![], vec![[0; 3]]).expect("a mesh");
     let modes =
         if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, columns).expect("modes") };
     Shape::new(mesh, modes).expect("a shape")
 }
 
 /// A scene of shapes of noise, one domain each per (n, r).
-pub fn scene(sizes: &[(usize, usize)], deformation: Deformation, noise: &mut Noise) -> Arc<Scene> {
-    let mut parts = Parts::named("noise");
+pub fn scene(sizes: &[(usize, usize)], deformation: DeformationSettings, noise: &mut TestRng) -> Arc<Scene> {
+    let mut parts = SceneParts::named("noise");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
     for (at, (vertices, rank)) in sizes.iter().enumerate() {
@@ -56,7 +56,7 @@ fn domain(shape: usize) -> Domain {
         name: format!("noise {shape}"),
         shape,
         material: 0,
-        runs: vec![],
+        material_ranges: vec![],
         placement: Transform::IDENTITY,
         attachment: None,
         follows: None,
@@ -67,22 +67,22 @@ fn domain(shape: usize) -> Domain {
 }
 
 /// One domain for each (vertices, rank, triangles), with random corner normals, and a random state.
-pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, State) {
-    let mut noise = Noise(shapes.len() as u64);
-    let mut parts = Parts::named("noise");
+pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, SceneState) {
+    let mut noise = TestRng(shapes.len() as u64);
+    let mut parts = SceneParts::named("noise");
     parts.materials = vec![Material::default()];
     for (at, (vertices, rank, triangles)) in shapes.iter().enumerate() {
         parts.shapes.push(shape_with_corners(&mut noise, *vertices, *rank, *triangles));
         parts.domains.push(domain(at));
     }
     let scene = Scene::new(parts).expect("a scene");
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     state.q.iter_mut().for_each(|coordinate| *coordinate = noise.next());
     state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| noise.next()));
     (scene, state)
 }
 
-fn shape_with_corners(noise: &mut Noise, vertices: usize, rank: usize, triangles: usize) -> Shape {
+fn shape_with_corners(noise: &mut TestRng, vertices: usize, rank: usize, triangles: usize) -> Shape {
     let rest = (0..vertices).map(|_| [0; 3].map(|_| noise.next())).collect();
     let corners = Corners {
         vertices: (0..vertices as u32).collect(),
@@ -97,7 +97,7 @@ fn shape_with_corners(noise: &mut Noise, vertices: usize, rank: usize, triangles
 }
 
 /// u = U q of a vertex, in f64.
-pub fn displacement_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f64; 3] {
+pub fn displacement_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f64; 3] {
     let modes = &scene.shape_of(domain).modes;
     let q = state.q_of(scene, domain);
     [0, 1, 2]
@@ -105,7 +105,7 @@ pub fn displacement_of(scene: &Scene, state: &State, domain: usize, vertex: usiz
 }
 
 /// x = T (x0 + u) of a vertex, in f64.
-pub fn position_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f64; 3] {
+pub fn position_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f64; 3] {
     let (u, rest) = (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest()[vertex]);
     let (linear, offset) = (state.transforms[domain].linear(), state.transforms[domain].translation());
     let bent = nalgebra::Vector3::from([0, 1, 2].map(|axis| f64::from(rest[axis]) + u[axis]));

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
-use super::viewer::Showing;
+use super::subscriber::FrameOutput;
 use crate::frame::Legend;
-use modalcast_model::deform::{Deformed, Surface, Wanted};
+use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Camera, Rectangle, Scene, State};
-use modalcast_render::{Hit, Image, Survey};
+use modalcast_model::scene::{Camera, PixelRect, Scene, SceneState};
+use modalcast_render::{AovImage, FrameImage, PickHit};
 
 /// Identifies a loaded scene on the device thread.
 pub(super) type SceneId = u64;
@@ -18,48 +18,48 @@ pub(super) type SceneId = u64;
 pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
 
 /// Vertices in host memory, and the milliseconds from the start of the copy to its completion.
-pub(super) type Copied = (Arc<Surface>, f64);
+pub(super) type TimedVertices = (Arc<DeformedSurface>, f64);
 
 /// A command to the device thread with the channel for its answer.
 pub(super) enum Command {
-    Stage {
+    LoadScene {
         id: SceneId,
         scene: Arc<Scene>,
         reply: Reply<()>,
     },
     Deform {
         id: SceneId,
-        state: Arc<State>,
-        reply: Reply<Deformed>,
+        state: Arc<SceneState>,
+        reply: Reply<DeformSummary>,
     },
     Draw {
         id: SceneId,
         camera: Camera,
         size: (u32, u32),
-        reply: Reply<Image>,
+        reply: Reply<FrameImage>,
     },
     /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.
-    Survey {
+    RenderAov {
         id: SceneId,
         camera: Camera,
         size: [u32; 2],
-        showing: Showing,
-        reply: Reply<(Survey, Option<Legend>)>,
+        frame_output: FrameOutput,
+        reply: Reply<(AovImage, Option<Legend>)>,
     },
     Pick {
         id: SceneId,
         camera: Camera,
         picture: [u32; 2],
-        rectangle: Rectangle,
-        reply: Reply<Vec<Hit>>,
+        rectangle: PixelRect,
+        reply: Reply<Vec<PickHit>>,
     },
     /// Copies the wanted vertex attributes to the host. The copy overlaps with the commands after it.
-    Copy {
+    ReadVertices {
         id: SceneId,
-        wanted: Wanted,
-        reply: Reply<Copied>,
+        wanted: VertexAttributes,
+        reply: Reply<TimedVertices>,
     },
-    Unstage {
+    UnloadScene {
         id: SceneId,
         reply: Reply<()>,
     },

@@ -9,15 +9,15 @@ use bytes::Bytes;
 use tokio::sync::{OnceCell, Semaphore};
 
 use super::blocking::run_blocking;
-use super::viewer::{Body, Shown, StepName};
+use super::subscriber::{OutputBody, StepId, StepOutput};
 use crate::frame::{self, Legend};
 use crate::telemetry::{Stage, StageTimes, ms_since};
-use modalcast_model::error::{Result, during};
-use modalcast_render::{Image, Paths, Survey};
+use modalcast_model::error::{Result, fault_in};
+use modalcast_render::{AovImage, FrameImage, RasterBackends};
 
 /// Wire format of pixels. Multi-byte values are little-endian; the top row comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum FrameFormat {
     Png,
     /// RGBA8 sRGB.
     Rgba,
@@ -31,12 +31,12 @@ pub enum Format {
 
 /// An encoded result of one step.
 #[derive(Debug, Clone)]
-pub struct Encoded {
-    pub step: StepName,
+pub struct EncodedOutput {
+    pub step: StepId,
     pub skipped: u64,
     pub stages: StageTimes,
     /// The rasterizers that drew a color frame; default for other results.
-    pub paths: Paths,
+    pub raster_backends: RasterBackends,
     pub bytes: Bytes,
 }
 
@@ -47,15 +47,15 @@ pub struct ColorFrame {
     pub height: u32,
     /// RGBA8 sRGB, top row first.
     pub rgba: Bytes,
-    paths: Paths,
+    raster_backends: RasterBackends,
     /// The PNG and the milliseconds that encoding took.
     png: OnceCell<(Bytes, f64)>,
 }
 
-impl From<Image> for ColorFrame {
-    fn from(image: Image) -> Self {
-        let Image { width, height, rgba, paths, .. } = image;
-        Self { width, height, rgba: rgba.into(), paths, png: OnceCell::new() }
+impl From<FrameImage> for ColorFrame {
+    fn from(image: FrameImage) -> Self {
+        let FrameImage { width, height, rgba, raster_backends, .. } = image;
+        Self { width, height, rgba: rgba.into(), raster_backends, png: OnceCell::new() }
     }
 }
 
@@ -84,27 +84,27 @@ impl FrameEncoder {
     /// Encodes a color frame or an AOV.
     ///
     /// # Errors
-    /// `Fault` when the PNG encoder fails, or when `shown` is not a picture.
-    pub async fn encode(&self, shown: Shown, format: Format) -> Result<Encoded> {
-        let mut stages = shown.stages;
-        let mut paths = Paths::default();
-        let (bytes, ms) = match shown.body {
-            Body::Frame(frame) => {
-                paths = frame.paths;
+    /// `Fault` when the PNG encoder fails, or when `output` is not a picture.
+    pub async fn encode(&self, output: StepOutput, format: FrameFormat) -> Result<EncodedOutput> {
+        let mut stages = output.stages;
+        let mut raster_backends = RasterBackends::default();
+        let (bytes, ms) = match output.body {
+            OutputBody::Frame(frame) => {
+                raster_backends = frame.raster_backends;
                 match format {
-                    Format::Png => self.png(&frame).await.map(|(bytes, ms)| (bytes, Some(ms)))?,
+                    FrameFormat::Png => self.png(&frame).await.map(|(bytes, ms)| (bytes, Some(ms)))?,
                     _ => (frame.rgba.clone(), None),
                 }
             }
-            Body::Survey(survey, Some(legend)) => {
+            OutputBody::Aov(survey, Some(legend)) => {
                 let map = move || color_map(&survey, &legend, format);
                 self.run(map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
             }
-            Body::Survey(survey, None) => (survey.bytes.into(), None),
-            Body::Vertices(_) | Body::Picked(_) => return Err(during("encode")("it is not a picture")),
+            OutputBody::Aov(survey, None) => (survey.bytes.into(), None),
+            OutputBody::Vertices(_) | OutputBody::Pick(_) => return Err(fault_in("encode")("it is not a picture")),
         };
         stages.extend(ms.map(|ms| (Stage::Encode, ms)));
-        Ok(Encoded { step: shown.step, skipped: shown.skipped, stages, paths, bytes })
+        Ok(EncodedOutput { step: output.step, skipped: output.skipped, stages, raster_backends, bytes })
     }
 
     /// The PNG of a frame and the milliseconds that encoding took. The first caller encodes it; if that caller is
@@ -112,7 +112,7 @@ impl FrameEncoder {
     async fn png(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
         let encode = || {
             let frame = Arc::clone(frame);
-            self.run(move || frame::png(frame.width, frame.height, &frame.rgba))
+            self.run(move || frame::encode_png(frame.width, frame.height, &frame.rgba))
         };
         frame.png.get_or_try_init(encode).await.cloned()
     }
@@ -120,7 +120,7 @@ impl FrameEncoder {
     /// Runs work on a blocking thread as soon as the thread limit permits. Returns the bytes and the run time in
     /// milliseconds, without the wait.
     async fn run(&self, work: impl FnOnce() -> Result<Vec<u8>> + Send + 'static) -> Result<(Bytes, f64)> {
-        let permit = Arc::clone(&self.threads).acquire_owned().await.map_err(during("encode"))?;
+        let permit = Arc::clone(&self.threads).acquire_owned().await.map_err(fault_in("encode"))?;
         run_blocking("encode", move || {
             let _permit = permit;
             let begin = Instant::now();
@@ -130,10 +130,10 @@ impl FrameEncoder {
     }
 }
 
-fn color_map(survey: &Survey, legend: &Legend, format: Format) -> Result<Vec<u8>> {
+fn color_map(survey: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
     let size = [survey.width, survey.height];
-    let rgba = frame::colour_map(&survey.bytes, survey.samples, size, legend)?;
-    if format == Format::Png { frame::png(size[0], size[1], &rgba) } else { Ok(rgba) }
+    let rgba = frame::color_map(&survey.bytes, survey.samples, size, legend)?;
+    if format == FrameFormat::Png { frame::encode_png(size[0], size[1], &rgba) } else { Ok(rgba) }
 }
 
 #[cfg(test)]
@@ -141,12 +141,13 @@ pub(super) mod tests {
     use super::*;
 
     /// A frame of noise, so that its PNG takes time.
-    pub(in crate::engine) fn noise(number: u64, side: u32) -> Shown {
+    pub(in crate::engine) fn noise(number: u64, side: u32) -> StepOutput {
         let mut random = fastrand::Rng::with_seed(number);
         let rgba = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
-        let image = Image { width: side, height: side, rgba, passes: vec![], paths: Paths::default() };
-        let step = StepName { run: 1, number, time: 0.0 };
-        Shown { step, skipped: 0, stages: vec![], cells: None, body: Body::Frame(Arc::new(image.into())) }
+        let image =
+            FrameImage { width: side, height: side, rgba, passes: vec![], raster_backends: RasterBackends::default() };
+        let step = StepId { run: 1, number, time: 0.0 };
+        StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Frame(Arc::new(image.into())) }
     }
 
     /// An encoder without threads. It starts to work when the test adds permits to the semaphore.
@@ -159,31 +160,31 @@ pub(super) mod tests {
     #[tokio::test]
     async fn subscribers_share_one_png_and_raw_pixels() {
         let encoder = FrameEncoder::new(2);
-        let shown = noise(1, 16);
+        let output = noise(1, 16);
         let both = async |format| {
-            let (one, other) = (encoder.encode(shown.clone(), format), encoder.encode(shown.clone(), format));
+            let (one, other) = (encoder.encode(output.clone(), format), encoder.encode(output.clone(), format));
             let (one, other) = tokio::join!(one, other);
             (one.expect("encodes"), other.expect("encodes"))
         };
-        for format in [Format::Png, Format::Rgba] {
+        for format in [FrameFormat::Png, FrameFormat::Rgba] {
             let (one, other) = both(format).await;
             assert_eq!((one.bytes.as_ptr(), one.bytes.len()), (other.bytes.as_ptr(), other.bytes.len()), "{format:?}");
             assert_eq!(one.stages, other.stages, "{format:?}");
         }
-        let apart = encoder.encode(noise(1, 16), Format::Png).await.expect("encodes");
-        let (shared, _) = both(Format::Png).await;
-        assert_eq!(apart.bytes, shared.bytes);
-        assert_ne!(apart.bytes.as_ptr(), shared.bytes.as_ptr(), "control: another drawing has its own PNG");
+        let separate = encoder.encode(noise(1, 16), FrameFormat::Png).await.expect("encodes");
+        let (shared, _) = both(FrameFormat::Png).await;
+        assert_eq!(separate.bytes, shared.bytes);
+        assert_ne!(separate.bytes.as_ptr(), shared.bytes.as_ptr(), "control: another drawing has its own PNG");
     }
 
     #[tokio::test]
     async fn cancelled_encoding_is_taken_over_by_the_next_subscriber() {
         let (encoder, threads) = paused(1);
-        let shown = noise(2, 8);
-        let first = encoder.encode(shown.clone(), Format::Png);
+        let output = noise(2, 8);
+        let first = encoder.encode(output.clone(), FrameFormat::Png);
         tokio::time::timeout(std::time::Duration::from_millis(20), first).await.expect_err("no thread is free");
         threads.add_permits(1);
-        let second = encoder.encode(shown, Format::Png).await.expect("encodes");
+        let second = encoder.encode(output, FrameFormat::Png).await.expect("encodes");
         assert!(image::load_from_memory(&second.bytes).is_ok());
     }
 }

@@ -1,51 +1,51 @@
 //! The engine: loads scenes, applies steps to them, and produces frames, picks and vertices. It runs one device thread
 //! and one task per open scene, and persists uploads, the list of open scenes and their last steps across restarts.
 //!
-//! A scene's task serializes all operations on the scene (`conductor`). A writer sends steps through a bounded queue
-//! (`lane`) and a subscriber receives results through a bounded channel (`viewer`). Exceeding a bound, or blocking the
+//! A scene's task serializes all operations on the scene (`scene_actor`). A writer sends steps through a bounded queue
+//! (`step_queue`) and a subscriber receives results through a bounded channel (`subscriber`). Exceeding a bound, or blocking the
 //! writer for too long, yields an error that names the limit.
 
 mod blocking;
+mod checkpoint_store;
 mod command;
-mod conductor;
-mod desk;
-mod encoded_feed;
+mod device_context;
+mod device_handle;
+mod device_loop;
+mod encoded_subscription;
 mod frame_encoder;
-mod host;
-mod keep;
-mod lane;
-mod late;
-mod ledger;
+mod in_flight;
+mod loaded_scene;
 mod pack;
-mod picked;
+mod pick_result;
 mod registry;
-mod show;
+mod scalar_field;
+mod scene_actor;
+mod scene_catalog;
+mod scene_handle;
 mod source;
-mod staged;
+mod step_output;
+mod step_queue;
+mod subscriber;
 #[cfg(test)]
 mod testing;
 mod upload;
-mod values;
-mod viewer;
-mod workbench;
-mod worker;
 
-pub use conductor::Which;
-pub use encoded_feed::EncodedFeed;
-pub use frame_encoder::{ColorFrame, Encoded, Format, FrameEncoder};
-pub use host::{Drive, Host};
-pub use lane::{Policy, Report};
-pub use ledger::{Origin, checked_name};
-pub use pack::{Packed, Selection, checked_domains, pack_vertices};
-pub use picked::{Picked, Picks, resolve_picks};
+pub use device_context::{DeviceContext, EngineInfo};
+pub use encoded_subscription::EncodedSubscription;
+pub use frame_encoder::{ColorFrame, EncodedOutput, FrameEncoder, FrameFormat};
+pub use loaded_scene::LoadedScene;
+pub use pack::{PackedVertices, VertexSelection, pack_vertices, validate_domains};
+pub use pick_result::{ModalHit, PickResult, resolve_picks};
+pub use scalar_field::validate_mode;
+pub use scene_actor::StepSelector;
+pub use scene_catalog::{SceneProvenance, validate_scene_name};
+pub use scene_handle::{SceneHandle, WriterSession};
 pub use source::SceneSource;
-pub use staged::Staged;
-pub use upload::{Announcement, Upload};
-pub use values::checked_mode;
-pub use viewer::{Body, Delivery, Feed, Showing, Shown, StepName, View};
-pub use workbench::{Info, Workbench};
+pub use step_queue::{Policy, StepReport};
+pub use subscriber::{Delivery, FrameOutput, OutputBody, OutputSpec, StepId, StepOutput, Subscription};
+pub use upload::{Upload, UploadHeader};
 
-pub use modalcast_render::{Path, Paths};
+pub use modalcast_render::{RasterBackend, RasterBackends};
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -54,21 +54,21 @@ use std::thread::JoinHandle;
 use tokio::sync::Semaphore;
 
 use self::blocking::run_blocking;
-use self::conductor::Means;
-use self::host::Opening;
-use self::keep::Keeper;
-use self::ledger::Ledger;
+use self::checkpoint_store::CheckpointStore;
+use self::device_handle::DeviceHandle;
 use self::registry::Registry;
-use self::worker::Worker;
+use self::scene_actor::SceneServices;
+use self::scene_catalog::SceneCatalog;
+use self::scene_handle::OpenParams;
 use crate::config::Config;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
 
 /// Scenes that are read from disk concurrently.
-const LOADS: usize = 2;
+const MAX_CONCURRENT_LOADS: usize = 2;
 
 /// Uploads that may be in progress at a time.
-const UPLOADS: usize = 8;
+const MAX_CONCURRENT_UPLOADS: usize = 8;
 
 /// Handle to the engine. A clone is shallow: all clones share one device thread and one set of scenes.
 #[derive(Clone)]
@@ -79,9 +79,9 @@ pub struct Engine {
 struct Shared {
     config: Arc<Config>,
     source: Arc<dyn SceneSource>,
-    info: Info,
+    info: EngineInfo,
     encoder: FrameEncoder,
-    means: Means,
+    services: SceneServices,
     registry: Registry,
     loads: Semaphore,
     uploads: Arc<Semaphore>,
@@ -89,7 +89,7 @@ struct Shared {
     stopping: AtomicBool,
     device: Mutex<Option<JoinHandle<()>>>,
     // Last field, so that its lock on the state folder is released only after every writer above is dropped.
-    ledger: Ledger,
+    scene_catalog: SceneCatalog,
 }
 
 impl Engine {
@@ -100,26 +100,26 @@ impl Engine {
     pub async fn start(config: Config, source: Arc<dyn SceneSource>) -> Result<Self> {
         let config = Arc::new(config);
         let state = config.state.clone();
-        let (ledger, keeper) = run_blocking("state folder", move || {
-            let ledger = Ledger::open(&state)?;
-            let keeper = Keeper::start(ledger.steps())?;
-            Ok((ledger, Arc::new(keeper)))
+        let (scene_catalog, checkpoints) = run_blocking("state folder", move || {
+            let scene_catalog = SceneCatalog::open(&state)?;
+            let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder())?;
+            Ok((scene_catalog, Arc::new(checkpoints)))
         })
         .await?;
-        let (worker, info, device) = Worker::start(&config).await?;
+        let (device_handle, info, device) = DeviceHandle::start(&config).await?;
         let shared = Shared {
-            means: Means { worker, keeper, config: Arc::clone(&config) },
+            services: SceneServices { device_handle, checkpoints, config: Arc::clone(&config) },
             registry: Registry::new(config.open_scenes),
             config,
             source,
             info,
             encoder: FrameEncoder::per_core(),
-            loads: Semaphore::new(LOADS),
-            uploads: Arc::new(Semaphore::new(UPLOADS)),
+            loads: Semaphore::new(MAX_CONCURRENT_LOADS),
+            uploads: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
             next_id: AtomicU64::new(1),
             stopping: AtomicBool::new(false),
             device: Mutex::new(Some(device)),
-            ledger,
+            scene_catalog,
         };
         let engine = Self { shared: Arc::new(shared) };
         engine.restore().await;
@@ -127,7 +127,7 @@ impl Engine {
     }
 
     /// The backend that deforms and the renderer that draws.
-    pub fn info(&self) -> &Info {
+    pub fn info(&self) -> &EngineInfo {
         &self.shared.info
     }
 
@@ -153,16 +153,20 @@ impl Engine {
     /// # Errors
     /// `Taken` when the name belongs to another source, `Busy` when too many scenes are open, and the errors of
     /// [`SceneSource::open`].
-    pub async fn open(&self, source: &str, name: &str) -> Result<Arc<Host>> {
-        let name = if name.is_empty() { ledger::own_name(source)? } else { checked_name(name)?.to_owned() };
-        self.admit(name, Origin::Repository { source: source.into() }, None).await
+    pub async fn open(&self, source: &str, name: &str) -> Result<Arc<SceneHandle>> {
+        let name = if name.is_empty() {
+            scene_catalog::default_scene_name(source)?
+        } else {
+            validate_scene_name(name)?.to_owned()
+        };
+        self.open_once(name, SceneProvenance::Repository { source: source.into() }, None).await
     }
 
     /// The open scene with this name.
     ///
     /// # Errors
     /// `NotFound` when no open scene has this name, `Unavailable` when the server is shutting down.
-    pub fn find(&self, name: &str) -> Result<Arc<Host>> {
+    pub fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         if self.is_stopping() {
             return Err(stopping());
         }
@@ -170,7 +174,7 @@ impl Engine {
     }
 
     /// All open scenes, sorted by name.
-    pub fn list(&self) -> Vec<Arc<Host>> {
+    pub fn list(&self) -> Vec<Arc<SceneHandle>> {
         self.shared.registry.list()
     }
 
@@ -188,31 +192,31 @@ impl Engine {
     /// # Errors
     /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `Taken` when the name is
     /// in use; `Busy` when too many uploads are in progress; `Fault` of the disk.
-    pub async fn begin_upload(&self, announced: Announcement) -> Result<Upload> {
-        checked_name(&announced.scene)?;
+    pub async fn begin_upload(&self, header: UploadHeader) -> Result<Upload> {
+        validate_scene_name(&header.scene)?;
         let config = &self.shared.config;
-        if announced.files == 0 || announced.files > config.upload_files {
-            return Err(invalid("header.files", format!("1 to {}", config.upload_files), announced.files));
+        if header.files == 0 || header.files > config.upload_files {
+            return Err(invalid("header.files", format!("1 to {}", config.upload_files), header.files));
         }
-        if announced.total_bytes > config.upload_bytes {
+        if header.total_bytes > config.upload_bytes {
             let expected = format!("at most {}", config.upload_bytes);
-            return Err(invalid("header.total_bytes", expected, announced.total_bytes));
+            return Err(invalid("header.total_bytes", expected, header.total_bytes));
         }
-        self.shared.registry.check_free(&announced.scene)?;
-        let full = |_| Error::Busy { queue: "uploads under way", limit: UPLOADS };
+        self.shared.registry.check_free(&header.scene)?;
+        let full = |_| Error::Busy { queue: "uploads under way", limit: MAX_CONCURRENT_UPLOADS };
         let place = Arc::clone(&self.shared.uploads).try_acquire_owned().map_err(full)?;
         let uploads = config.state.join("uploads");
-        run_blocking("upload", move || Upload::begin(&uploads, announced, place)).await
+        run_blocking("upload", move || Upload::begin(&uploads, header, place)).await
     }
 
     /// Opens a complete upload as a scene. On failure the uploaded files are removed.
     ///
     /// # Errors
     /// `Invalid` naming the missing or malformed file; `Taken` when the name was claimed in the meantime.
-    pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<Host>> {
+    pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<SceneHandle>> {
         upload.finish()?;
-        let (name, entry) = (upload.announced.scene.clone(), upload.announced.entry.clone());
-        self.admit(name, Origin::Upload { entry }, Some(upload)).await
+        let (name, entry) = (upload.header.scene.clone(), upload.header.entry.clone());
+        self.open_once(name, SceneProvenance::Upload { entry }, Some(upload)).await
     }
 
     /// Closes a scene and ends its streams; removes its persisted step and, for an upload, its files.
@@ -221,10 +225,10 @@ impl Engine {
     /// `NotFound` when the name is neither open nor in the list of open scenes, `Busy` while the scene is being opened.
     pub async fn close(&self, name: &str) -> Result<()> {
         let engine = self.clone();
-        let name = checked_name(name)?.to_owned();
+        let name = validate_scene_name(name)?.to_owned();
         // A separate task, so that closing completes even if the caller is cancelled.
-        let work = async move { engine.close_whole(&name).await };
-        tokio::spawn(work).await.map_err(modalcast_model::error::during("close"))?
+        let work = async move { engine.close_scene(&name).await };
+        tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("close"))?
     }
 
     /// Ends every stream with `Unavailable`, writes outstanding checkpoints, joins the device thread and releases the
@@ -233,16 +237,16 @@ impl Engine {
         if self.shared.stopping.swap(true, Ordering::AcqRel) {
             return;
         }
-        for host in self.list() {
-            host.stop(stopping()).await;
+        for scene_handle in self.list() {
+            scene_handle.stop(stopping()).await;
         }
         let engine = self.clone();
         let finish = move || {
-            engine.shared.means.keeper.finish();
+            engine.shared.services.checkpoints.finish();
             let device = engine.shared.device.lock().unwrap_or_else(PoisonError::into_inner).take();
-            engine.shared.means.worker.quit();
+            engine.shared.services.device_handle.quit();
             device.map(JoinHandle::join);
-            engine.shared.ledger.release();
+            engine.shared.scene_catalog.release();
             Ok(())
         };
         if let Err(error) = run_blocking("shutdown", finish).await {
@@ -257,10 +261,10 @@ impl Engine {
 
     async fn restore(&self) {
         let mut openings = tokio::task::JoinSet::new();
-        for (name, origin) in self.shared.ledger.entries() {
+        for (name, provenance) in self.shared.scene_catalog.entries() {
             let engine = self.clone();
             openings.spawn(async move {
-                if let Err(error) = engine.admit(name.clone(), origin, None).await {
+                if let Err(error) = engine.open_once(name.clone(), provenance, None).await {
                     // The entry remains in the list, because the files may be available again at the next start.
                     tracing::warn!(scene = name, %error, "a kept scene could not be opened");
                 }
@@ -271,71 +275,88 @@ impl Engine {
 
     /// Opens a scene, once for all concurrent callers. Runs in a separate task, so that a cancelled caller does not
     /// cancel the opening.
-    async fn admit(&self, name: String, origin: Origin, upload: Option<Upload>) -> Result<Arc<Host>> {
+    async fn open_once(
+        &self,
+        name: String,
+        provenance: SceneProvenance,
+        upload: Option<Upload>,
+    ) -> Result<Arc<SceneHandle>> {
         if self.is_stopping() {
             return Err(stopping());
         }
         let engine = self.clone();
         let work = async move {
-            let seat = engine.shared.registry.seat(&name, &origin, upload.is_some())?;
-            let opened = seat.open(|| engine.host(name.clone(), origin, upload)).await;
-            engine.shared.registry.leave(&name, &seat);
+            let entry = engine.shared.registry.entry(&name, &provenance, upload.is_some())?;
+            let opened = entry.get_or_open(|| engine.open_or_discard(name.clone(), provenance, upload)).await;
+            engine.shared.registry.release(&name, &entry);
             opened
         };
-        tokio::spawn(work).await.map_err(modalcast_model::error::during("open"))?
+        tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("open"))?
     }
 
-    async fn host(&self, name: String, origin: Origin, upload: Option<Upload>) -> Result<Arc<Host>> {
+    async fn open_or_discard(
+        &self,
+        name: String,
+        provenance: SceneProvenance,
+        upload: Option<Upload>,
+    ) -> Result<Arc<SceneHandle>> {
         let is_new_upload = upload.is_some();
-        let hosted = self.load_and_stage(&name, &origin, upload).await;
+        let hosted = self.load_and_stage(&name, &provenance, upload).await;
         if hosted.is_err() && is_new_upload {
-            let place = self.shared.ledger.upload(&name);
+            let place = self.shared.scene_catalog.upload_folder(&name);
             run_blocking("upload", move || Ok(std::fs::remove_dir_all(place).ok())).await?;
         }
         hosted.map(Arc::new)
     }
 
-    async fn load_and_stage(&self, name: &str, origin: &Origin, upload: Option<Upload>) -> Result<Host> {
-        let scene = self.load(name, origin, upload).await?;
+    async fn load_and_stage(
+        &self,
+        name: &str,
+        provenance: &SceneProvenance,
+        upload: Option<Upload>,
+    ) -> Result<SceneHandle> {
+        let scene = self.load(name, provenance, upload).await?;
         let (engine, key, kept) = (self.clone(), name.to_owned(), Arc::clone(&scene));
-        let state = run_blocking("kept step", move || Ok(engine.shared.means.keeper.load(&key, &kept))).await?;
+        let state = run_blocking("kept step", move || Ok(engine.shared.services.checkpoints.load(&key, &kept))).await?;
         let state = state.unwrap_or_else(|error| {
             tracing::warn!(scene = name, %error, "the scene begins at rest");
             None
         });
-        let opening = Opening {
+        let params = OpenParams {
             name: name.into(),
-            origin: origin.clone(),
+            provenance: provenance.clone(),
             scene,
             id: self.shared.next_id.fetch_add(1, Ordering::Relaxed),
             state,
-            no_frames: self.shared.info.renderer.as_ref().err().cloned(),
+            frames_unavailable: self.shared.info.renderer.as_ref().err().cloned(),
         };
-        let host = Host::open(opening, self.shared.means.clone()).await?;
-        let (engine, key, origin) = (self.clone(), name.to_owned(), origin.clone());
-        if let Err(error) = run_blocking("scenes.json", move || engine.shared.ledger.add(&key, &origin)).await {
-            host.stop(error.clone()).await;
+        let scene_handle = SceneHandle::open(params, self.shared.services.clone()).await?;
+        let (engine, key, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        if let Err(error) =
+            run_blocking("scenes.json", move || engine.shared.scene_catalog.add(&key, &provenance)).await
+        {
+            scene_handle.stop(error.clone()).await;
             return Err(error);
         }
-        let layout = &host.scene.layout;
+        let layout = &scene_handle.scene.layout;
         tracing::info!(scene = name, domains = layout.slots.len(), vertices = layout.vertices, "opened");
-        Ok(host)
+        Ok(scene_handle)
     }
 
     /// Reads a scene's files. A panic in a loader becomes a `Fault` of this call.
-    async fn load(&self, name: &str, origin: &Origin, upload: Option<Upload>) -> Result<Arc<Scene>> {
+    async fn load(&self, name: &str, provenance: &SceneProvenance, upload: Option<Upload>) -> Result<Arc<Scene>> {
         let stopped = |_| stopping();
         let _permit = self.shared.loads.acquire().await.map_err(stopped)?;
         let source = Arc::clone(&self.shared.source);
-        let place = self.shared.ledger.upload(name);
-        let (engine, key, origin) = (self.clone(), name.to_owned(), origin.clone());
-        let read = move || match origin {
-            Origin::Repository { source: path } => source.open(&path),
-            Origin::Upload { entry } => {
+        let place = self.shared.scene_catalog.upload_folder(name);
+        let (engine, key, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        let read = move || match provenance {
+            SceneProvenance::Repository { source: path } => source.open(&path),
+            SceneProvenance::Upload { entry } => {
                 if let Some(upload) = upload {
                     // A checkpoint of an older scene with this name does not apply to the new one.
-                    engine.shared.means.keeper.forget(&key);
-                    upload.settle(&place)?;
+                    engine.shared.services.checkpoints.remove(&key);
+                    upload.commit(&place)?;
                 }
                 source.open_within(&place, &entry)
             }
@@ -343,32 +364,32 @@ impl Engine {
         run_blocking("load", read).await
     }
 
-    async fn close_whole(&self, name: &str) -> Result<()> {
-        let seat = self.shared.registry.seat_of(name);
-        match seat.as_ref().map(|seat| seat.host()) {
-            Some(Some(host)) if host.is_closing() => return Err(not_open(name)),
-            Some(Some(host)) => host.stop(not_open(name)).await,
+    async fn close_scene(&self, name: &str) -> Result<()> {
+        let entry = self.shared.registry.find_entry(name);
+        match entry.as_ref().map(|entry| entry.scene_handle()) {
+            Some(Some(scene_handle)) if scene_handle.is_closing() => return Err(scene_not_open(name)),
+            Some(Some(scene_handle)) => scene_handle.stop(scene_not_open(name)).await,
             Some(None) => return Err(Error::Busy { queue: "the name of a scene that is being opened", limit: 1 }),
             None => {}
         }
         let (engine, key) = (self.clone(), name.to_owned());
         let removed = run_blocking("close", move || {
-            engine.shared.means.keeper.forget(&key);
-            std::fs::remove_dir_all(engine.shared.ledger.upload(&key)).ok(); // Only uploads have a folder.
-            engine.shared.ledger.remove(&key)
+            engine.shared.services.checkpoints.remove(&key);
+            std::fs::remove_dir_all(engine.shared.scene_catalog.upload_folder(&key)).ok(); // Only uploads have a folder.
+            engine.shared.scene_catalog.remove(&key)
         })
         .await;
         // The name is released only after the files are removed, so that a new upload under it does not lose its files.
         // It is released even if the list could not be written.
-        if let Some(seat) = &seat {
-            self.shared.registry.remove(name, seat);
+        if let Some(entry) = &entry {
+            self.shared.registry.remove(name, entry);
         }
         let was_kept = removed?;
-        if seat.is_some() || was_kept { Ok(()) } else { Err(not_open(name)) }
+        if entry.is_some() || was_kept { Ok(()) } else { Err(scene_not_open(name)) }
     }
 }
 
-fn not_open(name: &str) -> Error {
+fn scene_not_open(name: &str) -> Error {
     Error::NotFound { what: "scene", given: format!("'{name}'") }
 }
 

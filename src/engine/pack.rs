@@ -4,24 +4,24 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::blocking::run_blocking;
-use super::frame_encoder::Encoded;
-use super::viewer::{Body, Shown};
+use super::frame_encoder::EncodedOutput;
+use super::subscriber::{OutputBody, StepOutput};
 use crate::telemetry::{Stage, ms_since};
-use modalcast_model::deform::{Surface, Wanted};
-use modalcast_model::error::{Result, during, invalid};
-use modalcast_model::scene::{Bounds, Cells, Layout, Scene, Slot};
-use modalcast_render::Paths;
+use modalcast_model::deform::{DeformedSurface, VertexAttributes};
+use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::scene::{Bounds, DomainLayout, FloatingOrigins, Layout, Scene};
+use modalcast_render::RasterBackends;
 
 // Vertices are copied in memory order, and the wire format is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"), "vertices would need their bytes swapped");
 
 /// Limit on the domains of one vertex reply, because the first message carries counts for every domain.
-const MOST_DOMAINS: usize = 65_536;
+const MAX_DOMAINS: usize = 65_536;
 
 /// Vertices as bytes, and the origin of their positions.
 #[derive(Debug, Clone)]
-pub struct Packed {
-    pub encoded: Encoded,
+pub struct PackedVertices {
+    pub encoded: EncodedOutput,
     /// Origin of the positions in the world, meters.
     pub origin: [f64; 3],
     /// Size in bytes of the per-domain origins at the end of the reply; 0 if `origin` applies to all selected domains.
@@ -33,24 +33,24 @@ const BOX_BYTES: u64 = 24;
 
 /// The domains and vertex attributes that a reader selects.
 #[derive(Debug, Clone)]
-pub struct Selection {
+pub struct VertexSelection {
     scene: Arc<Scene>,
     /// Domains by index, in the order of the reply.
     pub domains: Vec<u32>,
-    pub wanted: Wanted,
+    pub wanted: VertexAttributes,
 }
 
-impl Selection {
+impl VertexSelection {
     /// Selects attributes of the given domains; an empty list selects all domains.
     ///
     /// # Errors
     /// `Invalid` when an index is out of range, the list is longer than the scene or than 65 536 domains, no attribute
     /// is selected, or the scene does not keep a selected attribute.
-    pub fn new(scene: &Arc<Scene>, domains: Vec<u32>, wanted: Wanted) -> Result<Self> {
-        check_kept(scene, wanted)?;
-        let domains = checked_domains("selection.domains", scene, domains)?;
-        if domains.len() > MOST_DOMAINS {
-            return Err(invalid("selection.domains", format!("at most {MOST_DOMAINS} per reply"), domains.len()));
+    pub fn new(scene: &Arc<Scene>, domains: Vec<u32>, wanted: VertexAttributes) -> Result<Self> {
+        check_available(scene, wanted)?;
+        let domains = validate_domains("selection.domains", scene, domains)?;
+        if domains.len() > MAX_DOMAINS {
+            return Err(invalid("selection.domains", format!("at most {MAX_DOMAINS} per reply"), domains.len()));
         }
         Ok(Self { scene: Arc::clone(scene), domains, wanted })
     }
@@ -89,8 +89,8 @@ impl Selection {
 }
 
 /// Rejects attributes that the scene does not keep; the error names the option of `scene.toml` that enables them.
-fn check_kept(scene: &Scene, wanted: Wanted) -> Result<()> {
-    if wanted == Wanted::default() {
+fn check_available(scene: &Scene, wanted: VertexAttributes) -> Result<()> {
+    if wanted == VertexAttributes::default() {
         return Err(invalid("selection.without_vertices", "displacements or boxes instead", "neither"));
     }
     let options = [
@@ -110,7 +110,7 @@ fn check_kept(scene: &Scene, wanted: Wanted) -> Result<()> {
 ///
 /// # Errors
 /// `Invalid` when an index is out of range or the list is longer than the scene.
-pub fn checked_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<Vec<u32>> {
+pub fn validate_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<Vec<u32>> {
     let count = scene.domains.len();
     if domains.is_empty() {
         return Ok((0..count as u32).collect());
@@ -128,50 +128,52 @@ pub fn checked_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<
 /// displacements and all boxes, then the per-domain origins if they differ.
 ///
 /// # Errors
-/// `Fault` when `shown` does not contain vertices.
-pub async fn pack_vertices(shown: Shown, selection: &Arc<Selection>) -> Result<Packed> {
-    let Body::Vertices(surface) = shown.body else { return Err(during("copy")("a picture is no vertices")) };
-    let mut stages = shown.stages;
+/// `Fault` when `output` does not contain vertices.
+pub async fn pack_vertices(output: StepOutput, selection: &Arc<VertexSelection>) -> Result<PackedVertices> {
+    let OutputBody::Vertices(surface) = output.body else { return Err(fault_in("copy")("a picture is no vertices")) };
+    let mut stages = output.stages;
     let begin = Instant::now();
-    let (selection, cells) = (Arc::clone(selection), shown.cells);
+    let (selection, origins) = (Arc::clone(selection), output.origins);
     let work = move || {
         let mut bytes = pack(&surface, &selection);
         let before = bytes.len();
-        let origin = push_origins(&selection, cells.as_deref(), &mut bytes);
+        let origin = push_origins(&selection, origins.as_deref(), &mut bytes);
         Ok((origin, (bytes.len() - before) as u64, bytes))
     };
     let (origin, origin_bytes, bytes) = run_blocking("copy", work).await?;
     stages.push((Stage::Encode, ms_since(begin)));
-    let (step, skipped, paths) = (shown.step, shown.skipped, Paths::default());
-    let encoded = Encoded { step, skipped, stages, paths, bytes: bytes.into() };
-    Ok(Packed { encoded, origin, origin_bytes })
+    let (step, skipped, raster_backends) = (output.step, output.skipped, RasterBackends::default());
+    let encoded = EncodedOutput { step, skipped, stages, raster_backends, bytes: bytes.into() };
+    Ok(PackedVertices { encoded, origin, origin_bytes })
 }
 
 /// Returns the origin of the reply in meters; appends per-domain origins to `bytes` if any differs from it.
-fn push_origins(selection: &Selection, cells: Option<&Cells>, bytes: &mut Vec<u8>) -> [f64; 3] {
+fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, bytes: &mut Vec<u8>) -> [f64; 3] {
     let scene = &selection.scene;
-    let metres = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
-    let Some(cells) = cells else { return scene.origin };
-    let own = || selection.domains.iter().map(|domain| cells.cell_of(scene.movers.of(*domain as usize)));
-    if own().any(|cell| cell != cells.shared()) {
-        bytes.extend(own().map(metres).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
+    let meters = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
+    let Some(origins) = origins else { return scene.origin };
+    let own = || selection.domains.iter().map(|domain| origins.origin_of(scene.movers.of(*domain as usize)));
+    if own().any(|cell| cell != origins.shared()) {
+        bytes.extend(own().map(meters).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
     }
-    metres(cells.shared())
+    meters(origins.shared())
 }
 
-fn pack(surface: &Surface, selection: &Selection) -> Vec<u8> {
-    let (layout, wanted): (&Layout, Wanted) = (&selection.scene.layout, selection.wanted);
+fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
+    let (layout, wanted): (&Layout, VertexAttributes) = (&selection.scene.layout, selection.wanted);
     let corners: usize = if wanted.normals { selection.corners().map(|count| count as usize).sum() } else { 0 };
     let others = selection.position_bytes() + selection.displacement_bytes() + selection.box_bytes();
     let mut bytes = Vec::with_capacity(12 * corners + others as usize);
-    let mut put = |wanted: bool, numbers: &[f32], range: &dyn Fn(&Slot) -> (usize, usize)| {
+    let mut put = |wanted: bool, numbers: &[f32], range: &dyn Fn(&DomainLayout) -> (usize, usize)| {
         for domain in selection.domains.iter().filter(|_| wanted) {
             let (first, count) = range(&layout.slots[*domain as usize]);
             bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first..][..3 * count]));
         }
     };
-    let (vertices, corners) =
-        (|slot: &Slot| (slot.first_vertex, slot.vertices), |slot: &Slot| (slot.first_corner, slot.corners));
+    let (vertices, corners) = (
+        |slot: &DomainLayout| (slot.first_vertex, slot.vertices),
+        |slot: &DomainLayout| (slot.first_corner, slot.corners),
+    );
     put(wanted.positions, &surface.positions, &vertices);
     put(wanted.normals, &surface.normals, &corners);
     put(wanted.displacements, &surface.displacements, &vertices);
@@ -193,13 +195,14 @@ mod tests {
     fn a_selection_packs_positions_then_normals_of_its_domains_in_order() {
         let scene = testing::two_strips();
         let count = |from: f32, len: usize| (0..len).map(|at| from + at as f32).collect::<Vec<_>>();
-        let surface = Surface { positions: count(0.0, 24), normals: count(100.0, 24), ..Surface::default() };
-        let selection = Selection::new(&scene, vec![1], Wanted::VERTICES).expect("in range");
+        let surface =
+            DeformedSurface { positions: count(0.0, 24), normals: count(100.0, 24), ..DeformedSurface::default() };
+        let selection = VertexSelection::new(&scene, vec![1], VertexAttributes::VERTICES).expect("in range");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));
         assert_eq!(floats, [count(12.0, 12), count(112.0, 12)].concat());
         assert_eq!(selection.position_bytes(), 48);
-        let positions = Wanted { positions: true, ..Wanted::default() };
-        let bare = Selection::new(&scene, vec![1, 0], positions).expect("in range");
+        let positions = VertexAttributes { positions: true, ..VertexAttributes::default() };
+        let bare = VertexSelection::new(&scene, vec![1, 0], positions).expect("in range");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &bare));
         assert_eq!(floats, [count(12.0, 12), count(0.0, 12)].concat());
     }
@@ -207,37 +210,39 @@ mod tests {
     #[test]
     fn indices_out_of_range_and_lists_longer_than_the_scene_are_refused() {
         let scene = testing::two_strips();
-        let refusal = Selection::new(&scene, vec![0, 2], Wanted::VERTICES).expect_err("out of range").to_string();
+        let refusal =
+            VertexSelection::new(&scene, vec![0, 2], VertexAttributes::VERTICES).expect_err("out of range").to_string();
         assert!(refusal.starts_with("selection.domains[1]: expected an index below 2, given 2"), "{refusal}");
-        assert!(Selection::new(&scene, vec![0; 3], Wanted::VERTICES).is_err());
+        assert!(VertexSelection::new(&scene, vec![0; 3], VertexAttributes::VERTICES).is_err());
     }
 
     #[test]
     fn displacements_and_boxes_follow_the_normals_and_are_refused_where_the_scene_keeps_none() {
-        let (bare, kept) = (testing::two_strips(), testing::kept_strips());
+        let (bare, kept) = (testing::two_strips(), testing::strips_with_attributes());
         let count = |from: f32, len: usize| (0..len).map(|at| from + at as f32).collect::<Vec<_>>();
         let side = |from: f64| Bounds { min: [from; 3], max: [from + 1.0, from + 2.0, from + 3.0] };
-        let surface = Surface {
+        let surface = DeformedSurface {
             displacements: count(50.0, 24),
             boxes: vec![side(7.0), side(-3.5)],
             positions: count(0.0, 24),
-            ..Surface::default()
+            ..DeformedSurface::default()
         };
-        let wanted = Wanted { normals: false, ..Wanted::ALL };
-        let selection = Selection::new(&kept, vec![1], wanted).expect("kept");
+        let wanted = VertexAttributes { normals: false, ..VertexAttributes::ALL };
+        let selection = VertexSelection::new(&kept, vec![1], wanted).expect("kept");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));
         let sides = vec![-3.5, -3.5, -3.5, -2.5, -1.5, -0.5];
         assert_eq!(floats, [count(12.0, 12), count(62.0, 12), sides.clone()].concat());
         assert_eq!((selection.displacement_bytes(), selection.box_bytes()), (48, 24));
-        let boxes = Wanted { boxes: true, ..Wanted::default() };
-        let alone = Selection::new(&kept, vec![1], boxes).expect("kept");
+        let boxes = VertexAttributes { boxes: true, ..VertexAttributes::default() };
+        let alone = VertexSelection::new(&kept, vec![1], boxes).expect("kept");
         assert_eq!(bytemuck::pod_collect_to_vec::<u8, f32>(&pack(&surface, &alone)), sides);
         assert_eq!((alone.position_bytes(), alone.displacement_bytes()), (0, 0));
-        for (wanted, field) in [(boxes, "boxes"), (Wanted { displacements: true, ..boxes }, "displacements")] {
-            let refusal = Selection::new(&bare, vec![1], wanted).expect_err("not kept").to_string();
+        for (wanted, field) in [(boxes, "boxes"), (VertexAttributes { displacements: true, ..boxes }, "displacements")]
+        {
+            let refusal = VertexSelection::new(&bare, vec![1], wanted).expect_err("not kept").to_string();
             assert!(refusal.starts_with(&format!("selection.{field}: ")), "{refusal}");
             assert!(refusal.contains(&format!("deform.{field} = true")), "{refusal}");
         }
-        assert!(Selection::new(&kept, vec![1], Wanted::default()).is_err());
+        assert!(VertexSelection::new(&kept, vec![1], VertexAttributes::default()).is_err());
     }
 }

@@ -7,37 +7,37 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::OnceCell;
 
-use super::host::Host;
-use super::ledger::Origin;
-use super::not_open;
+use super::scene_catalog::SceneProvenance;
+use super::scene_handle::SceneHandle;
+use super::scene_not_open;
 use modalcast_model::error::{Error, Result};
 
 /// A reserved name, and its scene once the scene is loaded.
-pub(super) struct Seat {
-    origin: Origin,
-    cell: OnceCell<Arc<Host>>,
+pub(super) struct RegistryEntry {
+    provenance: SceneProvenance,
+    cell: OnceCell<Arc<SceneHandle>>,
     /// Number of concurrent openings; modified only under the registry's lock.
-    openings: AtomicUsize,
+    open_calls: AtomicUsize,
 }
 
-impl Seat {
+impl RegistryEntry {
     /// The scene, loaded by the first caller. The other callers wait; if the load fails, the next caller retries it.
     ///
     /// # Errors
     /// The error of `load`; `Busy` when the scene is being closed.
-    pub(super) async fn open<F>(&self, load: impl FnOnce() -> F) -> Result<Arc<Host>>
+    pub(super) async fn get_or_open<F>(&self, load: impl FnOnce() -> F) -> Result<Arc<SceneHandle>>
     where
-        F: Future<Output = Result<Arc<Host>>>,
+        F: Future<Output = Result<Arc<SceneHandle>>>,
     {
-        let host = self.cell.get_or_try_init(load).await?;
-        match host.is_closing() {
-            false => Ok(Arc::clone(host)),
+        let scene_handle = self.cell.get_or_try_init(load).await?;
+        match scene_handle.is_closing() {
+            false => Ok(Arc::clone(scene_handle)),
             true => Err(Error::Busy { queue: "the name of a scene that is being closed", limit: 1 }),
         }
     }
 
     /// The scene; `None` while it is not loaded.
-    pub(super) fn host(&self) -> Option<&Arc<Host>> {
+    pub(super) fn scene_handle(&self) -> Option<&Arc<SceneHandle>> {
         self.cell.get()
     }
 }
@@ -45,79 +45,88 @@ impl Seat {
 /// All reserved names.
 pub(super) struct Registry {
     limit: usize,
-    seats: Mutex<BTreeMap<String, Arc<Seat>>>,
+    entries: Mutex<BTreeMap<String, Arc<RegistryEntry>>>,
 }
 
 impl Registry {
     pub(super) const fn new(limit: usize) -> Self {
-        Self { limit, seats: Mutex::new(BTreeMap::new()) }
+        Self { limit, entries: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Reserves a name until [`Self::leave`], or joins an existing reservation with the same origin. With `fresh` the
+    /// Reserves a name until [`Self::release`], or joins an existing reservation with the same origin. With `fresh` the
     /// name must be free.
     ///
     /// # Errors
     /// `Taken` when the name is reserved for another origin, `Busy` when too many scenes are open.
-    pub(super) fn seat(&self, name: &str, origin: &Origin, fresh: bool) -> Result<Arc<Seat>> {
-        let mut seats = self.lock();
-        if let Some(seat) = seats.get(name) {
-            return match !fresh && seat.origin == *origin {
+    pub(super) fn entry(&self, name: &str, provenance: &SceneProvenance, fresh: bool) -> Result<Arc<RegistryEntry>> {
+        let mut entries = self.lock();
+        if let Some(entry) = entries.get(name) {
+            return match !fresh && entry.provenance == *provenance {
                 true => {
-                    seat.openings.fetch_add(1, Ordering::Relaxed);
-                    Ok(Arc::clone(seat))
+                    entry.open_calls.fetch_add(1, Ordering::Relaxed);
+                    Ok(Arc::clone(entry))
                 }
-                false => Err(taken(name, seat)),
+                false => Err(taken(name, entry)),
             };
         }
-        if seats.len() >= self.limit {
+        if entries.len() >= self.limit {
             return Err(Error::Busy { queue: "list of open scenes", limit: self.limit });
         }
-        let seat = Arc::new(Seat { origin: origin.clone(), cell: OnceCell::new(), openings: AtomicUsize::new(1) });
-        seats.insert(name.to_owned(), Arc::clone(&seat));
-        Ok(seat)
+        let entry = Arc::new(RegistryEntry {
+            provenance: provenance.clone(),
+            cell: OnceCell::new(),
+            open_calls: AtomicUsize::new(1),
+        });
+        entries.insert(name.to_owned(), Arc::clone(&entry));
+        Ok(entry)
     }
 
     pub(super) fn check_free(&self, name: &str) -> Result<()> {
-        self.lock().get(name).map_or(Ok(()), |seat| Err(taken(name, seat)))
+        self.lock().get(name).map_or(Ok(()), |entry| Err(taken(name, entry)))
     }
 
-    pub(super) fn seat_of(&self, name: &str) -> Option<Arc<Seat>> {
+    pub(super) fn find_entry(&self, name: &str) -> Option<Arc<RegistryEntry>> {
         self.lock().get(name).cloned()
     }
 
-    pub(super) fn find(&self, name: &str) -> Result<Arc<Host>> {
-        let seats = self.lock();
-        let host = seats.get(name).and_then(|seat| seat.host()).filter(|host| !host.is_closing());
-        host.cloned().ok_or_else(|| not_open(name))
+    pub(super) fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
+        let entries = self.lock();
+        let scene_handle =
+            entries.get(name).and_then(|entry| entry.scene_handle()).filter(|scene_handle| !scene_handle.is_closing());
+        scene_handle.cloned().ok_or_else(|| scene_not_open(name))
     }
 
-    pub(super) fn list(&self) -> Vec<Arc<Host>> {
-        self.lock().values().filter_map(|seat| seat.host().cloned()).filter(|host| !host.is_closing()).collect()
+    pub(super) fn list(&self) -> Vec<Arc<SceneHandle>> {
+        self.lock()
+            .values()
+            .filter_map(|entry| entry.scene_handle().cloned())
+            .filter(|scene_handle| !scene_handle.is_closing())
+            .collect()
     }
 
     /// Ends an opening. The last one releases the name if no scene was loaded.
-    pub(super) fn leave(&self, name: &str, seat: &Arc<Seat>) {
-        let mut seats = self.lock();
-        let is_last = seat.openings.fetch_sub(1, Ordering::Relaxed) == 1;
-        if is_last && seat.host().is_none() {
-            seats.remove(name);
+    pub(super) fn release(&self, name: &str, entry: &Arc<RegistryEntry>) {
+        let mut entries = self.lock();
+        let is_last = entry.open_calls.fetch_sub(1, Ordering::Relaxed) == 1;
+        if is_last && entry.scene_handle().is_none() {
+            entries.remove(name);
         }
     }
 
     /// Releases the name of a closed scene unless another opening has reserved it since.
-    pub(super) fn remove(&self, name: &str, seat: &Arc<Seat>) {
-        let mut seats = self.lock();
-        if seats.get(name).is_some_and(|held| Arc::ptr_eq(held, seat)) {
-            seats.remove(name);
+    pub(super) fn remove(&self, name: &str, entry: &Arc<RegistryEntry>) {
+        let mut entries = self.lock();
+        if entries.get(name).is_some_and(|held| Arc::ptr_eq(held, entry)) {
+            entries.remove(name);
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Seat>>> {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<RegistryEntry>>> {
         // Every change under the lock is one insertion or removal, so the map behind a poisoned lock is valid.
-        self.seats.lock().unwrap_or_else(PoisonError::into_inner)
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn taken(name: &str, seat: &Seat) -> Error {
-    Error::Taken { what: "the name of the scene", holder: format!("'{name}' is {}", seat.origin.source()) }
+fn taken(name: &str, entry: &RegistryEntry) -> Error {
+    Error::Taken { what: "the name of the scene", holder: format!("'{name}' is {}", entry.provenance.label()) }
 }

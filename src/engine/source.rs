@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use modalcast_model::error::Result;
-use modalcast_model::load::Repository;
+use modalcast_model::load::SceneRepository;
 use modalcast_model::scene::Scene;
 
 /// Opens scenes for the engine. The engine calls it on threads that may block on the disk.
@@ -25,7 +25,7 @@ pub trait SceneSource: Send + Sync + 'static {
     fn list(&self) -> Vec<String>;
 }
 
-impl SceneSource for Repository {
+impl SceneSource for SceneRepository {
     fn open(&self, source: &str) -> Result<Arc<Scene>> {
         Self::open(self, source)
     }

@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
-use super::map::viridis;
-use modalcast_model::error::{Result, during};
+use super::colormap::viridis;
+use modalcast_model::error::{Result, fault_in};
 
 /// Title and scale of a color map.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,7 +15,7 @@ pub struct Legend {
 }
 
 /// The smallest width and height in pixels of a picture that gets a legend.
-const ROOM: [u32; 2] = [240, 160];
+const MIN_SIZE: [u32; 2] = [240, 160];
 /// Width and height of the legend's box in pixels of a picture with 720 rows; scaled for other sizes.
 const WIDTH: f64 = 330.0;
 const HEIGHT: f64 = 84.0;
@@ -30,15 +30,15 @@ const STOPS: u32 = 64;
 /// # Errors
 /// `Fault` when the legend cannot be rasterized.
 pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Result<()> {
-    if width < ROOM[0] || height < ROOM[1] {
+    if width < MIN_SIZE[0] || height < MIN_SIZE[1] {
         return Ok(());
     }
     let scale = (f64::from(height) / 720.0).max(0.62).min(f64::from(width) / (1.15 * WIDTH));
     let mut options = resvg::usvg::Options::default();
     options.fontdb_mut().load_font_data(dejavu::sans::regular().to_vec());
-    let tree = resvg::usvg::Tree::from_str(&svg(legend), &options).map_err(during("legend"))?;
+    let tree = resvg::usvg::Tree::from_str(&svg(legend), &options).map_err(fault_in("legend"))?;
     let size = [(WIDTH * scale).ceil() as u32, (HEIGHT * scale).ceil() as u32];
-    let too_large = || during("legend")("it is too large");
+    let too_large = || fault_in("legend")("it is too large");
     let mut pixels = resvg::tiny_skia::Pixmap::new(size[0], size[1]).ok_or_else(too_large)?;
     let scaled = resvg::tiny_skia::Transform::from_scale(scale as f32, scale as f32);
     resvg::render(&tree, scaled, &mut pixels.as_mut());
@@ -58,7 +58,7 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
 
 /// Rounds up to 1, 2, 2.5 or 5 times a power of ten, so that the scale has readable ticks. Returns 1 for values that
 /// are not finite and positive.
-pub fn round_up(value: f64) -> f64 {
+pub fn nice_ceiling(value: f64) -> f64 {
     if !(value.is_finite() && value > 0.0) {
         return 1.0;
     }
@@ -134,7 +134,7 @@ mod tests {
 
     #[test]
     fn scales_end_at_numbers_that_people_can_read() {
-        let rounded = [0.013, 0.2, 0.21, 3.0, 7.0, 1e-9, 1e9, 0.0, f64::NAN].map(round_up);
+        let rounded = [0.013, 0.2, 0.21, 3.0, 7.0, 1e-9, 1e9, 0.0, f64::NAN].map(nice_ceiling);
         for (got, want) in rounded.iter().zip([0.02, 0.2, 0.25, 5.0, 10.0, 1e-9, 1e9, 1.0, 1.0]) {
             assert!((got / want - 1.0).abs() < 1e-9, "{got} is not {want}");
         }

@@ -1,21 +1,21 @@
 //! Encodes pixels as PNG and values as color maps. Pure functions that run off the device thread.
 
+mod colormap;
 mod legend;
-mod map;
 
-pub use legend::{Legend, draw as draw_legend, round_up};
-pub use map::{paint, viridis};
+pub use colormap::{apply_colormap, viridis};
+pub use legend::{Legend, draw as draw_legend, nice_ceiling};
 
 use modalcast_model::error::Result;
 
 /// Converts an AOV of values to RGBA8 sRGB pixels with a legend. `words` are little-endian u32, `samples` per pixel;
-/// see [`paint`]. `size` is the width and height in pixels.
+/// see [`apply_colormap`]. `size` is the width and height in pixels.
 ///
 /// # Errors
 /// `Fault` when the legend cannot be drawn.
-pub fn colour_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -> Result<Vec<u8>> {
+pub fn color_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -> Result<Vec<u8>> {
     let words: Vec<u32> = bytemuck::pod_collect_to_vec(words);
-    let mut rgba = paint(&words, samples as usize);
+    let mut rgba = apply_colormap(&words, samples as usize);
     draw_legend(&mut rgba, size, legend)?;
     Ok(rgba)
 }
@@ -25,10 +25,10 @@ pub fn colour_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -
 ///
 /// # Errors
 /// `Fault` when the encoder fails.
-pub fn png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
+pub fn encode_png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
     match opaque_rgb(rgba) {
-        Some(rgb) => encode_png(width, height, png::ColorType::Rgb, &rgb),
-        None => encode_png(width, height, png::ColorType::Rgba, rgba),
+        Some(rgb) => write_png(width, height, png::ColorType::Rgb, &rgb),
+        None => write_png(width, height, png::ColorType::Rgba, rgba),
     }
 }
 
@@ -45,8 +45,8 @@ fn opaque_rgb(rgba: &[u8]) -> Option<Vec<u8>> {
     Some(rgb)
 }
 
-fn encode_png(width: u32, height: u32, color: png::ColorType, pixels: &[u8]) -> Result<Vec<u8>> {
-    let fail = modalcast_model::error::during::<png::EncodingError>("encode");
+fn write_png(width: u32, height: u32, color: png::ColorType, pixels: &[u8]) -> Result<Vec<u8>> {
+    let fail = modalcast_model::error::fault_in::<png::EncodingError>("encode");
     let mut bytes = Vec::with_capacity(pixels.len() / 4);
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(color);
@@ -73,7 +73,7 @@ mod tests {
         let mut last_is_translucent = opaque.clone();
         last_is_translucent[4 * 5 * 3 - 1] = 254;
         for (pixels, has_alpha) in [(translucent, true), (opaque, false), (last_is_translucent, true)] {
-            let decoded = image::load_from_memory(&png(5, 3, &pixels).expect("encodes")).expect("decodes");
+            let decoded = image::load_from_memory(&encode_png(5, 3, &pixels).expect("encodes")).expect("decodes");
             assert_eq!(decoded.color().has_alpha(), has_alpha);
             let decoded = decoded.into_rgba8();
             assert_eq!((decoded.dimensions(), decoded.into_raw()), ((5, 3), pixels));

@@ -2,20 +2,20 @@
 //! tangents of the deformed surface.
 //!
 //! Vertices are read back only on request. [`Deformer::surface`] blocks until they are in host memory;
-//! [`Deformer::fetch`] starts a readback that can overlap the next step.
+//! [`Deformer::readback`] starts a readback that can overlap the next step.
 //!
 //! Three backends implement [`Deformer`]: `reference` (f64, the definition), `cpu` (f32, rayon and SIMD) and `gpu`
 //! (CUDA).
 
 use std::sync::Arc;
 
-use crate::error::{Result, during};
-use crate::scene::{Bounds, LightBounds, State};
+use crate::error::{Result, fault_in};
+use crate::scene::{Bounds, LightSpaceBox, SceneState};
 
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Surface {
-    /// World positions, three numbers per vertex, relative to the cell of their domain ([`State::cell_of`]). The cell
+pub struct DeformedSurface {
+    /// World positions, three numbers per vertex, relative to the cell of their domain ([`SceneState::origin_of`]). The cell
     /// is the scene's origin unless a step with f64 translations moved the domain far from it.
     pub positions: Vec<f32>,
     /// World-space unit normals, three numbers per corner.
@@ -30,9 +30,9 @@ pub struct Surface {
     pub boxes: Vec<Bounds>,
 }
 
-impl Surface {
+impl DeformedSurface {
     /// Copies the requested attributes. Tangents are never copied: only the renderer uses them.
-    fn only(&self, wanted: Wanted) -> Self {
+    fn select(&self, wanted: VertexAttributes) -> Self {
         let list = |wanted: bool, list: &Vec<f32>| if wanted { list.clone() } else { Vec::new() };
         Self {
             positions: list(wanted.positions, &self.positions),
@@ -44,17 +44,17 @@ impl Surface {
     }
 }
 
-/// Attributes of a [`Surface`] to read back. The default is none.
+/// Attributes of a [`DeformedSurface`] to read back. The default is none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Wanted {
+pub struct VertexAttributes {
     pub positions: bool,
-    /// Normals, and tangents where a deformer reads them in place. A [`Fetch`] never contains tangents.
+    /// Normals, and tangents where a deformer reads them in place. A [`VertexReadback`] never contains tangents.
     pub normals: bool,
     pub displacements: bool,
     pub boxes: bool,
 }
 
-impl Wanted {
+impl VertexAttributes {
     /// The attributes that are needed for drawing.
     pub const VERTICES: Self = Self { positions: true, normals: true, displacements: false, boxes: false };
     /// Every attribute.
@@ -62,7 +62,7 @@ impl Wanted {
 
     /// The union of both sets.
     #[must_use]
-    pub const fn or(self, other: Self) -> Self {
+    pub const fn union(self, other: Self) -> Self {
         Self {
             positions: self.positions || other.positions,
             normals: self.normals || other.normals,
@@ -72,46 +72,46 @@ impl Wanted {
     }
 
     /// Whether `other` is a subset of this set.
-    pub fn covers(self, other: Self) -> bool {
-        self.or(other) == self
+    pub fn contains(self, other: Self) -> bool {
+        self.union(other) == self
     }
 }
 
 /// A readback of one step's vertices, in flight or complete. Deforming later steps does not change its contents. It can
 /// be awaited at any time, more than once, or never. Its memory stays allocated while this handle or the result of
-/// [`Deformer::fetched`] is alive.
+/// [`Deformer::wait_readback`] is alive.
 ///
 /// A pending readback does not expose its vertices, because the device may still write them. Only the deformer that
 /// started it can complete it.
 #[derive(Debug, Clone)]
-pub struct Fetch {
-    surface: Arc<Surface>,
+pub struct VertexReadback {
+    surface: Arc<DeformedSurface>,
     is_ready: bool,
 }
 
-impl Fetch {
+impl VertexReadback {
     /// A readback in flight. The deformer identifies it by [`Self::is_of`].
-    pub const fn pending(surface: Arc<Surface>) -> Self {
+    pub const fn pending(surface: Arc<DeformedSurface>) -> Self {
         Self { surface, is_ready: false }
     }
 
     /// A completed readback.
-    pub const fn ready(surface: Arc<Surface>) -> Self {
+    pub const fn ready(surface: Arc<DeformedSurface>) -> Self {
         Self { surface, is_ready: true }
     }
 
-    /// Whether the readback was complete when it was created, so that [`Deformer::fetched`] does not block.
+    /// Whether the readback was complete when it was created, so that [`Deformer::wait_readback`] does not block.
     pub const fn is_ready(&self) -> bool {
         self.is_ready
     }
 
     /// Whether this readback writes to `surface`.
-    pub fn is_of(&self, surface: &Arc<Surface>) -> bool {
+    pub fn is_of(&self, surface: &Arc<DeformedSurface>) -> bool {
         Arc::ptr_eq(&self.surface, surface)
     }
 
     /// The vertices, or `None` if they may still be in flight.
-    fn complete(&self) -> Option<&Arc<Surface>> {
+    fn complete(&self) -> Option<&Arc<DeformedSurface>> {
         self.is_ready.then_some(&self.surface)
     }
 }
@@ -138,8 +138,8 @@ impl Backend {
 
 /// The result of [`Deformer::deform`] apart from the vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Deformed {
-    /// Bounds of all deformed positions in the coordinates of [`Surface::positions`]. Not finite if f32 overflowed in a
+pub struct DeformSummary {
+    /// Bounds of all deformed positions in the coordinates of [`DeformedSurface::positions`]. Not finite if f32 overflowed in a
     /// position or in a stored displacement.
     pub bounds: Bounds,
     /// Bounds of the same positions along the axes of light space ([`Scene::light_axes`](crate::scene::Scene)),
@@ -147,7 +147,7 @@ pub struct Deformed {
     /// contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
     /// each: they exceed the tight bounds by less than the diagonal of such a box, and never extend beyond the corners
     /// of `bounds` by more than rounding.
-    pub light: Option<LightBounds>,
+    pub light: Option<LightSpaceBox>,
     /// Milliseconds from the call until the vertices were complete. If they are written to the renderer's own buffers,
     /// the wait for frames that still read these buffers is not included.
     pub ms: f64,
@@ -162,7 +162,7 @@ pub trait Deformer {
     ///
     /// # Errors
     /// `Fault` if the device fails.
-    fn deform(&mut self, state: &State) -> Result<Deformed>;
+    fn deform(&mut self, state: &SceneState) -> Result<DeformSummary>;
 
     /// Whether the output is written to the renderer's own buffers, so that no upload is needed.
     fn shares_buffers(&self) -> bool {
@@ -173,33 +173,33 @@ pub trait Deformer {
     ///
     /// # Errors
     /// `Fault` if the copy from the device fails.
-    fn surface(&mut self) -> Result<&Surface>;
+    fn surface(&mut self) -> Result<&DeformedSurface>;
 
     /// Like [`Self::surface`], but only the attributes in `wanted` are guaranteed. The others may be empty or belong to
     /// an earlier step. A deformer whose output is in host memory returns all of them.
     ///
     /// # Errors
     /// As for [`Self::surface`].
-    fn read(&mut self, _wanted: Wanted) -> Result<&Surface> {
+    fn read(&mut self, _wanted: VertexAttributes) -> Result<&DeformedSurface> {
         self.surface()
     }
 
     /// Starts a readback of the attributes in `wanted` of the last [`Self::deform`]. All other arrays of the resulting
-    /// [`Surface`] are empty; tangents are never read back. Positions and normals may still be in flight while the next
+    /// [`DeformedSurface`] are empty; tangents are never read back. Positions and normals may still be in flight while the next
     /// step is deformed. Displacements and boxes are complete when this returns.
     ///
     /// # Errors
     /// `Fault` if no step was deformed yet, or if the copy from the device fails.
-    fn fetch(&mut self, wanted: Wanted) -> Result<Fetch> {
-        Ok(Fetch::ready(Arc::new(self.read(wanted)?.only(wanted))))
+    fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
+        Ok(VertexReadback::ready(Arc::new(self.read(wanted)?.select(wanted))))
     }
 
     /// Blocks until the readback is complete.
     ///
     /// # Errors
     /// `Fault` if the copy from the device fails, or if another deformer started the readback.
-    fn fetched(&mut self, fetch: &Fetch) -> Result<Arc<Surface>> {
-        fetch.complete().cloned().ok_or_else(|| during("fetch")("it was begun by another deformer"))
+    fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
+        readback.complete().cloned().ok_or_else(|| fault_in("fetch")("it was begun by another deformer"))
     }
 }
 
@@ -209,51 +209,54 @@ mod tests {
 
     #[test]
     fn a_reader_is_served_by_what_holds_all_that_it_wants() {
-        let boxes = Wanted { boxes: true, ..Wanted::default() };
-        assert!(Wanted::ALL.covers(Wanted::VERTICES.or(boxes)) && Wanted::VERTICES.or(boxes).covers(boxes));
-        assert!(!Wanted::VERTICES.covers(boxes) && !boxes.covers(Wanted::VERTICES));
-        assert!(boxes.covers(Wanted::default()) && !Wanted::default().covers(boxes));
+        let boxes = VertexAttributes { boxes: true, ..VertexAttributes::default() };
+        assert!(
+            VertexAttributes::ALL.contains(VertexAttributes::VERTICES.union(boxes))
+                && VertexAttributes::VERTICES.union(boxes).contains(boxes)
+        );
+        assert!(!VertexAttributes::VERTICES.contains(boxes) && !boxes.contains(VertexAttributes::VERTICES));
+        assert!(boxes.contains(VertexAttributes::default()) && !VertexAttributes::default().contains(boxes));
     }
 
     /// A deformer whose output is in host memory.
-    struct OnHost(Surface);
+    struct OnHost(DeformedSurface);
 
     impl Deformer for OnHost {
         fn backend(&self) -> Backend {
             Backend::Cpu
         }
 
-        fn deform(&mut self, _: &State) -> Result<Deformed> {
-            Ok(Deformed { bounds: Bounds::EMPTY, light: None, ms: 0.0 })
+        fn deform(&mut self, _: &SceneState) -> Result<DeformSummary> {
+            Ok(DeformSummary { bounds: Bounds::EMPTY, light: None, ms: 0.0 })
         }
 
-        fn surface(&mut self) -> Result<&Surface> {
+        fn surface(&mut self) -> Result<&DeformedSurface> {
             Ok(&self.0)
         }
     }
 
     #[test]
     fn a_pending_fetch_of_another_deformer_is_refused() {
-        let mut deformer = OnHost(Surface { positions: vec![1.0], ..Surface::default() });
-        let own = deformer.fetch(Wanted::ALL).expect("fetches");
-        assert_eq!(deformer.fetched(&own).expect("its own").positions, [1.0]);
-        let pending = Fetch::pending(Arc::new(Surface::default()));
-        let error = deformer.fetched(&pending).expect_err("a device may be writing it").to_string();
+        let mut deformer = OnHost(DeformedSurface { positions: vec![1.0], ..DeformedSurface::default() });
+        let own = deformer.readback(VertexAttributes::ALL).expect("fetches");
+        assert_eq!(deformer.wait_readback(&own).expect("its own").positions, [1.0]);
+        let pending = VertexReadback::pending(Arc::new(DeformedSurface::default()));
+        let error = deformer.wait_readback(&pending).expect_err("a device may be writing it").to_string();
         assert!(error.contains("another deformer"), "{error}");
     }
 
     #[test]
     fn a_copy_has_what_is_wanted_and_never_tangents() {
-        let whole = Surface {
+        let whole = DeformedSurface {
             positions: vec![1.0],
             normals: vec![2.0],
             tangents: vec![3.0],
             displacements: vec![4.0],
             boxes: vec![Bounds::EMPTY],
         };
-        assert_eq!(whole.only(Wanted::ALL), Surface { tangents: vec![], ..whole.clone() });
-        assert_eq!(whole.only(Wanted::default()), Surface::default());
-        let normals = Wanted { normals: true, ..Wanted::default() };
-        assert_eq!(whole.only(normals), Surface { normals: vec![2.0], ..Surface::default() });
+        assert_eq!(whole.select(VertexAttributes::ALL), DeformedSurface { tangents: vec![], ..whole.clone() });
+        assert_eq!(whole.select(VertexAttributes::default()), DeformedSurface::default());
+        let normals = VertexAttributes { normals: true, ..VertexAttributes::default() };
+        assert_eq!(whole.select(normals), DeformedSurface { normals: vec![2.0], ..DeformedSurface::default() });
     }
 }

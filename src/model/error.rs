@@ -39,14 +39,14 @@ pub fn invalid(field: impl Into<String>, expected: impl Into<String>, given: imp
 }
 
 /// Converts any library error to an [`Error::Fault`] of `stage`, for use with `map_err`.
-pub fn during<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Error {
+pub fn fault_in<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Error {
     move |error| Error::Fault { stage, reason: error.to_string() }
 }
 
 impl Error {
     /// Prefixes the field of an [`Error::Invalid`] with `place`, so that the message contains the whole path. Other
     /// variants remain unchanged.
-    pub fn within(self, place: &str) -> Self {
+    pub fn prefix_field(self, place: &str) -> Self {
         match self {
             Self::Invalid { field, expected, given } => {
                 Self::Invalid { field: format!("{place}: {field}"), expected, given }

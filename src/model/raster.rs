@@ -6,7 +6,7 @@
 //! the last bits of filtered images.
 
 use crate::error::Result;
-use crate::scene::{Group, Window};
+use crate::scene::{DrawRange, Viewport};
 
 /// A buffer of the OpenGL context that is current on the calling thread.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,13 +17,13 @@ pub struct GlBuffer {
 
 /// The geometry to draw.
 #[derive(Debug, Clone)]
-pub struct Mesh {
+pub struct RasterGeometry {
     /// Three f32 per vertex, rewritten by every step.
     pub positions: GlBuffer,
     /// Vertex indices. The id of a triangle is its index in this list.
     pub triangles: Vec<[u32; 3]>,
     /// Consecutive ranges that together cover all triangles.
-    pub groups: Vec<Group>,
+    pub groups: Vec<DrawRange>,
     /// Alpha-tested triangles; `None` if the mesh has none.
     pub cut_outs: Option<CutOuts>,
 }
@@ -35,19 +35,19 @@ pub struct CutOuts {
     pub first: u32,
     /// Per alpha-tested triangle, the texture coordinates of its corners.
     pub uvs: Vec<[[f32; 2]; 3]>,
-    /// Per alpha-tested triangle, its index in `table`.
-    pub surfaces: Vec<u32>,
-    pub table: Vec<Surface>,
+    /// Per alpha-tested triangle, its index in `materials`.
+    pub material_indices: Vec<u32>,
+    pub materials: Vec<AlphaMaterial>,
     pub images: Vec<AlphaImage>,
     /// Maximum anisotropy: the largest number of samples along the major axis of a pixel's footprint, at least 1.
     pub anisotropy: f32,
 }
 
-/// Alpha-test parameters of a material. A sample survives if `alpha` times the image's alpha is at least `least`.
+/// Alpha-test parameters of a material. A sample survives if `alpha` times the image's alpha is at least `cutoff`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Surface {
+pub struct AlphaMaterial {
     pub alpha: f32,
-    pub least: f32,
+    pub cutoff: f32,
     /// Index in [`CutOuts::images`].
     pub image: Option<u32>,
 }
@@ -63,13 +63,13 @@ pub struct AlphaImage {
 }
 
 /// A window and the buffer that receives its samples.
-pub type Order<'a> = (&'a Window, GlBuffer);
+pub type DrawTarget<'a> = (&'a Viewport, GlBuffer);
 
 /// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
 /// host. The implementation may keep the position buffer and the target buffers registered. The caller must therefore
 /// delete the position buffer only after it drops the rasterizer, and a target only after
-/// [`forget`](Rasteriser::forget).
-pub trait Rasteriser: std::fmt::Debug {
+/// [`release_target`](Rasteriser::forget).
+pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.
     ///
@@ -79,14 +79,14 @@ pub trait Rasteriser: std::fmt::Debug {
     ///
     /// # Errors
     /// `Fault` if the device fails, or if a buffer is unknown or smaller than its window.
-    fn draw(&mut self, depth: Option<Order<'_>>, ids: Option<Order<'_>>) -> Result<()>;
+    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()>;
 
     /// Compiles the kernels for depth, id, or both passes ahead of the first frame.
     ///
     /// # Errors
     /// `Unavailable` if there is no compiler; `Fault` if compilation fails.
-    fn make_ready(&mut self, depth: bool, ids: bool) -> Result<()>;
+    fn precompile(&mut self, depth: bool, ids: bool) -> Result<()>;
 
     /// Releases a target buffer. Call it before OpenGL deletes the buffer, because OpenGL may reuse the name.
-    fn forget(&mut self, _name: u32) {}
+    fn release_target(&mut self, _name: u32) {}
 }

@@ -1,7 +1,7 @@
 //! EGL devices: describes all of them for `doctor`, and selects one.
 
-use super::Prefer;
-use super::egl::{Candidate, Context, candidates, none_fits};
+use super::DevicePreference;
+use super::egl::{Candidate, Context, candidates, no_device_error};
 use super::gl::Gl;
 use modalcast_model::error::{Error, Result};
 
@@ -55,9 +55,9 @@ fn describe(candidate: Candidate) -> EglDevice {
 }
 
 /// Opens the preferred device and returns it with the ordinal of its CUDA device.
-pub(super) fn open(prefer: Prefer) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
+pub(super) fn open(prefer: DevicePreference) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
     let mut tried = Vec::new();
-    for (candidate, software) in order(candidates()?, prefer) {
+    for (candidate, software) in rank_candidates(candidates()?, prefer) {
         let name = candidate.index.map_or("surfaceless".to_string(), |index| format!("device {index}"));
         match Context::open(&candidate).and_then(Gl::new) {
             Ok(gl) if software.is_none_or(|software| software == gl.limits.software) => {
@@ -70,17 +70,19 @@ pub(super) fn open(prefer: Prefer) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
     Err(refusal(prefer, &tried))
 }
 
-fn refusal(prefer: Prefer, tried: &[String]) -> Error {
+fn refusal(prefer: DevicePreference, tried: &[String]) -> Error {
     match prefer {
-        Prefer::Cuda(ordinal) => none_fits(&format!("the EGL device that is CUDA device {ordinal}"), tried),
-        Prefer::Any => none_fits("any device", tried),
-        Prefer::Software => none_fits("Mesa's software rasteriser", tried),
+        DevicePreference::Cuda(ordinal) => {
+            no_device_error(&format!("the EGL device that is CUDA device {ordinal}"), tried)
+        }
+        DevicePreference::Any => no_device_error("any device", tried),
+        DevicePreference::Software => no_device_error("Mesa's software rasterizer", tried),
     }
 }
 
 /// The candidates to try, best first. The flag says whether the context must be a software one (`true`) or hardware
 /// (`false`).
-fn order(found: Vec<Candidate>, prefer: Prefer) -> Vec<(Candidate, Option<bool>)> {
+fn rank_candidates(found: Vec<Candidate>, prefer: DevicePreference) -> Vec<(Candidate, Option<bool>)> {
     let hardware = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
         (Some(_), _) => 0,
         (None, Some(_)) => 1,
@@ -93,12 +95,12 @@ fn order(found: Vec<Candidate>, prefer: Prefer) -> Vec<(Candidate, Option<bool>)
         list.into_iter().map(|candidate| (candidate, wanted)).collect::<Vec<_>>()
     };
     match prefer {
-        Prefer::Cuda(ordinal) => {
+        DevicePreference::Cuda(ordinal) => {
             let is_it = |candidate: &Candidate| candidate.cuda_device == Some(ordinal);
             found.into_iter().filter(is_it).map(|candidate| (candidate, None)).collect()
         }
-        Prefer::Software => sorted(&software, Some(true)),
-        Prefer::Any => {
+        DevicePreference::Software => sorted(&software, Some(true)),
+        DevicePreference::Any => {
             let mut list = sorted(&hardware, Some(false));
             list.retain(|(candidate, _)| !candidate.software);
             list.extend(sorted(&software, Some(true)));

@@ -10,14 +10,14 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use khronos_egl as egl;
 
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 type Instance = egl::DynamicInstance<egl::EGL1_4>;
-type Raw = *mut c_void;
-type QueryDevices = unsafe extern "system" fn(i32, *mut Raw, *mut i32) -> u32;
-type QueryAttribute = unsafe extern "system" fn(Raw, i32, *mut isize) -> u32;
-type QueryString = unsafe extern "system" fn(Raw, i32) -> *const c_char;
-type PlatformDisplay = unsafe extern "system" fn(u32, *mut c_void, *const i32) -> Raw;
+type EglHandle = *mut c_void;
+type QueryDevices = unsafe extern "system" fn(i32, *mut EglHandle, *mut i32) -> u32;
+type QueryAttribute = unsafe extern "system" fn(EglHandle, i32, *mut isize) -> u32;
+type QueryString = unsafe extern "system" fn(EglHandle, i32) -> *const c_char;
+type PlatformDisplay = unsafe extern "system" fn(u32, *mut c_void, *const i32) -> EglHandle;
 
 const PLATFORM_DEVICE: u32 = 0x313F;
 const PLATFORM_SURFACELESS: u32 = 0x31DD;
@@ -27,16 +27,16 @@ const DRIVER_NAME: i32 = 0x335E;
 /// EGL_CONTEXT_FLAGS_KHR and EGL_CONTEXT_OPENGL_DEBUG_BIT_KHR.
 const CONTEXT_FLAGS: i32 = 0x30FC;
 const DEBUG_BIT: i32 = 1;
-const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasteriser), or the NVIDIA \
+const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasterizer), or the NVIDIA \
                       driver's libEGL_nvidia.so.0 with its vendor file 10_nvidia.json in /usr/share/glvnd/egl_vendor.d";
 
 /// Serializes display queries and the creation and destruction of contexts: drivers are known to race there.
-static DOOR: Mutex<()> = Mutex::new(());
-static NEXT: AtomicU64 = AtomicU64::new(1);
+static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
+static NEXT_CONTEXT_ID: AtomicU64 = AtomicU64::new(1);
 
 thread_local! {
     /// Number of the context that is current on this thread; 0 for none.
-    static CURRENT: Cell<u64> = const { Cell::new(0) };
+    static CURRENT_CONTEXT: Cell<u64> = const { Cell::new(0) };
 }
 
 /// A display on which a context can be created.
@@ -62,7 +62,7 @@ pub(super) struct Context {
     pub(super) is_debug: bool,
 }
 
-struct Api {
+struct EglApi {
     instance: Instance,
     query_devices: Option<QueryDevices>,
     query_attribute: Option<QueryAttribute>,
@@ -74,17 +74,17 @@ fn unavailable(reason: impl Into<String>) -> Error {
     Error::Unavailable { what: "headless OpenGL (EGL)", reason: reason.into(), remedy: REMEDY.into() }
 }
 
-fn door() -> MutexGuard<'static, ()> {
+fn lock_contexts() -> MutexGuard<'static, ()> {
     // The lock guards no data, so a poisoned lock is safe to use.
-    DOOR.lock().unwrap_or_else(PoisonError::into_inner)
+    CONTEXT_LOCK.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn api() -> Result<&'static Api> {
-    static API: OnceLock<Result<Api>> = OnceLock::new();
-    API.get_or_init(Api::load).as_ref().map_err(Clone::clone)
+fn api() -> Result<&'static EglApi> {
+    static API: OnceLock<Result<EglApi>> = OnceLock::new();
+    API.get_or_init(EglApi::load).as_ref().map_err(Clone::clone)
 }
 
-impl Api {
+impl EglApi {
     fn load() -> Result<Self> {
         // SAFETY: loading libEGL runs the initializers of libEGL and of its vendor libraries, which is their purpose.
         let instance = unsafe { Instance::load_required_from_filename("libEGL.so.1") }
@@ -107,7 +107,7 @@ impl Api {
         Ok(Self { instance, query_devices, query_attribute, query_string, platform_display })
     }
 
-    fn devices(&self) -> Vec<Raw> {
+    fn devices(&self) -> Vec<EglHandle> {
         let Some(query) = self.query_devices else { return Vec::new() };
         let mut devices = [std::ptr::null_mut(); 64];
         let mut count = 0;
@@ -117,7 +117,7 @@ impl Api {
         devices[..count.min(devices.len())].to_vec()
     }
 
-    fn text(&self, device: Raw, name: i32) -> Option<String> {
+    fn text(&self, device: EglHandle, name: i32) -> Option<String> {
         let query = self.query_string?;
         // SAFETY: the device came from eglQueryDevicesEXT; the result is null or a string that lives as long as EGL.
         unsafe {
@@ -126,14 +126,14 @@ impl Api {
         }
     }
 
-    fn cuda_device(&self, device: Raw) -> Option<i32> {
+    fn cuda_device(&self, device: EglHandle) -> Option<i32> {
         let mut value = -1_isize;
         // SAFETY: the device came from eglQueryDevicesEXT and the value outlives the call.
         let good = unsafe { self.query_attribute?(device, CUDA_DEVICE, &raw mut value) };
         (good != 0).then(|| i32::try_from(value).ok()).flatten()
     }
 
-    fn display(&self, platform: u32, native: Raw) -> Option<egl::Display> {
+    fn display(&self, platform: u32, native: EglHandle) -> Option<egl::Display> {
         let none = [egl::NONE];
         // SAFETY: `native` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; NONE ends the list.
         let display = unsafe { self.platform_display?(platform, native, none.as_ptr()) };
@@ -141,7 +141,7 @@ impl Api {
         (!display.is_null()).then(|| unsafe { egl::Display::from_ptr(display) })
     }
 
-    fn candidate(&self, index: usize, device: Raw) -> Option<Candidate> {
+    fn candidate(&self, index: usize, device: EglHandle) -> Option<Candidate> {
         let extensions: Vec<String> =
             self.text(device, egl::EXTENSIONS).unwrap_or_default().split_whitespace().map(String::from).collect();
         let has = |name: &str| extensions.iter().any(|extension| extension == name);
@@ -171,7 +171,7 @@ impl Api {
 /// `Unavailable` when libEGL cannot be loaded.
 pub(super) fn candidates() -> Result<Vec<Candidate>> {
     let api = api()?;
-    let _door = door();
+    let _door = lock_contexts();
     let mut found: Vec<Candidate> =
         api.devices().into_iter().enumerate().filter_map(|(index, device)| api.candidate(index, device)).collect();
     let surfaceless = api.display(PLATFORM_SURFACELESS, std::ptr::null_mut());
@@ -188,7 +188,7 @@ pub(super) fn candidates() -> Result<Vec<Candidate>> {
 }
 
 /// Error when no candidate is suitable.
-pub(super) fn none_fits(wanted: &str, tried: &[String]) -> Error {
+pub(super) fn no_device_error(wanted: &str, tried: &[String]) -> Error {
     let tried = if tried.is_empty() { "no EGL device is there".to_string() } else { tried.join("; ") };
     unavailable(format!("no context on {wanted}: {tried}"))
 }
@@ -196,7 +196,7 @@ pub(super) fn none_fits(wanted: &str, tried: &[String]) -> Error {
 impl Context {
     /// Creates a context on a candidate and makes it current on this thread.
     pub(super) fn open(candidate: &Candidate) -> Result<Self> {
-        let is_debug = super::gl::is_debug_wanted();
+        let is_debug = super::gl::is_debug_enabled();
         let made = Self::make(candidate.display, is_debug)?;
         // Outside the lock: on failure the context is dropped, which takes the lock.
         made.make_current()?;
@@ -205,12 +205,12 @@ impl Context {
 
     fn make(display: egl::Display, is_debug: bool) -> Result<Self> {
         let instance = &api()?.instance;
-        let fail = during::<egl::Error>("EGL context");
-        let _door = door();
-        instance.initialize(display).map_err(during("EGL initialise"))?;
+        let fail = fault_in::<egl::Error>("EGL context");
+        let _door = lock_contexts();
+        instance.initialize(display).map_err(fault_in("EGL initialize"))?;
         let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&fail)?.to_string_lossy();
         if !extensions.contains("EGL_KHR_surfaceless_context") {
-            return Err(during("EGL context")("EGL_KHR_surfaceless_context is missing"));
+            return Err(fault_in("EGL context")("EGL_KHR_surfaceless_context is missing"));
         }
         instance.bind_api(egl::OPENGL_API).map_err(&fail)?;
         let config = config(instance, display)?;
@@ -226,17 +226,17 @@ impl Context {
             egl::NONE,
         ];
         let context = instance.create_context(display, config, None, &wanted).map_err(&fail)?;
-        Ok(Self { number: NEXT.fetch_add(1, Ordering::Relaxed), display, context, is_debug })
+        Ok(Self { number: NEXT_CONTEXT_ID.fetch_add(1, Ordering::Relaxed), display, context, is_debug })
     }
 
     /// Makes the context current on this thread unless it already is.
     pub(super) fn make_current(&self) -> Result<()> {
-        if CURRENT.get() == self.number {
+        if CURRENT_CONTEXT.get() == self.number {
             return Ok(());
         }
         let made = api()?.instance.make_current(self.display, None, None, Some(self.context));
-        made.map_err(during("eglMakeCurrent"))?;
-        CURRENT.set(self.number);
+        made.map_err(fault_in("eglMakeCurrent"))?;
+        CURRENT_CONTEXT.set(self.number);
         Ok(())
     }
 
@@ -250,11 +250,11 @@ impl Context {
 impl Drop for Context {
     fn drop(&mut self) {
         let Ok(api) = api() else { return };
-        let _door = door();
+        let _door = lock_contexts();
         // A thread that exits may have lost its thread-locals already; then no context is current on it either.
-        if CURRENT.try_with(Cell::get) == Ok(self.number) {
+        if CURRENT_CONTEXT.try_with(Cell::get) == Ok(self.number) {
             api.instance.make_current(self.display, None, None, None).ok();
-            CURRENT.set(0);
+            CURRENT_CONTEXT.set(0);
         }
         // Destroying fails only for a context that no longer exists, which is the wanted state.
         api.instance.destroy_context(self.display, self.context).ok();
@@ -269,5 +269,5 @@ fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
             return Ok(config);
         }
     }
-    Err(during("EGL config")("no config renders desktop OpenGL, with a pbuffer or without"))
+    Err(fault_in("EGL config")("no config renders desktop OpenGL, with a pbuffer or without"))
 }

@@ -6,11 +6,11 @@
 use nalgebra::Vector3;
 
 use modalcast_model::domain::{AlphaMode, Domain, Material};
-use modalcast_model::scene::{Scene, Slot};
+use modalcast_model::scene::{DomainLayout, Scene};
 
 /// The pass that draws a triangle, from its material's alpha mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Kind {
+pub(super) enum BlendMode {
     Opaque,
     Mask,
     Blend,
@@ -18,8 +18,8 @@ pub(super) enum Kind {
 
 /// A contiguous range of triangles that one call draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Group {
-    pub(super) kind: Kind,
+pub(super) struct DrawGroup {
+    pub(super) blend_mode: BlendMode,
     pub(super) double_sided: bool,
     pub(super) first_triangle: usize,
     pub(super) triangles: usize,
@@ -27,7 +27,7 @@ pub(super) struct Group {
 
 /// A range of triangles that is contiguous both in a mesh and in the draw order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Stretch {
+pub(super) struct TriangleSpan {
     /// Its first triangle in the draw order.
     pub(super) first: usize,
     pub(super) domain: usize,
@@ -36,9 +36,9 @@ pub(super) struct Stretch {
 }
 
 /// Domain of a triangle, and its index in the domain's mesh; `place` is the triangle's index in the draw order.
-pub(super) fn whose(stretches: &[Stretch], place: usize) -> Option<(usize, usize)> {
-    let after = stretches.partition_point(|stretch| stretch.first <= place);
-    let stretch = stretches.get(after.checked_sub(1)?)?;
+pub(super) fn locate_triangle(spans: &[TriangleSpan], place: usize) -> Option<(usize, usize)> {
+    let after = spans.partition_point(|stretch| stretch.first <= place);
+    let stretch = spans.get(after.checked_sub(1)?)?;
     Some((stretch.domain, stretch.triangle + place - stretch.first))
 }
 
@@ -55,33 +55,33 @@ pub(super) struct Geometry {
     pub(super) triangle_vertices: Vec<[u32; 3]>,
     /// Per triangle: index of its material among the used ones; empty when all triangles have the same material.
     pub(super) materials: Vec<u32>,
-    pub(super) groups: Vec<Group>,
+    pub(super) groups: Vec<DrawGroup>,
     /// Sorted by the first triangle.
-    pub(super) stretches: Vec<Stretch>,
+    pub(super) spans: Vec<TriangleSpan>,
     /// Group of each material.
     group_of: Vec<usize>,
 }
 
 /// Whether the shaders look up the material of each triangle.
-pub(super) fn looks_up(scene: &Scene) -> bool {
+pub(super) fn uses_material_table(scene: &Scene) -> bool {
     used_materials(scene).len() > 1
 }
 
 /// The groups of a scene, opaque, then mask, then blend, six at most; and the group of each material.
-pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
-    let mut groups: Vec<Group> = Vec::new();
+pub(super) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
+    let mut groups: Vec<DrawGroup> = Vec::new();
     let mut of_material = vec![0; scene.materials.len()];
     let mut used = used_materials(scene);
-    used.sort_by_key(|material| state(&scene.materials[*material]));
+    used.sort_by_key(|material| pipeline_key(&scene.materials[*material]));
     for material in used {
-        let (kind, double_sided) = state(&scene.materials[material]);
-        if groups.last().is_none_or(|last| (last.kind, last.double_sided) != (kind, double_sided)) {
-            groups.push(Group { kind, double_sided, first_triangle: 0, triangles: 0 });
+        let (blend_mode, double_sided) = pipeline_key(&scene.materials[material]);
+        if groups.last().is_none_or(|last| (last.blend_mode, last.double_sided) != (blend_mode, double_sided)) {
+            groups.push(DrawGroup { blend_mode, double_sided, first_triangle: 0, triangles: 0 });
         }
         of_material[material] = groups.len() - 1;
     }
     for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
-        for (material, triangles) in stretches(domain, slot) {
+        for (material, triangles) in spans(domain, slot) {
             groups[of_material[material]].triangles += triangles.len();
         }
     }
@@ -94,15 +94,15 @@ pub(super) fn groups(scene: &Scene) -> (Vec<Group>, Vec<usize>) {
 }
 
 /// Pipeline state of a material.
-fn state(material: &Material) -> (Kind, bool) {
-    (kind(material), material.double_sided)
+fn pipeline_key(material: &Material) -> (BlendMode, bool) {
+    (blend_mode(material), material.double_sided)
 }
 
-pub(super) const fn kind(material: &Material) -> Kind {
+pub(super) const fn blend_mode(material: &Material) -> BlendMode {
     match material.alpha_mode {
-        AlphaMode::Opaque => Kind::Opaque,
-        AlphaMode::Mask { .. } => Kind::Mask,
-        AlphaMode::Blend => Kind::Blend,
+        AlphaMode::Opaque => BlendMode::Opaque,
+        AlphaMode::Mask { .. } => BlendMode::Mask,
+        AlphaMode::Blend => BlendMode::Blend,
     }
 }
 
@@ -122,9 +122,9 @@ impl Geometry {
             uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),
             triangles: vec![[0; 3]; layout.triangles],
             triangle_vertices: Vec::new(),
-            materials: vec![0; if looks_up(scene) { layout.triangles } else { 0 }],
+            materials: vec![0; if uses_material_table(scene) { layout.triangles } else { 0 }],
             groups,
-            stretches: Vec::new(),
+            spans: Vec::new(),
             group_of,
         };
         let mut rank = vec![0; scene.materials.len()];
@@ -138,11 +138,11 @@ impl Geometry {
         }
         let vertex = |corner: u32| geometry.vertices[corner as usize];
         geometry.triangle_vertices = geometry.triangles.iter().map(|corners| corners.map(vertex)).collect();
-        geometry.stretches.sort_unstable_by_key(|stretch| stretch.first);
+        geometry.spans.sort_unstable_by_key(|stretch| stretch.first);
         geometry
     }
 
-    fn add_corners(&mut self, scene: &Scene, domain: &Domain, slot: &Slot, textured: bool) {
+    fn add_corners(&mut self, scene: &Scene, domain: &Domain, slot: &DomainLayout, textured: bool) {
         let corners = scene.shapes[domain.shape].mesh.corners();
         self.vertices.extend(corners.vertices.iter().map(|vertex| vertex + slot.first_vertex as u32));
         if textured {
@@ -157,12 +157,12 @@ impl Geometry {
         let mesh = &scene.shapes[domain.shape].mesh;
         // A mirroring placement reverses the winding of all triangles.
         let mirrored = domain.placement.linear().determinant() < 0.0;
-        for (material, range) in stretches(domain, slot) {
-            let kind = &scene.materials[material];
+        for (material, range) in spans(domain, slot) {
+            let blend_mode = &scene.materials[material];
             let place = &mut next[self.group_of[material]];
-            self.stretches.push(Stretch { first: *place, domain: index, triangle: range.start });
+            self.spans.push(TriangleSpan { first: *place, domain: index, triangle: range.start });
             for triangle in &mesh.triangles()[range] {
-                let disagrees = kind.double_sided && winding_disagrees(mesh, *triangle);
+                let disagrees = blend_mode.double_sided && winding_disagrees(mesh, *triangle);
                 let [a, b, c] = triangle.map(|corner| corner + slot.first_corner as u32);
                 self.triangles[*place] = if mirrored == disagrees { [a, b, c] } else { [a, c, b] };
                 if let Some(slot) = self.materials.get_mut(*place) {
@@ -175,12 +175,13 @@ impl Geometry {
 }
 
 /// The material runs of a domain, as ranges of its triangles.
-fn stretches<'a>(domain: &'a Domain, slot: &Slot) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
+fn spans<'a>(domain: &'a Domain, slot: &DomainLayout) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
     let count = slot.triangles;
-    let whole = domain.runs.is_empty().then_some((domain.material, 0..count));
-    let ends = domain.runs.iter().skip(1).map(|run| run.first_triangle).chain([count]);
-    let runs = domain.runs.iter().zip(ends).map(|(run, end)| (run.material, run.first_triangle..end));
-    whole.into_iter().chain(runs)
+    let whole = domain.material_ranges.is_empty().then_some((domain.material, 0..count));
+    let ends = domain.material_ranges.iter().skip(1).map(|run| run.first_triangle).chain([count]);
+    let material_ranges =
+        domain.material_ranges.iter().zip(ends).map(|(run, end)| (run.material, run.first_triangle..end));
+    whole.into_iter().chain(material_ranges)
 }
 
 /// Whether a triangle's winding contradicts its normals. The winding decides which side of a double-sided triangle is
@@ -197,15 +198,16 @@ fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use modalcast_model::domain::{Mesh, Metadata, Modes, Run, Shape, Transform};
-    use modalcast_model::scene::Parts;
+    use modalcast_model::domain::{MaterialRange, Mesh, Metadata, Modes, Shape, Transform};
+    use modalcast_model::scene::SceneParts;
 
     /// A scene of one unit square (two triangles) per material.
-    pub(crate) fn squares(materials: Vec<Material>) -> Parts {
+    pub(crate) fn squares(materials: Vec<Material>) -> SceneParts {
         let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
         let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-        let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
-        let mut parts = Parts::named("squares");
+        let mesh =
+            Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+        let mut parts = SceneParts::named("squares");
         parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
         parts.domains = (0..materials.len()).map(|material| domain(material, Transform::IDENTITY)).collect();
         parts.materials = materials;
@@ -217,7 +219,7 @@ pub(super) mod tests {
             name: format!("square {material}"),
             shape: 0,
             material,
-            runs: vec![],
+            material_ranges: vec![],
             placement,
             attachment: None,
             follows: None,
@@ -238,13 +240,13 @@ pub(super) mod tests {
         let materials: Vec<Material> = (0..300).map(|index| pattern[index % 3].clone()).collect();
         let scene = Scene::new(squares(materials)).expect("good");
         let geometry = Geometry::new(&scene);
-        let kinds: Vec<Kind> = geometry.groups.iter().map(|group| group.kind).collect();
-        assert_eq!(kinds, [Kind::Opaque, Kind::Mask, Kind::Blend]);
+        let kinds: Vec<BlendMode> = geometry.groups.iter().map(|group| group.blend_mode).collect();
+        assert_eq!(kinds, [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend]);
         assert_eq!(geometry.groups.iter().map(|group| group.triangles).sum::<usize>(), 600);
         for group in &geometry.groups {
             for triangle in group.first_triangle..group.first_triangle + group.triangles {
                 let material = &scene.materials[geometry.materials[triangle] as usize];
-                assert_eq!(state(material), (group.kind, group.double_sided));
+                assert_eq!(pipeline_key(material), (group.blend_mode, group.double_sided));
             }
         }
         let mut seen = geometry.triangles.as_flattened().to_vec();
@@ -257,12 +259,13 @@ pub(super) mod tests {
     fn runs_split_a_domain_between_groups() {
         let mut parts = squares(vec![of(AlphaMode::Opaque, false), of(AlphaMode::Blend, false)]);
         parts.domains.truncate(1);
-        parts.domains[0].runs = vec![Run { first_triangle: 0, material: 1 }, Run { first_triangle: 1, material: 0 }];
+        parts.domains[0].material_ranges =
+            vec![MaterialRange { first_triangle: 0, material: 1 }, MaterialRange { first_triangle: 1, material: 0 }];
         let geometry = Geometry::new(&Scene::new(parts).expect("good"));
         assert_eq!(geometry.materials, [0, 1]);
         assert_eq!(geometry.triangles, [[0, 2, 3], [0, 1, 2]]);
-        let stretch = |first, triangle| Stretch { first, domain: 0, triangle };
-        assert_eq!(geometry.stretches, [stretch(0, 1), stretch(1, 0)], "where each came from");
+        let stretch = |first, triangle| TriangleSpan { first, domain: 0, triangle };
+        assert_eq!(geometry.spans, [stretch(0, 1), stretch(1, 0)], "where each came from");
     }
 
     #[test]
@@ -282,7 +285,7 @@ pub(super) mod tests {
         for (double_sided, expected) in [(true, [0, 2, 1]), (false, [0, 1, 2])] {
             let mut parts = squares(vec![of(AlphaMode::Opaque, double_sided)]);
             let rest = parts.shapes[0].mesh.rest().to_vec();
-            let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]]).expect("good");
+            let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]]).expect("good");
             parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
             let geometry = Geometry::new(&Scene::new(parts).expect("good"));
             assert_eq!(geometry.triangles, [expected]);

@@ -8,9 +8,9 @@ mod clear;
 mod culling;
 mod debug;
 mod fence;
+mod indirect;
 mod layers;
 mod limits;
-mod lists;
 mod object;
 mod staging;
 mod timer;
@@ -20,15 +20,15 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
-pub(super) use self::clear::{Clear, Traces};
-pub(super) use self::debug::is_wanted as is_debug_wanted;
+pub(super) use self::clear::{ClearOp, VisibilityDirty};
+pub(super) use self::debug::is_enabled as is_debug_enabled;
 pub(super) use self::fence::Fence;
 pub(super) use self::limits::Limits;
-pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureKind, VertexArray};
-pub(super) use self::staging::{Lent, Staging};
-pub(super) use self::timer::Stopwatch;
+pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureDesc, VertexArray};
+pub(super) use self::staging::{ReadbackView, StagingBuffer};
+pub(super) use self::timer::PassTimer;
 use super::egl::Context;
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// OpenGL constants that other modules use.
 pub(super) use glow::{
@@ -45,9 +45,9 @@ pub(super) struct Gl {
     context: Context,
     pub(super) limits: Limits,
     /// Pool of timer queries that are not in use.
-    timers: RefCell<Vec<glow::Query>>,
+    free_queries: RefCell<Vec<glow::Query>>,
     /// Buffers that will be freed once their readers are done.
-    retired: RefCell<Vec<staging::Retired>>,
+    retired: RefCell<Vec<staging::RetiredBuffer>>,
 }
 
 impl Drop for Gl {
@@ -64,7 +64,7 @@ impl std::fmt::Debug for Gl {
 }
 
 /// A vertex attribute: location, buffer, number of 32-bit components, and whether it is an integer.
-pub(super) struct Attribute<'a> {
+pub(super) struct VertexAttribute<'a> {
     pub(super) location: u32,
     pub(super) buffer: &'a Buffer,
     pub(super) components: i32,
@@ -73,12 +73,12 @@ pub(super) struct Attribute<'a> {
 
 /// The fixed-function state of a pass.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Fixed {
+pub(super) struct PipelineState {
     pub(super) depth_write: bool,
     /// Depth outside near and far is clamped instead of clipped.
     pub(super) depth_clamp: bool,
     /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
-    pub(super) behind: bool,
+    pub(super) polygon_offset: bool,
     pub(super) cull: bool,
     /// Colors are blended over the existing ones; alpha becomes the transmittance: the share of the background that
     /// remains visible.
@@ -93,13 +93,13 @@ impl Gl {
         let mut glow = unsafe { glow::Context::from_loader_function_cstr(address) };
         let limits = Limits::of(&glow);
         if context.is_debug {
-            debug::listen(&mut glow);
+            debug::install_debug_callback(&mut glow);
         }
-        Ok(Rc::new(Self { glow, context, limits, timers: RefCell::default(), retired: RefCell::default() }))
+        Ok(Rc::new(Self { glow, context, limits, free_queries: RefCell::default(), retired: RefCell::default() }))
     }
 
     /// The OpenGL functions; makes the context current first.
-    fn on(&self) -> &glow::Context {
+    fn current(&self) -> &glow::Context {
         // If the context cannot be made current, `check` reports the errors at the end of the pass.
         self.context.make_current().ok();
         &self.glow
@@ -108,10 +108,10 @@ impl Gl {
     /// Fails if OpenGL reported an error since the last check.
     pub(super) fn check(&self, stage: &'static str) -> Result<()> {
         // SAFETY: a query without side effects on memory; the context is current.
-        match unsafe { self.on().get_error() } {
+        match unsafe { self.current().get_error() } {
             glow::NO_ERROR => Ok(()),
-            glow::OUT_OF_MEMORY => Err(during(stage)("OpenGL is out of memory")),
-            error => Err(during(stage)(format!("OpenGL error 0x{error:04X}"))),
+            glow::OUT_OF_MEMORY => Err(fault_in(stage)("OpenGL is out of memory")),
+            error => Err(fault_in(stage)(format!("OpenGL error 0x{error:04X}"))),
         }
     }
 
@@ -119,12 +119,12 @@ impl Gl {
     /// has exactly `bytes` bytes.
     pub(super) fn buffer(self: &Rc<Self>, bytes: u64, usage: u32, data: Option<&[u8]>) -> Result<Buffer> {
         let size = i32::try_from(bytes.max(4))
-            .map_err(|_| during("buffer")(format!("{bytes} bytes is over the 2 GiB that one buffer may have")))?;
-        let gl = self.on();
+            .map_err(|_| fault_in("buffer")(format!("{bytes} bytes is over the 2 GiB that one buffer may have")))?;
+        let gl = self.current();
         // SAFETY: the size is that of the data, or there is no data and the content stays undefined until the first
         // write.
         let name = unsafe {
-            let name = gl.create_buffer().map_err(during("buffer"))?;
+            let name = gl.create_buffer().map_err(fault_in("buffer"))?;
             gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(name));
             match data {
                 Some(data) if data.len() as u64 == bytes && bytes >= 4 => {
@@ -138,52 +138,52 @@ impl Gl {
         self.check("buffer").map(|()| buffer)
     }
 
-    pub(super) fn texture(self: &Rc<Self>, kind: TextureKind) -> Result<Texture> {
-        let gl = self.on();
-        let [width, height, depth, levels] = [kind.width, kind.height, kind.depth, kind.levels].map(|side| side as i32);
+    pub(super) fn texture(self: &Rc<Self>, desc: TextureDesc) -> Result<Texture> {
+        let gl = self.current();
+        let [width, height, depth, levels] = [desc.width, desc.height, desc.depth, desc.levels].map(|side| side as i32);
         // SAFETY: allocates storage for a new texture; OpenGL reports sizes above the limits as errors.
         let name = unsafe {
-            let name = gl.create_texture().map_err(during("texture"))?;
-            gl.bind_texture(kind.target, Some(name));
-            match kind.target {
-                glow::TEXTURE_2D_ARRAY => gl.tex_storage_3d(kind.target, levels, kind.format, width, height, depth),
+            let name = gl.create_texture().map_err(fault_in("texture"))?;
+            gl.bind_texture(desc.target, Some(name));
+            match desc.target {
+                glow::TEXTURE_2D_ARRAY => gl.tex_storage_3d(desc.target, levels, desc.format, width, height, depth),
                 glow::TEXTURE_2D_MULTISAMPLE => {
-                    gl.tex_storage_2d_multisample(kind.target, depth, kind.format, width, height, true);
+                    gl.tex_storage_2d_multisample(desc.target, depth, desc.format, width, height, true);
                 }
-                _ => gl.tex_storage_2d(kind.target, levels, kind.format, width, height),
+                _ => gl.tex_storage_2d(desc.target, levels, desc.format, width, height),
             }
             name
         };
-        let texture = Texture { gl: Rc::clone(self), name, kind };
+        let texture = Texture { gl: Rc::clone(self), name, desc };
         self.check("texture").map(|()| texture)
     }
 
     /// Creates a buffer texture over a whole buffer. The buffer must outlive it.
-    pub(super) fn view(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
-        let gl = self.on();
+    pub(super) fn buffer_texture(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
+        let gl = self.current();
         let target = glow::TEXTURE_BUFFER;
         // SAFETY: a new texture over a buffer of this context.
         let name = unsafe {
-            let name = gl.create_texture().map_err(during("texture"))?;
+            let name = gl.create_texture().map_err(fault_in("texture"))?;
             gl.bind_texture(target, Some(name));
             gl.tex_buffer(target, format, Some(buffer.name));
             name
         };
-        let kind = TextureKind { target, format, width: 0, height: 1, depth: 1, levels: 1 };
-        let texture = Texture { gl: Rc::clone(self), name, kind };
+        let desc = TextureDesc { target, format, width: 0, height: 1, depth: 1, levels: 1 };
+        let texture = Texture { gl: Rc::clone(self), name, desc };
         self.check("texture").map(|()| texture)
     }
 
     /// Compiles and links a program from pairs of stage and source.
     pub(super) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
-        let gl = self.on();
-        let fail = |log: String| during("shader")(format!("{label}: {log}"));
+        let gl = self.current();
+        let fail = |log: String| fault_in("shader")(format!("{label}: {log}"));
         // SAFETY: new objects; the shaders are flagged for deletion and live until the program is deleted.
         unsafe {
-            let name = gl.create_program().map_err(during("shader"))?;
+            let name = gl.create_program().map_err(fault_in("shader"))?;
             let program = Program { gl: Rc::clone(self), name };
             for (stage, source) in stages {
-                let shader = gl.create_shader(*stage).map_err(during("shader"))?;
+                let shader = gl.create_shader(*stage).map_err(fault_in("shader"))?;
                 gl.shader_source(shader, source);
                 gl.compile_shader(shader);
                 gl.attach_shader(name, shader);
@@ -197,36 +197,40 @@ impl Gl {
         }
     }
 
-    pub(super) fn framebuffer(self: &Rc<Self>, colour: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
-        self.attached(colour, Some(depth))
+    pub(super) fn framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
+        self.attach_framebuffer(color, Some(depth))
     }
 
-    fn attached(self: &Rc<Self>, colour: Option<&Texture>, depth: Option<&Texture>) -> Result<Framebuffer> {
-        let gl = self.on();
+    fn attach_framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: Option<&Texture>) -> Result<Framebuffer> {
+        let gl = self.current();
         // SAFETY: attaches textures of this context; completeness is checked right after.
         unsafe {
-            let name = gl.create_framebuffer().map_err(during("framebuffer"))?;
+            let name = gl.create_framebuffer().map_err(fault_in("framebuffer"))?;
             let framebuffer = Framebuffer { gl: Rc::clone(self), name };
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(name));
-            if let Some(colour) = colour {
-                gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(colour.name), 0);
+            if let Some(color) = color {
+                gl.framebuffer_texture(glow::FRAMEBUFFER, glow::COLOR_ATTACHMENT0, Some(color.name), 0);
             }
             if let Some(depth) = depth {
                 gl.framebuffer_texture(glow::FRAMEBUFFER, glow::DEPTH_ATTACHMENT, Some(depth.name), 0);
             }
-            gl.draw_buffers(&[if colour.is_some() { glow::COLOR_ATTACHMENT0 } else { glow::NONE }]);
+            gl.draw_buffers(&[if color.is_some() { glow::COLOR_ATTACHMENT0 } else { glow::NONE }]);
             match gl.check_framebuffer_status(glow::FRAMEBUFFER) {
                 glow::FRAMEBUFFER_COMPLETE => self.check("framebuffer").map(|()| framebuffer),
-                status => Err(during("framebuffer")(format!("incomplete, 0x{status:04X}"))),
+                status => Err(fault_in("framebuffer")(format!("incomplete, 0x{status:04X}"))),
             }
         }
     }
 
-    pub(super) fn vertex_array(self: &Rc<Self>, index: Option<&Buffer>, from: &[Attribute<'_>]) -> Result<VertexArray> {
-        let gl = self.on();
+    pub(super) fn vertex_array(
+        self: &Rc<Self>,
+        index: Option<&Buffer>,
+        from: &[VertexAttribute<'_>],
+    ) -> Result<VertexArray> {
+        let gl = self.current();
         // SAFETY: tightly packed attributes of 32-bit components in buffers of this context.
         unsafe {
-            let name = gl.create_vertex_array().map_err(during("vertex array"))?;
+            let name = gl.create_vertex_array().map_err(fault_in("vertex array"))?;
             let array = VertexArray { gl: Rc::clone(self), name };
             gl.bind_vertex_array(Some(name));
             for attribute in from {
@@ -245,12 +249,12 @@ impl Gl {
     }
 
     /// Sample positions within the pixels of a framebuffer, 0 to 1 from the lower left.
-    pub(super) fn sample_places(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
+    pub(super) fn sample_positions(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
         type GetMultisample = unsafe extern "system" fn(u32, u32, *mut f32);
-        let gl = self.on();
+        let gl = self.current();
         let address = self.context.address("glGetMultisamplefv");
         if address.is_null() {
-            return Err(during("samples")("glGetMultisamplefv is not there"));
+            return Err(fault_in("samples")("glGetMultisamplefv is not there"));
         }
         // SAFETY: the address is that of glGetMultisamplefv, which has this signature and writes two floats.
         unsafe {
@@ -264,15 +268,15 @@ impl Gl {
         }
     }
 
-    pub(super) fn set(&self, fixed: Fixed) {
-        let gl = self.on();
+    pub(super) fn set_pipeline_state(&self, fixed: PipelineState) {
+        let gl = self.current();
         let flip = |flag: u32, on: bool| {
             // SAFETY: flags that every 4.3 core context accepts.
             unsafe { if on { gl.enable(flag) } else { gl.disable(flag) } }
         };
         flip(glow::DEPTH_TEST, true);
         flip(glow::DEPTH_CLAMP, fixed.depth_clamp);
-        flip(glow::POLYGON_OFFSET_FILL, fixed.behind);
+        flip(glow::POLYGON_OFFSET_FILL, fixed.polygon_offset);
         flip(glow::CULL_FACE, fixed.cull);
         flip(glow::BLEND, fixed.blend);
         // SAFETY: sets state; no memory is accessed.
@@ -287,7 +291,7 @@ impl Gl {
 
     /// Draws `triangles` triangles of an array's index buffer from triangle `first` on.
     pub(super) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
-        let gl = self.on();
+        let gl = self.current();
         // SAFETY: the indices come from validated meshes and stay below the number of elements of each attribute.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
@@ -297,8 +301,8 @@ impl Gl {
     }
 
     /// Draws vertices that the vertex shader derives from their index.
-    pub(super) fn draw_made(&self, array: &VertexArray, vertices: u32) {
-        let gl = self.on();
+    pub(super) fn draw_procedural(&self, array: &VertexArray, vertices: u32) {
+        let gl = self.current();
         // SAFETY: no attribute is read.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
@@ -309,7 +313,7 @@ impl Gl {
 
     /// Runs the bound compute program, followed by a barrier that makes its writes visible to later commands.
     pub(super) fn dispatch(&self, groups_x: u32, groups_y: u32) {
-        let gl = self.on();
+        let gl = self.current();
         // SAFETY: the shaders check their own bounds.
         unsafe {
             gl.dispatch_compute(groups_x, groups_y, 1);
@@ -318,8 +322,8 @@ impl Gl {
     }
 
     /// Like [`Self::dispatch`]; the first three words of a buffer give the number of workgroups.
-    pub(super) fn dispatch_listed(&self, groups: &Buffer) {
-        let gl = self.on();
+    pub(super) fn dispatch_indirect(&self, groups: &Buffer) {
+        let gl = self.current();
         // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
         unsafe {
             gl.bind_buffer(glow::DISPATCH_INDIRECT_BUFFER, Some(groups.name));
@@ -329,12 +333,12 @@ impl Gl {
     }
 
     pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
-        self.copy_to(from, (to, 0), bytes);
+        self.copy_to_offset(from, (to, 0), bytes);
     }
 
     /// Copies the first `bytes` bytes to byte offset `place` of the other buffer.
-    pub(super) fn copy_to(&self, from: &Buffer, (to, place): (&Buffer, u64), bytes: u64) {
-        let gl = self.on();
+    pub(super) fn copy_to_offset(&self, from: &Buffer, (to, place): (&Buffer, u64), bytes: u64) {
+        let gl = self.current();
         let (read, write) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
         // SAFETY: OpenGL rejects ranges outside either buffer.
         unsafe {

@@ -2,7 +2,7 @@
 //!
 //! | pass | what it does | runs when |
 //! |---|---|---|
-//! | raster | shadow depth, visibility or both, drawn by the compute rasterizer ([`Path`]) | the look asks for it |
+//! | raster | shadow depth, visibility or both, drawn by the compute rasterizer ([`RasterBackend`]) | the look asks for it |
 //! | shadow cull | lists of the triangles that may appear in the shadow map (compute) | triangles are culled |
 //! | shadow | depth as seen from the sun; cut-outs leave holes | the look has a shadow |
 //! | blur | depth to moments, blurred in x and in y (compute) | the shadow is a variance map |
@@ -20,11 +20,11 @@
 //! | encode | linear light to sRGB bytes, top row first; smooths edges and dithers (compute) | always |
 //!
 //! Submitting a frame and collecting its pixels are separate calls, so that several frames can be in flight
-//! ([`Ticket`]).
+//! ([`PendingFrame`]).
 //!
 //! Two outputs are drawn only on request, with programs and buffers that are created on first use: picking, which finds
-//! the triangles at a few pixels ([`Pick`]), and AOV (arbitrary output variable) readbacks, which deliver numbers
-//! instead of colors ([`Survey`]).
+//! the triangles at a few pixels ([`PendingPick`]), and AOV (arbitrary output variable) readbacks, which deliver numbers
+//! instead of colors ([`AovImage`]).
 //!
 //! Shading is deferred: the rasterizer writes ids only, and each visible triangle is shaded once per pixel, whatever
 //! lies behind it. Multisampled id buffers are not cleared; the depth buffer says which samples hold an id. A frame
@@ -33,60 +33,60 @@
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
+mod aov;
+mod cascades;
 mod cull;
 mod device;
 mod egl;
-mod frame;
+mod frame_uniforms;
 mod geometry;
 mod gl;
 mod light;
-mod lists;
+mod oit;
 mod passes;
-mod paths;
 mod pick;
 mod plan;
 mod post;
 mod programs;
+mod raster_backends;
+mod readback_ring;
 mod region;
-mod ring;
 mod scene_buffers;
-mod seen;
 mod shaders;
 mod shadow;
-mod splits;
 mod submit;
-mod survey;
 mod target;
 mod textures;
+mod visibility_id;
 
 use std::collections::HashMap;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
-pub use self::cull::{Culled, Sifted};
+pub use self::aov::{Aov, AovImage};
+pub use self::cull::{CullStats, FrameCullStats};
 pub use self::device::{EglDevice, devices};
-pub use self::frame::{shadow_clip, shadow_texel};
+pub use self::frame_uniforms::{shadow_clip_from_world, shadow_texel_axes};
 use self::gl::{Gl, Program};
-pub use self::lists::Lists;
-pub use self::paths::{Path, Paths};
-pub use self::pick::{Hit, Pick};
-pub use self::plan::{Allocation, Plan, Saving, plan};
-pub use self::ring::FRAMES_UNDER_WAY;
-use self::scene_buffers::Apart;
+pub use self::oit::OitStats;
+pub use self::pick::{PendingPick, PickHit};
+pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
+pub use self::raster_backends::{RasterBackend, RasterBackends};
+pub use self::readback_ring::MAX_FRAMES_IN_FLIGHT;
+use self::scene_buffers::RebasedPositions;
 pub use self::scene_buffers::SceneBuffers;
-pub use self::seen::Seen;
-use self::shaders::Source;
-pub use self::submit::{Pixels, Ticket};
-pub use self::survey::{Field, Survey};
-use self::target::{Form, Target};
-use modalcast_model::deform::Surface;
-use modalcast_model::error::{Result, during};
-use modalcast_model::scene::{Bounds, Camera, LightBounds, Scene};
+use self::shaders::ProgramSource;
+pub use self::submit::{MappedPixels, PendingFrame};
+use self::target::{RenderTarget, TargetDesc};
+pub use self::visibility_id::VisibilityId;
+use modalcast_model::deform::DeformedSurface;
+use modalcast_model::error::{Result, fault_in};
+use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene};
 
 /// Preference for the EGL device that draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Prefer {
+pub enum DevicePreference {
     /// The EGL device that corresponds to this CUDA device ordinal.
     Cuda(i32),
     /// Any hardware device; Mesa's software rasterizer when there is none.
@@ -97,7 +97,7 @@ pub enum Prefer {
 
 /// Description of the OpenGL device and driver.
 #[derive(Debug, Clone, serde::Serialize)]
-pub struct Info {
+pub struct RendererInfo {
     /// The GL_RENDERER string.
     pub renderer: String,
     /// The GL_VERSION string.
@@ -112,7 +112,7 @@ pub struct Info {
 
 /// Parameters of one frame; the geometry is the current content of the scene's buffers.
 #[derive(Debug, Clone, Copy)]
-pub struct Shot {
+pub struct FrameParams {
     pub camera: Camera,
     pub width: u32,
     pub height: u32,
@@ -121,12 +121,12 @@ pub struct Shot {
     pub bounds: Bounds,
     /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
     /// to the corners of `bounds`.
-    pub light: Option<LightBounds>,
+    pub light: Option<LightSpaceBox>,
 }
 
 /// RGBA8 sRGB pixels of a frame, top row first.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Image {
+pub struct FrameImage {
     pub width: u32,
     pub height: u32,
     pub rgba: Vec<u8>,
@@ -135,7 +135,7 @@ pub struct Image {
     /// it draws visibility only), "cull" (with the occluders), "visibility" (with the ground), "blended" (with the
     /// fragment lists), "shade" (with the backdrop), "bloom" and "encode" are part of the draw stage.
     pub passes: Vec<(&'static str, f64)>,
-    pub paths: Paths,
+    pub raster_backends: RasterBackends,
 }
 
 /// Names of the OpenGL buffers that a deformer can write directly, instead of an upload.
@@ -151,51 +151,51 @@ pub struct SharedBuffers {
 
 /// Statistics of the last frame that was collected: the passes that ran and how many triangles they processed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Ran {
+pub struct FrameStats {
     /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"
-    /// and "blur"; see [`SceneBuffers::hold_step`].
+    /// and "blur"; see [`SceneBuffers::set_step`].
     pub passes: Vec<&'static str>,
     /// The rasterizer that drew the shadow map and the visibility.
-    pub paths: Paths,
+    pub raster_backends: RasterBackends,
     /// Number of draw calls of the visibility and blended passes.
-    pub draws: usize,
+    pub draw_calls: usize,
     /// Samples per pixel.
     pub samples: u32,
     /// Fragment list statistics; present with exact transparency.
-    pub lists: Option<Lists>,
+    pub oit: Option<OitStats>,
     /// Culling statistics; present when triangles are culled.
-    pub culled: Option<Culled>,
+    pub culled: Option<FrameCullStats>,
 }
 
 /// Longest side of a frame in pixels, even on devices that support more.
 const MAX_SIDE: u32 = 8192;
 /// Number of render targets that are cached, by frame form.
-const TARGETS: usize = 4;
+const MAX_TARGETS: usize = 4;
 /// Number of programs that are cached across scenes.
-const PROGRAMS: usize = 128;
+const MAX_PROGRAMS: usize = 128;
 /// Maximum time that a dropped renderer waits for each thread that still copies pixels.
-const LAST_READERS: Duration = Duration::from_secs(1);
+const READER_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time limit of the device for one frame.
-const WATCHDOG: Duration = Duration::from_secs(60);
+const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A headless OpenGL context with its cached programs and render targets. It is created, used and dropped on the device
 /// thread.
 #[derive(Debug)]
 pub struct Renderer {
-    info: Info,
+    info: RendererInfo,
     gl: Rc<Gl>,
-    programs: HashMap<Source, Rc<Program>>,
-    sample_places: Vec<[f32; 2]>,
+    programs: HashMap<ProgramSource, Rc<Program>>,
+    sample_positions: Vec<[f32; 2]>,
     /// Least recently used first.
-    targets: Vec<Target>,
-    ran: Ran,
+    targets: Vec<RenderTarget>,
+    stats: FrameStats,
     /// Uniforms of the last frame.
-    last: Option<frame::Frame>,
-    watchdog: Duration,
+    last_uniforms: Option<frame_uniforms::FrameUniforms>,
+    frame_timeout: Duration,
     /// Render target for picks; created by the first pick.
-    picker: Option<pick::Picker>,
+    pick_target: Option<pick::PickTarget>,
     /// Render target of the last AOV readback.
-    surveyor: Option<survey::Surveyor>,
+    aov_target: Option<aov::AovTarget>,
 }
 
 impl Renderer {
@@ -203,38 +203,38 @@ impl Renderer {
     ///
     /// # Errors
     /// `Unavailable` with the name of the missing library or vendor file.
-    pub fn open(prefer: Prefer) -> Result<Self> {
+    pub fn open(prefer: DevicePreference) -> Result<Self> {
         let (gl, cuda_device) = device::open(prefer)?;
-        let info = Info {
+        let info = RendererInfo {
             renderer: gl.limits.renderer.clone(),
             version: gl.limits.version.clone(),
             software: gl.limits.software,
             cuda_device,
             max_side: gl.limits.max_side.min(MAX_SIDE),
         };
-        let sample_places = target::sample_places(&gl)?;
+        let sample_positions = target::sample_positions(&gl)?;
         Ok(Self {
             info,
             gl,
             programs: HashMap::new(),
-            sample_places,
+            sample_positions,
             targets: Vec::new(),
-            ran: Ran::default(),
-            last: None,
-            watchdog: WATCHDOG,
-            picker: None,
-            surveyor: None,
+            stats: FrameStats::default(),
+            last_uniforms: None,
+            frame_timeout: FRAME_TIMEOUT,
+            pick_target: None,
+            aov_target: None,
         })
     }
 
     /// The OpenGL device and driver.
-    pub const fn info(&self) -> &Info {
+    pub const fn info(&self) -> &RendererInfo {
         &self.info
     }
 
     /// Statistics of the last frame that was collected.
-    pub const fn ran(&self) -> &Ran {
-        &self.ran
+    pub const fn stats(&self) -> &FrameStats {
+        &self.stats
     }
 
     /// Uploads the static data of a scene and allocates the buffers of the deformed data.
@@ -242,11 +242,11 @@ impl Renderer {
     /// # Errors
     /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
-        let (gl, places) = (Rc::clone(&self.gl), self.sample_places.clone());
-        if self.programs.len() > PROGRAMS {
+        let (gl, places) = (Rc::clone(&self.gl), self.sample_positions.clone());
+        if self.programs.len() > MAX_PROGRAMS {
             self.programs.clear();
         }
-        let compile: &mut programs::Compile<'_> = &mut |source| self.program(source);
+        let compile: &mut programs::ProgramCompiler<'_> = &mut |source| self.program(source);
         let buffers = SceneBuffers::new(&gl, scene, &places, compile)?;
         gl.check("load").map(|()| buffers)
     }
@@ -262,14 +262,14 @@ impl Renderer {
     ///
     /// # Errors
     /// `Fault` when an array of the surface has another length than its buffer, or OpenGL reports an error.
-    pub fn upload(&mut self, buffers: &SceneBuffers, surface: &Surface) -> Result<()> {
-        buffers.shared_shadow.forget();
+    pub fn upload(&mut self, buffers: &SceneBuffers, surface: &DeformedSurface) -> Result<()> {
+        buffers.shadow_cache.invalidate();
         for (name, list) in
             [("positions", &surface.positions), ("normals", &surface.normals), ("tangents", &surface.tangents)]
         {
             let Some(buffer) = buffers.buffers.get(name) else { continue };
             if 4 * list.len() as u64 != buffer.bytes {
-                return Err(during("upload")(format!(
+                return Err(fault_in("upload")(format!(
                     "{} numbers of {name}, {} expected",
                     list.len(),
                     buffer.bytes / 4
@@ -280,25 +280,25 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::relative_to`]. For
+    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::set_origin`]. For
     /// scenes whose domains have separate local origins: the shared positions then have no common origin, and
     /// `positions` are rebased to `origin` (scene units, from the scene's origin).
     ///
     /// # Errors
     /// `Fault` when the number of positions differs from the scene's, or OpenGL reports an error.
-    pub fn upload_apart(&mut self, buffers: &mut SceneBuffers, positions: &[f32], origin: [f64; 3]) -> Result<()> {
+    pub fn upload_rebased(&mut self, buffers: &mut SceneBuffers, positions: &[f32], origin: [f64; 3]) -> Result<()> {
         let bytes = buffers.buffer("positions")?.bytes;
         if 4 * positions.len() as u64 != bytes {
             let given = format!("{} numbers of positions, {} expected", positions.len(), bytes / 4);
-            return Err(during("upload")(given));
+            return Err(fault_in("upload")(given));
         }
-        let apart = match buffers.apart.take() {
-            Some(apart) => apart,
-            None => Apart::new(&self.gl, buffers)?,
+        let rebased = match buffers.rebased.take() {
+            Some(rebased) => rebased,
+            None => RebasedPositions::new(&self.gl, buffers)?,
         };
-        buffers.shared_shadow.forget();
-        apart.buffer.write(bytemuck::cast_slice(positions));
-        buffers.apart = Some(apart);
+        buffers.shadow_cache.invalidate();
+        rebased.buffer.write(bytemuck::cast_slice(positions));
+        buffers.rebased = Some(rebased);
         buffers.origin = origin;
         self.gl.check("upload")
     }
@@ -307,43 +307,45 @@ impl Renderer {
     ///
     /// # Errors
     /// `Fault` when no frame was drawn, or the device does not finish in time.
-    pub fn seen(&mut self) -> Result<Vec<Seen>> {
-        let nothing = || during("seen")("no frame was drawn");
-        let samples = self.targets.last().ok_or_else(nothing)?.form.samples;
-        let program = self.program(shaders::seen(samples))?;
+    pub fn read_visibility(&mut self) -> Result<Vec<VisibilityId>> {
+        let nothing = || fault_in("visibility readback")("no frame was drawn");
+        let samples = self.targets.last().ok_or_else(nothing)?.desc.samples;
+        let program = self.program(shaders::visibility_readback(samples))?;
         let target = self.targets.last().ok_or_else(nothing)?;
-        passes::seen(&self.gl, target, &program)?;
+        passes::resolve_ids(&self.gl, target, &program)?;
         // A temporary staging buffer, because the ring may be full of frames in flight.
-        let bytes = target.form.bytes();
+        let bytes = target.desc.bytes();
         let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
-        self.gl.copy(&target.packed, &staging, bytes);
-        self.gl.wait("seen", self.watchdog)?;
+        self.gl.copy(&target.readback_source, &staging, bytes);
+        self.gl.wait("visibility readback", self.frame_timeout)?;
         let words = staging.read(bytes as usize)?;
         let id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
-        let place = if samples > 1 { self.sample_places[0] } else { [0.5; 2] };
-        let size = [target.form.width, target.form.height];
-        let behind = |pixel: u32| self.last.is_some_and(|last| last.meets_ground(image_place(pixel, size, place)));
-        let seen = words.chunks_exact(4).zip(0..).map(|(word, pixel)| match Seen::from_id(id(word)) {
-            Seen::Nothing if behind(pixel) => Seen::Ground,
+        let place = if samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
+        let size = [target.desc.width, target.desc.height];
+        let behind = |pixel: u32| {
+            self.last_uniforms.is_some_and(|last| last.ray_hits_ground(ndc_from_pixel(pixel, size, place)))
+        };
+        let seen = words.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(id(word)) {
+            VisibilityId::Background if behind(pixel) => VisibilityId::Ground,
             seen => seen,
         });
         Ok(seen.collect())
     }
 
     /// Moves the target of this form to the end of the cache, and creates it if it is not cached.
-    fn make_room(&mut self, form: Form) -> Result<()> {
-        if let Some(at) = self.targets.iter().position(|target| target.form == form) {
+    fn ensure_target(&mut self, desc: TargetDesc) -> Result<()> {
+        if let Some(at) = self.targets.iter().position(|target| target.desc == desc) {
             self.targets[at..].rotate_left(1);
             return Ok(());
         }
-        if self.targets.len() >= TARGETS {
+        if self.targets.len() >= MAX_TARGETS {
             self.targets.remove(0);
         }
-        self.targets.push(Target::new(&self.gl, form)?);
+        self.targets.push(RenderTarget::new(&self.gl, desc)?);
         Ok(())
     }
 
-    fn program(&mut self, source: Source) -> Result<Rc<Program>> {
+    fn program(&mut self, source: ProgramSource) -> Result<Rc<Program>> {
         if let Some(program) = self.programs.get(&source) {
             return Ok(Rc::clone(program));
         }
@@ -356,7 +358,7 @@ impl Renderer {
 
 /// Normalized device coordinates of a point in a pixel. `pixel` counts from the top left; `place` is measured from the
 /// pixel's lower left corner, 0 to 1.
-fn image_place(pixel: u32, [width, height]: [u32; 2], place: [f32; 2]) -> [f64; 2] {
+fn ndc_from_pixel(pixel: u32, [width, height]: [u32; 2], place: [f32; 2]) -> [f64; 2] {
     let (column, row) = (pixel % width, height - 1 - pixel / width);
     let across = |at: u32, place: f32, side: u32| 2.0 * (f64::from(at) + f64::from(place)) / f64::from(side) - 1.0;
     [across(column, place[0], width), across(row, place[1], height)]
@@ -365,6 +367,6 @@ fn image_place(pixel: u32, [width, height]: [u32; 2], place: [f32; 2]) -> [f64; 
 impl Drop for Renderer {
     fn drop(&mut self) {
         self.targets.clear();
-        self.gl.bury(LAST_READERS);
+        self.gl.free_retired_buffers(READER_TIMEOUT);
     }
 }

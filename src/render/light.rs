@@ -10,34 +10,34 @@
 
 use nalgebra::{Matrix4, Vector3};
 
-use modalcast_model::scene::{Bounds, LightBounds, UpAxis, light_axes};
+use modalcast_model::scene::{Bounds, LightSpaceBox, UpAxis, light_axes};
 
 /// Maximum distance by which the ground may push the far plane below the box, in diagonals of the bounds. A grazing sun
 /// would push it to infinity. Receivers beyond the far plane are still shaded correctly.
-const REACH: f64 = 8.0;
+const MAX_GROUND_PULL: f64 = 8.0;
 
 /// The fitted shadow map.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LightBox {
     /// World space to the map: x and y are 0 to 1 across the map, z is 0 at the plane nearest to the sun and 1 at the
     /// farthest.
-    pub(super) map_from_world: Matrix4<f64>,
+    pub(super) shadow_from_world: Matrix4<f64>,
     /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
     pub(super) ground: [f64; 3],
     /// Axes x, y and z of light space.
     pub(super) axes: [Vector3<f64>; 3],
     /// Extent of the map along x and y of light space.
-    pub(super) sides: [Side; 2],
+    pub(super) sides: [TexelSpan; 2],
 }
 
 /// Inputs of the fit.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Fit {
+pub(super) struct LightBoxParams {
     pub(super) to_sun: Vector3<f64>,
     pub(super) up: UpAxis,
     pub(super) bounds: Bounds,
     /// Light-space bounds of the same vertices; without them, the corners of `bounds` are used.
-    pub(super) light: Option<LightBounds>,
+    pub(super) light: Option<LightSpaceBox>,
     /// Height of the ground along the up axis.
     pub(super) ground: Option<f64>,
     /// Side of the map and the empty rim that the blur needs, both in texels.
@@ -49,53 +49,53 @@ pub(super) struct Fit {
 /// bounds grow or move, the length changes in few discrete steps and the side moves by whole texels, so that shadows do
 /// not crawl.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Side {
+pub(super) struct TexelSpan {
     pub(super) low: f64,
     pub(super) half: f64,
 }
 
-impl Side {
+impl TexelSpan {
     /// Covers `reach` to each side of the center, inside the rim.
-    pub(super) fn snapped(centre: f64, reach: f64, fit: &Fit) -> Self {
-        let half = rung(reach) * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
+    pub(super) fn snap(center: f64, reach: f64, fit: &LightBoxParams) -> Self {
+        let half = next_length_step(reach) * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
         let texel = 2.0 * half / fit.size;
-        Self { low: (centre / texel).round() * texel - half, half }
+        Self { low: (center / texel).round() * texel - half, half }
     }
 }
 
 /// The next larger quantized length, in sixteenths of the next lower power of two.
-fn rung(length: f64) -> f64 {
+fn next_length_step(length: f64) -> f64 {
     let step = length.log2().floor().exp2() / 16.0;
     ((length / step).floor() + 1.0) * step
 }
 
 impl LightBox {
-    pub(super) fn fit(fit: &Fit) -> Self {
+    pub(super) fn fit(fit: &LightBoxParams) -> Self {
         let axes = light_axes(fit.to_sun, fit.up);
-        let LightBounds(held) = fit.light.unwrap_or_else(|| LightBounds::of_box(&axes, &fit.bounds));
+        let LightSpaceBox(held) = fit.light.unwrap_or_else(|| LightSpaceBox::enclosing(&axes, &fit.bounds));
         let diagonal = diagonal(fit);
         let sides = [0, 1].map(|axis: usize| {
-            let (centre, reach) = (0.5 * (held.min[axis] + held.max[axis]), 0.5 * (held.max[axis] - held.min[axis]));
-            Side::snapped(centre, reach.max(diagonal / 64.0), fit)
+            let (center, reach) = (0.5 * (held.min[axis] + held.max[axis]), 0.5 * (held.max[axis] - held.min[axis]));
+            TexelSpan::snap(center, reach.max(diagonal / 64.0), fit)
         });
         let plane = fit.ground.and_then(|height| ground_plane(&axes, fit.up, height));
-        let (near, far) = depths(fit, [held.min[2], held.max[2]], &sides, plane);
+        let (near, far) = depth_range(fit, [held.min[2], held.max[2]], &sides, plane);
         let range = near - far;
-        let mut map_from_world = Matrix4::identity();
+        let mut shadow_from_world = Matrix4::identity();
         for (axis, side) in sides.iter().enumerate() {
             let scale = 1.0 / (2.0 * side.half);
-            map_from_world.fixed_view_mut::<1, 3>(axis, 0).copy_from(&(axes[axis] * scale).transpose());
-            map_from_world[(axis, 3)] = -side.low * scale;
+            shadow_from_world.fixed_view_mut::<1, 3>(axis, 0).copy_from(&(axes[axis] * scale).transpose());
+            shadow_from_world[(axis, 3)] = -side.low * scale;
         }
-        map_from_world.fixed_view_mut::<1, 3>(2, 0).copy_from(&(-axes[2] / range).transpose());
-        map_from_world[(2, 3)] = near / range;
+        shadow_from_world.fixed_view_mut::<1, 3>(2, 0).copy_from(&(-axes[2] / range).transpose());
+        shadow_from_world[(2, 3)] = near / range;
         let ground = plane.map_or([0.0, 0.0, 1.0], |[a, b, c]| {
             let depth = |x: f64, y: f64| (near - (a * x + b * y + c)) / range;
             let [x, y] = sides;
             let origin = depth(x.low, y.low);
             [depth(x.low + 2.0 * x.half, y.low) - origin, depth(x.low, y.low + 2.0 * y.half) - origin, origin]
         });
-        Self { map_from_world, ground, axes, sides }
+        Self { shadow_from_world, ground, axes, sides }
     }
 
     /// The longer side of a texel, in scene units.
@@ -105,18 +105,23 @@ impl LightBox {
 }
 
 /// Reference length of the box. Bounds without extent get one that f32 can still resolve at their position.
-fn diagonal(fit: &Fit) -> f64 {
-    fit.bounds.diagonal().max(1e-6).max(1e-6 * fit.bounds.centre().coords.amax())
+fn diagonal(fit: &LightBoxParams) -> f64 {
+    fit.bounds.diagonal().max(1e-6).max(1e-6 * fit.bounds.center().coords.amax())
 }
 
 /// z of light space at the planes nearest to the sun and farthest from it, quantized like the sides.
-fn depths(fit: &Fit, [mut far, nearest]: [f64; 2], sides: &[Side; 2], plane: Option<[f64; 3]>) -> (f64, f64) {
+fn depth_range(
+    fit: &LightBoxParams,
+    [mut far, nearest]: [f64; 2],
+    sides: &[TexelSpan; 2],
+    plane: Option<[f64; 3]>,
+) -> (f64, f64) {
     let diagonal = diagonal(fit);
     let near = nearest + 0.01 * diagonal;
     for corner in 0..4 {
         let at = |axis: usize| sides[axis].low + if corner >> axis & 1 == 0 { 0.0 } else { 2.0 * sides[axis].half };
         let meets = plane.map_or(far, |[a, b, c]| a * at(0) + b * at(1) + c);
-        far = far.min(meets.max(near - REACH * diagonal));
+        far = far.min(meets.max(near - MAX_GROUND_PULL * diagonal));
     }
     let step = diagonal.log2().floor().exp2() / 64.0;
     ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
@@ -134,9 +139,17 @@ mod tests {
 
     use super::*;
 
-    fn fit(to_sun: Vector3<f64>, ground: Option<f64>) -> Fit {
+    fn fit(to_sun: Vector3<f64>, ground: Option<f64>) -> LightBoxParams {
         let bounds = Bounds { min: [-1.0, 0.0, -2.0], max: [1.0, 3.0, 2.0] };
-        Fit { to_sun: to_sun.normalize(), up: UpAxis::Y, bounds, light: None, ground, size: 1024.0, rim: 6.0 }
+        LightBoxParams {
+            to_sun: to_sun.normalize(),
+            up: UpAxis::Y,
+            bounds,
+            light: None,
+            ground,
+            size: 1024.0,
+            rim: 6.0,
+        }
     }
 
     #[test]
@@ -145,9 +158,9 @@ mod tests {
             let fit = fit(sun, Some(-0.5));
             let light = LightBox::fit(&fit);
             for corner in fit.bounds.corners() {
-                let inside = light.map_from_world.transform_point(&corner);
+                let inside = light.shadow_from_world.transform_point(&corner);
                 let shadow = corner - fit.to_sun * ((corner.y + 0.5) / fit.to_sun.y);
-                let shadow = light.map_from_world.transform_point(&shadow);
+                let shadow = light.shadow_from_world.transform_point(&shadow);
                 for point in [inside, shadow] {
                     assert!(point.iter().all(|number| (0.0..=1.0).contains(number)), "{sun} {point}");
                 }
@@ -168,23 +181,24 @@ mod tests {
         (0..=500).map(point).collect()
     }
 
-    fn held(fit: &Fit, points: &[Point3<f64>]) -> Option<LightBounds> {
+    fn held(fit: &LightBoxParams, points: &[Point3<f64>]) -> Option<LightSpaceBox> {
         let axes = light_axes(fit.to_sun, fit.up);
-        let one =
-            |point: &Point3<f64>| LightBounds::of_box(&axes, &Bounds { min: (*point).into(), max: (*point).into() });
-        Some(points.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union))
+        let one = |point: &Point3<f64>| {
+            LightSpaceBox::enclosing(&axes, &Bounds { min: (*point).into(), max: (*point).into() })
+        };
+        Some(points.iter().map(one).fold(LightSpaceBox::EMPTY, LightSpaceBox::union))
     }
 
     #[test]
     fn a_box_around_what_was_measured_holds_it_and_its_shadow_and_is_smaller_than_one_around_the_corners() {
         for sun in [Vector3::new(0.4, 0.8, 0.5), Vector3::new(1.0, 0.3, 0.0), Vector3::new(-0.5, 0.6, 0.7)] {
             let (corners, points) = (fit(sun, Some(-0.5)), ball([0.9, 1.4, 1.9]));
-            let fit = Fit { light: held(&corners, &points), ..corners };
+            let fit = LightBoxParams { light: held(&corners, &points), ..corners };
             let (light, by_corners) = (LightBox::fit(&fit), LightBox::fit(&corners));
             for point in points {
                 let shadow = point - fit.to_sun * ((point.y + 0.5) / fit.to_sun.y);
                 for point in [point, shadow] {
-                    let at = light.map_from_world.transform_point(&point);
+                    let at = light.shadow_from_world.transform_point(&point);
                     let rim = fit.rim / fit.size;
                     assert!(at.xy().iter().all(|number| (rim..=1.0 - rim).contains(number)), "{sun} {at}");
                     assert!((0.0..=1.0).contains(&at.z), "{sun} {at}");
@@ -204,18 +218,18 @@ mod tests {
             (Vector3::y(), None),
         ] {
             let light = LightBox::fit(&fit(sun, ground));
-            assert!(light.map_from_world.iter().chain(&light.ground).all(|number| number.is_finite()), "{sun}");
+            assert!(light.shadow_from_world.iter().chain(&light.ground).all(|number| number.is_finite()), "{sun}");
         }
         let point = Bounds { min: [5.0; 3], max: [5.0; 3] };
-        let light = LightBox::fit(&Fit { bounds: point, ..fit(Vector3::y(), Some(5.0)) });
-        let centre = light.map_from_world.transform_point(&Point3::new(5.0, 5.0, 5.0));
-        assert!(centre.iter().all(|number| (0.0..=1.0).contains(number)), "{centre}");
+        let light = LightBox::fit(&LightBoxParams { bounds: point, ..fit(Vector3::y(), Some(5.0)) });
+        let center = light.shadow_from_world.transform_point(&Point3::new(5.0, 5.0, 5.0));
+        assert!(center.iter().all(|number| (0.0..=1.0).contains(number)), "{center}");
     }
 
     /// Tracks a fixed point in the texel grid of the map while the bounds sway and grow slowly. Returns its largest
     /// movement between steps, in fractions of a texel, and the number of steps at which the map changed its quantized
     /// size, which are excluded from the movement.
-    fn crawl(is_lit: bool, place: impl Fn(&Fit) -> [f64; 2]) -> (f64, usize) {
+    fn crawl(is_lit: bool, place: impl Fn(&LightBoxParams) -> [f64; 2]) -> (f64, usize) {
         let mut fit = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut last, mut most, mut jumps): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
         for step in 0..400 {
@@ -240,7 +254,7 @@ mod tests {
         let point = Point3::new(0.3, 1.1, -0.7);
         for is_lit in [false, true] {
             let (most, jumps) = crawl(is_lit, |fit| {
-                let at = LightBox::fit(fit).map_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
+                let at = LightBox::fit(fit).shadow_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
                 [at.x, at.y]
             });
             assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs, measured {is_lit}");
@@ -261,7 +275,11 @@ mod tests {
     fn a_box_holds_what_it_is_fitted_to_whatever_its_length_and_wastes_a_sixteenth() {
         for step in -200..200 {
             let length = 1.37_f64.powi(step);
-            assert!(rung(length) > length && rung(length) <= length * 1.0626, "{length}: {}", rung(length));
+            assert!(
+                next_length_step(length) > length && next_length_step(length) <= length * 1.0626,
+                "{length}: {}",
+                next_length_step(length)
+            );
         }
     }
 }

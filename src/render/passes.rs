@@ -1,51 +1,51 @@
-//! The passes of one frame, in execution order: shadow, blur, visibility, ground, blended, backdrop, shade. `post.rs`
+//! The passes of one frame, in execution order: shadow, blur, visibility, ground, blended, background, shade. `post.rs`
 //! has the passes after them.
 
-use super::cull::{SHADOW_CULL, command};
-use super::frame::{Frame, above_ground};
-use super::geometry::{Group, Kind};
-use super::gl::{Buffer, Clear, Fixed, Framebuffer, Gl, Program, Texture};
-use super::paths::Path;
-use super::programs::Sampled;
+use super::cascades::ShadowCascades;
+use super::cull::{SHADOW_CULL, command_offset};
+use super::frame_uniforms::{FrameUniforms, camera_is_above_ground};
+use super::geometry::{BlendMode, DrawGroup};
+use super::gl::{Buffer, ClearOp, Framebuffer, Gl, PipelineState, Program, Texture};
+use super::programs::SampleCountPrograms;
+use super::raster_backends::RasterBackend;
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
-    COLOUR_UNIT, COUNT_UNIT, DEPTH_UNIT, ID_UNIT, LANES, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE,
-    TILE_ROW,
+    COLOR_UNIT, COUNT_UNIT, DEPTH_UNIT, ID_UNIT, LAYER_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT, TILE, TILE_ROW,
+    WORKGROUP_SIZE,
 };
-use super::splits::Splits;
-use super::target::Target;
-use super::{Ran, Shot};
+use super::target::RenderTarget;
+use super::{FrameParams, FrameStats};
 use modalcast_model::error::Result;
 
 pub(super) const PIXELS: u32 = 0;
 pub(super) const TILES: u32 = 1;
 /// Initial indirect dispatch over listed tiles: group counts (TILE_ROW, 0 rows, 1), then the tile count 0.
-pub(super) const NO_TILES: [u32; 4] = [TILE_ROW, 0, 1, 0];
+pub(super) const EMPTY_TILE_LIST: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
-const SPLITS: u32 = 2;
+const CASCADES: u32 = 2;
 /// Cleared layer: no light, full transmittance.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 /// Which triangles of a kind a pass draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Drawn {
+pub(super) enum TriangleSet {
     All,
     /// The triangles in the culled lists.
-    Listed,
+    Visible,
 }
 
 /// Binds the buffers and textures that all passes read.
 pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
-    buffers.drawn_positions().bind(POSITION_UNIT);
-    for (unit, view) in &buffers.views.others {
+    buffers.position_texture().bind(POSITION_UNIT);
+    for (unit, view) in &buffers.buffer_textures.others {
         view.bind(*unit);
     }
-    buffers.buffer("frame")?.bind_uniform(FRAME, 0, size_of::<Frame>());
-    if let Ok(splits) = buffers.buffer("splits") {
-        splits.bind_uniform(SPLITS, 0, size_of::<Splits>());
+    buffers.buffer("frame uniforms")?.bind_uniform(FRAME, 0, size_of::<FrameUniforms>());
+    if let Ok(splits) = buffers.buffer("shadow cascades") {
+        splits.bind_uniform(CASCADES, 0, size_of::<ShadowCascades>());
     }
-    for (unit, texture) in (COLOUR_UNIT..).zip(&buffers.colours) {
+    for (unit, texture) in (COLOR_UNIT..).zip(&buffers.color_arrays) {
         texture.bind(unit);
     }
     for (unit, texture) in (NORMAL_UNIT..).zip(&buffers.normals) {
@@ -55,20 +55,20 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
 }
 
 /// Draws the depth of the shadow map, unless the compute rasterizer has drawn it.
-pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
-    let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_beside().is_none()) else { return Ok(()) };
-    ran.paths.shadow = Some(Path::OpenGl);
+pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> Result<()> {
+    let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_rasterizer().is_none()) else { return Ok(()) };
+    stats.raster_backends.shadow = Some(RasterBackend::OpenGl);
     super::shadow::depth(gl, buffers, map)?;
-    ran.passes.extend(buffers.culler.as_ref().map(|_| SHADOW_CULL));
-    ran.passes.push("shadow");
+    stats.passes.extend(buffers.culler.as_ref().map(|_| SHADOW_CULL));
+    stats.passes.push("shadow");
     Ok(())
 }
 
 /// Blurs the moments of a variance map. Other shadow methods need depth only.
-pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()> {
+pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> Result<()> {
     let Some(map) = &buffers.shadow else { return Ok(()) };
     if super::shadow::blur(gl, buffers, map)? {
-        ran.passes.push("blur");
+        stats.passes.push("blur");
     }
     Ok(())
 }
@@ -77,59 +77,69 @@ pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, ran: &mut Ran) -> Result<()>
 pub(super) fn visibility(
     gl: &Gl,
     buffers: &SceneBuffers,
-    target: &Target,
-    sampled: &Sampled,
-    ran: &mut Ran,
+    target: &RenderTarget,
+    sample_programs: &SampleCountPrograms,
+    stats: &mut FrameStats,
 ) -> Result<()> {
-    let programs = (sampled.mask.as_deref(), sampled.parts.as_deref());
+    let programs = (sample_programs.mask.as_deref(), sample_programs.opaque_parts.as_deref());
     // With several samples, depth says where an id is valid; the ids need no clear.
-    let clear = match target.form.samples {
-        1 => Clear::DepthAndIds(Some(&target.touched)),
-        _ => Clear::Depth(Some(&target.touched.depth)),
+    let clear = match target.desc.samples {
+        1 => ClearOp::DepthAndIds(Some(&target.dirty)),
+        _ => ClearOp::Depth(Some(&target.dirty.depth)),
     };
-    let into = (&target.visible, clear, target.reach.get(), listed(buffers));
-    identify(gl, buffers, into, programs, ran)?;
-    super::cull::remember(gl, buffers, target, sampled)
+    let into = (&target.visibility_fbo, clear, target.draw_region.get(), triangle_set(buffers));
+    draw_ids(gl, buffers, into, programs, stats)?;
+    super::cull::record_visible(gl, buffers, target, sample_programs)
 }
 
 /// Draws ids and depth into `part` of a framebuffer that is at least as large as the part's frame: of opaque triangles,
 /// of cut-outs with the first program, and of the opaque parts of blended triangles with the second.
-pub(super) fn identify(
+pub(super) fn draw_ids(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (into, clear, part, drawn): (&Framebuffer, Clear<'_>, Region, Drawn),
-    (cut_out, parts): (Option<&Program>, Option<&Program>),
-    ran: &mut Ran,
+    (into, clear, part, drawn): (&Framebuffer, ClearOp<'_>, Region, TriangleSet),
+    (cut_out, opaque_parts): (Option<&Program>, Option<&Program>),
+    stats: &mut FrameStats,
 ) -> Result<()> {
-    gl.begin(into, part, clear);
+    gl.begin_pass(into, part, clear);
     // Cut-outs come after opaque triangles: where something opaque is nearer, the depth test saves their texture
     // lookups.
-    let kinds = [(Kind::Opaque, buffers.programs.opaque.as_deref()), (Kind::Mask, cut_out), (Kind::Blend, parts)];
-    let written = Fixed { depth_write: true, ..Fixed::default() };
+    let kinds = [
+        (BlendMode::Opaque, buffers.programs.opaque.as_deref()),
+        (BlendMode::Mask, cut_out),
+        (BlendMode::Blend, opaque_parts),
+    ];
+    let written = PipelineState { depth_write: true, ..PipelineState::default() };
     let mut any = false;
-    for (kind, program) in kinds {
+    for (blend_mode, program) in kinds {
         if let Some(program) = program {
-            draw(gl, buffers, (kind, program, drawn), written, ran);
+            draw(gl, buffers, (blend_mode, program, drawn), written, stats);
             any = true;
         }
     }
     if any {
-        ran.passes.push("visibility");
-        ran.paths.visibility = Some(Path::OpenGl);
+        stats.passes.push("visibility");
+        stats.raster_backends.visibility = Some(RasterBackend::OpenGl);
     }
     gl.check("visibility")
 }
 
 /// Draws the ground into ids and depth. A picture draws it only when something lies below it; otherwise the shading
 /// finds the ground.
-pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran) -> Result<()> {
-    let Some(program) = buffers.programs.ground.as_ref().filter(|_| above_ground(&buffers.scene, shot)) else {
+pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &FrameParams, stats: &mut FrameStats) -> Result<()> {
+    let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, shot))
+    else {
         return Ok(());
     };
-    gl.set(Fixed { depth_clamp: true, depth_write: true, behind: true, ..Fixed::default() });
+    gl.set_pipeline_state(PipelineState {
+        depth_clamp: true,
+        depth_write: true,
+        polygon_offset: true,
+        ..PipelineState::default()
+    });
     program.bind(None);
-    gl.draw_made(&buffers.nothing, 3);
-    ran.passes.push("ground");
+    gl.draw_procedural(&buffers.empty_vertex_array, 3);
+    stats.passes.push("ground");
     gl.check("ground")
 }
 
@@ -137,60 +147,66 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &Shot, ran: &mut Ran
 pub(super) fn blended(
     gl: &Gl,
     buffers: &SceneBuffers,
-    target: &Target,
-    sampled: &Sampled,
-    ran: &mut Ran,
+    target: &RenderTarget,
+    sample_programs: &SampleCountPrograms,
+    stats: &mut FrameStats,
 ) -> Result<()> {
-    if let (Some(programs), Some(lists)) = (&sampled.lists, &target.lists) {
-        return super::lists::draw(gl, buffers, (lists, target.reach.get()), programs, ran);
+    if let (Some(programs), Some(oit)) = (&sample_programs.oit, &target.oit) {
+        return super::oit::draw(gl, buffers, (oit, target.draw_region.get()), programs, stats);
     }
-    let (Some(program), Some(layer)) = (&sampled.blended, &target.layer) else { return Ok(()) };
-    gl.begin(&layer.framebuffer, target.reach.get(), Clear::Colour(CLEAR_LAYER, &layer.touched));
+    let (Some(program), Some(layer)) = (&sample_programs.blended, &target.layer) else { return Ok(()) };
+    gl.begin_pass(&layer.framebuffer, target.draw_region.get(), ClearOp::Color(CLEAR_LAYER, &layer.dirty));
     bind_shadow(buffers);
-    let program = (Kind::Blend, program.as_ref(), listed(buffers));
-    draw(gl, buffers, program, Fixed { blend: true, ..Fixed::default() }, ran);
-    ran.passes.push("blended");
+    let program = (BlendMode::Blend, program.as_ref(), triangle_set(buffers));
+    draw(gl, buffers, program, PipelineState { blend: true, ..PipelineState::default() }, stats);
+    stats.passes.push("blended");
     gl.check("blended")
 }
 
 /// Shades the visible surfaces to linear light.
-pub(super) fn shade(gl: &Gl, buffers: &SceneBuffers, target: &Target, sampled: &Sampled, ran: &mut Ran) -> Result<()> {
+pub(super) fn shade(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    target: &RenderTarget,
+    sample_programs: &SampleCountPrograms,
+    stats: &mut FrameStats,
+) -> Result<()> {
     bind_shadow(buffers);
-    bind_seen(target);
+    bind_visibility(target);
     if let Some(layer) = &target.layer {
-        layer.colour.bind(LAYER_UNIT);
+        layer.color.bind(LAYER_UNIT);
     }
-    if let Some(lists) = &target.lists {
-        lists.layers.bind(LAYER_UNIT);
-        lists.counts.bind(COUNT_UNIT);
+    if let Some(oit) = &target.oit {
+        oit.layers.bind(LAYER_UNIT);
+        oit.counts.bind(COUNT_UNIT);
     }
-    target.picture.bind_image(0);
-    if let Some(glare) = target.glow.first() {
-        glare.bind_image(1);
+    target.scene_color.bind_image(0);
+    if let Some(source) = target.bloom_mips.first() {
+        source.bind_image(1);
     }
-    target.tiles.write(bytemuck::cast_slice(&NO_TILES));
+    target.tiles.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
     target.tiles.bind_storage(TILES);
-    sampled.backdrop.bind(None);
-    gl.dispatch(target.form.width.div_ceil(TILE), target.form.height.div_ceil(TILE));
-    ran.passes.push("backdrop");
-    gl.check("backdrop")?;
-    if let Some(program) = &sampled.shade {
+    sample_programs.background.bind(None);
+    gl.dispatch(target.desc.width.div_ceil(TILE), target.desc.height.div_ceil(TILE));
+    stats.passes.push("background");
+    gl.check("background")?;
+    if let Some(program) = &sample_programs.shade {
         program.bind(None);
-        gl.dispatch_listed(&target.tiles);
-        ran.passes.push("shade");
+        gl.dispatch_indirect(&target.tiles);
+        stats.passes.push("shade");
     }
     gl.check("shade")
 }
 
 /// Binds ids and depth. Depth says which samples hold a valid id.
-pub(super) fn bind_seen(target: &Target) {
+pub(super) fn bind_visibility(target: &RenderTarget) {
     target.ids.bind(ID_UNIT);
     target.depth.bind(DEPTH_UNIT);
 }
 
 /// Converts ids to words in a buffer that can be copied to the host. `number` is the uniform at location 0 of programs
 /// that have one.
-pub(super) fn words(
+pub(super) fn run_readback(
     gl: &Gl,
     (ids, into): (&Texture, &Buffer),
     (program, number): (&Program, Option<u32>),
@@ -199,26 +215,32 @@ pub(super) fn words(
     program.bind(number);
     ids.bind(ID_UNIT);
     into.bind_storage(PIXELS);
-    gl.dispatch(width.div_ceil(LANES), height);
+    gl.dispatch(width.div_ceil(WORKGROUP_SIZE), height);
     gl.check("words")
 }
 
 /// Packs the ids of each pixel's first sample into a buffer that can be copied to the host.
-pub(super) fn seen(gl: &Gl, target: &Target, program: &Program) -> Result<()> {
+pub(super) fn resolve_ids(gl: &Gl, target: &RenderTarget, program: &Program) -> Result<()> {
     program.bind(None);
-    bind_seen(target);
-    target.packed.bind_storage(PIXELS);
-    gl.dispatch(target.form.width.div_ceil(LANES), target.form.height);
-    gl.check("seen")
+    bind_visibility(target);
+    target.readback_source.bind_storage(PIXELS);
+    gl.dispatch(target.desc.width.div_ceil(WORKGROUP_SIZE), target.desc.height);
+    gl.check("visibility readback")
 }
 
 /// Draws the triangles of one kind: one call for single-sided, one for double-sided ones.
-fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program, drawn): (Kind, &Program, Drawn), fixed: Fixed, ran: &mut Ran) {
-    for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == kind) {
-        gl.set(Fixed { cull: !group.double_sided, ..fixed });
-        program.bind(Some(begins(group, drawn)));
+fn draw(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    (blend_mode, program, drawn): (BlendMode, &Program, TriangleSet),
+    fixed: PipelineState,
+    stats: &mut FrameStats,
+) {
+    for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.blend_mode == blend_mode) {
+        gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..fixed });
+        program.bind(Some(first_triangle_of(group, drawn)));
         draw_group(gl, buffers, index, drawn);
-        ran.draws += 1;
+        stats.draw_calls += 1;
     }
 }
 
@@ -226,61 +248,72 @@ fn draw(gl: &Gl, buffers: &SceneBuffers, (kind, program, drawn): (Kind, &Program
 pub(super) fn draw_depth(
     gl: &Gl,
     buffers: &SceneBuffers,
-    (kind, program): (Kind, &Program),
-    drawn: Drawn,
-    ran: &mut Ran,
+    (blend_mode, program): (BlendMode, &Program),
+    drawn: TriangleSet,
+    stats: &mut FrameStats,
 ) {
-    draw(gl, buffers, (kind, program, drawn), Fixed { depth_write: true, ..Fixed::default() }, ran);
+    draw(
+        gl,
+        buffers,
+        (blend_mode, program, drawn),
+        PipelineState { depth_write: true, ..PipelineState::default() },
+        stats,
+    );
 }
 
 /// Draws the triangles of one kind, single- and double-sided alike, with the bound program: in one call, or in one call
 /// per culled list.
-pub(super) fn draw_kind(gl: &Gl, buffers: &SceneBuffers, (kind, program): (Kind, &Program), drawn: Drawn) {
-    let has_fragments = kind != Kind::Opaque;
-    if drawn == Drawn::All {
-        let (first, count) = buffers.triangles(kind);
+pub(super) fn draw_blend_mode(
+    gl: &Gl,
+    buffers: &SceneBuffers,
+    (blend_mode, program): (BlendMode, &Program),
+    drawn: TriangleSet,
+) {
+    let has_fragments = blend_mode != BlendMode::Opaque;
+    if drawn == TriangleSet::All {
+        let (first, count) = buffers.triangles(blend_mode);
         if has_fragments {
-            program.first(first as u32);
+            program.set_first_triangle(first as u32);
         }
-        if let Some(array) = buffers.array(kind) {
+        if let Some(array) = buffers.vertex_array(blend_mode) {
             gl.draw_indexed(array, first, count);
         }
         return;
     }
-    for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.kind == kind) {
+    for (index, group) in buffers.groups.iter().enumerate().filter(|(_, group)| group.blend_mode == blend_mode) {
         if has_fragments {
-            program.first(begins(group, drawn));
+            program.set_first_triangle(first_triangle_of(group, drawn));
         }
         draw_group(gl, buffers, index, drawn);
     }
 }
 
 /// The culled lists when the scene is culled, else all triangles.
-pub(super) fn listed(buffers: &SceneBuffers) -> Drawn {
-    if buffers.culler.is_some() { Drawn::Listed } else { Drawn::All }
+pub(super) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
+    if buffers.culler.is_some() { TriangleSet::Visible } else { TriangleSet::All }
 }
 
 /// Offset of a group for the shaders: its first triangle, or the complement of it for a list
-/// (`shaders/shared/drawn.glsl`).
-pub(super) const fn begins(group: &Group, drawn: Drawn) -> u32 {
+/// (`shaders/shared/triangle_id.glsl`).
+pub(super) const fn first_triangle_of(group: &DrawGroup, drawn: TriangleSet) -> u32 {
     match drawn {
-        Drawn::All => group.first_triangle as u32,
-        Drawn::Listed => !(group.first_triangle as u32),
+        TriangleSet::All => group.first_triangle as u32,
+        TriangleSet::Visible => !(group.first_triangle as u32),
     }
 }
 
 /// Draws a group, or the culled list of the group.
-pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: Drawn) {
+pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: TriangleSet) {
     let group = buffers.groups[index];
     match drawn {
-        Drawn::All => {
-            if let Some(array) = buffers.array(group.kind) {
+        TriangleSet::All => {
+            if let Some(array) = buffers.vertex_array(group.blend_mode) {
                 gl.draw_indexed(array, group.first_triangle, group.triangles);
             }
         }
-        Drawn::Listed => {
-            if let Some((array, ledger)) = buffers.listed(group.kind) {
-                gl.draw_told(array, ledger, command(index));
+        TriangleSet::Visible => {
+            if let Some((array, ledger)) = buffers.visible_draws(group.blend_mode) {
+                gl.draw_indexed_indirect(array, ledger, command_offset(index));
             }
         }
     }

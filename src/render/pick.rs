@@ -11,25 +11,25 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix4, Vector3};
 
-use super::geometry::{Stretch, whose};
+use super::geometry::{TriangleSpan, locate_triangle};
 use super::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
-use super::seen::Seen;
 use super::shaders;
-use super::target::{Form, image};
-use super::{Ran, Renderer, Shot, frame, passes};
+use super::target::{TargetDesc, create_image};
+use super::visibility_id::VisibilityId;
+use super::{FrameParams, FrameStats, Renderer, frame_uniforms, passes};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Camera, Rectangle, Scene};
+use modalcast_model::scene::{Camera, PixelRect, Scene};
 
 /// 32-bit words per pixel that `shaders/pick.comp` writes.
-const WORDS: usize = 22;
-const LARGEST: u32 = Rectangle::LARGEST;
-const BYTES: u64 = 4 * WORDS as u64 * LARGEST as u64 * LARGEST as u64;
+const WORDS_PER_PIXEL: usize = 22;
+const MAX_SIDE: u32 = PixelRect::LARGEST;
+const MAX_BYTES: u64 = 4 * WORDS_PER_PIXEL as u64 * MAX_SIDE as u64 * MAX_SIDE as u64;
 
 /// The surface point at the center of a pixel.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Hit {
+pub struct PickHit {
     /// Column and row in the full picture; (0, 0) is the top left.
     pub pixel: [u32; 2],
     pub domain: usize,
@@ -38,7 +38,7 @@ pub struct Hit {
     /// Vertices of the triangle in the domain's mesh (row of U divided by three).
     pub vertices: [u32; 3],
     /// Barycentric coordinates of the point, in the order of `vertices`: 0 to 1, with sum 1.
-    pub shares: [f64; 3],
+    pub barycentrics: [f64; 3],
     /// The point, in scene units from the scene's origin.
     pub position: [f64; 3],
     /// Interpolated unit normal on the visible side; zero when the corner normals cancel.
@@ -49,10 +49,10 @@ pub struct Hit {
 
 /// Render target and buffers of picks.
 #[derive(Debug)]
-pub(super) struct Picker {
+pub(super) struct PickTarget {
     ids: Texture,
-    visible: Framebuffer,
-    packed: Buffer,
+    visibility_fbo: Framebuffer,
+    readback_source: Buffer,
     /// Staging buffers of finished picks, for reuse.
     free: Vec<Buffer>,
     // Attached to the framebuffer, which must not outlive it.
@@ -61,24 +61,24 @@ pub(super) struct Picker {
 
 /// A pick in flight.
 #[derive(Debug)]
-pub struct Pick {
+pub struct PendingPick {
     staging: Buffer,
     fence: Fence,
     scene: Arc<Scene>,
-    stretches: Rc<[Stretch]>,
-    rectangle: Rectangle,
+    spans: Rc<[TriangleSpan]>,
+    rectangle: PixelRect,
     /// Camera of the rectangle, relative to `origin`.
     camera: Camera,
     origin: [f64; 3],
 }
 
-impl Picker {
+impl PickTarget {
     fn new(gl: &Rc<Gl>) -> Result<Self> {
-        let form = Form { width: LARGEST, height: LARGEST, samples: 1, ..Form::EMPTY };
-        let (ids, depth) = (image(gl, form, gl::R32UI)?, image(gl, form, gl::DEPTH_COMPONENT32F)?);
-        let visible = gl.framebuffer(Some(&ids), &depth)?;
-        let packed = gl.buffer(BYTES, gl::STREAM_COPY, None)?;
-        Ok(Self { ids, visible, packed, free: Vec::new(), _depth: depth })
+        let desc = TargetDesc { width: MAX_SIDE, height: MAX_SIDE, samples: 1, ..TargetDesc::EMPTY };
+        let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
+        let visibility_fbo = gl.framebuffer(Some(&ids), &depth)?;
+        let readback_source = gl.buffer(MAX_BYTES, gl::STREAM_COPY, None)?;
+        Ok(Self { ids, visibility_fbo, readback_source, free: Vec::new(), _depth: depth })
     }
 }
 
@@ -87,42 +87,56 @@ impl Renderer {
     ///
     /// # Errors
     /// `Invalid` for a camera whose matrices overflow, `Fault` when OpenGL reports an error.
-    pub fn begin_pick(&mut self, buffers: &SceneBuffers, shot: &Shot, rectangle: Rectangle) -> Result<Pick> {
+    pub fn begin_pick(
+        &mut self,
+        buffers: &SceneBuffers,
+        shot: &FrameParams,
+        rectangle: PixelRect,
+    ) -> Result<PendingPick> {
         let [width, height] = rectangle.size();
-        let camera = shot.camera.cropped([shot.width, shot.height], rectangle);
-        let shot = Shot { camera, width, height, ..*shot };
-        let numbers = frame::Frame::new(&buffers.scene, &shot, buffers.origin)?;
-        let cut_out = buffers.cut_out(1, &mut |source| self.program(source))?;
+        let camera = shot.camera.cropped_to([shot.width, shot.height], rectangle);
+        let shot = FrameParams { camera, width, height, ..*shot };
+        let numbers = frame_uniforms::FrameUniforms::new(&buffers.scene, &shot, buffers.origin)?;
+        let cut_out = buffers.mask_program(1, &mut |source| self.program(source))?;
         let program = self.program(shaders::pick())?;
-        let mut picker = match self.picker.take() {
-            Some(picker) => picker,
-            None => Picker::new(&self.gl)?,
+        let mut pick_target = match self.pick_target.take() {
+            Some(pick_target) => pick_target,
+            None => PickTarget::new(&self.gl)?,
         };
-        let free = picker.free.pop();
-        let picker = self.picker.insert(picker);
+        let free = pick_target.free.pop();
+        let pick_target = self.pick_target.insert(pick_target);
         let gl = &self.gl;
         let staging = match free {
             Some(staging) => staging,
-            None => gl.buffer(BYTES, gl::STREAM_READ, None)?,
+            None => gl.buffer(MAX_BYTES, gl::STREAM_READ, None)?,
         };
-        buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
+        buffers.buffer("frame uniforms")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
-        let ran = &mut Ran::default();
-        passes::identify(
+        let stats = &mut FrameStats::default();
+        passes::draw_ids(
             gl,
             buffers,
-            (&picker.visible, gl::Clear::DepthAndIds(None), Region::whole([width, height]), passes::Drawn::All),
+            (
+                &pick_target.visibility_fbo,
+                gl::ClearOp::DepthAndIds(None),
+                Region::whole([width, height]),
+                passes::TriangleSet::All,
+            ),
             (cut_out.as_deref(), None),
-            ran,
+            stats,
         )?;
         let size = Some(width | height << 16);
-        passes::words(gl, (&picker.ids, &picker.packed), (&program, size), [width, height])?;
-        gl.copy(&picker.packed, &staging, 4 * (WORDS * width as usize * height as usize) as u64);
-        Ok(Pick {
+        passes::run_readback(gl, (&pick_target.ids, &pick_target.readback_source), (&program, size), [width, height])?;
+        gl.copy(
+            &pick_target.readback_source,
+            &staging,
+            4 * (WORDS_PER_PIXEL * width as usize * height as usize) as u64,
+        );
+        Ok(PendingPick {
             staging,
             fence: gl.fence("pick")?,
             scene: Arc::clone(&buffers.scene),
-            stretches: Rc::clone(&buffers.stretches),
+            spans: Rc::clone(&buffers.spans),
             rectangle,
             camera: camera.relative_to(buffers.origin),
             origin: buffers.origin,
@@ -133,37 +147,37 @@ impl Renderer {
     ///
     /// # Errors
     /// `Fault` when the device does not finish in time.
-    pub fn finish_pick(&mut self, pick: Pick) -> Result<Vec<Hit>> {
-        pick.fence.wait("pick", self.watchdog)?;
+    pub fn finish_pick(&mut self, pick: PendingPick) -> Result<Vec<PickHit>> {
+        pick.fence.wait("pick", self.frame_timeout)?;
         let [width, height] = pick.rectangle.size();
-        let words = WORDS * width as usize * height as usize;
+        let words = WORDS_PER_PIXEL * width as usize * height as usize;
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(&pick.staging.read(4 * words)?);
-        let rays = Rays::of(&pick);
-        let pixels = words.chunks_exact(WORDS).zip(0..);
+        let rays = PixelRays::of(&pick);
+        let pixels = words.chunks_exact(WORDS_PER_PIXEL).zip(0..);
         let hits = pixels.filter_map(|(words, at)| hit(&pick, &rays, words, [at % width, at / width])).collect();
-        if let Some(picker) = &mut self.picker {
-            picker.free.push(pick.staging);
+        if let Some(pick_target) = &mut self.pick_target {
+            pick_target.free.push(pick.staging);
         }
         self.gl.check("pick").map(|()| hits)
     }
 }
 
-impl Pick {
+impl PendingPick {
     /// Whether [`Renderer::finish_pick`] would return without waiting.
     pub fn is_ready(&self) -> bool {
-        self.fence.is_over()
+        self.fence.is_done()
     }
 }
 
 /// View rays through the pixels of the rectangle.
-struct Rays {
+struct PixelRays {
     camera_from_world: Matrix4<f64>,
     /// fx, fy, cx and cy.
     lens: [f64; 4],
 }
 
-impl Rays {
-    fn of(pick: &Pick) -> Self {
+impl PixelRays {
+    fn of(pick: &PendingPick) -> Self {
         let lens = pick.camera.intrinsics(pick.rectangle.size());
         Self { camera_from_world: pick.camera.camera_from_world(), lens }
     }
@@ -176,9 +190,9 @@ impl Rays {
 }
 
 /// Hit of one pixel of the rectangle, from the words that the device wrote.
-fn hit(pick: &Pick, rays: &Rays, words: &[u32], at: [u32; 2]) -> Option<Hit> {
-    let Seen::Triangle(place) = Seen::from_id(words[0]) else { return None };
-    let (domain, triangle) = whose(&pick.stretches, place)?;
+fn hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], at: [u32; 2]) -> Option<PickHit> {
+    let VisibilityId::Triangle(place) = VisibilityId::from_id(words[0]) else { return None };
+    let (domain, triangle) = locate_triangle(&pick.spans, place)?;
     let mesh = &pick.scene.shapes[pick.scene.domains[domain].shape].mesh;
     let corners = *mesh.triangles().get(triangle)?;
     let first = pick.scene.layout.slots[domain].first_corner as u32;
@@ -190,35 +204,36 @@ fn hit(pick: &Pick, rays: &Rays, words: &[u32], at: [u32; 2]) -> Option<Hit> {
     };
     let ray = rays.through(at);
     let in_camera = [0, 1, 2].map(|index| rays.camera_from_world.transform_point(&point(4, index).into()).coords);
-    let (shares, front) = meet(&in_camera, &ray);
-    let shares = Vector3::from(shares);
-    let mix = |from: usize| Matrix3::from_columns(&[point(from, 0), point(from, 1), point(from, 2)]) * shares;
+    let (barycentrics, front) = intersect_triangle(&in_camera, &ray);
+    let barycentrics = Vector3::from(barycentrics);
+    let mix = |from: usize| Matrix3::from_columns(&[point(from, 0), point(from, 1), point(from, 2)]) * barycentrics;
     let normal = mix(13).try_normalize(1e-30).filter(|unit| unit.iter().all(|number| number.is_finite()));
     let normal = normal.unwrap_or_default();
-    Some(Hit {
+    Some(PickHit {
         pixel: [pick.rectangle.x() + at[0], pick.rectangle.y() + at[1]],
         domain,
         triangle,
         vertices: corners.map(|corner| mesh.corners().vertices[corner as usize]),
-        shares: order.map(|index| shares[index]),
+        barycentrics: order.map(|index| barycentrics[index]),
         position: (mix(4) + Vector3::from(pick.origin)).into(),
         normal: if front { normal } else { -normal }.into(),
-        depth: -(Matrix3::from_columns(&in_camera) * shares).z,
+        depth: -(Matrix3::from_columns(&in_camera) * barycentrics).z,
     })
 }
 
 /// Barycentric coordinates of the intersection of a ray from the origin with a triangle, and whether its front side is
 /// visible. Corner i has the share d . (v_j x v_k) of their sum. The ray may miss the triangle by the rounding of the
 /// rasterizer (1/256 pixel); negative shares are then clamped to 0. A triangle without screen area gets equal shares.
-fn meet([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
+fn intersect_triangle([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
     let volumes = [b.cross(c), c.cross(a), a.cross(b)].map(|normal| ray.dot(&normal));
     let sum: f64 = volumes.iter().sum();
     let inside = volumes.map(|volume| (volume / sum).max(0.0));
     let whole: f64 = inside.iter().sum();
     // NaN fails the comparison.
-    let shares = if whole > 0.5 && whole.is_finite() { inside.map(|share| share / whole) } else { [1.0 / 3.0; 3] };
+    let barycentrics =
+        if whole > 0.5 && whole.is_finite() { inside.map(|share| share / whole) } else { [1.0 / 3.0; 3] };
     // Rays point away from the eye, so the front side is visible when the sum is negative.
-    (shares, sum < 0.0)
+    (barycentrics, sum < 0.0)
 }
 
 #[cfg(test)]
@@ -230,21 +245,21 @@ mod tests {
         let corners = [Vector3::new(-1.0, -1.0, -4.0), Vector3::new(3.0, -1.0, -9.0), Vector3::new(0.5, 2.0, -2.0)];
         let want = [0.2, 0.5, 0.3];
         let point: Vector3<f64> = corners.iter().zip(want).map(|(corner, share)| corner * share).sum();
-        let (shares, front) = meet(&corners, &(point / -point.z));
-        assert!(shares.iter().zip(want).all(|(got, want)| (got - want).abs() < 1e-14), "{shares:?}");
+        let (barycentrics, front) = intersect_triangle(&corners, &(point / -point.z));
+        assert!(barycentrics.iter().zip(want).all(|(got, want)| (got - want).abs() < 1e-14), "{barycentrics:?}");
         assert!(front, "counter-clockwise");
         let turned = [corners[0], corners[2], corners[1]];
-        assert!(!meet(&turned, &(point / -point.z)).1);
+        assert!(!intersect_triangle(&turned, &(point / -point.z)).1);
         for flat in [[corners[0]; 3], [Vector3::zeros(); 3], [corners[0] * f64::NAN; 3]] {
-            let (shares, _) = meet(&flat, &Vector3::new(0.1, 0.2, -1.0));
-            assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{shares:?}");
+            let (barycentrics, _) = intersect_triangle(&flat, &Vector3::new(0.1, 0.2, -1.0));
+            assert!((barycentrics.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{barycentrics:?}");
         }
     }
 
     #[test]
     fn a_ray_that_passes_by_is_moved_onto_the_rim() {
         let corners = [Vector3::new(0.0, 0.0, -1.0), Vector3::new(1.0, 0.0, -1.0), Vector3::new(0.0, 1.0, -1.0)];
-        let (shares, _) = meet(&corners, &Vector3::new(0.5, -0.01, -1.0));
-        assert!(shares[2] == 0.0 && (shares[0] + shares[1] - 1.0).abs() < 1e-15, "{shares:?}");
+        let (barycentrics, _) = intersect_triangle(&corners, &Vector3::new(0.5, -0.01, -1.0));
+        assert!(barycentrics[2] == 0.0 && (barycentrics[0] + barycentrics[1] - 1.0).abs() < 1e-15, "{barycentrics:?}");
     }
 }

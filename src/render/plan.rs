@@ -1,15 +1,15 @@
-//! Plan of the device resources of a scene, derived once from its [`modalcast_model::scene::Needs`]: buffers, textures,
+//! Plan of the device resources of a scene, derived once from its [`modalcast_model::scene::SceneFeatures`]: buffers, textures,
 //! passes and shader branches. It also lists the features that were left out, and what each saves compared with a scene
 //! that uses every feature.
 //!
 //! The renderer allocates and compiles exactly what the plan lists. Planning is pure and needs no device.
 
-use super::cull::{self, allocations, chosen};
-use super::geometry::{Group, Kind, groups, kind, looks_up, used_materials};
+use super::cull::{self, allocations, select_culling};
+use super::geometry::{BlendMode, DrawGroup, blend_mode, groups, used_materials, uses_material_table};
 use super::gl::Limits;
-use super::shadow::fitting;
-use super::textures::{Use, arrays};
-use modalcast_model::scene::{Antialias, Culling, Scene, Shadow, Tone, Transparency};
+use super::shadow::resolve_blurring;
+use super::textures::{TextureRole, arrays};
+use modalcast_model::scene::{Antialiasing, Culling, Scene, ShadowSettings, ToneMapping, Transparency};
 
 /// A buffer or texture and its size.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -20,7 +20,7 @@ pub struct Allocation {
 
 /// A feature that the scene does not need, and the savings from leaving it out.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Saving {
+pub struct OmittedFeature {
     /// Name of the feature.
     pub feature: &'static str,
     /// Device memory that is not allocated.
@@ -33,7 +33,7 @@ pub struct Saving {
 
 /// All device resources and passes of a scene.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Plan {
+pub struct RenderPlan {
     /// Buffers of the scene, by name.
     pub buffers: Vec<Allocation>,
     /// Textures of the scene, by name.
@@ -43,13 +43,13 @@ pub struct Plan {
     pub passes: Vec<&'static str>,
     /// Draw calls of the occluders, visibility and blended passes, fourteen at most; independent of the number of
     /// domains and materials.
-    pub draws: usize,
+    pub draw_calls: usize,
     /// Defines that the shaders are compiled with.
     pub defines: Vec<&'static str>,
-    pub left_out: Vec<Saving>,
+    pub omitted: Vec<OmittedFeature>,
 }
 
-impl Plan {
+impl RenderPlan {
     /// Whether the shaders are compiled with a define.
     pub fn defines(&self, name: &str) -> bool {
         self.defines.contains(&name)
@@ -62,22 +62,22 @@ impl Plan {
 }
 
 /// Plans a scene for a GPU without limits.
-pub fn plan(scene: &Scene) -> Plan {
-    planned(scene, &Limits { max_storage: u64::MAX, ..Limits::default() })
+pub fn plan(scene: &Scene) -> RenderPlan {
+    plan_for_device(scene, &Limits { max_storage_bytes: u64::MAX, ..Limits::default() })
 }
 
 /// Plans a scene for a device, which may be a software rasterizer.
-pub(super) fn planned(scene: &Scene, limits: &Limits) -> Plan {
+pub(super) fn plan_for_device(scene: &Scene, limits: &Limits) -> RenderPlan {
     let (groups, _) = groups(scene);
-    let has = |kind: Kind| groups.iter().any(|group| group.kind == kind);
+    let has = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
     let mut passes = Vec::new();
-    let culling = chosen(scene, limits);
+    let culling = select_culling(scene, limits);
     if let Some(shadow) = scene.look.shadow {
         passes.extend((culling != Culling::None).then_some(cull::SHADOW_CULL));
         passes.push("shadow");
         passes.extend(shadow.has_moments().then_some("blur"));
     }
-    let seen = has(Kind::Opaque) || has(Kind::Mask) || opaque_parts(scene);
+    let seen = has(BlendMode::Opaque) || has(BlendMode::Mask) || opaque_parts(scene);
     passes.extend(cull::passes(culling));
     if seen {
         passes.push("visibility");
@@ -86,19 +86,19 @@ pub(super) fn planned(scene: &Scene, limits: &Limits) -> Plan {
     if scene.needs.blend {
         passes.extend(blended(scene));
     }
-    passes.push("backdrop");
+    passes.push("background");
     if seen {
         passes.push("shade");
     }
     passes.extend(scene.look.bloom.map(|_| "bloom"));
     passes.push("encode");
-    Plan {
+    RenderPlan {
         buffers: [buffers(scene), allocations(scene, culling)].concat(),
         textures: textures(scene, limits.software),
         passes,
-        draws: draws(scene, &groups) + occluders(&groups, culling),
-        defines: [defines(scene), culled(culling)].concat(),
-        left_out: left_out(scene, culling),
+        draw_calls: draw_calls(scene, &groups) + occluder_draw_calls(&groups, culling),
+        defines: [defines(scene), cull_defines(culling)].concat(),
+        omitted: omitted(scene, culling),
     }
 }
 
@@ -106,7 +106,7 @@ pub(super) fn planned(scene: &Scene, limits: &Limits) -> Plan {
 fn blended(scene: &Scene) -> Vec<&'static str> {
     match scene.look.transparency {
         Transparency::TwoPass => vec!["blended"],
-        Transparency::Exact => super::lists::PASSES.to_vec(),
+        Transparency::OrderIndependent => super::oit::PASSES.to_vec(),
     }
 }
 
@@ -115,86 +115,87 @@ fn opaque_parts(scene: &Scene) -> bool {
     let (look, materials) = (scene.look, used_materials(scene));
     let dense = |material: usize| {
         let material = &scene.materials[material];
-        kind(material) == Kind::Blend && material.alpha >= look.opaque_alpha
+        blend_mode(material) == BlendMode::Blend && material.alpha >= look.opaque_alpha
     };
     look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
 }
 
 /// Draw calls of the occluder pass: culling by depth draws opaque and cut-out groups twice.
-fn occluders(groups: &[Group], culling: Culling) -> usize {
-    let hiding = groups.iter().filter(|group| group.kind != Kind::Blend).count();
-    if culling == Culling::Depth { hiding } else { 0 }
+fn occluder_draw_calls(groups: &[DrawGroup], culling: Culling) -> usize {
+    let hiding = groups.iter().filter(|group| group.blend_mode != BlendMode::Blend).count();
+    if culling == Culling::Occlusion { hiding } else { 0 }
 }
 
-fn culled(culling: Culling) -> Vec<&'static str> {
+fn cull_defines(culling: Culling) -> Vec<&'static str> {
     match culling {
-        Culling::Depth => vec!["CULLED", "REMEMBERS"],
+        Culling::Occlusion => vec!["CULLED", "OCCLUSION_CULLING"],
         Culling::Triangles => vec!["CULLED"],
-        Culling::None | Culling::Fitting => vec![],
+        Culling::None | Culling::Auto => vec![],
     }
 }
 
 /// Draw calls without occluders. Exact transparency draws blended triangles in three phases, the third only on demand;
 /// two-pass transparency draws their opaque parts in a second phase.
-fn draws(scene: &Scene, groups: &[Group]) -> usize {
-    let blended = groups.iter().filter(|group| group.kind == Kind::Blend).count();
+fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
+    let blended = groups.iter().filter(|group| group.blend_mode == BlendMode::Blend).count();
     let turns = match scene.look.transparency {
-        Transparency::Exact => 3,
+        Transparency::OrderIndependent => 3,
         Transparency::TwoPass => 1 + usize::from(opaque_parts(scene)),
     };
     groups.len() + (turns - 1) * blended
 }
 
-fn named(name: impl Into<String>, bytes: usize) -> Allocation {
+fn allocation_of(name: impl Into<String>, bytes: usize) -> Allocation {
     Allocation { name: name.into(), bytes: bytes as u64 }
 }
 
 fn buffers(scene: &Scene) -> Vec<Allocation> {
     let layout = &scene.layout;
     let mut buffers = vec![
-        named("positions", 12 * layout.vertices),
-        named("normals", 12 * layout.corners),
-        named("triangles", 12 * layout.triangles),
-        named("triangle vertices", 12 * layout.triangles),
-        named("materials", super::scene_buffers::MATERIAL_BYTES * used_materials(scene).len()),
-        named("frame", size_of::<super::frame::Frame>()),
+        allocation_of("positions", 12 * layout.vertices),
+        allocation_of("normals", 12 * layout.corners),
+        allocation_of("triangles", 12 * layout.triangles),
+        allocation_of("triangle vertices", 12 * layout.triangles),
+        allocation_of("materials", super::scene_buffers::MATERIAL_BYTES * used_materials(scene).len()),
+        allocation_of("frame uniforms", size_of::<super::frame_uniforms::FrameUniforms>()),
     ];
     if scene.needs.mask || scene.needs.blend {
-        buffers.push(named("corner vertices", 4 * layout.corners));
+        buffers.push(allocation_of("corner vertices", 4 * layout.corners));
     }
     if scene.needs.normal_maps {
-        buffers.push(named("tangents", 16 * layout.corners));
+        buffers.push(allocation_of("tangents", 16 * layout.corners));
     }
     if scene.needs.textures || scene.needs.normal_maps {
-        buffers.push(named("uvs", 8 * layout.corners));
+        buffers.push(allocation_of("uvs", 8 * layout.corners));
     }
-    if looks_up(scene) {
-        buffers.push(named("triangle materials", 4 * layout.triangles));
+    if uses_material_table(scene) {
+        buffers.push(allocation_of("triangle materials", 4 * layout.triangles));
     }
     if scene.look.shadow.is_some_and(|shadow| shadow.splits > 1) {
-        buffers.push(named("splits", size_of::<super::splits::Splits>()));
+        buffers.push(allocation_of("shadow cascades", size_of::<super::cascades::ShadowCascades>()));
     }
     buffers
 }
 
 fn textures(scene: &Scene, software: bool) -> Vec<Allocation> {
     let mut textures = Vec::new();
-    for (purpose, word) in [(Use::Colour, "colours"), (Use::Normal, "normals")] {
+    for (purpose, word) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
         for array in arrays(scene, purpose) {
             let name = format!("{word} {} x {} x {}", array.width, array.height, array.layers.len());
             textures.push(Allocation { name, bytes: array.bytes() });
         }
     }
     if let Some(shadow) = scene.look.shadow {
-        textures.extend(shadow_textures(fitting(shadow, software)));
+        textures.extend(shadow_textures(resolve_blurring(shadow, software)));
     }
     textures
 }
 
-fn shadow_textures(shadow: Shadow) -> Vec<Allocation> {
+fn shadow_textures(shadow: ShadowSettings) -> Vec<Allocation> {
     let texels = shadow.size as usize * shadow.size as usize;
-    let named = |(name, bytes, layers): (&'static str, u32, u32)| named(name, (bytes * layers) as usize * texels);
-    super::shadow::textures(&shadow).into_iter().map(named).collect()
+    let allocation_of =
+        |(name, bytes, layers): (&'static str, u32, u32)| allocation_of(name, (bytes * layers) as usize * texels);
+    super::shadow::textures(&shadow).into_iter().map(allocation_of).collect()
 }
 
 fn defines(scene: &Scene) -> Vec<&'static str> {
@@ -203,17 +204,17 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
         ("TEXTURES", needs.textures),
         ("NORMAL_MAPS", needs.normal_maps),
         ("UVS", needs.textures || needs.normal_maps),
-        ("LOOK_UP", looks_up(scene)),
-        ("GROUND_SEEN", scene.look.ground.is_some()),
-        ("LAYERS", needs.blend),
-        ("LISTED", needs.blend && scene.look.transparency == Transparency::Exact),
+        ("MATERIAL_TABLE", uses_material_table(scene)),
+        ("HAS_GROUND", scene.look.ground.is_some()),
+        ("BLEND_LAYERS", needs.blend),
+        ("OIT", needs.blend && scene.look.transparency == Transparency::OrderIndependent),
         ("OPAQUE_PARTS", opaque_parts(scene)),
     ];
     let shadows = scene.look.shadow.iter().flat_map(super::shadow::defines);
     branches.into_iter().filter_map(|(name, on)| on.then_some(name)).chain(shadows).collect()
 }
 
-fn left_out(scene: &Scene, culling: Culling) -> Vec<Saving> {
+fn omitted(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
     let (needs, layout, look) = (scene.needs, &scene.layout, &scene.look);
     let map: u64 = shadow_textures(look.shadow.unwrap_or_default()).iter().map(|part| part.bytes).sum();
     let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
@@ -224,11 +225,11 @@ fn left_out(scene: &Scene, culling: Culling) -> Vec<Saving> {
         (needs.mask, "mask", 0, vec![], "no discard, no sample mask; depth needs no fragment shader"),
         (needs.blend, "blend", 0, blended(scene), "no layers in the shading, 8 bytes a sample less"),
         (needs.shadows, "shadows", map, vec!["shadow", "blur"], "no shadow lookup"),
-        (looks_up(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
+        (uses_material_table(scene), "many materials", 4 * layout.triangles as u64, vec![], "no lookup per triangle"),
         (look.ground.is_some(), "ground", 0, vec!["ground"], "no ground program"),
         (look.bloom.is_some(), "bloom", 0, vec!["bloom"], "what glows is not kept, 10.7 bytes a pixel less"),
-        (look.tone != Tone::None, "tone curve", 0, vec![], "light is shown as it is"),
-        (look.antialias == Antialias::Fxaa, "fxaa", 0, vec![], "no search for edges in the picture"),
+        (look.tone != ToneMapping::None, "tone curve", 0, vec![], "light is shown as it is"),
+        (look.antialias == Antialiasing::Fxaa, "fxaa", 0, vec![], "no search for edges in the picture"),
         (
             culling != Culling::None,
             "culling",
@@ -239,7 +240,7 @@ fn left_out(scene: &Scene, culling: Culling) -> Vec<Saving> {
         (look.dither, "dither", 0, vec![], "levels are rounded without a pattern"),
     ];
     let unneeded = all.into_iter().filter(|row| !row.0);
-    unneeded.map(|(_, feature, bytes, passes, shaders)| Saving { feature, bytes, passes, shaders }).collect()
+    unneeded.map(|(_, feature, bytes, passes, shaders)| OmittedFeature { feature, bytes, passes, shaders }).collect()
 }
 
 #[cfg(test)]
@@ -247,22 +248,23 @@ mod tests {
     use super::super::geometry::tests::squares;
     use super::*;
     use modalcast_model::domain::{AlphaMode, Material, Texture};
-    use modalcast_model::scene::{Bloom, Look};
+    use modalcast_model::scene::{Bloom, RenderSettings};
 
     fn names(allocations: &[Allocation]) -> Vec<&str> {
         allocations.iter().map(|allocation| allocation.name.as_str()).collect()
     }
 
-    fn everything() -> modalcast_model::scene::Parts {
+    fn everything() -> modalcast_model::scene::SceneParts {
         let materials = vec![
-            Material { colour_texture: Some(0), normal_texture: Some(0), ..Material::default() },
+            Material { color_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
             Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
         ];
         let mut parts = squares(materials);
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
-        let look = Look { bloom: Some(Bloom::default()), tone: Tone::Aces, dither: true, ..parts.look };
-        parts.look = Look { antialias: Antialias::Fxaa, culling: Culling::Depth, ..look };
+        let look =
+            RenderSettings { bloom: Some(Bloom::default()), tone: ToneMapping::Aces, dither: true, ..parts.look };
+        parts.look = RenderSettings { antialias: Antialiasing::Fxaa, culling: Culling::Occlusion, ..look };
         parts
     }
 
@@ -273,15 +275,15 @@ mod tests {
         parts.look.ground = None;
         let scene = Scene::new(parts).expect("good");
         let plan = plan(&scene);
-        assert_eq!(plan.passes, ["visibility", "backdrop", "shade", "encode"]);
-        let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame"];
+        assert_eq!(plan.passes, ["visibility", "background", "shade", "encode"]);
+        let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame uniforms"];
         assert_eq!(names(&plan.buffers), expected);
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
-        let left: Vec<&str> = plan.left_out.iter().map(|saving| saving.feature).collect();
+        let left: Vec<&str> = plan.omitted.iter().map(|saving| saving.feature).collect();
         let materials = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
         assert_eq!(left, [&materials[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
-        assert_eq!(plan.left_out[0].bytes, 16 * 4, "tangents of four corners");
-        assert_eq!(plan.left_out[4].bytes, 12 * 1024 * 1024, "map and moments");
+        assert_eq!(plan.omitted[0].bytes, 16 * 4, "tangents of four corners");
+        assert_eq!(plan.omitted[4].bytes, 12 * 1024 * 1024, "map and moments");
     }
 
     #[test]
@@ -292,19 +294,22 @@ mod tests {
             plan(&Scene::new(parts).expect("good"))
         };
         let passes = glass(Transparency::TwoPass, 0.5);
-        assert_eq!(passes.passes, ["ground", "blended", "backdrop", "encode"]);
-        assert_eq!((passes.draws, passes.defines), (1, vec!["GROUND_SEEN", "LAYERS"]));
+        assert_eq!(passes.passes, ["ground", "blended", "background", "encode"]);
+        assert_eq!((passes.draw_calls, passes.defines), (1, vec!["HAS_GROUND", "BLEND_LAYERS"]));
         assert_eq!(passes.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
-        let exact = glass(Transparency::Exact, 1.0);
-        assert_eq!(exact.passes, ["ground", "count", "scan", "fill", "resolve", "backdrop", "encode"]);
-        assert_eq!((exact.draws, exact.defines), (3, vec!["GROUND_SEEN", "LAYERS", "LISTED"]));
+        let exact = glass(Transparency::OrderIndependent, 1.0);
+        assert_eq!(
+            exact.passes,
+            ["ground", "oit count", "oit allocate", "oit fill", "oit resolve", "background", "encode"]
+        );
+        assert_eq!((exact.draw_calls, exact.defines), (3, vec!["HAS_GROUND", "BLEND_LAYERS", "OIT"]));
         let dense = glass(Transparency::TwoPass, 1.0);
         assert_eq!(
             dense.passes,
-            ["visibility", "ground", "blended", "backdrop", "shade", "encode"],
+            ["visibility", "ground", "blended", "background", "shade", "encode"],
             "it may be opaque"
         );
-        assert_eq!((dense.draws, dense.defines), (2, vec!["GROUND_SEEN", "LAYERS", "OPAQUE_PARTS"]));
+        assert_eq!((dense.draw_calls, dense.defines), (2, vec!["HAS_GROUND", "BLEND_LAYERS", "OPAQUE_PARTS"]));
     }
 
     #[test]
@@ -316,12 +321,12 @@ mod tests {
             plan.passes,
             [
                 &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility", "ground", "blended"][..],
-                &["backdrop", "shade", "bloom", "encode"]
+                &["background", "shade", "bloom", "encode"]
             ]
             .concat()
         );
-        assert!(plan.left_out.is_empty(), "{:?}", plan.left_out);
+        assert!(plan.omitted.is_empty(), "{:?}", plan.omitted);
         assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
-        assert_eq!(plan.textures[0], Allocation { name: "colours 1 x 1 x 1".into(), bytes: 4 });
+        assert_eq!(plan.textures[0], Allocation { name: "colors 1 x 1 x 1".into(), bytes: 4 });
     }
 }

@@ -17,11 +17,11 @@ pub(super) struct Region {
 
 /// Dirty region of an image: the pixels that may differ from the clear value. Initially all of them.
 #[derive(Debug, Default)]
-pub(super) struct Touched(Cell<Option<Region>>);
+pub(super) struct DirtyRegion(Cell<Option<Region>>);
 
 /// Bound on the f32 rounding error of a clip coordinate, relative to the sum of the magnitudes of its products: each
 /// matrix element, each product and three sums are rounded.
-const ROUNDINGS: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
+const CLIP_RELATIVE_ERROR: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
 
 /// Margin in pixels: a rasterizer moves vertices by up to 1/256 pixel, and a sample may lie anywhere in its pixel.
 const MARGIN: f64 = 1.0;
@@ -36,10 +36,10 @@ impl Region {
 
     /// Region of the frame that can show points in `bounds` when `clip` transforms positions in f32. The whole frame if
     /// the bounds reach behind the eye or overflow.
-    pub(super) fn of(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
+    pub(super) fn project(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
         let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip.abs() * corner.abs());
-        let rounded = magnitudes.fold(Vector4::zeros(), |most: Vector4<f64>, one| most.sup(&one)) * ROUNDINGS;
+        let rounded = magnitudes.fold(Vector4::zeros(), |most: Vector4<f64>, one| most.sup(&one)) * CLIP_RELATIVE_ERROR;
         let shown = corners.map(|corner| clip * corner);
         let nearest = shown.iter().fold(f64::INFINITY, |least, at| least.min(at.w)) - rounded.w;
         let numbers = shown.iter().chain([&rounded]).flat_map(|four| four.iter());
@@ -59,7 +59,7 @@ impl Region {
     }
 
     /// Grows the region by this many pixels on each side, clamped to the frame.
-    fn grown(self, by: u32) -> Self {
+    fn expanded(self, by: u32) -> Self {
         let low = self.corner.map(|at| at.saturating_sub(by));
         let high = [0, 1].map(|axis| (self.corner[axis] + self.size[axis] + by).min(self.frame[axis]));
         Self { corner: low, size: [high[0] - low[0], high[1] - low[1]], ..self }
@@ -71,20 +71,20 @@ impl Region {
     }
 
     /// Column and row of the bottom left pixel, width and height.
-    pub(super) const fn part(&self) -> [u32; 4] {
+    pub(super) const fn rect(&self) -> [u32; 4] {
         let ([x, y], [width, height]) = (self.corner, self.size);
         [x, y, width, height]
     }
 }
 
-impl Touched {
+impl DirtyRegion {
     /// Returns the dirty region, none for all pixels, and replaces it by `by`.
     pub(super) fn replace(&self, by: Region) -> Option<Region> {
-        self.0.replace(Some(by.grown(SLACK)))
+        self.0.replace(Some(by.expanded(SLACK)))
     }
 
     /// Marks all pixels as dirty.
-    pub(super) fn everywhere(&self) {
+    pub(super) fn mark_all(&self) {
         self.0.set(None);
     }
 }
@@ -110,11 +110,11 @@ mod tests {
     }
 
     /// A cube with this half side, and points in steps of a fifth of it from the center to its corners.
-    fn filled(centre: [f64; 3], half: f64) -> (Bounds, Vec<[f32; 3]>) {
+    fn filled(center: [f64; 3], half: f64) -> (Bounds, Vec<[f32; 3]>) {
         let (mut bounds, mut points) = (Bounds::EMPTY, Vec::new());
         for index in 0..216 {
             let step = [index % 6, index / 6 % 6, index / 36].map(|step| f64::from(step) / 2.5 - 1.0);
-            let point: [f32; 3] = std::array::from_fn(|axis| (centre[axis] + half * step[axis]) as f32);
+            let point: [f32; 3] = std::array::from_fn(|axis| (center[axis] + half * step[axis]) as f32);
             bounds.include(point.map(f64::from));
             points.push(point);
         }
@@ -124,16 +124,16 @@ mod tests {
     #[test]
     fn what_lies_in_the_bounds_is_drawn_inside_the_region_however_far_from_the_origin() {
         // Near the origin, and where f32 rounding moves points by pixels.
-        for (centre, away) in [([0.3, -0.2, 0.1], 5.0), ([2e5, -3e4, 1e5], 5.0), ([-9e6, 0.0, 9e6], 900.0)] {
-            let (bounds, points) = filled(centre, 0.1 * away);
+        for (center, away) in [([0.3, -0.2, 0.1], 5.0), ([2e5, -3e4, 1e5], 5.0), ([-9e6, 0.0, 9e6], 900.0)] {
+            let (bounds, points) = filled(center, 0.1 * away);
             for turn in 0..16 {
                 let angle = 0.4 * f64::from(turn);
                 let aside = 0.02 * away * f64::from(turn);
-                let eye = [centre[0] + away * angle.cos(), centre[1] + aside, centre[2] + away * angle.sin()];
-                let target = [centre[0] + aside, centre[1], centre[2] - aside];
+                let eye = [center[0] + away * angle.cos(), center[1] + aside, center[2] + away * angle.sin()];
+                let target = [center[0] + aside, center[1], center[2] - aside];
                 let clip = clip(eye, target, &bounds);
-                let region = Region::of(&clip, &bounds, FRAME);
-                let [x, y, width, height] = region.part().map(|number| number as f32);
+                let region = Region::project(&clip, &bounds, FRAME);
+                let [x, y, width, height] = region.rect().map(|number| number as f32);
                 for point in &points {
                     let at = pixel(&clip, *point);
                     let outside = |at: f32, low: f32, size: f32, side: f32| {
@@ -151,7 +151,7 @@ mod tests {
         let (bounds, points) = filled([0.0; 3], 0.5);
         let clip_from = |target: [f64; 3]| clip([0.3, 0.4, 6.0], target, &bounds);
         let seen = clip_from([0.0; 3]);
-        let [x, y, width, height] = Region::of(&seen, &bounds, FRAME).part().map(|number| number as f32);
+        let [x, y, width, height] = Region::project(&seen, &bounds, FRAME).rect().map(|number| number as f32);
         let far = |pick: fn(f32, f32) -> f32, axis: usize| {
             points.iter().map(|point| pixel(&seen, *point)[axis]).reduce(pick).expect("points")
         };
@@ -164,7 +164,7 @@ mod tests {
             assert!((own - tight).abs() <= 2.01, "{own} for {tight}");
         }
         for aside in [[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, -9.0, 0.0]] {
-            let [_, _, width, height] = Region::of(&clip_from(aside), &bounds, FRAME).part();
+            let [_, _, width, height] = Region::project(&clip_from(aside), &bounds, FRAME).rect();
             assert_eq!(width * height, 0, "{aside:?}");
         }
     }
@@ -174,34 +174,35 @@ mod tests {
         let (bounds, _) = filled([0.0; 3], 0.5);
         let whole = Region::whole(FRAME);
         let inside = clip([0.1, 0.2, 0.3], [0.0; 3], &bounds);
-        assert_eq!(Region::of(&inside, &bounds, FRAME), whole);
+        assert_eq!(Region::project(&inside, &bounds, FRAME), whole);
         let away = clip([0.0, 0.0, 6.0], [0.0, 0.0, 12.0], &bounds);
-        assert_eq!(Region::of(&away, &bounds, FRAME), whole);
+        assert_eq!(Region::project(&away, &bounds, FRAME), whole);
         let seen = clip([0.0, 0.0, 6.0], [0.0; 3], &bounds);
-        assert_ne!(Region::of(&seen, &bounds, FRAME), whole, "control");
+        assert_ne!(Region::project(&seen, &bounds, FRAME), whole, "control");
         for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             for axis in 0..3 {
                 let mut lost = bounds;
                 lost.max[axis] = bad;
-                assert_eq!(Region::of(&seen, &lost, FRAME), whole);
+                assert_eq!(Region::project(&seen, &lost, FRAME), whole);
             }
-            assert_eq!(Region::of(&(seen * bad), &bounds, FRAME), whole);
+            assert_eq!(Region::project(&(seen * bad), &bounds, FRAME), whole);
         }
-        assert_eq!(Region::of(&seen, &Bounds::EMPTY, FRAME), whole);
+        assert_eq!(Region::project(&seen, &Bounds::EMPTY, FRAME), whole);
         // So far along x that f32 rounding may place it at any column.
         let (bounds, _) = filled([1e9, 0.0, 0.0], 0.5);
-        let [_, y, width, height] = Region::of(&clip([1e9, 0.0, 6.0], [1e9, 0.0, 0.0], &bounds), &bounds, FRAME).part();
+        let [_, y, width, height] =
+            Region::project(&clip([1e9, 0.0, 6.0], [1e9, 0.0, 0.0], &bounds), &bounds, FRAME).rect();
         assert!(width == FRAME[0] && y > 100 && height < 200, "{y}, {width} x {height}");
     }
 
     #[test]
     fn an_image_is_touched_everywhere_at_first_and_again_when_somebody_says_so() {
-        let (touched, part) = (Touched::default(), Region { frame: FRAME, corner: [3, 1], size: [5, 6] });
-        assert_eq!(touched.replace(part), None);
+        let (dirty, part) = (DirtyRegion::default(), Region { frame: FRAME, corner: [3, 1], size: [5, 6] });
+        assert_eq!(dirty.replace(part), None);
         let around = Region { frame: FRAME, corner: [1, 0], size: [9, 9] };
-        assert_eq!(touched.replace(Region::whole(FRAME)), Some(around));
-        assert_eq!(touched.replace(part), Some(Region::whole(FRAME)));
-        touched.everywhere();
-        assert_eq!(touched.replace(part), None);
+        assert_eq!(dirty.replace(Region::whole(FRAME)), Some(around));
+        assert_eq!(dirty.replace(part), Some(Region::whole(FRAME)));
+        dirty.mark_all();
+        assert_eq!(dirty.replace(part), None);
     }
 }

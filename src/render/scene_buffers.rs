@@ -8,18 +8,18 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::SharedBuffers;
-use super::cull::{Culler, LISTED};
-use super::geometry::{Geometry, Group, Kind, Stretch, kind, used_materials, whose};
-use super::gl::{self, Attribute, Buffer, Gl, Program, Texture, TextureKind, VertexArray};
-use super::paths::Beside;
-use super::plan::{Allocation, Plan, planned};
-use super::post::Post;
-use super::programs::{Compile, Programs, Sampled};
-use super::shaders::{self, OTHER_READS, Options, Used};
-use super::shadow::{ShadowMap, Shared, fitting};
-use super::textures::{Array, Use, arrays, cutoff, levels, place, within_budget};
+use super::cull::{TriangleCuller, VISIBLE_INDICES};
+use super::geometry::{BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, locate_triangle, used_materials};
+use super::gl::{self, Buffer, Gl, Program, Texture, TextureDesc, VertexArray, VertexAttribute};
+use super::plan::{Allocation, RenderPlan, plan_for_device};
+use super::post::PostProcess;
+use super::programs::{ProgramCompiler, SampleCountPrograms, ScenePrograms};
+use super::raster_backends::ComputeRasterizer;
+use super::shaders::{self, FIXED_TEXTURE_READS, MaterialUse, ShaderOptions};
+use super::shadow::{ShadowCache, ShadowMap, resolve_blurring};
+use super::textures::{TextureArray, TextureRole, arrays, check_texture_budget, cutoff, find_layer, mip_levels};
 use modalcast_model::domain::AlphaMode;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::Scene;
 
 /// GPU layout of a material. Twin of `material_of` in `shaders/shared/material.glsl`.
@@ -46,68 +46,69 @@ pub struct SceneBuffers {
     pub shared: SharedBuffers,
     /// Compute rasterizer that draws some passes instead of OpenGL; present when the look asks for it and one was
     /// given. Declared before the buffers that it has registered, so that it is dropped first.
-    pub(super) beside: Option<Beside>,
+    pub(super) compute_rasterizer: Option<ComputeRasterizer>,
     pub(super) scene: Arc<Scene>,
     pub(super) buffers: BTreeMap<String, Buffer>,
-    pub(super) views: Views,
-    pub(super) groups: Vec<Group>,
+    pub(super) buffer_textures: BufferTextures,
+    pub(super) groups: Vec<DrawGroup>,
     /// Vertex array of opaque triangles.
-    solids: VertexArray,
+    position_array: VertexArray,
     /// Vertex array of cut-out and blended triangles; none without such triangles.
     corners: Option<VertexArray>,
     /// Vertex array without attributes, for triangles that a vertex shader generates.
-    pub(super) nothing: VertexArray,
-    pub(super) colours: Vec<Texture>,
+    pub(super) empty_vertex_array: VertexArray,
+    pub(super) color_arrays: Vec<Texture>,
     pub(super) normals: Vec<Texture>,
     pub(super) shadow: Option<ShadowMap>,
-    pub(super) shared_shadow: Shared,
-    pub(super) programs: Programs,
-    pub(super) post: Post,
+    pub(super) shadow_cache: ShadowCache,
+    pub(super) programs: ScenePrograms,
+    pub(super) post: PostProcess,
     /// Lists of culled triangles; present when triangles are culled.
-    pub(super) culler: Option<Culler>,
+    pub(super) culler: Option<TriangleCuller>,
     /// Programs for the number of samples per pixel that the look asks for.
-    sampled: Sampled,
-    options: Options,
-    pub(super) stretches: Rc<[Stretch]>,
+    sample_programs: SampleCountPrograms,
+    options: ShaderOptions,
+    pub(super) spans: Rc<[TriangleSpan]>,
     /// Origin of the positions, in scene units from the scene's origin.
     pub(super) origin: [f64; 3],
     /// Rebased positions that are drawn instead of the shared ones.
-    pub(super) apart: Option<Apart>,
+    pub(super) rebased: Option<RebasedPositions>,
     /// A scalar per vertex for AOV readbacks; allocated by the first upload.
-    pub(super) values: Option<Values>,
-    plan: Plan,
+    pub(super) values: Option<VertexValues>,
+    plan: RenderPlan,
 }
 
 /// Positions rebased to one origin, for scenes whose domains have separate local origins.
 #[derive(Debug)]
-pub(super) struct Apart {
+pub(super) struct RebasedPositions {
     pub(super) buffer: Buffer,
     view: Texture,
-    solids: VertexArray,
+    position_array: VertexArray,
     /// Vertex array of the culled lists, when triangles are culled.
     listed: Option<VertexArray>,
 }
 
-impl Apart {
+impl RebasedPositions {
     pub(super) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
         let buffer = gl.buffer(scene.buffer("positions")?.bytes, gl::DYNAMIC_DRAW, None)?;
-        let view = gl.view(&buffer, gl::RGB32F)?;
+        let view = gl.buffer_texture(&buffer, gl::RGB32F)?;
         let array = |index: &Buffer| gl.vertex_array(Some(index), &[attribute(0, &buffer, 3, false)]);
-        let (solids, listed) = (array(scene.buffer("triangle vertices")?)?, scene.buffers.get(LISTED).map(array));
-        Ok(Self { view, solids, listed: listed.transpose()?, buffer })
+        let (position_array, listed) =
+            (array(scene.buffer("triangle vertices")?)?, scene.buffers.get(VISIBLE_INDICES).map(array));
+        Ok(Self { view, position_array, listed: listed.transpose()?, buffer })
     }
 }
 
 /// A scalar per vertex, which the shader of an AOV readback interpolates.
 #[derive(Debug)]
-pub(super) struct Values {
+pub(super) struct VertexValues {
     pub(super) buffer: Buffer,
     pub(super) view: Texture,
 }
 
 /// Buffer textures over the scene's buffers.
 #[derive(Debug)]
-pub(super) struct Views {
+pub(super) struct BufferTextures {
     positions: Texture,
     /// Texture unit and view.
     pub(super) others: Vec<(u32, Texture)>,
@@ -118,160 +119,182 @@ impl SceneBuffers {
     pub(super) fn new(
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
-        sample_places: &[[f32; 2]],
-        compile: &mut Compile<'_>,
+        sample_positions: &[[f32; 2]],
+        compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
-        let plan = planned(scene, &gl.limits);
-        let shadow = scene.look.shadow.map(|shadow| fitting(shadow, gl.limits.software));
-        let images = [arrays(scene, Use::Colour), arrays(scene, Use::Normal)];
-        within_budget(&images)?;
-        let reads = OTHER_READS + images[0].len() + images[1].len();
-        if reads > gl.limits.max_reads as usize {
-            return Err(gl::too_large("textures read by the shading", gl.limits.max_reads.into(), reads as u64));
+        let plan = plan_for_device(scene, &gl.limits);
+        let shadow = scene.look.shadow.map(|shadow| resolve_blurring(shadow, gl.limits.software));
+        let images = [arrays(scene, TextureRole::Color), arrays(scene, TextureRole::Normal)];
+        check_texture_budget(&images)?;
+        let reads = FIXED_TEXTURE_READS + images[0].len() + images[1].len();
+        if reads > gl.limits.max_compute_textures as usize {
+            return Err(gl::too_large(
+                "textures read by the shading",
+                gl.limits.max_compute_textures.into(),
+                reads as u64,
+            ));
         }
         let geometry = Geometry::new(scene);
-        let buffers = allocate(gl, &plan, &geometry, &pack(scene, &images))?;
-        let (views, shared) = (Views::new(gl, scene, &buffers)?, shared(&buffers)?);
-        let options = Options {
+        let buffers = allocate(gl, &plan, &geometry, &pack_materials(scene, &images))?;
+        let (buffer_textures, shared) = (BufferTextures::new(gl, scene, &buffers)?, shared(&buffers)?);
+        let options = ShaderOptions {
             defines: plan.defines.clone(),
             used: used(scene, &images),
             shadow: shadow.unwrap_or_default(),
-            sample_places: sample_places.to_vec(),
-            resolve: super::post::resolve(&scene.look),
-            post_depth: gl.limits.post_depth,
+            sample_positions: sample_positions.to_vec(),
+            sample_resolve: super::post::sample_resolve(&scene.look),
+            post_depth_coverage: gl.limits.post_depth_coverage,
         };
-        let programs = Programs::compile(&options, &plan, &geometry.groups, compile)?;
-        let samples = if sample_places.is_empty() { 1 } else { scene.look.samples_a_pixel() };
-        let sampled = Sampled::compile(&options, &geometry.groups, samples, compile)?;
-        let [colours, normals] = images;
+        let programs = ScenePrograms::compile(&options, &plan, &geometry.groups, compile)?;
+        let samples = if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() };
+        let sample_programs = SampleCountPrograms::compile(&options, &geometry.groups, samples, compile)?;
+        let [color_arrays, normals] = images;
         Ok(Self {
             shared,
-            beside: None,
+            compute_rasterizer: None,
             scene: Arc::clone(scene),
-            views,
-            solids: solids(gl, &buffers, "triangle vertices")?,
+            buffer_textures,
+            position_array: position_array(gl, &buffers, "triangle vertices")?,
             corners: corners(gl, &buffers, "triangles")?,
             culler: culler(gl, &buffers, &geometry.groups)?,
             buffers,
             groups: geometry.groups,
-            nothing: gl.vertex_array(None, &[])?,
-            colours: upload_arrays(gl, scene, &colours, Use::Colour)?,
-            normals: upload_arrays(gl, scene, &normals, Use::Normal)?,
+            empty_vertex_array: gl.vertex_array(None, &[])?,
+            color_arrays: upload_arrays(gl, scene, &color_arrays, TextureRole::Color)?,
+            normals: upload_arrays(gl, scene, &normals, TextureRole::Normal)?,
             shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow)).transpose()?,
-            shared_shadow: Shared::default(),
+            shadow_cache: ShadowCache::default(),
             programs,
-            post: Post::compile(&scene.look, compile)?,
-            sampled,
+            post: PostProcess::compile(&scene.look, compile)?,
+            sample_programs,
             options,
-            stretches: geometry.stretches.into(),
+            spans: geometry.spans.into(),
             origin: [0.0; 3],
-            apart: None,
+            rebased: None,
             values: None,
             plan,
         })
     }
 
-    pub(super) const fn options(&self) -> &Options {
+    pub(super) const fn options(&self) -> &ShaderOptions {
         &self.options
     }
 
     /// The programs for this number of samples per pixel; compiled now unless the look asked for the same number.
-    pub(super) fn sampled(&self, samples: u32, compile: &mut Compile<'_>) -> Result<Sampled> {
-        match self.sampled.samples == samples {
-            true => Ok(self.sampled.clone()),
-            false => Sampled::compile(&self.options, &self.groups, samples, compile),
+    pub(super) fn sample_programs(
+        &self,
+        samples: u32,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<SampleCountPrograms> {
+        match self.sample_programs.samples == samples {
+            true => Ok(self.sample_programs.clone()),
+            false => SampleCountPrograms::compile(&self.options, &self.groups, samples, compile),
         }
     }
 
     /// The program that draws ids of cut-out triangles with this number of samples per pixel; none without such
     /// triangles.
-    pub(super) fn cut_out(&self, samples: u32, compile: &mut Compile<'_>) -> Result<Option<Rc<Program>>> {
-        if self.sampled.samples == samples {
-            return Ok(self.sampled.mask.clone());
+    pub(super) fn mask_program(&self, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Option<Rc<Program>>> {
+        if self.sample_programs.samples == samples {
+            return Ok(self.sample_programs.mask.clone());
         }
-        let any = self.groups.iter().any(|group| group.kind == Kind::Mask);
-        if any { compile(self.options.visibility(Kind::Mask, samples)).map(Some) } else { Ok(None) }
+        let any = self.groups.iter().any(|group| group.blend_mode == BlendMode::Mask);
+        if any { compile(self.options.visibility(BlendMode::Mask, samples)).map(Some) } else { Ok(None) }
     }
 
     /// The program that reads an AOV field from ids with this number of samples per pixel.
-    pub(super) fn survey(&self, field: &'static str, samples: u32, compile: &mut Compile<'_>) -> Result<Rc<Program>> {
-        compile(self.options.survey(field, samples))
+    pub(super) fn aov_program(
+        &self,
+        field: &'static str,
+        samples: u32,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Rc<Program>> {
+        compile(self.options.aov(field, samples))
     }
 
     /// First triangle and number of triangles of one kind; they are contiguous.
-    pub(super) fn triangles(&self, kind: Kind) -> (usize, usize) {
-        let mut of_kind = self.groups.iter().filter(|group| group.kind == kind);
+    pub(super) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
+        let mut of_kind = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
         let first = of_kind.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
         of_kind.fold(first, |(first, count), group| (first, count + group.triangles))
     }
 
     /// Domain of a triangle that an id of a frame names (`place` is the id minus 1), and its index in the domain's
     /// mesh.
-    pub fn triangle(&self, place: usize) -> Option<(usize, usize)> {
-        if place < self.scene.layout.triangles { whose(&self.stretches, place) } else { None }
+    pub fn source_triangle(&self, place: usize) -> Option<(usize, usize)> {
+        if place < self.scene.layout.triangles { locate_triangle(&self.spans, place) } else { None }
     }
 
     /// Sets the origin of the shared positions, in scene units from the scene's origin, and draws the shared positions
     /// from now on. Before the first call, positions are relative to the scene's origin.
-    pub fn relative_to(&mut self, origin: [f64; 3]) {
+    pub fn set_origin(&mut self, origin: [f64; 3]) {
         self.origin = origin;
-        self.apart = None;
+        self.rebased = None;
     }
 
     /// The positions that are drawn: the rebased ones if there are any, else the shared ones.
-    pub(super) fn drawn_positions(&self) -> &Texture {
-        self.apart.as_ref().map_or(&self.views.positions, |apart| &apart.view)
+    pub(super) fn position_texture(&self) -> &Texture {
+        self.rebased.as_ref().map_or(&self.buffer_textures.positions, |rebased| &rebased.view)
     }
 
     /// Vertex array of one kind of triangle, for ids and depth; none without such triangles.
-    pub(super) fn array(&self, kind: Kind) -> Option<&VertexArray> {
-        match kind {
-            Kind::Opaque => Some(self.apart.as_ref().map_or(&self.solids, |apart| &apart.solids)),
-            Kind::Mask | Kind::Blend => self.corners.as_ref(),
+    pub(super) fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
+        match blend_mode {
+            BlendMode::Opaque => {
+                Some(self.rebased.as_ref().map_or(&self.position_array, |rebased| &rebased.position_array))
+            }
+            BlendMode::Mask | BlendMode::Blend => self.corners.as_ref(),
         }
     }
 
     /// Vertex array of the culled list of one kind, and the buffer with the indirect draw commands; none when triangles
     /// are not culled.
-    pub(super) fn listed(&self, kind: Kind) -> Option<(&VertexArray, &Buffer)> {
-        let (culler, ledger) = (self.culler.as_ref()?, self.buffers.get("cull ledger")?);
-        let apart = self.apart.as_ref().and_then(|apart| apart.listed.as_ref()).filter(|_| kind == Kind::Opaque);
-        apart.or_else(|| culler.array(kind)).map(|array| (array, ledger))
+    pub(super) fn visible_draws(&self, blend_mode: BlendMode) -> Option<(&VertexArray, &Buffer)> {
+        let (culler, ledger) = (self.culler.as_ref()?, self.buffers.get("cull draws")?);
+        let rebased = self
+            .rebased
+            .as_ref()
+            .and_then(|rebased| rebased.listed.as_ref())
+            .filter(|_| blend_mode == BlendMode::Opaque);
+        rebased.or_else(|| culler.vertex_array(blend_mode)).map(|array| (array, ledger))
     }
 
     /// The plan that the buffers follow.
-    pub const fn plan(&self) -> &Plan {
+    pub const fn plan(&self) -> &RenderPlan {
         &self.plan
     }
 
     /// The buffers that the device holds for this scene, by name.
-    pub fn allocated(&self) -> Vec<Allocation> {
+    pub fn allocations(&self) -> Vec<Allocation> {
         let buffers = self.buffers.iter().map(|(name, buffer)| Allocation { name: name.clone(), bytes: buffer.bytes });
-        let apart = self.apart.iter().map(|apart| Allocation { name: "apart".into(), bytes: apart.buffer.bytes });
-        let values = self.values.iter().map(|own| Allocation { name: "values".into(), bytes: own.buffer.bytes });
-        let beside = self.beside.iter().flat_map(Beside::allocated);
-        let beside = beside.map(|(name, bytes)| Allocation { name: name.into(), bytes });
-        buffers.chain(apart).chain(values).chain(beside).collect()
+        let rebased = self
+            .rebased
+            .iter()
+            .map(|rebased| Allocation { name: "rebased positions".into(), bytes: rebased.buffer.bytes });
+        let values = self.values.iter().map(|own| Allocation { name: "vertex values".into(), bytes: own.buffer.bytes });
+        let compute_rasterizer = self.compute_rasterizer.iter().flat_map(ComputeRasterizer::allocations);
+        let compute_rasterizer = compute_rasterizer.map(|(name, bytes)| Allocation { name: name.into(), bytes });
+        buffers.chain(rebased).chain(values).chain(compute_rasterizer).collect()
     }
 
     /// Number of textures that the device holds for this scene: texture arrays and shadow map textures.
     pub fn texture_count(&self) -> usize {
-        self.colours.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
+        self.color_arrays.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
     }
 
     pub(super) fn buffer(&self, name: &'static str) -> Result<&Buffer> {
-        named(&self.buffers, name)
+        find_buffer(&self.buffers, name)
     }
 }
 
-fn named<'a>(buffers: &'a BTreeMap<String, Buffer>, name: &'static str) -> Result<&'a Buffer> {
-    buffers.get(name).ok_or_else(|| during("render")(format!("the plan has no buffer '{name}'")))
+fn find_buffer<'a>(buffers: &'a BTreeMap<String, Buffer>, name: &'static str) -> Result<&'a Buffer> {
+    buffers.get(name).ok_or_else(|| fault_in("render")(format!("the plan has no buffer '{name}'")))
 }
 
-fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
+fn pack_materials(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<PackedMaterial> {
     let wide = |[r, g, b]: [f32; 3], fourth: f32| [r, g, b, fourth];
-    let at = |arrays: &[Array], texture: Option<usize>| {
-        let place = texture.and_then(|texture| place(arrays, texture));
+    let at = |arrays: &[TextureArray], texture: Option<usize>| {
+        let place = texture.and_then(|texture| find_layer(arrays, texture));
         place.map_or([-1.0; 2], |(array, layer)| [array as f32, layer as f32])
     };
     let one = |material: &modalcast_model::domain::Material| {
@@ -280,32 +303,32 @@ fn pack(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<PackedMaterial> {
             AlphaMode::Blend => scene.look.opaque_alpha,
             AlphaMode::Opaque => 0.0,
         };
-        let [colour_array, colour_layer] = at(&images[0], material.colour_texture);
+        let [color_array, color_layer] = at(&images[0], material.color_texture);
         let [normal_array, normal_layer] = at(&images[1], material.normal_texture);
         PackedMaterial {
             ambient_array: wide(material.ambient, normal_array),
             diffuse_layer: wide(material.diffuse, normal_layer),
             specular_exponent: wide(material.specular, material.shininess),
-            cut: [colour_array, colour_layer, material.alpha, cutoff],
+            cut: [color_array, color_layer, material.alpha, cutoff],
         }
     };
     used_materials(scene).into_iter().map(|material| one(&scene.materials[material])).collect()
 }
 
 /// The properties of each material that the shader sources depend on.
-fn used(scene: &Scene, images: &[Vec<Array>; 2]) -> Vec<Used> {
-    let array = |arrays: &[Array], texture: Option<usize>| Some(place(arrays, texture?)?.0);
+fn used(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
+    let array = |arrays: &[TextureArray], texture: Option<usize>| Some(find_layer(arrays, texture?)?.0);
     let one = |material: usize| {
         let material = &scene.materials[material];
-        let (colour, normal) = (array(&images[0], material.colour_texture), array(&images[1], material.normal_texture));
-        Used { kind: kind(material), colour, normal }
+        let (color, normal) = (array(&images[0], material.color_texture), array(&images[1], material.normal_texture));
+        MaterialUse { blend_mode: blend_mode(material), color, normal }
     };
     used_materials(scene).into_iter().map(one).collect()
 }
 
 fn allocate(
     gl: &Rc<Gl>,
-    plan: &Plan,
+    plan: &RenderPlan,
     geometry: &Geometry,
     materials: &[PackedMaterial],
 ) -> Result<BTreeMap<String, Buffer>> {
@@ -329,13 +352,13 @@ fn allocate(
 
 fn shared(buffers: &BTreeMap<String, Buffer>) -> Result<SharedBuffers> {
     Ok(SharedBuffers {
-        positions: named(buffers, "positions")?.name(),
-        normals: named(buffers, "normals")?.name(),
+        positions: find_buffer(buffers, "positions")?.name(),
+        normals: find_buffer(buffers, "normals")?.name(),
         tangents: buffers.get("tangents").map(Buffer::name),
     })
 }
 
-impl Views {
+impl BufferTextures {
     fn new(gl: &Rc<Gl>, scene: &Scene, buffers: &BTreeMap<String, Buffer>) -> Result<Self> {
         let (limit, layout) = (gl.limits.max_texels, &scene.layout);
         for (field, count) in
@@ -355,52 +378,57 @@ impl Views {
             ("tangents", shaders::TANGENT_UNIT, gl::RGBA32F),
         ];
         let view = |(name, unit, format): (&str, u32, u32)| {
-            buffers.get(name).map(|buffer| Ok((unit, gl.view(buffer, format)?)))
+            buffers.get(name).map(|buffer| Ok((unit, gl.buffer_texture(buffer, format)?)))
         };
         let others: Result<Vec<_>> = read.into_iter().filter_map(view).collect();
-        Ok(Self { positions: gl.view(named(buffers, "positions")?, gl::RGB32F)?, others: others? })
+        Ok(Self { positions: gl.buffer_texture(find_buffer(buffers, "positions")?, gl::RGB32F)?, others: others? })
     }
 }
 
-const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: bool) -> Attribute<'_> {
-    Attribute { location, buffer, components, integer }
+const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: bool) -> VertexAttribute<'_> {
+    VertexAttribute { location, buffer, components, integer }
 }
 
 /// Vertex array of opaque triangles, which need positions only.
-fn solids(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<VertexArray> {
-    gl.vertex_array(Some(named(buffers, index)?), &[attribute(0, named(buffers, "positions")?, 3, false)])
+fn position_array(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<VertexArray> {
+    gl.vertex_array(Some(find_buffer(buffers, index)?), &[attribute(0, find_buffer(buffers, "positions")?, 3, false)])
 }
 
 /// Creates the culled lists if the plan has buffers for them.
-fn culler(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, groups: &[Group]) -> Result<Option<Culler>> {
-    if !buffers.contains_key(LISTED) {
+fn culler(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, groups: &[DrawGroup]) -> Result<Option<TriangleCuller>> {
+    if !buffers.contains_key(VISIBLE_INDICES) {
         return Ok(None);
     }
-    Culler::new(gl, buffers, groups, (solids(gl, buffers, LISTED)?, corners(gl, buffers, LISTED)?))
+    TriangleCuller::new(
+        gl,
+        buffers,
+        groups,
+        (position_array(gl, buffers, VISIBLE_INDICES)?, corners(gl, buffers, VISIBLE_INDICES)?),
+    )
 }
 
 /// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
 fn corners(gl: &Rc<Gl>, buffers: &BTreeMap<String, Buffer>, index: &'static str) -> Result<Option<VertexArray>> {
     let Some(vertices) = buffers.get("corner vertices") else { return Ok(None) };
-    let mut from = vec![attribute(0, vertices, 1, true), attribute(1, named(buffers, "normals")?, 3, false)];
+    let mut from = vec![attribute(0, vertices, 1, true), attribute(1, find_buffer(buffers, "normals")?, 3, false)];
     from.extend(buffers.get("uvs").map(|buffer| attribute(2, buffer, 2, false)));
     from.extend(buffers.get("tangents").map(|buffer| attribute(3, buffer, 4, false)));
-    gl.vertex_array(Some(named(buffers, index)?), &from).map(Some)
+    gl.vertex_array(Some(find_buffer(buffers, index)?), &from).map(Some)
 }
 
-fn upload_arrays(gl: &Rc<Gl>, scene: &Scene, arrays: &[Array], purpose: Use) -> Result<Vec<Texture>> {
+fn upload_arrays(gl: &Rc<Gl>, scene: &Scene, arrays: &[TextureArray], purpose: TextureRole) -> Result<Vec<Texture>> {
     arrays.iter().map(|array| upload_array(gl, scene, array, purpose)).collect()
 }
 
-fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Result<Texture> {
+fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, purpose: TextureRole) -> Result<Texture> {
     let layers = array.layers.len() as u32;
     if layers > gl.limits.max_layers {
         let field = format!("textures of {} x {}", array.width, array.height);
         return Err(gl::too_large(&field, u64::from(gl.limits.max_layers), u64::from(layers)));
     }
-    let texture = gl.texture(TextureKind {
+    let texture = gl.texture(TextureDesc {
         target: gl::TEXTURE_2D_ARRAY,
-        format: if purpose == Use::Colour { gl::SRGB8_ALPHA8 } else { gl::RGBA8 },
+        format: if purpose == TextureRole::Color { gl::SRGB8_ALPHA8 } else { gl::RGBA8 },
         width: array.width,
         height: array.height,
         depth: layers,
@@ -410,8 +438,8 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
     // textures.
     for (chunk, part) in array.layers.chunks(8).enumerate() {
         let chain = |layer: &usize| {
-            let cutoff = if purpose == Use::Colour { cutoff(scene, *layer) } else { None };
-            levels(&scene.textures[*layer], array, purpose, cutoff)
+            let cutoff = if purpose == TextureRole::Color { cutoff(scene, *layer) } else { None };
+            mip_levels(&scene.textures[*layer], array, purpose, cutoff)
         };
         let chains: Vec<Vec<Vec<u8>>> = part.par_iter().map(chain).collect();
         for (offset, chain) in chains.iter().enumerate() {
@@ -429,6 +457,6 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &Array, purpose: Use) -> Resu
         (gl::TEXTURE_WRAP_S, gl::REPEAT),
         (gl::TEXTURE_WRAP_T, gl::REPEAT),
     ];
-    texture.sampling(&sampling, gl.limits.anisotropy);
+    texture.set_sampling(&sampling, gl.limits.anisotropy);
     Ok(texture)
 }

@@ -1,37 +1,37 @@
 //! Assembles the shader sources from the files under `shaders/`, with only the branches that a scene needs.
 
-mod asked;
-pub(super) mod lists;
+pub(super) mod oit;
+mod readback;
 
-pub(super) use self::asked::pick;
+pub(super) use self::readback::pick;
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-use super::geometry::Kind;
+use super::geometry::BlendMode;
 use super::gl;
-use super::textures::Use;
-use modalcast_model::scene::Shadow;
+use super::textures::TextureRole;
+use modalcast_model::scene::ShadowSettings;
 
 pub(super) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
 const CLIP: &str = include_str!("../../shaders/shared/clip.glsl");
 const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
-pub(super) const DRAWN: &str = include_str!("../../shaders/shared/drawn.glsl");
-pub(super) const IDS: &str = include_str!("../../shaders/shared/ids.glsl");
-const CUT_OUT: &str = include_str!("../../shaders/shared/cut_out.glsl");
-pub(super) const CASTER: &str = include_str!("../../shaders/shared/caster.glsl");
-const LISTS: &str = include_str!("../../shaders/shared/lists.glsl");
+pub(super) const TRIANGLE_ID: &str = include_str!("../../shaders/shared/triangle_id.glsl");
+pub(super) const VISIBILITY_IDS: &str = include_str!("../../shaders/shared/visibility_ids.glsl");
+const ALPHA_COVERAGE: &str = include_str!("../../shaders/shared/alpha_coverage.glsl");
+pub(super) const SHADOW_CASTER: &str = include_str!("../../shaders/shared/shadow_caster.glsl");
+const OIT_LISTS: &str = include_str!("../../shaders/shared/oit_lists.glsl");
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
-const GROUND: &str = include_str!("../../shaders/shared/ground.glsl");
-const MEETS: &str = include_str!("../../shaders/shared/meets.glsl");
+const GROUND: &str = include_str!("../../shaders/shared/ground_shading.glsl");
+const GROUND_PLANE: &str = include_str!("../../shaders/shared/ground_plane.glsl");
 const PHONG: &str = include_str!("../../shaders/shared/phong.glsl");
-const SHARES: &str = include_str!("../../shaders/shared/shares.glsl");
-const TRIANGLE: &str = include_str!("../../shaders/shared/triangle.glsl");
+const BARYCENTRICS: &str = include_str!("../../shaders/shared/barycentrics.glsl");
+const TRIANGLE_SHADING: &str = include_str!("../../shaders/shared/triangle_shading.glsl");
 
 /// First texture unit of each use.
 pub(super) const SHADOW_UNIT: u32 = 0;
-pub(super) const COLOUR_UNIT: u32 = 1;
-pub(super) const NORMAL_UNIT: u32 = COLOUR_UNIT + super::textures::MAX_ARRAYS as u32;
+pub(super) const COLOR_UNIT: u32 = 1;
+pub(super) const NORMAL_UNIT: u32 = COLOR_UNIT + super::textures::MAX_ARRAYS as u32;
 /// Units of the buffer textures and of the frame's images, the same as in the shaders.
 pub(super) const POSITION_UNIT: u32 = 13;
 pub(super) const MATERIAL_UNIT: u32 = 14;
@@ -48,11 +48,11 @@ pub(super) const LAYER_UNIT: u32 = 22;
 pub(super) const COUNT_UNIT: u32 = 23;
 pub(super) const VALUE_UNIT: u32 = 24;
 /// Maximum number of textures that the shading reads in addition to the scene's images.
-pub(super) const OTHER_READS: usize = 13;
+pub(super) const FIXED_TEXTURE_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Lanes of a compute workgroup, along x.
-pub(super) const LANES: u32 = 64;
+pub(super) const WORKGROUP_SIZE: u32 = 64;
 /// Side of the square of pixels that a workgroup shades.
 pub(super) const TILE: u32 = 8;
 /// Workgroups in a row of the dispatch over listed tiles.
@@ -60,58 +60,58 @@ pub(super) const TILE_ROW: u32 = 64;
 
 /// Parameters of the shader sources.
 #[derive(Debug, Clone)]
-pub(super) struct Options {
+pub(super) struct ShaderOptions {
     pub(super) defines: Vec<&'static str>,
     /// The materials that triangles use.
-    pub(super) used: Vec<Used>,
+    pub(super) used: Vec<MaterialUse>,
     /// Shadow settings as resolved for the device; used only when the defines contain SHADOWS.
-    pub(super) shadow: Shadow,
+    pub(super) shadow: ShadowSettings,
     /// Sample positions within a multisampled pixel.
-    pub(super) sample_places: Vec<[f32; 2]>,
+    pub(super) sample_positions: Vec<[f32; 2]>,
     /// Source that is applied to the light of each sample.
-    pub(super) resolve: String,
+    pub(super) sample_resolve: String,
     /// Whether a fragment can read its coverage after the depth test.
-    pub(super) post_depth: bool,
+    pub(super) post_depth_coverage: bool,
 }
 
 /// A material that triangles use: the pipeline that draws them, and the arrays of its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Used {
-    pub(super) kind: Kind,
-    pub(super) colour: Option<usize>,
+pub(super) struct MaterialUse {
+    pub(super) blend_mode: BlendMode,
+    pub(super) color: Option<usize>,
     pub(super) normal: Option<usize>,
 }
 
 /// The source text of a program's stages.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct Source {
+pub(super) struct ProgramSource {
     pub(super) label: String,
     pub(super) stages: Vec<(u32, String)>,
 }
 
-impl Options {
+impl ShaderOptions {
     pub(super) fn head(&self, more: &[&str]) -> String {
         let mut text = String::from("#version 430 core\n");
         for define in self.defines.iter().chain(more) {
             writeln!(text, "#define {define}").ok();
         }
-        writeln!(text, "#define STRIDE {}", super::scene_buffers::MATERIAL_BYTES / 16).ok();
+        writeln!(text, "#define MATERIAL_STRIDE {}", super::scene_buffers::MATERIAL_BYTES / 16).ok();
         text
     }
 
     /// Defines for triangles of these kinds: for their images, and for the material lookup if they have several
     /// materials.
-    pub(super) fn branches(&self, kinds: &[Kind]) -> String {
-        let mut own = (0..).zip(&self.used).filter(|(_, used)| kinds.contains(&used.kind));
+    pub(super) fn material_defines(&self, kinds: &[BlendMode]) -> String {
+        let mut own = (0..).zip(&self.used).filter(|(_, used)| kinds.contains(&used.blend_mode));
         let mut text = match (own.next(), own.next()) {
-            (Some((only, _)), None) => format!("#undef LOOK_UP\n#define ONLY_MATERIAL {only}\n"),
+            (Some((only, _)), None) => format!("#undef MATERIAL_TABLE\n#define SINGLE_MATERIAL {only}\n"),
             _ => String::new(),
         };
-        let (colours, normals) = (self.arrays(kinds, Use::Colour), self.arrays(kinds, Use::Normal));
+        let (colors, normals) = (self.arrays(kinds, TextureRole::Color), self.arrays(kinds, TextureRole::Normal));
         for (define, unneeded) in [
-            ("TEXTURES", colours.is_empty()),
+            ("TEXTURES", colors.is_empty()),
             ("NORMAL_MAPS", normals.is_empty()),
-            ("UVS", colours.is_empty() && normals.is_empty()),
+            ("UVS", colors.is_empty() && normals.is_empty()),
         ] {
             if unneeded {
                 writeln!(text, "#undef {define}").ok();
@@ -121,19 +121,19 @@ impl Options {
     }
 
     /// Lookup functions for the images and materials of these kinds.
-    pub(super) fn lookups(&self, kinds: &[Kind], slopes: Slopes) -> String {
-        let colours = sampler("colour", COLOUR_UNIT, &self.arrays(kinds, Use::Colour), slopes);
-        let normals = sampler("normal", NORMAL_UNIT, &self.arrays(kinds, Use::Normal), slopes);
-        [MATERIAL, &colours, &normals].concat()
+    pub(super) fn material_lookups(&self, kinds: &[BlendMode], slopes: UvDerivatives) -> String {
+        let colors = sampler("color", COLOR_UNIT, &self.arrays(kinds, TextureRole::Color), slopes);
+        let normals = sampler("normal", NORMAL_UNIT, &self.arrays(kinds, TextureRole::Normal), slopes);
+        [MATERIAL, &colors, &normals].concat()
     }
 
     /// Texture arrays that hold images of these kinds' materials.
-    fn arrays(&self, kinds: &[Kind], purpose: Use) -> BTreeSet<usize> {
-        let image = |used: &Used| match purpose {
-            Use::Colour => used.colour,
-            Use::Normal => used.normal,
+    fn arrays(&self, kinds: &[BlendMode], purpose: TextureRole) -> BTreeSet<usize> {
+        let image = |used: &MaterialUse| match purpose {
+            TextureRole::Color => used.color,
+            TextureRole::Normal => used.normal,
         };
-        self.used.iter().filter(|used| kinds.contains(&used.kind)).filter_map(image).collect()
+        self.used.iter().filter(|used| kinds.contains(&used.blend_mode)).filter_map(image).collect()
     }
 
     /// Whether two-pass transparency draws parts of blended triangles as opaque.
@@ -142,104 +142,119 @@ impl Options {
     }
 
     /// Defines that depend on the samples per pixel.
-    pub(super) fn sampling(&self, samples: u32) -> String {
+    pub(super) fn sample_defines(&self, samples: u32) -> String {
         let middle = vec![[0.5; 2]];
-        let places = if samples > 1 { &self.sample_places } else { &middle };
+        let places = if samples > 1 { &self.sample_positions } else { &middle };
         let places: Vec<String> = places.iter().map(|[x, y]| format!("vec2({x:?}, {y:?})")).collect();
         let list = places.join(", ");
-        format!("#define SAMPLES {samples}\nconst vec2 SAMPLE_PLACES[{}] = vec2[]({list});\n", places.len())
+        format!("#define SAMPLES {samples}\nconst vec2 SAMPLE_POSITIONS[{}] = vec2[]({list});\n", places.len())
     }
 
     /// Draws ids and depth of one kind of triangle.
-    pub(super) fn visibility(&self, kind: Kind, samples: u32) -> Source {
-        let label = format!("visibility, {kind:?}, {samples} samples");
+    pub(super) fn visibility(&self, blend_mode: BlendMode, samples: u32) -> ProgramSource {
+        let label = format!("visibility, {blend_mode:?}, {samples} samples");
         let (vertex, body) =
             (include_str!("../../shaders/visibility.vert"), include_str!("../../shaders/visibility.frag"));
-        if kind == Kind::Opaque {
+        if blend_mode == BlendMode::Opaque {
             let head = self.head(&[]);
-            return Source {
+            return ProgramSource {
                 label,
-                stages: drawn([&head, FRAME, CLIP, vertex].concat(), [&head, DRAWN, body].concat()),
+                stages: vertex_and_fragment([&head, FRAME, CLIP, vertex].concat(), [&head, TRIANGLE_ID, body].concat()),
             };
         }
-        let head = self.head(&["MASK"]) + &self.branches(&[kind]);
-        let (lookups, sampling) = (self.lookups(&[kind], Slopes::OfTheQuad), self.sampling(samples));
-        let fragment = [&head, &lookups, DRAWN, &sampling, CUT_OUT, body].concat();
-        Source { label, stages: drawn([&head, FRAME, CLIP, vertex].concat(), fragment) }
+        let head = self.head(&["MASK"]) + &self.material_defines(&[blend_mode]);
+        let (material_lookups, sample_defines) =
+            (self.material_lookups(&[blend_mode], UvDerivatives::Implicit), self.sample_defines(samples));
+        let fragment = [&head, &material_lookups, TRIANGLE_ID, &sample_defines, ALPHA_COVERAGE, body].concat();
+        ProgramSource { label, stages: vertex_and_fragment([&head, FRAME, CLIP, vertex].concat(), fragment) }
     }
 
     /// Draws the layer of the blended triangles, except the parts that were drawn as opaque.
-    pub(super) fn blended(&self, samples: u32) -> Source {
-        let head = self.head(&[]) + &self.branches(&[Kind::Blend]);
-        let lookups = self.lookups(&[Kind::Blend], Slopes::OfTheQuad);
+    pub(super) fn blended(&self, samples: u32) -> ProgramSource {
+        let head = self.head(&[]) + &self.material_defines(&[BlendMode::Blend]);
+        let material_lookups = self.material_lookups(&[BlendMode::Blend], UvDerivatives::Implicit);
         let vertex = [&head, FRAME, CLIP, include_str!("../../shaders/blended.vert")].concat();
         let body = include_str!("../../shaders/blended.frag");
-        let parts = if self.opaque_parts() { self.sampling(samples) + CUT_OUT } else { String::new() };
-        let fragment = [&head, FRAME, &lookups, DRAWN, &self.sun(), PHONG, &parts, body].concat();
-        Source { label: "blended".into(), stages: drawn(vertex, fragment) }
+        let parts = if self.opaque_parts() { self.sample_defines(samples) + ALPHA_COVERAGE } else { String::new() };
+        let fragment = [&head, FRAME, &material_lookups, TRIANGLE_ID, &self.sun(), PHONG, &parts, body].concat();
+        ProgramSource { label: "blended".into(), stages: vertex_and_fragment(vertex, fragment) }
     }
 
     /// Shades tiles in which no triangle is visible.
-    pub(super) fn backdrop(&self, samples: u32) -> Source {
-        let mut text = self.shading(samples, &["BACKDROP"]);
+    pub(super) fn background(&self, samples: u32) -> ProgramSource {
+        let mut text = self.shading(samples, &["BACKGROUND"]);
         text += include_str!("../../shaders/shade.comp");
-        Source { label: format!("backdrop, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+        ProgramSource { label: format!("background, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
     /// Shades the other tiles.
-    pub(super) fn shade(&self, samples: u32) -> Source {
-        let all = [Kind::Opaque, Kind::Mask, Kind::Blend];
+    pub(super) fn shade(&self, samples: u32) -> ProgramSource {
+        let all = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
         let kinds = if self.opaque_parts() { &all } else { &all[..2] };
-        let mut text = self.shading(samples, &[]) + &self.branches(kinds);
-        text += &[&self.lookups(kinds, Slopes::Given), PHONG, SHARES, TRIANGLE].concat();
+        let mut text = self.shading(samples, &[]) + &self.material_defines(kinds);
+        text +=
+            &[&self.material_lookups(kinds, UvDerivatives::Explicit), PHONG, BARYCENTRICS, TRIANGLE_SHADING].concat();
         text += include_str!("../../shaders/shade.comp");
-        Source { label: format!("shade, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+        ProgramSource { label: format!("shade, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
     fn shading(&self, samples: u32, more: &[&str]) -> String {
         let mut head = self.head(more);
-        writeln!(head, "#define TILE {TILE}\n#define ROW {TILE_ROW}u").ok();
-        let ground = if self.defines.contains(&"GROUND_SEEN") { GROUND } else { "" };
-        [&head, &self.sampling(samples), FRAME, CLIP, IDS, MEETS, &self.sun(), SKY, ground, &self.resolve].concat()
+        writeln!(head, "#define TILE {TILE}\n#define TILES_PER_ROW {TILE_ROW}u").ok();
+        let ground = if self.defines.contains(&"HAS_GROUND") { GROUND } else { "" };
+        [
+            &head,
+            &self.sample_defines(samples),
+            FRAME,
+            CLIP,
+            VISIBILITY_IDS,
+            GROUND_PLANE,
+            &self.sun(),
+            SKY,
+            ground,
+            &self.sample_resolve,
+        ]
+        .concat()
     }
 
     /// Converts the keys of the compute rasterizer to ids.
-    pub(super) fn unpack(&self) -> Source {
+    pub(super) fn unpack(&self) -> ProgramSource {
         let mut head = self.head(&[]);
         writeln!(head, "#define TILE {TILE}").ok();
-        let text = [&head, FRAME, IDS, MEETS, include_str!("../../shaders/unpack.comp")].concat();
-        Source { label: "unpack".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+        let text =
+            [&head, FRAME, VISIBILITY_IDS, GROUND_PLANE, include_str!("../../shaders/visibility_unpack.comp")].concat();
+        ProgramSource { label: "unpack".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
-    pub(super) fn ground(&self) -> Source {
+    pub(super) fn ground(&self) -> ProgramSource {
         let head = self.head(&[]);
-        let vertex = [&head, FRAME, MEETS, include_str!("../../shaders/ground.vert")].concat();
-        let fragment = [&head, FRAME, IDS, MEETS, include_str!("../../shaders/ground.frag")].concat();
-        Source { label: "ground".into(), stages: drawn(vertex, fragment) }
+        let vertex = [&head, FRAME, GROUND_PLANE, include_str!("../../shaders/ground.vert")].concat();
+        let fragment = [&head, FRAME, VISIBILITY_IDS, GROUND_PLANE, include_str!("../../shaders/ground.frag")].concat();
+        ProgramSource { label: "ground".into(), stages: vertex_and_fragment(vertex, fragment) }
     }
 }
 
-pub(super) fn drawn(vertex: String, fragment: String) -> Vec<(u32, String)> {
+pub(super) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32, String)> {
     vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
 }
 
 /// Lookup in texture arrays. Implicit derivatives are undefined in divergent control flow, so with several arrays the
 /// derivatives are computed before the array is chosen.
-fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: Slopes) -> String {
+fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: UvDerivatives) -> String {
     let mut text = String::new();
     let Some(first) = arrays.first() else { return text };
     for index in arrays {
         let unit = unit as usize + index;
         writeln!(text, "layout(binding = {unit}) uniform sampler2DArray {name}_{index};").ok();
     }
-    let given = if slopes == Slopes::Given { ", vec2 dx, vec2 dy" } else { "" };
+    let given = if slopes == UvDerivatives::Explicit { ", vec2 dx, vec2 dy" } else { "" };
     writeln!(text, "vec4 {name}_texel(ivec2 place, vec2 uv{given}) {{").ok();
     writeln!(text, "    vec3 at = vec3(uv, float(max(place.y, 0)));").ok();
-    if slopes == Slopes::OfTheQuad && arrays.len() == 1 {
+    if slopes == UvDerivatives::Implicit && arrays.len() == 1 {
         writeln!(text, "    return texture({name}_{first}, at);\n}}").ok();
         return text;
     }
-    if slopes == Slopes::OfTheQuad {
+    if slopes == UvDerivatives::Implicit {
         writeln!(text, "    vec2 dx = dFdx(uv), dy = dFdy(uv);").ok();
     }
     for index in arrays.iter().skip(1) {
@@ -251,18 +266,18 @@ fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: Slopes) -> S
 
 /// Source of the derivatives of texture coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Slopes {
+pub(super) enum UvDerivatives {
     /// Differences between the fragments of a quad.
-    OfTheQuad,
+    Implicit,
     /// Arguments of the lookup.
-    Given,
+    Explicit,
 }
 
 /// Packs the ids of each pixel's first sample.
-pub(super) fn seen(samples: u32) -> Source {
-    let head = format!("#version 430 core\n#define LANES {LANES}\n#define SAMPLES {samples}\n");
-    let body = [&head, IDS, include_str!("../../shaders/seen.comp")].concat();
-    Source { label: format!("seen, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
+pub(super) fn visibility_readback(samples: u32) -> ProgramSource {
+    let head = format!("#version 430 core\n#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES {samples}\n");
+    let body = [&head, VISIBILITY_IDS, include_str!("../../shaders/visibility_readback.comp")].concat();
+    ProgramSource { label: format!("visibility readback, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }
 }
 
 #[cfg(test)]
@@ -272,74 +287,82 @@ mod tests {
     use modalcast_model::domain::{AlphaMode, Material};
     use modalcast_model::scene::Scene;
 
-    fn options(alpha_mode: AlphaMode) -> Options {
+    fn options(alpha_mode: AlphaMode) -> ShaderOptions {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
         let plan = super::super::plan::plan(&scene);
-        let sample_places = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
-        let used = vec![Used { kind: Kind::Opaque, colour: None, normal: None }];
-        let resolve = super::super::post::resolve(&scene.look);
-        Options { defines: plan.defines, used, shadow: Shadow::default(), sample_places, resolve, post_depth: false }
+        let sample_positions = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
+        let used = vec![MaterialUse { blend_mode: BlendMode::Opaque, color: None, normal: None }];
+        let sample_resolve = super::super::post::sample_resolve(&scene.look);
+        ShaderOptions {
+            defines: plan.defines,
+            used,
+            shadow: ShadowSettings::default(),
+            sample_positions,
+            sample_resolve,
+            post_depth_coverage: false,
+        }
     }
 
-    fn text(source: Source) -> String {
+    fn text(source: ProgramSource) -> String {
         source.stages.into_iter().map(|(_, text)| text).collect()
     }
 
     #[test]
     fn only_cut_out_triangles_have_a_discard_in_their_shader_and_depth_alone_needs_no_fragment_shader() {
         let options = options(AlphaMode::Opaque);
-        assert!(!text(options.visibility(Kind::Opaque, 4)).contains("discard;"));
+        assert!(!text(options.visibility(BlendMode::Opaque, 4)).contains("discard;"));
         assert!(!text(options.blended(4)).contains("discard;"));
         for (samples, masks) in [(4, true), (1, false)] {
-            let text = text(options.visibility(Kind::Mask, samples));
+            let text = text(options.visibility(BlendMode::Mask, samples));
             assert!(text.contains("discard;") && text.contains(&format!("SAMPLES {samples}")));
             assert_eq!(text.contains("vec2(0.375, 0.125)"), masks, "places of the samples");
         }
-        assert_eq!(options.shadow(Kind::Opaque).stages.len(), 1);
+        assert_eq!(options.shadow(BlendMode::Opaque).stages.len(), 1);
     }
 
     #[test]
     fn the_shading_of_a_plain_scene_knows_no_image_no_shadow_no_ground_and_no_layer() {
-        let plain = Options { defines: vec![], ..options(AlphaMode::Opaque) };
-        let [backdrop, shading] = [plain.backdrop(4), plain.shade(4)].map(text);
-        assert!(!backdrop.contains("vec4 triangle_seen("), "no triangle, no shading of one");
-        assert!(shading.contains("vec4 triangle_seen("));
-        for text in [&backdrop, &shading] {
-            assert!(!text.contains("vec3 ground(") && !text.contains("textureGrad"));
+        let plain = ShaderOptions { defines: vec![], ..options(AlphaMode::Opaque) };
+        let [background, shading] = [plain.background(4), plain.shade(4)].map(text);
+        assert!(!background.contains("vec4 shade_triangle("), "no triangle, no shading of one");
+        assert!(shading.contains("vec4 shade_triangle("));
+        for text in [&background, &shading] {
+            assert!(!text.contains("vec3 shade_ground(") && !text.contains("textureGrad"));
         }
-        let used = vec![Used { kind: Kind::Opaque, colour: Some(0), normal: None }];
-        let full = Options { defines: vec!["TEXTURES", "UVS", "GROUND_SEEN"], used, ..plain };
+        let used = vec![MaterialUse { blend_mode: BlendMode::Opaque, color: Some(0), normal: None }];
+        let full = ShaderOptions { defines: vec!["TEXTURES", "UVS", "HAS_GROUND"], used, ..plain };
         let shading = text(full.shade(1));
-        assert!(shading.contains("vec3 ground(") && shading.contains("textureGrad(colour_0"));
+        assert!(shading.contains("vec3 shade_ground(") && shading.contains("textureGrad(color_0"));
     }
 
     #[test]
     fn each_kind_reads_the_arrays_of_its_own_materials_and_looks_up_a_material_only_among_several() {
-        let of = |kind, colour, normal| Used { kind, colour, normal };
+        let of = |blend_mode, color, normal| MaterialUse { blend_mode, color, normal };
         let used = vec![
-            of(Kind::Opaque, Some(0), Some(0)),
-            of(Kind::Mask, Some(1), None),
-            of(Kind::Blend, None, None),
-            of(Kind::Blend, Some(2), None),
+            of(BlendMode::Opaque, Some(0), Some(0)),
+            of(BlendMode::Mask, Some(1), None),
+            of(BlendMode::Blend, None, None),
+            of(BlendMode::Blend, Some(2), None),
         ];
-        let options = Options { used, ..options(AlphaMode::Opaque) };
-        let of = |kinds: &[Kind], slopes| options.branches(kinds) + &options.lookups(kinds, slopes);
-        let mask = of(&[Kind::Mask], Slopes::OfTheQuad);
-        assert!(mask.contains("texture(colour_1, at)") && !mask.contains("colour_0") && !mask.contains("textureGrad"));
+        let options = ShaderOptions { used, ..options(AlphaMode::Opaque) };
+        let of =
+            |kinds: &[BlendMode], slopes| options.material_defines(kinds) + &options.material_lookups(kinds, slopes);
+        let mask = of(&[BlendMode::Mask], UvDerivatives::Implicit);
+        assert!(mask.contains("texture(color_1, at)") && !mask.contains("color_0") && !mask.contains("textureGrad"));
         assert!(mask.contains("#undef NORMAL_MAPS") && !mask.contains("#undef UVS"));
-        assert!(mask.contains("ONLY_MATERIAL 1") && mask.contains("#undef LOOK_UP"));
-        let blend = of(&[Kind::Blend], Slopes::OfTheQuad);
-        assert!(!blend.contains("#undef LOOK_UP") && !blend.contains("#undef TEXTURES"));
-        let shade = of(&[Kind::Opaque, Kind::Mask], Slopes::Given);
-        assert!(shade.contains("if (place.x == 1) return textureGrad(colour_1") && !shade.contains("dFdx"));
-        assert!(shade.contains("normal_0") && !shade.contains("colour_2"));
+        assert!(mask.contains("SINGLE_MATERIAL 1") && mask.contains("#undef MATERIAL_TABLE"));
+        let blend = of(&[BlendMode::Blend], UvDerivatives::Implicit);
+        assert!(!blend.contains("#undef MATERIAL_TABLE") && !blend.contains("#undef TEXTURES"));
+        let shade = of(&[BlendMode::Opaque, BlendMode::Mask], UvDerivatives::Explicit);
+        assert!(shade.contains("if (place.x == 1) return textureGrad(color_1") && !shade.contains("dFdx"));
+        assert!(shade.contains("normal_0") && !shade.contains("color_2"));
     }
 
     #[test]
     fn several_arrays_are_chosen_by_their_number_and_slopes_taken_before() {
-        let text = sampler("colour", 1, &BTreeSet::from([0, 2, 3]), Slopes::OfTheQuad);
+        let text = sampler("color", 1, &BTreeSet::from([0, 2, 3]), UvDerivatives::Implicit);
         let (slopes, choice) = (text.find("dFdx"), text.find("place.x == 2"));
         assert!(slopes.is_some() && slopes < choice, "{text}");
-        assert_eq!(sampler("colour", 1, &BTreeSet::new(), Slopes::Given), "");
+        assert_eq!(sampler("color", 1, &BTreeSet::new(), UvDerivatives::Explicit), "");
     }
 }

@@ -1,4 +1,4 @@
-//! Asynchronous frames: [`Renderer::submit`] records the commands of a frame, [`Renderer::collect`] takes its pixels
+//! Asynchronous frames: [`Renderer::submit`] records the commands of a frame, [`Renderer::read_image`] takes its pixels
 //! when they are ready. In between, the host can do other work or submit more frames.
 //!
 //! The uniforms of a frame (`frame`, `splits`, the initial values of the counters) are written with stream-ordered
@@ -10,65 +10,67 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
-use super::gl::{Fence, Lent, Stopwatch};
-use super::lists;
-use super::programs::Sampled;
+use super::cascades::ShadowCascades;
+use super::gl::{Fence, PassTimer, ReadbackView};
+use super::oit;
+use super::programs::SampleCountPrograms;
+use super::readback_ring::ReadbackSlot;
 use super::region::Region;
-use super::ring::Slot;
 use super::scene_buffers::SceneBuffers;
-use super::splits::Splits;
-use super::target::{Form, Target};
-use super::{Image, Path, Paths, Ran, Renderer, Shot, cull, frame, passes};
-use modalcast_model::error::{Error, Result, during, invalid};
+use super::target::{RenderTarget, TargetDesc};
+use super::{
+    FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, cull, frame_uniforms, passes,
+};
+use modalcast_model::error::{Error, Result, fault_in, invalid};
 
 /// Bytes that one thread copies at a time: large enough that the cost of starting a task is small in comparison.
-const STRETCH: usize = 1 << 20;
+const COPY_CHUNK_BYTES: usize = 1 << 20;
 
 /// A frame in flight. Dropping the ticket abandons the frame.
 #[derive(Debug)]
-pub struct Ticket {
-    form: Form,
+pub struct PendingFrame {
+    desc: TargetDesc,
     /// None for a frame whose pixels are not read back.
-    slot: Option<Slot>,
+    slot: Option<ReadbackSlot>,
     fence: Fence,
     /// Passes in execution order, each with its timer.
-    passes: Vec<(&'static str, Stopwatch)>,
-    ran: Ran,
+    passes: Vec<(&'static str, PassTimer)>,
+    stats: FrameStats,
     limit: Duration,
     /// When the host first polled or waited for the frame.
-    waited: Cell<Option<Instant>>,
+    first_wait: Cell<Option<Instant>>,
 }
 
 /// Pixels of a finished frame, still in the staging buffer that the device wrote. Any thread may copy them. The ring
 /// cannot reuse the staging buffer until then, so copy them soon.
 #[derive(Debug)]
-pub struct Pixels {
+pub struct MappedPixels {
     width: u32,
     height: u32,
-    lent: Option<Lent>,
+    view: Option<ReadbackView>,
     passes: Vec<(&'static str, f64)>,
-    paths: Paths,
+    raster_backends: RasterBackends,
 }
 
 impl Renderer {
     /// Draws one frame of the current buffers and waits for its pixels.
     ///
     /// # Errors
-    /// Those of [`Self::submit`] and [`Self::retrieve`].
-    pub fn draw(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Image> {
+    /// Those of [`Self::submit`] and [`Self::map_pixels`].
+    pub fn draw(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<FrameImage> {
         let ticket = self.submit(buffers, shot)?;
-        self.collect(ticket)
+        self.read_image(ticket)
     }
 
     /// Submits one frame of the current buffers; later changes of the buffers do not affect it. At most
-    /// [`super::FRAMES_UNDER_WAY`] frames of one form may be in flight. A further one is refused until the oldest is
+    /// [`super::MAX_FRAMES_IN_FLIGHT`] frames of one form may be in flight. A further one is refused until the oldest is
     /// collected.
     ///
     /// # Errors
     /// `Busy` when too many frames are in flight, `Invalid` for a size above the limit or a camera whose matrices
     /// overflow, `Fault` naming the pass when OpenGL reports an error.
-    pub fn submit(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Ticket> {
-        self.start(buffers, shot, true)
+    pub fn submit(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<PendingFrame> {
+        self.submit_frame(buffers, shot, true)
     }
 
     /// Submits a frame whose pixels stay on the device, like a frame that is shown on a screen: its image is empty.
@@ -76,88 +78,91 @@ impl Renderer {
     ///
     /// # Errors
     /// Those of [`Self::submit`] except `Busy`.
-    pub fn submit_unread(&mut self, buffers: &SceneBuffers, shot: &Shot) -> Result<Ticket> {
-        self.start(buffers, shot, false)
+    pub fn submit_without_readback(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<PendingFrame> {
+        self.submit_frame(buffers, shot, false)
     }
 
     /// Waits for a frame and copies its pixels.
     ///
     /// # Errors
-    /// Those of [`Self::retrieve`].
-    pub fn collect(&mut self, ticket: Ticket) -> Result<Image> {
-        self.retrieve(ticket).map(Pixels::into_image)
+    /// Those of [`Self::map_pixels`].
+    pub fn read_image(&mut self, ticket: PendingFrame) -> Result<FrameImage> {
+        self.map_pixels(ticket).map(MappedPixels::into_image)
     }
 
     /// Waits for a frame and returns its pixels uncopied, so that another thread can copy them.
     ///
     /// # Errors
     /// `Fault` naming the pass that did not finish within the time limit, or the OpenGL error.
-    pub fn retrieve(&mut self, ticket: Ticket) -> Result<Pixels> {
+    pub fn map_pixels(&mut self, ticket: PendingFrame) -> Result<MappedPixels> {
         ticket.wait()?;
-        let Ticket { form, slot, passes, mut ran, .. } = ticket;
-        let staging = slot.as_ref().and_then(Slot::staging);
+        let PendingFrame { desc, slot, passes, mut stats, .. } = ticket;
+        let staging = slot.as_ref().and_then(ReadbackSlot::staging);
         if let Some(staging) = staging {
-            let [listed, culled] = form.told().map(|part| part.start as usize..part.end as usize);
-            let told = |part: Range<usize>| if part.is_empty() { Ok(None) } else { staging.read(part).map(Some) };
-            (ran.lists, ran.culled) =
-                (told(listed)?.map(|head| lists::told(&head)), told(culled)?.map(|counts| cull::told(&counts)));
+            let [listed, culled] = desc.readback_ranges().map(|part| part.start as usize..part.end as usize);
+            let read = |part: Range<usize>| if part.is_empty() { Ok(None) } else { staging.read(part).map(Some) };
+            (stats.oit, stats.culled) = (
+                read(listed)?.map(|head| oit::parse_stats(&head)),
+                read(culled)?.map(|counts| cull::parse_stats(&counts)),
+            );
         }
         // When the compute rasterizer drew the visibility there are no camera counts; the sun's are dropped with them.
-        ran.culled = ran.culled.filter(|_| ran.paths.visibility != Some(Path::Cuda));
-        let lent = staging.map(|staging| staging.lend(form.bytes() as usize)).transpose()?;
+        stats.culled = stats.culled.filter(|_| stats.raster_backends.visibility != Some(RasterBackend::Cuda));
+        let view = staging.map(|staging| staging.view(desc.bytes() as usize)).transpose()?;
         self.gl.check("read")?;
-        warn_of_lists(&self.ran, &ran);
-        if let Some(culled) = &ran.culled {
+        warn_of_dropped_fragments(&self.stats, &stats);
+        if let Some(culled) = &stats.culled {
             tracing::trace!(?culled, "triangles before they were drawn");
         }
-        let paths = ran.paths;
-        self.ran = ran;
-        Ok(Pixels { width: form.width, height: form.height, lent, passes: times(&passes), paths })
+        let raster_backends = stats.raster_backends;
+        self.stats = stats;
+        Ok(MappedPixels { width: desc.width, height: desc.height, view, passes: stage_times(&passes), raster_backends })
     }
 
-    fn start(&mut self, buffers: &SceneBuffers, shot: &Shot, is_read: bool) -> Result<Ticket> {
+    fn submit_frame(&mut self, buffers: &SceneBuffers, shot: &FrameParams, is_read: bool) -> Result<PendingFrame> {
         self.check_size(shot)?;
-        let numbers = frame::Frame::new(&buffers.scene, shot, buffers.origin)?;
+        let numbers = frame_uniforms::FrameUniforms::new(&buffers.scene, shot, buffers.origin)?;
         let look = &buffers.scene.look;
         let size = [shot.width, shot.height];
-        let form = Form::new(&self.gl, size, look, lists::wanted(&self.gl, &buffers.scene, size)?);
-        let form = Form { culling: cull::of(buffers.plan()), ..form };
-        self.make_room(form)?;
-        let sampled = buffers.sampled(form.samples, &mut |source| self.program(source))?;
-        let Some(target) = self.targets.last() else { return Err(during("draw")("no target")) };
-        let slot = if is_read { Some(target.ring.take(self.watchdog)?) } else { None };
+        let desc = TargetDesc::new(&self.gl, size, look, oit::blend_storage(&self.gl, &buffers.scene, size)?);
+        let desc = TargetDesc { culling: cull::culling_of(buffers.plan()), ..desc };
+        self.ensure_target(desc)?;
+        let sample_programs = buffers.sample_programs(desc.samples, &mut |source| self.program(source))?;
+        let Some(target) = self.targets.last() else { return Err(fault_in("draw")("no target")) };
+        let slot = if is_read { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
         let ground = draws_ground(buffers, shot);
-        target.reach.set(reach(buffers, shot, ground));
-        buffers.buffer("frame")?.write(bytemuck::bytes_of(&numbers));
+        target.draw_region.set(draw_region(buffers, shot, ground));
+        buffers.buffer("frame uniforms")?.write(bytemuck::bytes_of(&numbers));
         passes::bind(buffers)?;
-        cull::begin(buffers);
-        if let Some(splits) = buffers.buffers.get("splits") {
-            let fit = frame::sun_fit(&buffers.scene, shot, buffers.origin);
-            splits.write(bytemuck::bytes_of(&Splits::new(&buffers.scene, shot, &fit, buffers.origin)));
+        cull::clear_counters(buffers);
+        if let Some(splits) = buffers.buffers.get("shadow cascades") {
+            let fit = frame_uniforms::light_box_params(&buffers.scene, shot, buffers.origin);
+            splits.write(bytemuck::bytes_of(&ShadowCascades::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
-        let mut ran = Ran { samples: form.samples, ..Ran::default() };
-        let passes = self.run(buffers, shot, (target, &sampled, ground), &mut ran).and_then(|mut passes| {
-            passes.extend(self.bring(buffers, target, slot.as_ref())?);
-            Ok(passes)
-        });
+        let mut stats = FrameStats { samples: desc.samples, ..FrameStats::default() };
+        let passes =
+            self.record_passes(buffers, shot, (target, &sample_programs, ground), &mut stats).and_then(|mut passes| {
+                passes.extend(self.record_readback(buffers, target, slot.as_ref())?);
+                Ok(passes)
+            });
         if passes.is_err() {
             // A failed pass leaves the images of the target undefined.
             self.targets.pop();
         }
         let passes = passes?;
-        self.last = Some(numbers);
-        Ok(Ticket {
-            form,
+        self.last_uniforms = Some(numbers);
+        Ok(PendingFrame {
+            desc,
             slot,
             fence: self.gl.fence("read")?,
             passes,
-            ran,
-            limit: self.watchdog,
-            waited: Cell::new(None),
+            stats,
+            limit: self.frame_timeout,
+            first_wait: Cell::new(None),
         })
     }
 
-    pub(super) fn check_size(&self, shot: &Shot) -> Result<()> {
+    pub(super) fn check_size(&self, shot: &FrameParams) -> Result<()> {
         let limit = self.info.max_side;
         if [shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
             return Ok(());
@@ -167,97 +172,102 @@ impl Renderer {
     }
 
     /// Records the passes that make the picture.
-    fn run(
+    fn record_passes(
         &self,
         buffers: &SceneBuffers,
-        shot: &Shot,
-        (target, sampled, ground): (&Target, &Sampled, bool),
-        ran: &mut Ran,
-    ) -> Result<Vec<(&'static str, Stopwatch)>> {
+        shot: &FrameParams,
+        (target, sample_programs, ground): (&RenderTarget, &SampleCountPrograms, bool),
+        stats: &mut FrameStats,
+    ) -> Result<Vec<(&'static str, PassTimer)>> {
         let gl = &self.gl;
-        let timed = |pass, commands: &mut dyn FnMut() -> Result<()>| {
-            gl.timed((pass, self.watchdog), commands).map(|stopwatch| (pass, stopwatch))
+        let time_pass = |pass, commands: &mut dyn FnMut() -> Result<()>| {
+            gl.time_pass((pass, self.frame_timeout), commands).map(|timer| (pass, timer))
         };
         let mut times = Vec::new();
-        let content = buffers.shadow_of(shot);
-        let by_others = buffers.drawn_beside().map(|(beside, draws)| {
-            let wanted = [draws[0] && buffers.shared_shadow.is_wanted(content), draws[1]];
-            (beside, wanted)
+        let content = buffers.shadow_key(shot);
+        let by_others = buffers.active_rasterizer().map(|(compute_rasterizer, enabled)| {
+            let wanted = [enabled[0] && buffers.shadow_cache.is_stale(content), enabled[1]];
+            (compute_rasterizer, wanted)
         });
-        if let Some((beside, wanted)) = by_others.filter(|(_, wanted)| wanted.contains(&true)) {
-            let name = if wanted[0] { "raster" } else { "ids" };
-            match timed(name, &mut || beside.draw(gl, (buffers, shot), wanted, ran)) {
+        if let Some((compute_rasterizer, wanted)) = by_others.filter(|(_, wanted)| wanted.contains(&true)) {
+            let name = if wanted[0] { "raster shadow" } else { "raster visibility" };
+            match time_pass(name, &mut || compute_rasterizer.draw(gl, (buffers, shot), wanted, stats)) {
                 Ok(time) => times.push(time),
-                Err(error) => beside.give_up(&error),
+                Err(error) => compute_rasterizer.disable(&error),
             }
         }
-        buffers.shared_shadow.draw_unless_there(content, || {
-            times.push(timed("shadow", &mut || passes::shadow(gl, buffers, ran))?);
-            times.push(timed("blur", &mut || passes::blur(gl, buffers, ran))?);
+        buffers.shadow_cache.draw_if_stale(content, || {
+            times.push(time_pass("shadow", &mut || passes::shadow(gl, buffers, stats))?);
+            times.push(time_pass("blur", &mut || passes::blur(gl, buffers, stats))?);
             Ok(())
         })?;
-        let beside = buffers.drawn_beside().filter(|(_, draws)| draws[1]).map(|(beside, _)| beside);
-        if buffers.culler.is_some() && beside.is_none() {
-            times.push(timed("cull", &mut || cull::camera(gl, buffers, target, sampled, ran))?);
+        let compute_rasterizer = buffers
+            .active_rasterizer()
+            .filter(|(_, enabled)| enabled[1])
+            .map(|(compute_rasterizer, _)| compute_rasterizer);
+        if buffers.culler.is_some() && compute_rasterizer.is_none() {
+            times.push(time_pass("cull", &mut || cull::cull_for_camera(gl, buffers, target, sample_programs, stats))?);
         }
         times.extend([
-            timed("visibility", &mut || match beside {
-                Some(beside) => beside.unpack(gl, target, ran),
+            time_pass("visibility", &mut || match compute_rasterizer {
+                Some(compute_rasterizer) => compute_rasterizer.unpack(gl, target, stats),
                 None => {
-                    passes::visibility(gl, buffers, target, sampled, ran)?;
-                    if ground { passes::ground(gl, buffers, shot, ran) } else { Ok(()) }
+                    passes::visibility(gl, buffers, target, sample_programs, stats)?;
+                    if ground { passes::ground(gl, buffers, shot, stats) } else { Ok(()) }
                 }
             })?,
-            timed("blended", &mut || passes::blended(gl, buffers, target, sampled, ran))?,
-            timed("shade", &mut || passes::shade(gl, buffers, target, sampled, ran))?,
-            timed("bloom", &mut || buffers.post.bloom(gl, target, ran))?,
-            timed("encode", &mut || buffers.post.encode(gl, target, ran))?,
+            time_pass("blended", &mut || passes::blended(gl, buffers, target, sample_programs, stats))?,
+            time_pass("shade", &mut || passes::shade(gl, buffers, target, sample_programs, stats))?,
+            time_pass("bloom", &mut || buffers.post.bloom(gl, target, stats))?,
+            time_pass("encode", &mut || buffers.post.encode(gl, target, stats))?,
         ]);
         Ok(times)
     }
 
     /// Copies the pixels, then the list and culling statistics, to the staging buffer.
-    fn bring(
+    fn record_readback(
         &self,
         buffers: &SceneBuffers,
-        target: &Target,
-        slot: Option<&Slot>,
-    ) -> Result<Option<(&'static str, Stopwatch)>> {
-        let Some(staging) = slot.and_then(Slot::staging) else { return Ok(None) };
-        let bytes = target.form.bytes();
+        target: &RenderTarget,
+        slot: Option<&ReadbackSlot>,
+    ) -> Result<Option<(&'static str, PassTimer)>> {
+        let Some(staging) = slot.and_then(ReadbackSlot::staging) else { return Ok(None) };
+        let bytes = target.desc.bytes();
         let copy = || {
-            self.gl.copy(&target.packed, &staging.buffer, bytes);
-            let ledger = target.lists.as_ref().map(|lists| &lists.ledger);
-            for (from, to) in [ledger, buffers.buffers.get(cull::COUNTED)].into_iter().zip(target.form.told()) {
+            self.gl.copy(&target.readback_source, &staging.buffer, bytes);
+            let counters = target.oit.as_ref().map(|oit| &oit.counters);
+            for (from, to) in
+                [counters, buffers.buffers.get(cull::COUNTERS)].into_iter().zip(target.desc.readback_ranges())
+            {
                 if let Some(from) = from.filter(|_| !to.is_empty()) {
-                    self.gl.copy_to(from, (&staging.buffer, to.start), to.end - to.start);
+                    self.gl.copy_to_offset(from, (&staging.buffer, to.start), to.end - to.start);
                 }
             }
             self.gl.check("read")
         };
-        self.gl.timed(("read", self.watchdog), copy).map(|stopwatch| Some(("read", stopwatch)))
+        self.gl.time_pass(("read", self.frame_timeout), copy).map(|timer| Some(("read", timer)))
     }
 }
 
 /// Whether the ground must be rasterized.
-fn draws_ground(buffers: &SceneBuffers, shot: &Shot) -> bool {
+fn draws_ground(buffers: &SceneBuffers, shot: &FrameParams) -> bool {
     let scene = &buffers.scene;
     // The bounds of a rebased scene leave out what is far away.
-    let is_last = buffers.apart.is_none() && frame::ground_is_last(scene, shot, buffers.origin);
-    scene.look.ground.is_some() && frame::above_ground(scene, shot) && !is_last
+    let is_last = buffers.rebased.is_none() && frame_uniforms::ground_is_behind_scene(scene, shot, buffers.origin);
+    scene.look.ground.is_some() && frame_uniforms::camera_is_above_ground(scene, shot) && !is_last
 }
 
 /// Region of the frame that may show triangles or rasterized ground.
-fn reach(buffers: &SceneBuffers, shot: &Shot, ground: bool) -> Region {
+fn draw_region(buffers: &SceneBuffers, shot: &FrameParams, ground: bool) -> Region {
     let size = [shot.width, shot.height];
-    if buffers.apart.is_some() || ground {
+    if buffers.rebased.is_some() || ground {
         return Region::whole(size);
     }
-    Region::of(&frame::camera_clip(&buffers.scene, shot, buffers.origin), &shot.bounds, size)
+    Region::project(&frame_uniforms::clip_from_positions(&buffers.scene, shot, buffers.origin), &shot.bounds, size)
 }
 
-impl Ticket {
-    /// Whether [`Renderer::retrieve`] would return without waiting.
+impl PendingFrame {
+    /// Whether [`Renderer::map_pixels`] would return without waiting.
     pub fn is_ready(&self) -> bool {
         self.is_ready_within(Duration::ZERO)
     }
@@ -265,58 +275,58 @@ impl Ticket {
     /// Waits at most `limit` for the frame and returns whether it is ready. A frame that exceeds the watchdog's limit
     /// counts as ready: retrieving it reports the timeout.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
-        self.left().is_zero() || self.fence.is_over_within(limit)
+        self.time_left().is_zero() || self.fence.is_done_within(limit)
     }
 
     /// Remaining watchdog time. The clock starts at the first poll or wait.
-    fn left(&self) -> Duration {
-        let begin = self.waited.get().unwrap_or_else(Instant::now);
-        self.waited.set(Some(begin));
+    fn time_left(&self) -> Duration {
+        let begin = self.first_wait.get().unwrap_or_else(Instant::now);
+        self.first_wait.set(Some(begin));
         self.limit.saturating_sub(begin.elapsed())
     }
 
     fn wait(&self) -> Result<()> {
-        self.fence.wait("read", self.left()).map_err(|error| self.blame(error))
+        self.fence.wait("read", self.time_left()).map_err(|error| self.name_failed_pass(error))
     }
 
     /// Names the pass at which the device stopped: the one after the last pass that is known to be finished.
-    fn blame(&self, error: Error) -> Error {
+    fn name_failed_pass(&self, error: Error) -> Error {
         let Error::Fault { stage, reason } = error else { return error };
-        let over = self.passes.iter().take_while(|(_, stopwatch)| stopwatch.is_over()).count();
+        let over = self.passes.iter().take_while(|(_, timer)| timer.is_done()).count();
         let stage = self.passes.get(over).map_or(stage, |(pass, _)| *pass);
         let last = over.checked_sub(1).map_or("none".into(), |last| format!("'{}'", self.passes[last].0));
         Error::Fault { stage, reason: format!("{reason} ({:?}); the last pass that it finished: {last}", self.limit) }
     }
 }
 
-impl Pixels {
+impl MappedPixels {
     /// Adds the milliseconds of a stage that ran before the others.
     #[must_use]
-    pub fn after(mut self, stage: &'static str, ms: f64) -> Self {
+    pub fn with_stage(mut self, stage: &'static str, ms: f64) -> Self {
         self.passes.insert(0, (stage, ms));
         self
     }
 
     /// Copies the pixels; several threads share the work when there are many.
-    pub fn into_image(self) -> Image {
+    pub fn into_image(self) -> FrameImage {
         let begin = Instant::now();
-        let Self { width, height, lent, mut passes, paths } = self;
-        let bytes = lent.as_ref().map_or(&[][..], Lent::bytes);
+        let Self { width, height, view, mut passes, raster_backends } = self;
+        let bytes = view.as_ref().map_or(&[][..], ReadbackView::bytes);
         let mut rgba = vec![0; bytes.len()];
-        let stretches = rgba.par_chunks_mut(STRETCH).zip(bytes.par_chunks(STRETCH));
+        let stretches = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
         stretches.for_each(|(to, from)| to.copy_from_slice(from));
-        drop(lent);
+        drop(view);
         if let Some((_, ms)) = passes.iter_mut().find(|(name, _)| *name == "read") {
             *ms += begin.elapsed().as_secs_f64() * 1e3;
         }
-        Image { width, height, rgba, passes, paths }
+        FrameImage { width, height, rgba, passes, raster_backends }
     }
 }
 
 /// Milliseconds of the stages and of their passes.
-fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
-    let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, stopwatch)| (*name, stopwatch.ms())).collect();
-    let of_shadow = |name: &str| ["raster", "shadow", "blur"].contains(&name);
+fn stage_times(passes: &[(&'static str, PassTimer)]) -> Vec<(&'static str, f64)> {
+    let all: Vec<(&'static str, f64)> = passes.iter().map(|(name, timer)| (*name, timer.ms())).collect();
+    let of_shadow = |name: &str| ["raster shadow", "shadow", "blur"].contains(&name);
     let sum =
         |wanted: &dyn Fn(&str) -> bool| all.iter().filter(|(name, _)| wanted(name)).fold(0.0, |sum, (_, ms)| sum + ms);
     let mut times = vec![("shadow", sum(&of_shadow))];
@@ -327,10 +337,10 @@ fn times(passes: &[(&'static str, Stopwatch)]) -> Vec<(&'static str, f64)> {
 }
 
 /// Warns when a frame drops blended fragments and the previous one did not.
-fn warn_of_lists(last: &Ran, ran: &Ran) {
-    let lacks = |ran: &Ran| ran.lists.filter(|lists| lists.dropped() > 0);
-    if let (Some(lists), None) = (lacks(ran), lacks(last)) {
-        let (dropped, kept) = (lists.dropped(), lists.kept);
+fn warn_of_dropped_fragments(last: &FrameStats, stats: &FrameStats) {
+    let lacks = |stats: &FrameStats| stats.oit.filter(|oit| oit.dropped() > 0);
+    if let (Some(oit), None) = (lacks(stats), lacks(last)) {
+        let (dropped, kept) = (oit.dropped(), oit.stored);
         tracing::warn!(
             dropped,
             kept,

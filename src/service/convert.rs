@@ -3,25 +3,27 @@
 
 use modalcast_proto::v1;
 
-use crate::engine::{self, Delivery, Engine, Format, Host, Path, Policy, StepName, View, Which};
+use crate::engine::{
+    self, Delivery, Engine, FrameFormat, OutputSpec, Policy, RasterBackend, SceneHandle, StepId, StepSelector,
+};
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Camera, RawUpdate, Rectangle, Scene, TransformFormat};
+use modalcast_model::scene::{Camera, PixelRect, RawStepUpdate, Scene, TransformFormat};
 
 mod camera;
 mod output;
 
 /// Limit in bytes on the remarks in one scene description.
-const MOST_REMARKS: usize = 64 << 10;
+const MAX_REMARK_BYTES: usize = 64 << 10;
 
 /// The public description of an open scene.
-pub(super) fn scene_info(host: &Host, with_remarks: bool) -> v1::SceneInfo {
-    let scene = &host.scene;
+pub(super) fn scene_info(scene_handle: &SceneHandle, with_remarks: bool) -> v1::SceneInfo {
+    let scene = &scene_handle.scene;
     let layout = &scene.layout;
     let bounds = scene.rest_bounds;
     v1::SceneInfo {
-        scene: host.name.clone(),
-        source: host.origin.source(),
+        scene: scene_handle.name.clone(),
+        source: scene_handle.provenance.label(),
         domains: scene.domains.len() as u32,
         vertices: layout.vertices as u64,
         corners: layout.corners as u64,
@@ -32,13 +34,13 @@ pub(super) fn scene_info(host: &Host, with_remarks: bool) -> v1::SceneInfo {
         origin: scene.origin.to_vec(),
         bounds: [bounds.min, bounds.max].concat(),
         affine: scene.needs.shear,
-        last_step: host.last_step().map(step_id),
+        last_step: scene_handle.last_step().map(step_id),
         remarks: if with_remarks { remarks(scene) } else { Vec::new() },
     }
 }
 
 fn remarks(scene: &Scene) -> Vec<String> {
-    let mut left = MOST_REMARKS;
+    let mut left = MAX_REMARK_BYTES;
     let fits = |remark: &&String| {
         left = left.saturating_sub(remark.len() + 8);
         left > 0
@@ -50,7 +52,7 @@ fn remarks(scene: &Scene) -> Vec<String> {
     kept
 }
 
-pub(super) const fn step_id(step: StepName) -> v1::StepId {
+pub(super) const fn step_id(step: StepId) -> v1::StepId {
     v1::StepId { run: step.run, number: step.number, time: step.time }
 }
 
@@ -62,22 +64,22 @@ pub(super) fn stages(times: &StageTimes) -> Vec<v1::StageTime> {
     times.iter().map(wire).collect()
 }
 
-pub(super) const fn drawn_by(path: Option<Path>) -> v1::DrawnBy {
+pub(super) const fn drawn_by(path: Option<RasterBackend>) -> v1::DrawnBy {
     match path {
         None => v1::DrawnBy::Unspecified,
-        Some(Path::OpenGl) => v1::DrawnBy::Opengl,
-        Some(Path::Cuda) => v1::DrawnBy::Cuda,
+        Some(RasterBackend::OpenGl) => v1::DrawnBy::Opengl,
+        Some(RasterBackend::Cuda) => v1::DrawnBy::Cuda,
     }
 }
 
-pub(super) fn raw_update(step: v1::Step) -> Result<RawUpdate> {
+pub(super) fn raw_update(step: v1::Step) -> Result<RawStepUpdate> {
     let transform_format = match v1::TransformFormat::try_from(step.transform_format) {
         Ok(v1::TransformFormat::Unspecified | v1::TransformFormat::AffineF32) => TransformFormat::Affine,
         Ok(v1::TransformFormat::RigidF32) => TransformFormat::RigidF32,
         Ok(v1::TransformFormat::RigidF64) => TransformFormat::RigidF64,
         Err(_) => return Err(invalid("step.transform_format", "a format of this version", step.transform_format)),
     };
-    Ok(RawUpdate {
+    Ok(RawStepUpdate {
         number: step.number,
         time: step.time,
         q_domains: step.q_domains,
@@ -114,9 +116,13 @@ pub(super) fn delivery(number: i32) -> Result<Delivery> {
 }
 
 /// Validates a picture; returns the view to render and the wire format.
-pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Picture>) -> Result<(View, Format)> {
+pub(super) fn picture(
+    engine: &Engine,
+    scene: &Scene,
+    picture: Option<v1::Picture>,
+) -> Result<(OutputSpec, FrameFormat)> {
     let picture = picture.unwrap_or_default();
-    let (showing, format) = output::parse(scene, &picture)?;
+    let (frame_output, format) = output::parse(scene, &picture)?;
     let (width, height) = match (picture.width, picture.height) {
         (0, 0) => (1280, 720),
         size => size,
@@ -126,23 +132,23 @@ pub(super) fn picture(engine: &Engine, scene: &Scene, picture: Option<v1::Pictur
         let expected = format!("1 to {most} pixels a side, or 0 x 0 for 1280 x 720");
         return Err(invalid("picture.size", expected, format!("{width} x {height}")));
     }
-    let framing = Camera::framing(scene, width, height);
+    let fit_to_scene = Camera::fit_to_scene(scene, width, height);
     let camera = match picture.camera {
-        None => framing,
-        Some(camera) => camera::parse(framing, camera).map_err(|error| error.within("picture"))?,
+        None => fit_to_scene,
+        Some(camera) => camera::parse(fit_to_scene, camera).map_err(|error| error.prefix_field("picture"))?,
     };
-    Ok((View::Frame { camera, width, height, showing }, format))
+    Ok((OutputSpec::Frame { camera, width, height, frame_output }, format))
 }
 
 /// Validates a pick request; returns the view that picks in its rectangle.
-pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<View> {
+pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<OutputSpec> {
     let bare = request.picture.clone().map(|wire| v1::Picture {
         width: wire.width,
         height: wire.height,
         camera: wire.camera,
         ..v1::Picture::default()
     });
-    let (View::Frame { camera, width, height, .. }, _) = picture(engine, scene, bare)? else {
+    let (OutputSpec::Frame { camera, width, height, .. }, _) = picture(engine, scene, bare)? else {
         return Err(invalid("picture", "a picture", "none"));
     };
     let size = match (request.width, request.height) {
@@ -150,55 +156,55 @@ pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) ->
         (width, height) => [width, height],
     };
     let picture = [width, height];
-    let rectangle = Rectangle::within(picture, [request.x, request.y], size)?;
-    Ok(View::Pick { camera, picture, rectangle })
+    let rectangle = PixelRect::within(picture, [request.x, request.y], size)?;
+    Ok(OutputSpec::Pick { camera, picture, rectangle })
 }
 
-pub(super) const fn wire_format(format: Format) -> v1::Format {
+pub(super) const fn wire_format(format: FrameFormat) -> v1::Format {
     match format {
-        Format::Png => v1::Format::Png,
-        Format::Rgba => v1::Format::Rgba,
-        Format::F32 => v1::Format::F32,
-        Format::U32 => v1::Format::U32,
-        Format::F32x3 => v1::Format::F32x3,
+        FrameFormat::Png => v1::Format::Png,
+        FrameFormat::Rgba => v1::Format::Rgba,
+        FrameFormat::F32 => v1::Format::F32,
+        FrameFormat::U32 => v1::Format::U32,
+        FrameFormat::F32x3 => v1::Format::F32x3,
     }
 }
 
-pub(super) const fn which_of_pick(step: Option<&v1::pick_request::Step>) -> Which {
+pub(super) const fn pick_step_selector(step: Option<&v1::pick_request::Step>) -> StepSelector {
     match step {
-        None => Which::Current,
-        Some(v1::pick_request::Step::ExactStep(number)) => Which::Exact(*number),
-        Some(v1::pick_request::Step::MinimumStep(number)) => Which::Minimum(*number),
+        None => StepSelector::Current,
+        Some(v1::pick_request::Step::ExactStep(number)) => StepSelector::Exact(*number),
+        Some(v1::pick_request::Step::MinimumStep(number)) => StepSelector::Minimum(*number),
     }
 }
 
-pub(super) const fn which_of_frame(step: Option<&v1::render_frame_request::Step>) -> Which {
+pub(super) const fn frame_step_selector(step: Option<&v1::render_frame_request::Step>) -> StepSelector {
     match step {
-        None => Which::Current,
-        Some(v1::render_frame_request::Step::ExactStep(number)) => Which::Exact(*number),
-        Some(v1::render_frame_request::Step::MinimumStep(number)) => Which::Minimum(*number),
+        None => StepSelector::Current,
+        Some(v1::render_frame_request::Step::ExactStep(number)) => StepSelector::Exact(*number),
+        Some(v1::render_frame_request::Step::MinimumStep(number)) => StepSelector::Minimum(*number),
     }
 }
 
-pub(super) const fn which_of_vertices(step: Option<&v1::get_vertices_request::Step>) -> Which {
+pub(super) const fn vertices_step_selector(step: Option<&v1::get_vertices_request::Step>) -> StepSelector {
     match step {
-        None => Which::Current,
-        Some(v1::get_vertices_request::Step::ExactStep(number)) => Which::Exact(*number),
-        Some(v1::get_vertices_request::Step::MinimumStep(number)) => Which::Minimum(*number),
+        None => StepSelector::Current,
+        Some(v1::get_vertices_request::Step::ExactStep(number)) => StepSelector::Exact(*number),
+        Some(v1::get_vertices_request::Step::MinimumStep(number)) => StepSelector::Minimum(*number),
     }
 }
 
 /// A readable name of the requested step, for errors.
-pub(super) fn said(which: Which, scene: &str) -> String {
-    match which {
-        Which::Current => format!("the step that scene '{scene}' shows"),
-        Which::Exact(number) => format!("step {number} of scene '{scene}'"),
-        Which::Minimum(number) => format!("step {number} or later of scene '{scene}'"),
+pub(super) fn describe_step_selector(selector: StepSelector, scene: &str) -> String {
+    match selector {
+        StepSelector::Current => format!("the step that scene '{scene}' shows"),
+        StepSelector::Exact(number) => format!("step {number} of scene '{scene}'"),
+        StepSelector::Minimum(number) => format!("step {number} or later of scene '{scene}'"),
     }
 }
 
-pub(super) fn announcement(header: v1::UploadHeader) -> engine::Announcement {
-    engine::Announcement {
+pub(super) fn upload_header(header: v1::UploadHeader) -> engine::UploadHeader {
+    engine::UploadHeader {
         scene: header.scene,
         entry: header.entry,
         files: header.files,

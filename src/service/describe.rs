@@ -10,32 +10,32 @@ use prost::Message as _;
 use tonic::{Response, Status};
 
 use super::convert::scene_info;
-use super::stream::{Outlet, Replies, pieces, respond};
-use crate::engine::{Host, checked_domains};
+use super::stream::{ReplySender, ReplyStream, respond, split_into_chunks};
+use crate::engine::{SceneHandle, validate_domains};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
 /// Describes the selected domains and sends the requested arrays.
 pub(super) fn scene(
-    host: Arc<Host>,
+    scene_handle: Arc<SceneHandle>,
     request: v1::DescribeSceneRequest,
     most: usize,
-) -> Result<Response<Replies<v1::DescribeSceneResponse>>> {
-    let domains = checked_domains("domains", &host.scene, request.domains)?;
+) -> Result<Response<ReplyStream<v1::DescribeSceneResponse>>> {
+    let domains = validate_domains("domains", &scene_handle.scene, request.domains)?;
     let arrays = request.arrays.into_iter().map(array).collect::<Result<Vec<_>>>()?;
     if arrays.len() > 5 {
         return Err(invalid("arrays", "at most 5", arrays.len()));
     }
-    Ok(respond(move |outlet| async move {
-        outlet.send(part(Part::Scene(scene_info(&host, true)))).await?;
-        send_descriptions(&host.scene, &domains, most, &outlet).await?;
+    Ok(respond(move |reply_sender| async move {
+        reply_sender.send(part(Part::Scene(scene_info(&scene_handle, true)))).await?;
+        send_descriptions(&scene_handle.scene, &domains, most, &reply_sender).await?;
         for domain in domains {
             for array in &arrays {
-                let bytes = contents(&host.scene, domain as usize, *array);
+                let bytes = array_bytes(&scene_handle.scene, domain as usize, *array);
                 let total = bytes.len() as u64;
-                for (offset, data) in pieces(bytes, most) {
+                for (offset, data) in split_into_chunks(bytes, most) {
                     let chunk = v1::ArrayChunk { domain, array: (*array).into(), offset, total, data };
-                    outlet.send(part(Part::Chunk(chunk))).await?;
+                    reply_sender.send(part(Part::Chunk(chunk))).await?;
                 }
             }
         }
@@ -45,15 +45,15 @@ pub(super) fn scene(
 
 /// Sends rows of one domain's U: three per requested vertex.
 pub(super) fn modes(
-    host: Arc<Host>,
+    scene_handle: Arc<SceneHandle>,
     request: v1::ReadModesRequest,
     most: usize,
-) -> Result<Response<Replies<v1::ReadModesResponse>>> {
-    let count = host.scene.domains.len();
+) -> Result<Response<ReplyStream<v1::ReadModesResponse>>> {
+    let count = scene_handle.scene.domains.len();
     if request.domain as usize >= count {
         return Err(invalid("domain", format!("an index below {count}"), request.domain));
     }
-    let shape = host.scene.shape_of(request.domain as usize);
+    let shape = scene_handle.scene.shape_of(request.domain as usize);
     let (vertices, rank) = (shape.mesh.rest().len(), shape.modes.rank());
     let chosen = match request.vertices {
         all if all.is_empty() => (0..vertices as u32).collect(),
@@ -69,14 +69,14 @@ pub(super) fn modes(
     let row_bytes = 12 * rank;
     let per_chunk = (most / row_bytes.max(1)).max(1);
     let total = (row_bytes * chosen.len()) as u64;
-    Ok(respond(move |outlet: Outlet<v1::ReadModesResponse>| async move {
-        let modes = &host.scene.shape_of(request.domain as usize).modes;
+    Ok(respond(move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
+        let modes = &scene_handle.scene.shape_of(request.domain as usize).modes;
         for (index, group) in chosen.chunks(if rank == 0 { chosen.len() } else { per_chunk }).enumerate() {
             let row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
             let rows = group.iter().flat_map(|vertex| (0..3).map(move |component| 3 * *vertex as usize + component));
             let data: Vec<u8> = rows.flat_map(row).flat_map(f32::to_le_bytes).collect();
             let offset = (index * per_chunk * row_bytes) as u64;
-            outlet.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() }).await?;
+            reply_sender.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() }).await?;
         }
         Ok(())
     }))
@@ -98,7 +98,7 @@ async fn send_descriptions(
     scene: &Scene,
     domains: &[u32],
     most: usize,
-    outlet: &Outlet<v1::DescribeSceneResponse>,
+    reply_sender: &ReplySender<v1::DescribeSceneResponse>,
 ) -> Result<(), Status> {
     let mut group = v1::DomainDescriptions::default();
     let mut size = 0;
@@ -106,13 +106,13 @@ async fn send_descriptions(
         let description = describe(scene, *domain);
         let more = description.encoded_len() + 8;
         if size + more > most && !group.domains.is_empty() {
-            outlet.send(part(Part::Domains(std::mem::take(&mut group)))).await?;
+            reply_sender.send(part(Part::Domains(std::mem::take(&mut group)))).await?;
             size = 0;
         }
         size += more;
         group.domains.push(description);
     }
-    outlet.send(part(Part::Domains(group))).await
+    reply_sender.send(part(Part::Domains(group))).await
 }
 
 fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
@@ -142,7 +142,7 @@ fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
     }
 }
 
-fn contents(scene: &Scene, domain: usize, array: v1::Array) -> Bytes {
+fn array_bytes(scene: &Scene, domain: usize, array: v1::Array) -> Bytes {
     let mesh = &scene.shape_of(domain).mesh;
     let corners = mesh.corners();
     let bytes: &[u8] = match array {

@@ -5,18 +5,20 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{delivery, drawn_by, picture, said, stages, step_id, which_of_frame, wire_format};
+use super::convert::{
+    delivery, describe_step_selector, drawn_by, frame_step_selector, picture, stages, step_id, wire_format,
+};
 use super::picks;
 use super::status::status;
-use super::stream::{Deadline, Outlet, Replies, pieces, respond};
-use crate::engine::{Encoded, EncodedFeed, Engine, Format, View};
+use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
+use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec};
 
 /// Implementation of `FrameService`.
-pub(super) struct Frames(pub(super) Engine);
+pub(super) struct FrameServiceImpl(pub(super) Engine);
 
 #[tonic::async_trait]
-impl v1::frame_service_server::FrameService for Frames {
-    type RenderFrameStream = Replies<v1::RenderFrameResponse>;
+impl v1::frame_service_server::FrameService for FrameServiceImpl {
+    type RenderFrameStream = ReplyStream<v1::RenderFrameResponse>;
 
     async fn render_frame(
         &self,
@@ -25,24 +27,24 @@ impl v1::frame_service_server::FrameService for Frames {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
-        let host = self.0.find(&request.scene).map_err(status)?;
-        let (view, format) = picture(&self.0, &host.scene, request.picture).map_err(status)?;
-        let which = which_of_frame(request.step.as_ref());
+        let scene_handle = self.0.find(&request.scene).map_err(status)?;
+        let (view, format) = picture(&self.0, &scene_handle.scene, request.picture).map_err(status)?;
+        let selector = frame_step_selector(request.step.as_ref());
         let (most, encoder) = (config.chunk_bytes, self.0.encoder().clone());
-        Ok(respond(move |outlet| async move {
+        Ok(respond(move |reply_sender| async move {
             let work = async {
-                let shown = host.show(which, view).await.map_err(status)?;
-                let frame = encoder.encode(shown, format).await.map_err(status)?;
+                let output = scene_handle.request_output(selector, view).await.map_err(status)?;
+                let frame = encoder.encode(output, format).await.map_err(status)?;
                 for chunk in chunks(&frame, view, format, most) {
-                    outlet.send(v1::RenderFrameResponse { chunk: Some(chunk) }).await?;
+                    reply_sender.send(v1::RenderFrameResponse { chunk: Some(chunk) }).await?;
                 }
                 Ok(())
             };
-            deadline.hold(&said(which, &host.name), work).await
+            deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
         }))
     }
 
-    type PickStream = Replies<v1::PickResponse>;
+    type PickStream = ReplyStream<v1::PickResponse>;
 
     async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
         let config = self.0.config();
@@ -50,7 +52,7 @@ impl v1::frame_service_server::FrameService for Frames {
         picks::answer(&self.0, deadline, request.into_inner())
     }
 
-    type StreamFramesStream = Replies<v1::StreamFramesResponse>;
+    type StreamFramesStream = ReplyStream<v1::StreamFramesResponse>;
 
     async fn stream_frames(
         &self,
@@ -58,43 +60,50 @@ impl v1::frame_service_server::FrameService for Frames {
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
-        let host = self.0.find(&request.scene).map_err(status)?;
-        let (view, format) = picture(&self.0, &host.scene, request.picture).map_err(status)?;
+        let scene_handle = self.0.find(&request.scene).map_err(status)?;
+        let (view, format) = picture(&self.0, &scene_handle.scene, request.picture).map_err(status)?;
         let delivery = delivery(request.delivery).map_err(status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let feed = host.watch(view, delivery).await.map_err(status)?;
-        let frames = EncodedFeed::new(feed, self.0.encoder().clone(), format, request.frames);
+        let subscription = scene_handle.subscribe(view, delivery).await.map_err(status)?;
+        let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), format, request.frames);
         let most = self.0.config().chunk_bytes;
-        let cut = move |frame: &Encoded| chunks(frame, view, format, most);
-        Ok(respond(move |outlet| deadline.hold("the end of the frame stream", send_frames(frames, cut, outlet))))
+        let cut = move |frame: &EncodedOutput| chunks(frame, view, format, most);
+        Ok(respond(move |reply_sender| {
+            deadline.enforce("the end of the frame stream", send_frames(frames, cut, reply_sender))
+        }))
     }
 }
 
 /// Sends frames in chunks until the stream ends, the client disconnects or the feed is cut off.
 async fn send_frames<C: Iterator<Item = v1::FrameChunk>>(
-    mut frames: EncodedFeed,
-    cut: impl Fn(&Encoded) -> C,
-    outlet: Outlet<v1::StreamFramesResponse>,
+    mut frames: EncodedSubscription,
+    cut: impl Fn(&EncodedOutput) -> C,
+    reply_sender: ReplySender<v1::StreamFramesResponse>,
 ) -> Result<(), Status> {
     loop {
         let frame = tokio::select! {
             frame = frames.next() => frame.map_err(status)?,
-            () = outlet.closed() => return Ok(()),
+            () = reply_sender.closed() => return Ok(()),
         };
         let Some(frame) = frame else { return Ok(()) };
         for chunk in cut(&frame) {
             tokio::select! {
-                sent = outlet.send(v1::StreamFramesResponse { chunk: Some(chunk) }) => sent?,
-                error = frames.cut_off() => return Err(status(error)),
+                sent = reply_sender.send(v1::StreamFramesResponse { chunk: Some(chunk) }) => sent?,
+                error = frames.disconnected() => return Err(status(error)),
             }
         }
     }
 }
 
-fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iterator<Item = v1::FrameChunk> + use<> {
+fn chunks(
+    frame: &EncodedOutput,
+    view: OutputSpec,
+    format: FrameFormat,
+    most: usize,
+) -> impl Iterator<Item = v1::FrameChunk> + use<> {
     let (width, height) = match view {
-        View::Frame { width, height, .. } => (width, height),
-        View::Vertices(_) | View::Pick { .. } => (0, 0),
+        OutputSpec::Frame { width, height, .. } => (width, height),
+        OutputSpec::Vertices(_) | OutputSpec::Pick { .. } => (0, 0),
     };
     let head = v1::FrameHead {
         step: Some(step_id(frame.step)),
@@ -104,10 +113,10 @@ fn chunks(frame: &Encoded, view: View, format: Format, most: usize) -> impl Iter
         total: frame.bytes.len() as u64,
         skipped: frame.skipped,
         stages: stages(&frame.stages),
-        shadow_drawn_by: drawn_by(frame.paths.shadow).into(),
-        visibility_drawn_by: drawn_by(frame.paths.visibility).into(),
+        shadow_drawn_by: drawn_by(frame.raster_backends.shadow).into(),
+        visibility_drawn_by: drawn_by(frame.raster_backends.visibility).into(),
     };
     let mut head = Some(head);
     let cut = move |(offset, data): (u64, Bytes)| v1::FrameChunk { head: head.take(), offset, data };
-    pieces(frame.bytes.clone(), most).map(cut)
+    split_into_chunks(frame.bytes.clone(), most).map(cut)
 }

@@ -6,10 +6,10 @@ use tonic::{Request, Response, Status};
 use crate::engine::Engine;
 
 /// Implementation of `ServerService`.
-pub(super) struct Info(pub(super) Engine);
+pub(super) struct ServerServiceImpl(pub(super) Engine);
 
 #[tonic::async_trait]
-impl v1::server_service_server::ServerService for Info {
+impl v1::server_service_server::ServerService for ServerServiceImpl {
     async fn get_server_info(
         &self,
         _: Request<v1::GetServerInfoRequest>,
@@ -24,7 +24,7 @@ impl v1::server_service_server::ServerService for Info {
             message_bytes: config.message_bytes as u64,
             frame_side: self.0.frame_side(),
             scenes: config.open_scenes as u32,
-            window: config.largest_window,
+            window: config.max_window,
             upload_bytes: config.upload_bytes,
             deadline_ms: u32::try_from(config.deadline.as_millis()).unwrap_or(u32::MAX),
         };

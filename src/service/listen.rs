@@ -15,17 +15,17 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
 /// Connections with received data that may be queued for the server.
-const AHEAD: usize = 16;
+const READY_CONNECTIONS: usize = 16;
 
 /// Pause of the listener after a failed accept.
-const REST: Duration = Duration::from_millis(50);
+const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
 
 /// An accepted connection with its permit.
 #[derive(Debug)]
 pub(super) struct Connection {
     stream: TcpStream,
     remote: SocketAddr,
-    _place: OwnedSemaphorePermit,
+    _permit: OwnedSemaphorePermit,
 }
 
 /// Accepts connections, at most `most` open at a time; each must send its first byte within `silence`. Stops when the
@@ -35,7 +35,7 @@ pub(super) fn connections(
     most: usize,
     silence: Duration,
 ) -> ReceiverStream<io::Result<Connection>> {
-    let (ready, connections) = mpsc::channel(AHEAD);
+    let (ready, connections) = mpsc::channel(READY_CONNECTIONS);
     tokio::spawn(async move {
         let places = Arc::new(Semaphore::new(most));
         loop {
@@ -45,11 +45,11 @@ pub(super) fn connections(
             };
             match accepted {
                 Ok(connection) => {
-                    tokio::spawn(hear(connection, silence, ready.clone()));
+                    tokio::spawn(await_first_byte(connection, silence, ready.clone()));
                 }
                 Err(error) => {
                     tracing::warn!(%error, "a connection could not be accepted");
-                    tokio::time::sleep(REST).await;
+                    tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
                 }
             }
         }
@@ -61,11 +61,11 @@ async fn accept(listener: &TcpListener, places: &Arc<Semaphore>) -> io::Result<C
     let place = Arc::clone(places).acquire_owned().await.map_err(io::Error::other)?;
     let (stream, remote) = listener.accept().await?;
     stream.set_nodelay(true)?;
-    Ok(Connection { stream, remote, _place: place })
+    Ok(Connection { stream, remote, _permit: place })
 }
 
 /// Forwards a connection once it has sent its first byte; drops it if it sends nothing within `silence`.
-async fn hear(connection: Connection, silence: Duration, ready: mpsc::Sender<io::Result<Connection>>) {
+async fn await_first_byte(connection: Connection, silence: Duration, ready: mpsc::Sender<io::Result<Connection>>) {
     let mut first = [0];
     let spoke = tokio::time::timeout(silence, connection.stream.peek(&mut first)).await;
     if matches!(spoke, Ok(Ok(1))) {

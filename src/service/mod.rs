@@ -24,11 +24,11 @@ use tonic_health::server::HealthReporter;
 use self::routes::Routes;
 use crate::config::Config;
 use crate::engine::Engine;
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// The largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head. The head of a vertex
 /// reply lists up to 65 536 domains with their counts.
-const LARGEST_REPLY: usize = 3 << 20;
+const MAX_REPLY_BYTES: usize = 3 << 20;
 
 /// Binds the configured address.
 ///
@@ -56,13 +56,13 @@ pub async fn serve(
     let (health, health_server) = tonic_health::server::health_reporter();
     set_health(&health, true).await;
     let routes = routes(&engine, &config)?.with(health_server);
-    let connections = listen::connections(listener, config.connections, config.first_byte);
+    let connections = listen::connections(listener, config.connections, config.first_byte_timeout);
     let (stop, stopped) = oneshot::channel();
     let draining = engine.clone();
     let drain = async move {
         shutdown.await;
         tracing::info!("the server stops");
-        let end = Instant::now() + draining.config().drain;
+        let end = Instant::now() + draining.config().drain_timeout;
         set_health(&health, false).await;
         if tokio::time::timeout_at(end, draining.shutdown()).await.is_err() {
             tracing::warn!("the device did not stop in time");
@@ -70,16 +70,17 @@ pub async fn serve(
         stop.send(()).ok(); // Fails only if the transport has failed and dropped the receiver.
         end
     };
-    let told = async {
+    let shutdown_signal = async {
         stopped.await.ok(); // A dropped sender means stop, too.
     };
-    let mut transport = std::pin::pin!(transport(&config).serve_with_incoming_shutdown(routes, connections, told));
+    let mut transport =
+        std::pin::pin!(transport(&config).serve_with_incoming_shutdown(routes, connections, shutdown_signal));
     let end = tokio::select! {
-        ended = &mut transport => return ended.map_err(during("transport")),
+        ended = &mut transport => return ended.map_err(fault_in("transport")),
         end = drain => end,
     };
     match tokio::time::timeout_at(end, transport).await {
-        Ok(ended) => ended.map_err(during("transport")),
+        Ok(ended) => ended.map_err(fault_in("transport")),
         Err(_) => {
             tracing::warn!("some clients did not close their connections and are left behind");
             Ok(())
@@ -107,7 +108,7 @@ fn transport(config: &Config) -> Server {
         .initial_stream_window_size(64 << 10)
         .initial_connection_window_size(16 << 20)
         .max_frame_size(64 << 10)
-        .http2_keepalive_interval(Some(config.keepalive))
+        .http2_keepalive_interval(Some(config.keepalive_interval))
         .http2_keepalive_timeout(Some(config.keepalive_timeout))
 }
 
@@ -120,7 +121,7 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
     // A macro, because the generated servers share no trait for these methods.
     macro_rules! limited {
         ($server:expr) => {
-            $server.max_decoding_message_size(config.message_bytes).max_encoding_message_size(LARGEST_REPLY)
+            $server.max_decoding_message_size(config.message_bytes).max_encoding_message_size(MAX_REPLY_BYTES)
         };
     }
     let reflection = || {
@@ -129,11 +130,11 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     Ok(Routes::default()
-        .with(reflection().build_v1().map_err(during("reflection"))?)
-        .with(reflection().build_v1alpha().map_err(during("reflection"))?)
-        .with(limited!(ServerServiceServer::new(info::Info(engine.clone()))))
-        .with(limited!(SceneServiceServer::new(scenes::Scenes(engine.clone()))))
-        .with(limited!(StepServiceServer::new(steps::Steps(engine.clone()))))
-        .with(limited!(FrameServiceServer::new(frames::Frames(engine.clone()))))
-        .with(limited!(VertexServiceServer::new(vertices::Vertices(engine.clone())))))
+        .with(reflection().build_v1().map_err(fault_in("reflection"))?)
+        .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
+        .with(limited!(ServerServiceServer::new(info::ServerServiceImpl(engine.clone()))))
+        .with(limited!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
+        .with(limited!(StepServiceServer::new(steps::StepServiceImpl(engine.clone()))))
+        .with(limited!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
+        .with(limited!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone())))))
 }

@@ -4,46 +4,46 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::Status;
 
-use super::convert::{pick, said, stages, step_id, which_of_pick};
+use super::convert::{describe_step_selector, pick, pick_step_selector, stages, step_id};
 use super::status::status;
-use super::stream::{Deadline, Replies, respond};
-use crate::engine::{Engine, Picked, Picks, resolve_picks};
+use super::stream::{Deadline, ReplyStream, respond};
+use crate::engine::{Engine, ModalHit, PickResult, resolve_picks};
 use modalcast_model::scene::Scene;
 
 /// Upper bound on the size of a hit without its modes, in bytes.
-const HIT_BYTES: usize = 256;
+const MAX_HIT_BYTES: usize = 256;
 
 /// Answers one pick request.
 pub(super) fn answer(
     engine: &Engine,
     deadline: Deadline,
     request: v1::PickRequest,
-) -> Result<tonic::Response<Replies<v1::PickResponse>>, Status> {
-    let host = engine.find(&request.scene).map_err(status)?;
-    let view = pick(engine, &host.scene, &request).map_err(status)?;
-    let which = which_of_pick(request.step.as_ref());
+) -> Result<tonic::Response<ReplyStream<v1::PickResponse>>, Status> {
+    let scene_handle = engine.find(&request.scene).map_err(status)?;
+    let view = pick(engine, &scene_handle.scene, &request).map_err(status)?;
+    let selector = pick_step_selector(request.step.as_ref());
     let most = engine.config().chunk_bytes;
-    Ok(respond(move |outlet| async move {
+    Ok(respond(move |reply_sender| async move {
         let work = async {
-            let shown = host.show(which, view).await.map_err(status)?;
-            let picks = resolve_picks(shown, &host.scene, !request.without_modes).await.map_err(status)?;
-            for response in responses(&picks, &host.scene, most) {
-                outlet.send(response).await?;
+            let output = scene_handle.request_output(selector, view).await.map_err(status)?;
+            let picks = resolve_picks(output, &scene_handle.scene, !request.without_modes).await.map_err(status)?;
+            for response in responses(&picks, &scene_handle.scene, most) {
+                reply_sender.send(response).await?;
             }
             Ok(())
         };
-        deadline.hold(&said(which, &host.name), work).await
+        deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
     }))
 }
 
 /// Splits a reply into messages of about `most` bytes; at least one message.
-fn responses(picks: &Picks, scene: &Scene, most: usize) -> Vec<v1::PickResponse> {
+fn responses(picks: &PickResult, scene: &Scene, most: usize) -> Vec<v1::PickResponse> {
     let head =
         v1::PickHead { step: Some(step_id(picks.step)), hits: picks.hits.len() as u32, stages: stages(&picks.stages) };
     let mut responses = vec![v1::PickResponse { head: Some(head), hits: Vec::new() }];
     let mut bytes = 0;
     for picked in &picks.hits {
-        let own = HIT_BYTES + 4 * picked.modes.len();
+        let own = MAX_HIT_BYTES + 4 * picked.modes.len();
         if bytes > 0 && bytes + own > most {
             responses.push(v1::PickResponse::default());
             bytes = 0;
@@ -56,7 +56,7 @@ fn responses(picks: &Picks, scene: &Scene, most: usize) -> Vec<v1::PickResponse>
     responses
 }
 
-fn hit(picked: &Picked, scene: &Scene) -> v1::Hit {
+fn hit(picked: &ModalHit, scene: &Scene) -> v1::Hit {
     let hit = &picked.hit;
     v1::Hit {
         x: hit.pixel[0],
@@ -64,7 +64,7 @@ fn hit(picked: &Picked, scene: &Scene) -> v1::Hit {
         domain: hit.domain as u32,
         triangle: hit.triangle as u32,
         vertices: hit.vertices.to_vec(),
-        barycentric: hit.shares.to_vec(),
+        barycentric: hit.barycentrics.to_vec(),
         position: hit.position.to_vec(),
         normal: hit.normal.to_vec(),
         depth: scene.unit * hit.depth,

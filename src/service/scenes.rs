@@ -7,33 +7,33 @@ use modalcast_proto::v1::upload_scene_request::Part;
 use prost::Message as _;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::convert::{announcement, scene_info};
+use super::convert::{scene_info, upload_header};
 use super::describe;
-use super::status::{status, transport};
-use super::stream::{Replies, guarded};
+use super::status::{status, transport_status};
+use super::stream::{ReplyStream, catch_panic};
 use crate::engine::{Engine, Upload};
-use modalcast_model::error::{Error, Result, during, invalid};
+use modalcast_model::error::{Error, Result, fault_in, invalid};
 
 /// Limit in bytes on the source names in one list.
-const MOST_SOURCES: usize = 512 << 10;
+const MAX_SOURCE_BYTES: usize = 512 << 10;
 
 /// The lowest sustained upload rate that the server accepts, in bytes per second.
-const SLOWEST_UPLOAD: f64 = 32768.0;
+const MIN_UPLOAD_RATE: f64 = 32768.0;
 
 /// Implementation of `SceneService`.
-pub(super) struct Scenes(pub(super) Engine);
+pub(super) struct SceneServiceImpl(pub(super) Engine);
 
 #[tonic::async_trait]
-impl v1::scene_service_server::SceneService for Scenes {
+impl v1::scene_service_server::SceneService for SceneServiceImpl {
     async fn open_scene(
         &self,
         request: Request<v1::OpenSceneRequest>,
     ) -> Result<Response<v1::OpenSceneResponse>, Status> {
         let engine = self.0.clone();
         let v1::OpenSceneRequest { source, scene } = request.into_inner();
-        guarded(async move {
-            let host = engine.open(&source, &scene).await?;
-            Ok(v1::OpenSceneResponse { scene: Some(scene_info(&host, true)) })
+        catch_panic(async move {
+            let scene_handle = engine.open(&source, &scene).await?;
+            Ok(v1::OpenSceneResponse { scene: Some(scene_info(&scene_handle, true)) })
         })
         .await
     }
@@ -44,27 +44,27 @@ impl v1::scene_service_server::SceneService for Scenes {
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
         let mut parts = request.into_inner();
         let limit = self.0.config().message_bytes;
-        let mut patience = Patience::new(self.0.config().stall);
+        let mut budget = UploadTimeBudget::new(self.0.config().stall_timeout);
         let mut upload = None;
-        while let Some(request) = patience.hold(parts.message()).await?.map_err(|fault| transport(fault, limit))? {
-            patience.regain(request.encoded_len());
+        while let Some(request) = budget.wait(parts.message()).await?.map_err(|fault| transport_status(fault, limit))? {
+            budget.refill(request.encoded_len());
             let part = request.part.ok_or_else(|| status(invalid("part", "header, file or chunk", "none")))?;
             upload = Some(receive(&self.0, upload, part).await.map_err(status)?);
         }
         let upload = upload.ok_or_else(|| status(invalid("part", "a header first", "nothing")))?;
         let engine = self.0.clone();
-        guarded(async move {
-            let host = engine.finish_upload(upload).await?;
-            Ok(v1::UploadSceneResponse { scene: Some(scene_info(&host, true)) })
+        catch_panic(async move {
+            let scene_handle = engine.finish_upload(upload).await?;
+            Ok(v1::UploadSceneResponse { scene: Some(scene_info(&scene_handle, true)) })
         })
         .await
     }
 
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
         let engine = self.0.clone();
-        guarded(async move {
-            let scenes = engine.list().iter().map(|host| scene_info(host, false)).collect();
-            let mut left = MOST_SOURCES;
+        catch_panic(async move {
+            let scenes = engine.list().iter().map(|scene_handle| scene_info(scene_handle, false)).collect();
+            let mut left = MAX_SOURCE_BYTES;
             let fits = |source: &String| {
                 left = left.saturating_sub(source.len() + 8);
                 left > 0
@@ -81,40 +81,40 @@ impl v1::scene_service_server::SceneService for Scenes {
     ) -> Result<Response<v1::DeleteSceneResponse>, Status> {
         let engine = self.0.clone();
         let name = request.into_inner().scene;
-        guarded(async move { engine.close(&name).await.map(|()| v1::DeleteSceneResponse {}) }).await
+        catch_panic(async move { engine.close(&name).await.map(|()| v1::DeleteSceneResponse {}) }).await
     }
 
-    type DescribeSceneStream = Replies<v1::DescribeSceneResponse>;
+    type DescribeSceneStream = ReplyStream<v1::DescribeSceneResponse>;
 
     async fn describe_scene(
         &self,
         request: Request<v1::DescribeSceneRequest>,
     ) -> Result<Response<Self::DescribeSceneStream>, Status> {
         let request = request.into_inner();
-        let host = self.0.find(&request.scene).map_err(status)?;
-        describe::scene(host, request, self.0.config().chunk_bytes).map_err(status)
+        let scene_handle = self.0.find(&request.scene).map_err(status)?;
+        describe::scene(scene_handle, request, self.0.config().chunk_bytes).map_err(status)
     }
 
-    type ReadModesStream = Replies<v1::ReadModesResponse>;
+    type ReadModesStream = ReplyStream<v1::ReadModesResponse>;
 
     async fn read_modes(
         &self,
         request: Request<v1::ReadModesRequest>,
     ) -> Result<Response<Self::ReadModesStream>, Status> {
         let request = request.into_inner();
-        let host = self.0.find(&request.scene).map_err(status)?;
-        describe::modes(host, request, self.0.config().chunk_bytes).map_err(status)
+        let scene_handle = self.0.find(&request.scene).map_err(status)?;
+        describe::modes(scene_handle, request, self.0.config().chunk_bytes).map_err(status)
     }
 }
 
 /// Time budget for waiting on an upload (a token bucket). Waiting consumes it and received bytes refill it, so that a
 /// client that stalls or trickles bytes does not hold its upload permit and disk space forever.
-struct Patience {
+struct UploadTimeBudget {
     most: Duration,
     left: Duration,
 }
 
-impl Patience {
+impl UploadTimeBudget {
     const fn new(most: Duration) -> Self {
         Self { most, left: most }
     }
@@ -123,7 +123,7 @@ impl Patience {
     ///
     /// # Errors
     /// `DEADLINE_EXCEEDED` when the budget is used up.
-    async fn hold<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
+    async fn wait<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
         let begin = Instant::now();
         let late = |_| Error::Deadline { what: "enough of the upload".into(), ms: self.most.as_millis() as u64 };
         let part = tokio::time::timeout(self.left, part).await.map_err(|end| status(late(end)))?;
@@ -131,8 +131,8 @@ impl Patience {
         Ok(part)
     }
 
-    fn regain(&mut self, bytes: usize) {
-        let earned = Duration::from_secs_f64(bytes as f64 / SLOWEST_UPLOAD);
+    fn refill(&mut self, bytes: usize) {
+        let earned = Duration::from_secs_f64(bytes as f64 / MIN_UPLOAD_RATE);
         self.left = self.most.min(self.left + earned);
     }
 }
@@ -140,18 +140,18 @@ impl Patience {
 /// Processes one part of an upload. Disk access runs on a blocking thread.
 async fn receive(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<Upload> {
     let mut upload = match (upload, part) {
-        (None, Part::Header(header)) => return engine.begin_upload(announcement(header)).await,
+        (None, Part::Header(header)) => return engine.begin_upload(upload_header(header)).await,
         (None, _) => return Err(invalid("part", "a header first", "a file or chunk")),
         (Some(_), Part::Header(_)) => return Err(invalid("part", "one header", "a second")),
         (Some(upload), part) => (upload, part),
     };
     let work = move || -> Result<Upload, Error> {
         match upload.1 {
-            Part::File(file) => upload.0.file(&file.path, file.bytes, &file.sha256)?,
-            Part::Chunk(bytes) => upload.0.chunk(&bytes)?,
+            Part::File(file) => upload.0.begin_file(&file.path, file.bytes, &file.sha256)?,
+            Part::Chunk(bytes) => upload.0.write_chunk(&bytes)?,
             Part::Header(_) => {}
         }
         Ok(upload.0)
     };
-    tokio::task::spawn_blocking(work).await.map_err(during("upload"))?
+    tokio::task::spawn_blocking(work).await.map_err(fault_in("upload"))?
 }

@@ -9,10 +9,10 @@ use modalcast_model::error::Error;
 
 /// Limit in characters on each text of a rejection. Clients control parts of the text, and it is sent in headers or
 /// between steps.
-const LONGEST: usize = 512;
+const MAX_TEXT_CHARS: usize = 512;
 
-fn short(text: String) -> String {
-    match text.char_indices().nth(LONGEST) {
+fn truncate(text: String) -> String {
+    match text.char_indices().nth(MAX_TEXT_CHARS) {
         None => text,
         Some((end, _)) => format!("{}...", &text[..end]),
     }
@@ -30,7 +30,7 @@ pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
         Error::Unavailable { what, reason, remedy } => (what.into(), remedy, reason),
         Error::Fault { stage, reason } => (stage.into(), "success".into(), reason),
     };
-    Rejection { step, field: short(field), expected: short(expected), given: short(given) }
+    Rejection { step, field: truncate(field), expected: truncate(expected), given: truncate(given) }
 }
 
 /// Converts an error to a gRPC status.
@@ -46,12 +46,12 @@ pub(super) fn status(error: Error) -> Status {
         Error::Fault { .. } => Code::Internal,
     };
     let details = rejection(None, &error);
-    Status::with_details(code, short(error.to_string()), details.encode_to_vec().into())
+    Status::with_details(code, truncate(error.to_string()), details.encode_to_vec().into())
 }
 
 /// Converts a transport error of a client's stream. Tonic reports a message over the size limit as `OUT_OF_RANGE`; it
 /// becomes `RESOURCE_EXHAUSTED`, as in other gRPC implementations.
-pub(super) fn transport(fault: Status, limit: usize) -> Status {
+pub(super) fn transport_status(fault: Status, limit: usize) -> Status {
     if fault.code() != Code::OutOfRange {
         return fault;
     }

@@ -4,80 +4,80 @@
 use std::collections::VecDeque;
 
 use modalcast_proto::v1;
-use modalcast_proto::v1::drive_scene_request::Kind as Asked;
-use modalcast_proto::v1::drive_scene_response::Kind as Told;
+use modalcast_proto::v1::drive_scene_request::Kind as RequestKind;
+use modalcast_proto::v1::drive_scene_response::Kind as ResponseKind;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::convert::{policy, raw_update, scene_info, stages, wire_policy};
-use super::status::{rejection, status, transport};
-use super::stream::{Deadline, Outlet, Replies, respond};
-use crate::engine::{Drive, Engine, Report};
+use super::status::{rejection, status, transport_status};
+use super::stream::{Deadline, ReplySender, ReplyStream, respond};
+use crate::engine::{Engine, StepReport, WriterSession};
 use modalcast_model::error::{Error, Result, invalid};
 
 /// Replies that are buffered for a client that does not read. The stream ends with an error beyond this limit.
-const MOST_REPLIES: usize = 256;
+const MAX_PENDING_REPLIES: usize = 256;
 
 /// Implementation of `StepService`.
-pub(super) struct Steps(pub(super) Engine);
+pub(super) struct StepServiceImpl(pub(super) Engine);
 
 #[tonic::async_trait]
-impl v1::step_service_server::StepService for Steps {
-    type DriveSceneStream = Replies<v1::DriveSceneResponse>;
+impl v1::step_service_server::StepService for StepServiceImpl {
+    type DriveSceneStream = ReplyStream<v1::DriveSceneResponse>;
 
     async fn drive_scene(
         &self,
         request: Request<Streaming<v1::DriveSceneRequest>>,
     ) -> Result<Response<Self::DriveSceneStream>, Status> {
-        let who = request.remote_addr().map_or_else(|| "a local client".into(), |address| address.to_string());
+        let peer = request.remote_addr().map_or_else(|| "a local client".into(), |address| address.to_string());
         let deadline = Deadline::of_stream(request.metadata());
-        let session = Session {
+        let session = DriveSession {
             engine: self.0.clone(),
-            who,
+            peer,
             inbound: request.into_inner(),
             drive: None,
             replies: VecDeque::new(),
         };
-        Ok(respond(move |outlet| deadline.hold("the end of the step stream", session.run(outlet))))
+        Ok(respond(move |reply_sender| deadline.enforce("the end of the step stream", session.run(reply_sender))))
     }
 }
 
 /// The state of one step stream.
-struct Session {
+struct DriveSession {
     engine: Engine,
-    who: String,
+    peer: String,
     inbound: Streaming<v1::DriveSceneRequest>,
     /// The writer lease, once it is acquired.
-    drive: Option<Drive>,
+    drive: Option<WriterSession>,
     replies: VecDeque<v1::DriveSceneResponse>,
 }
 
-impl Session {
+impl DriveSession {
     /// Reads requests and sends replies until the client has closed its side and all replies are sent.
-    async fn run(mut self, outlet: Outlet<v1::DriveSceneResponse>) -> Result<(), Status> {
+    async fn run(mut self, reply_sender: ReplySender<v1::DriveSceneResponse>) -> Result<(), Status> {
         let mut listens = true;
         loop {
-            let is_drained = self.drive.as_ref().is_none_or(Drive::is_drained);
+            let is_drained = self.drive.as_ref().is_none_or(WriterSession::is_drained);
             if !listens && is_drained && self.replies.is_empty() {
                 return Ok(());
             }
-            let has_room = self.replies.len() < MOST_REPLIES;
+            let has_room = self.replies.len() < MAX_PENDING_REPLIES;
             tokio::select! {
                 message = self.inbound.message(), if listens => match message {
                     Ok(Some(message)) => self.receive(message).await?,
                     Ok(None) => listens = false,
-                    Err(fault) => return Err(transport(fault, self.engine.config().message_bytes)),
+                    Err(fault) => return Err(transport_status(fault, self.engine.config().message_bytes)),
                 },
                 report = next_report(self.drive.as_ref()), if has_room => match report {
-                    Ok(report) => self.replies.push_back(told(report)),
-                    Err(error) => return self.say_farewell(&outlet, error).await,
+                    Ok(report) => self.replies.push_back(response_of(report)),
+                    Err(error) => return self.close_with_error(&reply_sender, error).await,
                 },
-                permit = outlet.ready(), if !self.replies.is_empty() => {
+                permit = reply_sender.reserve(), if !self.replies.is_empty() => {
                     let permit = permit?;
                     if let Some(reply) = self.replies.pop_front() {
                         permit.send(Ok(reply));
                     }
                 }
-                () = outlet.closed() => return Ok(()),
+                () = reply_sender.closed() => return Ok(()),
             }
         }
     }
@@ -86,15 +86,15 @@ impl Session {
     /// error.
     async fn receive(&mut self, message: v1::DriveSceneRequest) -> Result<(), Status> {
         let refused = match message.kind {
-            Some(Asked::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
-            Some(Asked::Step(step)) => {
+            Some(RequestKind::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
+            Some(RequestKind::Step(step)) => {
                 let number = step.number;
                 self.step(step).err().map(|error| (Some(number), error))
             }
             None => Some((None, invalid("kind", "open or step", "neither"))),
         };
         if let Some((step, error)) = refused {
-            self.push(Told::Rejection(rejection(step, &error)))?;
+            self.push(ResponseKind::Rejection(rejection(step, &error)))?;
         }
         Ok(())
     }
@@ -104,17 +104,17 @@ impl Session {
             return Err(invalid("open", "one open per stream", format!("a second, of '{}'", open.scene)));
         }
         let policy = policy(open.policy)?;
-        let host = self.engine.find(&open.scene)?;
+        let scene_handle = self.engine.find(&open.scene)?;
         let window = if open.window == 0 { self.engine.config().window } else { open.window };
-        let drive = host.drive(self.who.clone(), policy, window).await?;
+        let drive = scene_handle.drive(self.peer.clone(), policy, window).await?;
         let opened = v1::Opened {
             run: drive.run,
             policy: wire_policy(drive.policy).into(),
             window: drive.window,
-            scene: Some(scene_info(&host, true)),
+            scene: Some(scene_info(&scene_handle, true)),
         };
         self.drive = Some(drive);
-        self.replies.push_back(v1::DriveSceneResponse { kind: Some(Told::Opened(opened)) });
+        self.replies.push_back(v1::DriveSceneResponse { kind: Some(ResponseKind::Opened(opened)) });
         Ok(())
     }
 
@@ -125,43 +125,47 @@ impl Session {
         }
     }
 
-    fn push(&mut self, kind: Told) -> Result<(), Status> {
-        if self.replies.len() >= MOST_REPLIES {
-            return Err(status(Error::Busy { queue: "replies not read by the client", limit: MOST_REPLIES }));
+    fn push(&mut self, kind: ResponseKind) -> Result<(), Status> {
+        if self.replies.len() >= MAX_PENDING_REPLIES {
+            return Err(status(Error::Busy { queue: "replies not read by the client", limit: MAX_PENDING_REPLIES }));
         }
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(kind) });
         Ok(())
     }
 
     /// Ends the stream with a server-side error. First sends the buffered replies, for at most half the drain time.
-    async fn say_farewell(mut self, outlet: &Outlet<v1::DriveSceneResponse>, error: Error) -> Result<(), Status> {
-        let patience = self.engine.config().drain / 2;
+    async fn close_with_error(
+        mut self,
+        reply_sender: &ReplySender<v1::DriveSceneResponse>,
+        error: Error,
+    ) -> Result<(), Status> {
+        let timeout = self.engine.config().drain_timeout / 2;
         let tell = async {
             while let Some(reply) = self.replies.pop_front() {
-                outlet.send(reply).await?;
+                reply_sender.send(reply).await?;
             }
             Ok::<(), Status>(())
         };
         // The error comes last, whether or not the client has read the replies.
-        tokio::time::timeout(patience, tell).await.ok();
+        tokio::time::timeout(timeout, tell).await.ok();
         Err(status(error))
     }
 }
 
 /// Waits for the next report; pends forever without a writer lease.
-async fn next_report(drive: Option<&Drive>) -> Result<Report> {
+async fn next_report(drive: Option<&WriterSession>) -> Result<StepReport> {
     match drive {
         Some(drive) => drive.next_report().await,
         None => std::future::pending().await,
     }
 }
 
-fn told(report: Report) -> v1::DriveSceneResponse {
+fn response_of(report: StepReport) -> v1::DriveSceneResponse {
     let kind = match report {
-        Report::Done { step, skipped, stages: times } => {
-            Told::Ack(v1::Acknowledgement { step, skipped, stages: stages(&times) })
+        StepReport::Done { step, skipped, stages: times } => {
+            ResponseKind::Ack(v1::Acknowledgement { step, skipped, stages: stages(&times) })
         }
-        Report::Refused { step, error } => Told::Rejection(rejection(Some(step), &error)),
+        StepReport::Rejected { step, error } => ResponseKind::Rejection(rejection(Some(step), &error)),
     };
     v1::DriveSceneResponse { kind: Some(kind) }
 }

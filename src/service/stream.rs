@@ -16,20 +16,20 @@ use crate::config::Config;
 use modalcast_model::error::{Error, Result};
 
 /// A reply stream.
-pub(super) type Replies<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+pub(super) type ReplyStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// Messages of a reply that may be buffered for the connection.
-const AHEAD: usize = 2;
+const REPLY_CAPACITY: usize = 2;
 
 /// Sender of a reply stream. Sending waits while the client reads slowly (back-pressure).
 #[derive(Debug)]
-pub(super) struct Outlet<T>(mpsc::Sender<Result<T, Status>>);
+pub(super) struct ReplySender<T>(mpsc::Sender<Result<T, Status>>);
 
-impl<T> Outlet<T> {
+impl<T> ReplySender<T> {
     /// Sends one message.
     ///
     /// # Errors
-    /// `CANCELLED` when the client has disconnected.
+    /// `CANCELLATION_RATIO` when the client has disconnected.
     pub(super) async fn send(&self, message: T) -> Result<(), Status> {
         self.0.send(Ok(message)).await.map_err(|_| gone())
     }
@@ -37,8 +37,8 @@ impl<T> Outlet<T> {
     /// Waits until the channel has capacity for a message. Cancel-safe.
     ///
     /// # Errors
-    /// `CANCELLED` when the client has disconnected.
-    pub(super) async fn ready(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
+    /// `CANCELLATION_RATIO` when the client has disconnected.
+    pub(super) async fn reserve(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
         self.0.reserve().await.map_err(|_| gone())
     }
 
@@ -54,16 +54,16 @@ fn gone() -> Status {
 
 /// Creates a reply stream that `work` fills. The result of `work` ends the stream; one slot of the channel is reserved
 /// for it. When the client disconnects, `work` is dropped at its next await, so that its resources are released.
-pub(super) fn respond<T, W, F>(work: W) -> Response<Replies<T>>
+pub(super) fn respond<T, W, F>(work: W) -> Response<ReplyStream<T>>
 where
     T: Send + 'static,
-    W: FnOnce(Outlet<T>) -> F,
+    W: FnOnce(ReplySender<T>) -> F,
     F: Future<Output = Result<(), Status>> + Send + 'static,
 {
-    let (sender, replies) = mpsc::channel(AHEAD + 1);
+    let (sender, replies) = mpsc::channel(REPLY_CAPACITY + 1);
     let last_word = sender.clone().try_reserve_owned();
     let client = sender.clone();
-    let work = work(Outlet(sender));
+    let work = work(ReplySender(sender));
     let work = tokio::spawn(async move {
         tokio::select! {
             end = work => end,
@@ -80,7 +80,7 @@ where
 }
 
 /// Runs the work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call.
-pub(super) async fn guarded<T: Send + 'static>(
+pub(super) async fn catch_panic<T: Send + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<Response<T>, Status> {
     match tokio::spawn(work).await {
@@ -90,7 +90,7 @@ pub(super) async fn guarded<T: Send + 'static>(
 }
 
 /// Splits a reply into pieces of at most `most` bytes, each with its offset. An empty reply is one empty piece.
-pub(super) fn pieces(bytes: Bytes, most: usize) -> impl Iterator<Item = (u64, Bytes)> {
+pub(super) fn split_into_chunks(bytes: Bytes, most: usize) -> impl Iterator<Item = (u64, Bytes)> {
     let starts = (0..bytes.len().max(1)).step_by(most.max(1));
     starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + most))))
 }
@@ -108,7 +108,7 @@ impl Deadline {
     pub(super) fn of_request(metadata: &MetadataMap, ms: u32, config: &Config) -> Self {
         let asked = (ms > 0).then(|| Duration::from_millis(ms.into()));
         let time = asked.into_iter().chain(header(metadata)).min().unwrap_or(config.deadline);
-        Self::after(time.min(config.longest_deadline))
+        Self::after(time.min(config.max_deadline))
     }
 
     /// The deadline of a stream: its `grpc-timeout` header, if present.
@@ -121,7 +121,11 @@ impl Deadline {
     }
 
     /// Awaits `work`. If the deadline passes first, drops `work` and returns `DEADLINE_EXCEEDED` naming `what`.
-    pub(super) async fn hold<T>(self, what: &str, work: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
+    pub(super) async fn enforce<T>(
+        self,
+        what: &str,
+        work: impl Future<Output = Result<T, Status>>,
+    ) -> Result<T, Status> {
         let Some((at, ms)) = self.at else { return work.await };
         match tokio::time::timeout_at(at.into(), work).await {
             Ok(result) => result,
@@ -159,13 +163,13 @@ mod tests {
     #[test]
     fn pieces_cover_a_reply_once_and_an_empty_reply_is_one_piece() {
         let bytes = Bytes::from((0..=250).collect::<Vec<u8>>());
-        let cut: Vec<_> = pieces(bytes.clone(), 100).collect();
+        let cut: Vec<_> = split_into_chunks(bytes.clone(), 100).collect();
         assert_eq!(
             cut.iter().map(|(at, piece)| (*at, piece.len())).collect::<Vec<_>>(),
             [(0, 100), (100, 100), (200, 51)]
         );
         assert_eq!(cut.iter().flat_map(|(_, piece)| piece.to_vec()).collect::<Vec<_>>(), bytes);
-        assert_eq!(pieces(Bytes::new(), 100).collect::<Vec<_>>(), [(0, Bytes::new())]);
+        assert_eq!(split_into_chunks(Bytes::new(), 100).collect::<Vec<_>>(), [(0, Bytes::new())]);
     }
 
     #[test]
@@ -199,7 +203,7 @@ mod tests {
     #[tokio::test]
     async fn work_ends_where_it_waits_when_its_client_leaves() {
         let (held, ended) = tokio::sync::oneshot::channel::<()>();
-        let replies = respond(move |_outlet: Outlet<u32>| async move {
+        let replies = respond(move |_outlet: ReplySender<u32>| async move {
             std::future::pending::<()>().await;
             drop(held);
             Ok(())
@@ -211,9 +215,9 @@ mod tests {
 
     #[tokio::test]
     async fn a_panicking_task_ends_its_stream_with_internal_even_when_nobody_reads() {
-        let respond = respond(|outlet: Outlet<u32>| async move {
-            outlet.send(1).await?;
-            outlet.send(2).await?;
+        let respond = respond(|reply_sender: ReplySender<u32>| async move {
+            reply_sender.send(1).await?;
+            reply_sender.send(2).await?;
             panic!("a planted panic")
         });
         let mut replies = respond.into_inner();

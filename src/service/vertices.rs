@@ -7,18 +7,18 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{delivery, said, stages, step_id, which_of_vertices};
+use super::convert::{delivery, describe_step_selector, stages, step_id, vertices_step_selector};
 use super::status::status;
-use super::stream::{Deadline, Outlet, Replies, pieces, respond};
-use crate::engine::{Engine, Feed, Host, Packed, Selection, View, pack_vertices};
-use modalcast_model::deform::Wanted;
+use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
+use crate::engine::{Engine, OutputSpec, PackedVertices, SceneHandle, Subscription, VertexSelection, pack_vertices};
+use modalcast_model::deform::VertexAttributes;
 
 /// Implementation of `VertexService`.
-pub(super) struct Vertices(pub(super) Engine);
+pub(super) struct VertexServiceImpl(pub(super) Engine);
 
 #[tonic::async_trait]
-impl v1::vertex_service_server::VertexService for Vertices {
-    type GetVerticesStream = Replies<v1::GetVerticesResponse>;
+impl v1::vertex_service_server::VertexService for VertexServiceImpl {
+    type GetVerticesStream = ReplyStream<v1::GetVerticesResponse>;
 
     async fn get_vertices(
         &self,
@@ -27,24 +27,27 @@ impl v1::vertex_service_server::VertexService for Vertices {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
-        let host = self.0.find(&request.scene).map_err(status)?;
-        let selection = select(&host, request.selection)?;
-        let which = which_of_vertices(request.step.as_ref());
+        let scene_handle = self.0.find(&request.scene).map_err(status)?;
+        let selection = select(&scene_handle, request.selection)?;
+        let selector = vertices_step_selector(request.step.as_ref());
         let most = config.chunk_bytes;
-        Ok(respond(move |outlet| async move {
+        Ok(respond(move |reply_sender| async move {
             let work = async {
-                let shown = host.show(which, View::Vertices(selection.wanted)).await.map_err(status)?;
-                let vertices = pack_vertices(shown, &selection).await.map_err(status)?;
+                let output = scene_handle
+                    .request_output(selector, OutputSpec::Vertices(selection.wanted))
+                    .await
+                    .map_err(status)?;
+                let vertices = pack_vertices(output, &selection).await.map_err(status)?;
                 for chunk in chunks(&vertices, &selection, most) {
-                    outlet.send(v1::GetVerticesResponse { chunk: Some(chunk) }).await?;
+                    reply_sender.send(v1::GetVerticesResponse { chunk: Some(chunk) }).await?;
                 }
                 Ok(())
             };
-            deadline.hold(&said(which, &host.name), work).await
+            deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
         }))
     }
 
-    type StreamVerticesStream = Replies<v1::StreamVerticesResponse>;
+    type StreamVerticesStream = ReplyStream<v1::StreamVerticesResponse>;
 
     async fn stream_vertices(
         &self,
@@ -52,37 +55,44 @@ impl v1::vertex_service_server::VertexService for Vertices {
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
-        let host = self.0.find(&request.scene).map_err(status)?;
-        let selection = select(&host, request.selection)?;
+        let scene_handle = self.0.find(&request.scene).map_err(status)?;
+        let selection = select(&scene_handle, request.selection)?;
         let delivery = delivery(request.delivery).map_err(status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let feed = host.watch(View::Vertices(selection.wanted), delivery).await.map_err(status)?;
-        let show = Show { selection, most: self.0.config().chunk_bytes, steps: request.steps };
-        Ok(respond(move |outlet| deadline.hold("the end of the vertex stream", show.run(feed, outlet))))
+        let subscription =
+            scene_handle.subscribe(OutputSpec::Vertices(selection.wanted), delivery).await.map_err(status)?;
+        let show = VertexSender { selection, most: self.0.config().chunk_bytes, steps: request.steps };
+        Ok(respond(move |reply_sender| {
+            deadline.enforce("the end of the vertex stream", show.run(subscription, reply_sender))
+        }))
     }
 }
 
 /// Parameters of a vertex stream.
-struct Show {
-    selection: Arc<Selection>,
+struct VertexSender {
+    selection: Arc<VertexSelection>,
     most: usize,
     /// Number of steps to send; 0 means no limit.
     steps: u64,
 }
 
-impl Show {
-    async fn run(self, mut feed: Feed, outlet: Outlet<v1::StreamVerticesResponse>) -> Result<(), Status> {
+impl VertexSender {
+    async fn run(
+        self,
+        mut subscription: Subscription,
+        reply_sender: ReplySender<v1::StreamVerticesResponse>,
+    ) -> Result<(), Status> {
         let mut sent = 0;
         while self.steps == 0 || sent < self.steps {
-            let shown = tokio::select! {
-                shown = feed.next() => shown.map_err(status)?,
-                () = outlet.closed() => return Ok(()),
+            let output = tokio::select! {
+                output = subscription.next() => output.map_err(status)?,
+                () = reply_sender.closed() => return Ok(()),
             };
-            let vertices = pack_vertices(shown, &self.selection).await.map_err(status)?;
+            let vertices = pack_vertices(output, &self.selection).await.map_err(status)?;
             for chunk in chunks(&vertices, &self.selection, self.most) {
                 tokio::select! {
-                    sent = outlet.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent?,
-                    error = feed.cut_off() => return Err(status(error)),
+                    sent = reply_sender.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent?,
+                    error = subscription.disconnected() => return Err(status(error)),
                 }
             }
             sent += 1;
@@ -91,15 +101,19 @@ impl Show {
     }
 }
 
-fn select(host: &Host, selection: Option<v1::VertexSelection>) -> Result<Arc<Selection>, Status> {
+fn select(scene_handle: &SceneHandle, selection: Option<v1::VertexSelection>) -> Result<Arc<VertexSelection>, Status> {
     let v1::VertexSelection { domains, positions_only, displacements, boxes, without_vertices } =
         selection.unwrap_or_default();
     let positions = !without_vertices;
-    let wanted = Wanted { positions, normals: positions && !positions_only, displacements, boxes };
-    Selection::new(&host.scene, domains, wanted).map(Arc::new).map_err(status)
+    let wanted = VertexAttributes { positions, normals: positions && !positions_only, displacements, boxes };
+    VertexSelection::new(&scene_handle.scene, domains, wanted).map(Arc::new).map_err(status)
 }
 
-fn chunks(packed: &Packed, selection: &Selection, most: usize) -> impl Iterator<Item = v1::VertexChunk> + use<> {
+fn chunks(
+    packed: &PackedVertices,
+    selection: &VertexSelection,
+    most: usize,
+) -> impl Iterator<Item = v1::VertexChunk> + use<> {
     let vertices = &packed.encoded;
     let head = v1::VertexHead {
         step: Some(step_id(vertices.step)),
@@ -117,5 +131,5 @@ fn chunks(packed: &Packed, selection: &Selection, most: usize) -> impl Iterator<
     };
     let mut head = Some(head);
     let cut = move |(offset, data): (u64, Bytes)| v1::VertexChunk { head: head.take(), offset, data };
-    pieces(vertices.bytes.clone(), most).map(cut)
+    split_into_chunks(vertices.bytes.clone(), most).map(cut)
 }

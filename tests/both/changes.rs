@@ -5,14 +5,17 @@ use std::sync::Arc;
 
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Domain, Shape};
-use modalcast_model::scene::{Batches, Changed, Deformation, Normals, RawUpdate, Scene, State, Storage, Update};
+use modalcast_model::scene::{
+    BatchPolicy, DeformationSettings, DirtyDomains, NormalMethod, RawStepUpdate, Scene, SceneState, StepUpdate,
+    StorageType,
+};
 
 use super::readers::{kept, wrong_box};
-use super::{Shown, run, strip};
+use super::{StepResult, run, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
 /// A wire step that names the domains of its coordinates and of its transforms.
-fn update(scene: &Scene, random: &mut Random, (q, transforms): (&[u32], &[u32])) -> Update {
+fn update(scene: &Scene, random: &mut Random, (q, transforms): (&[u32], &[u32])) -> StepUpdate {
     let rank: usize = q.iter().map(|domain| scene.rank_of(*domain as usize)).sum();
     let numbers: Vec<f32> = (0..rank).map(|_| random.number()).collect();
     let place = |domain: &u32| match domain % 3 {
@@ -23,18 +26,18 @@ fn update(scene: &Scene, random: &mut Random, (q, transforms): (&[u32], &[u32]))
     let places: Vec<f32> = transforms.iter().flat_map(place).collect();
     let bytes =
         |numbers: Vec<f32>| -> bytes::Bytes { numbers.iter().flat_map(|number| number.to_le_bytes()).collect() };
-    let raw = RawUpdate {
+    let raw = RawStepUpdate {
         q_domains: q.to_vec(),
         q: bytes(numbers),
         transform_domains: transforms.to_vec(),
         transforms: bytes(places),
-        ..RawUpdate::default()
+        ..RawStepUpdate::default()
     };
-    Update::parse(scene, &raw).expect("a step")
+    StepUpdate::parse(scene, &raw).expect("a step")
 }
 
 /// Applies a random step that names these domains.
-pub(crate) fn apply(scene: &Scene, state: &mut State, random: &mut Random, named: (&[u32], &[u32])) {
+pub(crate) fn apply(scene: &Scene, state: &mut SceneState, random: &mut Random, named: (&[u32], &[u32])) {
     state.apply(scene, &update(scene, random, named));
 }
 
@@ -47,7 +50,7 @@ const CROWD: u32 = 40;
 
 /// A scene of small domains of many ranks, with and without separate corners, a large domain, one without modes,
 /// instances, and domains of one shape or of two shapes that share coordinates.
-fn crowd(deformation: Deformation, normal_maps: bool) -> Arc<Scene> {
+fn crowd(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene> {
     let mut random = Random(50);
     let mut shapes: Vec<Shape> = (0..20).map(|at| strip(&mut random, 5 + at % 9, at % 5)).collect();
     shapes.extend((0..6).map(|at| scenes::shape(&mut random, 3 + 7 * at, 3)));
@@ -120,9 +123,9 @@ struct Both<D> {
 }
 
 impl<D: Deformer> Both<D> {
-    fn show(&mut self, state: &State, name: &str) -> Shown {
+    fn show(&mut self, state: &SceneState, name: &str) -> StepResult {
         let mut whole = state.clone();
-        whole.touch();
+        whole.mark_all_dirty();
         let (listed, whole) = (run(&mut self.listed, state), run(&mut self.whole, &whole));
         // The bounds of a refused state are not finite, and NaNs equal nothing, so its numbers are not compared.
         if listed.bounds.is_finite() {
@@ -178,27 +181,27 @@ fn follow<D: Deformer>(name: &str, scene: &Arc<Scene>, make: &impl Fn(&Arc<Scene
 
 /// Twenty steps for every storage type and every feature of a deformation.
 pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    let plain = |storage| Deformation { storage, ..Deformation::default() };
-    let exact = |storage| Deformation { normals: Normals::Exact, ..plain(storage) };
-    let compensated = |deformation| Deformation { compensated: true, ..deformation };
-    let together = |deformation| Deformation { batches: Batches::Always, ..deformation };
-    let truncated = |storage| Deformation { truncation: Some(0.2), ..plain(storage) };
+    let plain = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
+    let exact = |storage| DeformationSettings { normals: NormalMethod::Exact, ..plain(storage) };
+    let compensated = |deformation| DeformationSettings { compensated: true, ..deformation };
+    let together = |deformation| DeformationSettings { batches: BatchPolicy::Always, ..deformation };
+    let truncated = |storage| DeformationSettings { truncation: Some(0.2), ..plain(storage) };
     for (deformation, normal_maps) in [
-        (plain(Storage::F32), true),
-        (exact(Storage::F32), true),
-        (compensated(exact(Storage::F32)), false),
-        (truncated(Storage::F32), false),
-        (plain(Storage::F16), true),
-        (truncated(Storage::F16), true),
-        (exact(Storage::Bf16), true),
-        (plain(Storage::Int8), true),
-        (compensated(exact(Storage::Int8)), false),
-        (kept(plain(Storage::F32)), true),
-        (kept(truncated(Storage::F16)), false),
-        (kept(compensated(exact(Storage::Int8))), false),
-        (together(plain(Storage::F32)), true),
-        (together(exact(Storage::F16)), true),
-        (Deformation { boxes: true, ..together(plain(Storage::Int8)) }, true),
+        (plain(StorageType::F32), true),
+        (exact(StorageType::F32), true),
+        (compensated(exact(StorageType::F32)), false),
+        (truncated(StorageType::F32), false),
+        (plain(StorageType::F16), true),
+        (truncated(StorageType::F16), true),
+        (exact(StorageType::Bf16), true),
+        (plain(StorageType::Int8), true),
+        (compensated(exact(StorageType::Int8)), false),
+        (kept(plain(StorageType::F32)), true),
+        (kept(truncated(StorageType::F16)), false),
+        (kept(compensated(exact(StorageType::Int8))), false),
+        (together(plain(StorageType::F32)), true),
+        (together(exact(StorageType::F16)), true),
+        (DeformationSettings { boxes: true, ..together(plain(StorageType::Int8)) }, true),
     ] {
         follow(&format!("{deformation:?}, normal maps {normal_maps}"), &crowd(deformation, normal_maps), &make);
     }
@@ -206,14 +209,14 @@ pub(crate) fn steps_of_a_few_domains<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
 
 /// Whether a deformer trusts a state's list of changes: it then skips a changed domain that is not listed, and computes
 /// a listed one.
-pub(crate) fn believes_lists<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) -> bool {
-    let scene = crowd(Deformation::default(), false);
+pub(crate) fn trusts_change_lists<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) -> bool {
+    let scene = crowd(DeformationSettings::default(), false);
     let mut deformer = make(&scene);
     let mut state = scenes::state(&scene, 54);
     let before = run(&mut deformer, &state).surface.positions;
     apply(&scene, &mut state, &mut Random(55), (&[LARGE, 3], &[]));
-    assert_eq!(state.changed, Changed::Some(vec![3, LARGE]));
-    state.changed = Changed::Some(vec![3]);
+    assert_eq!(state.changed, DirtyDomains::Some(vec![3, LARGE]));
+    state.changed = DirtyDomains::Some(vec![3]);
     let after = run(&mut deformer, &state).surface.positions;
     let stays = |domain: u32| {
         let slot = scene.layout.slots[domain as usize];

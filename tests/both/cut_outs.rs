@@ -1,9 +1,9 @@
 //! Triangle soups with cut-outs, and the samples where two filters may disagree.
 
 use modalcast_compute::reference::raster::cut_out::{alpha, footprint};
-use modalcast_compute::reference::raster::{Raster, corners, depth_at, outline, pieces};
-use modalcast_model::raster::{AlphaImage, CutOuts, Surface};
-use modalcast_model::scene::{Faces, Group, Window};
+use modalcast_compute::reference::raster::{VisibilityBuffer, clipped_polygon, corners, depth_at, fan_triangles};
+use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts};
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 use super::soups::{Soup, flat, perspective, soups};
 use crate::scenes::Random;
@@ -16,9 +16,9 @@ pub(crate) struct Holes {
 
 impl Holes {
     /// The result of the definition.
-    pub(crate) fn drawn(&self) -> Raster {
+    pub(crate) fn drawn(&self) -> VisibilityBuffer {
         let Soup { window, positions, triangles, groups, .. } = &self.soup;
-        let mut raster = Raster::new(*window);
+        let mut raster = VisibilityBuffer::new(*window);
         groups.iter().for_each(|group| raster.draw_cut_out(positions, triangles, *group, &self.cut_outs));
         raster
     }
@@ -26,7 +26,7 @@ impl Holes {
     /// Samples at which an alpha value is within `tolerance` of its threshold.
     pub(crate) fn doubtful(&self, tolerance: f32) -> Vec<bool> {
         let (soup, cut_outs) = (&self.soup, &self.cut_outs);
-        let mut list = vec![false; soup.window.pixels()];
+        let mut list = vec![false; soup.window.pixel_count()];
         for (triangle, faces) in soup
             .groups
             .iter()
@@ -34,15 +34,15 @@ impl Holes {
         {
             let Some(own) = triangle.checked_sub(cut_outs.first) else { continue };
             let vertices = soup.triangles[triangle as usize];
-            let Ok(outline) = outline(&soup.window, &soup.positions, vertices, faces) else { continue };
+            let Ok(clipped_polygon) = clipped_polygon(&soup.window, &soup.positions, vertices, faces) else { continue };
             let (corners, uvs) = (corners(&soup.window, &soup.positions, vertices), &cut_outs.uvs[own as usize]);
-            let least = cut_outs.table[cut_outs.surfaces[own as usize] as usize].least;
-            let [x0, y0, x1, y1] = outline.samples;
-            for piece in pieces(&outline) {
+            let cutoff = cut_outs.materials[cut_outs.material_indices[own as usize] as usize].cutoff;
+            let [x0, y0, x1, y1] = clipped_polygon.samples;
+            for piece in fan_triangles(&clipped_polygon) {
                 for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
                     if depth_at(&piece, column, row).is_some() {
                         let at = footprint(&soup.window, &corners, uvs, [column, row]);
-                        let near = (alpha(cut_outs, triangle, &at) - least).abs() <= tolerance;
+                        let near = (alpha(cut_outs, triangle, &at) - cutoff).abs() <= tolerance;
                         list[row as usize * soup.window.size()[0] as usize + column as usize] |= near;
                     }
                 }
@@ -65,8 +65,8 @@ pub(crate) fn image(width: u32, height: u32, mut of: impl FnMut(u32, u32, u32) -
 /// but the first third of the triangles are cut out.
 pub(crate) fn plain_holes() -> Vec<Holes> {
     let mut random = Random(21);
-    let surface = |alpha, least, image| Surface { alpha, least, image };
-    let table = vec![
+    let surface = |alpha, cutoff, image| AlphaMaterial { alpha, cutoff, image };
+    let materials = vec![
         surface(1.0, 0.5, Some(0)),
         surface(1.0, 0.5, Some(1)),
         surface(0.25, 0.5, Some(1)),
@@ -81,9 +81,9 @@ pub(crate) fn plain_holes() -> Vec<Holes> {
         let count = soup.triangles.len() - first as usize;
         let mut uv = || [random.number(), random.number()].map(|number| 3.0 * number);
         let uvs = (0..count).map(|_| [uv(), uv(), uv()]).collect();
-        let surfaces = (0..count).map(|at| (at % table.len()) as u32).collect();
-        let (table, images) = (table.clone(), images.clone());
-        Holes { soup, cut_outs: CutOuts { first, uvs, surfaces, table, images, anisotropy: 8.0 } }
+        let material_indices = (0..count).map(|at| (at % materials.len()) as u32).collect();
+        let (materials, images) = (materials.clone(), images.clone());
+        Holes { soup, cut_outs: CutOuts { first, uvs, material_indices, materials, images, anisotropy: 8.0 } }
     };
     soups().into_iter().map(holes).collect()
 }
@@ -97,12 +97,12 @@ pub(crate) fn sheet(side: u32, image: AlphaImage) -> Holes {
     let cut_outs = CutOuts {
         first: 0,
         uvs: triangles.iter().map(|corners: &[u32; 3]| corners.map(uv)).collect(),
-        surfaces: vec![0; 2],
-        table: vec![Surface { alpha: 1.0, least: 0.5, image: Some(0) }],
+        material_indices: vec![0; 2],
+        materials: vec![AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) }],
         images: vec![image],
         anisotropy: 1.0,
     };
-    let groups = vec![Group { first: 0, triangles: 2, faces: Faces::Fronts }];
+    let groups = vec![DrawRange { first: 0, triangles: 2, faces: CullMode::Back }];
     Holes { soup: Soup { name: "a sheet", positions, triangles, groups, window: flat(side, side) }, cut_outs }
 }
 
@@ -125,16 +125,16 @@ pub(crate) fn floor(cuts: u32) -> Holes {
     }
     let cut_outs = CutOuts {
         first: 2,
-        surfaces: vec![0; uvs.len()],
+        material_indices: vec![0; uvs.len()],
         uvs,
-        table: vec![Surface { alpha: 1.0, least: 0.4, image: Some(0) }],
+        materials: vec![AlphaMaterial { alpha: 1.0, cutoff: 0.4, image: Some(0) }],
         images: vec![waves()],
         anisotropy: 1.0,
     };
-    let window: Window = perspective(192, 128, 0.1, 100.0);
+    let window: Viewport = perspective(192, 128, 0.1, 100.0);
     let groups = vec![
-        Group { first: 0, triangles: 2, faces: Faces::Fronts },
-        Group { first: 2, triangles: triangles.len() as u32 - 2, faces: Faces::Both },
+        DrawRange { first: 0, triangles: 2, faces: CullMode::Back },
+        DrawRange { first: 2, triangles: triangles.len() as u32 - 2, faces: CullMode::None },
     ];
     Holes { soup: Soup { name: "a floor", positions, triangles, groups, window }, cut_outs }
 }

@@ -5,23 +5,25 @@ use std::sync::Arc;
 use modalcast_compute::reference;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Mesh, Modes, Shape, Transform};
-use modalcast_model::scene::{Deformation, Scene, State, Storage};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
 
 use super::{beyond, run, scene_of, strip, within};
 use crate::scenes::{self, Random};
 
 /// Every storage type, with and without compensated summation.
-fn deformations() -> impl Iterator<Item = Deformation> {
-    let of = |storage| [false, true].map(|compensated| Deformation { storage, compensated, ..Deformation::default() });
-    Storage::ALL.into_iter().flat_map(of)
+fn deformations() -> impl Iterator<Item = DeformationSettings> {
+    let of = |storage| {
+        [false, true].map(|compensated| DeformationSettings { storage, compensated, ..DeformationSettings::default() })
+    };
+    StorageType::ALL.into_iter().flat_map(of)
 }
 
-fn named(deformation: Deformation) -> String {
+fn named(deformation: DeformationSettings) -> String {
     format!("{}{}", deformation.storage.name(), if deformation.compensated { " compensated" } else { "" })
 }
 
 /// One domain with these columns whose rest positions are all 0, so that nothing hides the sum.
-pub(super) fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> Arc<Scene> {
+pub(super) fn columns_of(vertices: usize, columns: Vec<f32>, deformation: DeformationSettings) -> Arc<Scene> {
     let like = scenes::shape(&mut Random(1), vertices, 0).mesh;
     let mesh = Mesh::new(vec![[0.0; 3]; vertices], like.corners().clone(), like.triangles().to_vec()).expect("a mesh");
     let modes = Modes::from_columns(3 * vertices, columns.len() / (3 * vertices), columns).expect("modes");
@@ -32,7 +34,7 @@ fn noise(random: &mut Random, count: usize) -> Vec<f32> {
     (0..count).map(|_| random.number()).collect()
 }
 
-fn negated(state: &State) -> State {
+fn negated(state: &SceneState) -> SceneState {
     let mut other = state.clone();
     other.q.iter_mut().for_each(|number| *number = -*number);
     other
@@ -46,14 +48,14 @@ pub(crate) fn huge_and_tiny_amounts<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D
         let mut deformer = make(&scene);
         for amount in [1e30, 1e-38, 1e-42, 1e-45, 0.0_f32] {
             let name = format!("{}, q of {amount:e}", named(deformation));
-            let mut state = State::rest(&scene);
+            let mut state = SceneState::rest(&scene);
             state.q = noise(&mut Random(7), 9).iter().map(|number| number * amount).collect();
             let shown = run(&mut deformer, &state);
             assert!(shown.bounds.is_finite(), "{name}: {:?}", shown.bounds);
             within(&name, (&scene, &state), &shown.surface.positions, 0.0);
             // f16 and int8 first multiply q by a scale. Denormals then have too few digits to distinguish signs.
-            let tells =
-                amount >= 1e-38 || amount == 1e-42 && matches!(deformation.storage, Storage::F32 | Storage::Bf16);
+            let tells = amount >= 1e-38
+                || amount == 1e-42 && matches!(deformation.storage, StorageType::F32 | StorageType::Bf16);
             if tells {
                 let wrong = beyond((&scene, &negated(&state)), &shown.surface.positions, 0.0);
                 assert_eq!(wrong, [0], "{name}: the judge can fail");
@@ -70,7 +72,7 @@ pub(crate) fn columns_of_every_scale<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
     columns.iter_mut().enumerate().for_each(|(at, entry)| *entry *= scale(at / (3 * vertices)));
     for deformation in deformations() {
         let scene = columns_of(vertices, columns.clone(), deformation);
-        let (mut deformer, mut state) = (make(&scene), State::rest(&scene));
+        let (mut deformer, mut state) = (make(&scene), SceneState::rest(&scene));
         let name = named(deformation);
         state.q = (0..rank).map(|mode| if mode % 2 == 0 { 0.75 } else { -1.25 }).collect();
         let alike = run(&mut deformer, &state).surface.positions;
@@ -96,8 +98,12 @@ pub(crate) fn modes_that_nearly_cancel<D: Deformer>(make: impl Fn(&Arc<Scene>) -
     let almost: Vec<f32> = half.iter().map(|entry| entry * (1.0 + 1e-5 * random.number())).collect();
     let columns = [half, almost].concat();
     let parts = [true, false].map(|compensated| {
-        let scene = columns_of(vertices, columns.clone(), Deformation { compensated, ..Deformation::default() });
-        let mut state = State::rest(&scene);
+        let scene = columns_of(
+            vertices,
+            columns.clone(),
+            DeformationSettings { compensated, ..DeformationSettings::default() },
+        );
+        let mut state = SceneState::rest(&scene);
         state.q = (0..rank).map(|mode| if mode < rank / 2 { 1000.0 } else { -1000.0 }).collect();
         let positions = run(&mut make(&scene), &state).surface.positions;
         within(&format!("nearly cancelling, compensated {compensated}"), (&scene, &state), &positions, 0.0);
@@ -127,10 +133,10 @@ pub(crate) fn finite_sums_that_overflow_on_their_way<D: Deformer>(make: impl Fn(
     for deformation in deformations() {
         let name = named(deformation);
         let scene = columns_of(5, columns.clone(), deformation);
-        let (mut deformer, mut state) = (make(&scene), State::rest(&scene));
+        let (mut deformer, mut state) = (make(&scene), SceneState::rest(&scene));
         state.q = vec![3e38, 3e38, -3e38, -3e38, 0.75];
         assert!((state.q[0] + state.q[1]).is_infinite());
-        let mut judge = |state: &State, want: [f32; 3]| {
+        let mut judge = |state: &SceneState, want: [f32; 3]| {
             let shown = run(&mut deformer, state);
             assert!(shown.bounds.is_finite(), "{name}: {:?}", shown.bounds);
             let positions = &shown.surface.positions;
@@ -186,7 +192,7 @@ pub(crate) fn tiles_of_zeros<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
 
 /// Ranks around the sizes of chunks and groups of chunks, for one vertex, for less than two quads, and for two tiles.
 pub(crate) fn ranks_of_all_sizes<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         for rank in [1, 3, 31, 33, 512] {
             let mut random = Random(rank as u64);
             let shapes = vec![
@@ -195,7 +201,7 @@ pub(crate) fn ranks_of_all_sizes<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
                 strip(&mut random, 1, rank),
                 scenes::shape(&mut random, 129, rank),
             ];
-            let scene = scene_of(shapes, 2, Deformation { storage, ..Deformation::default() }, true);
+            let scene = scene_of(shapes, 2, DeformationSettings { storage, ..DeformationSettings::default() }, true);
             let state = scenes::state(&scene, 5);
             let positions = run(&mut make(&scene), &state).surface.positions;
             within(&format!("{}, r {rank}", storage.name()), (&scene, &state), &positions, 0.0);

@@ -2,17 +2,18 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::reference::{self, orient_normals, orient_tangents};
+use modalcast_compute::reference::{self, rigid_normals, rigid_tangents};
 use modalcast_model::deform::Deformer;
-use modalcast_model::domain::{Domain, Follow, Mesh, Modes, Shape, Transform};
+use modalcast_model::domain::{Domain, FollowConstraint, Mesh, Modes, Shape, Transform};
 use modalcast_model::scene::{
-    Changed, Deformation, Normals, Parts, RawUpdate, Scene, State, Storage, TransformFormat, Update,
+    DeformationSettings, DirtyDomains, NormalMethod, RawStepUpdate, Scene, SceneParts, SceneState, StepUpdate,
+    StorageType, TransformFormat,
 };
 
 use super::changes::apply;
 use super::readers::{kept, wrong_box};
 use super::surfaces::largest_error;
-use super::{Shown, beyond, run, strip, within};
+use super::{StepResult, beyond, run, strip, within};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
 /// Largest accepted error of a component of a unit vector. Products of shears have a worse condition number than single
@@ -35,7 +36,7 @@ fn frame(random: &mut Random, at: usize, rigid: bool) -> Transform {
 
 /// A scene in which one third of the domains are transform roots. Each other domain follows an earlier one, which may
 /// be a follower itself.
-pub(crate) fn grove(count: usize, deformation: Deformation, rigid: bool) -> Parts {
+pub(crate) fn grove(count: usize, deformation: DeformationSettings, rigid: bool) -> SceneParts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> = SIZES.iter().map(|(vertices, rank)| strip(&mut random, *vertices, *rank)).collect();
     // A shape with more corners than vertices.
@@ -46,7 +47,7 @@ pub(crate) fn grove(count: usize, deformation: Deformation, rigid: bool) -> Part
     for at in 0..count {
         let follows = (at % 3 != 0).then(|| {
             let parent = ((random.number().abs() * at as f32) as usize).min(at - 1);
-            Follow { parent, frame: frame(&mut random, at, rigid) }
+            FollowConstraint { parent, frame: frame(&mut random, at, rigid) }
         });
         let material = if at % 4 == 0 { NORMAL_MAPPED } else { 0 };
         let name = format!("domain {at}");
@@ -56,26 +57,26 @@ pub(crate) fn grove(count: usize, deformation: Deformation, rigid: bool) -> Part
 }
 
 /// The same scene without followers, in a state whose transforms are given by `place`.
-fn apart(mut parts: Parts, state: &State, place: impl Fn(usize) -> Transform) -> (Arc<Scene>, State) {
+fn apart(mut parts: SceneParts, state: &SceneState, place: impl Fn(usize) -> Transform) -> (Arc<Scene>, SceneState) {
     parts.domains.iter_mut().for_each(|domain| domain.follows = None);
     let scene = Scene::new(parts).expect("a scene");
-    let mut placed = State::rest(&scene);
+    let mut placed = SceneState::rest(&scene);
     placed.q.clone_from(&state.q);
     placed.transforms = (0..scene.domains.len()).map(place).collect();
     (scene, placed)
 }
 
 /// Errors of normals and tangents.
-fn turned(shown: &Shown, scene: &Scene, state: &State) -> [f64; 2] {
-    let normals = largest_error(&shown.surface.normals, orient_normals(scene, state).as_flattened());
-    [normals, largest_error(&shown.surface.tangents, orient_tangents(scene, state).as_flattened())]
+fn turned(shown: &StepResult, scene: &Scene, state: &SceneState) -> [f64; 2] {
+    let normals = largest_error(&shown.surface.normals, rigid_normals(scene, state).as_flattened());
+    [normals, largest_error(&shown.surface.tangents, rigid_tangents(scene, state).as_flattened())]
 }
 
 /// Mirrored, sheared and chained frames of small and large shapes for every storage type.
 pub(crate) fn frames_of_all_sizes<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    for (storage, rigid) in Storage::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
+    for (storage, rigid) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
         let name = format!("followers, {}, rigid {rigid}", storage.name());
-        let parts = || grove(45, Deformation { storage, ..Deformation::default() }, rigid);
+        let parts = || grove(45, DeformationSettings { storage, ..DeformationSettings::default() }, rigid);
         let scene = Scene::new(parts()).expect("a scene");
         assert_eq!((scene.movers.count(), scene.needs.shear), (15, !rigid));
         let state = scenes::state(&scene, 61);
@@ -113,13 +114,13 @@ fn changed_by(scene: &Scene, q: &[u32], transforms: &[u32]) -> Vec<u32> {
 
 /// A list that moves some roots and bends some followers gives the bits of a full step.
 pub(crate) fn steps_of_movers<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    let plain = Deformation::default();
+    let plain = DeformationSettings::default();
     for deformation in [
         plain,
         kept(plain),
-        Deformation { normals: Normals::Exact, ..plain },
-        Deformation { normals: Normals::Exact, storage: Storage::Int8, ..plain },
-        Deformation { truncation: Some(0.2), storage: Storage::F16, ..plain },
+        DeformationSettings { normals: NormalMethod::Exact, ..plain },
+        DeformationSettings { normals: NormalMethod::Exact, storage: StorageType::Int8, ..plain },
+        DeformationSettings { truncation: Some(0.2), storage: StorageType::F16, ..plain },
     ] {
         let scene = Scene::new(grove(120, deformation, false)).expect("a scene");
         let (mut listed, mut whole, mut random) = (make(&scene), make(&scene), Random(62));
@@ -134,10 +135,10 @@ pub(crate) fn steps_of_movers<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
             let q: &[u32] = if step % 4 == 1 { &[1, 5, 64] } else { &[] };
             apply(&scene, &mut state, &mut random, (q, transforms));
             let expected = changed_by(&scene, q, transforms);
-            assert_eq!(state.changed, Changed::Some(expected.clone()), "step {step}");
+            assert_eq!(state.changed, DirtyDomains::Some(expected.clone()), "step {step}");
             let shown = run(&mut listed, &state);
             let mut all = state.clone();
-            all.touch();
+            all.mark_all_dirty();
             assert_eq!(shown.difference(&run(&mut whole, &all)), None, "{deformation:?}, step {step}");
             let moved: Vec<u32> = (0..120).filter(|domain| moves(&scene, *domain, [&last, &shown])).collect();
             let in_place = |domain: &u32| transforms.contains(&(root(&scene, *domain as usize) as u32));
@@ -151,21 +152,21 @@ pub(crate) fn steps_of_movers<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     }
 }
 
-fn moves(scene: &Scene, domain: u32, [before, after]: [&Shown; 2]) -> bool {
+fn moves(scene: &Scene, domain: u32, [before, after]: [&StepResult; 2]) -> bool {
     let slot = scene.layout.slots[domain as usize];
-    let own = |shown: &Shown| bits(&shown.surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
+    let own = |shown: &StepResult| bits(&shown.surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
     own(before) != own(after)
 }
 
 /// A step that moves a domain by an f64 translation without rotating it.
-fn far_step(domain: u32, translation: [f64; 3]) -> RawUpdate {
+fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     let rotation = [0.0_f32, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
     let bytes: Vec<u8> = rotation.chain(translation.into_iter().flat_map(f64::to_le_bytes)).collect();
-    RawUpdate {
+    RawStepUpdate {
         transform_domains: vec![domain],
         transforms: bytes.into(),
         transform_format: TransformFormat::RigidF64,
-        ..RawUpdate::default()
+        ..RawStepUpdate::default()
     }
 }
 
@@ -174,16 +175,16 @@ pub(crate) fn far_away<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
     let mut parts = scenes::parts(vec![strip(&mut random, 50, 0)]);
     let frame = random.similarity(true);
-    for follows in [None, Some(Follow { parent: 0, frame }), None] {
+    for follows in [None, Some(FollowConstraint { parent: 0, frame }), None] {
         parts.domains.push(Domain { follows, ..scenes::domain(0, 0) });
     }
     let scene = Scene::new(parts).expect("a scene");
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     let place = [1e7 + 0.3, -1e7 - 0.7, 12.25];
-    state.apply(&scene, &Update::parse(&scene, &far_step(0, place)).expect("a step"));
+    state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, place)).expect("a step"));
     assert_eq!((scene.movers.of(1), state.transforms.len()), (0, 2));
     let shown = run(&mut make(&scene), &state);
-    let (slot, cell) = (scene.layout.slots[1], state.cell_of(scene.movers.of(1)));
+    let (slot, cell) = (scene.layout.slots[1], state.origin_of(scene.movers.of(1)));
     let [mut error, mut rounded] = [0.0_f64; 2];
     for (vertex, rest) in scene.shape_of(1).mesh.rest().iter().enumerate() {
         let inside = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest).cast());
@@ -205,7 +206,7 @@ pub(crate) fn products_that_overflow<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
     let rest: Vec<[f32; 3]> = (0..37).map(|_| random.triple().map(|number| number * 1e-20)).collect();
     let normals = (0..37).map(|_| random.triple()).collect();
     let triangles = (0..35).map(|at| [at, at + 1, at + 2]).collect();
-    let mesh = Mesh::indexed(rest, normals, vec![], triangles).expect("a strip");
+    let mesh = Mesh::from_indexed(rest, normals, vec![], triangles).expect("a strip");
     let scaled = |transform: Transform, scale: f32| {
         let mut linear = transform.0.map(|entry| entry * scale);
         [3, 7, 11].into_iter().for_each(|at| linear[at] = 0.0);
@@ -215,11 +216,11 @@ pub(crate) fn products_that_overflow<D: Deformer>(make: impl Fn(&Arc<Scene>) -> 
         let mut parts = scenes::parts(vec![Shape::new(mesh.clone(), Modes::rigid()).expect("rigid")]);
         parts.rigid_transforms = rigid;
         let frame = scaled(random.similarity(true), 1e25);
-        for follows in [None, Some(Follow { parent: 0, frame })] {
+        for follows in [None, Some(FollowConstraint { parent: 0, frame })] {
             parts.domains.push(Domain { follows, ..scenes::domain(0, 0) });
         }
         let scene = Scene::new(parts).expect("a scene");
-        let mut state = State::rest(&scene);
+        let mut state = SceneState::rest(&scene);
         state.transforms[0] = scaled(random.similarity(false), 1e25);
         assert!(!state.transform_of(&scene, 1).0[0].is_finite(), "the product leaves f32");
         let shown = run(&mut make(&scene), &state);

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Mesh, Modes, Shape};
-use modalcast_model::scene::{Batches, Bounds, Deformation, LightBounds, Scene, State};
+use modalcast_model::scene::{BatchPolicy, Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
 
-use super::{Shown, run, scene_of};
+use super::{StepResult, run, scene_of};
 use crate::scenes::{self, Random};
 
 /// Vertices per tile; each tile contributes one box.
@@ -25,24 +25,24 @@ pub(crate) fn coil(vertices: usize, rank: usize) -> Shape {
     let modes = Modes::from_columns(3 * vertices, rank, (0..3 * vertices * rank).map(wave).collect()).expect("modes");
     let last = vertices as u32 - 1;
     let triangles = (0..=last).map(|at| [at, (at + 1).min(last), (at + 2).min(last)]).collect();
-    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; vertices], vec![], triangles).expect("a mesh");
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; vertices], vec![], triangles).expect("a mesh");
     Shape::new(mesh, modes).expect("a shape")
 }
 
 /// Coils that fill tiles of their own and coils that share tiles.
-pub(crate) fn coils(deformation: Deformation) -> Arc<Scene> {
+pub(crate) fn coils(deformation: DeformationSettings) -> Arc<Scene> {
     scene_of(vec![coil(5000, 4), coil(700, 2), coil(9, 1)], 2, deformation, false)
 }
 
 /// The smallest box along the light axes of a scene that contains the boxes of all tiles of `size` packed positions.
-pub(crate) fn along(scene: &Scene, positions: &[f32], size: usize) -> LightBounds {
+pub(crate) fn along(scene: &Scene, positions: &[f32], size: usize) -> LightSpaceBox {
     let axes = scene.light_axes().expect("the look has a shadow");
-    let tile = |positions: &[f32]| LightBounds::of_box(&axes, &Bounds::of(positions));
-    positions.chunks(3 * size).map(tile).fold(LightBounds::EMPTY, LightBounds::union)
+    let tile = |positions: &[f32]| LightSpaceBox::enclosing(&axes, &Bounds::from_positions(positions));
+    positions.chunks(3 * size).map(tile).fold(LightSpaceBox::EMPTY, LightSpaceBox::union)
 }
 
 /// Distance by which `inner` exceeds `outer`, or NaN if either contains a NaN.
-pub(crate) fn beyond(outer: &LightBounds, inner: &LightBounds) -> f64 {
+pub(crate) fn beyond(outer: &LightSpaceBox, inner: &LightSpaceBox) -> f64 {
     let ends = (0..3).flat_map(|axis| [outer.0.min[axis] - inner.0.min[axis], inner.0.max[axis] - outer.0.max[axis]]);
     ends.fold(0.0, |most: f64, end| if end.is_nan() || most.is_nan() { f64::NAN } else { most.max(end) })
 }
@@ -54,31 +54,31 @@ pub(crate) fn reach(bounds: &Bounds) -> f64 {
 
 /// Largest diagonal of the box of a tile.
 fn widest(positions: &[f32]) -> f64 {
-    positions.chunks(3 * TILE).map(|tile| Bounds::of(tile).diagonal()).fold(0.0, f64::max)
+    positions.chunks(3 * TILE).map(|tile| Bounds::from_positions(tile).diagonal()).fold(0.0, f64::max)
 }
 
 /// Light bounds of a step, checked to contain every vertex and to exceed the box of the corners of the bounds only by
 /// rounding.
-fn held(name: &str, scene: &Scene, shown: &Shown) -> LightBounds {
+fn held(name: &str, scene: &Scene, shown: &StepResult) -> LightSpaceBox {
     let light = shown.light.expect("the look has a shadow");
     let (exact, corners) = (along(scene, &shown.surface.positions, 1), along_corners(scene, &shown.bounds));
     let reach = reach(&shown.bounds);
     assert!(beyond(&light, &exact) <= 1e-12 * reach, "{name}: a vertex is outside: {light:?}, {exact:?}");
     assert!(beyond(&corners, &light) <= 4e-7 * reach, "{name}: {light:?} reaches beyond {corners:?}");
-    let smaller = exact.widened(-1e-3 * shown.bounds.diagonal());
+    let smaller = exact.expanded_by(-1e-3 * shown.bounds.diagonal());
     assert!(shown.bounds.diagonal() == 0.0 || beyond(&smaller, &exact) > 0.0, "{name}: control");
     light
 }
 
-fn along_corners(scene: &Scene, bounds: &Bounds) -> LightBounds {
-    LightBounds::of_box(&scene.light_axes().expect("the look has a shadow"), bounds)
+fn along_corners(scene: &Scene, bounds: &Bounds) -> LightSpaceBox {
+    LightSpaceBox::enclosing(&scene.light_axes().expect("the look has a shadow"), bounds)
 }
 
 /// Scenes that are random, smooth, far away or tiny, that have one vertex, or whose domains share tiles.
 pub(crate) fn every_vertex_is_held<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    let together = Deformation { batches: Batches::Always, ..Deformation::default() };
+    let together = DeformationSettings { batches: BatchPolicy::Always, ..DeformationSettings::default() };
     let scenes = [
-        ("coils", coils(Deformation::default())),
+        ("coils", coils(DeformationSettings::default())),
         ("coils together", coils(together)),
         ("one vertex", scenes::scene(&[(1, 1)], 1, false, true)),
         ("small ones", scenes::scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
@@ -98,14 +98,16 @@ pub(crate) fn every_vertex_is_held<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
 
 /// Less than half the volume of the box of the corners, and no more than the diagonal of a tile beyond the vertices.
 pub(crate) fn a_thin_scene_is_fitted_closely<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scene_of(vec![coil(5000, 4)], 1, Deformation::default(), false);
-    let shown = run(&mut make(&scene), &State::rest(&scene));
+    let scene = scene_of(vec![coil(5000, 4)], 1, DeformationSettings::default(), false);
+    let shown = run(&mut make(&scene), &SceneState::rest(&scene));
     let light = held("coil", &scene, &shown);
     let (exact, corners) = (along(&scene, &shown.surface.positions, 1), along_corners(&scene, &shown.bounds));
     let widest = widest(&shown.surface.positions);
     assert!(beyond(&exact, &light) < widest, "{light:?} beyond {exact:?}, tiles of {widest}");
-    let volume = |LightBounds(of): &LightBounds| (0..3).map(|axis| of.max[axis] - of.min[axis]).product::<f64>();
-    let [light, exact, corners] = [light, exact, corners].map(|of| volume(&of));
+    let volume = |LightSpaceBox(from_positions): &LightSpaceBox| {
+        (0..3).map(|axis| from_positions.max[axis] - from_positions.min[axis]).product::<f64>()
+    };
+    let [light, exact, corners] = [light, exact, corners].map(|from_positions| volume(&from_positions));
     eprintln!("coil: {:.3} of the volume by corners, {:.3} by vertices", light / corners, exact / corners);
     assert!(light < 0.5 * corners && exact <= light);
 }
@@ -116,15 +118,15 @@ pub(crate) fn nothing_is_measured_without_a_shadow_and_overflow_is_told<D: Defor
     parts.domains = vec![scenes::domain(0, 0); 2];
     parts.look.shadow = None;
     let dark = Scene::new(parts).expect("a scene");
-    assert_eq!(run(&mut make(&dark), &State::rest(&dark)).light, None);
+    assert_eq!(run(&mut make(&dark), &SceneState::rest(&dark)).light, None);
     let scene = scenes::scene(&[(300, 2)], 2, false, false);
-    let (mut deformer, good) = (make(&scene), State::rest(&scene));
+    let (mut deformer, good) = (make(&scene), SceneState::rest(&scene));
     let before = run(&mut deformer, &good).light;
-    assert!(before.is_some_and(|light| light.is_sound()));
+    assert!(before.is_some_and(|light| light.is_valid()));
     for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
         let mut lost = good.clone();
         lost.transforms[1].0.fill(bad);
-        assert!(run(&mut deformer, &lost).light.is_some_and(|light| !light.is_sound()), "{bad}");
+        assert!(run(&mut deformer, &lost).light.is_some_and(|light| !light.is_valid()), "{bad}");
         assert_eq!(run(&mut deformer, &good).light, before, "forgotten");
     }
 }

@@ -1,15 +1,15 @@
 //! Checks that every deformer must pass: the limits of f32, partial steps, followers and readers. Each check takes a
 //! function that creates the deformer of a scene, and prints its figures; `tests/it` and `tests/gpu` run all of them.
 
+mod bound_checks;
 pub(crate) mod changes;
 #[allow(dead_code, reason = "each test binary uses a part")]
 pub(crate) mod cut_outs;
 pub(crate) mod exact;
 pub(crate) mod extremes;
 pub(crate) mod following;
-mod judge;
 pub(crate) mod light;
-pub(crate) mod neighbours;
+pub(crate) mod neighbors;
 pub(crate) mod readers;
 pub(crate) mod refusal;
 pub(crate) mod soups;
@@ -18,31 +18,31 @@ pub(crate) mod truncation;
 
 use std::sync::Arc;
 
-use modalcast_model::deform::{Deformed, Deformer, Surface};
+use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::domain::{Domain, Mesh, Shape};
-use modalcast_model::scene::{Bounds, Deformation, LightBounds, Scene, State};
+use modalcast_model::scene::{Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
 
 use crate::scenes::{self, NORMAL_MAPPED, Random};
-pub(crate) use judge::{beyond, displacements_beyond, displacements_within, within};
+pub(crate) use bound_checks::{beyond, displacements_beyond, displacements_within, within};
 
 /// All results of a step.
 #[derive(Debug, Clone)]
-pub(crate) struct Shown {
+pub(crate) struct StepResult {
     pub(crate) bounds: Bounds,
-    pub(crate) light: Option<LightBounds>,
-    pub(crate) surface: Surface,
+    pub(crate) light: Option<LightSpaceBox>,
+    pub(crate) surface: DeformedSurface,
 }
 
-pub(crate) fn run(deformer: &mut dyn Deformer, state: &State) -> Shown {
-    let Deformed { bounds, light, .. } = deformer.deform(state).expect("deforms");
-    Shown { bounds, light, surface: deformer.surface().expect("a surface").clone() }
+pub(crate) fn run(deformer: &mut dyn Deformer, state: &SceneState) -> StepResult {
+    let DeformSummary { bounds, light, .. } = deformer.deform(state).expect("deforms");
+    StepResult { bounds, light, surface: deformer.surface().expect("a surface").clone() }
 }
 
-impl Shown {
+impl StepResult {
     /// Describes the first number whose bits differ.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         let lists = |shown: &Self| {
-            let Surface { positions, normals, tangents, displacements, .. } = shown.surface.clone();
+            let DeformedSurface { positions, normals, tangents, displacements, .. } = shown.surface.clone();
             [("position", positions), ("normal", normals), ("tangent", tangents), ("displacement", displacements)]
         };
         for ((name, own), (_, other)) in lists(self).into_iter().zip(lists(other)) {
@@ -67,7 +67,7 @@ pub(crate) fn strip(random: &mut Random, vertices: usize, rank: usize) -> Shape 
     let last = vertices as u32 - 1;
     let triangles = (0..=last).map(|at| [at, (at + 1).min(last), (at + 2).min(last)]).collect();
     let uvs = other.mesh.corners().uvs[..vertices].to_vec();
-    let mesh = Mesh::indexed(other.mesh.rest().to_vec(), normals, uvs, triangles).expect("a strip");
+    let mesh = Mesh::from_indexed(other.mesh.rest().to_vec(), normals, uvs, triangles).expect("a strip");
     Shape::new(mesh, other.modes).expect("a shape")
 }
 
@@ -75,7 +75,7 @@ pub(crate) fn strip(random: &mut Random, vertices: usize, rank: usize) -> Shape 
 pub(crate) fn scene_of(
     shapes: Vec<Shape>,
     instances: usize,
-    deformation: Deformation,
+    deformation: DeformationSettings,
     normal_maps: bool,
 ) -> Arc<Scene> {
     let count = shapes.len();
@@ -89,10 +89,10 @@ pub(crate) fn scene_of(
 
 #[test]
 fn difference_detects_bits_lengths_and_bounds() {
-    let surface = Surface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..Surface::default() };
-    let shown = Shown { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
+    let surface = DeformedSurface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..DeformedSurface::default() };
+    let shown = StepResult { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
     assert_eq!(shown.difference(&shown), None);
-    let spoilt = |spoil: &dyn Fn(&mut Shown)| {
+    let spoilt = |spoil: &dyn Fn(&mut StepResult)| {
         let mut other = shown.clone();
         spoil(&mut other);
         shown.difference(&other)

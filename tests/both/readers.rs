@@ -3,30 +3,30 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::engine::Workbench;
-use modalcast_model::deform::{Deformer, Wanted};
+use modalcast::engine::DeviceContext;
+use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::domain::{Domain, Transform};
-use modalcast_model::scene::{Bounds, Deformation, Scene, State, Storage};
+use modalcast_model::scene::{Bounds, DeformationSettings, Scene, SceneState, StorageType};
 
 use super::extremes::columns_of;
-use super::neighbours::is_narrow;
-use super::{Shown, changes, displacements_beyond, displacements_within, run, scene_of, strip};
+use super::neighbors::has_one_item_per_lane;
+use super::{StepResult, changes, displacements_beyond, displacements_within, run, scene_of, strip};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
 /// The same deformation with displacements and boxes.
-pub(crate) fn kept(deformation: Deformation) -> Deformation {
-    Deformation { displacements: true, boxes: true, ..deformation }
+pub(crate) fn kept(deformation: DeformationSettings) -> DeformationSettings {
+    DeformationSettings { displacements: true, boxes: true, ..deformation }
 }
 
 /// The first domain whose box differs from the bounds of its positions.
-pub(crate) fn wrong_box(scene: &Scene, shown: &Shown) -> Option<usize> {
+pub(crate) fn wrong_box(scene: &Scene, shown: &StepResult) -> Option<usize> {
     let slots = &scene.layout.slots;
     assert_eq!(shown.surface.boxes.len(), slots.len(), "a box of each domain");
-    let of = |domain: usize| {
+    let from_positions = |domain: usize| {
         let positions = &shown.surface.positions[3 * slots[domain].first_vertex..][..3 * slots[domain].vertices];
-        Bounds::of(positions)
+        Bounds::from_positions(positions)
     };
-    (0..slots.len()).find(|domain| shown.surface.boxes[*domain] != of(*domain))
+    (0..slots.len()).find(|domain| shown.surface.boxes[*domain] != from_positions(*domain))
 }
 
 /// Numbers of vertices and ranks for every kind of tile: shared, own, and several per domain. With `many` there are so
@@ -38,7 +38,7 @@ fn sizes(many: bool) -> Vec<(usize, usize)> {
 }
 
 /// A scene with two domains per shape, or with `many` one domain per shape and 30 of the last.
-fn scene(deformation: Deformation, many: bool) -> Arc<Scene> {
+fn scene(deformation: DeformationSettings, many: bool) -> Arc<Scene> {
     let mut random = Random(101);
     let shape = |(at, (vertices, rank)): (usize, (usize, usize))| match at % 2 {
         0 => strip(&mut random, vertices, rank),
@@ -59,14 +59,14 @@ fn scene(deformation: Deformation, many: bool) -> Arc<Scene> {
 /// Displacements are within their bound, boxes are tight, and vertices have the bits that they have without these
 /// attributes.
 pub(crate) fn displacements_and_boxes_equal_their_twins<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    for (storage, compensated, many) in Storage::ALL.into_iter().flat_map(|storage| {
-        [(storage, false, false), (storage, true, false), (storage, storage == Storage::Bf16, true)]
+    for (storage, compensated, many) in StorageType::ALL.into_iter().flat_map(|storage| {
+        [(storage, false, false), (storage, true, false), (storage, storage == StorageType::Bf16, true)]
     }) {
-        let plain = Deformation { storage, compensated, ..Deformation::default() };
+        let plain = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
         let (bare, kept) = (scene(plain, many), scene(kept(plain), many));
         let state = scenes::state(&kept, 102);
         let (without, with) = (run(&mut make(&bare), &state), run(&mut make(&kept), &state));
-        assert_eq!(is_narrow(&kept), !many);
+        assert_eq!(has_one_item_per_lane(&kept), !many);
         let name = format!("{}, compensated {compensated}, {} domains", storage.name(), kept.domains.len());
         assert!(without.surface.displacements.is_empty() && without.surface.boxes.is_empty(), "{name}");
         let mut vertices = with.clone();
@@ -89,7 +89,7 @@ pub(crate) fn displacements_and_boxes_equal_their_twins<D: Deformer>(make: impl 
 pub(crate) fn a_scene_without_modes_has_zeros<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(103);
     let shapes = vec![strip(&mut random, 7, 0), scenes::shape(&mut random, 300, 0)];
-    let scene = scene_of(shapes, 2, kept(Deformation::default()), false);
+    let scene = scene_of(shapes, 2, kept(DeformationSettings::default()), false);
     assert!(!scene.needs.modes && scene.needs.displacements);
     let shown = run(&mut make(&scene), &scenes::state(&scene, 104));
     assert_eq!(shown.surface.displacements, vec![0.0; 3 * scene.layout.vertices]);
@@ -98,16 +98,16 @@ pub(crate) fn a_scene_without_modes_has_zeros<D: Deformer>(make: impl Fn(&Arc<Sc
 
 /// Attributes read alone are those of the last step, and so are attributes read later.
 pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scene(kept(Deformation::default()), false);
+    let scene = scene(kept(DeformationSettings::default()), false);
     let (mut deformer, mut random) = (make(&scene), Random(105));
     let mut state = scenes::state(&scene, 106);
     let mut last = run(&mut deformer, &state);
-    let nothing = Wanted::default();
+    let nothing = VertexAttributes::default();
     for (number, wanted) in [
-        Wanted { boxes: true, ..nothing },
-        Wanted { displacements: true, ..nothing },
-        Wanted { positions: true, ..nothing },
-        Wanted { displacements: true, boxes: true, ..nothing },
+        VertexAttributes { boxes: true, ..nothing },
+        VertexAttributes { displacements: true, ..nothing },
+        VertexAttributes { positions: true, ..nothing },
+        VertexAttributes { displacements: true, boxes: true, ..nothing },
     ]
     .into_iter()
     .enumerate()
@@ -123,7 +123,7 @@ pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
         assert!(is(wanted.displacements, same, new.displacements != old.displacements), "step {number}");
         assert!(is(wanted.positions, got.positions == new.positions, new.positions != old.positions), "step {number}");
         let whole =
-            Shown { bounds: want.bounds, light: want.light, surface: deformer.surface().expect("copies").clone() };
+            StepResult { bounds: want.bounds, light: want.light, surface: deformer.surface().expect("copies").clone() };
         assert_eq!(whole.difference(&want), None, "step {number}: the rest comes after");
         last = want;
     }
@@ -132,7 +132,7 @@ pub(crate) fn parts_are_read_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D)
 /// A fetch returns the requested attributes of its own step and nothing else. Other requests for the same step succeed
 /// too, and fetched data stay valid when later steps are computed.
 pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scene(kept(Deformation::default()), false);
+    let scene = scene(kept(DeformationSettings::default()), false);
     let (mut deformer, mut random, mut state) = (make(&scene), Random(108), scenes::state(&scene, 109));
     let mut before = Vec::new();
     for step in 0..20 {
@@ -140,10 +140,10 @@ pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) ->
         let want = run(&mut make(&scene), &state).surface;
         deformer.deform(&state).expect("deforms");
         let wishes = [step, step / 4 * 3 + 1, step * 7 + 2].map(|number| wish(number as usize % 16));
-        let begun = wishes.map(|wanted| (wanted, deformer.fetch(wanted).expect("begins")));
+        let begun = wishes.map(|wanted| (wanted, deformer.readback(wanted).expect("begins")));
         for (want, begun) in std::mem::replace(&mut before, vec![(want, begun)]) {
-            for (wanted, fetch) in begun.iter().rev() {
-                let got = deformer.fetched(fetch).expect("arrives");
+            for (wanted, readback) in begun.iter().rev() {
+                let got = deformer.wait_readback(readback).expect("arrives");
                 let parts = [
                     (wanted.positions, got.positions == want.positions, got.positions.is_empty()),
                     (wanted.normals, got.normals == want.normals, got.normals.is_empty()),
@@ -165,13 +165,13 @@ pub(crate) fn parts_are_fetched_alone<D: Deformer>(make: impl Fn(&Arc<Scene>) ->
 }
 
 /// One of the sixteen combinations of attributes.
-fn wish(number: usize) -> Wanted {
+fn wish(number: usize) -> VertexAttributes {
     let bit = |at: usize| number >> at & 1 == 1;
-    Wanted { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
+    VertexAttributes { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
 }
 
 /// Modes of ones along x and y (twice) and along z, so that u is known.
-fn ones(deformation: Deformation) -> Arc<Scene> {
+fn ones(deformation: DeformationSettings) -> Arc<Scene> {
     let column = |row: [f32; 3]| row.repeat(5);
     let columns = [column([1.0, 1.0, 0.0]), column([1.0, 1.0, 0.0]), column([0.0, 0.0, 1.0])].concat();
     columns_of(5, columns, deformation)
@@ -183,12 +183,12 @@ const TINY: Transform = Transform([1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0
 /// A displacement in the range of f32 survives intermediate overflow. One that overflows is reported, even if x is
 /// finite.
 pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    for (storage, compensated) in Storage::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
-        let plain = Deformation { storage, compensated, ..Deformation::default() };
+    for (storage, compensated) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
+        let plain = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
         let name = format!("{}, compensated {compensated}", storage.name());
         let (bare, kept) = (ones(plain), ones(kept(plain)));
         let (mut without, mut with) = (make(&bare), make(&kept));
-        let mut state = State::rest(&kept);
+        let mut state = SceneState::rest(&kept);
         state.transforms[0] = TINY;
         // u is 6e38, which exceeds f32.
         state.q = vec![3e38, 3e38, 0.75];
@@ -201,8 +201,9 @@ pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: 
     }
     // Partial sums overflow although the total is finite.
     let row = [1.0_f32, -1.0, 0.5].repeat(5);
-    let scene = columns_of(5, [row.clone(), row.clone(), row.clone(), row].concat(), kept(Deformation::default()));
-    let mut state = State::rest(&scene);
+    let scene =
+        columns_of(5, [row.clone(), row.clone(), row.clone(), row].concat(), kept(DeformationSettings::default()));
+    let mut state = SceneState::rest(&scene);
     (state.transforms[0], state.q) = (TINY, vec![3e38, 3e38, -3e38, -2.5e38]);
     let shown = run(&mut make(&scene), &state);
     assert!(shown.bounds.is_finite() && wrong_box(&scene, &shown).is_none(), "{:?}", shown.bounds);
@@ -216,10 +217,10 @@ pub(crate) fn lost_displacements_are_told_and_others_survive<D: Deformer>(make: 
 /// A step with an overflowing displacement is refused with the name of its domain, and no reader sees it.
 pub(crate) fn lost_displacements_are_refused_by_name(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
-    let mut bench = Workbench::open(&config).expect("a workbench");
-    let scene = scene(kept(Deformation::default()), false);
-    let (mut staged, mut random) = (bench.stage(&scene).expect("stages"), Random(107));
-    let mut good = State::rest(&scene);
+    let mut bench = DeviceContext::open(&config).expect("a workbench");
+    let scene = scene(kept(DeformationSettings::default()), false);
+    let (mut staged, mut random) = (bench.load_scene(&scene).expect("stages"), Random(107));
+    let mut good = SceneState::rest(&scene);
     changes::apply(&scene, &mut good, &mut random, (&[1, 4], &[4]));
     staged.deform(&good).expect("a good step");
     let before = staged.surface().expect("vertices").clone();
@@ -237,5 +238,5 @@ pub(crate) fn lost_displacements_are_refused_by_name(backend: BackendChoice) {
     changes::apply(&scene, &mut good, &mut random, (&[8], &[]));
     staged.deform(&good).expect("a good step");
     assert_ne!(staged.surface().expect("vertices"), &before, "the judge can fail");
-    bench.unstage(staged);
+    bench.unload_scene(staged);
 }

@@ -3,16 +3,16 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::engine::Workbench;
+use modalcast::engine::DeviceContext;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::Transform;
-use modalcast_model::scene::{Deformation, Scene, State, Storage};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
 
 use super::{changes, run, scene_of, strip};
 use crate::scenes::{self, Random};
 
 /// Enough domains that a list of changes may name two of them.
-fn scene(storage: Storage) -> Arc<Scene> {
+fn scene(storage: StorageType) -> Arc<Scene> {
     let mut random = Random(71);
     let shapes = vec![
         strip(&mut random, 7, 2),
@@ -20,7 +20,7 @@ fn scene(storage: Storage) -> Arc<Scene> {
         strip(&mut random, 9, 3),
         scenes::shape(&mut random, 30, 0),
     ];
-    scene_of(shapes, 2, Deformation { storage, ..Deformation::default() }, true)
+    scene_of(shapes, 2, DeformationSettings { storage, ..DeformationSettings::default() }, true)
 }
 
 /// Large enough that f32 overflows in the transform if it does not in the sum.
@@ -28,7 +28,7 @@ const FAR: Transform = Transform([1e3, -2e3, 1e3, 0.0, 1e3, 1e3, -3e3, 0.0, -1e3
 
 /// A step that overflows gives bounds that are not finite. The next valid step equals that of a fresh deformer.
 pub(crate) fn overflow_is_told_and_forgotten<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         let scene = scene(storage);
         let (mut deformer, mut random) = (make(&scene), Random(72));
         let mut good = scenes::state(&scene, 73);
@@ -53,10 +53,10 @@ pub(crate) fn overflow_is_told_and_forgotten<D: Deformer>(make: impl Fn(&Arc<Sce
 /// The step is refused with the name of its domain, and the vertices stay those of the last valid step.
 pub(crate) fn overflow_is_refused_by_name(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
-    let mut bench = Workbench::open(&config).expect("a workbench");
-    let scene = scene(Storage::F32);
-    let (mut staged, mut random) = (bench.stage(&scene).expect("stages"), Random(74));
-    let mut good = State::rest(&scene);
+    let mut bench = DeviceContext::open(&config).expect("a workbench");
+    let scene = scene(StorageType::F32);
+    let (mut staged, mut random) = (bench.load_scene(&scene).expect("stages"), Random(74));
+    let mut good = SceneState::rest(&scene);
     changes::apply(&scene, &mut good, &mut random, (&[0, 5], &[5]));
     staged.deform(&good).expect("a good step");
     let before = staged.surface().expect("vertices").clone();
@@ -75,9 +75,9 @@ pub(crate) fn overflow_is_refused_by_name(backend: BackendChoice) {
     staged.deform(&good).expect("a good step");
     let after = staged.surface().expect("vertices").clone();
     assert_ne!(after, before, "the judge can fail");
-    let mut fresh = bench.stage(&scene).expect("stages");
+    let mut fresh = bench.load_scene(&scene).expect("stages");
     fresh.deform(&good).expect("a good step");
     assert_eq!(fresh.surface().expect("vertices"), &after);
-    bench.unstage(staged);
-    bench.unstage(fresh);
+    bench.unload_scene(staged);
+    bench.unload_scene(fresh);
 }

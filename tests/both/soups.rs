@@ -1,7 +1,7 @@
 //! Triangle soups that are hard to rasterize, and their windows.
 
-use modalcast_compute::reference::raster::Raster;
-use modalcast_model::scene::{Faces, Group, Window};
+use modalcast_compute::reference::raster::VisibilityBuffer;
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 use nalgebra::{Matrix4, Point3, Vector3};
 
 use crate::scenes::Random;
@@ -11,45 +11,45 @@ pub(crate) struct Soup {
     pub(crate) name: &'static str,
     pub(crate) positions: Vec<f32>,
     pub(crate) triangles: Vec<[u32; 3]>,
-    pub(crate) groups: Vec<Group>,
-    pub(crate) window: Window,
+    pub(crate) groups: Vec<DrawRange>,
+    pub(crate) window: Viewport,
 }
 
 impl Soup {
-    fn new(name: &'static str, positions: Vec<f32>, triangles: Vec<[u32; 3]>, window: Window) -> Self {
+    fn new(name: &'static str, positions: Vec<f32>, triangles: Vec<[u32; 3]>, window: Viewport) -> Self {
         let half = triangles.len() as u32 / 2;
         let rest = triangles.len() as u32 - half;
         let groups = vec![
-            Group { first: 0, triangles: half, faces: Faces::Both },
-            Group { first: half, triangles: rest, faces: Faces::Fronts },
+            DrawRange { first: 0, triangles: half, faces: CullMode::None },
+            DrawRange { first: half, triangles: rest, faces: CullMode::Back },
         ];
         Self { name, positions, triangles, groups, window }
     }
 
     /// Triangles without shared vertices.
-    fn apart(name: &'static str, positions: Vec<f32>, window: Window) -> Self {
+    fn apart(name: &'static str, positions: Vec<f32>, window: Viewport) -> Self {
         let count = positions.len() as u32 / 9;
         Self::new(name, positions, (0..count).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect(), window)
     }
 
     /// The result of the definition.
-    pub(crate) fn drawn(&self) -> Raster {
-        let mut raster = Raster::new(self.window);
+    pub(crate) fn drawn(&self) -> VisibilityBuffer {
+        let mut raster = VisibilityBuffer::new(self.window);
         self.groups.iter().for_each(|group| raster.draw(&self.positions, &self.triangles, *group));
         raster
     }
 }
 
 /// A camera at the origin that looks along -z with a vertical field of view of 60 degrees.
-pub(crate) fn perspective(width: u32, height: u32, near: f64, far: f64) -> Window {
+pub(crate) fn perspective(width: u32, height: u32, near: f64, far: f64) -> Viewport {
     let aspect = f64::from(width) / f64::from(height);
     let clip = nalgebra::Perspective3::new(aspect, 60.0_f64.to_radians(), near, far);
-    Window::new(&clip.to_homogeneous(), width, height).expect("a window")
+    Viewport::new(&clip.to_homogeneous(), width, height).expect("a window")
 }
 
 /// A window whose scene coordinates are clip space.
-pub(crate) fn flat(width: u32, height: u32) -> Window {
-    Window::new(&Matrix4::identity(), width, height).expect("a window")
+pub(crate) fn flat(width: u32, height: u32) -> Viewport {
+    Viewport::new(&Matrix4::identity(), width, height).expect("a window")
 }
 
 /// Triangles with random corners around random centers.
@@ -66,7 +66,7 @@ fn scattered(random: &mut Random, count: usize, reach: f32, size: [f32; 3]) -> V
 }
 
 /// A fan around a center; its rim lies beyond the border of [`flat`].
-pub(crate) fn fan(window: Window) -> Soup {
+pub(crate) fn fan(window: Viewport) -> Soup {
     let mut random = Random(11);
     let mut positions = vec![0.05, -0.03, 0.0];
     let spokes = 40_u32;
@@ -76,7 +76,7 @@ pub(crate) fn fan(window: Window) -> Soup {
     }
     let triangles = (0..spokes).map(|spoke| [0, 1 + spoke, 1 + (spoke + 1) % spokes]).collect();
     let mut soup = Soup::new("a fan", positions, triangles, window);
-    soup.groups = vec![Group { first: 0, triangles: spokes, faces: Faces::Both }];
+    soup.groups = vec![DrawRange { first: 0, triangles: spokes, faces: CullMode::None }];
     soup
 }
 
@@ -121,12 +121,12 @@ pub(crate) fn soups() -> Vec<Soup> {
         Soup::apart("beyond the far plane", scattered(random, 200, 6.0, [4.0; 3]), perspective(90, 90, 0.1, 4.0)),
         Soup::apart("no numbers", holes, flat(97, 101)),
         Soup::apart("tied", tied, flat(64, 64)),
-        Soup::apart("1e7 away", far, Window::new(&far_clip, 150, 100).expect("a window")),
+        Soup::apart("1e7 away", far, Viewport::new(&far_clip, 150, 100).expect("a window")),
         Soup::apart("one pixel", scattered(random, 200, 1.0, [2.0; 3]), flat(1, 1)),
         Soup::apart("a long window", scattered(random, 40, 1.0, [1.0; 3]), flat(16384, 2)),
         Soup::apart("a tall window", scattered(random, 40, 1.0, [1.0; 3]), flat(2, 16384)),
         Soup::apart("a window without numbers", scattered(random, 9, 1.0, [1.0; 3]), {
-            Window::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("a window")
+            Viewport::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("a window")
         }),
         Soup::apart("nothing", Vec::new(), flat(8, 8)),
         degenerate(),

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::reference::{orient_normals, orient_tangents};
+use modalcast_compute::reference::{rigid_normals, rigid_tangents};
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Corners, Mesh, Shape, Transform};
-use modalcast_model::scene::{Deformation, Normals, Scene, State};
+use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneState};
 
 use super::{run, scene_of, within};
 use crate::scenes::{self, Random};
@@ -37,9 +37,9 @@ pub(crate) fn shears_and_mirrors<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     }
     let shown = run(&mut make(&scene), &state);
     within("shears and mirrors", (&scene, &state), &shown.surface.positions, 0.0);
-    let errors = |state: &State| {
-        let normals = largest_error(&shown.surface.normals, orient_normals(&scene, state).as_flattened());
-        (normals, largest_error(&shown.surface.tangents, orient_tangents(&scene, state).as_flattened()))
+    let errors = |state: &SceneState| {
+        let normals = largest_error(&shown.surface.normals, rigid_normals(&scene, state).as_flattened());
+        (normals, largest_error(&shown.surface.tangents, rigid_tangents(&scene, state).as_flattened()))
     };
     let (normal, tangent) = errors(&state);
     eprintln!("shears and mirrors: normals off by {normal:.2e}, tangents by {tangent:.2e}");
@@ -86,8 +86,9 @@ pub(crate) fn no_area_and_no_uvs<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
     let modes = scenes::shape(&mut Random(35), 9, 2).modes;
     let shapes: Vec<Shape> =
         flat_meshes().into_iter().map(|mesh| Shape::new(mesh, modes.clone()).expect("a shape")).collect();
-    for normals in [Normals::Rigid, Normals::Exact] {
-        let scene = scene_of(shapes.clone(), 1, Deformation { normals, ..Deformation::default() }, true);
+    for normals in [NormalMethod::Rigid, NormalMethod::Exact] {
+        let scene =
+            scene_of(shapes.clone(), 1, DeformationSettings { normals, ..DeformationSettings::default() }, true);
         let mut deformer = make(&scene);
         for amount in [0.0, 1e-30, 1.0, 1e15] {
             let mut state = scenes::state(&scene, 8);

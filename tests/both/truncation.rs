@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use modalcast_model::deform::Deformer;
-use modalcast_model::scene::{Deformation, Scene, State, Storage};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
 
 use super::extremes::columns_of;
 use super::{beyond, changes, run, scene_of, strip, within};
@@ -18,7 +18,7 @@ pub(crate) fn errors_within_the_budget<D: Deformer>(
     make: impl Fn(&Arc<Scene>) -> D,
     left_out: impl Fn(&D, &Scene) -> f64,
 ) {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         let mut random = Random(81);
         let shapes = vec![
             scenes::shape(&mut random, 300, 24),
@@ -26,7 +26,7 @@ pub(crate) fn errors_within_the_budget<D: Deformer>(
             strip(&mut random, 7, 5),
             strip(&mut random, 60, 0),
         ];
-        let deformation = Deformation { storage, truncation: Some(BUDGET), ..Deformation::default() };
+        let deformation = DeformationSettings { storage, truncation: Some(BUDGET), ..DeformationSettings::default() };
         let scene = scene_of(shapes, 2, deformation, false);
         assert_eq!(scene.unit, 1.0);
         let (mut deformer, mut state) = (make(&scene), scenes::state(&scene, 82));
@@ -51,13 +51,16 @@ pub(crate) fn errors_within_the_budget<D: Deformer>(
         }
         eprintln!("{}: at most {most:.2e} of {BUDGET} left out, to be seen in {seen} of 20 states", storage.name());
         assert!(most > BUDGET / 10.0, "modes are left out");
-        assert!(storage != Storage::F32 || seen > 10, "and their absence is an error that the judge sees");
+        assert!(storage != StorageType::F32 || seen > 10, "and their absence is an error that the judge sees");
     }
 }
 
 /// Number of times that the second of two modes appears or disappears while its amplitude oscillates around half of the
 /// budget.
-fn changes_of_a_swinging_mode(storage: Storage, mut deform: impl FnMut(&Arc<Scene>, &State) -> Vec<f32>) -> usize {
+fn changes_of_a_swinging_mode(
+    storage: StorageType,
+    mut deform: impl FnMut(&Arc<Scene>, &SceneState) -> Vec<f32>,
+) -> usize {
     let (vertices, rank, swinging) = (5, 8, 4);
     let mut columns = vec![0.0; 3 * vertices * rank];
     for vertex in 0..vertices {
@@ -65,13 +68,17 @@ fn changes_of_a_swinging_mode(storage: Storage, mut deform: impl FnMut(&Arc<Scen
         // The mode is in another chunk for every storage type, because a chunk is summed with all of its modes.
         columns[3 * vertices * swinging + 3 * vertex] = 1.0;
     }
-    let scene = columns_of(vertices, columns, Deformation { storage, truncation: Some(1.0), ..Deformation::default() });
-    let mut state = State::rest(&scene);
+    let scene = columns_of(
+        vertices,
+        columns,
+        DeformationSettings { storage, truncation: Some(1.0), ..DeformationSettings::default() },
+    );
+    let mut state = SceneState::rest(&scene);
     state.q[0] = 10.0;
     let (mut count, mut before) = (0, None);
     for step in 0..60 {
         state.q[swinging] = 0.5 + 0.1 * (0.7 * step as f32).sin();
-        state.touch();
+        state.mark_all_dirty();
         let positions = deform(&scene, &state);
         assert!((positions[1] - 10.0).abs() < 1e-3, "the first mode is always there");
         let is_out = positions[0] == 0.0;
@@ -84,7 +91,7 @@ fn changes_of_a_swinging_mode(storage: Storage, mut deform: impl FnMut(&Arc<Scen
 
 /// A mode near the limit is truncated once and stays so (hysteresis); without memory it flickers.
 pub(crate) fn no_flicker<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         let mut kept: Option<D> = None;
         let count = changes_of_a_swinging_mode(storage, |scene, state| {
             run(kept.get_or_insert_with(|| make(scene)), state).surface.positions
@@ -93,7 +100,7 @@ pub(crate) fn no_flicker<D: Deformer>(make: impl Fn(&Arc<Scene>) -> D) {
         assert!(count <= 1);
     }
     let forgetful =
-        changes_of_a_swinging_mode(Storage::F32, |scene, state| run(&mut make(scene), state).surface.positions);
+        changes_of_a_swinging_mode(StorageType::F32, |scene, state| run(&mut make(scene), state).surface.positions);
     eprintln!("without memory it came or went {forgetful} times");
     assert!(forgetful > 10);
 }

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::Launch;
+use modalcast_compute::gpu::KernelKind;
 use modalcast_compute::storage::{QUAD, TILE_QUADS};
 use modalcast_model::domain::Transform;
-use modalcast_model::scene::{Batches, Deformation, Normals, Parts, Scene, Storage};
+use modalcast_model::scene::{BatchPolicy, DeformationSettings, NormalMethod, Scene, SceneParts, StorageType};
 
 use crate::both::following::grove;
 use crate::both::readers::wrong_box;
@@ -15,8 +15,8 @@ use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
 /// The scene with batches and without.
-fn both(mut parts: impl FnMut() -> Parts) -> [Arc<Scene>; 2] {
-    [Batches::Always, Batches::Never].map(|batches| {
+fn both(mut parts: impl FnMut() -> SceneParts) -> [Arc<Scene>; 2] {
+    [BatchPolicy::Always, BatchPolicy::Never].map(|batches| {
         let mut parts = parts();
         parts.deformation.batches = batches;
         Scene::new(parts).expect("a scene")
@@ -26,8 +26,8 @@ fn both(mut parts: impl FnMut() -> Parts) -> [Arc<Scene>; 2] {
 /// Deforms states of a scene with batches and without, and returns the number of states with a differing bit.
 fn differences(name: &str, [together, apart]: &[Arc<Scene>; 2]) -> usize {
     let (mut one, mut other) = (deformer(together), deformer(apart));
-    assert!(one.plan().kernel(Launch::Batch).is_some(), "{name}: there is a batch");
-    assert!(other.plan().kernel(Launch::Batch).is_none(), "{name}: there is none");
+    assert!(one.plan().kernel(KernelKind::Batch).is_some(), "{name}: there is a batch");
+    assert!(other.plan().kernel(KernelKind::Batch).is_none(), "{name}: there is none");
     assert!(one.plan().launches() <= 4, "{name}");
     let states = states(together);
     let count = states.iter().filter(|state| {
@@ -49,7 +49,7 @@ fn differences(name: &str, [together, apart]: &[Arc<Scene>; 2]) -> usize {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batches_have_the_bits_of_separate_domains() {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         for size in [
             (1, 3, 2),
             (33, 1, 2),
@@ -61,7 +61,7 @@ fn gpu_batches_have_the_bits_of_separate_domains() {
             (2000, 32, 16),
             (5003, 512, 13),
         ] {
-            let deformation = Deformation { boxes: true, ..stored(storage) };
+            let deformation = DeformationSettings { boxes: true, ..stored(storage) };
             let name = format!("{} n, r, domains {size:?}", storage.name());
             assert_eq!(differences(&name, &both(|| ensemble(size, deformation))), 0, "{name}");
         }
@@ -72,10 +72,13 @@ fn gpu_batches_have_the_bits_of_separate_domains() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
     // More than 8,192 tiles, so that a block has two or three of them; the last tile is not full.
-    for (storage, vertices) in [(Storage::F32, 1_100_007), (Storage::Int8, 1_100_007), (Storage::F16, 1_600_001)] {
+    for (storage, vertices) in
+        [(StorageType::F32, 1_100_007), (StorageType::Int8, 1_100_007), (StorageType::F16, 1_600_001)]
+    {
         let name = format!("{} n {vertices}", storage.name());
-        let scenes = both(|| ensemble((vertices, 5, 3), Deformation { boxes: true, ..stored(storage) }));
-        let blocks = modalcast_compute::gpu::plan(&scenes[0]).kernel(Launch::Batch).expect("a batch").blocks as usize;
+        let scenes = both(|| ensemble((vertices, 5, 3), DeformationSettings { boxes: true, ..stored(storage) }));
+        let blocks =
+            modalcast_compute::gpu::plan(&scenes[0]).kernel(KernelKind::Batch).expect("a batch").blocks as usize;
         assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
         assert_eq!(differences(&name, &scenes), 0, "{name}");
     }
@@ -85,8 +88,8 @@ fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batches_agree_with_every_feature_of_a_scene() {
-    let exact = |storage| Deformation { normals: Normals::Exact, ..stored(storage) };
-    let crowd = |deformation: Deformation, normal_maps: bool| {
+    let exact = |storage| DeformationSettings { normals: NormalMethod::Exact, ..stored(storage) };
+    let crowd = |deformation: DeformationSettings, normal_maps: bool| {
         let mut random = Random(70);
         let sizes = [(300, 33), (40, 0), (7, 2), (513, 5), (200, 0), (130, 1)];
         let shapes = sizes.iter().enumerate().map(|(at, (vertices, rank))| match at % 2 {
@@ -102,11 +105,11 @@ fn gpu_batches_agree_with_every_feature_of_a_scene() {
         parts
     };
     for (deformation, normal_maps) in [
-        (stored(Storage::F32), true),
-        (stored(Storage::F16), false),
-        (exact(Storage::F32), true),
-        (exact(Storage::Int8), false),
-        (Deformation { boxes: true, ..stored(Storage::Bf16) }, true),
+        (stored(StorageType::F32), true),
+        (stored(StorageType::F16), false),
+        (exact(StorageType::F32), true),
+        (exact(StorageType::Int8), false),
+        (DeformationSettings { boxes: true, ..stored(StorageType::Bf16) }, true),
     ] {
         let name = format!("{deformation:?}, normal maps {normal_maps}");
         assert_eq!(differences(&name, &both(|| crowd(deformation, normal_maps))), 0, "{name}");
@@ -120,7 +123,7 @@ fn gpu_batches_agree_with_every_feature_of_a_scene() {
 fn gpu_batches_repair_intermediate_overflow() {
     for vertices in [300, 512] {
         let [together, apart] =
-            both(|| ensemble((vertices, 5, 6), Deformation { boxes: true, ..Deformation::default() }));
+            both(|| ensemble((vertices, 5, 6), DeformationSettings { boxes: true, ..DeformationSettings::default() }));
         let (mut one, mut other) = (deformer(&together), deformer(&apart));
         let mut state = scenes::state(&together, 4);
         // The sum of domain 1 overflows. The products of domain 3 overflow too, although their sum may be finite.

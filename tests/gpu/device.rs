@@ -1,6 +1,6 @@
 //! The device: struct layouts agree with the host, missing devices are refused, and memory is released.
 
-use modalcast_compute::gpu::{CudaDeformer, Device, agreements, device_values, probe};
+use modalcast_compute::gpu::{CudaDeformer, Device, device_layout_values, layout_constants, probe};
 use modalcast_model::deform::Deformer;
 use modalcast_model::error::Error;
 
@@ -10,11 +10,11 @@ use crate::scenes;
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_host_and_device_agree_on_every_size_and_offset() {
     let device = Device::open(0).expect("a CUDA device");
-    let values = device_values(&device).expect("reports");
-    for (agreement, device) in agreements().iter().zip(&values) {
+    let values = device_layout_values(&device).expect("reports");
+    for (agreement, device) in layout_constants().iter().zip(&values) {
         assert_eq!(agreement.host, *device, "{}", agreement.expression);
     }
-    assert_eq!(values.len(), agreements().len());
+    assert_eq!(values.len(), layout_constants().len());
     assert!(values.iter().any(|value| *value > 0), "the report was written");
 }
 

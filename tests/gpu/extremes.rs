@@ -1,12 +1,12 @@
 //! Zero rows, the signs of overflows, and singular or tiny transforms on the device. Checks for every deformer are in
 //! `tests/both`.
 
-use modalcast_compute::reference::orient_normals;
+use modalcast_compute::reference::rigid_normals;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Modes, Shape, Transform};
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
-use crate::judge::{DIRECTION, check, largest_error, same_bits};
+use crate::accuracy::{DIRECTION, check, largest_error, same_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 use crate::twins::deformer;
 
@@ -52,7 +52,7 @@ fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     let mut parts = scenes::parts(vec![Shape::new(shape.mesh, modes).expect("a shape")]);
     parts.domains = vec![scenes::domain(0, 0)];
     let scene = Scene::new(parts).expect("a scene");
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     state.q[0] = f32::MAX;
     // Infinity minus infinity in the first row, which is finite in f64. The other rows overflow in f32.
     state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
@@ -82,7 +82,7 @@ fn gpu_directions_of_singular_transforms_equal_the_twin() {
     let mut parts = scenes::parts(vec![scenes::shape(&mut random, 40, 0)]);
     parts.domains = vec![scenes::domain(0, NORMAL_MAPPED); linear.len()];
     let scene = Scene::new(parts).expect("a scene");
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     for (transform, [a, b, c, d, e, f, g, h, i]) in state.transforms.iter_mut().zip(linear) {
         *transform = Transform([a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0]);
     }
@@ -90,6 +90,6 @@ fn gpu_directions_of_singular_transforms_equal_the_twin() {
     check("edge transforms", &scene, &state, &mut deformer);
     // Control: the twin of other transforms differs.
     let normals = &deformer.surface().expect("copies").normals;
-    let other = orient_normals(&scene, &State::rest(&scene));
+    let other = rigid_normals(&scene, &SceneState::rest(&scene));
     assert!(largest_error(normals, &other, DIRECTION).is_err(), "the judge can fail");
 }

@@ -4,7 +4,7 @@ use std::num::NonZeroU32;
 
 use glow::HasContext as _;
 use modalcast_model::raster::GlBuffer;
-use modalcast_render::{Prefer, Renderer};
+use modalcast_render::{DevicePreference, Renderer};
 
 /// The context of a renderer, which stays current on this thread.
 pub(crate) struct Gl {
@@ -14,7 +14,7 @@ pub(crate) struct Gl {
 
 impl Gl {
     pub(crate) fn open() -> Self {
-        let renderer = Renderer::open(Prefer::Cuda(0)).expect("OpenGL on the CUDA device");
+        let renderer = Renderer::open(DevicePreference::Cuda(0)).expect("OpenGL on the CUDA device");
         // SAFETY: loading runs the initializers of libEGL. They have run already, because the renderer has loaded the
         // library.
         let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("EGL");

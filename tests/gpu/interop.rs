@@ -2,21 +2,21 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, Device, GlBuffers};
-use modalcast_model::deform::{Deformer, Wanted};
+use modalcast_compute::gpu::{CudaDeformer, Device, GlVertexBuffers};
+use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::scene::{Camera, Scene};
-use modalcast_render::{FRAMES_UNDER_WAY, Prefer, Renderer, SceneBuffers, Shot};
+use modalcast_render::{DevicePreference, FrameParams, MAX_FRAMES_IN_FLIGHT, Renderer, SceneBuffers};
 
-use crate::judge::{check, same_bits};
+use crate::accuracy::{check, same_bits};
 use crate::scenes;
 
-fn shared(buffers: &SceneBuffers) -> GlBuffers {
+fn shared(buffers: &SceneBuffers) -> GlVertexBuffers {
     let modalcast_render::SharedBuffers { positions, normals, tangents } = buffers.shared;
-    GlBuffers { positions, normals, tangents }
+    GlVertexBuffers { positions, normals, tangents }
 }
 
 fn stage() -> (Renderer, Arc<Device>, Arc<Scene>) {
-    let renderer = Renderer::open(Prefer::Cuda(0)).expect("OpenGL on the CUDA device");
+    let renderer = Renderer::open(DevicePreference::Cuda(0)).expect("OpenGL on the CUDA device");
     let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
     (renderer, Device::open(0).expect("a CUDA device"), scene)
 }
@@ -58,9 +58,9 @@ fn gpu_shared_buffers_are_fetched_during_the_next_step() {
         direct.deform(&state).expect("deforms");
         plain.deform(&state).expect("deforms");
         let want = plain.surface().expect("copies").clone();
-        let next = (direct.fetch(Wanted::VERTICES).expect("begins"), want);
-        if let Some((fetch, want)) = before.replace(next) {
-            let got = direct.fetched(&fetch).expect("arrives");
+        let next = (direct.readback(VertexAttributes::VERTICES).expect("begins"), want);
+        if let Some((readback, want)) = before.replace(next) {
+            let got = direct.wait_readback(&readback).expect("arrives");
             assert!(same_bits(&got.positions, &want.positions), "step {seed}");
             assert!(same_bits(&got.normals, &want.normals), "step {seed}");
             let now = &before.as_ref().expect("there").1;
@@ -80,7 +80,8 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
     let (to_share, to_fill) = (renderer.load(&scene).expect("loads"), renderer.load(&scene).expect("loads"));
     let mut direct = CudaDeformer::new(&device, &scene, Some(shared(&to_share))).expect("a deformer");
     let bounds = direct.deform(&state).expect("deforms").bounds;
-    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
+    let shot =
+        FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
     let shown = renderer.draw(&to_share, &shot).expect("draws");
     renderer.upload(&to_fill, direct.surface().expect("copies")).expect("uploads");
     let uploaded = renderer.draw(&to_fill, &shot).expect("draws");
@@ -105,19 +106,24 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
     let mut copied = CudaDeformer::new(&device, &scene, None).expect("a deformer");
     assert!(direct.shares_buffers(), "interop was refused");
     // A large picture, so that a frame takes longer than a step.
-    let shot =
-        |bounds| Shot { camera: Camera::framing(&scene, 64, 64), width: 1920, height: 1080, bounds, light: None };
+    let shot = |bounds| FrameParams {
+        camera: Camera::fit_to_scene(&scene, 64, 64),
+        width: 1920,
+        height: 1080,
+        bounds,
+        light: None,
+    };
     let (mut frames, mut wanted) = (std::collections::VecDeque::new(), Vec::new());
     let mut images = Vec::new();
     for seed in 0..30 {
         let state = scenes::state(&scene, seed);
-        if frames.len() == FRAMES_UNDER_WAY {
-            images.extend(frames.pop_front().map(|frame| renderer.collect(frame).expect("draws").rgba));
+        if frames.len() == MAX_FRAMES_IN_FLIGHT {
+            images.extend(frames.pop_front().map(|frame| renderer.read_image(frame).expect("draws").rgba));
         }
         let bounds = direct.deform(&state).expect("deforms").bounds;
         frames.push_back(renderer.submit(&to_share, &shot(bounds)).expect("submits"));
     }
-    images.extend(frames.into_iter().map(|frame| renderer.collect(frame).expect("draws").rgba));
+    images.extend(frames.into_iter().map(|frame| renderer.read_image(frame).expect("draws").rgba));
     for seed in 0..30 {
         let bounds = copied.deform(&scenes::state(&scene, seed)).expect("deforms").bounds;
         renderer.upload(&to_fill, copied.surface().expect("copies")).expect("uploads");
@@ -138,8 +144,8 @@ fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let (mut renderer, device, scene) = stage();
     let small = renderer.load(&scenes::scene(&[(4, 0)], 1, true, false)).expect("loads");
     let good = renderer.load(&scene).expect("loads");
-    let unknown = GlBuffers { positions: 999_999, normals: 999_998, tangents: Some(999_997) };
-    let without_tangents = GlBuffers { tangents: None, ..shared(&good) };
+    let unknown = GlVertexBuffers { positions: 999_999, normals: 999_998, tangents: Some(999_997) };
+    let without_tangents = GlVertexBuffers { tangents: None, ..shared(&good) };
     for buffers in [shared(&small), unknown, without_tangents] {
         let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers)).expect("a deformer");
         assert!(!deformer.shares_buffers(), "{buffers:?}");

@@ -2,6 +2,7 @@
 //! them with `--include-ignored --test-threads=1`. The binary needs no build tree; real inputs come from
 //! MODALCAST_DATA.
 
+mod accuracy;
 mod batch;
 #[path = "../both/mod.rs"]
 mod both;
@@ -11,11 +12,10 @@ mod ensembles;
 mod extremes;
 mod gl;
 mod interop;
-mod judge;
 mod light;
 mod normals;
 mod overlap;
-mod paths;
+mod raster_backends;
 mod raster_gl;
 mod real;
 mod scenes;

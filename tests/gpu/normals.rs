@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, Role};
-use modalcast_compute::reference::{exact_normals, exact_tangents, orient_normals, orient_tangents};
+use modalcast_compute::gpu::{BufferRole, CudaDeformer};
+use modalcast_compute::reference::{exact_normals, exact_tangents, rigid_normals, rigid_tangents};
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Transform};
-use modalcast_model::scene::{Normals, Scene, State};
+use modalcast_model::scene::{NormalMethod, Scene, SceneState};
 use nalgebra::Vector3;
 
-use crate::judge::{DIRECTION, largest_error, same_bits};
+use crate::accuracy::{DIRECTION, largest_error, same_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random, domain};
 use crate::twins::deformer;
 
@@ -51,7 +51,7 @@ fn tube(random: &mut Random, around: u32, rows: u32, rank: usize) -> Shape {
 fn scene_of(shapes: Vec<Shape>, instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
     let count = shapes.len();
     let mut parts = scenes::parts(shapes);
-    parts.deformation.normals = Normals::Exact;
+    parts.deformation.normals = NormalMethod::Exact;
     parts.rigid_transforms = rigid;
     let material = if normal_maps { NORMAL_MAPPED } else { 0 };
     parts.domains = (0..instances * count).map(|index| domain(index % count, material)).collect();
@@ -66,7 +66,7 @@ struct Both {
     want_tangents: Vec<[f64; 4]>,
 }
 
-fn both(scene: &Scene, state: &State, deformer: &mut CudaDeformer) -> Both {
+fn both(scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) -> Both {
     deformer.deform(state).expect("deforms");
     let surface = deformer.surface().expect("copies");
     let positions: Vec<[f64; 3]> =
@@ -90,13 +90,13 @@ fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
 }
 
 /// Compares the device with the twin, and with rigid normals as a control.
-fn check(name: &str, scene: &Scene, state: &State, deformer: &mut CudaDeformer) {
+fn check(name: &str, scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) {
     let both = both(scene, state, deformer);
     let normal = largest_error(&both.normals, &both.want_normals, DIRECTION);
     let normal = normal.unwrap_or_else(|error| panic!("{name}: normal {error}"));
     let tangent = largest_error(&both.tangents, &both.want_tangents, DIRECTION);
     let tangent = tangent.unwrap_or_else(|error| panic!("{name}: tangent {error}"));
-    let rigid = largest_angle(&both.normals, &orient_normals(scene, state));
+    let rigid = largest_angle(&both.normals, &rigid_normals(scene, state));
     assert!(rigid > 5.0, "{name}: rigid normals are only {rigid} degrees off");
     let off = largest_angle(&both.normals, &both.want_normals);
     eprintln!("{name}: normal {normal:.2e} ({off:.1e} degrees), tangent {tangent:.2e}; rigid ones {rigid:.1} degrees");
@@ -115,7 +115,7 @@ fn test_scenes_bend_but_do_not_fold() {
             let surface = cpu.surface().expect("a surface");
             let positions = modalcast_compute::reference::deform(&scene, &state);
             let want = exact_normals(&scene, &state, &positions);
-            let turned = largest_angle(&surface.normals, &orient_normals(&scene, &state));
+            let turned = largest_angle(&surface.normals, &rigid_normals(&scene, &state));
             assert!((5.0..150.0).contains(&turned), "{turned} degrees");
             assert!(largest_angle(&surface.normals, &want) < 0.01);
         }
@@ -133,7 +133,7 @@ fn gpu_exact_normals_equal_their_twin() {
         let scene = scene_of(shapes.clone(), 4, normal_maps, rigid);
         let mut deformer = deformer(&scene);
         assert!(deformer.plan().kernels.iter().any(|kernel| kernel.name == "normals"));
-        assert!(deformer.plan().bytes(Role::Rings) > 0);
+        assert!(deformer.plan().bytes(BufferRole::RingTables) > 0);
         let name = format!("normal maps {normal_maps}, rigid {rigid}");
         check(&name, &scene, &scenes::state(&scene, 5), &mut deformer);
         assert_eq!(deformer.surface().expect("copies").tangents.is_empty(), !normal_maps);
@@ -158,7 +158,7 @@ fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
         let want: Vec<[f64; 1]> = want[first..][..count].iter().map(|number| [*number]).collect();
         largest_error(&got[first..][..count], &want, limit).unwrap_or_else(|error| panic!("domain {at}: {error}"));
     };
-    let (normals, tangents) = (orient_normals(&scene, &state).into_flattened(), orient_tangents(&scene, &state));
+    let (normals, tangents) = (rigid_normals(&scene, &state).into_flattened(), rigid_tangents(&scene, &state));
     let tangents = tangents.into_flattened();
     for at in 0..scene.domains.len() {
         let limit = if at % 2 == 0 { 1e-3 } else { DIRECTION };
@@ -168,7 +168,7 @@ fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     state.q.fill(1.0);
     deformer.deform(&state).expect("deforms");
     let bent = &deformer.surface().expect("copies").normals;
-    assert!(largest_angle(bent, &orient_normals(&scene, &state)) > 5.0, "the judge can fail");
+    assert!(largest_angle(bent, &rigid_normals(&scene, &state)) > 5.0, "the judge can fail");
 }
 
 /// Bits do not depend on earlier steps or on the place of an instance in the packing.
@@ -184,7 +184,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
         state.q[scene.layout.slots[at].first_q..][..5].copy_from_slice(&q);
     }
     let mut deformer = deformer(&scene);
-    let mut run = |state: &State| {
+    let mut run = |state: &SceneState| {
         deformer.deform(state).expect("deforms");
         deformer.surface().expect("copies").clone()
     };
@@ -230,7 +230,7 @@ fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
     for scale in [1e-40, 1e-30, 1e-20, 1.0, 1e18, 1e30, 1e37_f32] {
         for far in [0.0, 1e7] {
             for q in [0.0, 0.7, 1e30, -3e38] {
-                let mut state = State::rest(&scene);
+                let mut state = SceneState::rest(&scene);
                 state.q.fill(q);
                 state.transforms[0] =
                     Transform([scale, 0.0, 0.0, far, 0.0, -scale, 0.5 * scale, -far, 0.2 * scale, 0.0, scale, far]);
@@ -257,14 +257,14 @@ fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
 fn gpu_exact_normals_of_a_million_corners_equal_the_twin() {
     let mut random = Random(6);
     let shape = tube(&mut random, 700, 720, 8);
-    let mut times = [Normals::Rigid, Normals::Exact].map(|normals| {
+    let mut times = [NormalMethod::Rigid, NormalMethod::Exact].map(|normals| {
         let mut parts = scenes::parts(vec![shape.clone()]);
         parts.deformation.normals = normals;
         parts.domains = vec![domain(0, 0)];
         let scene = Scene::new(parts).expect("a scene");
         let state = scenes::state(&scene, 10);
         let mut deformer = deformer(&scene);
-        if normals == Normals::Exact {
+        if normals == NormalMethod::Exact {
             check("a million corners", &scene, &state, &mut deformer);
         }
         let mut times: Vec<f64> = (0..50).map(|_| deformer.deform(&state).expect("deforms").ms).collect();

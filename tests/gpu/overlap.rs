@@ -3,22 +3,22 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, MOST_UNDER_WAY};
-use modalcast_model::deform::{Deformer, Fetch, Surface, Wanted};
-use modalcast_model::domain::{Domain, Follow};
+use modalcast_compute::gpu::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
+use modalcast_model::deform::{DeformedSurface, Deformer, VertexAttributes, VertexReadback};
+use modalcast_model::domain::{Domain, FollowConstraint};
 use modalcast_model::error::Error;
-use modalcast_model::scene::{Deformation, Normals, Scene, State, Storage};
+use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneState, StorageType};
 
+use crate::accuracy::{check, same_bits};
 use crate::both::readers::kept;
 use crate::both::{self, changes};
-use crate::judge::{check, same_bits};
 use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
 const STEPS: usize = 50;
 
 /// Sixty domains: some of several tiles, some of few quads, some without modes.
-fn crowd(deformation: Deformation) -> Arc<Scene> {
+fn crowd(deformation: DeformationSettings) -> Arc<Scene> {
     let mut random = Random(70);
     let mut shapes: Vec<_> = (0..16).map(|at| both::strip(&mut random, 5 + at % 9, at % 5)).collect();
     shapes.push(scenes::shape(&mut random, 900, 33));
@@ -27,12 +27,14 @@ fn crowd(deformation: Deformation) -> Arc<Scene> {
 }
 
 /// Sixty domains: the first twenty are transform roots, and each other domain follows one of them.
-fn following(deformation: Deformation) -> Arc<Scene> {
+fn following(deformation: DeformationSettings) -> Arc<Scene> {
     let mut random = Random(73);
     let mut parts = scenes::parts((0..20).map(|at| both::strip(&mut random, 5 + 20 * at, at % 3)).collect());
     parts.deformation = deformation;
-    let follow =
-        |at: usize, random: &mut Random| Follow { parent: at % 20, frame: random.similarity(at.is_multiple_of(2)) };
+    let follow = |at: usize, random: &mut Random| FollowConstraint {
+        parent: at % 20,
+        frame: random.similarity(at.is_multiple_of(2)),
+    };
     let domain = |at: usize| Domain {
         name: format!("domain {at}"),
         follows: (at >= 20).then(|| follow(at, &mut random)),
@@ -49,7 +51,7 @@ fn some(scene: &Scene, random: &mut Random) -> Vec<u32> {
 }
 
 /// A sequence of states with random lists of changes; every 17th marks every domain as changed.
-fn states(scene: &Scene) -> Vec<State> {
+fn states(scene: &Scene) -> Vec<SceneState> {
     let mut random = Random(71);
     let mut state = scenes::state(scene, 72);
     let next = |at: usize| {
@@ -61,7 +63,7 @@ fn states(scene: &Scene) -> Vec<State> {
         }
         changes::apply(scene, &mut state, &mut random, (&q, &transforms));
         if at % 17 == 16 {
-            state.touch();
+            state.mark_all_dirty();
         }
         state.clone()
     };
@@ -69,18 +71,18 @@ fn states(scene: &Scene) -> Vec<State> {
 }
 
 /// Surfaces of each step, computed in full and read before the next step.
-fn plainly(scene: &Arc<Scene>, states: &[State]) -> Vec<Surface> {
+fn plainly(scene: &Arc<Scene>, states: &[SceneState]) -> Vec<DeformedSurface> {
     let mut deformer = deformer(scene);
-    let mut show = |state: &State| {
+    let mut show = |state: &SceneState| {
         let mut whole = state.clone();
-        whole.touch();
+        whole.mark_all_dirty();
         deformer.deform(&whole).expect("deforms");
         deformer.surface().expect("copies").clone()
     };
     states.iter().map(&mut show).collect()
 }
 
-fn is(got: &Surface, want: &Surface) -> bool {
+fn is(got: &DeformedSurface, want: &DeformedSurface) -> bool {
     same_bits(&got.positions, &want.positions)
         && same_bits(&got.normals, &want.normals)
         && same_bits(&got.displacements, &want.displacements)
@@ -90,19 +92,19 @@ fn is(got: &Surface, want: &Surface) -> bool {
 
 /// Reads fetches in order and compares each with the step in which it was started.
 struct Reader<'a> {
-    want: &'a [Surface],
-    waiting: VecDeque<(usize, Fetch)>,
+    want: &'a [DeformedSurface],
+    waiting: VecDeque<(usize, VertexReadback)>,
     read: usize,
 }
 
 impl Reader<'_> {
     fn read(&mut self, deformer: &mut CudaDeformer, behind: usize) {
         while self.waiting.len() > behind {
-            let Some((step, fetch)) = self.waiting.pop_front() else { break };
-            let surface = deformer.fetched(&fetch).expect("arrives");
+            let Some((step, readback)) = self.waiting.pop_front() else { break };
+            let surface = deformer.wait_readback(&readback).expect("arrives");
             assert!(is(&surface, &self.want[step]), "step {step}");
             // A second read returns the same memory.
-            assert!(Arc::ptr_eq(&surface, &deformer.fetched(&fetch).expect("is there")));
+            assert!(Arc::ptr_eq(&surface, &deformer.wait_readback(&readback).expect("is there")));
             let other = (step + STEPS / 2) % self.want.len();
             assert!(!is(&surface, &self.want[other]), "the judge can fail");
             self.read += 1;
@@ -110,17 +112,17 @@ impl Reader<'_> {
     }
 }
 
-fn deformations() -> Vec<Deformation> {
-    let plain = |storage| Deformation { storage, ..Deformation::default() };
-    let exact = Deformation { normals: Normals::Exact, ..plain(Storage::F32) };
-    let truncated = Deformation { truncation: Some(1e-9), ..plain(Storage::F32) };
-    vec![plain(Storage::F32), exact, plain(Storage::Int8), truncated, kept(plain(Storage::F32))]
+fn deformations() -> Vec<DeformationSettings> {
+    let plain = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
+    let exact = DeformationSettings { normals: NormalMethod::Exact, ..plain(StorageType::F32) };
+    let truncated = DeformationSettings { truncation: Some(1e-9), ..plain(StorageType::F32) };
+    vec![plain(StorageType::F32), exact, plain(StorageType::Int8), truncated, kept(plain(StorageType::F32))]
 }
 
 /// Scenes of all deformations, some of them also with followers.
 fn all_scenes() -> Vec<Arc<Scene>> {
-    let exact = Deformation { normals: Normals::Exact, ..Deformation::default() };
-    let followed = [Deformation::default(), exact, kept(Deformation::default())].map(following);
+    let exact = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
+    let followed = [DeformationSettings::default(), exact, kept(DeformationSettings::default())].map(following);
     deformations().into_iter().map(crowd).chain(followed).collect()
 }
 
@@ -139,9 +141,9 @@ fn gpu_overlapped_reads_equal_blocking_reads() {
                 deformer.deform(state).expect("deforms");
                 // Some steps are fetched and never read, some are not fetched.
                 match step % 7 {
-                    3 => drop(deformer.fetch(Wanted::ALL).expect("begins")),
+                    3 => drop(deformer.readback(VertexAttributes::ALL).expect("begins")),
                     5 => {}
-                    _ => reader.waiting.push_back((step, deformer.fetch(Wanted::ALL).expect("begins"))),
+                    _ => reader.waiting.push_back((step, deformer.readback(VertexAttributes::ALL).expect("begins"))),
                 }
                 reader.read(&mut deformer, late);
             }
@@ -157,8 +159,8 @@ fn gpu_overlapped_reads_equal_blocking_reads() {
     }
 }
 
-fn without_tangents(surface: &Surface) -> Surface {
-    Surface { tangents: vec![], ..surface.clone() }
+fn without_tangents(surface: &DeformedSurface) -> DeformedSurface {
+    DeformedSurface { tangents: vec![], ..surface.clone() }
 }
 
 #[test]
@@ -174,20 +176,20 @@ fn gpu_two_steps_in_flight_keep_their_own_results() {
         assert_ne!(bounds[0], bounds[STEPS - 1], "the judge can fail");
         let mut deformer = deformer(&scene);
         let mut reader = Reader { want: &want, waiting: VecDeque::new(), read: 0 };
-        for step in 0..STEPS + MOST_UNDER_WAY {
-            if step >= MOST_UNDER_WAY {
+        for step in 0..STEPS + MAX_STEPS_IN_FLIGHT {
+            if step >= MAX_STEPS_IN_FLIGHT {
                 let told = deformer.finish().expect("ends").bounds;
-                assert_eq!(told, bounds[step - MOST_UNDER_WAY], "step {}", step - MOST_UNDER_WAY);
+                assert_eq!(told, bounds[step - MAX_STEPS_IN_FLIGHT], "step {}", step - MAX_STEPS_IN_FLIGHT);
             }
             if step < STEPS {
                 deformer.submit(&states[step]).expect("starts");
-                reader.waiting.push_back((step, deformer.fetch(Wanted::ALL).expect("begins")));
+                reader.waiting.push_back((step, deformer.readback(VertexAttributes::ALL).expect("begins")));
             }
-            reader.read(&mut deformer, MOST_UNDER_WAY);
+            reader.read(&mut deformer, MAX_STEPS_IN_FLIGHT);
         }
         reader.read(&mut deformer, 0);
         assert_eq!(reader.read, STEPS);
-        if scene.deformation == Deformation::default() && !scene.needs.followers {
+        if scene.deformation == DeformationSettings::default() && !scene.needs.followers {
             check("after it all", &scene, &scenes::state(&scene, 5), &mut deformer);
         }
     }
@@ -197,46 +199,46 @@ fn gpu_two_steps_in_flight_keep_their_own_results() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_steps_after_a_fault_are_computed_in_full() {
-    let scene = crowd(Deformation::default());
+    let scene = crowd(DeformationSettings::default());
     let states = states(&scene);
     let want = plainly(&scene, &states);
     let mut deformer = deformer(&scene);
     for step in 0..STEPS {
         deformer.submit(&states[step]).expect("starts");
-        let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+        let readback = deformer.readback(VertexAttributes::ALL).expect("begins");
         if step % 5 == 4 {
             // As after a failed step: no result counts as complete.
-            deformer.forget();
-            assert!(matches!(deformer.fetch(Wanted::ALL), Err(Error::Fault { .. })), "nothing is whole");
+            deformer.invalidate();
+            assert!(matches!(deformer.readback(VertexAttributes::ALL), Err(Error::Fault { .. })), "nothing is whole");
             assert!(matches!(deformer.finish(), Err(Error::Fault { .. })), "nothing is under way");
         } else {
             deformer.finish().expect("ends");
         }
-        assert!(is(&deformer.fetched(&fetch).expect("arrives"), &want[step]), "step {step}");
+        assert!(is(&deformer.wait_readback(&readback).expect("arrives"), &want[step]), "step {step}");
     }
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_invalid_call_sequences_are_refused() {
-    let scene = crowd(Deformation::default());
+    let scene = crowd(DeformationSettings::default());
     let states = states(&scene);
     let want = plainly(&scene, &states[..3]);
     let (mut one, mut other) = (deformer(&scene), deformer(&scene));
-    assert!(matches!(one.fetch(Wanted::VERTICES), Err(Error::Fault { .. })), "nothing was deformed");
+    assert!(matches!(one.readback(VertexAttributes::VERTICES), Err(Error::Fault { .. })), "nothing was deformed");
     assert!(matches!(one.finish(), Err(Error::Fault { .. })));
     one.submit(&states[0]).expect("starts");
     one.submit(&states[1]).expect("starts");
-    assert!(matches!(one.submit(&states[2]), Err(Error::Busy { limit: MOST_UNDER_WAY, .. })));
+    assert!(matches!(one.submit(&states[2]), Err(Error::Busy { limit: MAX_STEPS_IN_FLIGHT, .. })));
     // A blocking step waits for the steps before it.
     one.deform(&states[2]).expect("deforms");
     other.deform(&states[0]).expect("deforms");
-    let strange = other.fetch(Wanted::VERTICES).expect("begins");
-    assert!(matches!(one.fetched(&strange), Err(Error::Fault { .. })));
-    let own = one.fetch(Wanted::VERTICES).expect("begins");
-    assert!(is(&one.fetched(&own).expect("arrives"), &want[2]));
+    let strange = other.readback(VertexAttributes::VERTICES).expect("begins");
+    assert!(matches!(one.wait_readback(&strange), Err(Error::Fault { .. })));
+    let own = one.readback(VertexAttributes::VERTICES).expect("begins");
+    assert!(is(&one.wait_readback(&own).expect("arrives"), &want[2]));
     // Data that were read outlive the deformer.
-    let kept = other.fetched(&strange).expect("arrives");
+    let kept = other.wait_readback(&strange).expect("arrives");
     drop(other);
     assert!(is(&kept, &want[0]));
 }
@@ -244,7 +246,7 @@ fn gpu_invalid_call_sequences_are_refused() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_second_output_exists_only_for_overlapped_reads() {
-    let scene = crowd(Deformation::default());
+    let scene = crowd(DeformationSettings::default());
     let states = states(&scene);
     let mut deformer = deformer(&scene);
     for state in &states[..10] {
@@ -253,40 +255,40 @@ fn gpu_second_output_exists_only_for_overlapped_reads() {
     assert_eq!(deformer.outputs(), 1, "nobody reads");
     for state in &states[10..20] {
         deformer.deform(state).expect("deforms");
-        let fetch = deformer.fetch(Wanted::ALL).expect("begins");
-        deformer.fetched(&fetch).expect("arrives");
+        let readback = deformer.readback(VertexAttributes::ALL).expect("begins");
+        deformer.wait_readback(&readback).expect("arrives");
         deformer.surface().expect("copies");
     }
     assert_eq!(deformer.outputs(), 1, "every step is read before the next");
-    let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+    let readback = deformer.readback(VertexAttributes::ALL).expect("begins");
     deformer.deform(&states[20]).expect("deforms");
     assert_eq!(deformer.outputs(), 1, "it was waited for already");
-    deformer.fetched(&fetch).expect("is there");
-    let fetch = deformer.fetch(Wanted::ALL).expect("begins");
+    deformer.wait_readback(&readback).expect("is there");
+    let readback = deformer.readback(VertexAttributes::ALL).expect("begins");
     deformer.deform(&states[21]).expect("deforms");
     assert_eq!(deformer.outputs(), 2);
-    deformer.fetched(&fetch).expect("arrives");
+    deformer.wait_readback(&readback).expect("arrives");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_box_and_displacement_readers_need_no_second_output() {
-    let scene = following(kept(Deformation::default()));
+    let scene = following(kept(DeformationSettings::default()));
     let states = states(&scene);
     let want = plainly(&scene, &states);
     let mut deformer = deformer(&scene);
-    let wanted = Wanted { displacements: true, boxes: true, ..Wanted::default() };
-    let mut before: Option<(usize, Fetch)> = None;
+    let wanted = VertexAttributes { displacements: true, boxes: true, ..VertexAttributes::default() };
+    let mut before: Option<(usize, VertexReadback)> = None;
     for (step, state) in states.iter().enumerate() {
         deformer.deform(state).expect("deforms");
-        let fetch = deformer.fetch(wanted).expect("begins");
-        assert!(fetch.is_ready());
-        if let Some((step, fetch)) = before.replace((step, fetch)) {
-            let got = deformer.fetched(&fetch).expect("is there");
-            let alone = Surface {
+        let readback = deformer.readback(wanted).expect("begins");
+        assert!(readback.is_ready());
+        if let Some((step, readback)) = before.replace((step, readback)) {
+            let got = deformer.wait_readback(&readback).expect("is there");
+            let alone = DeformedSurface {
                 displacements: want[step].displacements.clone(),
                 boxes: want[step].boxes.clone(),
-                ..Surface::default()
+                ..DeformedSurface::default()
             };
             assert!(is(&got, &alone), "step {step}");
             assert!(got.boxes != want[(step + STEPS / 2) % STEPS].boxes, "the judge can fail");
@@ -294,10 +296,10 @@ fn gpu_box_and_displacement_readers_need_no_second_output() {
         assert_eq!(deformer.outputs(), 1, "nobody reads an output");
     }
     // Only positions are copied, and the fetch waits for nothing else.
-    let positions = Wanted { positions: true, ..Wanted::default() };
-    let fetch = deformer.fetch(positions).expect("begins");
+    let positions = VertexAttributes { positions: true, ..VertexAttributes::default() };
+    let readback = deformer.readback(positions).expect("begins");
     deformer.deform(&states[0]).expect("deforms");
     assert_eq!(deformer.outputs(), 2);
-    let got = deformer.fetched(&fetch).expect("arrives");
+    let got = deformer.wait_readback(&readback).expect("arrives");
     assert!(same_bits(&got.positions, &want[STEPS - 1].positions) && got.normals.is_empty() && got.boxes.is_empty());
 }

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, Device, GlBuffers, GlRaster};
-use modalcast_compute::reference::raster::Raster;
+use modalcast_compute::gpu::{CudaDeformer, CudaRasterizer, Device, GlVertexBuffers};
+use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::deform::Deformer as _;
-use modalcast_model::raster::{CutOuts, GlBuffer, Mesh, Rasteriser};
-use modalcast_model::scene::{Faces, Group, Window};
+use modalcast_model::raster::{CutOuts, GlBuffer, RasterGeometry, Rasterizer};
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 use crate::both::cut_outs::plain_holes;
 use crate::both::soups::{Soup, flat, soups};
@@ -25,32 +25,32 @@ impl Stage {
         Self { device: Device::open(0).expect("a CUDA device"), gl }
     }
 
-    fn raster(&self, soup: &Soup, cut_outs: Option<CutOuts>) -> (GlRaster, GlBuffer) {
+    fn raster(&self, soup: &Soup, cut_outs: Option<CutOuts>) -> (CudaRasterizer, GlBuffer) {
         let positions = self.gl.filled(&soup.positions);
         let mesh = mesh(positions, soup, cut_outs);
-        (GlRaster::new(&self.device, mesh).expect("a rasteriser"), positions)
+        (CudaRasterizer::new(&self.device, mesh).expect("a rasteriser"), positions)
     }
 
-    fn ids(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u64> {
+    fn ids(&self, raster: &mut CudaRasterizer, window: &Viewport, into: GlBuffer) -> Vec<u64> {
         raster.draw(None, Some((window, into))).expect("draws");
-        self.gl.read(into, window.pixels())
+        self.gl.read(into, window.pixel_count())
     }
 
     /// Depths as bits.
-    fn depth(&self, raster: &mut GlRaster, window: &Window, into: GlBuffer) -> Vec<u32> {
+    fn depth(&self, raster: &mut CudaRasterizer, window: &Viewport, into: GlBuffer) -> Vec<u32> {
         raster.draw(Some((window, into)), None).expect("draws");
-        self.gl.read(into, window.pixels())
+        self.gl.read(into, window.pixel_count())
     }
 }
 
-fn mesh(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) -> Mesh {
-    Mesh { positions, triangles: soup.triangles.clone(), groups: soup.groups.clone(), cut_outs }
+fn mesh(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) -> RasterGeometry {
+    RasterGeometry { positions, triangles: soup.triangles.clone(), groups: soup.groups.clone(), cut_outs }
 }
 
 /// Depths of all triangles with both faces, as in a depth-only pass.
 fn from_both_sides(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
-    let mut raster = Raster::new(soup.window);
-    let all = Group { first: 0, triangles: soup.triangles.len() as u32, faces: Faces::Both };
+    let mut raster = VisibilityBuffer::new(soup.window);
+    let all = DrawRange { first: 0, triangles: soup.triangles.len() as u32, faces: CullMode::None };
     match cut_outs {
         Some(cut_outs) => raster.draw_cut_out(&soup.positions, &soup.triangles, all, cut_outs),
         None => raster.draw(&soup.positions, &soup.triangles, all),
@@ -70,8 +70,8 @@ fn gpu_samples_have_the_bits_of_the_definition() {
     let mut backs = 0;
     for soup in soups() {
         let (mut raster, positions) = stage.raster(&soup, None);
-        let pixels = soup.window.pixels() as u64;
-        let (keys, depths) = (stage.gl.room(8 * pixels), stage.gl.room(4 * pixels));
+        let pixel_count = soup.window.pixel_count() as u64;
+        let (keys, depths) = (stage.gl.room(8 * pixel_count), stage.gl.room(4 * pixel_count));
         let (want, want_depths) = (soup.drawn(), from_both_sides(&soup, None));
         backs += differing(&want_depths, &want.depths().into_iter().map(f32::to_bits).collect::<Vec<_>>());
         for run in 0..3 {
@@ -94,10 +94,10 @@ fn gpu_uniform_cut_outs_have_the_bits_of_the_definition() {
     for holes in plain_holes() {
         let soup = &holes.soup;
         let (mut raster, _) = stage.raster(soup, Some(holes.cut_outs.clone()));
-        let pixels = soup.window.pixels() as u64;
-        let got = stage.ids(&mut raster, &soup.window, stage.gl.room(8 * pixels));
+        let pixel_count = soup.window.pixel_count() as u64;
+        let got = stage.ids(&mut raster, &soup.window, stage.gl.room(8 * pixel_count));
         assert_eq!(differing(&got, &holes.drawn().keys), 0, "{}", soup.name);
-        let got = stage.depth(&mut raster, &soup.window, stage.gl.room(4 * pixels));
+        let got = stage.depth(&mut raster, &soup.window, stage.gl.room(4 * pixel_count));
         assert_eq!(differing(&got, &from_both_sides(soup, Some(&holes.cut_outs))), 0, "{}, depth", soup.name);
     }
 }
@@ -108,7 +108,7 @@ fn gpu_positions_written_by_opengl_need_no_wait() {
     let stage = Stage::open();
     let mut soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
     let (mut raster, positions) = stage.raster(&soup, None);
-    let keys = stage.gl.room(8 * soup.window.pixels() as u64);
+    let keys = stage.gl.room(8 * soup.window.pixel_count() as u64);
     let mut before = Vec::new();
     for step in 0..20 {
         soup.positions
@@ -132,18 +132,18 @@ fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
     let (mut raster, _) = stage.raster(&soup, None);
     for (width, height) in [(64, 64), (640, 480), (640, 480), (33, 7), (1, 1), (640, 480)] {
         soup.window = flat(width, height);
-        let keys = stage.gl.room(8 * soup.window.pixels() as u64);
+        let keys = stage.gl.room(8 * soup.window.pixel_count() as u64);
         let want = soup.drawn();
         for _ in 0..2 {
             assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &want.keys), 0, "{width} x {height}");
         }
-        raster.forget(keys.name);
+        raster.release_target(keys.name);
         stage.gl.delete(keys);
     }
     // Targets larger than needed, and two targets that alternate without being forgotten.
-    let list = [0, 100].map(|more| stage.gl.room(8 * soup.window.pixels() as u64 + more));
+    let list = [0, 100].map(|more| stage.gl.room(8 * soup.window.pixel_count() as u64 + more));
     for keys in [list[0], list[1], list[0], list[1]] {
-        stage.gl.write(keys, &vec![0_u64; soup.window.pixels()]);
+        stage.gl.write(keys, &vec![0_u64; soup.window.pixel_count()]);
         assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &soup.drawn().keys), 0);
     }
 }
@@ -154,18 +154,20 @@ fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
 fn gpu_unknown_or_small_buffers_are_refused() {
     let stage = Stage::open();
     let soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
-    let pixels = soup.window.pixels() as u64;
+    let pixel_count = soup.window.pixel_count() as u64;
     let unknown = |bytes| GlBuffer { name: 999_999, bytes };
-    let refused = GlRaster::new(&stage.device, mesh(unknown(4 * soup.positions.len() as u64), &soup, None));
+    let refused = CudaRasterizer::new(&stage.device, mesh(unknown(4 * soup.positions.len() as u64), &soup, None));
     assert!(refused.expect_err("unknown").to_string().contains("999999"));
     let (mut raster, positions) = stage.raster(&soup, None);
-    raster.draw(None, Some((&soup.window, unknown(8 * pixels)))).expect_err("unknown");
-    let small = stage.gl.room(4 * pixels);
+    raster.draw(None, Some((&soup.window, unknown(8 * pixel_count)))).expect_err("unknown");
+    let small = stage.gl.room(4 * pixel_count);
     raster.draw(None, Some((&soup.window, small))).expect_err("too small, and it says so");
-    raster.draw(None, Some((&soup.window, GlBuffer { bytes: 8 * pixels, ..small }))).expect_err("smaller than it says");
+    raster
+        .draw(None, Some((&soup.window, GlBuffer { bytes: 8 * pixel_count, ..small })))
+        .expect_err("smaller than it says");
     let fewer = GlBuffer { bytes: 3 * 4 * 2, ..positions };
-    GlRaster::new(&stage.device, mesh(fewer, &soup, None)).expect_err("vertices that are not there");
-    let keys = stage.gl.room(8 * pixels);
+    CudaRasterizer::new(&stage.device, mesh(fewer, &soup, None)).expect_err("vertices that are not there");
+    let keys = stage.gl.room(8 * pixel_count);
     assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &soup.drawn().keys), 0, "after refusals");
     assert_eq!(differing(&stage.depth(&mut raster, &soup.window, small), &from_both_sides(&soup, None)), 0);
 }
@@ -177,20 +179,20 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
     let buffers = stage.gl.renderer.load(&scene).expect("loads");
     let modalcast_render::SharedBuffers { positions, normals, tangents } = buffers.shared;
-    let shared = GlBuffers { positions, normals, tangents };
+    let shared = GlVertexBuffers { positions, normals, tangents };
     let mut deformer = CudaDeformer::new(&stage.device, &scene, Some(shared)).expect("a deformer");
     assert!(deformer.shares_buffers(), "interop was refused");
     let list = scene.triangle_vertices();
-    let all = Group { first: 0, triangles: list.len() as u32, faces: Faces::Both };
+    let all = DrawRange { first: 0, triangles: list.len() as u32, faces: CullMode::None };
     let positions = GlBuffer { name: positions, bytes: 12 * scene.layout.vertices as u64 };
-    let mesh = Mesh { positions, triangles: list.clone(), groups: vec![all], cut_outs: None };
-    let mut raster = GlRaster::new(&stage.device, mesh).expect("a buffer that is registered twice");
+    let mesh = RasterGeometry { positions, triangles: list.clone(), groups: vec![all], cut_outs: None };
+    let mut raster = CudaRasterizer::new(&stage.device, mesh).expect("a buffer that is registered twice");
     let window = flat(300, 200);
-    let keys = stage.gl.room(8 * window.pixels() as u64);
+    let keys = stage.gl.room(8 * window.pixel_count() as u64);
     for seed in 0..10 {
         deformer.deform(&scenes::state(&scene, seed)).expect("deforms");
         let got = stage.ids(&mut raster, &window, keys);
-        let mut want = Raster::new(window);
+        let mut want = VisibilityBuffer::new(window);
         want.draw(&deformer.surface().expect("copies").positions, &list, all);
         assert_eq!(differing(&got, &want.keys), 0, "step {seed}");
         assert!(got.iter().any(|key| *key != u64::MAX), "something is seen");

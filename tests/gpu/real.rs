@@ -3,20 +3,20 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
-use crate::judge::check;
+use crate::accuracy::check;
 use crate::scenes::Random;
 use crate::twins::deformer;
 
 /// A state with random coordinates, scaled so that the largest displacement is 6 % of the rest diagonal.
-fn bent(scene: &Scene) -> State {
+fn bent(scene: &Scene) -> SceneState {
     let mut random = Random(8);
-    let mut state = State::rest(scene);
+    let mut state = SceneState::rest(scene);
     state.q.fill(0.0);
     let still = modalcast_compute::reference::deform(scene, &state);
     state.q.iter_mut().for_each(|coordinate| *coordinate = random.number());
-    let largest = |state: &State| {
+    let largest = |state: &SceneState| {
         let moved = modalcast_compute::reference::deform(scene, state);
         let distance = |(a, b): (&[f64; 3], &[f64; 3])| (0..3).map(|axis| (a[axis] - b[axis]).powi(2)).sum::<f64>();
         moved.iter().zip(&still).map(distance).fold(0.0, f64::max).sqrt()

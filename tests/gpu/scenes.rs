@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-use modalcast_model::scene::{Parts, Scene, State};
+use modalcast_model::scene::{Scene, SceneParts, SceneState};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 /// A small deterministic random generator (splitmix64).
@@ -63,7 +63,7 @@ pub(crate) fn domain(shape: usize, material: usize) -> Domain {
         shape,
         material,
         placement: Transform::IDENTITY,
-        runs: vec![],
+        material_ranges: vec![],
         attachment: None,
         follows: None,
         rest_q: Vec::new(),
@@ -76,8 +76,8 @@ pub(crate) fn domain(shape: usize, material: usize) -> Domain {
 pub(crate) const NORMAL_MAPPED: usize = 1;
 
 /// Parts with the shapes, two materials and no domains.
-pub(crate) fn parts(shapes: Vec<Shape>) -> Parts {
-    let mut parts = Parts::named("random");
+pub(crate) fn parts(shapes: Vec<Shape>) -> SceneParts {
+    let mut parts = SceneParts::named("random");
     parts.shapes = shapes;
     let mapped = Material { normal_texture: Some(0), ..Material::default() };
     parts.materials = vec![Material::default(), mapped];
@@ -100,9 +100,9 @@ pub(crate) fn scene(shapes: &[(usize, usize)], instances: usize, normal_maps: bo
 }
 
 /// A random state: every third domain is sheared if the scene allows it, and every third is mirrored.
-pub(crate) fn state(scene: &Scene, seed: u64) -> State {
+pub(crate) fn state(scene: &Scene, seed: u64) -> SceneState {
     let mut random = Random(seed);
-    let mut state = State::rest(scene);
+    let mut state = SceneState::rest(scene);
     state.q.iter_mut().for_each(|coordinate| *coordinate = random.number());
     for (index, transform) in state.transforms.iter_mut().enumerate() {
         *transform = match index % 3 {

@@ -1,11 +1,11 @@
 //! Runs the checks of `tests/both` on the device, and checks of scenes too large for the CPU tests.
 
 use modalcast::config::BackendChoice;
-use modalcast_compute::gpu::{CudaDeformer, Launch, Role};
-use modalcast_model::domain::{Domain, Follow};
-use modalcast_model::scene::{Deformation, Scene};
+use modalcast_compute::gpu::{BufferRole, CudaDeformer, KernelKind};
+use modalcast_model::domain::{Domain, FollowConstraint};
+use modalcast_model::scene::{DeformationSettings, Scene};
 
-use crate::both::{self, changes, extremes, following, neighbours, readers, refusal, surfaces, truncation};
+use crate::both::{self, changes, extremes, following, neighbors, readers, refusal, surfaces, truncation};
 use crate::scenes::{self, Random};
 use crate::twins::deformer;
 
@@ -95,7 +95,7 @@ fn gpu_partial_steps_have_the_bits_of_full_steps() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_domain_missing_from_the_list_does_not_move() {
-    assert!(changes::believes_lists(deformer));
+    assert!(changes::trusts_change_lists(deformer));
 }
 
 #[test]
@@ -132,7 +132,7 @@ fn gpu_displacement_overflow_refusal_names_the_domain() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_domain_has_the_same_bits_alone_and_among_others() {
-    neighbours::alone_and_among_others(deformer);
+    neighbors::alone_and_among_others(deformer);
 }
 
 #[test]
@@ -153,10 +153,14 @@ fn gpu_domain_of_four_million_vertices_is_within_its_bound() {
 fn gpu_two_hundred_thousand_domains_take_three_launches() {
     let mut random = Random(92);
     let shapes: Vec<_> = (0..200_000).map(|at| both::strip(&mut random, 7, at % 5)).collect();
-    let scene = both::scene_of(shapes, 1, Deformation::default(), false);
+    let scene = both::scene_of(shapes, 1, DeformationSettings::default(), false);
     let mut deformer = deformer(&scene);
     let plan = deformer.plan();
-    eprintln!("200,000 domains of 7: at most {} launches a step, {:?}", plan.launches(), plan.kernel(Launch::Deform));
+    eprintln!(
+        "200,000 domains of 7: at most {} launches a step, {:?}",
+        plan.launches(),
+        plan.kernel(KernelKind::Deform)
+    );
     assert_eq!(plan.launches(), 3);
     let mut state = scenes::state(&scene, 93);
     let shown = both::run(&mut deformer, &state);
@@ -166,7 +170,7 @@ fn gpu_two_hundred_thousand_domains_take_three_launches() {
     changes::apply(&scene, &mut state, &mut random, (&few, &few[..500]));
     let after = both::run(&mut deformer, &state);
     let mut whole = state.clone();
-    whole.touch();
+    whole.mark_all_dirty();
     assert_eq!(after.difference(&both::run(&mut deformer, &whole)), None);
     let moves = |domain: usize| {
         let first = 3 * scene.layout.slots[domain].first_vertex;
@@ -213,14 +217,18 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     for at in 0..201_000 {
         let parent = at % 1000;
         let frame = random.similarity(at % 5 == 0);
-        let follows = (at >= 1000).then_some(Follow { parent, frame });
+        let follows = (at >= 1000).then_some(FollowConstraint { parent, frame });
         let shape = if at < 1000 { 0 } else { 1 + at % 2 };
         parts.domains.push(Domain { name: format!("domain {at}"), follows, ..scenes::domain(shape, 0) });
     }
     let scene = Scene::new(parts).expect("a scene");
     let mut deformer = deformer(&scene);
     let plan = deformer.plan();
-    eprintln!("201,000 domains: {} bytes a step, {} bytes of frames", plan.bytes_in, plan.bytes(Role::Frames));
+    eprintln!(
+        "201,000 domains: {} bytes a step, {} bytes of frames",
+        plan.bytes_in,
+        plan.bytes(BufferRole::FollowerFrames)
+    );
     assert_eq!((plan.launches(), plan.bytes_in), (3, 112 + 48 * 1000 + 4 * 6000));
     let mut state = scenes::state(&scene, 95);
     let before = both::run(&mut deformer, &state);
@@ -229,7 +237,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     let after = both::run(&mut deformer, &state);
     both::within("200,000 leaves, some moved", (&scene, &state), &after.surface.positions, 0.0);
     let mut whole = state.clone();
-    whole.touch();
+    whole.mark_all_dirty();
     assert_eq!(after.difference(&both::run(&mut deformer, &whole)), None);
     let moves = |domain: usize| {
         let slot = scene.layout.slots[domain];

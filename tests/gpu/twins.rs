@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use modalcast_compute::gpu::{CudaDeformer, Device};
 use modalcast_model::deform::Deformer;
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
-use crate::judge::{check, same_bits};
+use crate::accuracy::{check, same_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
 pub(crate) fn deformer(scene: &Arc<Scene>) -> CudaDeformer {
@@ -63,7 +63,7 @@ fn gpu_a_million_vertices_equal_the_twin() {
     report("n 1,000,000 r 32", &mut deformer, &state);
 }
 
-fn report(name: &str, deformer: &mut CudaDeformer, state: &State) {
+fn report(name: &str, deformer: &mut CudaDeformer, state: &SceneState) {
     let mut times: Vec<f64> = (0..50).map(|_| deformer.deform(state).expect("deforms").ms).collect();
     times.sort_by(f64::total_cmp);
     eprintln!("{name}: {:.3} ms a step (median of 50, copies and waiting included)", times[25]);

@@ -1,9 +1,9 @@
 //! Alpha tests of cut-outs in the compute rasterizer, compared with geometry.
 
 use modalcast_compute::reference::raster::cut_out::{Footprint, alpha, footprint};
-use modalcast_compute::reference::raster::{Raster, corners};
-use modalcast_model::raster::{AlphaImage, CutOuts, Surface};
-use modalcast_model::scene::Window;
+use modalcast_compute::reference::raster::{VisibilityBuffer, corners};
+use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts};
+use modalcast_model::scene::Viewport;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::both::cut_outs::{floor, image, plain_holes, sheet};
@@ -11,7 +11,7 @@ use crate::both::soups::{flat, perspective};
 
 /// Texture coordinates at the point where the ray through a sample meets the plane of a triangle, in f64. The eye is
 /// that of [`perspective`], with a vertical field of view of 60 degrees.
-fn by_ray(window: &Window, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
+fn by_ray(window: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     let [width, height] = window.size().map(f64::from);
     let focal = 1.0 / 30.0_f64.to_radians().tan();
     let ray = Vector3::new((2.0 * x / width - 1.0) * width / height / focal, (1.0 - 2.0 * y / height) / focal, -1.0);
@@ -27,7 +27,7 @@ struct Case {
     triangle: [[f64; 3]; 3],
     uvs: [[f64; 2]; 3],
     pixel: [i32; 2],
-    window: Window,
+    window: Viewport,
 }
 
 impl Case {
@@ -108,8 +108,15 @@ fn degenerate_footprints_are_zero() {
 }
 
 fn of_image(image: AlphaImage) -> CutOuts {
-    let table = vec![Surface { alpha: 1.0, least: 0.5, image: Some(0) }];
-    CutOuts { first: 4, uvs: vec![[[0.0; 2]; 3]], surfaces: vec![0], table, images: vec![image], anisotropy: 1.0 }
+    let materials = vec![AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) }];
+    CutOuts {
+        first: 4,
+        uvs: vec![[[0.0; 2]; 3]],
+        material_indices: vec![0],
+        materials,
+        images: vec![image],
+        anisotropy: 1.0,
+    }
 }
 
 #[test]
@@ -159,12 +166,12 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
         let (soup, cut_outs) = (&holes.soup, &holes.cut_outs);
         // Whether each surface of the table keeps any sample.
         let keeps = [false, true, false, true, true, false, false];
-        let mut kept = Raster::new(soup.window);
+        let mut kept = VisibilityBuffer::new(soup.window);
         for group in &soup.groups {
             for triangle in group.first..group.first + group.triangles {
                 let own = triangle.checked_sub(cut_outs.first);
-                if own.is_none_or(|own| keeps[cut_outs.surfaces[own as usize] as usize]) {
-                    let one = modalcast_model::scene::Group { first: triangle, triangles: 1, faces: group.faces };
+                if own.is_none_or(|own| keeps[cut_outs.material_indices[own as usize] as usize]) {
+                    let one = modalcast_model::scene::DrawRange { first: triangle, triangles: 1, faces: group.faces };
                     kept.draw(&soup.positions, &soup.triangles, one);
                 }
             }

@@ -6,21 +6,21 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
-use modalcast_model::scene::{Parts, Scene, State};
+use modalcast_model::scene::{Scene, SceneParts, SceneState};
 
 use crate::tolerance::{Tolerance, first_wrong, largest_error};
 
 /// Deterministic pseudo-random numbers in -1 to 1.
-pub(crate) struct Noise(pub(crate) u64);
+pub(crate) struct TestRng(pub(crate) u64);
 
-impl Noise {
+impl TestRng {
     pub(crate) fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
     }
 }
 
-pub(crate) fn strip(vertices: usize, rank: usize, noise: &mut Noise) -> Shape {
+pub(crate) fn strip(vertices: usize, rank: usize, noise: &mut TestRng) -> Shape {
     let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let normals = rest.iter().map(|_| [noise.next(), noise.next(), noise.next() + 2.0]).collect();
     let uvs = rest.iter().map(|_| [noise.next(), noise.next()]).collect();
@@ -42,7 +42,7 @@ pub(crate) fn domain(shape: usize, name: String) -> Domain {
         placement: Transform::IDENTITY,
         attachment: None,
         follows: None,
-        runs: vec![],
+        material_ranges: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),
@@ -51,8 +51,8 @@ pub(crate) fn domain(shape: usize, name: String) -> Domain {
 
 /// A scene of strips with a normal map; each strip has n vertices and rank r, given as (n, r).
 fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
-    let mut noise = Noise(42);
-    let mut parts = Parts::named("strips");
+    let mut noise = TestRng(42);
+    let mut parts = SceneParts::named("strips");
     parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
     parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
     for (at, (vertices, rank)) in sizes.iter().enumerate() {
@@ -63,9 +63,9 @@ fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
 }
 
 /// A state with random coordinates q and sheared or mirrored transforms.
-pub(crate) fn shaken(scene: &Scene) -> State {
-    let mut noise = Noise(7);
-    let mut state = State::rest(scene);
+pub(crate) fn shaken(scene: &Scene) -> SceneState {
+    let mut noise = TestRng(7);
+    let mut state = SceneState::rest(scene);
     state.q.iter_mut().for_each(|number| *number = noise.next());
     for transform in &mut state.transforms {
         transform.0.iter_mut().for_each(|number| *number += 0.7 * noise.next());
@@ -88,9 +88,9 @@ fn cpu_equals_twin_for_all_sizes_ranks_shears_and_mirrors() {
     let error = largest_error(&surface.positions, &want) / diagonal;
     assert!(error <= 1e-6, "positions are off by {error} of the diagonal");
     let loose = Tolerance { abs: 2e-5, rel: 0.0 };
-    let normals = reference::orient_normals(&scene, &state).into_flattened();
+    let normals = reference::rigid_normals(&scene, &state).into_flattened();
     assert_eq!(first_wrong(&surface.normals, &normals, loose), None);
-    let tangents = reference::orient_tangents(&scene, &state).into_flattened();
+    let tangents = reference::rigid_tangents(&scene, &state).into_flattened();
     assert_eq!(first_wrong(&surface.tangents, &tangents, loose), None);
     for point in &want {
         let slack = 1e-6 * diagonal;
@@ -106,7 +106,7 @@ fn wrong_q_transform_or_missing_mode_is_detected() {
     let state = shaken(&scene);
     let want = reference::deform(&scene, &state);
     let mut cpu = CpuDeformer::new(&scene);
-    let mut spoil = |change: &dyn Fn(&mut State)| {
+    let mut spoil = |change: &dyn Fn(&mut SceneState)| {
         let mut wrong = state.clone();
         change(&mut wrong);
         cpu.deform(&wrong).expect("deforms");
@@ -123,7 +123,7 @@ fn twin_is_linear_in_q() {
     let scene = strips(&[(50, 6)]);
     let modes = &scene.shape_of(0).modes;
     let rest = scene.shape_of(0).mesh.rest();
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     let still = reference::deform(&scene, &state);
     state.q[4] = 1.0;
     let one = reference::deform(&scene, &state);
@@ -142,14 +142,14 @@ fn twin_is_linear_in_q() {
 /// The normal of a sheared plane stays orthogonal to it. The control shows that the untransformed normal does not.
 #[test]
 fn normals_stay_orthogonal_to_a_sheared_plane() {
-    let mut parts = Parts::named("plane");
+    let mut parts = SceneParts::named("plane");
     let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
-    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a plane");
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a plane");
     parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
     parts.materials = vec![Material::default()];
     parts.domains = vec![domain(0, "plane".into())];
     let scene = Scene::new(parts).expect("a scene");
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     // z += x tilts the plane about y. Transforming the normal by A itself would leave it upright.
     state.transforms[0].0[8] = 1.0;
     let mut cpu = CpuDeformer::new(&scene);
@@ -166,7 +166,7 @@ fn only_overflow_makes_bounds_non_finite() {
     let scene = strips(&[(40, 3), (9, 0)]);
     let mut cpu = CpuDeformer::new(&scene);
     let mut bounds = |amount: f32| {
-        let mut state = State::rest(&scene);
+        let mut state = SceneState::rest(&scene);
         state.q.fill(amount);
         cpu.deform(&state).expect("deforms").bounds
     };
@@ -179,8 +179,8 @@ fn only_overflow_makes_bounds_non_finite() {
 /// Repeated steps give the same bits. Vertices whose rows of U are zero stay bit-equal to their positions at q = 0.
 #[test]
 fn runs_are_bit_identical_and_zero_rows_do_not_move() {
-    let mut parts = Parts::named("clamped");
-    let mut shape = strip(300, 8, &mut Noise(3));
+    let mut parts = SceneParts::named("clamped");
+    let mut shape = strip(300, 8, &mut TestRng(3));
     let mut columns = shape.modes.columns().to_vec();
     for mode in 0..8 {
         columns[900 * mode..][..30].fill(0.0);
@@ -191,13 +191,13 @@ fn runs_are_bit_identical_and_zero_rows_do_not_move() {
     parts.domains = vec![domain(0, "clamped".into())];
     let scene = Scene::new(parts).expect("a scene");
     let mut cpu = CpuDeformer::new(&scene);
-    let mut run = |state: &State| {
+    let mut run = |state: &SceneState| {
         cpu.deform(state).expect("deforms");
         cpu.surface().expect("a surface").positions.clone()
     };
-    let still = run(&State::rest(&scene));
+    let still = run(&SceneState::rest(&scene));
     let mut state = shaken(&scene);
-    state.transforms = State::rest(&scene).transforms;
+    state.transforms = SceneState::rest(&scene).transforms;
     let moved = run(&state);
     assert_eq!(moved, run(&state));
     assert_eq!(moved[..30], still[..30]);

@@ -8,7 +8,7 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use v1::TransformFormat::{AffineF32, RigidF32, RigidF64, Unspecified};
 
 use crate::service_harness::{
-    Got, Server, config, expected, far_strips, get_vertices, rigid_step, state_after, step, strips,
+    ReceivedVertices, Server, config, expected, far_strips, get_vertices, rigid_step, state_after, step, strips,
 };
 
 /// Placement of one domain: quaternion x y z w and translation.
@@ -41,7 +41,7 @@ fn truth(scene: &Scene, domain: usize, q: &[f32], (rotation, translation): Place
 }
 
 /// World positions in meters, decoded from the reply.
-fn told(scene: &Scene, got: &Got) -> Vec<Vector3<f64>> {
+fn told(scene: &Scene, got: &ReceivedVertices) -> Vec<Vector3<f64>> {
     let mut points = got.positions.chunks_exact(3);
     let mut world = Vec::new();
     for (place, vertices) in got.head.vertices.iter().enumerate() {
@@ -88,7 +88,7 @@ async fn transform_formats_agree_at_any_byte_alignment() {
         // An odd number of bytes before the transforms changes their alignment within the message.
         step.q_domains = vec![0; usize::from(number % 2 == 1)];
         step.q = vec![0; 8 * step.q_domains.len()].into();
-        driver.acked(step).await;
+        driver.step_acknowledged(step).await;
         let got = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
         assert_eq!((&got.positions, &got.normals), (&want.0, &want.1), "step {number}");
         assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0));
@@ -105,13 +105,13 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
     server.open("far").await;
     let mut driver = server.drive("far", v1::Policy::Lossless, 0).await;
     let q = [0.25, -0.5, 0.125, 0.75_f32];
-    driver.acked(step(0, &[], &q)).await;
+    driver.step_acknowledged(step(0, &[], &q)).await;
     // In half meters from the world origin. The first domain is near the scene origin, the second is 10,000 km east of
     // it.
-    let home = scene.origin.map(|metres| metres / scene.unit);
+    let home = scene.origin.map(|meters| meters / scene.unit);
     let near = (turn(0.1, 0.2, 0.3), [home[0] + 3.001, home[1] - 2.003, home[2] + 0.007]);
     let away = (turn(-1.0, 0.5, 0.9), [home[0] + 2e7 + 1.234, home[1] + 0.001, home[2] - 700.021]);
-    driver.acked(rigid_step(1, RigidF64, &[(0, near.0, near.1), (1, away.0, away.1)])).await;
+    driver.step_acknowledged(rigid_step(1, RigidF64, &[(0, near.0, near.1), (1, away.0, away.1)])).await;
     let got = get_vertices(&server, ask("far", &[])).await.expect("vertices");
     assert_eq!((got.head.origin.as_slice(), got.head.origin_bytes), (scene.origin.as_slice(), 48));
     assert_eq!(got.origins[..3], scene.origin);
@@ -144,7 +144,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let places =
         [(turn(0.0, 0.4, 0.0), [1e7 + 0.004, 5.006, -1e7 - 0.002]), (turn(1.0, 0.0, 0.0), [1e7 + 9.5, 0.0, -1e7])];
     let both = |number| rigid_step(number, RigidF64, &[0, 1].map(|at| (at as u32, places[at].0, places[at].1)));
-    driver.acked(both(4)).await;
+    driver.step_acknowledged(both(4)).await;
     let got = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
     assert_eq!(
         (got.head.origin.as_slice(), got.head.origin_bytes),
@@ -161,7 +161,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     // The next f64 transform applies to the state restored from the checkpoint.
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let moved = (places[1].0, [1e7 + 11.5, 0.001, -1e7]);
-    driver.acked(rigid_step(0, RigidF64, &[(1, moved.0, moved.1)])).await;
+    driver.step_acknowledged(rigid_step(0, RigidF64, &[(1, moved.0, moved.1)])).await;
     let got = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
     let want = [truth(&scene, 0, &[], places[0]), truth(&scene, 1, &[], moved)].concat();
     assert!(got.origins.is_empty() && largest(&told(&scene, &got), &want) <= 1e-3);

@@ -29,7 +29,7 @@ async fn moved_branch_moves_only_its_leaves() {
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
     let at_rest = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
     let step = moved(0, &[BRANCH], &[TURN]);
-    driver.acked(step.clone()).await;
+    driver.step_acknowledged(step.clone()).await;
     let got = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
     assert_eq!(got, expected(&twig(), &[step]).0);
     assert_eq!(got[..12], at_rest[..12], "the other strip stays");
@@ -52,7 +52,7 @@ async fn transform_of_a_follower_is_refused_whole() {
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
     // Transforms without a list of domains are those of both strips; the two followers have none.
     let all = moved(0, &[], &[SHIFT, TURN]);
-    driver.acked(all.clone()).await;
+    driver.step_acknowledged(all.clone()).await;
     let got = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
     assert_eq!(got, expected(&twig(), &[all]).0);
     let wrong = v1::Step { q_domains: vec![0], q: vec![1; 8].into(), ..moved(1, &[BRANCH, LEAFLET], &[SHIFT, TURN]) };
@@ -66,7 +66,7 @@ async fn transform_of_a_follower_is_refused_whole() {
     driver.finish().await;
     // A follower has coordinates of its own: only the leaf bends.
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
-    driver.acked(step(2, &[LEAF], &[0.5, -0.25])).await;
+    driver.step_acknowledged(step(2, &[LEAF], &[0.5, -0.25])).await;
     let bent = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
     assert!(bent[..24] == got[..24] && bent[24..36] != got[24..36] && bent[36..] == got[36..]);
     driver.finish().await;

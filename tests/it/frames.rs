@@ -65,7 +65,7 @@ async fn frame_names_its_step_and_png_equals_rgba() {
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let rest = render(&server, request()).await.expect("the rest state can be drawn");
     assert_eq!(rest.head.step.map(|step| step.run), Some(0));
-    driver.acked(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
+    driver.step_acknowledged(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
     let raw = render(&server, v1::RenderFrameRequest { step: Some(Which::ExactStep(5)), ..request() }).await;
     let raw = raw.expect("a frame");
     assert_eq!(raw.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
@@ -113,7 +113,7 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
     let mut driver = server.drive("strips", v1::Policy::Lossless, 3).await;
     let write = async {
         for number in 1..=12 {
-            driver.acked(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
+            driver.step_acknowledged(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
         }
     };
     let read = async {

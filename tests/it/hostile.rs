@@ -6,8 +6,8 @@ use prost::Message as _;
 use sha2::{Digest as _, Sha256};
 use tonic::Code;
 use v1::Policy;
-use v1::drive_scene_request::Kind as Asked;
-use v1::drive_scene_response::Kind as Told;
+use v1::drive_scene_request::Kind as RequestKind;
+use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
 use crate::service_harness::{Driver, Server, details, expected, get_vertices, rigid_step, step, strips, within};
@@ -135,7 +135,7 @@ async fn bad_steps_are_refused_and_the_stream_stays_open() {
     let mut other = server.drive("other", Policy::Lossless, 0).await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let good = step(10, &[], &[0.1, 0.2, 0.3, 0.4]);
-    driver.acked(good.clone()).await;
+    driver.step_acknowledged(good.clone()).await;
     let want = expected(&strips(), &[good]);
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     // The server keeps the number of a step that it refused for overflow, so the numbers of the following steps
@@ -152,9 +152,9 @@ async fn bad_steps_are_refused_and_the_stream_stays_open() {
         let got = get_vertices(&server, ask.clone()).await.expect("vertices");
         assert_eq!((got.step().number, &got.positions, &got.normals), (10, &want.0, &want.1), "{name}");
         assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
-        other.acked(step(index as u64, &[0], &[0.5, 0.5])).await;
+        other.step_acknowledged(step(index as u64, &[0], &[0.5, 0.5])).await;
     }
-    driver.acked(step(1000, &[0], &[0.0, 0.0])).await;
+    driver.step_acknowledged(step(1000, &[0], &[0.0, 0.0])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -164,15 +164,17 @@ async fn stream_opens_after_refused_openings() {
     let mut driver = Driver::connect(server.channel().await).await;
     driver.step(step(1, &[], &[])).await;
     assert!(begins(&driver.rejection().await, ["kind", "open, before any step", "a step"]));
-    let Told::Rejection(unknown) = driver.open("nowhere", Policy::Lossless, 0).await else { panic!("opened") };
+    let ResponseKind::Rejection(unknown) = driver.open("nowhere", Policy::Lossless, 0).await else { panic!("opened") };
     assert!(begins(&unknown, ["scene", "a scene that is there", "'nowhere'"]), "{unknown:?}");
     let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: 0 };
-    driver.send(Asked::Open(open)).await;
+    driver.send(RequestKind::Open(open)).await;
     assert!(begins(&driver.rejection().await, ["open.policy", "a policy of this version", "77"]));
-    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
-    let Told::Rejection(again) = driver.open("strips", Policy::Lossless, 0).await else { panic!("opened twice") };
+    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    let ResponseKind::Rejection(again) = driver.open("strips", Policy::Lossless, 0).await else {
+        panic!("opened twice")
+    };
     assert!(begins(&again, ["open", "one open per stream", "a second"]), "{again:?}");
-    driver.acked(step(0, &[0], &[0.0, 0.0])).await;
+    driver.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
 }
 
 /// The scene keeps its last good step, and the other stream on the same connection continues.
@@ -185,11 +187,11 @@ async fn oversized_message_ends_only_its_own_stream() {
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("opens");
     let mut other = Driver::connect(channel.clone()).await;
-    assert!(matches!(other.open("other", Policy::Lossless, 0).await, Told::Opened(_)));
+    assert!(matches!(other.open("other", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     let mut driver = Driver::connect(channel).await;
-    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
+    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     let good = step(1, &[0], &[0.5, 0.25]);
-    driver.acked(good.clone()).await;
+    driver.step_acknowledged(good.clone()).await;
     driver.step(step(2, &[0], &vec![0.0; 20_000])).await;
     let end = within(driver.replies.message()).await.expect_err("a fault of transport");
     assert_eq!(end.code(), Code::ResourceExhausted);
@@ -197,9 +199,9 @@ async fn oversized_message_ends_only_its_own_stream() {
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     let got = get_vertices(&server, ask).await.expect("vertices");
     assert_eq!((got.step().number, got.positions), (1, expected(&strips(), &[good]).0));
-    other.acked(step(1, &[0], &[0.5, 0.5])).await;
+    other.step_acknowledged(step(1, &[0], &[0.5, 0.5])).await;
     let mut next = server.drive("strips", Policy::Lossless, 0).await;
-    next.acked(step(0, &[0], &[0.0, 0.0])).await;
+    next.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -3,16 +3,22 @@
 
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::deform::{Deformed, Deformer};
+use modalcast_model::deform::{DeformSummary, Deformer};
 use modalcast_model::load;
-use modalcast_model::scene::{Camera, Scene, State};
-use modalcast_render::{Shot, shadow_texel};
+use modalcast_model::scene::{Camera, Scene, SceneState};
+use modalcast_render::{FrameParams, shadow_texel_axes};
 
 /// Side lengths of a shadow map texel in scene units, for a deformation.
-fn texel(scene: &Scene, deformed: &Deformed, is_lit: bool) -> [f64; 2] {
+fn texel(scene: &Scene, deformed: &DeformSummary, is_lit: bool) -> [f64; 2] {
     let light = deformed.light.filter(|_| is_lit);
-    let shot = Shot { camera: Camera::framing(scene, 64, 64), width: 64, height: 64, bounds: deformed.bounds, light };
-    shadow_texel(scene, &shot).expect("the look has a shadow").map(|side| side.norm())
+    let shot = FrameParams {
+        camera: Camera::fit_to_scene(scene, 64, 64),
+        width: 64,
+        height: 64,
+        bounds: deformed.bounds,
+        light,
+    };
+    shadow_texel_axes(scene, &shot).expect("the look has a shadow").map(|side| side.norm())
 }
 
 /// Texels fitted to the light-space boxes of tiles have less than half the area of texels fitted to the corners of the
@@ -20,7 +26,7 @@ fn texel(scene: &Scene, deformed: &Deformed, is_lit: bool) -> [f64; 2] {
 #[test]
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
     let scene = load::open("tree").expect("built in");
-    let state = State::rest(&scene);
+    let state = SceneState::rest(&scene);
     let exact = ReferenceDeformer::new(&scene).deform(&state).expect("deforms");
     let tiled = CpuDeformer::new(&scene).deform(&state).expect("deforms");
     let [corners, tiled, exact] =

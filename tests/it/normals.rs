@@ -5,7 +5,7 @@ mod extremes;
 mod kept;
 
 use modalcast_compute::reference;
-use modalcast_model::scene::Normals;
+use modalcast_model::scene::NormalMethod;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use build::{
@@ -39,7 +39,7 @@ fn bent_strip_has_normals_and_tangents_of_its_parabola() {
     let state = bent(&scene, 0.5);
     let (normals, tangents) = exact(&scene, &state);
     let cpu = on_cpu(&scene, &state);
-    let rigid = reference::orient_normals(&scene, &state);
+    let rigid = reference::rigid_normals(&scene, &state);
     let mut largest = 0.0_f64;
     let inner = |(_, rest): &(usize, &[f32; 3])| rest[0].abs() < 0.99 && rest[1].abs() < 0.99;
     for (corner, [x, ..]) in scene.shapes[0].mesh.rest().iter().enumerate().filter(inner) {
@@ -52,7 +52,7 @@ fn bent_strip_has_normals_and_tangents_of_its_parabola() {
     }
     assert!(largest > 40.0, "rigid normals are off by {largest} degrees");
     assert!(largest_angle(&cpu.normals, &normals) < TOLERANCE);
-    let rigid_scene = scene_with(scene.shapes.clone(), Normals::Rigid);
+    let rigid_scene = scene_with(scene.shapes.clone(), NormalMethod::Rigid);
     assert!(largest_angle(&on_cpu(&rigid_scene, &state).normals, &normals) > 40.0, "the judge can fail");
 }
 
@@ -89,7 +89,7 @@ fn stretched_sphere_has_normals_of_the_ellipsoid() {
         }
         assert!(largest_angle(&on_cpu(&scene, &state).normals, &normals) < TOLERANCE);
         let smooth: Vec<_> = mesh.rest().iter().map(|place| by_cofactors(stretch, place.map(f64::from))).collect();
-        let rigid = reference::orient_normals(&scene, &state);
+        let rigid = reference::rigid_normals(&scene, &state);
         let off = |(normal, smooth): (&[f64; 3], &[f64; 3])| degrees(*normal, *smooth);
         assert!(rigid.iter().zip(&smooth).map(off).fold(0.0, f64::max) > 30.0, "rigid ones are no ellipsoid's");
         normals.iter().zip(&smooth).map(off).fold(0.0, f64::max)
@@ -103,15 +103,15 @@ fn stretched_sphere_has_normals_of_the_ellipsoid() {
 fn exact_normals_equal_rigid_ones_at_zero_q() {
     let mut authored = sheet(9, 9);
     let corners = authored.corners().clone();
-    let mut noise = crate::deformers::Noise(5);
+    let mut noise = crate::deformers::TestRng(5);
     let normals = corners.normals.iter().map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let rest = authored.rest().iter().map(|[x, y, _]| [*x, *y, 0.3 * noise.next()]).collect();
     let triangles = authored.triangles().to_vec();
-    authored = modalcast_model::domain::Mesh::indexed(rest, normals, corners.uvs, triangles).expect("a sheet");
+    authored = modalcast_model::domain::Mesh::from_indexed(rest, normals, corners.uvs, triangles).expect("a sheet");
     let scene = scene(vec![with_mode(authored, parabola), with_mode(cube(), parabola)]);
     for linear in linear_parts() {
         let mut state = state(&scene, 0.0, linear, [1.0, -2.0, 0.5]);
-        let (rigid, along) = (reference::orient_normals(&scene, &state), reference::orient_tangents(&scene, &state));
+        let (rigid, along) = (reference::rigid_normals(&scene, &state), reference::rigid_tangents(&scene, &state));
         let (normals, tangents) = exact(&scene, &state);
         let cpu = on_cpu(&scene, &state);
         for (exact, rigid) in normals.iter().zip(&rigid) {
@@ -154,7 +154,8 @@ fn both_sides_of_a_uv_seam_share_one_normal() {
 fn rest_normals_opposite_to_the_winding_stay_opposite() {
     let mesh = sheet(9, 9);
     let down = vec![[0.0, 0.0, -1.0]; 81];
-    let flipped = modalcast_model::domain::Mesh::indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
+    let flipped =
+        modalcast_model::domain::Mesh::from_indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
     let scene = scene(vec![with_mode(mesh, parabola), with_mode(flipped.expect("a sheet"), parabola)]);
     let (normals, _) = exact(&scene, &bent(&scene, 0.5));
     for corner in 0..81 {
@@ -187,7 +188,7 @@ fn transforms_act_on_bent_normals_by_their_cofactors() {
 /// Shapes without texture coordinates have zero tangents.
 #[test]
 fn tangents_are_unit_and_orthogonal_to_normals() {
-    let bare = modalcast_model::domain::Mesh::indexed(
+    let bare = modalcast_model::domain::Mesh::from_indexed(
         sheet(5, 5).rest().to_vec(),
         vec![build::UP; 25],
         vec![],
@@ -223,8 +224,8 @@ fn only_deformable_shapes_have_smoothing_groups() {
     assert!(asks.shapes[0].smoothing().is_some() && asks.shapes[1].smoothing().is_none());
     let state = state(&asks, 0.5, linear_parts()[2], [0.0; 3]);
     let cpu = on_cpu(&asks, &state);
-    let orient = reference::orient_normals(&asks, &state);
+    let orient = reference::rigid_normals(&asks, &state);
     assert!(largest_angle(&cpu.normals[27..], &orient[9..]) < TOLERANCE, "the rigid shape");
-    let silent = scene_with(shapes(), Normals::Rigid);
+    let silent = scene_with(shapes(), NormalMethod::Rigid);
     assert!(!silent.needs.exact_normals && silent.shapes.iter().all(|shape| shape.smoothing().is_none()));
 }

@@ -1,7 +1,9 @@
 //! Picks and AOV frames (depth, domains, normals, value maps) over the wire. Needs an EGL driver that can render.
 
 use modalcast::config::{Config, RendererChoice};
-use modalcast_client::{Camera, Client, Code, Format, FrameRequest, Hit, Lens, Output, PickRequest, Picture, View};
+use modalcast_client::{
+    Camera, Client, Code, FrameFormat, FrameRequest, Hit, Lens, Output, PickRequest, Picture, View,
+};
 use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
 use modalcast_proto::v1;
@@ -70,12 +72,12 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
         rigid_step(2, v1::TransformFormat::RigidF32, &[(1, [0.0, 0.0, half, half], [1.0, 0.25, -0.5])]),
     ];
-    let before = client.pick(&PickRequest::of("strips", picture(), 44, 37)).await.expect("at rest");
+    let before = client.pick(&PickRequest::new("strips", picture(), 44, 37)).await.expect("at rest");
     assert_eq!((before.step.run, before.hits.len()), (0, 1));
     for step in steps.clone() {
-        driver.acked(step).await;
+        driver.step_acknowledged(step).await;
     }
-    let request = PickRequest::of("strips", picture(), 0, 0).rectangle(64, 64).exactly(2);
+    let request = PickRequest::new("strips", picture(), 0, 0).rectangle(64, 64).exact_step(2);
     let picks = client.pick(&request).await.expect("picks");
     assert_eq!(picks.step.number, 2);
     let state = state_after(&scene, &steps);
@@ -94,7 +96,7 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
     let without_turn = whole_force(&scene, turned, Matrix3::identity(), force);
     let got = DVector::from_vec(turned.reduced_force(force.into()));
     assert!((got - without_turn).norm() > 0.1, "control: A matters");
-    let now = client.pick(&PickRequest::of("strips", picture(), 44, 37)).await.expect("now");
+    let now = client.pick(&PickRequest::new("strips", picture(), 44, 37)).await.expect("now");
     assert!((Vector3::from(now.hits[0].position) - Vector3::from(before.hits[0].position)).norm() > 0.01, "it moved");
 }
 
@@ -106,7 +108,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(20.0), clip: None });
     let picture = Picture { width: 640, height: 480, camera, ..Picture::default() };
-    let all = client.pick(&PickRequest::of("sheet", picture, 100, 100).rectangle(64, 64)).await.expect("picks");
+    let all = client.pick(&PickRequest::new("sheet", picture, 100, 100).rectangle(64, 64)).await.expect("picks");
     assert_eq!(all.hits.len(), 64 * 64, "the sheet fills the view");
     let scene = sheet();
     for hit in all.hits.iter().step_by(97) {
@@ -115,21 +117,21 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
         assert!((got - want).norm() < 1e-5);
     }
     let bare =
-        client.pick(&PickRequest::of("sheet", picture, 0, 0).rectangle(2, 1).without_modes()).await.expect("picks");
+        client.pick(&PickRequest::new("sheet", picture, 0, 0).rectangle(2, 1).without_modes()).await.expect("picks");
     assert!(bare.hits.iter().all(|hit| hit.modes.is_empty() && hit.rank == 4));
 
     let (server, client) = server_of_far().await;
     let scene = far_strips();
     let places = [0, 1].map(|domain| (domain, [0.0, 0.0, 0.0, 1.0], [3e7, -2e7 + 0.125, 2e7]));
     let moved = rigid_step(1, v1::TransformFormat::RigidF64, &places);
-    server.drive("far", v1::Policy::Lossless, 0).await.acked(moved.clone()).await;
+    server.drive("far", v1::Policy::Lossless, 0).await.step_acknowledged(moved.clone()).await;
     // In scene units from the scene origin.
     let at: [f64; 3] = std::array::from_fn(|axis| places[0].2[axis] - scene.origin[axis] / scene.unit);
     let near = |x: f64, y: f64, z: f64| [at[0] + x, at[1] + y, at[2] + z];
     let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
     let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
-    let hit = client.pick(&PickRequest::of("far", picture, 32, 32)).await.expect("picks").hits.remove(0);
+    let hit = client.pick(&PickRequest::new("far", picture, 32, 32)).await.expect("picks").hits.remove(0);
     let off = (Vector3::from(hit.position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
     assert!(off < 1e-3, "{off} units at {at:?}");
     assert!((hit.depth - 1.5).abs() < 1e-3, "half metres: {}", hit.depth);
@@ -148,15 +150,15 @@ async fn bad_rectangles_outputs_and_steps_are_refused() {
         ([95, 79], [2, 1], "rectangle"),
         ([96, 0], [1, 1], "rectangle"),
     ] {
-        let request = PickRequest::of("strips", picture(), corner[0], corner[1]).rectangle(size[0], size[1]);
+        let request = PickRequest::new("strips", picture(), corner[0], corner[1]).rectangle(size[0], size[1]);
         let error = client.pick(&request).await.expect_err(field);
-        assert_eq!(error.refusal().map(|refusal| refusal.field.as_str()), Some(field), "{error}");
+        assert_eq!(error.rejection().map(|refusal| refusal.field.as_str()), Some(field), "{error}");
     }
-    let corner = client.pick(&PickRequest::of("strips", picture(), 95, 79)).await.expect("the last pixel");
+    let corner = client.pick(&PickRequest::new("strips", picture(), 95, 79)).await.expect("the last pixel");
     assert!(corner.hits.is_empty(), "nothing is there");
-    let late = PickRequest::of("strips", picture(), 0, 0).at_least(1).within_ms(60);
+    let late = PickRequest::new("strips", picture(), 0, 0).minimum_step(1).deadline_ms(60);
     let error = client.pick(&late).await.expect_err("no step yet");
-    assert!(matches!(error, modalcast_client::Error::Refused { code: Code::DeadlineExceeded, .. }), "{error}");
+    assert!(matches!(error, modalcast_client::Error::Status { code: Code::DeadlineExceeded, .. }), "{error}");
 
     let wire = |output: v1::Output, format: v1::Format| v1::Picture {
         width: 32,
@@ -189,16 +191,19 @@ async fn bad_rectangles_outputs_and_steps_are_refused() {
 async fn outputs_have_their_format_and_agree_with_picks() {
     let (server, client) = server("strips").await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-    driver.acked(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
+    driver.step_acknowledged(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
     let show = async |output| {
-        let mut request = FrameRequest::of("strips").at_least(1);
+        let mut request = FrameRequest::new("strips").minimum_step(1);
         request.picture = Picture { output, ..picture() };
         client.frame(&request).await.expect("a frame")
     };
     let (depth, domains, normals) =
         (show(Output::Depth).await, show(Output::Domains).await, show(Output::Normals).await);
-    assert_eq!([depth.format, domains.format, normals.format], [Format::F32, Format::U32, Format::F32x3]);
-    let picks = client.pick(&PickRequest::of("strips", picture(), 20, 10).rectangle(64, 64)).await.expect("picks");
+    assert_eq!(
+        [depth.format, domains.format, normals.format],
+        [FrameFormat::F32, FrameFormat::U32, FrameFormat::F32x3]
+    );
+    let picks = client.pick(&PickRequest::new("strips", picture(), 20, 10).rectangle(64, 64)).await.expect("picks");
     let word = |bytes: &[u8], at: usize| <[u8; 4]>::try_from(&bytes[4 * at..][..4]).expect("four bytes");
     let mut differ = 0;
     for hit in &picks.hits {
@@ -210,7 +215,7 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         differ += usize::from(!(same && off < 1e-5 && aside < 1e-5));
     }
     assert!(picks.hits.len() > 1000 && differ <= 3, "{differ} of {} pixels", picks.hits.len());
-    let colour = show(Output::Colour).await.bytes;
+    let color = show(Output::Color).await.bytes;
     let maps = [
         show(Output::Displacement { largest: 0.0 }).await,
         show(Output::Displacement { largest: 9.0 }).await,
@@ -218,8 +223,8 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         show(Output::ModeShape { mode: 1, largest: 0.0 }).await,
     ];
     for (at, map) in maps.iter().enumerate() {
-        assert_eq!((map.format, image::load_from_memory(&map.bytes).expect("a PNG").width()), (Format::Png, 96));
-        assert!(map.bytes != colour && maps[..at].iter().all(|other| other.bytes != map.bytes), "{at}");
+        assert_eq!((map.format, image::load_from_memory(&map.bytes).expect("a PNG").width()), (FrameFormat::Png, 96));
+        assert!(map.bytes != color && maps[..at].iter().all(|other| other.bytes != map.bytes), "{at}");
     }
 }
 
@@ -229,13 +234,13 @@ async fn distant_domains_are_picked_by_nearby_cameras() {
     let (server, client) = server("strips").await;
     let away = [1e7 + 1.25, 0.0, -1e7];
     let moved = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, [0.0, 0.0, 0.0, 1.0], away)]);
-    server.drive("strips", v1::Policy::Lossless, 0).await.acked(moved).await;
+    server.drive("strips", v1::Policy::Lossless, 0).await.step_acknowledged(moved).await;
     for (domain, at) in [(1, away), (0, [0.0; 3]), (1, away)] {
         let near = |x: f64, y: f64, z: f64| [at[0] + x, at[1] + y, at[2] + z];
         let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
         let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
         let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
-        let hits = client.pick(&PickRequest::of("strips", picture, 32, 32)).await.expect("picks").hits;
+        let hits = client.pick(&PickRequest::new("strips", picture, 32, 32)).await.expect("picks").hits;
         let off = (Vector3::from(hits[0].position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
         assert!(hits[0].domain == domain && off < 1e-3, "{off} units from {at:?}: {hits:?}");
     }

@@ -1,25 +1,25 @@
 //! Rendered pixels compared with arithmetic; most tests have a negative control. Runs on any EGL driver, including
 //! Mesa's llvmpipe.
 
+mod aov;
 mod below_ground;
-mod beside;
-mod build;
 mod culling;
 mod culling_real;
+mod draw_region;
 mod far;
 mod ground;
-mod layers;
+mod harness;
 mod limits;
+mod oit;
 mod picking;
 mod post;
 mod raster;
-mod reach;
+mod raster_backends;
 mod shading;
 mod shadow;
+mod shadow_cache;
 mod shadow_extremes;
 mod shadow_ground;
 mod shadow_methods;
-mod shadow_shared;
 mod snapshots;
-mod surveys;
 mod visibility;

@@ -2,17 +2,18 @@
 //! the definition.
 
 use modalcast_compute::reference::raster::{
-    Corner, Dropped, NOTHING, Outline, Raster, depth_at, edge, outline, pieces,
+    ClippedPolygon, CullReason, EMPTY_KEY, SnappedVertex, VisibilityBuffer, clipped_polygon, depth_at, edge,
+    fan_triangles,
 };
-use modalcast_model::scene::{Faces, Group, Window};
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 use crate::both::soups::{Soup, fan, flat, perspective, soups};
 
 /// Constants of `kernels/raster.cu`; a test compares them with its text.
-const FEW: i32 = 32;
-const NARROW: i32 = 16384;
-const TILE: i32 = 64;
-const HALVINGS: u32 = 3;
+const MAX_THREAD_SAMPLES: i32 = 32;
+const MAX_WARP_EXTENT: i32 = 16384;
+const TILE_SIZE: i32 = 64;
+const MAX_STRIP_SPLITS: u32 = 3;
 const BITS: u32 = 40;
 
 /// CPU twin of the raster kernels for one window. Queues may have any order, and the per-thread and per-warp paths use
@@ -33,29 +34,31 @@ impl Walk<'_> {
         self.keys[at] = self.keys[at].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
     }
 
-    fn outline(&self, triangle: u32, faces: Faces) -> Result<Outline, Dropped> {
-        outline(&self.soup.window, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
+    fn clipped_polygon(&self, triangle: u32, faces: CullMode) -> Result<ClippedPolygon, CullReason> {
+        clipped_polygon(&self.soup.window, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
     }
 
-    /// `raster`: the narrow tests of `aim_whole`, and the entries that each path pushes.
-    fn aim(&mut self, triangle: u32, faces: Faces) {
-        let Ok(outline) = self.outline(triangle, faces) else { return };
-        let extent = |of: fn(&Corner) -> i32| {
-            let all = || outline.corners.iter().map(of);
+    /// `raster`: the narrow tests of `setup_unclipped`, and the entries that each path pushes.
+    fn aim(&mut self, triangle: u32, faces: CullMode) {
+        let Ok(clipped_polygon) = self.clipped_polygon(triangle, faces) else { return };
+        let extent = |of: fn(&SnappedVertex) -> i32| {
+            let all = || clipped_polygon.corners.iter().map(of);
             all().max().expect("corners") - all().min().expect("corners")
         };
-        let [x0, y0, x1, y1] = outline.samples;
-        let narrow = !outline.clipped && extent(|corner| corner.x) <= NARROW && extent(|corner| corner.y) <= NARROW;
-        if narrow && (x1 - x0 + 1) * (y1 - y0 + 1) <= FEW {
+        let [x0, y0, x1, y1] = clipped_polygon.samples;
+        let narrow = !clipped_polygon.clipped
+            && extent(|corner| corner.x) <= MAX_WARP_EXTENT
+            && extent(|corner| corner.y) <= MAX_WARP_EXTENT;
+        if narrow && (x1 - x0 + 1) * (y1 - y0 + 1) <= MAX_THREAD_SAMPLES {
             self.paths[0] += 1;
-            self.draw_narrow(&outline, triangle);
+            self.draw_narrow(&clipped_polygon, triangle);
         } else if narrow {
             self.paths[1] += 1;
             self.medium.push(triangle);
         } else {
             self.paths[2] += 1;
-            let (x, y) = (x0 / TILE, y0 / TILE);
-            let (across, down) = (x1 / TILE - x + 1, y1 / TILE - y + 1);
+            let (x, y) = (x0 / TILE_SIZE, y0 / TILE_SIZE);
+            let (across, down) = (x1 / TILE_SIZE - x + 1, y1 / TILE_SIZE - y + 1);
             assert!(x < 256 && y < 256 && across <= 256, "boxes are three bytes");
             let before = self.tally;
             self.tally += 1 << BITS | (across * down) as u64;
@@ -66,15 +69,15 @@ impl Walk<'_> {
     }
 
     /// Checked arithmetic panics when an edge function overflows 32 bits.
-    fn draw_narrow(&mut self, outline: &Outline, triangle: u32) {
-        let edge = |from: &Corner, to: &Corner, x: i32, y: i32| -> i32 {
+    fn draw_narrow(&mut self, clipped_polygon: &ClippedPolygon, triangle: u32) {
+        let edge = |from: &SnappedVertex, to: &SnappedVertex, x: i32, y: i32| -> i32 {
             let [one, other] = [(to.x - from.x, y - from.y), (to.y - from.y, x - from.x)];
             let product = |(a, b): (i32, i32)| a.checked_mul(b).expect("32 bits hold it");
             product(one).checked_sub(product(other)).expect("32 bits hold it")
         };
-        let [a, b, c] = pieces(outline)[0];
+        let [a, b, c] = fan_triangles(clipped_polygon)[0];
         let area = edge(&a, &b, c.x, c.y);
-        let [x0, y0, x1, y1] = outline.samples;
+        let [x0, y0, x1, y1] = clipped_polygon.samples;
         for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
             let (x, y) = (256 * column + 128, 256 * row + 128);
             let inside = [(&b, &c), (&c, &a), (&a, &b)].iter().all(|(from, to)| {
@@ -103,18 +106,19 @@ impl Walk<'_> {
 
     /// `raster_tiles`: one strip of a listed tile, clipped to the triangle's samples. A strip that lies entirely beyond
     /// an edge is rejected.
-    fn strip(&mut self, at: u64, halvings: u32) {
-        let tile = at >> halvings;
+    fn strip(&mut self, at: u64, strip_splits: u32) {
+        let tile = at >> strip_splits;
         let (first, triangle, box_of) = self.large[self.find(tile)];
         let (own, across) = ((tile - first) as u32, (box_of >> 16 & 255) + 1);
-        let tall = TILE >> halvings;
-        let x = TILE * ((box_of & 255) + own % across) as i32;
-        let y = TILE * ((box_of >> 8 & 255) + own / across) as i32 + tall * (at as i32 & ((1 << halvings) - 1));
-        let outline = self.outline(triangle, Faces::Both).expect("queued");
-        let [x0, y0, x1, y1] = outline.samples;
-        let (x, right, y, bottom) = (x.max(x0), (x + TILE - 1).min(x1), y.max(y0), (y + tall - 1).min(y1));
-        for piece in pieces(&outline) {
-            let beyond = |from: &Corner, to: &Corner| {
+        let tall = TILE_SIZE >> strip_splits;
+        let x = TILE_SIZE * ((box_of & 255) + own % across) as i32;
+        let y =
+            TILE_SIZE * ((box_of >> 8 & 255) + own / across) as i32 + tall * (at as i32 & ((1 << strip_splits) - 1));
+        let clipped_polygon = self.clipped_polygon(triangle, CullMode::None).expect("queued");
+        let [x0, y0, x1, y1] = clipped_polygon.samples;
+        let (x, right, y, bottom) = (x.max(x0), (x + TILE_SIZE - 1).min(x1), y.max(y0), (y + tall - 1).min(y1));
+        for piece in fan_triangles(&clipped_polygon) {
+            let beyond = |from: &SnappedVertex, to: &SnappedVertex| {
                 let column = if to.y > from.y { x } else { right };
                 let row = if to.x > from.x { bottom } else { y };
                 let takes = to.y < from.y || (to.y == from.y && to.x > from.x);
@@ -133,19 +137,19 @@ impl Walk<'_> {
     }
 }
 
-/// Runs `raster`, `raster_warps` and `raster_tiles` in sequence, with reversed queues and tiles halved `halvings`
+/// Runs `raster`, `raster_warps` and `raster_tiles` in sequence, with reversed queues and tiles halved `strip_splits`
 /// times.
-fn twin_of_raster(soup: &Soup, halvings: u32) -> (Vec<u64>, [usize; 3]) {
-    let keys = vec![NOTHING; soup.window.pixels()];
+fn twin_of_raster(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
+    let keys = vec![EMPTY_KEY; soup.window.pixel_count()];
     let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
     for group in &soup.groups {
         (group.first..group.first + group.triangles).rev().for_each(|triangle| walk.aim(triangle, group.faces));
     }
     for triangle in std::mem::take(&mut walk.medium) {
-        let outline = walk.outline(triangle, Faces::Both).expect("queued");
-        walk.draw_narrow(&outline, triangle);
+        let clipped_polygon = walk.clipped_polygon(triangle, CullMode::None).expect("queued");
+        walk.draw_narrow(&clipped_polygon, triangle);
     }
-    (0..(walk.tally & ((1 << BITS) - 1)) << halvings).rev().for_each(|at| walk.strip(at, halvings));
+    (0..(walk.tally & ((1 << BITS) - 1)) << strip_splits).rev().for_each(|at| walk.strip(at, strip_splits));
     (walk.keys, walk.paths)
 }
 
@@ -155,20 +159,20 @@ fn twin_of_raster(soup: &Soup, halvings: u32) -> (Vec<u64>, [usize; 3]) {
 fn all_raster_paths_equal_the_definition() {
     let text = include_str!("../../kernels/raster.cu");
     for line in [
-        format!("#define FEW {FEW}"),
-        format!("#define NARROW {NARROW}"),
-        format!("constexpr int TILE = {TILE};"),
-        format!("constexpr unsigned HALVINGS = {HALVINGS};"),
-        format!("constexpr unsigned TILES_BITS = {BITS};"),
+        format!("#define MAX_THREAD_SAMPLES {MAX_THREAD_SAMPLES}"),
+        format!("#define MAX_WARP_EXTENT {MAX_WARP_EXTENT}"),
+        format!("constexpr int TILE_SIZE = {TILE_SIZE};"),
+        format!("constexpr unsigned MAX_STRIP_SPLITS = {MAX_STRIP_SPLITS};"),
+        format!("constexpr unsigned TILE_COUNT_BITS = {BITS};"),
     ] {
         assert!(text.contains(&line), "the kernel has another {line}");
     }
     let mut all = [0; 3];
     for soup in soups() {
         let want = soup.drawn().keys;
-        for halvings in 0..=HALVINGS {
-            let (keys, paths) = twin_of_raster(&soup, halvings);
-            assert!(keys == want, "{}, {halvings} halvings", soup.name);
+        for strip_splits in 0..=MAX_STRIP_SPLITS {
+            let (keys, paths) = twin_of_raster(&soup, strip_splits);
+            assert!(keys == want, "{}, {strip_splits} halvings", soup.name);
             (0..3).for_each(|path| all[path] += paths[path]);
         }
     }
@@ -178,11 +182,11 @@ fn all_raster_paths_equal_the_definition() {
 /// Number of pieces that cover each sample, with the top-left rule or with all edges closed.
 fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
     let [width, height] = soup.window.size().map(|side| side as i32);
-    let all: Vec<[Corner; 3]> = (soup.triangles.iter())
-        .filter_map(|triangle| outline(&soup.window, &soup.positions, *triangle, Faces::Both).ok())
-        .flat_map(|outline| pieces(&outline))
+    let all: Vec<[SnappedVertex; 3]> = (soup.triangles.iter())
+        .filter_map(|triangle| clipped_polygon(&soup.window, &soup.positions, *triangle, CullMode::None).ok())
+        .flat_map(|clipped_polygon| fan_triangles(&clipped_polygon))
         .collect();
-    let takes = |piece: &[Corner; 3], column: i32, row: i32| {
+    let takes = |piece: &[SnappedVertex; 3], column: i32, row: i32| {
         let [a, b, c] = piece;
         let inside = |from, to| edge(from, to, 256 * column + 128, 256 * row + 128) >= 0;
         if closed { inside(a, b) && inside(b, c) && inside(c, a) } else { depth_at(piece, column, row).is_some() }
@@ -229,8 +233,8 @@ fn depth_ties_go_to_the_lower_id() {
     let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
     let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
     let drawn = |triangles: &[[u32; 3]]| {
-        let mut raster = Raster::new(flat(4, 4));
-        let group = Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both };
+        let mut raster = VisibilityBuffer::new(flat(4, 4));
+        let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
         raster.draw(&positions, triangles, group);
         (raster.ids(), raster.depths())
     };
@@ -243,27 +247,28 @@ fn depth_ties_go_to_the_lower_id() {
 #[test]
 fn dropped_triangles_report_the_reason() {
     let window = flat(10, 10);
-    let why = |corners: [[f32; 3]; 3], faces: Faces| outline(&window, &corners.concat(), [0, 1, 2], faces).err();
+    let why =
+        |corners: [[f32; 3]; 3], faces: CullMode| clipped_polygon(&window, &corners.concat(), [0, 1, 2], faces).err();
     let front = [[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]];
     let back = [front[1], front[0], front[2]];
-    assert_eq!(why(front, Faces::Fronts), None);
-    assert_eq!(why(back, Faces::Both), None);
-    assert_eq!(why(back, Faces::Fronts), Some(Dropped::Back));
-    assert_eq!(why([[f32::NAN, 0.0, 0.0], front[1], front[2]], Faces::Both), Some(Dropped::NotFinite));
-    assert_eq!(why(front.map(|[x, y, z]| [x + 2.0, y, z]), Faces::Both), Some(Dropped::Outside));
-    assert_eq!(why(front.map(|[x, y, z]| [x, y, z + 1.5]), Faces::Both), Some(Dropped::Outside));
-    assert_eq!(why([front[0], front[0], front[1]], Faces::Both), Some(Dropped::Flat));
-    assert_eq!(why(front.map(|[x, y, z]| [0.05 * x, 0.05 * y, z]), Faces::Both), Some(Dropped::Missed));
+    assert_eq!(why(front, CullMode::Back), None);
+    assert_eq!(why(back, CullMode::None), None);
+    assert_eq!(why(back, CullMode::Back), Some(CullReason::BackFacing));
+    assert_eq!(why([[f32::NAN, 0.0, 0.0], front[1], front[2]], CullMode::None), Some(CullReason::NotFinite));
+    assert_eq!(why(front.map(|[x, y, z]| [x + 2.0, y, z]), CullMode::None), Some(CullReason::OutsideFrustum));
+    assert_eq!(why(front.map(|[x, y, z]| [x, y, z + 1.5]), CullMode::None), Some(CullReason::OutsideFrustum));
+    assert_eq!(why([front[0], front[0], front[1]], CullMode::None), Some(CullReason::Degenerate));
+    assert_eq!(why(front.map(|[x, y, z]| [0.05 * x, 0.05 * y, z]), CullMode::None), Some(CullReason::NoSample));
 }
 
 #[test]
 fn plane_depth_and_rectangle_coverage_are_exact() {
     let (near, far) = (0.5, 50.0);
-    let window: Window = perspective(200, 200, near, far);
+    let window: Viewport = perspective(200, 200, near, far);
     let corners = [[-2.0, -2.0, -4.0], [2.0, -2.0, -9.0], [-1.0, 3.0, -20.0]];
-    let mut raster = Raster::new(window);
+    let mut raster = VisibilityBuffer::new(window);
     let positions = corners.map(|corner| corner.map(|number: f64| number as f32)).concat();
-    raster.draw(&positions, &[[0, 1, 2]], Group { first: 0, triangles: 1, faces: Faces::Both });
+    raster.draw(&positions, &[[0, 1, 2]], DrawRange { first: 0, triangles: 1, faces: CullMode::None });
     let [a, b, c] = corners.map(nalgebra::Vector3::from);
     let normal = (b - a).cross(&(c - a));
     let focal = 1.0 / 30.0_f64.to_radians().tan();
@@ -280,8 +285,8 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     // per pixel.
     assert!(seen > 1000 && worst < 4e-6, "{seen} samples, off by up to {worst:e}");
 
-    let mut raster = Raster::new(flat(100, 100));
+    let mut raster = VisibilityBuffer::new(flat(100, 100));
     let square = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
-    raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], Group { first: 0, triangles: 2, faces: Faces::Fronts });
+    raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, faces: CullMode::Back });
     assert_eq!(raster.ids().iter().flatten().count(), 40 * 60);
 }

@@ -2,18 +2,19 @@
 //! requests for others.
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::engine::{Delivery, View};
+use modalcast::engine::{Delivery, OutputSpec};
 use modalcast_compute::reference::{self, ReferenceDeformer};
-use modalcast_model::deform::{Deformer, Surface, Wanted};
+use modalcast_model::deform::{DeformedSurface, Deformer, VertexAttributes};
 use modalcast_model::scene::Bounds;
 use modalcast_proto::v1;
 use tonic::Code;
 use v1::Policy;
-use v1::drive_scene_response::Kind as Told;
+use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::both::readers;
 use crate::service_harness::{
-    Got, Server, details, expected, get_vertices, kept_strips, next_vertices, state_after, step, within,
+    ReceivedVertices, Server, details, expected, get_vertices, next_vertices, state_after, step,
+    strips_with_attributes, within,
 };
 
 fn ask(scene: &str, selection: v1::VertexSelection) -> v1::GetVerticesRequest {
@@ -30,7 +31,7 @@ fn alone(domains: &[u32]) -> v1::VertexSelection {
 
 /// Displacements u of the f64 twin after some steps.
 fn expected_u(steps: &[v1::Step]) -> Vec<f32> {
-    let scene = kept_strips();
+    let scene = strips_with_attributes();
     let u = reference::displacements(&scene, &state_after(&scene, steps));
     u.into_flattened().into_iter().map(|number| number as f32).collect()
 }
@@ -38,7 +39,7 @@ fn expected_u(steps: &[v1::Step]) -> Vec<f32> {
 /// Bounding boxes of packed domains with four vertices each.
 fn boxes_of(positions: &[f32]) -> Vec<f32> {
     let sides = |positions| {
-        let Bounds { min, max } = Bounds::of(positions);
+        let Bounds { min, max } = Bounds::from_positions(positions);
         [min, max].concat().into_iter().map(|number| number as f32)
     };
     positions.chunks_exact(12).flat_map(sides).collect()
@@ -64,9 +65,9 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
         let mut driver = server.drive("kept", Policy::Lossless, 0).await;
         let steps = [step(1, &[1], &[0.5, -0.25]), turned()];
         for sent in 0..steps.len() {
-            driver.acked(steps[sent].clone()).await;
-            let (x, u) = (expected(&kept_strips(), &steps[..=sent]).0, expected_u(&steps[..=sent]));
-            let check = |got: &Got, domains: std::ops::Range<usize>| {
+            driver.step_acknowledged(steps[sent].clone()).await;
+            let (x, u) = (expected(&strips_with_attributes(), &steps[..=sent]).0, expected_u(&steps[..=sent]));
+            let check = |got: &ReceivedVertices, domains: std::ops::Range<usize>| {
                 let floats = 12 * domains.start..12 * domains.end;
                 assert!(largest_error(&got.displacements, &u[floats.clone()]) < 1e-6);
                 assert!(largest_error(&got.boxes, &boxes_of(&x[floats])) < 1e-6);
@@ -107,17 +108,17 @@ async fn box_stream_delivers_every_step() {
     let mut driver = server.drive("kept", Policy::Lossless, 0).await;
     let steps = [step(1, &[1], &[0.5, -0.25]), turned()];
     for sent in 0..steps.len() {
-        driver.acked(steps[sent].clone()).await;
+        driver.step_acknowledged(steps[sent].clone()).await;
         let got = next_vertices(&mut stream).await.expect("goes on").expect("a step");
         assert_eq!(got.step().number, steps[sent].number);
-        assert_eq!(got.boxes, boxes_of(&expected(&kept_strips(), &steps[..=sent]).0));
+        assert_eq!(got.boxes, boxes_of(&expected(&strips_with_attributes(), &steps[..=sent]).0));
         assert!(got.displacements.is_empty() && got.positions.is_empty());
     }
 }
 
 /// Step number and vertex data of a message.
-fn parts_of(shown: &modalcast::engine::Shown) -> (usize, &Surface) {
-    let modalcast::engine::Body::Vertices(surface) = &shown.body else { panic!("not vertices") };
+fn parts_of(shown: &modalcast::engine::StepOutput) -> (usize, &DeformedSurface) {
+    let modalcast::engine::OutputBody::Vertices(surface) = &shown.body else { panic!("not vertices") };
     (shown.step.number as usize, surface)
 }
 
@@ -127,27 +128,28 @@ async fn readers_of_different_parts_get_every_step() {
     let server = Server::fresh().await;
     server.open("kept").await;
     let engine = server.engine.find("kept").expect("open");
-    let nothing = Wanted::default();
+    let nothing = VertexAttributes::default();
     let wishes = [
-        Wanted { positions: true, ..nothing },
-        Wanted { boxes: true, ..nothing },
-        Wanted { displacements: true, normals: true, ..nothing },
+        VertexAttributes { positions: true, ..nothing },
+        VertexAttributes { boxes: true, ..nothing },
+        VertexAttributes { displacements: true, normals: true, ..nothing },
     ];
     let mut feeds = Vec::new();
     for wanted in wishes {
-        feeds.push(engine.watch(View::Vertices(wanted), Delivery::Lossless).await.expect("a feed"));
+        feeds.push(engine.subscribe(OutputSpec::Vertices(wanted), Delivery::Lossless).await.expect("a feed"));
     }
-    let mut late = engine.watch(View::Vertices(Wanted::ALL), Delivery::Latest).await.expect("a feed");
+    let mut late =
+        engine.subscribe(OutputSpec::Vertices(VertexAttributes::ALL), Delivery::Latest).await.expect("a feed");
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
     let mut driver = server.drive("kept", Policy::Lossless, 40).await;
     for step in &steps {
         driver.step(step.clone()).await;
     }
     let want = |sent: usize| {
-        let ((x, n), u) = (expected(&kept_strips(), &steps[..=sent]), expected_u(&steps[..=sent]));
+        let ((x, n), u) = (expected(&strips_with_attributes(), &steps[..=sent]), expected_u(&steps[..=sent]));
         (x, n, u)
     };
-    let boxes = |surface: &Surface| -> Vec<f32> {
+    let boxes = |surface: &DeformedSurface| -> Vec<f32> {
         surface.boxes.iter().flat_map(|side| [side.min, side.max].concat()).map(|number| number as f32).collect()
     };
     let shown = within(late.next()).await.expect("the newest");
@@ -172,7 +174,7 @@ async fn readers_of_different_parts_get_every_step() {
     let (x, _, u) = want(0);
     assert!(x != want(1).0 && boxes_of(&x) != boxes_of(&want(1).0) && largest_error(&u, &want(1).2) > 1e-6);
     for sent in 0..40 {
-        assert!(matches!(driver.reply().await, Told::Ack(ack) if ack.step == sent));
+        assert!(matches!(driver.reply().await, ResponseKind::Ack(ack) if ack.step == sent));
     }
     driver.finish().await;
 }
@@ -217,7 +219,7 @@ async fn displacement_overflow_refuses_the_step() {
     let server = Server::with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
     server.open("kept").await;
     let mut driver = server.drive("kept", Policy::Lossless, 0).await;
-    driver.acked(step(1, &[1], &[0.5, -0.25])).await;
+    driver.step_acknowledged(step(1, &[1], &[0.5, -0.25])).await;
     let before = get_vertices(&server, ask("kept", alone(&[]))).await.expect("kept");
     // The transform shrinks x into the range of f32; u of up to 3 q overflows.
     let tiny = [1e-24_f32, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0];
@@ -236,5 +238,5 @@ fn reference_keeps_displacements_and_boxes() {
     let reference = |scene: &std::sync::Arc<_>| ReferenceDeformer::new(scene);
     readers::displacements_and_boxes_equal_their_twins(reference);
     readers::a_scene_without_modes_has_zeros(reference);
-    assert!(!reference(&kept_strips()).shares_buffers());
+    assert!(!reference(&strips_with_attributes()).shares_buffers());
 }

@@ -8,11 +8,11 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference;
 use modalcast_model::deform::Deformer;
 use modalcast_model::load;
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
 use modalcast_proto::v1;
 
-use crate::deformers::Noise;
+use crate::deformers::TestRng;
 use crate::service_harness::{Server, config, details, get_vertices};
 use crate::tolerance::largest_error;
 
@@ -25,14 +25,14 @@ fn data(path: &str) -> String {
 }
 
 /// A state with random coordinates, scaled so that the largest displacement is this fraction of the diagonal.
-fn bent(scene: &Scene, fraction: f64) -> State {
-    let mut noise = Noise(11);
-    let mut state = State::rest(scene);
+fn bent(scene: &Scene, fraction: f64) -> SceneState {
+    let mut noise = TestRng(11);
+    let mut state = SceneState::rest(scene);
     let rest = reference::deform(scene, &state);
     for number in &mut state.q {
         *number = noise.next();
     }
-    let largest = |state: &State| {
+    let largest = |state: &SceneState| {
         let moved = reference::deform(scene, state);
         let distance =
             |(a, b): (&[f64; 3], &[f64; 3])| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
@@ -52,7 +52,7 @@ fn agrees(scene: &Arc<Scene>) {
     let error = largest_error(&bent, &reference::deform(scene, &state)) / scene.rest_bounds.diagonal();
     println!("{}: cpu is off by {error:.2e} of the diagonal", scene.name);
     assert!(error <= 1e-5, "{}: {error}", scene.name);
-    cpu.deform(&State { q: vec![0.0; state.q.len()], ..state.clone() }).expect("deforms");
+    cpu.deform(&SceneState { q: vec![0.0; state.q.len()], ..state.clone() }).expect("deforms");
     let still = cpu.surface().expect("a surface").positions.clone();
     let (mut clamped, mut moved) = (0, 0);
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
@@ -90,7 +90,7 @@ fn real_modal_inputs_agree_with_their_reference() {
 /// with the reference.
 async fn streamed_agrees(backend: BackendChoice) {
     let state = tempfile::tempdir().expect("a folder");
-    let repository = Arc::new(load::Repository::new(Some(Path::new(&data("")))).expect("the real inputs"));
+    let repository = Arc::new(load::SceneRepository::new(Some(Path::new(&data("")))).expect("the real inputs"));
     let server = Server::start_from(Config { backend, ..config(state.path()) }, repository).await;
     for source in MODAL.iter().chain(&["tree"]) {
         let path = if *source == "tree" { (*source).to_owned() } else { data(source) };
@@ -99,7 +99,7 @@ async fn streamed_agrees(backend: BackendChoice) {
         let bent = bent(&scene, 0.0501);
         let q: Vec<u8> = bent.q.iter().flat_map(|number| number.to_le_bytes()).collect();
         let mut driver = server.drive(&name, v1::Policy::Lossless, 0).await;
-        driver.acked(v1::Step { number: 1, q: q.into(), ..v1::Step::default() }).await;
+        driver.step_acknowledged(v1::Step { number: 1, q: q.into(), ..v1::Step::default() }).await;
         let ask = v1::GetVerticesRequest { scene: name.clone(), ..v1::GetVerticesRequest::default() };
         let got = get_vertices(&server, ask).await.expect("vertices");
         assert_eq!(got.step().number, 1);
@@ -107,7 +107,7 @@ async fn streamed_agrees(backend: BackendChoice) {
         let error = largest_error(&got.positions, &want) / scene.rest_bounds.diagonal();
         println!("{source}: streamed by {backend:?}, off by {error:.2e} of the diagonal");
         assert!(error <= 1e-5, "{source}: {error}");
-        let rest = reference::deform(&scene, &State::rest(&scene));
+        let rest = reference::deform(&scene, &SceneState::rest(&scene));
         assert!(largest_error(&got.positions, &rest) >= 0.05 * scene.rest_bounds.diagonal(), "the control moved");
         driver.finish().await;
     }
@@ -131,7 +131,7 @@ async fn real_malformed_modes_are_refused_and_the_server_continues() {
     let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
     std::fs::copy(data("sofa/ball/modes.txt"), scenes.path().join("modes.txt")).expect("copied");
     std::fs::copy(data("sofa/hexaBeam/hexaBeam.derived.obj"), scenes.path().join("ball.obj")).expect("copied");
-    let repository = Arc::new(load::Repository::new(Some(scenes.path())).expect("a repository"));
+    let repository = Arc::new(load::SceneRepository::new(Some(scenes.path())).expect("a repository"));
     let server = Server::start_from(config(state.path()), repository).await;
     let open = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: String::new() };
     let refusal = server.scenes().await.open_scene(open("ball.obj")).await.expect_err("malformed");

@@ -7,7 +7,7 @@ use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{PATIENCE, Server, config, expected, get_vertices, step, strips};
+use crate::service_harness::{Server, TIMEOUT, config, expected, get_vertices, step, strips};
 
 fn ask(scene: &str) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
@@ -26,7 +26,7 @@ async fn play(server: &Server) -> Vec<f32> {
     server.open("strips").await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     for step in steps() {
-        driver.acked(step).await;
+        driver.step_acknowledged(step).await;
     }
     driver.finish().await;
     get_vertices(server, ask("strips")).await.expect("vertices").positions
@@ -43,7 +43,7 @@ fn shown_by_the_next_server(state: &Path) -> (v1::StepId, Vec<f32>) {
         let shown = (got.step(), got.positions);
         // A writer starts a new run at any number.
         let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-        driver.acked(step(0, &[0], &[0.0, 0.0])).await;
+        driver.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
         let got = get_vertices(&server, ask("strips")).await.expect("vertices");
         assert_eq!((got.step().run, got.step().number), (shown.0.run + 1, 0));
         shown
@@ -78,7 +78,7 @@ fn killed_server_restores_the_last_checkpoint() {
         let begin = Instant::now();
         let is_kept = |bytes: Vec<u8>| bytes.get(16..24) == Some(9_u64.to_le_bytes().as_slice());
         while !std::fs::read(folder.path().join("steps/strips.step")).is_ok_and(is_kept) {
-            assert!(begin.elapsed() < PATIENCE, "the step was never kept");
+            assert!(begin.elapsed() < TIMEOUT, "the step was never kept");
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
         std::fs::create_dir(copy.path().join("steps")).expect("a folder");

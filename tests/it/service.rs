@@ -240,7 +240,7 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
         assert!(names.iter().any(|name| name == service), "{service} is not in {names:?}");
     }
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-    driver.acked(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
+    driver.step_acknowledged(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
     let watched = health.watch(tonic_health::pb::HealthCheckRequest { service: String::new() }).await;
     let mut watched = watched.expect("a watch").into_inner();
     assert_eq!(watched.message().await.expect("fine").expect("one").status, 1);

@@ -12,10 +12,10 @@ use tokio::sync::watch;
 use tonic::Code;
 use tonic::transport::Channel;
 use v1::Policy;
-use v1::drive_scene_response::Kind as Told;
+use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Driver, PATIENCE, Server, step, within};
+use crate::service_harness::{Driver, Server, TIMEOUT, step, within};
 
 /// Another stream on the same connection continues.
 #[tokio::test(flavor = "multi_thread")]
@@ -25,9 +25,9 @@ async fn flood_of_steps_is_merged_under_latest() {
     server.open("strips").await;
     let channel = server.channel().await;
     let mut flood = Driver::connect(channel.clone()).await;
-    assert!(matches!(flood.open("sheet", Policy::Latest, 0).await, Told::Opened(_)));
+    assert!(matches!(flood.open("sheet", Policy::Latest, 0).await, ResponseKind::Opened(_)));
     let mut other = Driver::connect(channel).await;
-    assert!(matches!(other.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
+    assert!(matches!(other.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     const COUNT: u64 = 20_000;
     let (sender, mut replies) = flood.split();
     let send = async {
@@ -39,15 +39,15 @@ async fn flood_of_steps_is_merged_under_latest() {
     let read = async {
         loop {
             match within(replies.message()).await.expect("goes on").expect("a reply").kind {
-                Some(Told::Ack(ack)) if ack.step == COUNT => return ack.skipped,
-                Some(Told::Ack(_)) => {}
+                Some(ResponseKind::Ack(ack)) if ack.step == COUNT => return ack.skipped,
+                Some(ResponseKind::Ack(_)) => {}
                 other => panic!("{other:?}"),
             }
         }
     };
     let live = async {
         for number in 0..50 {
-            other.acked(step(number, &[0], &[0.1, 0.2])).await;
+            other.step_acknowledged(step(number, &[0], &[0.1, 0.2])).await;
         }
     };
     let ((), skipped, ()) = tokio::join!(send, read, live);
@@ -61,7 +61,7 @@ async fn writer_that_reads_no_refusals_is_disconnected() {
     server.open("strips").await;
     let channel = server.channel().await;
     let mut driver = Driver::connect(channel.clone()).await;
-    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
+    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     // Enough long refusals to fill every buffer between server and client.
     let open = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
     let (sender, mut replies) = driver.split();
@@ -77,13 +77,13 @@ async fn writer_that_reads_no_refusals_is_disconnected() {
     let next = async {
         loop {
             let mut next = Driver::connect(channel.clone()).await;
-            if matches!(next.open("strips", Policy::Lossless, 0).await, Told::Opened(_)) {
+            if matches!(next.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)) {
                 return next;
             }
         }
     };
     let mut next = within(next).await;
-    next.acked(step(0, &[0], &[0.1, 0.2])).await;
+    next.step_acknowledged(step(0, &[0], &[0.1, 0.2])).await;
     let mut refusals = 0;
     let end = loop {
         match within(replies.message()).await {
@@ -95,36 +95,36 @@ async fn writer_that_reads_no_refusals_is_disconnected() {
     assert!(refusals < 20_000, "{refusals}");
     assert_eq!(end.code(), Code::ResourceExhausted, "{end:?}");
     within(flood).await.expect("it ends with its stream");
-    next.acked(step(1, &[0], &[0.1, 0.2])).await;
+    next.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_connection_is_closed_and_active_one_is_not() {
-    let server = Server::with(|config| Config { first_byte: Duration::from_millis(60), ..config }).await;
+    let server = Server::with(|config| Config { first_byte_timeout: Duration::from_millis(60), ..config }).await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let address = server.address.trim_start_matches("http://").to_owned();
     let mut silent = TcpStream::connect(address).await.expect("connects");
     let read = within(silent.read(&mut [0; 1])).await;
     assert!(matches!(read, Ok(0) | Err(_)), "{read:?}");
-    driver.acked(step(1, &[0], &[0.1, 0.2])).await;
+    driver.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn frozen_writer_loses_its_lease() {
-    let (keepalive, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
-    let server = Server::with(|config| Config { keepalive, keepalive_timeout, ..config }).await;
+    let (keepalive_interval, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
+    let server = Server::with(|config| Config { keepalive_interval, keepalive_timeout, ..config }).await;
     server.open("strips").await;
     let proxy = Proxy::start(server.address.trim_start_matches("http://").to_owned()).await;
     let mut frozen = Driver::connect(proxy.channel().await).await;
-    assert!(matches!(frozen.open("strips", Policy::Lossless, 0).await, Told::Opened(_)));
-    frozen.acked(step(1, &[0], &[0.1, 0.2])).await;
+    assert!(matches!(frozen.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    frozen.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
     proxy.freeze();
     let begin = Instant::now();
     let next = async {
         loop {
             let mut next = Driver::connect(server.channel().await).await;
-            if matches!(next.open("strips", Policy::Lossless, 0).await, Told::Opened(_)) {
+            if matches!(next.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)) {
                 return;
             }
         }
@@ -135,8 +135,8 @@ async fn frozen_writer_loses_its_lease() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn server_stops_in_time_despite_unread_streams() {
-    let drain = Duration::from_millis(300);
-    let server = Server::with(|config| Config { drain, ..config }).await;
+    let drain_timeout = Duration::from_millis(300);
+    let server = Server::with(|config| Config { drain_timeout, ..config }).await;
     server.open("sheet").await;
     let subscribe =
         v1::StreamVerticesRequest { scene: "sheet".into(), delivery: 1, ..v1::StreamVerticesRequest::default() };
@@ -154,7 +154,7 @@ async fn server_stops_in_time_despite_unread_streams() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_upload_times_out_and_leaves_no_files() {
-    let server = Server::with(|config| Config { stall: Duration::from_millis(60), ..config }).await;
+    let server = Server::with(|config| Config { stall_timeout: Duration::from_millis(60), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5 };
     let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
     let never = tokio_stream::StreamExt::chain(tokio_stream::iter([part]), tokio_stream::pending());
@@ -166,7 +166,7 @@ async fn silent_upload_times_out_and_leaves_no_files() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_upload_times_out_despite_short_pauses() {
-    let server = Server::with(|config| Config { stall: Duration::from_millis(400), ..config }).await;
+    let server = Server::with(|config| Config { stall_timeout: Duration::from_millis(400), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
     let parts = [Part::Header(header), Part::File(file)].into_iter();
@@ -199,7 +199,7 @@ impl Proxy {
                     tokio::select! {
                         _ = tokio::io::copy_bidirectional(&mut near, &mut far) => {}
                         () = async { frozen.wait_for(|frozen| *frozen).await.map(drop).unwrap_or_default() } => {
-                            tokio::time::sleep(PATIENCE).await;
+                            tokio::time::sleep(TIMEOUT).await;
                         }
                     }
                 });

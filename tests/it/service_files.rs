@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use modalcast_model::load::Repository;
+use modalcast_model::load::SceneRepository;
 use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
 use tonic::{Code, Status};
@@ -32,7 +32,7 @@ fn lift() -> Vec<u8> {
 }
 
 async fn server(state: &Path, scenes: &Path) -> Server {
-    let repository = Repository::new(Some(scenes)).expect("a repository");
+    let repository = SceneRepository::new(Some(scenes)).expect("a repository");
     Server::start_from(config(state), Arc::new(repository)).await
 }
 
@@ -58,7 +58,7 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
 /// Drives the single mode of a scene and returns the position of its last vertex.
 async fn lifted(server: &Server, scene: &str) -> [f32; 3] {
     let mut driver = server.drive(scene, v1::Policy::Lossless, 0).await;
-    driver.acked(step(1, &[0], &[1.5])).await;
+    driver.step_acknowledged(step(1, &[0], &[1.5])).await;
     let ask = v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() };
     let got = get_vertices(server, ask).await.expect("vertices");
     [9, 10, 11].map(|at| got.positions[at])

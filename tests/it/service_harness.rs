@@ -8,9 +8,14 @@ use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{Engine, SceneSource};
 use modalcast::service;
 use modalcast_compute::reference;
-use modalcast_model::domain::{Attachment, Domain, Follow, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::domain::{
+    Attachment, Domain, FollowConstraint, Material, Mesh, Metadata, Modes, Shape, Transform,
+};
 use modalcast_model::error::{Error, Result, invalid};
-use modalcast_model::scene::{Deformation, Look, Parts, RawUpdate, Scene, Shadow, State, TransformFormat, Update};
+use modalcast_model::scene::{
+    DeformationSettings, RawStepUpdate, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, StepUpdate,
+    TransformFormat,
+};
 use modalcast_proto::v1;
 use prost::Message as _;
 use tokio::sync::{mpsc, oneshot};
@@ -19,28 +24,28 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
 use tonic::transport::Channel;
 
-use v1::drive_scene_request::Kind as Asked;
-use v1::drive_scene_response::Kind as Told;
+use v1::drive_scene_request::Kind as RequestKind;
+use v1::drive_scene_response::Kind as ResponseKind;
 use v1::frame_service_client::FrameServiceClient;
 use v1::scene_service_client::SceneServiceClient;
 use v1::step_service_client::StepServiceClient;
 use v1::vertex_service_client::VertexServiceClient;
 
 /// Longest time that a test waits for an answer.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Source of scenes built in code: `strips` (two small domains), `far` (the same, far from the origin), `twig` (with
 /// followers), `kept` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (a loader that
 /// panics).
-pub(crate) struct InCode;
+pub(crate) struct SyntheticScenes;
 
-impl SceneSource for InCode {
+impl SceneSource for SyntheticScenes {
     fn open(&self, source: &str) -> Result<Arc<Scene>> {
         match source {
             "strips" => Ok(strips()),
             "far" => Ok(far_strips()),
             "twig" => Ok(twig()),
-            "kept" => Ok(kept_strips()),
+            "kept" => Ok(strips_with_attributes()),
             "sheet" => Ok(sheet()),
             "panic" => panic!("a planted panic of a loader"),
             _ => Err(Error::NotFound { what: "scene", given: source.into() }),
@@ -69,7 +74,7 @@ pub(crate) fn twig() -> Arc<Scene> {
     let (shape, mut domains) = two_strips(1.0);
     let frame = Transform([0.0, -1.0, 0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -0.25]);
     for (name, parent) in [("leaf", 1), ("leaflet", 2)] {
-        domains.push(Domain { follows: Some(Follow { parent, frame }), ..domain(name, None) });
+        domains.push(Domain { follows: Some(FollowConstraint { parent, frame }), ..domain(name, None) });
     }
     scene("twig", shape, domains)
 }
@@ -78,16 +83,23 @@ pub(crate) fn twig() -> Arc<Scene> {
 pub(crate) fn far_strips() -> Arc<Scene> {
     let (shape, domains) = two_strips(1.0);
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
-    let parts = Parts { shapes, materials, domains, unit: 0.5, origin: [1e7, -1e7, 1e7 + 0.25], ..Parts::named("far") };
+    let parts = SceneParts {
+        shapes,
+        materials,
+        domains,
+        unit: 0.5,
+        origin: [1e7, -1e7, 1e7 + 0.25],
+        ..SceneParts::named("far")
+    };
     Scene::new(parts).expect("a scene")
 }
 
 /// [`strips`] with larger modes, displacements and boxes.
-pub(crate) fn kept_strips() -> Arc<Scene> {
+pub(crate) fn strips_with_attributes() -> Arc<Scene> {
     let (shape, domains) = two_strips(4.0);
-    let deformation = Deformation { displacements: true, boxes: true, ..Deformation::default() };
+    let deformation = DeformationSettings { displacements: true, boxes: true, ..DeformationSettings::default() };
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
-    Scene::new(Parts { shapes, materials, domains, deformation, ..Parts::named("kept") }).expect("a scene")
+    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("kept") }).expect("a scene")
 }
 
 fn two_strips(size: f32) -> (Shape, Vec<Domain>) {
@@ -115,7 +127,7 @@ fn grid(side: u32) -> Mesh {
     let cells = (0..(side - 1) * (side - 1)).map(|cell| cell % (side - 1) + cell / (side - 1) * side);
     let triangles = cells.flat_map(|at| [[at, at + 1, at + side], [at + 1, at + side + 1, at + side]]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
-    Mesh::indexed(rest, normals, uvs, triangles).expect("a grid")
+    Mesh::from_indexed(rest, normals, uvs, triangles).expect("a grid")
 }
 
 fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
@@ -123,7 +135,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
         name: name.into(),
         shape: 0,
         material: 0,
-        runs: vec![],
+        material_ranges: vec![],
         placement: Transform::IDENTITY,
         attachment,
         follows: None,
@@ -135,9 +147,12 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
 
 fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
     // A small shadow map, because these tests are about the wire.
-    let look = Look { shadow: Some(Shadow { size: 128, ..Shadow::default() }), ..Look::default() };
+    let look = RenderSettings {
+        shadow: Some(ShadowSettings { size: 128, ..ShadowSettings::default() }),
+        ..RenderSettings::default()
+    };
     let materials = vec![Material::default()];
-    let parts = Parts { shapes: vec![shape], materials, domains, look, ..Parts::named(name) };
+    let parts = SceneParts { shapes: vec![shape], materials, domains, look, ..SceneParts::named(name) };
     Scene::new(parts).expect("a scene")
 }
 
@@ -177,11 +192,11 @@ impl Server {
     }
 
     pub(crate) async fn start(config: Config) -> Self {
-        Self::start_from(config, Arc::new(InCode)).await
+        Self::start_from(config, Arc::new(SyntheticScenes)).await
     }
 
     pub(crate) async fn start_from(config: Config, source: Arc<dyn SceneSource>) -> Self {
-        let config = config.checked().expect("settings");
+        let config = config.validated().expect("settings");
         let listener = service::bind(&config).await.expect("a port");
         let address = format!("http://{}", listener.local_addr().expect("an address"));
         let engine = Engine::start(config, source).await.expect("an engine");
@@ -219,7 +234,7 @@ impl Server {
     pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> Driver {
         let mut driver = Driver::connect(self.channel().await).await;
         let opened = driver.open(scene, policy, window).await;
-        assert!(matches!(opened, Told::Opened(_)), "{opened:?}");
+        assert!(matches!(opened, ResponseKind::Opened(_)), "{opened:?}");
         driver
     }
 
@@ -230,9 +245,9 @@ impl Server {
     }
 }
 
-/// Awaits a future and panics after [`PATIENCE`].
+/// Awaits a future and panics after [`TIMEOUT`].
 pub(crate) async fn within<T>(work: impl Future<Output = T>) -> T {
-    tokio::time::timeout(PATIENCE, work).await.expect("an answer in time")
+    tokio::time::timeout(TIMEOUT, work).await.expect("an answer in time")
 }
 
 /// Client end of a step stream, as a physics process uses it.
@@ -249,31 +264,31 @@ impl Driver {
         Self { sender, replies }
     }
 
-    pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> Told {
+    pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> ResponseKind {
         let open = v1::OpenDrive { scene: scene.into(), policy: policy.into(), window };
-        self.send(Asked::Open(open)).await;
+        self.send(RequestKind::Open(open)).await;
         self.reply().await
     }
 
-    pub(crate) async fn send(&self, kind: Asked) {
+    pub(crate) async fn send(&self, kind: RequestKind) {
         self.sender.send(v1::DriveSceneRequest { kind: Some(kind) }).await.expect("the stream lives");
     }
 
     pub(crate) async fn step(&self, step: v1::Step) {
-        self.send(Asked::Step(step)).await;
+        self.send(RequestKind::Step(step)).await;
     }
 
-    pub(crate) async fn reply(&mut self) -> Told {
+    pub(crate) async fn reply(&mut self) -> ResponseKind {
         let reply = within(self.replies.message()).await.expect("the stream goes on").expect("a reply");
         reply.kind.expect("a kind")
     }
 
     /// Sends a step and expects its acknowledgement.
-    pub(crate) async fn acked(&mut self, step: v1::Step) -> v1::Acknowledgement {
+    pub(crate) async fn step_acknowledged(&mut self, step: v1::Step) -> v1::Acknowledgement {
         let number = step.number;
         self.step(step).await;
         match self.reply().await {
-            Told::Ack(ack) if ack.step == number => ack,
+            ResponseKind::Ack(ack) if ack.step == number => ack,
             other => panic!("step {number} was answered with {other:?}"),
         }
     }
@@ -281,7 +296,7 @@ impl Driver {
     /// Expects a refusal.
     pub(crate) async fn rejection(&mut self) -> v1::Rejection {
         match self.reply().await {
-            Told::Rejection(rejection) => rejection,
+            ResponseKind::Rejection(rejection) => rejection,
             other => panic!("expected a rejection, not {other:?}"),
         }
     }
@@ -299,7 +314,7 @@ impl Driver {
     }
 
     /// Drops the stream without closing it properly.
-    pub(crate) fn vanish(self) {}
+    pub(crate) fn disconnect(self) {}
 }
 
 /// A step that sets the coordinates of some domains.
@@ -330,20 +345,20 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, places: &[(u3
 pub(crate) fn expected(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
     let state = state_after(scene, steps);
     let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
-    (round(reference::deform(scene, &state)), round(reference::orient_normals(scene, &state)))
+    (round(reference::deform(scene, &state)), round(reference::rigid_normals(scene, &state)))
 }
 
 /// State of the scene after some steps.
-pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> State {
+pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> SceneState {
     use v1::TransformFormat as Wire;
-    let mut state = State::rest(scene);
+    let mut state = SceneState::rest(scene);
     for step in steps.iter().cloned() {
         let transform_format = match step.transform_format() {
             Wire::Unspecified | Wire::AffineF32 => TransformFormat::Affine,
             Wire::RigidF32 => TransformFormat::RigidF32,
             Wire::RigidF64 => TransformFormat::RigidF64,
         };
-        let raw = RawUpdate {
+        let raw = RawStepUpdate {
             number: step.number,
             time: step.time,
             q_domains: step.q_domains,
@@ -352,14 +367,14 @@ pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> State {
             transforms: step.transforms,
             transform_format,
         };
-        state.apply(scene, &Update::parse(scene, &raw).expect("a good step"));
+        state.apply(scene, &StepUpdate::parse(scene, &raw).expect("a good step"));
     }
     state
 }
 
 /// Vertex data joined from chunks.
 #[derive(Debug)]
-pub(crate) struct Got {
+pub(crate) struct ReceivedVertices {
     pub(crate) head: v1::VertexHead,
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
@@ -370,14 +385,17 @@ pub(crate) struct Got {
     pub(crate) origins: Vec<f64>,
 }
 
-impl Got {
+impl ReceivedVertices {
     pub(crate) fn step(&self) -> v1::StepId {
         self.head.step.expect("a step")
     }
 }
 
 /// Requests the vertices of a scene.
-pub(crate) async fn get_vertices(server: &Server, request: v1::GetVerticesRequest) -> Result<Got, tonic::Status> {
+pub(crate) async fn get_vertices(
+    server: &Server,
+    request: v1::GetVerticesRequest,
+) -> Result<ReceivedVertices, tonic::Status> {
     let mut stream = within(server.vertices().await.get_vertices(request)).await?.into_inner();
     let mut chunks = Vec::new();
     while let Some(response) = within(stream.message()).await? {
@@ -390,7 +408,7 @@ pub(crate) async fn get_vertices(server: &Server, request: v1::GetVerticesReques
 /// Reads the next step of a vertex stream; `None` at its end.
 pub(crate) async fn next_vertices(
     stream: &mut Streaming<v1::StreamVerticesResponse>,
-) -> Result<Option<Got>, tonic::Status> {
+) -> Result<Option<ReceivedVertices>, tonic::Status> {
     let mut chunks = Vec::<v1::VertexChunk>::new();
     while let Some(response) = within(stream.message()).await? {
         chunks.push(response.chunk.expect("a chunk"));
@@ -403,7 +421,7 @@ pub(crate) async fn next_vertices(
     Ok(None)
 }
 
-fn join(mut chunks: Vec<v1::VertexChunk>) -> Got {
+fn join(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
     let head = chunks[0].head.take().expect("a head first");
     let mut bytes = Vec::new();
     for chunk in chunks {
@@ -419,7 +437,7 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> Got {
     let floats = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, f32>(bytes);
     let origins = bytemuck::pod_collect_to_vec::<u8, f64>(origins);
     let [positions, normals, displacements, boxes] = [positions, normals, displacements, boxes].map(floats);
-    Got { positions, normals, displacements, boxes, origins, head }
+    ReceivedVertices { positions, normals, displacements, boxes, origins, head }
 }
 
 /// Decodes the refusal in the details of a status.

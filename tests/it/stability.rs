@@ -7,7 +7,7 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::storage::Truncation;
 use modalcast_model::scene::Scene;
 
-use crate::both::{changes, extremes, following, light, neighbours, readers, refusal, surfaces, truncation};
+use crate::both::{changes, extremes, following, light, neighbors, readers, refusal, surfaces, truncation};
 
 fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene)
@@ -82,7 +82,7 @@ fn mode_near_the_truncation_limit_does_not_flicker() {
 #[test]
 fn partial_steps_have_the_bits_of_full_steps() {
     changes::steps_of_a_few_domains(deformer);
-    assert!(!changes::believes_lists(deformer), "the cpu compares values");
+    assert!(!changes::trusts_change_lists(deformer), "the cpu compares values");
 }
 
 #[test]
@@ -113,7 +113,7 @@ fn displacement_overflow_refusal_names_the_domain() {
 
 #[test]
 fn domain_has_the_same_bits_alone_and_among_others() {
-    neighbours::alone_and_among_others(deformer);
+    neighbors::alone_and_among_others(deformer);
 }
 
 #[test]

@@ -1,10 +1,10 @@
 //! Steps over the wire: the scene shows the acknowledged steps, under both policies.
 
-use modalcast::engine::{Delivery, View, Which};
-use modalcast_model::deform::Wanted;
+use modalcast::engine::{Delivery, OutputSpec, StepSelector};
+use modalcast_model::deform::VertexAttributes;
 use modalcast_proto::v1;
 use v1::Policy;
-use v1::drive_scene_response::Kind as Told;
+use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{Server, expected, get_vertices, next_vertices, sheet, step, strips, within};
 
@@ -23,7 +23,7 @@ async fn acknowledged_steps_have_vertices_of_the_reference() {
     turned.transforms = turn.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     let steps = [step(0, &[], &[0.1, 0.2, 0.3, 0.4]), turned, step(7, &[0], &[0.75, 0.0])];
     for sent in 0..steps.len() {
-        let ack = driver.acked(steps[sent].clone()).await;
+        let ack = driver.step_acknowledged(steps[sent].clone()).await;
         let stages: Vec<&str> = ack.stages.iter().map(|stage| stage.stage.as_str()).collect();
         assert_eq!(stages, ["parse", "queue", "deform"]);
         let got = get_vertices(&server, vertices_of("strips")).await.expect("vertices");
@@ -62,7 +62,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
     };
     let write = async {
         for step in &steps {
-            driver.acked(step.clone()).await;
+            driver.step_acknowledged(step.clone()).await;
         }
     };
     tokio::join!(read, write);
@@ -76,7 +76,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
     let engine = server.engine.find("strips").expect("open");
     let mut feeds = Vec::new();
     for delivery in [Delivery::Lossless, Delivery::Lossless, Delivery::Latest] {
-        feeds.push(engine.watch(View::Vertices(Wanted::VERTICES), delivery).await.expect("a feed"));
+        feeds.push(engine.subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), delivery).await.expect("a feed"));
     }
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
     let mut driver = server.drive("strips", Policy::Lossless, 40).await;
@@ -84,8 +84,8 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
     for step in &steps {
         driver.step(step.clone()).await;
     }
-    let judge = |shown: &modalcast::engine::Shown| {
-        let modalcast::engine::Body::Vertices(surface) = &shown.body else { panic!("not vertices") };
+    let judge = |shown: &modalcast::engine::StepOutput| {
+        let modalcast::engine::OutputBody::Vertices(surface) = &shown.body else { panic!("not vertices") };
         let sent = shown.step.number as usize;
         let stages: Vec<_> = shown.stages.iter().map(|(stage, _)| stage.name()).collect();
         assert_eq!(stages, ["parse", "queue", "deform", "copy"]);
@@ -104,7 +104,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         }
     }
     for sent in 0..40 {
-        assert!(matches!(driver.reply().await, Told::Ack(ack) if ack.step == sent));
+        assert!(matches!(driver.reply().await, ResponseKind::Ack(ack) if ack.step == sent));
     }
     driver.finish().await;
 }
@@ -118,14 +118,14 @@ async fn unread_lossless_feed_applies_back_pressure() {
         .engine
         .find("strips")
         .expect("open")
-        .watch(View::Vertices(Wanted::VERTICES), Delivery::Lossless)
+        .subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless)
         .await
         .expect("a feed");
     let mut driver = server.drive("strips", Policy::Lossless, 2).await;
     // Two steps are queued in the feed. The third is computed but not acknowledged, the fourth waits, and the fifth
     // exceeds the window.
-    driver.acked(step(1, &[0], &[0.1, 0.0])).await;
-    driver.acked(step(2, &[0], &[0.2, 0.0])).await;
+    driver.step_acknowledged(step(1, &[0], &[0.1, 0.0])).await;
+    driver.step_acknowledged(step(2, &[0], &[0.2, 0.0])).await;
     for number in 3..=5 {
         driver.step(step(number, &[0], &[number as f32 / 10.0, 0.0])).await;
     }
@@ -137,7 +137,7 @@ async fn unread_lossless_feed_applies_back_pressure() {
         assert_eq!(within(feed.next()).await.expect("goes on").step.number, number);
     }
     for number in 3..=4 {
-        assert!(matches!(driver.reply().await, Told::Ack(ack) if ack.step == number));
+        assert!(matches!(driver.reply().await, ResponseKind::Ack(ack) if ack.step == number));
     }
     let got = get_vertices(&server, vertices_of("strips")).await.expect("vertices");
     assert_eq!(got.positions, expected(&strips(), &[step(4, &[0], &[0.4, 0.0])]).0);
@@ -145,21 +145,21 @@ async fn unread_lossless_feed_applies_back_pressure() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn stalled_subscriber_is_cut_off_and_the_writer_goes_on() {
-    let stall = std::time::Duration::from_millis(50);
-    let server = Server::with(|config| modalcast::config::Config { stall, ..config }).await;
+    let stall_timeout = std::time::Duration::from_millis(50);
+    let server = Server::with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
     server.open("strips").await;
     let mut feed = server
         .engine
         .find("strips")
         .expect("open")
-        .watch(View::Vertices(Wanted::VERTICES), Delivery::Lossless)
+        .subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless)
         .await
         .expect("a feed");
     let mut driver = server.drive("strips", Policy::Lossless, 1).await;
     for number in 1..=6 {
-        driver.acked(step(number, &[0], &[0.1, 0.0])).await;
+        driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
     }
-    let cut = within(feed.cut_off()).await;
+    let cut = within(feed.disconnected()).await;
     assert!(matches!(cut, modalcast_model::error::Error::Busy { .. }), "{cut}");
     within(feed.next()).await.expect("the first that it held");
     within(feed.next()).await.expect("the second");
@@ -185,8 +185,8 @@ async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     let mut acks = 0;
     let last = loop {
         match driver.reply().await {
-            Told::Ack(ack) if ack.step == 200 => break ack,
-            Told::Ack(_) => acks += 1,
+            ResponseKind::Ack(ack) if ack.step == 200 => break ack,
+            ResponseKind::Ack(_) => acks += 1,
             other => panic!("{other:?}"),
         }
     };
@@ -201,13 +201,14 @@ async fn latest_subscriber_gets_current_step_and_skip_count() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
-    driver.acked(step(3, &[0], &[0.1, 0.0])).await;
+    driver.step_acknowledged(step(3, &[0], &[0.1, 0.0])).await;
     let host = server.engine.find("strips").expect("open");
-    let mut feed = host.watch(View::Vertices(Wanted::VERTICES), Delivery::Latest).await.expect("a feed");
+    let mut feed =
+        host.subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Latest).await.expect("a feed");
     let first = within(feed.next()).await.expect("the current step");
     assert_eq!((first.step.number, first.skipped), (3, 0));
     for number in 4..=8 {
-        driver.acked(step(number, &[0], &[0.1, 0.0])).await;
+        driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
     }
     let second = within(feed.next()).await.expect("the newest step");
     assert_eq!((second.step.number, second.skipped), (8, 4));
@@ -220,23 +221,23 @@ async fn second_writer_waits_for_the_first_to_leave() {
     let server = Server::fresh().await;
     server.open("strips").await;
     let mut first = server.drive("strips", Policy::Lossless, 0).await;
-    first.acked(step(100, &[0], &[0.1, 0.0])).await;
+    first.step_acknowledged(step(100, &[0], &[0.1, 0.0])).await;
     let mut second = crate::service_harness::Driver::connect(server.channel().await).await;
-    let Told::Rejection(refusal) = second.open("strips", Policy::Lossless, 0).await else { panic!("let in") };
+    let ResponseKind::Rejection(refusal) = second.open("strips", Policy::Lossless, 0).await else { panic!("let in") };
     assert!(refusal.field.contains("writer"), "{refusal:?}");
     assert!(refusal.given.contains("127.0.0.1") && refusal.given.contains("run 1"), "{refusal:?}");
-    first.acked(step(101, &[0], &[0.2, 0.0])).await;
+    first.step_acknowledged(step(101, &[0], &[0.2, 0.0])).await;
     first.finish().await;
     // The refused stream can open the scene now, and its step numbers start again.
-    let Told::Opened(opened) = second.open("strips", Policy::Latest, 100_000).await else { panic!("kept out") };
+    let ResponseKind::Opened(opened) = second.open("strips", Policy::Latest, 100_000).await else { panic!("kept out") };
     assert_eq!((opened.run, opened.window), (2, 256));
     assert_eq!(opened.scene.and_then(|scene| scene.last_step).map(|step| (step.run, step.number)), Some((1, 101)));
-    second.acked(step(0, &[0], &[0.3, 0.0])).await;
-    second.vanish();
+    second.step_acknowledged(step(0, &[0], &[0.3, 0.0])).await;
+    second.disconnect();
     let third = async {
         loop {
             let mut third = crate::service_harness::Driver::connect(server.channel().await).await;
-            if let Told::Opened(opened) = third.open("strips", Policy::Lossless, 0).await {
+            if let ResponseKind::Opened(opened) = third.open("strips", Policy::Lossless, 0).await {
                 return opened.run;
             }
         }
@@ -246,7 +247,7 @@ async fn second_writer_waits_for_the_first_to_leave() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn requests_of_departed_clients_free_their_slots() {
-    let server = Server::with(|config| modalcast::config::Config { waiting: 4, ..config }).await;
+    let server = Server::with(|config| modalcast::config::Config { max_pending_requests: 4, ..config }).await;
     server.open("strips").await;
     let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
     let never = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertices_of("strips") };
@@ -278,14 +279,14 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let host = server.engine.find("strips").expect("open");
-    let mut waiting = [Which::Exact(2), Which::Minimum(3), Which::Exact(5)]
-        .map(|which| Box::pin(host.show(which, View::Vertices(Wanted::VERTICES))));
+    let mut waiting = [StepSelector::Exact(2), StepSelector::Minimum(3), StepSelector::Exact(5)]
+        .map(|selector| Box::pin(host.request_output(selector, OutputSpec::Vertices(VertexAttributes::VERTICES))));
     for request in &mut waiting {
         // One poll registers the request.
         assert!(tokio::time::timeout(std::time::Duration::ZERO, request).await.is_err(), "there is no step yet");
     }
     for number in [1, 2, 4, 5] {
-        driver.acked(step(number, &[0], &[number as f32, 0.0])).await;
+        driver.step_acknowledged(step(number, &[0], &[number as f32, 0.0])).await;
     }
     let mut shown = Vec::new();
     for request in waiting {

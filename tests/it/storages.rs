@@ -4,22 +4,22 @@ use std::sync::Arc;
 
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference;
-use modalcast_compute::storage::bound::{Reaches, Step};
-use modalcast_compute::storage::{QUAD, TILE_QUADS, Tiles};
-use modalcast_model::deform::{Deformed, Deformer};
+use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
+use modalcast_compute::storage::{QUAD, TILE_QUADS, TiledModes};
+use modalcast_model::deform::{DeformSummary, Deformer};
 use modalcast_model::domain::{Material, Modes, Shape, Transform};
-use modalcast_model::scene::{Deformation, Parts, Scene, State, Storage};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
-use crate::deformers::{Noise, domain, shaken, strip};
+use crate::deformers::{TestRng, domain, shaken, strip};
 
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
 
 /// A scene of strips of [`SIZES`]. The last two domains are instances of the first and of the fourth shape; the last
 /// one also shares the coordinates of its twin.
-fn scene_of(deformation: Deformation) -> Arc<Scene> {
-    let mut noise = Noise(42);
-    let mut parts = Parts::named("storages");
+fn scene_of(deformation: DeformationSettings) -> Arc<Scene> {
+    let mut noise = TestRng(42);
+    let mut parts = SceneParts::named("storages");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
     for (at, (vertices, rank)) in SIZES.iter().enumerate() {
@@ -34,11 +34,11 @@ fn scene_of(deformation: Deformation) -> Arc<Scene> {
 }
 
 /// One domain with these columns of U and rest positions of zero.
-fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> Arc<Scene> {
-    let mut parts = Parts::named("columns");
+fn columns_of(vertices: usize, columns: Vec<f32>, deformation: DeformationSettings) -> Arc<Scene> {
+    let mut parts = SceneParts::named("columns");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
-    let flat = strip(vertices, 0, &mut Noise(1)).mesh;
+    let flat = strip(vertices, 0, &mut TestRng(1)).mesh;
     let mesh =
         modalcast_model::domain::Mesh::new(vec![[0.0; 3]; vertices], flat.corners().clone(), flat.triangles().to_vec());
     let rank = columns.len() / (3 * vertices);
@@ -48,28 +48,32 @@ fn columns_of(vertices: usize, columns: Vec<f32>, deformation: Deformation) -> A
     Scene::new(parts).expect("a scene")
 }
 
-fn run(deformer: &mut CpuDeformer, state: &State) -> (Deformed, Vec<f32>) {
+fn run(deformer: &mut CpuDeformer, state: &SceneState) -> (DeformSummary, Vec<f32>) {
     let told = deformer.deform(state).expect("deforms");
     (told, deformer.surface().expect("a surface").positions.clone())
 }
 
 /// Error bound of each tile of a domain, including the bound of the truncated modes.
-fn bounds_of(scene: &Scene, state: &State, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
+fn bounds_of(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
     let shape = scene.shape_of(domain);
-    let tiles = Tiles::new(shape, scene.deformation.storage);
+    let tiles = TiledModes::new(shape, scene.deformation.storage);
     let mut q = state.q_of(scene, domain).to_vec();
     let mut left_out = 0.0;
     if let Some(truncation) = deformer.truncation(domain) {
         left_out = truncation.bound();
-        (0..q.len()).filter(|mode| !truncation.kept().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
+        (0..q.len()).filter(|mode| !truncation.retained().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
     }
-    let step = Step { q: &q, transform: state.composed(scene, domain), compensated: scene.deformation.compensated };
-    let reaches = Reaches::new(shape, &tiles);
+    let step = ErrorBoundInput {
+        q: &q,
+        transform: state.composed_transform(scene, domain),
+        compensated: scene.deformation.compensated,
+    };
+    let reaches = ShapeErrorModel::new(shape, &tiles);
     (0..tiles.count()).map(|tile| reaches.tile(tile, &step).total() + left_out).collect()
 }
 
 /// Largest error of each domain relative to the bound of its tile; infinite for NaN.
-fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
+fn parts_of_bound(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let want = reference::deform(scene, state);
     let part = |domain: usize| {
         let slot = scene.layout.slots[domain];
@@ -88,9 +92,10 @@ fn parts_of_bound(scene: &Scene, state: &State, positions: &[f32], deformer: &Cp
 /// Control: a state with the wrong sign exceeds the bound.
 #[test]
 fn errors_stay_within_bounds_in_every_storage() {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
-            let scene = scene_of(Deformation { storage, compensated, truncation, ..Deformation::default() });
+            let scene =
+                scene_of(DeformationSettings { storage, compensated, truncation, ..DeformationSettings::default() });
             let mut state = shaken(&scene);
             // Decreasing amplitudes, so that some modes may be truncated.
             let count = state.q.len() as f32;
@@ -118,12 +123,12 @@ fn errors_stay_within_bounds_in_every_storage() {
 
 #[test]
 fn positions_do_not_depend_on_threads_or_earlier_steps() {
-    for storage in Storage::ALL {
-        let scene = scene_of(Deformation { storage, ..Deformation::default() });
+    for storage in StorageType::ALL {
+        let scene = scene_of(DeformationSettings { storage, ..DeformationSettings::default() });
         let mut state = shaken(&scene);
-        let mut kept = CpuDeformer::new(&scene);
-        run(&mut kept, &state);
-        let mut noise = Noise(5);
+        let mut retained = CpuDeformer::new(&scene);
+        run(&mut retained, &state);
+        let mut noise = TestRng(5);
         for step in 0..6 {
             // Each step changes q of one domain and the transform of another. The last step changes nothing, the one
             // before it all of q.
@@ -133,15 +138,15 @@ fn positions_do_not_depend_on_threads_or_earlier_steps() {
                 state.q[moved].iter_mut().for_each(|number| *number = noise.next());
                 state.transforms[[1, 6, 10, 3, 5][step]].0[3] += 0.5;
             }
-            let (told, positions) = run(&mut kept, &state);
+            let (told, positions) = run(&mut retained, &state);
             for threads in [1, 2, 5] {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
                 let mut fresh = CpuDeformer::new(&scene);
                 let (fresh_told, fresh_positions) = pool.install(|| run(&mut fresh, &state));
                 assert_eq!(bits(&positions), bits(&fresh_positions), "{storage:?}, step {step}, {threads} threads");
                 assert_eq!(told.bounds, fresh_told.bounds);
-                let (kept, fresh) = (kept.surface().expect("one"), fresh.surface().expect("one"));
-                assert_eq!(kept.normals, fresh.normals);
+                let (retained, fresh) = (retained.surface().expect("one"), fresh.surface().expect("one"));
+                assert_eq!(retained.normals, fresh.normals);
             }
         }
     }
@@ -155,11 +160,11 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
 fn vertices_do_not_depend_on_the_tiling() {
     // The first 129 vertices of a shape of 1500 vertices, together with the others or alone, fall into tiles of
     // different sizes.
-    let mut noise = Noise(8);
+    let mut noise = TestRng(8);
     let columns: Vec<f32> = (0..4500 * 9).map(|_| noise.next()).collect();
     let few: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
-    for storage in [Storage::F32, Storage::F16, Storage::Bf16] {
-        let deformation = Deformation { storage, ..Deformation::default() };
+    for storage in [StorageType::F32, StorageType::F16, StorageType::Bf16] {
+        let deformation = DeformationSettings { storage, ..DeformationSettings::default() };
         let (large, small) =
             (columns_of(1500, columns.clone(), deformation), columns_of(129, few.clone(), deformation));
         let state = shaken(&large);
@@ -170,9 +175,9 @@ fn vertices_do_not_depend_on_the_tiling() {
 
 #[test]
 fn huge_tiny_and_denormal_q_stay_within_the_bound() {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         for compensated in [false, true] {
-            let scene = scene_of(Deformation { storage, compensated, ..Deformation::default() });
+            let scene = scene_of(DeformationSettings { storage, compensated, ..DeformationSettings::default() });
             let mut deformer = CpuDeformer::new(&scene);
             for amount in [1e30, 1e-38, 1e-42, 1e-45, 0.0] {
                 let mut state = shaken(&scene);
@@ -192,12 +197,12 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
 fn finite_sums_survive_overflowing_terms() {
     let mode = |entry: f32| vec![entry; 3 * 5];
     let columns = [mode(2.0), mode(2.0), mode(1.0)].concat();
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         for compensated in [false, true] {
-            let deformation = Deformation { storage, compensated, ..Deformation::default() };
+            let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
             let scene = columns_of(5, columns.clone(), deformation);
             let mut deformer = CpuDeformer::new(&scene);
-            let mut state = State::rest(&scene);
+            let mut state = SceneState::rest(&scene);
             // Plain f32 summation gives infinity, and compensated summation gives infinity minus infinity.
             state.q = vec![3e38, -3e38, 0.75];
             assert!(2.0_f32.mul_add(state.q[1], 2.0_f32.mul_add(state.q[0], 0.0)).is_infinite());
@@ -216,26 +221,26 @@ fn finite_sums_survive_overflowing_terms() {
 #[test]
 fn truncation_budget_in_meters_holds_in_scene_units() {
     for unit in [1.0, 0.01] {
-        let mut parts = Parts::named("millimetres");
+        let mut parts = SceneParts::named("millimetres");
         parts.unit = unit;
         parts.deformation.truncation = Some(1e-3);
         parts.materials = vec![Material::default()];
-        parts.shapes = vec![strip(300, 24, &mut Noise(2))];
+        parts.shapes = vec![strip(300, 24, &mut TestRng(2))];
         parts.domains = vec![domain(0, "strip".into())];
         let scene = Scene::new(parts).expect("a scene");
-        let mut state = State::rest(&scene);
+        let mut state = SceneState::rest(&scene);
         state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
         state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
         let mut deformer = CpuDeformer::new(&scene);
         let (_, positions) = run(&mut deformer, &state);
         let truncation = deformer.truncation(0).expect("a budget");
-        let kept = truncation.kept().to_vec();
+        let retained = truncation.retained().to_vec();
         assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
-        assert!(kept.len() > 2 && kept.len() < 20, "{kept:?}");
+        assert!(retained.len() > 2 && retained.len() < 20, "{retained:?}");
         assert!(parts_of_bound(&scene, &state, &positions, &deformer)[0] <= 1.0);
         // Truncated modes contribute nothing: the result has the bits of a state with zeros for these modes.
         let mut zeroed = state.clone();
-        (0..24).filter(|mode| !kept.contains(&(*mode as u16))).for_each(|mode| zeroed.q[mode] = 0.0);
+        (0..24).filter(|mode| !retained.contains(&(*mode as u16))).for_each(|mode| zeroed.q[mode] = 0.0);
         let plain = columns_and_rest(&scene);
         assert_eq!(bits(&run(&mut CpuDeformer::new(&plain), &zeroed).1), bits(&positions));
         assert_ne!(bits(&run(&mut CpuDeformer::new(&plain), &state).1), bits(&positions));
@@ -244,7 +249,7 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
 
 /// The same scene without a truncation budget.
 fn columns_and_rest(scene: &Scene) -> Arc<Scene> {
-    let mut parts = Parts::named("plain");
+    let mut parts = SceneParts::named("plain");
     parts.materials = scene.materials.clone();
     parts.shapes = scene.shapes.clone();
     parts.domains = scene.domains.clone();

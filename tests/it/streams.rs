@@ -4,13 +4,13 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::engine::{Body, Delivery, Showing, Shown, View, Workbench};
+use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, StepOutput};
 use modalcast_model::scene::{Camera, Lens};
 use modalcast_proto::v1;
 use v1::Policy;
-use v1::drive_scene_response::Kind as Told;
+use v1::drive_scene_response::Kind as ResponseKind;
 
-use crate::service_harness::{Server, kept_strips, state_after, step, within};
+use crate::service_harness::{Server, state_after, step, strips_with_attributes, within};
 
 const SIZE: (u32, u32) = (48, 32);
 const STEPS: u64 = 30;
@@ -18,12 +18,12 @@ const STEPS: u64 = 30;
 const BAD: u64 = 13;
 
 fn cameras(count: usize) -> Vec<Camera> {
-    let first = Camera::framing(&kept_strips(), SIZE.0, SIZE.1);
+    let first = Camera::fit_to_scene(&strips_with_attributes(), SIZE.0, SIZE.1);
     (0..count).map(|at| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * at as f64), ..first }).collect()
 }
 
-fn view(camera: Camera) -> View {
-    View::Frame { camera, width: SIZE.0, height: SIZE.1, showing: Showing::Colour }
+fn view(camera: Camera) -> OutputSpec {
+    OutputSpec::Frame { camera, width: SIZE.0, height: SIZE.1, frame_output: FrameOutput::Color }
 }
 
 fn steps() -> Vec<v1::Step> {
@@ -33,22 +33,22 @@ fn steps() -> Vec<v1::Step> {
 
 /// Reference pictures of every valid step, rendered one by one.
 fn expected(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
-    let (scene, steps) = (kept_strips(), steps());
+    let (scene, steps) = (strips_with_attributes(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
-    let mut bench = Workbench::open(&config).expect("opens");
-    let mut staged = bench.stage(&scene).expect("stages");
+    let mut bench = DeviceContext::open(&config).expect("opens");
+    let mut staged = bench.load_scene(&scene).expect("stages");
     let mut pictures = Vec::new();
     for step in steps.iter().filter(|step| step.number != BAD) {
         staged.deform(&state_after(&scene, std::slice::from_ref(step))).expect("deforms");
         let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE.0, SIZE.1).expect("draws").rgba;
         pictures.push((step.number, cameras.iter().map(&mut draw).collect()));
     }
-    bench.unstage(staged);
+    bench.unload_scene(staged);
     pictures
 }
 
-fn pixels(shown: &Shown) -> &[u8] {
-    let Body::Frame(image) = &shown.body else { panic!("no frame") };
+fn pixels(shown: &StepOutput) -> &[u8] {
+    let OutputBody::Frame(image) = &shown.body else { panic!("no frame") };
     &image.rgba
 }
 
@@ -66,13 +66,13 @@ async fn frames_of_many_cameras_show_their_own_step() {
     let host = server.engine.find("kept").expect("open");
     let mut feeds = Vec::new();
     for camera in &cameras {
-        feeds.push(host.watch(view(*camera), Delivery::Lossless).await.expect("a feed"));
+        feeds.push(host.subscribe(view(*camera), Delivery::Lossless).await.expect("a feed"));
     }
-    let positions = modalcast_model::deform::Wanted { positions: true, ..Default::default() };
-    let mut vertices = host.watch(View::Vertices(positions), Delivery::Lossless).await.expect("a feed");
+    let positions = modalcast_model::deform::VertexAttributes { positions: true, ..Default::default() };
+    let mut vertices = host.subscribe(OutputSpec::Vertices(positions), Delivery::Lossless).await.expect("a feed");
     // One feed is dropped halfway, and one is never read.
-    let mut leaver = Some(host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed"));
-    let _idle = host.watch(view(cameras[0]), Delivery::Latest).await.expect("a feed");
+    let mut leaver = Some(host.subscribe(view(cameras[0]), Delivery::Lossless).await.expect("a feed"));
+    let _idle = host.subscribe(view(cameras[0]), Delivery::Latest).await.expect("a feed");
     let mut driver = server.drive("kept", Policy::Lossless, 40).await;
     for step in steps() {
         driver.step(step).await;
@@ -94,8 +94,8 @@ async fn frames_of_many_cameras_show_their_own_step() {
     }
     for number in 0..STEPS {
         match driver.reply().await {
-            Told::Ack(ack) => assert!(ack.step == number && number != BAD, "{ack:?}"),
-            Told::Rejection(_) => assert_eq!(number, BAD, "refused in its turn"),
+            ResponseKind::Ack(ack) => assert!(ack.step == number && number != BAD, "{ack:?}"),
+            ResponseKind::Rejection(_) => assert_eq!(number, BAD, "refused in its turn"),
             other => panic!("{other:?}"),
         }
     }
@@ -107,7 +107,7 @@ async fn frames_of_many_cameras_show_their_own_step() {
 async fn closing_a_scene_delivers_frames_in_flight() {
     let (server, cameras) = (server().await, cameras(2));
     let host = Arc::clone(&server.engine.find("kept").expect("open"));
-    let mut feed = host.watch(view(cameras[0]), Delivery::Lossless).await.expect("a feed");
+    let mut feed = host.subscribe(view(cameras[0]), Delivery::Lossless).await.expect("a feed");
     let driver = server.drive("kept", Policy::Lossless, 40).await;
     for step in steps().into_iter().take(12) {
         driver.step(step).await;

@@ -30,9 +30,9 @@ impl Affine {
         })
     }
 
-    /// Composes transforms: `a_from_c = a_from_b.then(b_from_c)`.
+    /// Composes transforms: `a_from_c = a_from_b.compose(b_from_c)`.
     #[must_use]
-    pub fn then(&self, b_from_c: &Self) -> Self {
+    pub fn compose(&self, b_from_c: &Self) -> Self {
         Self { linear: self.linear * b_from_c.linear, translation: self.apply(&b_from_c.translation) }
     }
 
@@ -42,7 +42,7 @@ impl Affine {
     }
 
     /// A rotation by `angle` radians about an axis through the point `about`. The axis is normalized.
-    pub fn turn(axis: &Vector3<f64>, angle: f64, about: &Vector3<f64>) -> Self {
+    pub fn rotation_about(axis: &Vector3<f64>, angle: f64, about: &Vector3<f64>) -> Self {
         let turn = nalgebra::Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(*axis), angle).into_inner();
         Self { linear: turn, translation: about - turn * about }
     }
@@ -90,7 +90,7 @@ mod tests {
     #[test]
     fn rigid_motion_recovers_the_motion_of_a_planar_ring() {
         for angle in [0.0, 1e-9, 0.3, 1.5, 3.0] {
-            let motion = Affine::turn(&Vector3::new(1.0, 2.0, -0.5), angle, &Vector3::new(0.3, -1.0, 4.0));
+            let motion = Affine::rotation_about(&Vector3::new(1.0, 2.0, -0.5), angle, &Vector3::new(0.3, -1.0, 4.0));
             let rest = ring(8);
             let now: Vec<_> = rest.iter().map(|point| motion.apply(point)).collect();
             let got = rigid_motion(&rest, &now);
@@ -124,11 +124,11 @@ mod tests {
 
     #[test]
     fn entries_round_trip_and_transforms_compose() {
-        let turn = Affine::turn(&Vector3::z(), std::f64::consts::FRAC_PI_2, &Vector3::new(1.0, 0.0, 0.0));
+        let turn = Affine::rotation_about(&Vector3::z(), std::f64::consts::FRAC_PI_2, &Vector3::new(1.0, 0.0, 0.0));
         let there = turn.apply(&Vector3::new(2.0, 0.0, 0.0));
         assert!((there - Vector3::new(1.0, 1.0, 0.0)).norm() <= 1e-15);
         assert_eq!(Affine::from_entries(&turn.entries()).entries(), turn.entries());
-        let both = turn.then(&turn).apply(&Vector3::new(2.0, 0.0, 0.0));
+        let both = turn.compose(&turn).apply(&Vector3::new(2.0, 0.0, 0.0));
         assert!((both - Vector3::zeros()).norm() <= 1e-15);
     }
 }

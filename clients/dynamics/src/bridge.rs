@@ -12,10 +12,10 @@ use serde_json::json;
 use crate::affine::Affine;
 use crate::cubic::ReducedForce;
 use crate::error::{Result, invalid};
-use crate::model::{Model, Part};
-use crate::newmark::{Motion as Reduced, System};
-use crate::run::{Motion, Report, Scenario};
-use crate::vega::Settings;
+use crate::model::{DomainModel, Model};
+use crate::newmark::{NewmarkState, ReducedSystem};
+use crate::run::{Motion, Scenario, ScenarioReport};
+use crate::vega::VegaSettings;
 
 /// Settings of the load.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,12 +26,12 @@ pub struct Options {
     pub deflection: f64,
     /// Period of the load in seconds.
     pub period: f64,
-    pub toward: Toward,
+    pub load_direction: LoadDirection,
 }
 
 /// Direction of the load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Toward {
+pub enum LoadDirection {
     /// Like a wind: across the span, with an upward component of 0.3 times the horizontal one.
     Across,
     /// Like a weight. A span close to the ground then moves below the ground plane of a picture.
@@ -42,16 +42,16 @@ pub enum Toward {
 /// The bridge scenario.
 pub struct Bridge {
     model: Model,
-    system: System,
+    system: ReducedSystem,
     options: Options,
     /// Index of the deforming part.
     part: usize,
     /// The full reduced load.
     load: DVector<f64>,
-    motion: Reduced,
+    motion: NewmarkState,
     next: u64,
     strength: f64,
-    still: f64,
+    static_deflection: f64,
     peak: f64,
 }
 
@@ -61,19 +61,19 @@ impl Bridge {
     /// # Errors
     /// `Invalid` if no part has the rank of the forces, the stiffness is not positive definite, or the load cannot
     /// deform the part.
-    pub fn new(model: Model, force: ReducedForce, settings: &Settings, options: Options) -> Result<Self> {
+    pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: Options) -> Result<Self> {
         let rank = force.rank();
-        let part = model.parts.iter().position(|part| part.owner && part.rank == rank);
+        let part = model.parts.iter().position(|part| part.owns_q && part.rank == rank);
         let ranks = || format!("{:?}", model.parts.iter().map(|part| part.rank).collect::<Vec<_>>());
         let part = part.ok_or_else(|| invalid("scene", format!("a domain of rank {rank}"), ranks()))?;
-        let system = System::new(force, settings)?;
-        let direction = pull(&model, &model.parts[part], options.toward)?;
+        let system = ReducedSystem::new(force, settings)?;
+        let direction = pull(&model, &model.parts[part], options.load_direction)?;
         let wanted = options.deflection * model.diagonal();
         let (strength, q) = calibrate(&system, &model.parts[part], &direction, wanted)?;
         let load = direction * strength;
-        let still = deflection(&model.parts[part], &q) / model.diagonal();
-        let motion = system.still(q);
-        Ok(Self { model, system, options, part, load, motion, next: 0, strength, still, peak: 0.0 })
+        let static_deflection = deflection(&model.parts[part], &q) / model.diagonal();
+        let motion = system.static_state(q);
+        Ok(Self { model, system, options, part, load, motion, next: 0, strength, static_deflection, peak: 0.0 })
     }
 
     /// The reduced load at a step.
@@ -88,7 +88,7 @@ impl Scenario for Bridge {
         &self.model
     }
 
-    fn at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
+    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
         while self.next < number {
             let (before, after) = (self.load(self.next), self.load(self.next + 1));
             self.motion = self.system.step(&self.motion, self.options.dt, (&before, &after));
@@ -106,25 +106,25 @@ impl Scenario for Bridge {
         Ok(())
     }
 
-    fn report(&self) -> Report {
+    fn report(&self) -> ScenarioReport {
         let load = format!(
             "a force of {:.4} (reduced mass 1) on the middle tenth of the span, {}, pulsating every {} s; it holds the \
              span at {:.4} of the diagonal, where the run begins",
             self.strength,
-            self.options.toward.words(),
+            self.options.load_direction.words(),
             self.options.period,
-            self.still,
+            self.static_deflection,
         );
-        Report::from_iter([
+        ScenarioReport::from_iter([
             ("load".to_owned(), json!(load)),
-            ("deflection_of_diagonal".to_owned(), json!(self.still)),
+            ("deflection_of_diagonal".to_owned(), json!(self.static_deflection)),
             ("peak_of_diagonal".to_owned(), json!(self.peak / self.model.diagonal())),
             ("frequencies_hz".to_owned(), json!(self.system.frequencies())),
         ])
     }
 }
 
-impl Toward {
+impl LoadDirection {
     const fn words(self) -> &'static str {
         match self {
             Self::Across => "across it with a lift of 0.3",
@@ -144,12 +144,12 @@ impl Toward {
 
 /// U^T times a unit force, spread over the middle tenth of the longer horizontal axis, or over the whole part if the
 /// middle tenth cannot move.
-fn pull(model: &Model, part: &Part, toward: Toward) -> Result<DVector<f64>> {
+fn pull(model: &Model, part: &DomainModel, load_direction: LoadDirection) -> Result<DVector<f64>> {
     let (axis, _) = model.ground_axes();
     let along = |rest: &Vector3<f64>| part.placement.apply(rest).dot(&axis);
     let places = || part.samples.iter().map(|sample| along(&sample.rest));
     let (low, high) = places().fold((f64::MAX, f64::MIN), |(low, high), at| (low.min(at), high.max(at)));
-    let push = part.placement.linear.transpose() * toward.direction(model);
+    let push = part.placement.linear.transpose() * load_direction.direction(model);
     let of = |near: f64| {
         let near = |at: f64| (at - 0.5 * (low + high)).abs() <= near * (high - low);
         let chosen: Vec<_> = part.samples.iter().filter(|sample| near(along(&sample.rest))).collect();
@@ -161,13 +161,18 @@ fn pull(model: &Model, part: &Part, toward: Toward) -> Result<DVector<f64>> {
 }
 
 /// The largest displacement of a part's samples, in scene units.
-fn deflection(part: &Part, q: &DVector<f64>) -> f64 {
+fn deflection(part: &DomainModel, q: &DVector<f64>) -> f64 {
     part.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
 }
 
 /// The strength of a load with the deflection `wanted` at equilibrium, and that equilibrium. The load is increased in
 /// steps, each solved from the previous equilibrium, and then bisected.
-fn calibrate(system: &System, part: &Part, direction: &DVector<f64>, wanted: f64) -> Result<(f64, DVector<f64>)> {
+fn calibrate(
+    system: &ReducedSystem,
+    part: &DomainModel,
+    direction: &DVector<f64>,
+    wanted: f64,
+) -> Result<(f64, DVector<f64>)> {
     let rest = DVector::zeros(system.rank());
     // The response to a tiny load is linear; extrapolate from it to a tenth of the wanted deflection.
     let tiny = 1e-6 * direction.norm().recip();
@@ -201,19 +206,20 @@ mod tests {
 
     /// A bridge with a part of two modes and a force of two coordinates.
     fn span(options: Options) -> Bridge {
-        Bridge::new(plant(), chain(&[40.0, 90.0], 30.0, 4.0), &Settings::default(), options).expect("valid")
+        Bridge::new(plant(), chain(&[40.0, 90.0], 30.0, 4.0), &VegaSettings::default(), options).expect("valid")
     }
 
-    const OPTIONS: Options = Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0, toward: Toward::Across };
+    const OPTIONS: Options =
+        Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0, load_direction: LoadDirection::Across };
 
     #[test]
     fn run_starts_at_the_requested_deflection_and_moves() {
         let mut bridge = span(OPTIONS);
-        assert!((bridge.still - 0.03).abs() <= 1e-6, "{}", bridge.still);
+        assert!((bridge.static_deflection - 0.03).abs() <= 1e-6, "{}", bridge.static_deflection);
         let (mut first, mut later) = (Motion::default(), Motion::default());
-        bridge.at(0, &mut first).expect("moves");
+        bridge.motion_at(0, &mut first).expect("moves");
         assert!(bridge.peak / bridge.model.diagonal() >= 0.0299);
-        bridge.at(40, &mut later).expect("moves");
+        bridge.motion_at(40, &mut later).expect("moves");
         assert!(first.q != later.q && first.transforms == later.transforms);
         assert!(bridge.peak / bridge.model.diagonal() < 0.2);
     }
@@ -221,7 +227,8 @@ mod tests {
     #[test]
     fn force_of_another_rank_is_refused_with_the_available_ranks() {
         let force = chain(&[1.0, 2.0, 3.0], 0.0, 0.0);
-        let refusal = Bridge::new(plant(), force, &Settings::default(), OPTIONS).err().expect("refused").to_string();
+        let refusal =
+            Bridge::new(plant(), force, &VegaSettings::default(), OPTIONS).err().expect("refused").to_string();
         assert!(refusal.contains("rank 3") && refusal.contains("[2, 2, 2, 0]"), "{refusal}");
     }
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use modalcast_client::Policy;
-use modalcast_dynamics::bridge::Toward;
+use modalcast_dynamics::bridge::LoadDirection;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -19,7 +19,7 @@ Exit codes: 0 done; 1 the server refused (no such scene, or another writer holds
 /// Drives a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-sim", version, after_help = EXAMPLES)]
-pub(crate) struct Arguments {
+pub(crate) struct Cli {
     #[command(subcommand)]
     pub(crate) command: Command,
 }
@@ -30,25 +30,25 @@ pub(crate) enum Command {
     #[command(after_help = EXAMPLES)]
     Tree {
         #[command(flatten)]
-        common: Common,
+        common: CommonOptions,
         #[command(flatten)]
-        wind: Wind,
+        wind: WindOptions,
     },
     /// A pulsating load on the middle of a span, by Vega's reduced cubic forces under implicit Newmark.
     #[command(after_help = EXAMPLES)]
     Bridge {
         #[command(flatten)]
-        common: Common,
+        common: CommonOptions,
         #[command(flatten)]
-        files: Files,
+        files: ForceFileOptions,
         #[command(flatten)]
-        load: Load,
+        load: LoadOptions,
     },
     /// Every coordinate in turn; a rigid scene rocks.
     #[command(after_help = EXAMPLES)]
     Sweep {
         #[command(flatten)]
-        common: Common,
+        common: CommonOptions,
         /// Largest displacement as a share of the diagonal.
         #[arg(long, default_value_t = 0.06, value_parser = share)]
         share: f64,
@@ -57,13 +57,13 @@ pub(crate) enum Command {
     #[command(after_help = EXAMPLES)]
     Auto {
         #[command(flatten)]
-        common: Common,
+        common: CommonOptions,
         #[command(flatten)]
-        files: Files,
+        files: ForceFileOptions,
         #[command(flatten)]
-        load: Load,
+        load: LoadOptions,
         #[command(flatten)]
-        wind: Wind,
+        wind: WindOptions,
         /// Largest displacement of the sweep as a share of the diagonal.
         #[arg(long, default_value_t = 0.06, value_parser = share)]
         share: f64,
@@ -71,7 +71,7 @@ pub(crate) enum Command {
 }
 
 #[derive(Debug, Clone, Args)]
-pub(crate) struct Common {
+pub(crate) struct CommonOptions {
     /// URL of the server.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
@@ -126,7 +126,7 @@ impl From<PolicyOption> for Policy {
 }
 
 #[derive(Debug, Clone, Copy, Args)]
-pub(crate) struct Wind {
+pub(crate) struct WindOptions {
     /// Strength of the wind; at 1 the crown sways by `--sway`.
     #[arg(long, default_value_t = 1.0, value_parser = number)]
     pub(crate) wind: f64,
@@ -143,7 +143,7 @@ pub(crate) struct Wind {
 }
 
 #[derive(Debug, Clone, Args)]
-pub(crate) struct Files {
+pub(crate) struct ForceFileOptions {
     /// Vega's file of reduced cubic forces.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
@@ -156,7 +156,7 @@ pub(crate) struct Files {
 }
 
 #[derive(Debug, Clone, Copy, Args)]
-pub(crate) struct Load {
+pub(crate) struct LoadOptions {
     /// Deflection at equilibrium, as a share of the diagonal.
     #[arg(long, default_value_t = 0.03, value_parser = share)]
     pub(crate) deflection: f64,
@@ -165,28 +165,28 @@ pub(crate) struct Load {
     pub(crate) period: f64,
     /// Direction of the load: across the span with some lift (a wind), down (a weight), or up.
     #[arg(long, value_enum, default_value = "across")]
-    pub(crate) toward: TowardOption,
+    pub(crate) toward: LoadDirectionOption,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-pub(crate) enum TowardOption {
+pub(crate) enum LoadDirectionOption {
     Across,
     Down,
     Up,
 }
 
-impl From<TowardOption> for Toward {
-    fn from(option: TowardOption) -> Self {
+impl From<LoadDirectionOption> for LoadDirection {
+    fn from(option: LoadDirectionOption) -> Self {
         match option {
-            TowardOption::Across => Self::Across,
-            TowardOption::Down => Self::Down,
-            TowardOption::Up => Self::Up,
+            LoadDirectionOption::Across => Self::Across,
+            LoadDirectionOption::Down => Self::Down,
+            LoadDirectionOption::Up => Self::Up,
         }
     }
 }
 
 impl Command {
-    pub(crate) const fn common(&self) -> &Common {
+    pub(crate) const fn common(&self) -> &CommonOptions {
         match self {
             Self::Tree { common, .. }
             | Self::Bridge { common, .. }
@@ -230,7 +230,7 @@ mod tests {
     #[test]
     fn command_line_is_valid() {
         use clap::CommandFactory as _;
-        Arguments::command().debug_assert();
+        Cli::command().debug_assert();
     }
 
     #[test]

@@ -14,19 +14,19 @@ use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::model::Model;
 use modalcast_dynamics::run::{Options, Scenario, Summary, run};
 use modalcast_dynamics::sweep::{Options as SweepOptions, Sweep};
-use modalcast_dynamics::tree::{Options as TreeOptions, Sway};
-use modalcast_dynamics::vega::Settings;
+use modalcast_dynamics::tree::{Options as TreeOptions, TreeScenario};
+use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid};
 use tokio::sync::watch;
 
-use cli::{Arguments, Command, Common, Files};
+use cli::{Cli, Command, CommonOptions, ForceFileOptions};
 
 /// The most sampled vertices per part, of a tree and of other scenes.
-const WATCHED_TREE: usize = 24;
-const WATCHED: usize = 1 << 16;
+const TREE_SAMPLES: usize = 24;
+const MAX_SAMPLES: usize = 1 << 16;
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = Cli::parse();
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(fault) => {
@@ -37,7 +37,7 @@ fn main() -> ExitCode {
     match runtime.block_on(drive(&arguments)) {
         Ok(summary) => {
             print(&summary, arguments.command.common().json);
-            ExitCode::from(if summary.refused > 0 { 6 } else { 0 })
+            ExitCode::from(if summary.rejected > 0 { 6 } else { 0 })
         }
         Err(error) => {
             eprintln!("modalcast-sim: {error}");
@@ -49,16 +49,16 @@ fn main() -> ExitCode {
 /// The documented exit code of an error.
 const fn code(error: &Error) -> u8 {
     match error {
-        Error::Client(ClientError::Connect { .. } | ClientError::Refused { code: Code::Unavailable, .. }) => 3,
-        Error::Client(ClientError::Refused { .. } | ClientError::Rejected(_)) => 1,
+        Error::Client(ClientError::Connect { .. } | ClientError::Status { code: Code::Unavailable, .. }) => 3,
+        Error::Client(ClientError::Status { .. } | ClientError::Rejected(_)) => 1,
         Error::Client(ClientError::File { .. }) => 4,
         Error::Client(_) | Error::Invalid { .. } => 5,
     }
 }
 
-async fn drive(arguments: &Arguments) -> Result<Summary> {
+async fn drive(arguments: &Cli) -> Result<Summary> {
     let common = arguments.command.common();
-    let client = Client::connect_within(&common.server, Duration::from_secs_f64(common.wait)).await?;
+    let client = Client::connect_with_retry(&common.server, Duration::from_secs_f64(common.wait)).await?;
     let scene = match &common.open {
         Some(source) => client.open_scene(source, &common.scene).await?.scene,
         None => common.scene.clone(),
@@ -66,7 +66,7 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
     let mut scenario = scenario(&client, &scene, &arguments.command).await?;
     let (stopper, stop) = watch::channel(false);
     tokio::spawn(async move {
-        told_to_stop().await;
+        shutdown_signal().await;
         stopper.send_replace(true);
         // The first signal ends the run in order. A later interrupt exits at once, also if the server has stalled.
         if tokio::signal::ctrl_c().await.is_ok() {
@@ -85,7 +85,7 @@ async fn drive(arguments: &Arguments) -> Result<Summary> {
 }
 
 /// Waits for Ctrl-C or SIGTERM.
-async fn told_to_stop() {
+async fn shutdown_signal() {
     use tokio::signal::unix::{SignalKind, signal};
     let Ok(mut terminate) = signal(SignalKind::terminate()) else {
         tokio::signal::ctrl_c().await.ok(); // Without a SIGTERM handler, wait for Ctrl-C only.
@@ -102,24 +102,28 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
     let (dt, steps) = (common.dt, common.count());
     match command {
         Command::Tree { wind, .. } => {
-            let model = Model::learn(client, scene, WATCHED_TREE).await?;
+            let model = Model::fetch(client, scene, TREE_SAMPLES).await?;
             let (strength, direction) = (wind.wind, wind.direction.to_radians());
             let options = TreeOptions { dt, steps, sway: wind.sway, wind: strength, direction, seed: wind.seed };
-            Ok(Box::new(Sway::new(model, options)?))
+            Ok(Box::new(TreeScenario::new(model, options)?))
         }
         Command::Bridge { files, load, .. } => {
-            let model = Model::learn(client, scene, WATCHED).await?;
-            let options =
-                BridgeOptions { dt, deflection: load.deflection, period: load.period, toward: load.toward.into() };
+            let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
+            let options = BridgeOptions {
+                dt,
+                deflection: load.deflection,
+                period: load.period,
+                load_direction: load.toward.into(),
+            };
             bridge(model, files, options)
         }
         Command::Sweep { share, .. } => {
-            let model = Model::learn(client, scene, WATCHED).await?;
+            let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
             Ok(Box::new(Sweep::new(model, SweepOptions { dt, steps, share: *share })))
         }
         Command::Auto { files, load, wind, share, .. } => {
             // A model with few samples is enough to choose the scenario.
-            let model = Model::learn(client, scene, WATCHED_TREE).await?;
+            let model = Model::fetch(client, scene, TREE_SAMPLES).await?;
             let command = if cubic(&model, files).is_some() {
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
             } else if model.parts.iter().any(|part| !part.eigenvalues.is_empty()) {
@@ -133,18 +137,18 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
     }
 }
 
-fn bridge(model: Model, files: &Files, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
+fn bridge(model: Model, files: &ForceFileOptions, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
     let missing = || invalid("cubic", "--cubic FILE.cub, or --files DIR with the file that the scene names", "none");
     let cubic = cubic(&model, files).ok_or_else(missing)?;
     let beside = cubic.with_extension("config");
     let config = files.config.clone().or_else(|| beside.is_file().then_some(beside));
-    let settings = config.map_or_else(|| Ok(Settings::default()), |path| Settings::read(&path))?;
+    let settings = config.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
     Ok(Box::new(Bridge::new(model, ReducedForce::read(&cubic)?, &settings, options)?))
 }
 
 /// The file of cubic forces: the one of `--cubic`, or the one in `--files` that a note of the scene names, or the only
 /// one in `--files`.
-fn cubic(model: &Model, files: &Files) -> Option<PathBuf> {
+fn cubic(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());
     }
@@ -170,7 +174,7 @@ fn print(summary: &Summary, json: bool) {
     }
 }
 
-impl Common {
+impl CommonOptions {
     /// The number of steps; `None` for an unlimited run.
     fn count(&self) -> Option<u64> {
         match (self.steps, self.seconds) {

@@ -12,7 +12,7 @@ use crate::affine::Affine;
 use crate::error::{Result, invalid};
 
 /// The most numbers of U that are read, over all parts.
-const BUDGET: usize = 8 << 20;
+const MAX_MODE_ENTRIES: usize = 8 << 20;
 
 /// A vertex at which the dynamics measures displacements or applies loads.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,14 +34,14 @@ pub struct Joint {
 
 /// One domain.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Part {
+pub struct DomainModel {
     pub name: String,
     pub rank: usize,
     /// Index of its first coordinate in the vector of all coordinates. Parts that share coordinates have the same
     /// index.
     pub first: usize,
     /// Whether steps carry the coordinates of this part. False if the part shares those of an earlier part.
-    pub owner: bool,
+    pub owns_q: bool,
     /// `world_from_domain` at rest.
     pub placement: Affine,
     pub joint: Option<Joint>,
@@ -51,9 +51,9 @@ pub struct Part {
     /// Surface area, and diagonal of the bounds; 0 if the mesh was not requested.
     pub area: f64,
     pub extent: f64,
-    /// The first `skin` samples are spread evenly over the vertices; the other vertices of joint rings follow.
+    /// The first `surface_samples` samples are spread evenly over the vertices; the other vertices of joint rings follow.
     pub samples: Vec<Sample>,
-    pub skin: usize,
+    pub surface_samples: usize,
     /// Index of the sample nearest to the part's origin, where the part is attached to its parent.
     pub base: Option<usize>,
 }
@@ -62,7 +62,7 @@ pub struct Part {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     pub scene: String,
-    pub parts: Vec<Part>,
+    pub parts: Vec<DomainModel>,
     /// Number of coordinates of all parts.
     pub coordinates: usize,
     pub up: Vector3<f64>,
@@ -87,12 +87,12 @@ impl Sample {
     }
 
     /// Displaced position of the vertex, in the frame of its part.
-    pub fn moved(&self, q: &[f64]) -> Vector3<f64> {
+    pub fn deformed_position(&self, q: &[f64]) -> Vector3<f64> {
         self.rest + self.displacement(q)
     }
 }
 
-impl Part {
+impl DomainModel {
     /// The coordinates of this part, from the vector of all coordinates.
     pub fn q<'a>(&self, all: &'a [f64]) -> &'a [f64] {
         &all[self.first..][..self.rank]
@@ -110,7 +110,7 @@ impl Model {
     ///
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.
-    pub async fn learn(client: &Client, scene: &str, watched: usize) -> Result<Self> {
+    pub async fn fetch(client: &Client, scene: &str, watched: usize) -> Result<Self> {
         let bare = client.describe(scene, &[]).await?;
         let bends = bare.domains.iter().any(|domain| domain.rank > 0);
         let swings = bare.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
@@ -122,7 +122,7 @@ impl Model {
             }
         };
         let numbers: usize = description.domains.iter().map(|domain| 3 * domain.rank).sum();
-        let watched = watched.min(BUDGET / numbers.max(1)).max(8);
+        let watched = watched.min(MAX_MODE_ENTRIES / numbers.max(1)).max(8);
         let choices = choose(&description, watched)?;
         let mut modes = BTreeMap::new();
         for (domain, choice) in description.domains.iter().zip(&choices) {
@@ -143,7 +143,7 @@ impl Model {
         choices: Vec<Choice>,
         rows: impl Fn(&Domain, &[u32]) -> Option<&'a ModeRows>,
     ) -> Result<Self> {
-        let (mut parts, mut coordinates): (Vec<Part>, _) = (vec![], 0);
+        let (mut parts, mut coordinates): (Vec<DomainModel>, _) = (vec![], 0);
         for (domain, choice) in description.domains.iter().zip(&choices) {
             let twin = domain.shares_q_with.map(|twin| parts.get(twin).map(|part| (part.first, part.rank)));
             let first = match twin {
@@ -154,7 +154,7 @@ impl Model {
             coordinates += if twin.is_none() { domain.rank } else { 0 };
             let read = rows(domain, &choice.vertices);
             let mut part = part(domain, choice, read);
-            (part.first, part.owner) = (first, twin.is_none());
+            (part.first, part.owns_q) = (first, twin.is_none());
             part.joint = joint(domain, &choices)?;
             parts.push(part);
         }
@@ -182,14 +182,14 @@ impl Model {
 
     /// The horizontal direction at an angle about the up axis, in radians, from the first horizontal axis (x, or y if x
     /// is up).
-    pub fn horizontal(&self, angle: f64) -> Vector3<f64> {
+    pub fn horizontal_direction(&self, angle: f64) -> Vector3<f64> {
         let first = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
         first * angle.cos() + self.up.cross(&first) * angle.sin()
     }
 
     /// The longer horizontal axis and the other one. The two and the up axis form a right-handed system.
     pub fn ground_axes(&self) -> (Vector3<f64>, Vector3<f64>) {
-        let (first, second) = (self.horizontal(0.0), self.horizontal(std::f64::consts::FRAC_PI_2));
+        let (first, second) = (self.horizontal_direction(0.0), self.horizontal_direction(std::f64::consts::FRAC_PI_2));
         let size = |axis: &Vector3<f64>| (self.high - self.low).dot(&axis.abs());
         if size(&second) > size(&first) { (second, -first) } else { (first, second) }
     }
@@ -198,20 +198,21 @@ impl Model {
     /// samples only.
     pub fn peak(&self, q: &[f64], world: &[Affine]) -> f64 {
         let parts = self.parts.iter().zip(world);
-        let of = |(part, pose): (&Part, &Affine)| {
-            let moved =
-                |sample: &Sample| (pose.apply(&sample.moved(part.q(q))) - part.placement.apply(&sample.rest)).norm();
+        let of = |(part, pose): (&DomainModel, &Affine)| {
+            let moved = |sample: &Sample| {
+                (pose.apply(&sample.deformed_position(part.q(q))) - part.placement.apply(&sample.rest)).norm()
+            };
             let origin = (pose.translation - part.placement.translation).norm();
-            part.samples[..part.skin].iter().map(moved).fold(origin, f64::max)
+            part.samples[..part.surface_samples].iter().map(moved).fold(origin, f64::max)
         };
         parts.map(of).fold(0.0, f64::max)
     }
 }
 
-/// The vertices of a domain to read: first `skin` evenly spread ones, then the others that joints need.
+/// The vertices of a domain to read: first `surface_samples` evenly spread ones, then the others that joints need.
 struct Choice {
     vertices: Vec<u32>,
-    skin: usize,
+    surface_samples: usize,
 }
 
 fn choose(description: &SceneDescription, watched: usize) -> Result<Vec<Choice>> {
@@ -231,14 +232,15 @@ fn choose(description: &SceneDescription, watched: usize) -> Result<Vec<Choice>>
     }
     let choice = |(domain, ring): (&Domain, BTreeSet<u32>)| {
         if domain.rest_positions.is_empty() {
-            return Choice { vertices: vec![], skin: 0 };
+            return Choice { vertices: vec![], surface_samples: 0 };
         }
-        let skin = domain.vertices.min(watched);
-        let mut vertices: Vec<u32> = (0..skin).map(|at| (at * domain.vertices / skin) as u32).collect();
+        let surface_samples = domain.vertices.min(watched);
+        let mut vertices: Vec<u32> =
+            (0..surface_samples).map(|at| (at * domain.vertices / surface_samples) as u32).collect();
         let spread: BTreeSet<u32> = vertices.iter().copied().collect();
         let others = ring.into_iter().chain([base(domain)]).collect::<BTreeSet<_>>();
         vertices.extend(others.difference(&spread));
-        Choice { vertices, skin }
+        Choice { vertices, surface_samples }
     };
     Ok(domains.iter().zip(rings).map(choice).collect())
 }
@@ -253,18 +255,18 @@ fn point(domain: &Domain, vertex: u32) -> Vector3<f64> {
     Vector3::from_fn(|row, _| f64::from(domain.rest_positions[3 * vertex as usize + row]))
 }
 
-fn part(domain: &Domain, choice: &Choice, read: Option<&ModeRows>) -> Part {
+fn part(domain: &Domain, choice: &Choice, read: Option<&ModeRows>) -> DomainModel {
     let sample = |(place, vertex): (usize, &u32)| {
-        let rows = read.map_or(&[][..], |rows| rows.of(place));
+        let rows = read.map_or(&[][..], |rows| rows.rows_of(place));
         Sample { rest: point(domain, *vertex), rows: rows.iter().map(|entry| f64::from(*entry)).collect() }
     };
     let samples: Vec<Sample> = choice.vertices.iter().enumerate().map(sample).collect();
     let base = if samples.is_empty() { None } else { Some(base(domain)) };
-    Part {
+    DomainModel {
         name: domain.name.clone(),
         rank: domain.rank,
         first: 0,
-        owner: true,
+        owns_q: true,
         placement: Affine::from_entries(&domain.placement),
         joint: None,
         eigenvalues: domain.eigenvalues.clone(),
@@ -273,7 +275,7 @@ fn part(domain: &Domain, choice: &Choice, read: Option<&ModeRows>) -> Part {
         extent: extent(domain),
         base: base.and_then(|base| choice.vertices.iter().position(|vertex| *vertex == base)),
         samples,
-        skin: choice.skin,
+        surface_samples: choice.surface_samples,
     }
 }
 

@@ -19,18 +19,18 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::cubic::ReducedForce;
 use crate::error::{Result, invalid};
-use crate::vega::Settings;
+use crate::vega::VegaSettings;
 
 /// The most Newton steps per solve, and the most halvings per line search.
-const NEWTON: usize = 60;
-const HALVINGS: usize = 50;
+const MAX_NEWTON_STEPS: usize = 60;
+const MAX_HALVINGS: usize = 50;
 
 /// The allowed spurious energy gain of rounding and the method, as a share of the highest energy so far.
-const ALLOWANCE: f64 = 0.02;
+const ENERGY_TOLERANCE: f64 = 0.02;
 
 /// A reduced model: r coordinates, unit mass.
 #[derive(Debug, Clone)]
-pub struct System {
+pub struct ReducedSystem {
     force: ReducedForce,
     /// s, the square of Vega's base frequency.
     scale: f64,
@@ -40,7 +40,7 @@ pub struct System {
 
 /// Coordinates, velocities and accelerations at one time.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Motion {
+pub struct NewmarkState {
     pub q: DVector<f64>,
     pub v: DVector<f64>,
     a: DVector<f64>,
@@ -59,12 +59,12 @@ struct Problem<'a> {
     load: &'a DVector<f64>,
 }
 
-impl System {
+impl ReducedSystem {
     /// Creates a model with Vega's frequency scaling and Rayleigh damping.
     ///
     /// # Errors
     /// `Invalid` if the stiffness at rest is not positive definite.
-    pub fn new(force: ReducedForce, settings: &Settings) -> Result<Self> {
+    pub fn new(force: ReducedForce, settings: &VegaSettings) -> Result<Self> {
         let scale = settings.base_frequency * settings.base_frequency;
         let stiffness = (force.linear() + force.linear().transpose()) * (0.5 * scale);
         if Cholesky::new(stiffness.clone()).is_none() {
@@ -90,33 +90,38 @@ impl System {
     }
 
     /// The motion at rest, without load.
-    pub fn at_rest(&self) -> Motion {
-        self.still(DVector::zeros(self.rank()))
+    pub fn at_rest(&self) -> NewmarkState {
+        self.static_state(DVector::zeros(self.rank()))
     }
 
     /// The motion at `q` with zero velocity and acceleration, in equilibrium with a load.
-    pub fn still(&self, q: DVector<f64>) -> Motion {
+    pub fn static_state(&self, q: DVector<f64>) -> NewmarkState {
         let zero = DVector::zeros(self.rank());
         let highest = self.scale * self.force.potential(&q);
-        Motion { q, v: zero.clone(), a: zero, surplus: 0.0, highest }
+        NewmarkState { q, v: zero.clone(), a: zero, surplus: 0.0, highest }
     }
 
     /// The sum of kinetic and elastic energy.
-    pub fn energy(&self, motion: &Motion) -> f64 {
+    pub fn energy(&self, motion: &NewmarkState) -> f64 {
         0.5 * motion.v.norm_squared() + self.scale * self.force.potential(&motion.q)
     }
 
     /// The equilibrium under a load, searched from `near`.
     pub fn equilibrium(&self, load: &DVector<f64>, near: &DVector<f64>) -> DVector<f64> {
         let zero = DVector::zeros(self.rank());
-        self.minimise(&Problem { inertia: 0.0, rate: 0.0, q: near.clone(), v: zero, load }, near)
+        self.minimize(&Problem { inertia: 0.0, rate: 0.0, q: near.clone(), v: zero, load }, near)
     }
 
     /// The motion `dt` seconds later, under a load that changes from `before` to `after`.
     #[must_use]
-    pub fn step(&self, motion: &Motion, dt: f64, (before, after): (&DVector<f64>, &DVector<f64>)) -> Motion {
+    pub fn step(
+        &self,
+        motion: &NewmarkState,
+        dt: f64,
+        (before, after): (&DVector<f64>, &DVector<f64>),
+    ) -> NewmarkState {
         let next = self.newmark(motion, dt, after);
-        let legal = |next: &Motion| {
+        let legal = |next: &NewmarkState| {
             let moved = &next.q - &motion.q;
             let work = 0.5 * (before + after).dot(&moved);
             let lost = (&self.damping * &moved).dot(&moved) / dt;
@@ -124,8 +129,8 @@ impl System {
         };
         let surplus = motion.surplus + self.energy(&next) - legal(&next);
         let highest = motion.highest.max(self.energy(&next).min(legal(&next)));
-        if surplus <= ALLOWANCE * highest {
-            return Motion { surplus: surplus.max(-ALLOWANCE * highest), highest, ..next };
+        if surplus <= ENERGY_TOLERANCE * highest {
+            return NewmarkState { surplus: surplus.max(-ENERGY_TOLERANCE * highest), highest, ..next };
         }
         let mut next = self.backward_euler(motion, dt, after);
         // Backward Euler damps fast modes; the kinetic energy of the result must not exceed the available energy.
@@ -136,34 +141,34 @@ impl System {
             next.v *= ((2.0 * kinetic.max(0.0)).sqrt() / speed).min(1.0);
         }
         next.a = after - &self.damping * &next.v - self.force.force(&next.q) * self.scale;
-        Motion { surplus: motion.surplus.min(0.0), highest: motion.highest.max(self.energy(&next)), ..next }
+        NewmarkState { surplus: motion.surplus.min(0.0), highest: motion.highest.max(self.energy(&next)), ..next }
     }
 
     /// One step of average acceleration.
-    fn newmark(&self, motion: &Motion, dt: f64, load: &DVector<f64>) -> Motion {
+    fn newmark(&self, motion: &NewmarkState, dt: f64, load: &DVector<f64>) -> NewmarkState {
         let (inertia, rate) = (4.0 / (dt * dt), 2.0 / dt);
         let q = &motion.q + &motion.v * dt + &motion.a * (0.25 * dt * dt);
         let v = &motion.v + &motion.a * (0.5 * dt);
-        let solved = self.minimise(&Problem { inertia, rate, q: q.clone(), v: v.clone(), load }, &motion.q);
+        let solved = self.minimize(&Problem { inertia, rate, q: q.clone(), v: v.clone(), load }, &motion.q);
         let ahead = &solved - q;
         let v = v + &ahead * rate;
-        Motion { q: solved, v, a: ahead * inertia, surplus: motion.surplus, highest: motion.highest }
+        NewmarkState { q: solved, v, a: ahead * inertia, surplus: motion.surplus, highest: motion.highest }
     }
 
-    fn backward_euler(&self, motion: &Motion, dt: f64, load: &DVector<f64>) -> Motion {
+    fn backward_euler(&self, motion: &NewmarkState, dt: f64, load: &DVector<f64>) -> NewmarkState {
         let ahead = &motion.q + &motion.v * dt;
         let problem = Problem { inertia: 1.0 / (dt * dt), rate: 1.0 / dt, q: ahead, v: motion.v.clone(), load };
-        let q = self.minimise(&problem, &motion.q);
+        let q = self.minimize(&problem, &motion.q);
         let v = (&q - &motion.q) / dt;
-        Motion { q, v, ..motion.clone() }
+        NewmarkState { q, v, ..motion.clone() }
     }
 
     /// Newton's method with a line search on the minimized value. Returns the last accepted point, which is no worse
     /// than the start up to rounding.
-    fn minimise(&self, problem: &Problem<'_>, start: &DVector<f64>) -> DVector<f64> {
+    fn minimize(&self, problem: &Problem<'_>, start: &DVector<f64>) -> DVector<f64> {
         let mut q = start.clone();
         let mut value = self.value(problem, &q);
-        for _ in 0..NEWTON {
+        for _ in 0..MAX_NEWTON_STEPS {
             let gradient = self.gradient(problem, &q);
             let direction = self.newton(problem, &q, &gradient);
             let slope = gradient.dot(&direction);
@@ -174,7 +179,7 @@ impl System {
             // Near the minimum the decrease is below rounding; there the norm of the gradient decides.
             let noise = 1e-13 * (value.abs() + problem.inertia * (&q - &problem.q).norm_squared());
             let mut share = 1.0;
-            let accepted = (0..HALVINGS).find_map(|_| {
+            let accepted = (0..MAX_HALVINGS).find_map(|_| {
                 let next = &q + &direction * share;
                 let there = self.value(problem, &next);
                 let falls = there <= value + 1e-4 * share * slope;
@@ -234,16 +239,16 @@ mod tests {
         (2.0 * std::f64::consts::PI * hertz).powi(2)
     }
 
-    fn undamped(force: ReducedForce) -> System {
-        System::new(force, &Settings::default()).expect("definite")
+    fn undamped(force: ReducedForce) -> ReducedSystem {
+        ReducedSystem::new(force, &VegaSettings::default()).expect("definite")
     }
 
     /// Two coupled hardening springs, deflected and released; `count` steps in one second.
-    fn released(count: u32) -> (System, Motion) {
+    fn released(count: u32) -> (ReducedSystem, NewmarkState) {
         let system = undamped(chain(&[40.0, 90.0], 30.0, 4.0));
         let none = DVector::zeros(2);
         let dt = 1.0 / f64::from(count);
-        let mut motion = system.still(DVector::from_column_slice(&[0.8, -0.3]));
+        let mut motion = system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
         // The holding load is removed, so the initial acceleration is not 0.
         motion.a = -system.force.force(&motion.q);
         let end = (0..count).fold(motion, |motion, _| system.step(&motion, dt, (&none, &none)));
@@ -264,10 +269,10 @@ mod tests {
         let (system, end) = released(1000);
         let start = system.scale * system.force.potential(&DVector::from_column_slice(&[0.8, -0.3]));
         assert!((system.energy(&end) / start - 1.0).abs() <= 1e-3, "{}", system.energy(&end) / start);
-        let settings = Settings { damping_mass: 0.5, damping_stiffness: 0.01, ..Settings::default() };
-        let damped = System::new(chain(&[40.0, 90.0], 30.0, 4.0), &settings).expect("definite");
+        let settings = VegaSettings { damping_mass: 0.5, damping_stiffness: 0.01, ..VegaSettings::default() };
+        let damped = ReducedSystem::new(chain(&[40.0, 90.0], 30.0, 4.0), &settings).expect("definite");
         let none = DVector::zeros(2);
-        let mut motion = damped.still(DVector::from_column_slice(&[0.8, -0.3]));
+        let mut motion = damped.static_state(DVector::from_column_slice(&[0.8, -0.3]));
         for _ in 0..2000 {
             let next = damped.step(&motion, 0.01, (&none, &none));
             assert!(damped.energy(&next) <= damped.energy(&motion) * (1.0 + 1e-3) + 1e-12);
@@ -278,8 +283,8 @@ mod tests {
 
     #[test]
     fn steady_load_converges_to_the_equilibrium() {
-        let settings = Settings { damping_mass: 4.0, ..Settings::default() };
-        let system = System::new(chain(&[40.0, 90.0], 30.0, 4.0), &settings).expect("definite");
+        let settings = VegaSettings { damping_mass: 4.0, ..VegaSettings::default() };
+        let system = ReducedSystem::new(chain(&[40.0, 90.0], 30.0, 4.0), &settings).expect("definite");
         let load = DVector::from_column_slice(&[12.0, -3.0]);
         let still = system.equilibrium(&load, &DVector::zeros(2));
         assert!((system.force.force(&still) - &load).norm() <= 1e-9);
@@ -331,7 +336,7 @@ mod tests {
 
     #[test]
     fn indefinite_stiffness_is_refused() {
-        assert!(System::new(chain(&[1.0, -1.0], 0.1, 0.0), &Settings::default()).is_err());
+        assert!(ReducedSystem::new(chain(&[1.0, -1.0], 0.1, 0.0), &VegaSettings::default()).is_err());
     }
 
     #[test]
@@ -339,8 +344,8 @@ mod tests {
     fn real_bridge_has_a_quarter_hertz_and_stays_bounded() {
         let folder = data().join("vega/simpleBridge");
         let force = ReducedForce::read(&folder.join("simpleBridge.cub")).expect("reads");
-        let settings = Settings::read(&folder.join("simpleBridge.config")).expect("reads");
-        let system = System::new(force, &settings).expect("definite");
+        let settings = VegaSettings::read(&folder.join("simpleBridge.config")).expect("reads");
+        let system = ReducedSystem::new(force, &settings).expect("definite");
         assert!((system.frequencies()[0] - 0.25).abs() <= 2.5e-4, "{:?}", system.frequencies());
         for dt in [1.0 / 60.0, 1.0, 20.0] {
             let load = noise(3, 20) * 5.0;

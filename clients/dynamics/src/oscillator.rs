@@ -29,8 +29,8 @@ struct Response {
     /// C: displacement after a unit initial displacement.
     cosine: f64,
     /// S and S': displacement and velocity after a unit impulse.
-    kick: f64,
-    kick_rate: f64,
+    impulse: f64,
+    impulse_rate: f64,
     /// G1 and G2: displacement under a unit force, and under a force that increases from 0 to 1.
     constant: f64,
     ramp: f64,
@@ -57,7 +57,7 @@ impl Oscillator {
     }
 
     /// A mode that never moves. Used for modes without stiffness, which would drift without bound under a steady force.
-    pub fn held() -> Self {
+    pub fn new_fixed() -> Self {
         Self { step: 1.0, response: Response::default(), w_squared: 0.0 }
     }
 
@@ -66,8 +66,8 @@ impl Oscillator {
     pub fn advance(&self, state: State, before: f64, after: f64) -> State {
         let (h, r) = (self.step, &self.response);
         let (p, pull, growth) = (h * state.v, h * h * before, h * h * (after - before));
-        let q = r.cosine * state.q + r.kick * p + r.constant * pull + r.ramp * growth;
-        let p = -self.w_squared * r.kick * state.q + r.kick_rate * p + r.kick * pull + r.constant * growth;
+        let q = r.cosine * state.q + r.impulse * p + r.constant * pull + r.ramp * growth;
+        let p = -self.w_squared * r.impulse * state.q + r.impulse_rate * p + r.impulse * pull + r.constant * growth;
         State { q, v: p / h }
     }
 }
@@ -78,7 +78,7 @@ impl Response {
         if w * w + 2.0 * sigma <= 1.0 {
             return Self::series(w, sigma);
         }
-        if zeta > 1.15 { Self::overdamped(w, sigma) } else { Self::ringing(w, sigma) }
+        if zeta > 1.15 { Self::overdamped(w, sigma) } else { Self::underdamped(w, sigma) }
     }
 
     /// The power series of S, for short steps, where the closed forms suffer from cancellation: s_0 = 0, s_1 = 1 and
@@ -88,8 +88,8 @@ impl Response {
         let (mut this, mut next) = (0.0, 1.0);
         for k in 0..40 {
             let order = f64::from(k);
-            sum.kick += this;
-            sum.kick_rate += order * this;
+            sum.impulse += this;
+            sum.impulse_rate += order * this;
             sum.constant += this / (order + 1.0);
             sum.ramp += this / ((order + 1.0) * (order + 2.0));
             let after = (-2.0 * sigma * (order + 1.0) * next - w * w * this) / ((order + 1.0) * (order + 2.0));
@@ -100,7 +100,7 @@ impl Response {
     }
 
     /// Underdamped, critically damped and slightly overdamped modes: e^-sigma times cosine and sine, or cosh and sinh.
-    fn ringing(w: f64, sigma: f64) -> Self {
+    fn underdamped(w: f64, sigma: f64) -> Self {
         let square = (w - sigma) * (w + sigma);
         let d = square.abs().sqrt();
         let fade = (-sigma).exp();
@@ -114,10 +114,10 @@ impl Response {
             let (slow, fast) = ((d - sigma).exp(), (-d - sigma).exp());
             (0.5 * (slow + fast), 0.5 * (slow - fast) / d)
         };
-        let (kick, cosine) = (odd, even + sigma * odd);
+        let (impulse, cosine) = (odd, even + sigma * odd);
         let constant = (1.0 - cosine) / (w * w);
-        let ramp = (1.0 - 2.0 * sigma * constant - kick) / (w * w);
-        Self { cosine, kick, kick_rate: even - sigma * odd, constant, ramp }
+        let ramp = (1.0 - 2.0 * sigma * constant - impulse) / (w * w);
+        Self { cosine, impulse, impulse_rate: even - sigma * odd, constant, ramp }
     }
 
     /// Two well separated real roots: the responses are divided differences of e^z, (e^z - 1)/z and (e^z - 1 - z)/z^2.
@@ -128,8 +128,8 @@ impl Response {
         let between = |function: fn(f64) -> f64| (function(slow) - function(fast)) / (slow - fast);
         Self {
             cosine: (slow * fast.exp() - fast * slow.exp()) / (slow - fast),
-            kick: between(f64::exp),
-            kick_rate: (slow * slow.exp() - fast * fast.exp()) / (slow - fast),
+            impulse: between(f64::exp),
+            impulse_rate: (slow * slow.exp() - fast * fast.exp()) / (slow - fast),
             constant: between(first),
             ramp: between(second),
         }
@@ -261,6 +261,6 @@ mod tests {
         for (eigenvalue, zeta, step) in [(-1.0, 0.0, 1.0), (f64::NAN, 0.0, 1.0), (1.0, -0.1, 1.0), (1.0, 0.1, 0.0)] {
             assert!(Oscillator::new(eigenvalue, zeta, step).is_err(), "{eigenvalue} {zeta} {step}");
         }
-        assert_eq!(Oscillator::held().advance(State::default(), 5.0, 9.0), State::default());
+        assert_eq!(Oscillator::new_fixed().advance(State::default(), 5.0, 9.0), State::default());
     }
 }

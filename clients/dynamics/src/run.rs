@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use modalcast_client::npy::Writer;
-use modalcast_client::{Ack, Client, Drive, Error as ClientError, Policy, Step};
+use modalcast_client::{Ack, Client, Error as ClientError, Policy, Step, StepStream};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
@@ -15,11 +15,11 @@ use crate::error::{Error, Result};
 use crate::model::Model;
 
 /// Named results of a scenario or a run.
-pub type Report = serde_json::Map<String, Value>;
+pub type ScenarioReport = serde_json::Map<String, Value>;
 
 /// The most times per stage, and the most refusals, that are kept for the summary.
-const KEPT: usize = 1 << 16;
-const REFUSALS: usize = 16;
+const MAX_STAGE_SAMPLES: usize = 1 << 16;
+const MAX_REJECTIONS: usize = 16;
 
 /// The state at one step: all coordinates, and `world_from_domain` of every part, row-major 3x4.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -37,10 +37,10 @@ pub trait Scenario {
     ///
     /// # Errors
     /// If the motion cannot be continued.
-    fn at(&mut self, number: u64, motion: &mut Motion) -> Result<()>;
+    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()>;
 
     /// Load, peak displacements and joint gaps up to now.
-    fn report(&self) -> Report;
+    fn report(&self) -> ScenarioReport;
 }
 
 /// Settings of a run.
@@ -63,15 +63,15 @@ pub struct Options {
 #[derive(Debug, Clone)]
 pub struct Summary {
     pub sent: u64,
-    pub refused: u64,
+    pub rejected: u64,
     pub value: Value,
 }
 
 /// Statistics of a run: acknowledgements, refusals and sent bytes.
 #[derive(Default)]
-struct Tally {
+struct RunStats {
     stages: BTreeMap<String, Vec<f32>>,
-    refusals: Vec<String>,
+    rejections: Vec<String>,
     acks: u64,
     bytes: u64,
 }
@@ -88,61 +88,61 @@ pub async fn run(
 ) -> Result<Summary> {
     let scene = scenario.model().scene.clone();
     let mut drive = client.drive(&scene, options.policy, options.window).await?;
-    let mut record = options.record.as_deref().map(|folder| Record::create(folder, scenario.model())).transpose()?;
-    let (bar, start, mut tally) = (progress(options.steps), Instant::now(), Tally::default());
+    let mut record = options.record.as_deref().map(|folder| Recorder::create(folder, scenario.model())).transpose()?;
+    let (bar, start, mut tally) = (progress(options.steps), Instant::now(), RunStats::default());
     let mut last: Option<Motion> = None;
     let mut motion = Motion::default();
     let mut number = 0;
     while options.steps.is_none_or(|steps| number < steps) && !*stop.borrow() {
-        scenario.at(number, &mut motion)?;
+        scenario.motion_at(number, &mut motion)?;
         if options.realtime {
             let due = start + Duration::try_from_secs_f64(number as f64 * options.dt).unwrap_or(Duration::MAX / 4);
             tokio::time::sleep_until(due.into()).await;
         }
-        let step = changed(scenario.model(), number, number as f64 * options.dt, (last.as_ref(), &motion));
-        let refused = tally.note(drive.step(&step).await)?;
-        tally.add(&drive, step.payload());
+        let step = encode_changes(scenario.model(), number, number as f64 * options.dt, (last.as_ref(), &motion));
+        let rejected = tally.record_rejection(drive.step(&step).await)?;
+        tally.add(&drive, step.payload_bytes());
         if let Some(record) = &mut record {
             record.add(&motion)?;
         }
         // After a refusal the server does not have the values of that step, so the next step sends everything.
-        last = if refused { None } else { Some(std::mem::take(&mut motion)) };
+        last = if rejected { None } else { Some(std::mem::take(&mut motion)) };
         number += 1;
         bar.inc(1);
     }
-    while tally.note(drive.settle().await)? {}
+    while tally.record_rejection(drive.flush().await)? {}
     tally.add(&drive, 0);
     let run = drive.run;
     let window = drive.window;
     let end = drive.finish().await?;
-    record.map(Record::finish).transpose()?;
+    record.map(Recorder::finish).transpose()?;
     bar.finish_and_clear();
     let elapsed = start.elapsed().as_secs_f64();
     let mut value = scenario.report();
     value.extend(tally.report());
-    value.extend(Report::from_iter([
+    value.extend(ScenarioReport::from_iter([
         ("scene".to_owned(), json!(scene)),
         ("run".to_owned(), json!(run)),
         ("window".to_owned(), json!(window)),
         ("dt_s".to_owned(), json!(options.dt)),
         ("steps_sent".to_owned(), json!(end.sent)),
         ("last_acknowledged".to_owned(), json!(end.acknowledged)),
-        ("rejected".to_owned(), json!(end.refused)),
+        ("rejected".to_owned(), json!(end.rejected)),
         ("skipped".to_owned(), json!(end.skipped)),
         ("elapsed_s".to_owned(), json!(elapsed)),
         ("steps_per_second".to_owned(), json!(end.sent as f64 / elapsed.max(1e-9))),
     ]));
-    Ok(Summary { sent: end.sent, refused: end.refused, value: Value::Object(value) })
+    Ok(Summary { sent: end.sent, rejected: end.rejected, value: Value::Object(value) })
 }
 
 /// A step with the values whose bits differ from the last motion; with all values if there is none.
-fn changed(model: &Model, number: u64, time: f64, (last, now): (Option<&Motion>, &Motion)) -> Step {
+fn encode_changes(model: &Model, number: u64, time: f64, (last, now): (Option<&Motion>, &Motion)) -> Step {
     let mut step = Step::new(number, time);
     let same = |old: &[f32], new: &[f32]| old.iter().map(|x| x.to_bits()).eq(new.iter().map(|x| x.to_bits()));
     for (index, part) in model.parts.iter().enumerate() {
         let range = part.first..part.first + part.rank;
         let moved = last.is_none_or(|last| !same(&last.q[range.clone()], &now.q[range.clone()]));
-        if part.owner && part.rank > 0 && moved {
+        if part.owns_q && part.rank > 0 && moved {
             step.set_q(index as u32, &now.q[range]);
         }
         if last.is_none_or(|last| !same(&last.transforms[index], &now.transforms[index])) {
@@ -152,14 +152,14 @@ fn changed(model: &Model, number: u64, time: f64, (last, now): (Option<&Motion>,
     step
 }
 
-impl Tally {
+impl RunStats {
     /// Records a refusal and returns whether there was one. Any other error is returned.
-    fn note(&mut self, sent: modalcast_client::Result<()>) -> Result<bool> {
+    fn record_rejection(&mut self, sent: modalcast_client::Result<()>) -> Result<bool> {
         match sent {
             Ok(()) => Ok(false),
             Err(ClientError::Rejected(refusal)) => {
-                if self.refusals.len() < REFUSALS {
-                    self.refusals.push(refusal.to_string());
+                if self.rejections.len() < MAX_REJECTIONS {
+                    self.rejections.push(refusal.to_string());
                 }
                 Ok(true)
             }
@@ -167,26 +167,26 @@ impl Tally {
         }
     }
 
-    fn add(&mut self, drive: &Drive, bytes: usize) {
+    fn add(&mut self, drive: &StepStream, bytes: usize) {
         self.bytes += bytes as u64;
         for Ack { stages, .. } in drive.take_acks() {
             self.acks += 1;
             for (stage, milliseconds) in stages {
                 let times = self.stages.entry(stage).or_default();
-                if times.len() < KEPT {
+                if times.len() < MAX_STAGE_SAMPLES {
                     times.push(milliseconds);
                 }
             }
         }
     }
 
-    fn report(mut self) -> Report {
+    fn report(mut self) -> ScenarioReport {
         let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
-        Report::from_iter([
+        ScenarioReport::from_iter([
             ("stages_ms".to_owned(), json!(medians)),
             ("acknowledgements".to_owned(), json!(self.acks)),
             ("payload_bytes".to_owned(), json!(self.bytes)),
-            ("rejections".to_owned(), json!(self.refusals)),
+            ("rejections".to_owned(), json!(self.rejections)),
         ])
     }
 }
@@ -208,12 +208,12 @@ fn progress(steps: Option<u64>) -> ProgressBar {
 }
 
 /// Records the coordinates and transforms of every step, so that results can be checked.
-struct Record {
+struct Recorder {
     q: Writer,
     transforms: Writer,
 }
 
-impl Record {
+impl Recorder {
     fn create(folder: &Path, model: &Model) -> Result<Self> {
         std::fs::create_dir_all(folder).map_err(|fault| ClientError::file(folder, fault))?;
         let q = Writer::create(&folder.join("q.npy"), &[model.coordinates])?;
@@ -242,7 +242,7 @@ mod tests {
     fn first_step_sends_everything_and_later_ones_changes() {
         let model = plant();
         let still = Motion { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
-        let wire = |last, now| changed(&model, 3, 0.5, (last, now)).to_wire();
+        let wire = |last, now| encode_changes(&model, 3, 0.5, (last, now)).to_wire();
         let first = wire(None, &still);
         assert_eq!((first.q_domains, first.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));
         assert_eq!((first.q.len(), first.transforms.len()), (24, 192));

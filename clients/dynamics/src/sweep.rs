@@ -8,11 +8,11 @@ use serde_json::json;
 
 use crate::affine::Affine;
 use crate::error::Result;
-use crate::model::{Model, Part};
-use crate::run::{Motion, Report, Scenario};
+use crate::model::{DomainModel, Model};
+use crate::run::{Motion, Scenario, ScenarioReport};
 
 /// Amplitude, in radians, and period, in seconds, of a rocking scene.
-const ROCK: f64 = 0.05;
+const ROCKING_ANGLE: f64 = 0.05;
 const PERIOD: f64 = 2.0;
 
 /// Settings of the sweep.
@@ -31,7 +31,7 @@ pub struct Sweep {
     model: Model,
     options: Options,
     /// Number of steps that each coordinate moves before the next one.
-    turn: u64,
+    steps_per_coordinate: u64,
     /// Per coordinate: the value that displaces a sample by the requested share.
     amplitudes: Vec<f64>,
     peak: f64,
@@ -44,28 +44,29 @@ impl Sweep {
         let mut largest = vec![0.0_f64; model.coordinates];
         for part in &model.parts {
             for (mode, largest) in largest[part.first..][..part.rank].iter_mut().enumerate() {
-                *largest = largest.max(reach(part, mode));
+                *largest = largest.max(displacement_per_unit(part, mode));
             }
         }
-        let amplitude = |reach: f64| if reach > 0.0 { wanted / reach } else { 0.0 };
+        let amplitude =
+            |displacement_per_unit: f64| if displacement_per_unit > 0.0 { wanted / displacement_per_unit } else { 0.0 };
         let amplitudes = largest.into_iter().map(amplitude).collect();
         let turns = model.parts.iter().map(|part| part.rank as u64).max().unwrap_or(0).max(1);
         let second = (1.0 / options.dt).clamp(1.0, 1e6) as u64;
-        let turn = options.steps.map_or(second, |steps| steps / turns).clamp(1, second.max(1));
-        Self { model, options, turn, amplitudes, peak: 0.0 }
+        let steps_per_coordinate = options.steps.map_or(second, |steps| steps / turns).clamp(1, second.max(1));
+        Self { model, options, steps_per_coordinate, amplitudes, peak: 0.0 }
     }
 
     /// The sine at a step within a turn, scaled so that its largest value at a step is 1.
     fn wave(&self, step: u64) -> f64 {
-        let at = |step: u64| (TAU * (step as f64 + 0.5) / self.turn as f64).sin();
-        let crest = (0..self.turn).map(at).fold(0.0, f64::max);
+        let at = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
+        let crest = (0..self.steps_per_coordinate).map(at).fold(0.0, f64::max);
         if crest > 1e-6 { at(step) / crest } else { 1.0 }
     }
 
     fn coordinates(&self, number: u64) -> Vec<f32> {
-        let (turn, wave) = (number / self.turn, self.wave(number % self.turn));
+        let (turn, wave) = (number / self.steps_per_coordinate, self.wave(number % self.steps_per_coordinate));
         let mut q = vec![0.0; self.model.coordinates];
-        for part in self.model.parts.iter().filter(|part| part.owner && part.rank > 0) {
+        for part in self.model.parts.iter().filter(|part| part.owns_q && part.rank > 0) {
             let at = part.first + (turn % part.rank as u64) as usize;
             q[at] = (self.amplitudes[at] * wave) as f32;
         }
@@ -80,7 +81,7 @@ impl Sweep {
         let (model, (_, axis)) = (&self.model, self.model.ground_axes());
         let middle = 0.5 * (model.low + model.high);
         let base: Vector3<f64> = middle - model.up * (0.5 * model.height());
-        Affine::turn(&axis, ROCK * (TAU * time / PERIOD).sin(), &base)
+        Affine::rotation_about(&axis, ROCKING_ANGLE * (TAU * time / PERIOD).sin(), &base)
     }
 }
 
@@ -89,28 +90,28 @@ impl Scenario for Sweep {
         &self.model
     }
 
-    fn at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
+    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
         let rocking = self.rocking(number as f64 * self.options.dt);
         motion.q = self.coordinates(number);
-        motion.transforms = self.model.parts.iter().map(|part| rocking.then(&part.placement).entries()).collect();
+        motion.transforms = self.model.parts.iter().map(|part| rocking.compose(&part.placement).entries()).collect();
         let q: Vec<f64> = motion.q.iter().map(|number| f64::from(*number)).collect();
         let world: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
         self.peak = self.peak.max(self.model.peak(&q, &world));
         Ok(())
     }
 
-    fn report(&self) -> Report {
+    fn report(&self) -> ScenarioReport {
         let load = match self.model.coordinates {
-            0 => format!("no coordinates: the scene rocks by {ROCK} rad about its base every {PERIOD} s"),
+            0 => format!("no coordinates: the scene rocks by {ROCKING_ANGLE} rad about its base every {PERIOD} s"),
             _ => format!("every coordinate in turn as a sine, {} of the diagonal at its crest", self.options.share),
         };
         let peak = self.peak / self.model.diagonal();
-        Report::from_iter([("load".to_owned(), json!(load)), ("peak_of_diagonal".to_owned(), json!(peak))])
+        ScenarioReport::from_iter([("load".to_owned(), json!(load)), ("peak_of_diagonal".to_owned(), json!(peak))])
     }
 }
 
 /// The largest displacement of a sample per unit of a coordinate, in world axes.
-fn reach(part: &Part, mode: usize) -> f64 {
+fn displacement_per_unit(part: &DomainModel, mode: usize) -> f64 {
     let world = |column: Vector3<f64>| (part.placement.linear * column).norm();
     part.samples.iter().map(|sample| world(sample.column(mode, part.rank))).fold(0.0, f64::max)
 }
@@ -127,7 +128,7 @@ mod tests {
         let mut shown = [0.0_f32; 6];
         for number in 0..60 {
             let mut motion = Motion::default();
-            sweep.at(number, &mut motion).expect("moves");
+            sweep.motion_at(number, &mut motion).expect("moves");
             shown.iter_mut().zip(motion.q).for_each(|(most, now)| *most = most.max(now));
         }
         for (most, amplitude) in shown.iter().zip(&sweep.amplitudes) {
@@ -139,7 +140,7 @@ mod tests {
     #[test]
     fn fewer_steps_than_coordinates_still_reach_the_full_share() {
         let mut sweep = Sweep::new(plant(), Options { dt: 1.0, steps: Some(1), share: 0.06 });
-        sweep.at(0, &mut Motion::default()).expect("moves");
+        sweep.motion_at(0, &mut Motion::default()).expect("moves");
         assert!((sweep.peak / sweep.model.diagonal() - 0.06).abs() <= 1e-6, "{}", sweep.peak);
     }
 
@@ -150,7 +151,7 @@ mod tests {
         model.coordinates = 0;
         let mut sweep = Sweep::new(model, Options { dt: 0.5, steps: None, share: 0.06 });
         let mut motion = Motion::default();
-        sweep.at(1, &mut motion).expect("moves");
+        sweep.motion_at(1, &mut motion).expect("moves");
         let turned = Affine::from_entries(&motion.transforms[0]);
         let base = 0.5 * (sweep.model.low + sweep.model.high) - sweep.model.up * (0.5 * sweep.model.height());
         assert!((turned.apply(&base) - base).norm() <= 1e-6);

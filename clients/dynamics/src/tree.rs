@@ -11,21 +11,21 @@ use serde_json::json;
 
 use crate::affine::Affine;
 use crate::error::{Result, invalid};
-use crate::hierarchy::{Gauge, transforms};
-use crate::model::{Model, Part};
+use crate::hierarchy::{JointGapMeter, transforms};
+use crate::model::{DomainModel, Model};
 use crate::oscillator::{Oscillator, State};
-use crate::run::{Motion, Report, Scenario};
+use crate::run::{Motion, Scenario, ScenarioReport};
 use crate::wind::Wind;
 
 /// The largest bending of a branch, and of the trunk, as a share of its extent.
-const BRANCH: f64 = 0.05;
-const TRUNK: f64 = 0.2;
+const MAX_BRANCH_BENDING: f64 = 0.05;
+const MAX_TRUNK_BENDING: f64 = 0.2;
 
 /// Scale of the rotation of a rigid leaf about its base, in radians.
-const FLUTTER: f64 = 0.15;
+const FLUTTER_ANGLE: f64 = 0.15;
 
 /// Damping ratio of parts without a note `damping_ratio`.
-const DAMPING: f64 = 0.03;
+const DEFAULT_DAMPING_RATIO: f64 = 0.03;
 
 /// Settings of the wind.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,37 +44,37 @@ pub struct Options {
 }
 
 /// Reduced loads of one part, per unit of wind pressure and of force of its children.
-struct Load {
+struct WindLoad {
     /// Per mode: U^T times a unit pressure along and across the wind.
     along: Vec<f64>,
     across: Vec<f64>,
     /// 3 x r of the parent: the mean rows of the parent's U at the joint, in world axes; empty without a parent.
-    passed: Vec<f64>,
+    joint_modes: Vec<f64>,
     /// Downwind distance of the part, in scene units.
     distance: f64,
 }
 
 /// The tree scenario.
-pub struct Sway {
+pub struct TreeScenario {
     model: Model,
     wind: Wind,
     options: Options,
     modes: Vec<Oscillator>,
-    loads: Vec<Load>,
+    loads: Vec<WindLoad>,
     gains: Vec<f64>,
     states: Vec<State>,
     forces: Vec<f64>,
     next: u64,
     /// Part and sample index of the highest sample of each part that reaches the crown.
     crown: Vec<(usize, usize)>,
-    gauge: Gauge,
-    calibrated: f64,
+    gauge: JointGapMeter,
+    calibrated_sway: f64,
     sway: f64,
     peak: f64,
     gap: f64,
 }
 
-impl Sway {
+impl TreeScenario {
     /// Calibrates the wind for the tree.
     ///
     /// # Errors
@@ -84,8 +84,9 @@ impl Sway {
             let given = format!("{} domains without any; try the sweep", model.parts.len());
             return Err(invalid("scene.eigenvalues", "a domain whose modes have eigenvalues", given));
         }
-        let along = model.horizontal(options.direction);
-        let wind = Wind { seed: options.seed, along, across: model.up.cross(&along), delay: 0.25 / model.height() };
+        let along = model.horizontal_direction(options.direction);
+        let wind =
+            Wind { seed: options.seed, along, across: model.up.cross(&along), delay_per_length: 0.25 / model.height() };
         let modes = oscillators(&model, options.dt)?;
         let loads = model.parts.iter().map(|part| load(&model, part, &wind)).collect();
         let mut sway = Self {
@@ -98,8 +99,8 @@ impl Sway {
             forces: vec![0.0; model.coordinates],
             next: 0,
             crown: crown(&model),
-            gauge: Gauge::new(&model),
-            calibrated: 0.0,
+            gauge: JointGapMeter::new(&model),
+            calibrated_sway: 0.0,
             sway: 0.0,
             peak: 0.0,
             gap: 0.0,
@@ -133,7 +134,7 @@ impl Sway {
             pull[index] += (self.wind.along * along + self.wind.across * across) * part.area;
             let Some(joint) = &part.joint else { continue };
             let (parent, down) = (&self.model.parts[joint.parent], pull[index]);
-            for (component, row) in load.passed.chunks_exact(parent.rank.max(1)).enumerate() {
+            for (component, row) in load.joint_modes.chunks_exact(parent.rank.max(1)).enumerate() {
                 for (mode, entry) in row.iter().enumerate() {
                     force[parent.first + mode] += entry * down[component];
                 }
@@ -165,7 +166,7 @@ impl Sway {
         for step in 0..steps {
             self.advance();
             let q: Vec<f64> = self.states.iter().map(|state| state.q).collect();
-            let own: Vec<f64> = self.model.parts.iter().map(|part| elastic(part, part.q(&q))).collect();
+            let own: Vec<f64> = self.model.parts.iter().map(|part| elastic_displacement(part, part.q(&q))).collect();
             let trunk: f64 =
                 self.model.parts.iter().zip(&own).filter(|(part, _)| part.joint.is_none()).map(|(_, own)| own).sum();
             bending.iter_mut().zip(own).for_each(|(most, now)| *most = most.max(now));
@@ -176,7 +177,7 @@ impl Sway {
         rehearsed.sort_by(|a, b| b.0.total_cmp(&a.0));
         rehearsed.truncate(24);
         let states: Vec<Vec<f64>> = rehearsed.into_iter().map(|(_, q)| q).collect();
-        (self.gains, self.calibrated) = self.search(&bending, &states);
+        (self.gains, self.calibrated_sway) = self.find_gains(&bending, &states);
         self.states.fill(State::default());
         self.forces.fill(0.0);
         self.next = 0;
@@ -184,15 +185,15 @@ impl Sway {
 
     /// The gains with which the crown peaks at the requested share of the height, or the largest that the limits allow,
     /// and the share that they reach.
-    fn search(&self, bending: &[f64], states: &[Vec<f64>]) -> (Vec<f64>, f64) {
-        let gains = |strength: f64| -> Vec<f64> { self.limited(strength, bending) };
+    fn find_gains(&self, bending: &[f64], states: &[Vec<f64>]) -> (Vec<f64>, f64) {
+        let gains = |strength: f64| -> Vec<f64> { self.limit_gains(strength, bending) };
         let reached = |strength: f64| {
             let gains = gains(strength);
             let of = |q: &Vec<f64>| self.crown_at(&self.coordinates(q, &gains));
             states.iter().map(of).fold(0.0, f64::max)
         };
         let wanted = self.options.sway * self.options.wind;
-        let mut high = self.strongest(bending);
+        let mut high = self.max_strength(bending);
         let asked = wanted > 0.0 && high > 0.0;
         if !asked {
             return (vec![0.0; bending.len()], 0.0);
@@ -208,9 +209,9 @@ impl Sway {
     }
 
     /// The gain of each part: `strength`, reduced for branches that would exceed their bending limit.
-    fn limited(&self, strength: f64, bending: &[f64]) -> Vec<f64> {
-        let limit = |(part, bending): (&Part, &f64)| match (&part.joint, *bending > 0.0) {
-            (Some(_), true) => strength.min(self.share(BRANCH) * part.extent / bending),
+    fn limit_gains(&self, strength: f64, bending: &[f64]) -> Vec<f64> {
+        let limit = |(part, bending): (&DomainModel, &f64)| match (&part.joint, *bending > 0.0) {
+            (Some(_), true) => strength.min(self.share(MAX_BRANCH_BENDING) * part.extent / bending),
             _ => strength,
         };
         self.model.parts.iter().zip(bending).map(limit).collect()
@@ -218,14 +219,15 @@ impl Sway {
 
     /// The strength at which the trunk reaches its bending limit; without a deforming trunk, the strength at which all
     /// branches have reached theirs.
-    fn strongest(&self, bending: &[f64]) -> f64 {
+    fn max_strength(&self, bending: &[f64]) -> f64 {
         let parts = || self.model.parts.iter().zip(bending).filter(|(_, bending)| **bending > 0.0);
         let roots = parts().filter(|(part, _)| part.joint.is_none());
-        let strength = roots.map(|(part, bending)| self.share(TRUNK) * part.extent / bending).fold(f64::MAX, f64::min);
+        let strength =
+            roots.map(|(part, bending)| self.share(MAX_TRUNK_BENDING) * part.extent / bending).fold(f64::MAX, f64::min);
         if strength < f64::MAX {
             return strength;
         }
-        parts().map(|(part, bending)| self.share(BRANCH) * part.extent / bending).fold(0.0, f64::max)
+        parts().map(|(part, bending)| self.share(MAX_BRANCH_BENDING) * part.extent / bending).fold(0.0, f64::max)
     }
 
     /// A bending limit scaled by the wind. The scale is at most 2.5, because linear modes do not represent larger
@@ -243,7 +245,7 @@ impl Sway {
         let moved = |(index, place): &(usize, usize)| {
             let (part, pose) = (&self.model.parts[*index], &world[*index]);
             let sample = &part.samples[*place];
-            pose.apply(&sample.moved(part.q(q))) - part.placement.apply(&sample.rest)
+            pose.apply(&sample.deformed_position(part.q(q))) - part.placement.apply(&sample.rest)
         };
         let sum: Vector3<f64> = self.crown.iter().map(moved).sum();
         sum.norm() / (self.crown.len().max(1) as f64 * self.model.height())
@@ -253,26 +255,26 @@ impl Sway {
     fn flutter(&self, time: f64) -> Vec<Option<Affine>> {
         let mut carries = vec![false; self.model.parts.len()];
         self.model.parts.iter().filter_map(|part| part.joint.as_ref()).for_each(|joint| carries[joint.parent] = true);
-        let strength = FLUTTER * self.options.wind.clamp(0.0, 2.0);
-        let turn = |(index, part): (usize, &Part)| {
+        let strength = FLUTTER_ANGLE * self.options.wind.clamp(0.0, 2.0);
+        let turn = |(index, part): (usize, &DomainModel)| {
             let leaf = part.rank == 0 && part.joint.is_some() && !carries[index] && strength > 0.0;
             leaf.then(|| {
                 let (push, _) = self.wind.pressure(time, index, self.loads[index].distance);
                 let axis = part.placement.linear.transpose() * self.wind.across;
                 let angle = strength * (0.5 * push + 0.5 * push.abs() * self.wind.turbulence(time, index, 1));
-                Affine::turn(&axis, angle, &Vector3::zeros())
+                Affine::rotation_about(&axis, angle, &Vector3::zeros())
             })
         };
         self.model.parts.iter().enumerate().map(turn).collect()
     }
 }
 
-impl Scenario for Sway {
+impl Scenario for TreeScenario {
     fn model(&self) -> &Model {
         &self.model
     }
 
-    fn at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
+    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
         while self.next < number {
             self.advance();
         }
@@ -292,15 +294,15 @@ impl Scenario for Sway {
         Ok(())
     }
 
-    fn report(&self) -> Report {
+    fn report(&self) -> ScenarioReport {
         let wind = self.options.wind;
         let load = format!(
             "wind {wind} on all surfaces, calibrated to a crown sway of {:.3} of the height in a rehearsal; branches bend \
              by at most {:.3} of their extent",
-            self.calibrated,
-            self.share(BRANCH),
+            self.calibrated_sway,
+            self.share(MAX_BRANCH_BENDING),
         );
-        Report::from_iter([
+        ScenarioReport::from_iter([
             ("load".to_owned(), json!(load)),
             ("crown_sway_of_height".to_owned(), json!(self.sway)),
             ("peak_of_height".to_owned(), json!(self.peak / self.model.height())),
@@ -313,9 +315,9 @@ impl Scenario for Sway {
 
 /// One oscillator per coordinate. Modes without stiffness would drift in any wind, so they are held.
 fn oscillators(model: &Model, dt: f64) -> Result<Vec<Oscillator>> {
-    let mut modes = vec![Oscillator::held(); model.coordinates];
-    for part in model.parts.iter().filter(|part| part.owner) {
-        let damping = part.note("damping_ratio").unwrap_or(DAMPING);
+    let mut modes = vec![Oscillator::new_fixed(); model.coordinates];
+    for part in model.parts.iter().filter(|part| part.owns_q) {
+        let damping = part.note("damping_ratio").unwrap_or(DEFAULT_DAMPING_RATIO);
         for (mode, eigenvalue) in part.eigenvalues.iter().enumerate().filter(|(_, value)| **value > 0.0) {
             modes[part.first + mode] = Oscillator::new(*eigenvalue, damping, dt)?;
         }
@@ -323,17 +325,19 @@ fn oscillators(model: &Model, dt: f64) -> Result<Vec<Oscillator>> {
     Ok(modes)
 }
 
-fn load(model: &Model, part: &Part, wind: &Wind) -> Load {
-    let skin = &part.samples[..part.skin];
-    let share = part.area / skin.len().max(1) as f64;
+fn load(model: &Model, part: &DomainModel, wind: &Wind) -> WindLoad {
+    let surface_samples = &part.samples[..part.surface_samples];
+    let share = part.area / surface_samples.len().max(1) as f64;
     let push = |direction: &Vector3<f64>| {
         let local = part.placement.linear.transpose() * direction;
-        let of = |mode| skin.iter().map(|sample| sample.column(mode, part.rank).dot(&local)).sum::<f64>() * share;
+        let of =
+            |mode| surface_samples.iter().map(|sample| sample.column(mode, part.rank).dot(&local)).sum::<f64>() * share;
         (0..part.rank).map(of).collect::<Vec<f64>>()
     };
-    let centre = skin.iter().map(|sample| sample.rest).sum::<Vector3<f64>>() / skin.len().max(1) as f64;
-    let distance = (part.placement.apply(&centre) - model.low).dot(&wind.along);
-    let passed = part.joint.as_ref().map_or(vec![], |joint| {
+    let center =
+        surface_samples.iter().map(|sample| sample.rest).sum::<Vector3<f64>>() / surface_samples.len().max(1) as f64;
+    let distance = (part.placement.apply(&center) - model.low).dot(&wind.along);
+    let joint_modes = part.joint.as_ref().map_or(vec![], |joint| {
         let parent = &model.parts[joint.parent];
         let ring = joint.ring.iter().map(|place| &parent.samples[*place]);
         let (count, turn) = (joint.ring.len().max(1) as f64, parent.placement.linear);
@@ -342,20 +346,20 @@ fn load(model: &Model, part: &Part, wind: &Wind) -> Load {
         let columns: Vec<Vector3<f64>> = (0..parent.rank).map(|mode| turn * mean(mode)).collect();
         (0..3).flat_map(|component| columns.iter().map(move |column| column[component])).collect()
     });
-    Load { along: push(&wind.along), across: push(&wind.across), passed, distance }
+    WindLoad { along: push(&wind.along), across: push(&wind.across), joint_modes, distance }
 }
 
 /// The largest elastic displacement of a part's evenly spread samples, in scene units.
-fn elastic(part: &Part, q: &[f64]) -> f64 {
-    part.samples[..part.skin].iter().map(|sample| sample.displacement(q).norm()).fold(0.0, f64::max)
+fn elastic_displacement(part: &DomainModel, q: &[f64]) -> f64 {
+    part.samples[..part.surface_samples].iter().map(|sample| sample.displacement(q).norm()).fold(0.0, f64::max)
 }
 
 /// Per part the highest of its evenly spread samples, if it is in the top quarter of the scene.
 fn crown(model: &Model) -> Vec<(usize, usize)> {
     let level = model.low.dot(&model.up) + 0.75 * model.height();
-    let highest = |(index, part): (usize, &Part)| {
+    let highest = |(index, part): (usize, &DomainModel)| {
         let height = |place: &usize| part.placement.apply(&part.samples[*place].rest).dot(&model.up);
-        let place = (0..part.skin).max_by(|a, b| height(a).total_cmp(&height(b)))?;
+        let place = (0..part.surface_samples).max_by(|a, b| height(a).total_cmp(&height(b)))?;
         (height(&place) >= level).then_some((index, place))
     };
     model.parts.iter().enumerate().filter_map(highest).collect()
@@ -366,11 +370,11 @@ mod tests {
     use super::*;
     use crate::hierarchy::tests::plant;
 
-    fn blown(options: Options) -> (Sway, Vec<Motion>) {
-        let mut sway = Sway::new(plant(), options).expect("valid");
+    fn blown(options: Options) -> (TreeScenario, Vec<Motion>) {
+        let mut sway = TreeScenario::new(plant(), options).expect("valid");
         let motion = |number| {
             let mut motion = Motion::default();
-            sway.at(number, &mut motion).expect("finite");
+            sway.motion_at(number, &mut motion).expect("finite");
             motion
         };
         let motions = (0..options.steps.unwrap_or(60)).map(motion).collect();
@@ -408,10 +412,10 @@ mod tests {
         }
         for dt in [1.0 / 60.0, 1.0, 10.0] {
             let options = Options { dt, steps: Some(400), ..CALM };
-            let mut sway = Sway::new(model.clone(), options).expect("valid");
+            let mut sway = TreeScenario::new(model.clone(), options).expect("valid");
             let mut motion = Motion::default();
             for number in 0..400 {
-                sway.at(number, &mut motion).expect("finite");
+                sway.motion_at(number, &mut motion).expect("finite");
             }
             assert!(sway.peak <= 0.5 * sway.model.diagonal() && sway.sway > 0.0, "dt {dt}: {}", sway.peak);
         }

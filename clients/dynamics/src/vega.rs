@@ -8,7 +8,7 @@ use crate::error::{Result, invalid};
 
 /// Frequencies and Rayleigh damping of a reduced model.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Settings {
+pub struct VegaSettings {
     /// Factor of all frequencies: the internal force is scaled by its square.
     pub base_frequency: f64,
     /// Mass coefficient of Rayleigh damping, 1/s.
@@ -17,13 +17,13 @@ pub struct Settings {
     pub damping_stiffness: f64,
 }
 
-impl Default for Settings {
+impl Default for VegaSettings {
     fn default() -> Self {
         Self { base_frequency: 1.0, damping_mass: 0.0, damping_stiffness: 0.0 }
     }
 }
 
-impl Settings {
+impl VegaSettings {
     /// Reads a file.
     ///
     /// # Errors
@@ -64,17 +64,17 @@ mod tests {
     #[test]
     fn known_settings_are_read_and_the_rest_keep_defaults() {
         let text = "*modesFilename\nx.URendering.float\n\n*baseFrequency\n0.25\n\n*dampingStiffnessCoef\n0.003\n";
-        let settings = Settings { base_frequency: 0.25, damping_mass: 0.0, damping_stiffness: 0.003 };
-        assert_eq!(Settings::parse(text).expect("parses"), settings);
-        assert_eq!(Settings::parse("").expect("parses"), Settings::default());
+        let settings = VegaSettings { base_frequency: 0.25, damping_mass: 0.0, damping_stiffness: 0.003 };
+        assert_eq!(VegaSettings::parse(text).expect("parses"), settings);
+        assert_eq!(VegaSettings::parse("").expect("parses"), VegaSettings::default());
     }
 
     #[test]
     fn invalid_values_are_refused_by_name() {
         for value in ["x", "nan", "-1", "inf", ""] {
-            let refusal = Settings::parse(&format!("*dampingMassCoef\n{value}")).expect_err("refused").to_string();
+            let refusal = VegaSettings::parse(&format!("*dampingMassCoef\n{value}")).expect_err("refused").to_string();
             assert!(refusal.starts_with("dampingMassCoef"), "{refusal}");
         }
-        assert!(Settings::parse("*baseFrequency\n0").is_err());
+        assert!(VegaSettings::parse("*baseFrequency\n0").is_err());
     }
 }

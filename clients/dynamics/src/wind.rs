@@ -20,14 +20,14 @@ pub struct Wind {
     pub along: Vector3<f64>,
     pub across: Vector3<f64>,
     /// Travel time of a gust, in seconds per scene unit.
-    pub delay: f64,
+    pub delay_per_length: f64,
 }
 
 impl Wind {
     /// Pressures along and across the wind at `time` (seconds) on a part at `distance` downwind. Both are 0 at time 0.
     pub fn pressure(&self, time: f64, part: usize, distance: f64) -> (f64, f64) {
-        let rise = smooth(time / RISE);
-        let here = time - FRONT - self.delay * distance;
+        let rise = smoothstep(time / RISE);
+        let here = time - FRONT - self.delay_per_length * distance;
         let gust: f64 = GUSTS.iter().map(|(period, strength)| strength * (TAU * here / period).cos()).sum();
         let (own, side) = (self.turbulence(time, part, 0), self.turbulence(time, part, 1));
         (rise * (0.55 + 0.45 * gust + 0.15 * own), rise * 0.25 * side)
@@ -45,7 +45,7 @@ impl Wind {
 }
 
 /// Smoothstep: 0 below 0, 1 above 1.
-fn smooth(x: f64) -> f64 {
+fn smoothstep(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * (3.0 - 2.0 * x)
 }
@@ -64,7 +64,7 @@ mod tests {
 
     #[test]
     fn wind_starts_at_zero_and_depends_on_seed_and_part() {
-        let wind = Wind { seed: 1, along: Vector3::x(), across: Vector3::z(), delay: 0.1 };
+        let wind = Wind { seed: 1, along: Vector3::x(), across: Vector3::z(), delay_per_length: 0.1 };
         assert_eq!(wind.pressure(0.0, 3, 0.5), (0.0, 0.0));
         let other = Wind { seed: 2, ..wind };
         let (mut same, mut largest) = (0, 0.0_f64);
@@ -81,7 +81,7 @@ mod tests {
 
     #[test]
     fn gust_arrives_later_downwind() {
-        let wind = Wind { seed: 1, along: Vector3::x(), across: Vector3::z(), delay: 0.2 };
+        let wind = Wind { seed: 1, along: Vector3::x(), across: Vector3::z(), delay_per_length: 0.2 };
         let peak = |distance: f64| {
             let steps = 40..300;
             let force = |step: &i32| {

@@ -8,7 +8,7 @@ mod fake;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use fake::{FakeDomain, IDENTITY, World, pack, serve};
+use fake::{FakeDomain, FakeServer, IDENTITY, pack, serve};
 use modalcast_client::{Client, VertexStreamRequest};
 
 /// A beam of length 1 along y with two bending modes. Each of its sections has six vertices.
@@ -27,7 +27,7 @@ fn beam(index: u32, radius: f32) -> FakeDomain {
 }
 
 /// A trunk, two generations of tilted branches, each at the tip ring of the previous part, and a rigid leaf.
-fn plant() -> World {
+fn plant() -> FakeServer {
     let (sine, cosine) = (0.6_f32, 0.8_f32);
     let frame = [cosine, sine, 0.0, 0.0, -sine, cosine, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0];
     let mut domains = vec![];
@@ -52,7 +52,7 @@ fn plant() -> World {
         }
         domains.push(domain);
     }
-    World::new(domains)
+    FakeServer::new(domains)
 }
 
 fn product(a: &[f32; 12], b: &[f32; 12]) -> [f32; 12] {
@@ -93,7 +93,7 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let client = Client::connect(&url).await.expect("connects");
     let rest = world.now().positions;
     let request = VertexStreamRequest { scene: "toy".into(), steps: 90, ..VertexStreamRequest::default() };
-    let mut sets = client.vertex_sets(&request).await.expect("accepted");
+    let mut sets = client.stream_vertices(&request).await.expect("accepted");
     let folder = tempfile::tempdir().expect("folder");
     let record = folder.path().display().to_string();
     let arguments = ["tree", "--scene", "toy", "--steps", "90", "--json", "--record", &record];
@@ -136,7 +136,7 @@ async fn auto_selects_tree_sweep_or_rocking_by_scene() {
     let mut bare = plant();
     bare.domains.iter_mut().for_each(|domain| domain.wire.eigenvalues.clear());
     let stone = vec![-1.0, 0.0, -1.0, 1.0, 2.0, 1.0, 0.0, 1.0, 0.0];
-    let rigid = World::new(vec![FakeDomain::new(0, stone, 0, vec![])]);
+    let rigid = FakeServer::new(vec![FakeDomain::new(0, stone, 0, vec![])]);
     for (world, name) in [(plant(), "tree"), (bare, "sweep"), (rigid, "sweep")] {
         let world = Arc::new(world);
         let rest = world.now().positions;
@@ -186,7 +186,7 @@ fn rendered(name: &str) -> FakeDomain {
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 async fn real_models_deflect_as_requested_and_stay_bounded() {
     for (name, first) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
-        let world = Arc::new(World::new(vec![rendered(name)]));
+        let world = Arc::new(FakeServer::new(vec![rendered(name)]));
         let url = serve(Arc::clone(&world)).await;
         let files = vega(name).display().to_string();
         for dt in ["0.0166667", "1"] {

@@ -7,10 +7,10 @@ use std::task::{Context, Poll, ready};
 use bytes::Bytes;
 use tokio_stream::Stream;
 
-use crate::error::{Error, Result, malformed};
+use crate::error::{Error, Result, malformed_reply};
 
 /// One message of a chunked reply.
-pub(crate) struct Piece<H> {
+pub(crate) struct Chunk<H> {
     /// Head and total size in bytes; on the first chunk only.
     pub(crate) head: Option<(H, u64)>,
     pub(crate) offset: u64,
@@ -18,12 +18,12 @@ pub(crate) struct Piece<H> {
 }
 
 /// A reply message that carries a chunk.
-pub(crate) trait Part: Sized {
+pub(crate) trait ChunkMessage: Sized {
     type Head;
-    type Whole;
+    type Reply;
     const WHAT: &'static str;
-    fn piece(self) -> Result<Piece<Self::Head>>;
-    fn whole(head: Self::Head, bytes: Bytes) -> Result<Self::Whole>;
+    fn into_chunk(self) -> Result<Chunk<Self::Head>>;
+    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
 }
 
 /// Collects the chunks of consecutive replies.
@@ -45,25 +45,25 @@ impl<H> Assembler<H> {
     }
 
     /// Adds a chunk. Returns the complete reply after its last chunk.
-    pub(crate) fn push(&mut self, piece: Piece<H>) -> Result<Option<(H, Bytes)>> {
+    pub(crate) fn push(&mut self, piece: Chunk<H>) -> Result<Option<(H, Bytes)>> {
         let field = |name: &str| format!("{}.{name}", self.what);
         match (piece.head, self.open.is_some()) {
             (Some((_, total)), false) if total > self.limit => {
-                return Err(malformed(field("total"), format!("at most {} bytes", self.limit), total));
+                return Err(malformed_reply(field("total"), format!("at most {} bytes", self.limit), total));
             }
             (Some(head), false) => self.open = Some(head),
             (None, true) => {}
-            (Some(_), true) => return Err(malformed(field("head"), "the rest of the last reply", "a new head")),
-            (None, false) => return Err(malformed(field("head"), "a head on the first chunk", "none")),
+            (Some(_), true) => return Err(malformed_reply(field("head"), "the rest of the last reply", "a new head")),
+            (None, false) => return Err(malformed_reply(field("head"), "a head on the first chunk", "none")),
         }
         let Some((_, total)) = &self.open else { return Ok(None) };
         let (total, kept) = (*total, self.bytes.len() as u64);
         if piece.offset != kept {
-            return Err(malformed(field("offset"), kept, piece.offset));
+            return Err(malformed_reply(field("offset"), kept, piece.offset));
         }
         let end = kept.saturating_add(piece.data.len() as u64);
         if end > total {
-            return Err(malformed(field("data"), format!("{total} bytes in all"), end));
+            return Err(malformed_reply(field("data"), format!("{total} bytes in all"), end));
         }
         if end < total {
             self.bytes.extend_from_slice(&piece.data);
@@ -85,24 +85,24 @@ impl<H> Assembler<H> {
 }
 
 /// Turns a server stream of chunks into a stream of complete replies. An error ends the stream.
-pub(crate) struct Replies<M: Part> {
+pub(crate) struct ChunkedReplies<M: ChunkMessage> {
     inner: tonic::Streaming<M>,
     assembler: Assembler<M::Head>,
     ended: bool,
 }
 
-impl<M: Part> Replies<M> {
+impl<M: ChunkMessage> ChunkedReplies<M> {
     pub(crate) const fn new(inner: tonic::Streaming<M>, limit: u64) -> Self {
         Self { inner, assembler: Assembler::new(M::WHAT, limit), ended: false }
     }
 
     /// Polls for the next complete reply.
-    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M::Whole>>> {
+    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M::Reply>>> {
         while !self.ended {
             let whole = match ready!(Pin::new(&mut self.inner).poll_next(context)) {
                 Some(Ok(message)) => self.accept(message),
                 Some(Err(status)) => Err(status.into()),
-                None if self.assembler.is_open() => Err(Error::Ended { what: "the last chunk of a reply" }),
+                None if self.assembler.is_open() => Err(Error::StreamEnded { what: "the last chunk of a reply" }),
                 None => {
                     self.ended = true;
                     return Poll::Ready(None);
@@ -117,13 +117,13 @@ impl<M: Part> Replies<M> {
     }
 
     /// The next complete reply.
-    pub(crate) async fn next(&mut self) -> Option<Result<M::Whole>> {
+    pub(crate) async fn next(&mut self) -> Option<Result<M::Reply>> {
         std::future::poll_fn(|context| self.poll(context)).await
     }
 
-    fn accept(&mut self, message: M) -> Result<Option<M::Whole>> {
-        match self.assembler.push(message.piece()?)? {
-            Some((head, bytes)) => M::whole(head, bytes).map(Some),
+    fn accept(&mut self, message: M) -> Result<Option<M::Reply>> {
+        match self.assembler.push(message.into_chunk()?)? {
+            Some((head, bytes)) => M::from_chunks(head, bytes).map(Some),
             None => Ok(None),
         }
     }
@@ -143,17 +143,17 @@ pub(crate) fn words(bytes: &[u8]) -> Vec<u32> {
 mod tests {
     use super::*;
 
-    fn piece(head: Option<u64>, offset: u64, data: &'static [u8]) -> Piece<()> {
-        Piece { head: head.map(|total| ((), total)), offset, data: Bytes::from_static(data) }
+    fn piece(head: Option<u64>, offset: u64, data: &'static [u8]) -> Chunk<()> {
+        Chunk { head: head.map(|total| ((), total)), offset, data: Bytes::from_static(data) }
     }
 
-    fn all(pieces: Vec<Piece<()>>) -> Result<Vec<Bytes>> {
+    fn all(pieces: Vec<Chunk<()>>) -> Result<Vec<Bytes>> {
         let mut assembler = Assembler::new("frame", 8);
         let mut whole = vec![];
         for piece in pieces {
             whole.extend(assembler.push(piece)?.map(|((), bytes)| bytes));
         }
-        if assembler.is_open() { Err(Error::Ended { what: "chunk" }) } else { Ok(whole) }
+        if assembler.is_open() { Err(Error::StreamEnded { what: "chunk" }) } else { Ok(whole) }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use modalcast_proto::v1;
 use tonic::transport::{Channel, Endpoint};
 
-use crate::error::{Error, Result, malformed};
+use crate::error::{Error, Result, malformed_reply};
 use crate::scene::ServerInfo;
 
 /// The default limit of one reply assembled from chunks, in bytes.
@@ -46,15 +46,15 @@ impl Client {
         Ok(Self { channel, reply_limit: REPLY_LIMIT })
     }
 
-    /// Connects, and retries until a server answers or `patience` has passed.
+    /// Connects, and retries until a server answers or `timeout` has passed.
     ///
     /// # Errors
     /// `Connect` with the reason of the last attempt.
-    pub async fn connect_within(url: &str, patience: Duration) -> Result<Self> {
+    pub async fn connect_with_retry(url: &str, timeout: Duration) -> Result<Self> {
         let start = Instant::now();
         loop {
             match Self::connect(url).await {
-                Err(_) if start.elapsed() < patience => tokio::time::sleep(Duration::from_millis(100)).await,
+                Err(_) if start.elapsed() < timeout => tokio::time::sleep(Duration::from_millis(100)).await,
                 answer => return answer,
             }
         }
@@ -70,7 +70,7 @@ impl Client {
     /// Backend, renderer and limits of the server.
     ///
     /// # Errors
-    /// `Refused`, `Connect` or `Malformed`, as for every call.
+    /// `Status`, `Connect` or `Malformed`, as for every call.
     pub async fn server_info(&self) -> Result<ServerInfo> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
         let wire = service.get_server_info(v1::GetServerInfoRequest {}).await?.into_inner();
@@ -88,17 +88,17 @@ impl Client {
     /// empty `name`, the scene has the name of its source.
     ///
     /// # Errors
-    /// `Refused` if the source does not exist; `Connect`; `Malformed`.
+    /// `Status` if the source does not exist; `Connect`; `Malformed`.
     pub async fn open_scene(&self, source: &str, name: &str) -> Result<v1::SceneInfo> {
         let request = v1::OpenSceneRequest { source: source.to_owned(), scene: name.to_owned() };
         let reply = self.scenes().open_scene(request).await?.into_inner();
-        reply.scene.ok_or_else(|| malformed("open_scene.scene", "a scene", "none"))
+        reply.scene.ok_or_else(|| malformed_reply("open_scene.scene", "a scene", "none"))
     }
 
     /// The open scenes, and the sources that [`Self::open_scene`] accepts.
     ///
     /// # Errors
-    /// `Refused` or `Connect`.
+    /// `Status` or `Connect`.
     pub async fn list_scenes(&self) -> Result<(Vec<v1::SceneInfo>, Vec<String>)> {
         let reply = self.scenes().list_scenes(v1::ListScenesRequest {}).await?.into_inner();
         Ok((reply.scenes, reply.sources))
@@ -107,7 +107,7 @@ impl Client {
     /// Closes a scene. The server deletes the files of an uploaded scene.
     ///
     /// # Errors
-    /// `Refused` if the scene does not exist; `Connect`.
+    /// `Status` if the scene does not exist; `Connect`.
     pub async fn delete_scene(&self, scene: &str) -> Result<()> {
         self.scenes().delete_scene(v1::DeleteSceneRequest { scene: scene.to_owned() }).await?;
         Ok(())

@@ -9,17 +9,17 @@ use std::time::Duration;
 use modalcast_proto::v1;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
-use v1::drive_scene_request::Kind as Ask;
-use v1::drive_scene_response::Kind as Answer;
+use v1::drive_scene_request::Kind as RequestKind;
+use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::client::Client;
-use crate::error::{Error, Refusal, Result, malformed};
-use crate::frames::{Stages, stages};
+use crate::error::{Error, Rejection, Result, malformed_reply};
+use crate::frames::{StageTimes, stages};
 use crate::step::Step;
 
 /// The most acknowledgements, and the most refusals, that are kept until the caller takes them. Older ones are dropped;
-/// [`Finished::refused`] counts all refusals.
-const KEPT: usize = 1024;
+/// [`StreamSummary::rejected`] counts all refusals.
+const MAX_RETAINED: usize = 1024;
 
 /// How the server handles steps that arrive faster than it processes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,17 +36,17 @@ pub struct Ack {
     pub step: u64,
     /// Number of steps merged into a newer one since the stream began.
     pub skipped: u64,
-    pub stages: Stages,
+    pub stages: StageTimes,
 }
 
 /// Totals of a stream.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Finished {
+pub struct StreamSummary {
     /// The last acknowledged step.
     pub acknowledged: Option<u64>,
     /// Number of steps sent, and how many of them the server refused.
     pub sent: u64,
-    pub refused: u64,
+    pub rejected: u64,
     /// Number of steps merged into a newer one.
     pub skipped: u64,
 }
@@ -57,14 +57,14 @@ struct Progress {
     outstanding: VecDeque<u64>,
     acknowledged: Option<u64>,
     skipped: u64,
-    refused: u64,
+    rejected: u64,
     acks: VecDeque<Ack>,
-    refusals: VecDeque<Refusal>,
+    rejections: VecDeque<Rejection>,
     ended: Option<Option<Error>>,
 }
 
 /// A step stream to one scene. Dropping it ends the stream and releases the scene.
-pub struct Drive {
+pub struct StepStream {
     /// The number of this run; every new writer of the scene increments it.
     pub run: u64,
     /// The most steps in flight: sent and not yet acknowledged.
@@ -79,32 +79,34 @@ pub struct Drive {
 }
 
 impl Client {
-    /// Becomes the writer of a scene. A `window` of 0 selects the server's default; [`Drive::window`] is the granted
+    /// Becomes the writer of a scene. A `window` of 0 selects the server's default; [`StepStream::window`] is the granted
     /// window.
     ///
     /// # Errors
-    /// `Rejected` or `Refused` if the scene does not exist or has another writer.
-    pub async fn drive(&self, scene: &str, policy: Policy, window: u32) -> Result<Drive> {
+    /// `Rejected` or `Status` if the scene does not exist or has another writer.
+    pub async fn drive(&self, scene: &str, policy: Policy, window: u32) -> Result<StepStream> {
         let policy = match policy {
             Policy::Lossless => v1::Policy::Lossless,
             Policy::Latest => v1::Policy::Latest,
         };
         let (requests, queue) = mpsc::channel(64);
         let open = v1::OpenDrive { scene: scene.to_owned(), policy: policy.into(), window };
-        let opening = v1::DriveSceneRequest { kind: Some(Ask::Open(open)) };
-        requests.send(opening).await.map_err(|_| Error::Ended { what: "the stream opened" })?;
+        let opening = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
+        requests.send(opening).await.map_err(|_| Error::StreamEnded { what: "the stream opened" })?;
         let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
         let mut replies = service.drive_scene(ReceiverStream::new(queue)).await?.into_inner();
         let opened = match replies.message().await?.and_then(|reply| reply.kind) {
-            Some(Answer::Opened(opened)) => opened,
-            Some(Answer::Rejection(refusal)) => return Err(Error::Rejected(Box::new(refusal.into()))),
-            Some(Answer::Ack(_)) => return Err(malformed("drive.opened", "`opened` first", "an acknowledgement")),
-            None => return Err(Error::Ended { what: "the stream opened" }),
+            Some(ResponseKind::Opened(opened)) => opened,
+            Some(ResponseKind::Rejection(rejection)) => return Err(Error::Rejected(Box::new(rejection.into()))),
+            Some(ResponseKind::Ack(_)) => {
+                return Err(malformed_reply("drive.opened", "`opened` first", "an acknowledgement"));
+            }
+            None => return Err(Error::StreamEnded { what: "the stream opened" }),
         };
         let progress = Arc::new(Mutex::new(Progress::default()));
         let (change, changed) = watch::channel(());
         let reader = tokio::spawn(read(replies, Arc::clone(&progress), change));
-        Ok(Drive {
+        Ok(StepStream {
             run: opened.run,
             window: (opened.window as usize).max(1),
             scene: opened.scene.unwrap_or_default(),
@@ -117,7 +119,7 @@ impl Client {
     }
 }
 
-impl Drive {
+impl StepStream {
     /// Sends a step as soon as the window has capacity.
     ///
     /// # Errors
@@ -128,15 +130,15 @@ impl Drive {
         step.check()?;
         self.wait(|progress, window| progress.outstanding.len() < window).await?;
         lock(&self.progress).outstanding.push_back(step.number());
-        let message = v1::DriveSceneRequest { kind: Some(Ask::Step(step.to_wire())) };
-        let requests = self.requests.as_ref().ok_or(Error::Ended { what: "this step" })?;
+        let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(step.to_wire())) };
+        let requests = self.requests.as_ref().ok_or(Error::StreamEnded { what: "this step" })?;
         if requests.send(message).await.is_err() {
             // The stream has ended; the reading task receives the reason.
             self.wait(|_, _| false).await?;
         }
         self.sent += 1;
-        match lock(&self.progress).refusals.pop_front() {
-            Some(refusal) => Err(Error::Rejected(Box::new(refusal))),
+        match lock(&self.progress).rejections.pop_front() {
+            Some(rejection) => Err(Error::Rejected(Box::new(rejection))),
             None => Ok(()),
         }
     }
@@ -145,10 +147,10 @@ impl Drive {
     ///
     /// # Errors
     /// `Rejected` with the oldest unreported refusal; every other error ends the stream.
-    pub async fn settle(&mut self) -> Result<()> {
+    pub async fn flush(&mut self) -> Result<()> {
         self.wait(|progress, _| progress.outstanding.is_empty()).await?;
-        match lock(&self.progress).refusals.pop_front() {
-            Some(refusal) => Err(Error::Rejected(Box::new(refusal))),
+        match lock(&self.progress).rejections.pop_front() {
+            Some(rejection) => Err(Error::Rejected(Box::new(rejection))),
             None => Ok(()),
         }
     }
@@ -159,8 +161,8 @@ impl Drive {
     }
 
     /// Takes the unreported refusals, oldest first; at most 1024 are kept.
-    pub fn take_refusals(&self) -> Vec<Refusal> {
-        lock(&self.progress).refusals.drain(..).collect()
+    pub fn take_rejections(&self) -> Vec<Rejection> {
+        lock(&self.progress).rejections.drain(..).collect()
     }
 
     /// Number of steps in flight.
@@ -169,12 +171,12 @@ impl Drive {
     }
 
     /// Totals of the stream up to now.
-    pub fn so_far(&self) -> Finished {
+    pub fn summary(&self) -> StreamSummary {
         let progress = lock(&self.progress);
-        Finished {
+        StreamSummary {
             acknowledged: progress.acknowledged,
             sent: self.sent,
-            refused: progress.refused,
+            rejected: progress.rejected,
             skipped: progress.skipped,
         }
     }
@@ -183,13 +185,13 @@ impl Drive {
     ///
     /// # Errors
     /// The error that ended the stream before all steps were acknowledged.
-    pub async fn finish(mut self) -> Result<Finished> {
+    pub async fn finish(mut self) -> Result<StreamSummary> {
         self.wait(|progress, _| progress.outstanding.is_empty()).await?;
         self.requests = None;
         // The server closes its side after it has released the scene. The timeout covers a server that does not.
         let closing = async { while self.changed.changed().await.is_ok() {} };
         tokio::time::timeout(Duration::from_secs(5), closing).await.ok();
-        Ok(self.so_far())
+        Ok(self.summary())
     }
 
     /// Waits until `enough` holds, or the stream has ended.
@@ -200,20 +202,20 @@ impl Drive {
             {
                 let progress = lock(&self.progress);
                 if let Some(end) = &progress.ended {
-                    return Err(end.clone().unwrap_or(Error::Ended { what: "the acknowledgement" }));
+                    return Err(end.clone().unwrap_or(Error::StreamEnded { what: "the acknowledgement" }));
                 }
                 if enough(&progress, self.window) {
                     return Ok(());
                 }
             }
             if self.changed.changed().await.is_err() && lock(&self.progress).ended.is_none() {
-                return Err(Error::Ended { what: "the acknowledgement" });
+                return Err(Error::StreamEnded { what: "the acknowledgement" });
             }
         }
     }
 }
 
-impl Drop for Drive {
+impl Drop for StepStream {
     fn drop(&mut self) {
         self.reader.abort();
     }
@@ -230,9 +232,9 @@ async fn read(
         let mut progress = lock(&progress);
         match reply {
             Ok(Some(reply)) => match reply.kind {
-                Some(Answer::Ack(ack)) => progress.acknowledge(ack),
-                Some(Answer::Rejection(refusal)) => progress.refuse(refusal.into()),
-                Some(Answer::Opened(_)) | None => {}
+                Some(ResponseKind::Ack(ack)) => progress.acknowledge(ack),
+                Some(ResponseKind::Rejection(rejection)) => progress.refuse(rejection.into()),
+                Some(ResponseKind::Opened(_)) | None => {}
             },
             Ok(None) => progress.ended = Some(None),
             Err(status) => progress.ended = Some(Some(status.into())),
@@ -249,22 +251,22 @@ impl Progress {
         self.outstanding.retain(|step| *step > ack.step);
         self.acknowledged = self.acknowledged.max(Some(ack.step));
         self.skipped = ack.skipped;
-        keep(&mut self.acks, Ack { step: ack.step, skipped: ack.skipped, stages: stages(ack.stages) });
+        push_bounded(&mut self.acks, Ack { step: ack.step, skipped: ack.skipped, stages: stages(ack.stages) });
     }
 
     /// Removes the refused step from the steps in flight. If several have its number, the oldest one is meant.
-    fn refuse(&mut self, refusal: Refusal) {
-        if let Some(at) = self.outstanding.iter().position(|step| Some(*step) == refusal.step) {
+    fn refuse(&mut self, rejection: Rejection) {
+        if let Some(at) = self.outstanding.iter().position(|step| Some(*step) == rejection.step) {
             self.outstanding.remove(at);
         }
-        self.refused += 1;
-        keep(&mut self.refusals, refusal);
+        self.rejected += 1;
+        push_bounded(&mut self.rejections, rejection);
     }
 }
 
 /// Appends to a bounded list and drops the oldest item of a full one.
-fn keep<T>(list: &mut VecDeque<T>, item: T) {
-    if list.len() == KEPT {
+fn push_bounded<T>(list: &mut VecDeque<T>, item: T) {
+    if list.len() == MAX_RETAINED {
         list.pop_front();
     }
     list.push_back(item);
@@ -279,28 +281,28 @@ fn lock(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
 mod tests {
     use super::*;
 
-    fn refusal(step: u64) -> Refusal {
-        Refusal { step: Some(step), field: "q".into(), expected: "4 bytes".into(), given: "3 bytes".into() }
+    fn rejection(step: u64) -> Rejection {
+        Rejection { step: Some(step), field: "q".into(), expected: "4 bytes".into(), given: "3 bytes".into() }
     }
 
     #[test]
     fn an_ack_covers_all_earlier_steps_and_a_refusal_covers_one() {
         let mut progress = Progress { outstanding: (0..6).collect(), ..Progress::default() };
-        progress.refuse(refusal(4));
+        progress.refuse(rejection(4));
         assert_eq!(progress.outstanding, [0, 1, 2, 3, 5]);
         progress.acknowledge(v1::Acknowledgement { step: 3, skipped: 2, stages: vec![] });
         assert_eq!((progress.outstanding.make_contiguous(), progress.skipped), (&mut [5][..], 2));
-        progress.refuse(refusal(9));
-        assert_eq!((progress.outstanding.len(), progress.refused), (1, 2));
+        progress.refuse(rejection(9));
+        assert_eq!((progress.outstanding.len(), progress.rejected), (1, 2));
     }
 
     #[test]
     fn untaken_refusals_are_bounded() {
         let mut progress = Progress::default();
-        for step in 0..2 * KEPT as u64 {
-            progress.refuse(refusal(step));
+        for step in 0..2 * MAX_RETAINED as u64 {
+            progress.refuse(rejection(step));
         }
-        assert_eq!((progress.refusals.len(), progress.refused), (KEPT, 2 * KEPT as u64));
-        assert_eq!(progress.refusals[0].step, Some(KEPT as u64));
+        assert_eq!((progress.rejections.len(), progress.rejected), (MAX_RETAINED, 2 * MAX_RETAINED as u64));
+        assert_eq!(progress.rejections[0].step, Some(MAX_RETAINED as u64));
     }
 }

@@ -8,7 +8,7 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Why the server refused a request or a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Refusal {
+pub struct Rejection {
     /// The number of the refused step; `None` for other requests.
     pub step: Option<u64>,
     pub field: String,
@@ -16,13 +16,13 @@ pub struct Refusal {
     pub given: String,
 }
 
-impl From<v1::Rejection> for Refusal {
+impl From<v1::Rejection> for Rejection {
     fn from(wire: v1::Rejection) -> Self {
         Self { step: wire.step, field: wire.field, expected: wire.expected, given: wire.given }
     }
 }
 
-impl std::fmt::Display for Refusal {
+impl std::fmt::Display for Rejection {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         if let Some(step) = self.step {
             write!(out, "step {step}: ")?;
@@ -37,18 +37,18 @@ pub enum Error {
     /// No connection, or the connection was lost.
     #[error("{url}: no connection: {reason}")]
     Connect { url: String, reason: String },
-    /// The server refused a call. `refusal` is present if the server sent details.
+    /// The server refused a call. `rejection` is present if the server sent details.
     #[error("refused ({code:?}): {message}")]
-    Refused { code: tonic::Code, message: String, refusal: Option<Box<Refusal>> },
+    Status { code: tonic::Code, message: String, rejection: Option<Box<Rejection>> },
     /// The server refused a step, or the opening of a step stream; a refused step does not end its stream.
     #[error("rejected: {0}")]
-    Rejected(Box<Refusal>),
+    Rejected(Box<Rejection>),
     /// The reply of the server contradicts itself or the contract.
     #[error("malformed reply: {field}: expected {expected}, given {given}")]
     Malformed { field: String, expected: String, given: String },
     /// A stream ended too early.
     #[error("the stream ended before {what}")]
-    Ended { what: &'static str },
+    StreamEnded { what: &'static str },
     /// A reply did not arrive in time.
     #[error("{what} did not come within {ms} ms")]
     Deadline { what: &'static str, ms: u64 },
@@ -67,17 +67,17 @@ impl Error {
     }
 
     /// The refusal of the server, if it sent details.
-    pub fn refusal(&self) -> Option<&Refusal> {
+    pub fn rejection(&self) -> Option<&Rejection> {
         match self {
-            Self::Rejected(refusal) => Some(refusal),
-            Self::Refused { refusal, .. } => refusal.as_deref(),
+            Self::Rejected(rejection) => Some(rejection),
+            Self::Status { rejection, .. } => rejection.as_deref(),
             _ => None,
         }
     }
 }
 
 /// A reply that violates the contract.
-pub(crate) fn malformed(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
+pub(crate) fn malformed_reply(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
     Error::Malformed { field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }
 
@@ -90,10 +90,10 @@ impl From<tonic::Status> for Error {
             return Self::Connect { url: "server".into(), reason: status.message().to_owned() };
         }
         let decoded = (!status.details().is_empty()).then(|| v1::Rejection::decode(status.details()).ok()).flatten();
-        Self::Refused {
+        Self::Status {
             code: status.code(),
             message: status.message().to_owned(),
-            refusal: decoded.map(|wire| Box::new(wire.into())),
+            rejection: decoded.map(|wire| Box::new(wire.into())),
         }
     }
 }
@@ -107,8 +107,8 @@ mod tests {
         let wire = v1::Rejection { step: Some(4), field: "q".into(), expected: "80".into(), given: "79".into() };
         let with = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
         let error = Error::from(with(wire.encode_to_vec()));
-        assert_eq!(error.refusal().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, given 79"));
-        assert_eq!(Error::from(with(vec![0xff, 0xff, 0xff])).refusal(), None);
-        assert_eq!(Error::from(tonic::Status::not_found("scene")).refusal(), None);
+        assert_eq!(error.rejection().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, given 79"));
+        assert_eq!(Error::from(with(vec![0xff, 0xff, 0xff])).rejection(), None);
+        assert_eq!(Error::from(tonic::Status::not_found("scene")).rejection(), None);
     }
 }

@@ -7,16 +7,16 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
 
-use crate::assemble::{Part, Piece, Replies};
+use crate::assemble::{Chunk, ChunkMessage, ChunkedReplies};
 use crate::client::Client;
-use crate::error::{Error, Result, malformed};
+use crate::error::{Error, Result, malformed_reply};
 
 /// Milliseconds per processing stage, under the server's stage names and in its order.
-pub type Stages = Vec<(String, f32)>;
+pub type StageTimes = Vec<(String, f32)>;
 
 /// Encoding of the bytes of a frame, top row first: 8-bit sRGB, or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Format {
+pub enum FrameFormat {
     #[default]
     Png,
     Rgba,
@@ -32,7 +32,7 @@ pub enum Format {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Output {
     #[default]
-    Colour,
+    Color,
     /// Meters along the view axis; infinity in the background.
     Depth,
     /// Index of the domain; `u32::MAX` in the background.
@@ -89,18 +89,18 @@ pub struct Camera {
 pub struct Picture {
     pub width: u32,
     pub height: u32,
-    pub format: Format,
+    pub format: FrameFormat,
     pub camera: Option<Camera>,
     pub output: Output,
 }
 
 /// Which step a single reply must show.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) enum Wanted {
+pub(crate) enum StepSelector {
     #[default]
-    Newest,
-    Exactly(u64),
-    AtLeast(u64),
+    Current,
+    Exact(u64),
+    Minimum(u64),
 }
 
 /// A request for one frame.
@@ -108,13 +108,13 @@ pub(crate) enum Wanted {
 pub struct FrameRequest {
     pub scene: String,
     pub picture: Picture,
-    at: Wanted,
+    at: StepSelector,
     deadline_ms: u32,
 }
 
 impl FrameRequest {
     /// A PNG of the newest state of a scene, 1280 x 720.
-    pub fn of(scene: &str) -> Self {
+    pub fn new(scene: &str) -> Self {
         Self { scene: scene.to_owned(), ..Self::default() }
     }
 
@@ -127,21 +127,21 @@ impl FrameRequest {
 
     /// Exactly this step of the current run. The server refuses a step that it no longer has.
     #[must_use]
-    pub const fn exactly(mut self, step: u64) -> Self {
-        self.at = Wanted::Exactly(step);
+    pub const fn exact_step(mut self, step: u64) -> Self {
+        self.at = StepSelector::Exact(step);
         self
     }
 
     /// This step of the current run or a later one.
     #[must_use]
-    pub const fn at_least(mut self, step: u64) -> Self {
-        self.at = Wanted::AtLeast(step);
+    pub const fn minimum_step(mut self, step: u64) -> Self {
+        self.at = StepSelector::Minimum(step);
         self
     }
 
     /// How long the server may wait for the step and the picture, in milliseconds; 0 selects the server's default.
     #[must_use]
-    pub const fn within_ms(mut self, milliseconds: u32) -> Self {
+    pub const fn deadline_ms(mut self, milliseconds: u32) -> Self {
         self.deadline_ms = milliseconds;
         self
     }
@@ -149,7 +149,7 @@ impl FrameRequest {
 
 /// A subscription to frames; with `frames` = 0 it never ends.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct FramesRequest {
+pub struct FrameStreamRequest {
     pub scene: String,
     pub picture: Picture,
     pub delivery: Delivery,
@@ -163,12 +163,12 @@ pub struct Frame {
     pub step: v1::StepId,
     pub width: u32,
     pub height: u32,
-    pub format: Format,
+    pub format: FrameFormat,
     /// A PNG file, or 4 or 12 bytes per pixel.
     pub bytes: Bytes,
     /// Number of steps skipped since the previous frame of the stream.
     pub skipped: u64,
-    pub stages: Stages,
+    pub stages: StageTimes,
     /// For color frames: the rasterizer of the shadow map (`None` if the map is shared with another frame of the step)
     /// and of the visible triangles.
     pub shadow_drawn_by: Option<DrawnBy>,
@@ -186,30 +186,30 @@ impl Client {
     /// Renders one frame.
     ///
     /// # Errors
-    /// `Refused` if the scene or the step does not exist or the deadline passed; `Malformed`; `Connect`.
+    /// `Status` if the scene or the step does not exist or the deadline passed; `Malformed`; `Connect`.
     pub async fn frame(&self, request: &FrameRequest) -> Result<Frame> {
         use v1::render_frame_request::Step;
         let wire = v1::RenderFrameRequest {
             scene: request.scene.clone(),
             picture: Some(request.picture.into()),
             step: match request.at {
-                Wanted::Newest => None,
-                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
-                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
+                StepSelector::Current => None,
+                StepSelector::Exact(step) => Some(Step::ExactStep(step)),
+                StepSelector::Minimum(step) => Some(Step::MinimumStep(step)),
             },
             deadline_ms: request.deadline_ms,
         };
         let stream = FrameServiceClient::new(self.channel.clone()).render_frame(wire).await?.into_inner();
-        let frame = Replies::new(stream, self.reply_limit).next().await;
-        frame.unwrap_or(Err(Error::Ended { what: "the frame" }))
+        let frame = ChunkedReplies::new(stream, self.reply_limit).next().await;
+        frame.unwrap_or(Err(Error::StreamEnded { what: "the frame" }))
     }
 
     /// Subscribes to frames. When this returns, the server has accepted the subscription, so that no later step is
     /// missed.
     ///
     /// # Errors
-    /// `Refused` if the scene does not exist; `Connect`.
-    pub async fn frames(&self, request: &FramesRequest) -> Result<Frames> {
+    /// `Status` if the scene does not exist; `Connect`.
+    pub async fn stream_frames(&self, request: &FrameStreamRequest) -> Result<FrameStream> {
         let wire = v1::StreamFramesRequest {
             scene: request.scene.clone(),
             picture: Some(request.picture.into()),
@@ -217,21 +217,21 @@ impl Client {
             frames: request.frames,
         };
         let stream = FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await?.into_inner();
-        Ok(Frames(Replies::new(stream, self.reply_limit)))
+        Ok(FrameStream(ChunkedReplies::new(stream, self.reply_limit)))
     }
 }
 
 /// A stream of frames; dropping it unsubscribes.
-pub struct Frames(Replies<v1::StreamFramesResponse>);
+pub struct FrameStream(ChunkedReplies<v1::StreamFramesResponse>);
 
-impl Frames {
+impl FrameStream {
     /// The next frame, or `None` after the requested number of frames.
     pub async fn next(&mut self) -> Option<Result<Frame>> {
         self.0.next().await
     }
 }
 
-impl tokio_stream::Stream for Frames {
+impl tokio_stream::Stream for FrameStream {
     type Item = Result<Frame>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
@@ -239,54 +239,54 @@ impl tokio_stream::Stream for Frames {
     }
 }
 
-impl Part for v1::RenderFrameResponse {
+impl ChunkMessage for v1::RenderFrameResponse {
     type Head = v1::FrameHead;
-    type Whole = Frame;
+    type Reply = Frame;
     const WHAT: &'static str = "frame";
 
-    fn piece(self) -> Result<Piece<Self::Head>> {
+    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
         piece(self.chunk)
     }
 
-    fn whole(head: Self::Head, bytes: Bytes) -> Result<Frame> {
+    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<Frame> {
         frame(head, bytes)
     }
 }
 
-impl Part for v1::StreamFramesResponse {
+impl ChunkMessage for v1::StreamFramesResponse {
     type Head = v1::FrameHead;
-    type Whole = Frame;
+    type Reply = Frame;
     const WHAT: &'static str = "frame";
 
-    fn piece(self) -> Result<Piece<Self::Head>> {
+    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
         piece(self.chunk)
     }
 
-    fn whole(head: Self::Head, bytes: Bytes) -> Result<Frame> {
+    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<Frame> {
         frame(head, bytes)
     }
 }
 
-fn piece(chunk: Option<v1::FrameChunk>) -> Result<Piece<v1::FrameHead>> {
-    let chunk = chunk.ok_or_else(|| malformed("frame.chunk", "a chunk", "none"))?;
+fn piece(chunk: Option<v1::FrameChunk>) -> Result<Chunk<v1::FrameHead>> {
+    let chunk = chunk.ok_or_else(|| malformed_reply("frame.chunk", "a chunk", "none"))?;
     let head = chunk.head.map(|head| (head.total, head)).map(|(total, head)| (head, total));
-    Ok(Piece { head, offset: chunk.offset, data: chunk.data })
+    Ok(Chunk { head, offset: chunk.offset, data: chunk.data })
 }
 
 fn frame(head: v1::FrameHead, bytes: Bytes) -> Result<Frame> {
     let (format, size) = match head.format() {
-        v1::Format::Png => (Format::Png, None),
-        v1::Format::Rgba => (Format::Rgba, Some(4)),
-        v1::Format::F32 => (Format::F32, Some(4)),
-        v1::Format::U32 => (Format::U32, Some(4)),
-        v1::Format::F32x3 => (Format::F32x3, Some(12)),
-        v1::Format::Unspecified => return Err(malformed("frame.format", "a format that is named", head.format)),
+        v1::Format::Png => (FrameFormat::Png, None),
+        v1::Format::Rgba => (FrameFormat::Rgba, Some(4)),
+        v1::Format::F32 => (FrameFormat::F32, Some(4)),
+        v1::Format::U32 => (FrameFormat::U32, Some(4)),
+        v1::Format::F32x3 => (FrameFormat::F32x3, Some(12)),
+        v1::Format::Unspecified => return Err(malformed_reply("frame.format", "a format that is named", head.format)),
     };
     let pixels = u64::from(head.width) * u64::from(head.height);
     if let Some(total) = size.map(|size: u64| size * pixels).filter(|total| *total != bytes.len() as u64) {
-        return Err(malformed("frame.total", format!("{total} bytes"), bytes.len()));
+        return Err(malformed_reply("frame.total", format!("{total} bytes"), bytes.len()));
     }
-    let step = head.step.ok_or_else(|| malformed("frame.step", "a step", "none"))?;
+    let step = head.step.ok_or_else(|| malformed_reply("frame.step", "a step", "none"))?;
     Ok(Frame {
         step,
         width: head.width,
@@ -308,7 +308,7 @@ const fn drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
     }
 }
 
-pub(crate) fn stages(wire: Vec<v1::StageTime>) -> Stages {
+pub(crate) fn stages(wire: Vec<v1::StageTime>) -> StageTimes {
     wire.into_iter().map(|time| (time.stage, time.milliseconds)).collect()
 }
 
@@ -324,7 +324,7 @@ impl From<Delivery> for v1::Delivery {
 impl From<Picture> for v1::Picture {
     fn from(picture: Picture) -> Self {
         let (output, mode, largest) = match picture.output {
-            Output::Colour => (v1::Output::Colour, 0, 0.0),
+            Output::Color => (v1::Output::Colour, 0, 0.0),
             Output::Depth => (v1::Output::Depth, 0, 0.0),
             Output::Domains => (v1::Output::Domains, 0, 0.0),
             Output::Normals => (v1::Output::Normals, 0, 0.0),
@@ -333,11 +333,11 @@ impl From<Picture> for v1::Picture {
         };
         // Depth, domains and normals have a single format each, which the server chooses.
         let format = match (picture.output, picture.format) {
-            (Output::Depth | Output::Domains | Output::Normals, _) | (_, Format::Png) => v1::Format::Unspecified,
-            (_, Format::Rgba) => v1::Format::Rgba,
-            (_, Format::F32) => v1::Format::F32,
-            (_, Format::U32) => v1::Format::U32,
-            (_, Format::F32x3) => v1::Format::F32x3,
+            (Output::Depth | Output::Domains | Output::Normals, _) | (_, FrameFormat::Png) => v1::Format::Unspecified,
+            (_, FrameFormat::Rgba) => v1::Format::Rgba,
+            (_, FrameFormat::F32) => v1::Format::F32,
+            (_, FrameFormat::U32) => v1::Format::U32,
+            (_, FrameFormat::F32x3) => v1::Format::F32x3,
         };
         let camera = picture.camera.map(Into::into);
         let (width, height) = (picture.width, picture.height);

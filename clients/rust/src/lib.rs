@@ -14,18 +14,19 @@ mod upload;
 mod vertices;
 
 pub use client::{Client, REPLY_LIMIT};
-pub use drive::{Ack, Drive, Finished, Policy};
-pub use error::{Error, Refusal, Result};
+pub use drive::{Ack, Policy, StepStream, StreamSummary};
+pub use error::{Error, Rejection, Result};
 pub use frames::{
-    Camera, Delivery, DrawnBy, Format, Frame, FrameRequest, Frames, FramesRequest, Lens, Output, Picture, Stages, View,
+    Camera, Delivery, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output,
+    Picture, StageTimes, View,
 };
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};
-pub use pick::{Hit, PickRequest, Picks};
+pub use pick::{Hit, PickRequest, PickResult};
 pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
-pub use step::{Step, Transforms};
+pub use step::{DomainTransform, Step};
 pub use tonic::Code;
-pub use vertices::{Readings, VertexRequest, VertexSet, VertexSets, VertexStreamRequest};
+pub use vertices::{ReadbackOptions, VertexRequest, VertexSet, VertexStream, VertexStreamRequest};
 
 /// Compiles the client code in the project's README as a doctest.
 #[cfg(doctest)]

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{BufWriter, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
-use crate::error::{Error, Result, malformed};
+use crate::error::{Error, Result, malformed_reply};
 
 /// Bytes of the header with its padding: enough for the shapes in use, and a multiple of 64 for alignment.
 const HEADER: usize = 128;
@@ -37,7 +37,7 @@ impl Writer {
     pub fn row(&mut self, numbers: &[f32]) -> Result<()> {
         let expected: usize = self.shape.iter().product();
         if numbers.len() != expected {
-            return Err(malformed("npy.row", expected, numbers.len()));
+            return Err(malformed_reply("npy.row", expected, numbers.len()));
         }
         let bytes: Vec<u8> = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
         self.rows += 1;

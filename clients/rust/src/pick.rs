@@ -5,8 +5,8 @@ use v1::frame_service_client::FrameServiceClient;
 
 use crate::assemble::floats;
 use crate::client::Client;
-use crate::error::{Result, malformed};
-use crate::frames::{Picture, Stages, Wanted, stages};
+use crate::error::{Result, malformed_reply};
+use crate::frames::{Picture, StageTimes, StepSelector, stages};
 
 /// A request for the surface points in a small rectangle of a picture.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -17,13 +17,13 @@ pub struct PickRequest {
     corner: [u32; 2],
     size: [u32; 2],
     without_modes: bool,
-    at: Wanted,
+    at: StepSelector,
     deadline_ms: u32,
 }
 
 impl PickRequest {
     /// One pixel of a picture of the newest state; (0, 0) is the top left.
-    pub fn of(scene: &str, picture: Picture, x: u32, y: u32) -> Self {
+    pub fn new(scene: &str, picture: Picture, x: u32, y: u32) -> Self {
         Self { scene: scene.to_owned(), picture, corner: [x, y], size: [1, 1], ..Self::default() }
     }
 
@@ -43,21 +43,21 @@ impl PickRequest {
 
     /// Exactly this step of the current run. The server refuses a step that it no longer has.
     #[must_use]
-    pub const fn exactly(mut self, step: u64) -> Self {
-        self.at = Wanted::Exactly(step);
+    pub const fn exact_step(mut self, step: u64) -> Self {
+        self.at = StepSelector::Exact(step);
         self
     }
 
     /// This step of the current run or a later one.
     #[must_use]
-    pub const fn at_least(mut self, step: u64) -> Self {
-        self.at = Wanted::AtLeast(step);
+    pub const fn minimum_step(mut self, step: u64) -> Self {
+        self.at = StepSelector::Minimum(step);
         self
     }
 
     /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
     #[must_use]
-    pub const fn within_ms(mut self, milliseconds: u32) -> Self {
+    pub const fn deadline_ms(mut self, milliseconds: u32) -> Self {
         self.deadline_ms = milliseconds;
         self
     }
@@ -68,9 +68,9 @@ impl PickRequest {
             scene: self.scene.clone(),
             picture: Some(self.picture.into()),
             step: match self.at {
-                Wanted::Newest => None,
-                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
-                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
+                StepSelector::Current => None,
+                StepSelector::Exact(step) => Some(Step::ExactStep(step)),
+                StepSelector::Minimum(step) => Some(Step::MinimumStep(step)),
             },
             deadline_ms: self.deadline_ms,
             x: self.corner[0],
@@ -84,10 +84,10 @@ impl PickRequest {
 
 /// The hits in a rectangle of pixels, row by row. A pixel that shows no triangle has no hit.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Picks {
+pub struct PickResult {
     pub step: v1::StepId,
     pub hits: Vec<Hit>,
-    pub stages: Stages,
+    pub stages: StageTimes,
 }
 
 /// The surface at the center of a pixel; `frames.proto` documents each field.
@@ -128,9 +128,9 @@ impl Client {
     /// Picks in a rectangle of a picture.
     ///
     /// # Errors
-    /// `Refused` if the scene or the step does not exist, the rectangle is outside the picture, or the deadline passed;
+    /// `Status` if the scene or the step does not exist, the rectangle is outside the picture, or the deadline passed;
     /// `Malformed`; `Connect`.
-    pub async fn pick(&self, request: &PickRequest) -> Result<Picks> {
+    pub async fn pick(&self, request: &PickRequest) -> Result<PickResult> {
         let wire = request.wire();
         let mut stream = FrameServiceClient::new(self.channel.clone()).pick(wire).await?.into_inner();
         let mut head = None;
@@ -142,22 +142,22 @@ impl Client {
             }
             // The server's limit. It bounds memory if a stream never ends.
             if hits.len() > 64 * 64 {
-                return Err(malformed("pick.hits", "at most 4096", hits.len()));
+                return Err(malformed_reply("pick.hits", "at most 4096", hits.len()));
             }
         }
-        let head = head.ok_or_else(|| malformed("pick.head", "a head", "none"))?;
+        let head = head.ok_or_else(|| malformed_reply("pick.head", "a head", "none"))?;
         if head.hits as usize != hits.len() {
-            return Err(malformed("pick.hits", head.hits, hits.len()));
+            return Err(malformed_reply("pick.hits", head.hits, hits.len()));
         }
-        let step = head.step.ok_or_else(|| malformed("pick.step", "a step", "none"))?;
-        Ok(Picks { step, hits, stages: stages(head.stages) })
+        let step = head.step.ok_or_else(|| malformed_reply("pick.step", "a step", "none"))?;
+        Ok(PickResult { step, hits, stages: stages(head.stages) })
     }
 }
 
 fn hit(wire: v1::Hit) -> Result<Hit> {
     let whole = 12 * wire.rank as usize;
     if !wire.modes.is_empty() && wire.modes.len() != whole {
-        return Err(malformed("hit.modes", format!("none or {whole} bytes"), wire.modes.len()));
+        return Err(malformed_reply("hit.modes", format!("none or {whole} bytes"), wire.modes.len()));
     }
     Ok(Hit {
         pixel: [wire.x, wire.y],
@@ -175,7 +175,7 @@ fn hit(wire: v1::Hit) -> Result<Hit> {
 }
 
 fn exactly<T, const N: usize>(field: &str, list: Vec<T>) -> Result<[T; N]> {
-    list.try_into().map_err(|list: Vec<T>| malformed(field, format!("{N} numbers"), list.len()))
+    list.try_into().map_err(|list: Vec<T>| malformed_reply(field, format!("{N} numbers"), list.len()))
 }
 
 #[cfg(test)]

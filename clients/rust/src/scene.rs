@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use bytes::Bytes;
 use modalcast_proto::v1;
 
-use crate::assemble::{Assembler, Piece, floats, words};
+use crate::assemble::{Assembler, Chunk, floats, words};
 use crate::client::Client;
-use crate::error::{Error, Result, malformed};
+use crate::error::{Error, Result, malformed_reply};
 
 /// Version, devices and limits of a server.
 #[derive(Debug, Clone, PartialEq)]
@@ -86,7 +86,7 @@ pub struct ModeRows {
 
 impl ModeRows {
     /// The 3 x r rows of the `place`-th requested vertex, row-major.
-    pub fn of(&self, place: usize) -> &[f32] {
+    pub fn rows_of(&self, place: usize) -> &[f32] {
         &self.rows[3 * self.rank * place..][..3 * self.rank]
     }
 }
@@ -95,7 +95,7 @@ impl Client {
     /// Describes all domains of a scene, with the requested arrays.
     ///
     /// # Errors
-    /// `Refused` if the scene does not exist; `Malformed` if lengths and counts contradict each other.
+    /// `Status` if the scene does not exist; `Malformed` if lengths and counts contradict each other.
     pub async fn describe(&self, scene: &str, arrays: &[Array]) -> Result<SceneDescription> {
         self.describe_domains(scene, &[], arrays).await
     }
@@ -111,7 +111,7 @@ impl Client {
             arrays: arrays.iter().map(|array| *array as i32).collect(),
         };
         let mut stream = self.scenes().describe_scene(request).await?.into_inner();
-        let mut collected = Collected::new(self.reply_limit);
+        let mut collected = DescriptionBuilder::new(self.reply_limit);
         while let Some(message) = stream.message().await? {
             collected.add(message)?;
         }
@@ -121,35 +121,35 @@ impl Client {
     /// The rows of U of selected vertices of a domain; an empty list selects all.
     ///
     /// # Errors
-    /// `Refused` if the scene, the domain or a vertex does not exist; `Malformed` if the reply does not have 3 r
+    /// `Status` if the scene, the domain or a vertex does not exist; `Malformed` if the reply does not have 3 r
     /// numbers per vertex.
     pub async fn modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
-        let domain = u32::try_from(domain).map_err(|_| malformed("modes.domain", "a 32-bit index", domain))?;
+        let domain = u32::try_from(domain).map_err(|_| malformed_reply("modes.domain", "a 32-bit index", domain))?;
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
         let mut stream = self.scenes().read_modes(request).await?.into_inner();
         let mut assembler = Assembler::new("modes", self.reply_limit);
         let mut whole = None;
         while let Some(message) = stream.message().await? {
             let head = (!assembler.is_open()).then_some((message.rank, message.total));
-            let done = assembler.push(Piece { head, offset: message.offset, data: message.data })?;
+            let done = assembler.push(Chunk { head, offset: message.offset, data: message.data })?;
             whole = done.or(whole);
         }
         if assembler.is_open() {
-            return Err(Error::Ended { what: "the last chunk of the modes" });
+            return Err(Error::StreamEnded { what: "the last chunk of the modes" });
         }
         // A rigid domain has no rows; a server may answer without any message.
         let (rank, bytes) = whole.unwrap_or((0, Bytes::new()));
         let rows = ModeRows { rank: rank as usize, rows: floats(&bytes) };
         let expected = 12_u64.saturating_mul(u64::from(rank)).saturating_mul(vertices.len() as u64);
         if !vertices.is_empty() && bytes.len() as u64 != expected {
-            return Err(malformed("modes.total", format!("{expected} bytes"), bytes.len()));
+            return Err(malformed_reply("modes.total", format!("{expected} bytes"), bytes.len()));
         }
         Ok(rows)
     }
 }
 
 /// The parts of a description received so far.
-struct Collected {
+struct DescriptionBuilder {
     limit: u64,
     kept: u64,
     info: Option<v1::SceneInfo>,
@@ -158,7 +158,7 @@ struct Collected {
     open: Option<((u32, i32), Assembler<()>)>,
 }
 
-impl Collected {
+impl DescriptionBuilder {
     const fn new(limit: u64) -> Self {
         Self { limit, kept: 0, info: None, domains: vec![], places: BTreeMap::new(), open: None }
     }
@@ -174,7 +174,7 @@ impl Collected {
                 }
             }
             Some(Part::Chunk(chunk)) => self.chunk(chunk)?,
-            None => return Err(malformed("describe.part", "a part", "none")),
+            None => return Err(malformed_reply("describe.part", "a part", "none")),
         }
         Ok(())
     }
@@ -185,12 +185,12 @@ impl Collected {
         let mut assembler = match self.open.take() {
             Some((open, assembler)) if open == key => assembler,
             Some((open, _)) => {
-                return Err(malformed("describe.chunk", format!("the rest of {open:?}"), format!("{key:?}")));
+                return Err(malformed_reply("describe.chunk", format!("the rest of {open:?}"), format!("{key:?}")));
             }
             None => Assembler::new("describe.chunk", self.limit),
         };
         let head = (!assembler.is_open()).then_some(((), chunk.total));
-        match assembler.push(Piece { head, offset: chunk.offset, data: chunk.data })? {
+        match assembler.push(Chunk { head, offset: chunk.offset, data: chunk.data })? {
             None => self.open = Some((key, assembler)),
             Some(((), bytes)) => self.store(key, &bytes)?,
         }
@@ -200,11 +200,11 @@ impl Collected {
     fn store(&mut self, (index, array): (u32, i32), bytes: &[u8]) -> Result<()> {
         self.kept = self.kept.saturating_add(bytes.len() as u64);
         if self.kept > self.limit {
-            return Err(malformed("describe.chunk", format!("at most {} bytes in all", self.limit), self.kept));
+            return Err(malformed_reply("describe.chunk", format!("at most {} bytes in all", self.limit), self.kept));
         }
         let place = self.places.get(&index).and_then(|place| self.domains.get_mut(*place));
         let Some(domain) = place else {
-            return Err(malformed("describe.chunk.domain", "a domain described before", index));
+            return Err(malformed_reply("describe.chunk.domain", "a domain described before", index));
         };
         match Array::try_from(array) {
             Ok(Array::Indices) => domain.indices = words(bytes),
@@ -212,16 +212,16 @@ impl Collected {
             Ok(Array::RestPositions) => domain.rest_positions = floats(bytes),
             Ok(Array::Uvs) => domain.uvs = floats(bytes),
             Ok(Array::RestNormals) => domain.rest_normals = floats(bytes),
-            _ => return Err(malformed("describe.chunk.array", "a known array", array)),
+            _ => return Err(malformed_reply("describe.chunk.array", "a known array", array)),
         }
         Ok(())
     }
 
     fn finish(self, arrays: &[Array]) -> Result<SceneDescription> {
         if self.open.is_some() {
-            return Err(Error::Ended { what: "the last chunk of an array" });
+            return Err(Error::StreamEnded { what: "the last chunk of an array" });
         }
-        let info = self.info.ok_or_else(|| malformed("describe.scene", "a scene", "none"))?;
+        let info = self.info.ok_or_else(|| malformed_reply("describe.scene", "a scene", "none"))?;
         for domain in &self.domains {
             for array in arrays {
                 domain.check(*array)?;
@@ -246,14 +246,14 @@ impl Domain {
         };
         let field = |what: &str| format!("domain '{}': {what}", self.name);
         if got != wanted {
-            return Err(malformed(field(array.as_str_name()), format!("{wanted} numbers"), got));
+            return Err(malformed_reply(field(array.as_str_name()), format!("{wanted} numbers"), got));
         }
         let below = |list: &[u32], limit: usize| list.iter().all(|index| (*index as usize) < limit);
         if !below(&self.indices, self.corners) {
-            return Err(malformed(field("indices"), format!("below {}", self.corners), "a larger one"));
+            return Err(malformed_reply(field("indices"), format!("below {}", self.corners), "a larger one"));
         }
         if !below(&self.corner_vertices, self.vertices) {
-            return Err(malformed(field("corner_vertices"), format!("below {}", self.vertices), "a larger one"));
+            return Err(malformed_reply(field("corner_vertices"), format!("below {}", self.vertices), "a larger one"));
         }
         Ok(())
     }
@@ -263,7 +263,7 @@ impl Domain {
 fn domain(wire: v1::DomainDescription) -> Result<Domain> {
     let place = |field: &str, bytes: &[u8]| match <[f32; 12]>::try_from(floats(bytes)) {
         Ok(entries) if bytes.len() == 48 => Ok(entries),
-        _ => Err(malformed(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len())),
+        _ => Err(malformed_reply(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len())),
     };
     let attachment = match wire.parent {
         None => None,
@@ -275,7 +275,7 @@ fn domain(wire: v1::DomainDescription) -> Result<Domain> {
     };
     if !wire.eigenvalues.is_empty() && wire.eigenvalues.len() != wire.rank as usize {
         let field = format!("domain '{}': eigenvalues", wire.name);
-        return Err(malformed(field, format!("none or {}", wire.rank), wire.eigenvalues.len()));
+        return Err(malformed_reply(field, format!("none or {}", wire.rank), wire.eigenvalues.len()));
     }
     Ok(Domain {
         index: wire.domain as usize,

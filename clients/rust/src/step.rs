@@ -8,7 +8,7 @@ use crate::error::{Error, Result};
 /// The transform `world_from_domain` of a domain, in scene units. A rotation is a quaternion x, y, z, w (w is the real
 /// part) with a norm of 1 within 0.001; the server normalizes it in f64.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Transforms {
+pub enum DomainTransform {
     /// 48 bytes: row-major 3x4, with a translation relative to the scene's origin. May shear and scale if the scene
     /// allows it.
     Affine([f32; 12]),
@@ -19,7 +19,7 @@ pub enum Transforms {
     RigidF64 { rotation: [f32; 4], translation: [f64; 3] },
 }
 
-impl Transforms {
+impl DomainTransform {
     const fn format(&self) -> v1::TransformFormat {
         match self {
             // Servers without the other formats also accept this one.
@@ -83,7 +83,7 @@ impl Step {
     /// Sets the transform of a domain, in any of the three formats. All transforms of one step must have the same
     /// format.
     #[must_use]
-    pub fn place(mut self, domain: u32, place: &Transforms) -> Self {
+    pub fn place(mut self, domain: u32, place: &DomainTransform) -> Self {
         self.set_place(domain, place);
         self
     }
@@ -96,11 +96,11 @@ impl Step {
 
     /// As [`Self::transform`], in place.
     pub fn set_transform(&mut self, domain: u32, world_from_domain: &[f32; 12]) {
-        self.set_place(domain, &Transforms::Affine(*world_from_domain));
+        self.set_place(domain, &DomainTransform::Affine(*world_from_domain));
     }
 
     /// As [`Self::place`], in place.
-    pub fn set_place(&mut self, domain: u32, place: &Transforms) {
+    pub fn set_place(&mut self, domain: u32, place: &DomainTransform) {
         if self.transform_domains.is_empty() {
             self.format = place.format();
         }
@@ -123,7 +123,7 @@ impl Step {
     }
 
     /// Bytes of coordinates and transforms.
-    pub fn payload(&self) -> usize {
+    pub fn payload_bytes(&self) -> usize {
         self.q.len() + self.transforms.len()
     }
 
@@ -161,10 +161,10 @@ mod tests {
     #[test]
     fn rigid_transforms_put_rotation_first_and_formats_do_not_mix() {
         let rotation = [0.0, 0.6, 0.0, 0.8];
-        let narrow = Transforms::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
-        let wide = Transforms::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
+        let narrow = DomainTransform::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
+        let wide = DomainTransform::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
         let step = Step::new(0, 0.0).place(4, &narrow).place(2, &narrow);
-        assert_eq!((step.check().is_ok(), step.payload()), (true, 56));
+        assert_eq!((step.check().is_ok(), step.payload_bytes()), (true, 56));
         let wire = step.clone().to_wire();
         assert_eq!(
             (wire.transform_domains.as_slice(), wire.transform_format()),

@@ -13,7 +13,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use v1::upload_scene_request::Part;
 
 use crate::client::Client;
-use crate::error::{Error, Result, malformed};
+use crate::error::{Error, Result, malformed_reply};
 
 /// Bytes per message: far below 4 MiB, the default limit of gRPC.
 const CHUNK: usize = 512 << 10;
@@ -32,7 +32,7 @@ impl Client {
     /// it is empty, the folder itself or the single file is opened.
     ///
     /// # Errors
-    /// `File` if a file cannot be read; `Refused` if the server refuses the upload or cannot open the scene.
+    /// `File` if a file cannot be read; `Status` if the server refuses the upload or cannot open the scene.
     pub async fn upload_scene(&self, path: &Path, scene: &str, entry: &str) -> Result<v1::SceneInfo> {
         let (root, listing) = (
             path.to_owned(),
@@ -46,7 +46,7 @@ impl Client {
         let header = v1::UploadHeader {
             scene: scene.to_owned(),
             entry: if entry.is_empty() { single.unwrap_or_default() } else { entry.to_owned() },
-            files: u32::try_from(entries.len()).map_err(|_| malformed("upload.files", "fewer", entries.len()))?,
+            files: u32::try_from(entries.len()).map_err(|_| malformed_reply("upload.files", "fewer", entries.len()))?,
             total_bytes: entries.iter().map(|entry| entry.file.bytes).sum(),
         };
         let (sender, queue) = mpsc::channel(4);
@@ -54,7 +54,7 @@ impl Client {
         let reply = self.scenes().upload_scene(ReceiverStream::new(queue)).await;
         // A read error truncates the upload, and the server refuses it. Report the read error, which is the cause.
         reading.await.map_err(|fault| Error::file(&root, fault))??;
-        reply?.into_inner().scene.ok_or_else(|| malformed("upload.scene", "a scene", "none"))
+        reply?.into_inner().scene.ok_or_else(|| malformed_reply("upload.scene", "a scene", "none"))
     }
 }
 

@@ -9,21 +9,21 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::vertex_service_client::VertexServiceClient;
 
-use crate::assemble::{Part, Piece, Replies, floats};
+use crate::assemble::{Chunk, ChunkMessage, ChunkedReplies, floats};
 use crate::client::Client;
-use crate::error::{Error, Result, malformed};
-use crate::frames::{Delivery, Stages, Wanted, stages};
+use crate::error::{Error, Result, malformed_reply};
+use crate::frames::{Delivery, StageTimes, StepSelector, stages};
 
 /// Additional attributes to read back with a step, for example for collision detection. The server refuses attributes
 /// that the scene does not keep.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Readings {
+pub struct ReadbackOptions {
     /// u = U q of each vertex; requires `deform.displacements` in the scene.
     pub displacements: bool,
     /// A bounding box of each selected domain; requires `deform.boxes` in the scene.
     pub boxes: bool,
     /// Omits positions and normals.
-    pub alone: bool,
+    pub without_vertices: bool,
 }
 
 /// A request for one step's vertices.
@@ -33,34 +33,34 @@ pub struct VertexRequest {
     /// Domain indices; empty selects all.
     pub domains: Vec<u32>,
     pub positions_only: bool,
-    pub readings: Readings,
-    at: Wanted,
+    pub readback: ReadbackOptions,
+    at: StepSelector,
     deadline_ms: u32,
 }
 
 impl VertexRequest {
     /// All vertices of a scene's newest state, with normals.
-    pub fn of(scene: &str) -> Self {
+    pub fn new(scene: &str) -> Self {
         Self { scene: scene.to_owned(), ..Self::default() }
     }
 
     /// Exactly this step of the current run. The server refuses a step that it no longer has.
     #[must_use]
-    pub const fn exactly(mut self, step: u64) -> Self {
-        self.at = Wanted::Exactly(step);
+    pub const fn exact_step(mut self, step: u64) -> Self {
+        self.at = StepSelector::Exact(step);
         self
     }
 
     /// This step of the current run or a later one.
     #[must_use]
-    pub const fn at_least(mut self, step: u64) -> Self {
-        self.at = Wanted::AtLeast(step);
+    pub const fn minimum_step(mut self, step: u64) -> Self {
+        self.at = StepSelector::Minimum(step);
         self
     }
 
     /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
     #[must_use]
-    pub const fn within_ms(mut self, milliseconds: u32) -> Self {
+    pub const fn deadline_ms(mut self, milliseconds: u32) -> Self {
         self.deadline_ms = milliseconds;
         self
     }
@@ -72,7 +72,7 @@ pub struct VertexStreamRequest {
     pub scene: String,
     pub domains: Vec<u32>,
     pub positions_only: bool,
-    pub readings: Readings,
+    pub readback: ReadbackOptions,
     pub delivery: Delivery,
     pub steps: u64,
 }
@@ -97,7 +97,7 @@ pub struct VertexSet {
     /// Per selected domain the minimum and the maximum x, y, z of its positions; empty unless requested.
     pub boxes: Vec<[[f32; 3]; 2]>,
     pub skipped: u64,
-    pub stages: Stages,
+    pub stages: StageTimes,
 }
 
 impl VertexSet {
@@ -119,52 +119,52 @@ impl Client {
     /// The vertices of one step.
     ///
     /// # Errors
-    /// `Refused` if the scene, a domain or the step does not exist, the scene does not keep a requested attribute, or
+    /// `Status` if the scene, a domain or the step does not exist, the scene does not keep a requested attribute, or
     /// the deadline passed; `Malformed`; `Connect`.
     pub async fn vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
         use v1::get_vertices_request::Step;
         let wire = v1::GetVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(selection(&request.domains, request.positions_only, request.readings)),
+            selection: Some(selection(&request.domains, request.positions_only, request.readback)),
             step: match request.at {
-                Wanted::Newest => None,
-                Wanted::Exactly(step) => Some(Step::ExactStep(step)),
-                Wanted::AtLeast(step) => Some(Step::MinimumStep(step)),
+                StepSelector::Current => None,
+                StepSelector::Exact(step) => Some(Step::ExactStep(step)),
+                StepSelector::Minimum(step) => Some(Step::MinimumStep(step)),
             },
             deadline_ms: request.deadline_ms,
         };
         let stream = VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await?.into_inner();
-        let set = Replies::new(stream, self.reply_limit).next().await;
-        set.unwrap_or(Err(Error::Ended { what: "the vertices" }))
+        let set = ChunkedReplies::new(stream, self.reply_limit).next().await;
+        set.unwrap_or(Err(Error::StreamEnded { what: "the vertices" }))
     }
 
     /// Subscribes to vertices. When this returns, the server has accepted the subscription.
     ///
     /// # Errors
-    /// `Refused` if the scene or a domain does not exist, or the scene does not keep a requested attribute; `Connect`.
-    pub async fn vertex_sets(&self, request: &VertexStreamRequest) -> Result<VertexSets> {
+    /// `Status` if the scene or a domain does not exist, or the scene does not keep a requested attribute; `Connect`.
+    pub async fn stream_vertices(&self, request: &VertexStreamRequest) -> Result<VertexStream> {
         let wire = v1::StreamVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(selection(&request.domains, request.positions_only, request.readings)),
+            selection: Some(selection(&request.domains, request.positions_only, request.readback)),
             delivery: v1::Delivery::from(request.delivery).into(),
             steps: request.steps,
         };
         let stream = VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await?.into_inner();
-        Ok(VertexSets(Replies::new(stream, self.reply_limit)))
+        Ok(VertexStream(ChunkedReplies::new(stream, self.reply_limit)))
     }
 }
 
 /// A stream of vertex sets; dropping it unsubscribes.
-pub struct VertexSets(Replies<v1::StreamVerticesResponse>);
+pub struct VertexStream(ChunkedReplies<v1::StreamVerticesResponse>);
 
-impl VertexSets {
+impl VertexStream {
     /// The vertices of the next step, or `None` after the requested number of steps.
     pub async fn next(&mut self) -> Option<Result<VertexSet>> {
         self.0.next().await
     }
 }
 
-impl tokio_stream::Stream for VertexSets {
+impl tokio_stream::Stream for VertexStream {
     type Item = Result<VertexSet>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
@@ -172,54 +172,58 @@ impl tokio_stream::Stream for VertexSets {
     }
 }
 
-impl Part for v1::GetVerticesResponse {
+impl ChunkMessage for v1::GetVerticesResponse {
     type Head = v1::VertexHead;
-    type Whole = VertexSet;
+    type Reply = VertexSet;
     const WHAT: &'static str = "vertices";
 
-    fn piece(self) -> Result<Piece<Self::Head>> {
+    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
         piece(self.chunk)
     }
 
-    fn whole(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
+    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
         set(head, &bytes)
     }
 }
 
-impl Part for v1::StreamVerticesResponse {
+impl ChunkMessage for v1::StreamVerticesResponse {
     type Head = v1::VertexHead;
-    type Whole = VertexSet;
+    type Reply = VertexSet;
     const WHAT: &'static str = "vertices";
 
-    fn piece(self) -> Result<Piece<Self::Head>> {
+    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
         piece(self.chunk)
     }
 
-    fn whole(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
+    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
         set(head, &bytes)
     }
 }
 
-fn selection(domains: &[u32], positions_only: bool, readings: Readings) -> v1::VertexSelection {
-    let Readings { displacements, boxes, alone } = readings;
-    v1::VertexSelection { domains: domains.to_vec(), positions_only, displacements, boxes, without_vertices: alone }
+fn selection(domains: &[u32], positions_only: bool, readback: ReadbackOptions) -> v1::VertexSelection {
+    let ReadbackOptions { displacements, boxes, without_vertices } = readback;
+    v1::VertexSelection { domains: domains.to_vec(), positions_only, displacements, boxes, without_vertices }
 }
 
-fn piece(chunk: Option<v1::VertexChunk>) -> Result<Piece<v1::VertexHead>> {
-    let chunk = chunk.ok_or_else(|| malformed("vertices.chunk", "a chunk", "none"))?;
+fn piece(chunk: Option<v1::VertexChunk>) -> Result<Chunk<v1::VertexHead>> {
+    let chunk = chunk.ok_or_else(|| malformed_reply("vertices.chunk", "a chunk", "none"))?;
     let head = chunk.head.map(|head| (head.total, head)).map(|(total, head)| (head, total));
-    Ok(Piece { head, offset: chunk.offset, data: chunk.data })
+    Ok(Chunk { head, offset: chunk.offset, data: chunk.data })
 }
 
 fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
     let counts = (head.domains.len(), head.vertices.len(), head.corners.len());
     if counts.0 != counts.1 || counts.0 != counts.2 {
-        return Err(malformed("vertices.domains", "one count of vertices and corners each", format!("{counts:?}")));
+        return Err(malformed_reply(
+            "vertices.domains",
+            "one count of vertices and corners each",
+            format!("{counts:?}"),
+        ));
     }
     let parts = parts(&head, bytes)?;
     let domains = head.domains.iter().zip(&head.vertices).zip(&head.corners);
     Ok(VertexSet {
-        step: head.step.ok_or_else(|| malformed("vertices.step", "a step", "none"))?,
+        step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
         origin: head.origin,
         origins: points(parts.origins),
         domains: domains.map(|((domain, vertices), corners)| (*domain, *vertices, *corners)).collect(),
@@ -251,14 +255,14 @@ fn parts<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<Parts<'a>> {
         ("vertices.origin_bytes", head.origin_bytes, domains),
     ] {
         if given != 0 && given != whole {
-            return Err(malformed(field, format!("0 or {whole}"), given));
+            return Err(malformed_reply(field, format!("0 or {whole}"), given));
         }
     }
     let total = bytes.len() as u64;
     let bare = head.position_bytes + head.displacement_bytes + head.box_bytes + head.origin_bytes;
     if total != bare && total != bare + sum(&head.corners) {
         let expected = format!("{bare} or {}", bare + sum(&head.corners));
-        return Err(malformed("vertices.total", expected, total));
+        return Err(malformed_reply("vertices.total", expected, total));
     }
     let (positions, rest) = bytes.split_at(head.position_bytes as usize);
     let (normals, rest) = rest.split_at((total - bare) as usize);
@@ -327,19 +331,19 @@ mod tests {
     #[test]
     fn displacements_and_boxes_follow_optional_vertices() {
         let bytes = |from: u16, count: u16| (from..from + count).flat_map(|at| f32::from(at).to_le_bytes());
-        let readings = |positions: bool| v1::VertexHead {
+        let readback = |positions: bool| v1::VertexHead {
             position_bytes: if positions { 12 } else { 0 },
             displacement_bytes: 12,
             box_bytes: 48,
             ..head(0)
         };
         let with_all: Vec<u8> = bytes(0, 3).chain(bytes(10, 3)).chain(bytes(20, 3)).chain(bytes(30, 12)).collect();
-        let all = set(readings(true), &with_all).expect("fits");
+        let all = set(readback(true), &with_all).expect("fits");
         assert_eq!((all.positions.as_slice(), all.normals.as_slice()), (&[0.0, 1.0, 2.0][..], &[10.0, 11.0, 12.0][..]));
         assert_eq!(all.displacements, [20.0, 21.0, 22.0]);
         let want = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
         assert_eq!(all.boxes, want);
-        let alone = set(readings(false), &with_all[24..]).expect("fits");
+        let alone = set(readback(false), &with_all[24..]).expect("fits");
         assert_eq!((alone.displacements, alone.boxes), (all.displacements, all.boxes));
         assert!(alone.positions.is_empty() && alone.normals.is_empty());
         for (spoil, field) in [

@@ -5,19 +5,21 @@ mod fake;
 use std::sync::Arc;
 use std::time::Duration;
 
-use fake::{FakeDomain, World, serve};
-use modalcast_client::{Array, Client, DrawnBy, Error, Format, FrameRequest, FramesRequest, Picture, Policy, Step};
+use fake::{FakeDomain, FakeServer, serve};
+use modalcast_client::{
+    Array, Client, DrawnBy, Error, FrameFormat, FrameRequest, FrameStreamRequest, Picture, Policy, Step,
+};
 use modalcast_client::{VertexRequest, VertexStreamRequest};
 use tokio::sync::Semaphore;
 
 /// One domain of n vertices and two modes. Each entry encodes its own index.
-fn world(vertices: usize) -> World {
+fn world(vertices: usize) -> FakeServer {
     let rest = (0..3 * vertices).map(|at| at as f32).collect();
     let modes = (0..6 * vertices).map(|at| (at % 1000) as f32).collect();
-    World::new(vec![FakeDomain::new(0, rest, 2, modes)])
+    FakeServer::new(vec![FakeDomain::new(0, rest, 2, modes)])
 }
 
-async fn connected(world: World) -> (Arc<World>, Client) {
+async fn connected(world: FakeServer) -> (Arc<FakeServer>, Client) {
     let world = Arc::new(world);
     let url = serve(Arc::clone(&world)).await;
     (world, Client::connect(&url).await.expect("connects"))
@@ -34,7 +36,7 @@ async fn arrays_and_modes_above_4_mib_arrive_complete() {
     let rows = client.modes("toy", 0, &[]).await.expect("reads");
     assert_eq!((rows.rank, &rows.rows), (2, &world.domains[0].modes));
     let chosen = client.modes("toy", 0, &[7, 2]).await.expect("reads");
-    assert_eq!((chosen.of(0), chosen.of(1)), (&rows.rows[42..48], &rows.rows[12..18]));
+    assert_eq!((chosen.rows_of(0), chosen.rows_of(1)), (&rows.rows[42..48], &rows.rows[12..18]));
     let refusal = client.with_reply_limit(1000).modes("toy", 0, &[]).await.expect_err("too much").to_string();
     assert!(refusal.contains("modes.total") && refusal.contains("1000"), "{refusal}");
 }
@@ -44,9 +46,9 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let (_, client) = connected(world(4)).await;
     let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
     drive.step(&Step::new(5, 0.1).q(0, &[1.0, 2.0])).await.expect("sent");
-    drive.settle().await.expect("acknowledged");
-    let mut request = FrameRequest::of("toy").size(1920, 1080).at_least(5);
-    request.picture.format = Format::Rgba;
+    drive.flush().await.expect("acknowledged");
+    let mut request = FrameRequest::new("toy").size(1920, 1080).minimum_step(5);
+    request.picture.format = FrameFormat::Rgba;
     let frame = client.frame(&request).await.expect("comes");
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
@@ -57,11 +59,11 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
 #[tokio::test]
 async fn subscription_before_the_first_step_receives_every_step() {
     let (world, client) = connected(world(4)).await;
-    let picture = Picture { width: 600, height: 600, format: Format::Rgba, ..Picture::default() };
-    let request = FramesRequest { scene: "toy".into(), picture, frames: 20, ..FramesRequest::default() };
-    let mut frames = client.frames(&request).await.expect("accepted");
+    let picture = Picture { width: 600, height: 600, format: FrameFormat::Rgba, ..Picture::default() };
+    let request = FrameStreamRequest { scene: "toy".into(), picture, frames: 20, ..FrameStreamRequest::default() };
+    let mut frames = client.stream_frames(&request).await.expect("accepted");
     let request = VertexStreamRequest { scene: "toy".into(), steps: 20, ..VertexStreamRequest::default() };
-    let mut sets = client.vertex_sets(&request).await.expect("accepted");
+    let mut sets = client.stream_vertices(&request).await.expect("accepted");
     let mut drive = client.drive("toy", Policy::Lossless, 3).await.expect("opens");
     assert_eq!((drive.run, drive.window), (1, 3));
     for number in 0..20 {
@@ -69,7 +71,7 @@ async fn subscription_before_the_first_step_receives_every_step() {
     }
     assert_eq!(drive.take_acks().first().map(|ack| ack.step), Some(0));
     let end = drive.finish().await.expect("all acknowledged");
-    assert_eq!((end.sent, end.acknowledged, end.refused), (20, Some(19), 0));
+    assert_eq!((end.sent, end.acknowledged, end.rejected), (20, Some(19), 0));
     for number in 0..20 {
         assert_eq!(frames.next().await.expect("a frame").expect("whole").step.number, number);
         let set = sets.next().await.expect("a set").expect("whole");
@@ -102,13 +104,13 @@ async fn refused_step_is_a_typed_error_and_stream_stays_open() {
     let (world, client) = connected(world(4)).await;
     let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
     drive.step(&Step::new(0, 0.0).q(0, &[1.0])).await.ok();
-    let refusal = drive.settle().await.expect_err("one of two coordinates");
-    let words = refusal.refusal().expect("typed").clone();
+    let refusal = drive.flush().await.expect_err("one of two coordinates");
+    let words = refusal.rejection().expect("typed").clone();
     assert_eq!((words.step, words.field.as_str()), (Some(0), "step.q"));
     assert_eq!((words.expected.as_str(), words.given.as_str()), ("8 bytes", "4 bytes"));
     drive.step(&Step::new(1, 0.0).q(0, &[1.0, 2.0])).await.expect("goes on");
     let end = drive.finish().await.expect("goes on");
-    assert_eq!((end.sent, end.refused, end.acknowledged), (2, 1, Some(1)));
+    assert_eq!((end.sent, end.rejected, end.acknowledged), (2, 1, Some(1)));
     assert_eq!(world.steps.lock().expect("lock").len(), 1);
 }
 
@@ -132,12 +134,12 @@ async fn refused_calls_report_the_details_of_the_server() {
     for error in [
         client.describe("none", &[]).await.expect_err("unknown"),
         client.modes("none", 0, &[]).await.expect_err("unknown"),
-        client.frame(&FrameRequest::of("none")).await.expect_err("unknown"),
-        client.vertices(&VertexRequest::of("none")).await.expect_err("unknown"),
+        client.frame(&FrameRequest::new("none")).await.expect_err("unknown"),
+        client.vertices(&VertexRequest::new("none")).await.expect_err("unknown"),
         client.open_scene("none", "").await.expect_err("unknown"),
     ] {
-        let Error::Refused { code, .. } = &error else { panic!("{error}") };
-        let refusal = error.refusal().expect("details");
+        let Error::Status { code, .. } = &error else { panic!("{error}") };
+        let refusal = error.rejection().expect("details");
         assert_eq!((*code, refusal.field.as_str(), refusal.given.as_str()), (tonic::Code::NotFound, "scene", "none"));
     }
     assert!(matches!(Client::connect("http://127.0.0.1:1").await, Err(Error::Connect { .. })));

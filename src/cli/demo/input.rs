@@ -3,12 +3,12 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::super::options::working;
+use super::super::options::with_spinner;
 use modalcast_model::error::Result;
 use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
-pub(super) struct Input {
+pub(super) struct DemoScene {
     pub(super) scene: Arc<Scene>,
     /// The source name that the server opens.
     pub(super) source: String,
@@ -19,13 +19,13 @@ pub(super) struct Input {
     pub(super) vega_config: Option<PathBuf>,
 }
 
-impl Input {
+impl DemoScene {
     /// Loads a scene by built-in name or path.
     ///
     /// # Errors
     /// Those of loading the scene.
     pub(super) fn find(source: &str) -> Result<Self> {
-        let scene = working("loading", || load::open(source))?;
+        let scene = with_spinner("loading", || load::open(source))?;
         let path = Path::new(source);
         let Some(path) = path.canonicalize().ok().filter(|_| path.exists()) else {
             return Ok(Self { scene, source: source.into(), repository: None, cubic: None, vega_config: None });

@@ -1,9 +1,9 @@
 //! `modalcast demo`: runs the server, a physics process and two receiving clients as separate processes on this
 //! machine, then prints a table of the results and checks them against acceptance criteria.
 
+mod evaluation;
 mod input;
 mod processes;
-mod verdict;
 
 use std::fs;
 use std::path::PathBuf;
@@ -11,14 +11,14 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum as _;
 
-use super::options::Size;
-use super::options::working;
-use super::{Outcome, say};
+use super::options::ImageSize;
+use super::options::with_spinner;
+use super::{Outcome, print_line};
 use crate::config::BackendChoice;
-use input::Input;
-use modalcast_model::error::{Result, during};
-use processes::{Process, program};
-use verdict::Verdict;
+use evaluation::Evaluation;
+use input::DemoScene;
+use modalcast_model::error::{Result, fault_in};
+use processes::{Process, program_path};
 
 /// Drives a scene with a physics process, receives its frames and vertices over the network, and checks them.
 #[derive(Debug, clap::Args)]
@@ -35,7 +35,7 @@ pub(super) struct Args {
     frames: u32,
     /// Frame size in pixels.
     #[arg(long, default_value = "1280x720")]
-    size: Size,
+    size: ImageSize,
     /// Simulated time between frames, in seconds.
     #[arg(long, default_value_t = 1.0 / 24.0)]
     dt: f64,
@@ -54,36 +54,37 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let input = Input::find(&args.scene)?;
+    let input = DemoScene::find(&args.scene)?;
     // Temporary files of the processes; removed with the folder.
-    let scratch = tempfile::tempdir().map_err(during("demo"))?;
+    let scratch = tempfile::tempdir().map_err(fault_in("demo"))?;
     let ran = drive(args, &input, scratch.path())?;
-    let verdict = working("comparing with the f64 reference", || Verdict::of(&input.scene, &ran, args.frames))?;
-    for line in verdict.table() {
-        say(line);
+    let evaluation =
+        with_spinner("comparing with the f64 reference", || Evaluation::of(&input.scene, &ran, args.frames))?;
+    for line in evaluation.table() {
+        print_line(line);
     }
     if let Some(path) = &args.report {
-        let text = serde_json::to_string_pretty(&record(&verdict)).map_err(during("demo"))?;
-        fs::write(path, text + "\n").map_err(during("demo"))?;
+        let text = serde_json::to_string_pretty(&record(&evaluation)).map_err(fault_in("demo"))?;
+        fs::write(path, text + "\n").map_err(fault_in("demo"))?;
     }
-    say(format!("frames in {}", args.out.display()));
-    Ok(verdict.broken().is_empty())
+    print_line(format!("frames in {}", args.out.display()));
+    Ok(evaluation.failed_checks().is_empty())
 }
 
 /// The verdict as JSON, with the command, version and machine for reproducibility.
-fn record(verdict: &Verdict) -> serde_json::Value {
+fn record(evaluation: &Evaluation) -> serde_json::Value {
     let command: Vec<String> = std::env::args().skip(1).collect();
     serde_json::json!({
         "command": format!("modalcast {}", command.join(" ")),
         "commit": std::env::var("MODALCAST_COMMIT").ok(),
         "version": env!("CARGO_PKG_VERSION"),
-        "machine": super::doctor::examine(),
-        "result": verdict.json(),
+        "machine": super::doctor::diagnose(),
+        "result": evaluation.json(),
     })
 }
 
 /// The results of the demo's processes.
-struct Ran {
+struct DemoRun {
     frames: serde_json::Value,
     sim: serde_json::Value,
     server: serde_json::Value,
@@ -96,11 +97,11 @@ struct Ran {
     frames_on_disk: usize,
 }
 
-fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
+fn drive(args: &Args, input: &DemoScene, scratch: &std::path::Path) -> Result<DemoRun> {
     let end = Instant::now() + Duration::from_secs(args.timeout);
     let (count, dt) = (args.frames.to_string(), args.dt.to_string());
     clear_frames(&args.out)?;
-    let mut server = Process::start("server", &program("modalcast")?, &server_flags(args, input, scratch))?;
+    let mut server = Process::start("server", &program_path("modalcast")?, &server_flags(args, input, scratch))?;
     let url = server.wait_for("listening on ", end)?;
     let common = ["--server", url.as_str(), "--scene", "demo"];
 
@@ -108,12 +109,12 @@ fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
     let size = args.size.to_string();
     let mut flags = vec!["frames", "--open", input.source.as_str(), "--count", &count, "--size", &size, "--json"];
     flags.extend(["--delivery", "lossless", "--out", &out]);
-    let mut frames = Process::start("fetch", &program("modalcast-fetch")?, &[&flags[..], &common].concat())?;
+    let mut frames = Process::start("fetch", &program_path("modalcast-fetch")?, &[&flags[..], &common].concat())?;
     frames.wait_for("ready", end)?;
 
     let vertices_file = scratch.join("vertices.npy").to_string_lossy().into_owned();
     let flags = ["vertices", "--count", &count, "--delivery", "lossless", "--out", &vertices_file, "--json"];
-    let mut vertices = Process::start("vertices", &program("modalcast-fetch")?, &[&flags[..], &common].concat())?;
+    let mut vertices = Process::start("vertices", &program_path("modalcast-fetch")?, &[&flags[..], &common].concat())?;
     vertices.wait_for("ready", end)?;
 
     let record = scratch.join("record").to_string_lossy().into_owned();
@@ -126,16 +127,16 @@ fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
     if let Some(path) = &config {
         flags.extend(["--config", path.as_str()]);
     }
-    let sim = Process::start("physics", &program("modalcast-sim")?, &[&flags[..], &common].concat())?;
+    let sim = Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common].concat())?;
 
     let sim = sim.finish(end)?;
     let frames = frames.finish(end)?;
     vertices.finish(end)?;
-    let told = Process::start("info", &program("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
+    let told = Process::start("info", &program_path("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
     let told = told.finish(end)?;
     server.stop();
     let record = scratch.join("record");
-    Ok(Ran {
+    Ok(DemoRun {
         frames,
         sim,
         server: told,
@@ -146,7 +147,7 @@ fn drive(args: &Args, input: &Input, scratch: &std::path::Path) -> Result<Ran> {
     })
 }
 
-fn server_flags<'a>(args: &'a Args, input: &'a Input, scratch: &'a std::path::Path) -> Vec<String> {
+fn server_flags<'a>(args: &'a Args, input: &'a DemoScene, scratch: &'a std::path::Path) -> Vec<String> {
     let mut flags = vec!["serve".to_owned(), "--listen".into(), "127.0.0.1:0".into(), "--state".into()];
     flags.push(scratch.join("state").to_string_lossy().into_owned());
     let backend = args.backend.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
@@ -158,12 +159,12 @@ fn server_flags<'a>(args: &'a Args, input: &'a Input, scratch: &'a std::path::Pa
 }
 
 fn read<D: ndarray::Dimension>(path: &std::path::Path) -> Result<ndarray::Array<f32, D>> {
-    ndarray_npy::read_npy(path).map_err(|error| during("demo")(format!("{}: {error}", path.display())))
+    ndarray_npy::read_npy(path).map_err(|error| fault_in("demo")(format!("{}: {error}", path.display())))
 }
 
 /// The frame files of a demo in a folder: `frame_00000.png` and so on. Other files are ignored.
 fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
-    let entries = fs::read_dir(folder).map_err(during("demo"))?;
+    let entries = fs::read_dir(folder).map_err(fault_in("demo"))?;
     let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
     files.retain(|path| path.file_name().is_some_and(|name| is_frame(&name.to_string_lossy())));
     Ok(files)
@@ -176,8 +177,8 @@ fn is_frame(name: &str) -> bool {
 }
 
 fn clear_frames(folder: &std::path::Path) -> Result<()> {
-    fs::create_dir_all(folder).map_err(during("demo"))?;
-    frame_files(folder)?.iter().try_for_each(fs::remove_file).map_err(during("demo"))
+    fs::create_dir_all(folder).map_err(fault_in("demo"))?;
+    frame_files(folder)?.iter().try_for_each(fs::remove_file).map_err(fault_in("demo"))
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// Buffered output lines per child. A child that prints more blocks until lines are read, which is harmless here.
 const LINES: usize = 1024;
@@ -17,8 +17,8 @@ const LINES: usize = 1024;
 ///
 /// # Errors
 /// `Unavailable` when the program does not exist.
-pub(super) fn program(name: &str) -> Result<PathBuf> {
-    let here = std::env::current_exe().map_err(during("demo"))?;
+pub(super) fn program_path(name: &str) -> Result<PathBuf> {
+    let here = std::env::current_exe().map_err(fault_in("demo"))?;
     let path = here.with_file_name(name);
     if path.exists() {
         return Ok(path);
@@ -40,15 +40,19 @@ pub(super) struct Process {
 
 impl Process {
     /// Starts a program; it inherits stderr.
-    pub(super) fn start(name: &'static str, program: &PathBuf, flags: &[impl AsRef<std::ffi::OsStr>]) -> Result<Self> {
-        let mut child = Command::new(program)
+    pub(super) fn start(
+        name: &'static str,
+        program_path: &PathBuf,
+        flags: &[impl AsRef<std::ffi::OsStr>],
+    ) -> Result<Self> {
+        let mut child = Command::new(program_path)
             .args(flags)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn()
-            .map_err(|error| during("demo")(format!("{}: {error}", program.display())))?;
+            .map_err(|error| fault_in("demo")(format!("{}: {error}", program_path.display())))?;
         let (send, lines) = sync_channel(LINES);
-        let output = child.stdout.take().ok_or_else(|| during("demo")("no output"))?;
+        let output = child.stdout.take().ok_or_else(|| fault_in("demo")("no output"))?;
         std::thread::spawn(move || {
             for line in BufReader::new(output).lines().map_while(std::io::Result::ok) {
                 if send.send(line).is_err() {
@@ -75,11 +79,11 @@ impl Process {
         while let Some(line) = self.line_or_end(end, "its end")? {
             last = line;
         }
-        let status = self.child.wait().map_err(during("demo"))?;
+        let status = self.child.wait().map_err(fault_in("demo"))?;
         if !status.success() {
-            return Err(during("demo")(format!("{} ended with {status}", self.name)));
+            return Err(fault_in("demo")(format!("{} ended with {status}", self.name)));
         }
-        serde_json::from_str(&last).map_err(|error| during("demo")(format!("{} said '{last}': {error}", self.name)))
+        serde_json::from_str(&last).map_err(|error| fault_in("demo")(format!("{} said '{last}': {error}", self.name)))
     }
 
     /// Sends SIGTERM and waits for at most 15 s; dropping the process kills it if it is still running.
@@ -96,7 +100,7 @@ impl Process {
     fn next_line(&mut self, end: Instant, what: &str) -> Result<String> {
         self.line_or_end(end, what)?.ok_or_else(|| {
             let status = self.child.wait().map(|status| status.to_string()).unwrap_or_default();
-            during("demo")(format!("{} ended with {status} before it said '{what}'", self.name))
+            fault_in("demo")(format!("{} ended with {status} before it said '{what}'", self.name))
         })
     }
 

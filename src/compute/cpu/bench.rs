@@ -4,17 +4,17 @@
 use std::time::Instant;
 
 use super::*;
-use crate::testing::{Noise, scene};
-use modalcast_model::scene::{Deformation, Storage};
+use crate::testing::{TestRng, scene};
+use modalcast_model::scene::{DeformationSettings, StorageType};
 
 /// The median time of a step in seconds, over 15 steps with different coordinates.
 fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
-    let mut noise = Noise(3);
-    let mut state = State::rest(scene);
+    let mut noise = TestRng(3);
+    let mut state = SceneState::rest(scene);
     let mut times: Vec<f64> = (0..20)
         .map(|_| {
             state.q.iter_mut().for_each(|number| *number = noise.next());
-            deformer.changes.follow(scene, &state);
+            deformer.changes.update(scene, &state);
             let begin = Instant::now();
             deformer.deform_positions(&state);
             begin.elapsed().as_secs_f64()
@@ -30,14 +30,14 @@ fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
 fn part_of_the_read_rate() {
     // The first size fits the caches: it shows the time of the computation alone.
     for (vertices, rank) in [(1 << 11, 32), (1 << 20, 10), (1 << 20, 32)] {
-        for storage in Storage::ALL {
+        for storage in StorageType::ALL {
             for compensated in [false, true] {
-                let deformation = Deformation { storage, compensated, ..Deformation::default() };
-                let scene = scene(&[(vertices, rank)], deformation, &mut Noise(1));
+                let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
+                let scene = scene(&[(vertices, rank)], deformation, &mut TestRng(1));
                 let mut deformer = CpuDeformer::new(&scene);
                 let bytes = deformer.stored_bytes() + 12 * vertices;
                 let rate = bytes as f64 / median_step(&scene, &mut deformer) / 1e9;
-                let roof = read_rate(bytes, 10);
+                let roof = read_bandwidth(bytes, 10);
                 let name = storage.name();
                 println!(
                     "n {vertices} r {rank} {name} compensated {compensated}: {rate:.1} of {roof:.1} GB/s, {:.2}",

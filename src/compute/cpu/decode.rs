@@ -1,16 +1,16 @@
 //! Decodes a chunk of stored planes to columns of f32, `[mode][axis][vertex of the tile]`, which is the stored order of
 //! f32 tiles. The planes of a tile are read sequentially.
 
-use crate::storage::{Plane, TILE_QUADS};
+use crate::storage::{PackedWord, TILE_QUADS};
 
 /// Capacity for the four modes that are added together.
 pub(super) type Columns = [f32; 4 * 12 * TILE_QUADS];
 
 /// Decodes two modes of f16, without their factors. Exact.
 #[inline(always)]
-pub(super) fn halves(planes: &[Plane], columns: &mut [f32]) {
+pub(super) fn unpack_f16(packed_words: &[PackedWord], columns: &mut [f32]) {
     let mut room = [0_u64; 6 * TILE_QUADS];
-    let bits: &[u16] = bytemuck::cast_slice(pairs_apart(planes, &mut room));
+    let bits: &[u16] = bytemuck::cast_slice(deinterleave(packed_words, &mut room));
     for (column, bits) in columns.iter_mut().zip(bits) {
         *column = half(*bits);
     }
@@ -33,9 +33,9 @@ pub(super) const SMALLEST_NORMAL_HALF: f32 = 1.0 / (1 << 14) as f32;
 
 /// Decodes two modes of bf16, without their factors. Exact.
 #[inline(always)]
-pub(super) fn brains(planes: &[Plane], columns: &mut [f32]) {
+pub(super) fn unpack_bf16(packed_words: &[PackedWord], columns: &mut [f32]) {
     let mut room = [0_u64; 6 * TILE_QUADS];
-    let bits: &[u16] = bytemuck::cast_slice(pairs_apart(planes, &mut room));
+    let bits: &[u16] = bytemuck::cast_slice(deinterleave(packed_words, &mut room));
     for (column, bits) in columns.iter_mut().zip(bits) {
         *column = f32::from_bits(u32::from(*bits) << 16);
     }
@@ -43,15 +43,15 @@ pub(super) fn brains(planes: &[Plane], columns: &mut [f32]) {
 
 /// Decodes four modes of codes, -127 to 127, without their scales.
 #[inline(always)]
-pub(super) fn codes(planes: &[Plane], columns: &mut [f32]) {
-    let quads = planes.len() / 3;
+pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
+    let quads = packed_words.len() / 3;
     let mut room = [0_u32; 12 * TILE_QUADS];
     let room = &mut room[..12 * quads];
-    for (planes, groups) in planes.chunks_exact(quads).zip(room.chunks_exact_mut(4 * quads)) {
+    for (packed_words, groups) in packed_words.chunks_exact(quads).zip(room.chunks_exact_mut(4 * quads)) {
         let (ab, cd) = groups.split_at_mut(2 * quads);
         let ((a, b), (c, d)) = (ab.split_at_mut(quads), cd.split_at_mut(quads));
-        let planes: &[[u32; 4]] = bytemuck::cast_slice(planes);
-        for ((((plane, a), b), c), d) in planes.iter().zip(a).zip(b).zip(c).zip(d) {
+        let packed_words: &[[u32; 4]] = bytemuck::cast_slice(packed_words);
+        for ((((plane, a), b), c), d) in packed_words.iter().zip(a).zip(b).zip(c).zip(d) {
             [*a, *b, *c, *d] = *plane;
         }
     }
@@ -64,13 +64,13 @@ pub(super) fn codes(planes: &[Plane], columns: &mut [f32]) {
 /// Separates the two groups of four halves that each plane of a chunk has per quad: the first groups of all quads, then
 /// the second.
 #[inline(always)]
-fn pairs_apart<'a>(planes: &[Plane], room: &'a mut [u64; 6 * TILE_QUADS]) -> &'a [u64] {
-    let quads = planes.len() / 3;
+fn deinterleave<'a>(packed_words: &[PackedWord], room: &'a mut [u64; 6 * TILE_QUADS]) -> &'a [u64] {
+    let quads = packed_words.len() / 3;
     let room = &mut room[..6 * quads];
-    for (planes, groups) in planes.chunks_exact(quads).zip(room.chunks_exact_mut(2 * quads)) {
+    for (packed_words, groups) in packed_words.chunks_exact(quads).zip(room.chunks_exact_mut(2 * quads)) {
         let (a, b) = groups.split_at_mut(quads);
-        let planes: &[[u64; 2]] = bytemuck::cast_slice(planes);
-        for ((plane, a), b) in planes.iter().zip(a).zip(b) {
+        let packed_words: &[[u64; 2]] = bytemuck::cast_slice(packed_words);
+        for ((plane, a), b) in packed_words.iter().zip(a).zip(b) {
             [*a, *b] = *plane;
         }
     }

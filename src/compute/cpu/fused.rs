@@ -7,29 +7,29 @@ use pulp::cast;
 use pulp::x86::V3;
 
 use super::decode::SMALLEST_NORMAL_HALF;
-use crate::storage::{Plane, QUAD};
+use crate::storage::{PackedWord, QUAD};
 
 /// Decoder of a storage type. The entries of two neighboring quads, the 32 bytes of two planes, decode to `GROUPS`
 /// vectors of one mode and axis each.
 pub(super) trait Decode<const GROUPS: usize> {
-    fn decode(simd: V3, planes: __m256i) -> [__m256; GROUPS];
+    fn decode(simd: V3, packed_words: __m256i) -> [__m256; GROUPS];
 }
 
 /// f16.
-pub(super) struct Halves;
+pub(super) struct DecodeF16;
 /// bf16.
-pub(super) struct Brains;
+pub(super) struct DecodeBf16;
 /// int8.
-pub(super) struct Codes;
+pub(super) struct DecodeInt8;
 
 // No closure may call an intrinsic here: it would be compiled without the features that intrinsics need to be inlined.
 
-impl Decode<2> for Halves {
+impl Decode<2> for DecodeF16 {
     #[inline(always)]
-    fn decode(simd: V3, planes: __m256i) -> [__m256; 2] {
+    fn decode(simd: V3, packed_words: __m256i) -> [__m256; 2] {
         let mut groups = [simd.avx._mm256_set1_ps(0.0); 2];
         for (group, target) in groups.iter_mut().enumerate() {
-            let bits = simd.avx2._mm256_shuffle_epi8(planes, cast(UPPER_HALVES[group]));
+            let bits = simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[group]));
             // The algorithm of `decode::half`.
             let kept = simd.avx._mm256_set1_epi32(0x0fff_e000);
             let magnitude = simd.avx2._mm256_and_si256(simd.avx2._mm256_srli_epi32::<3>(bits), kept);
@@ -43,25 +43,25 @@ impl Decode<2> for Halves {
     }
 }
 
-impl Decode<2> for Brains {
+impl Decode<2> for DecodeBf16 {
     #[inline(always)]
-    fn decode(simd: V3, planes: __m256i) -> [__m256; 2] {
+    fn decode(simd: V3, packed_words: __m256i) -> [__m256; 2] {
         [
-            cast(simd.avx2._mm256_shuffle_epi8(planes, cast(UPPER_HALVES[0]))),
-            cast(simd.avx2._mm256_shuffle_epi8(planes, cast(UPPER_HALVES[1]))),
+            cast(simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[0]))),
+            cast(simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[1]))),
         ]
     }
 }
 
-impl Decode<4> for Codes {
+impl Decode<4> for DecodeInt8 {
     #[inline(always)]
-    fn decode(simd: V3, planes: __m256i) -> [__m256; 4] {
+    fn decode(simd: V3, packed_words: __m256i) -> [__m256; 4] {
         // A byte in the mantissa of 2^23 is 2^23 + byte: the subtraction also removes the bias of 128, exactly.
         let above = simd.avx._mm256_set1_epi32(0x4b00_0000);
         let zero = simd.avx._mm256_set1_ps(8_388_608.0 + 128.0);
         let mut groups = [zero; 4];
         for (group, target) in groups.iter_mut().enumerate() {
-            let bytes = simd.avx2._mm256_shuffle_epi8(planes, cast(BYTES[group]));
+            let bytes = simd.avx2._mm256_shuffle_epi8(packed_words, cast(INT8_SHUFFLE[group]));
             *target = simd.avx._mm256_sub_ps(cast(simd.avx2._mm256_or_si256(bytes, above)), zero);
         }
         groups
@@ -70,26 +70,26 @@ impl Decode<4> for Codes {
 
 /// Shuffle masks that move each half of a group to the upper bits of a word: indices into the 16 bytes of a quad, 0x80
 /// for zero.
-const UPPER_HALVES: [[u8; 32]; 2] = [places(2, 0), places(2, 1)];
+const F16_SHUFFLE: [[u8; 32]; 2] = [shuffle_mask(2, 0), shuffle_mask(2, 1)];
 
 /// Shuffle masks that move each byte of a group to the lower bits of a word.
-const BYTES: [[u8; 32]; 4] = [places(1, 0), places(1, 1), places(1, 2), places(1, 3)];
+const INT8_SHUFFLE: [[u8; 32]; 4] = [shuffle_mask(1, 0), shuffle_mask(1, 1), shuffle_mask(1, 2), shuffle_mask(1, 3)];
 
-const fn places(size: u8, group: u8) -> [u8; 32] {
-    let mut places = [0x80; 32];
+const fn shuffle_mask(size: u8, group: u8) -> [u8; 32] {
+    let mut shuffle_mask = [0x80; 32];
     let mut vertex = 0;
     while vertex < 4 {
         let mut byte = 0;
         while byte < size {
             // Halves go to bytes 2 and 3 of a word, codes to byte 0.
             let target = (4 * vertex + if size == 2 { 2 } else { 0 } + byte) as usize;
-            places[target] = size * (4 * group + vertex) + byte;
-            places[target + 16] = places[target];
+            shuffle_mask[target] = size * (4 * group + vertex) + byte;
+            shuffle_mask[target + 16] = shuffle_mask[target];
             byte += 1;
         }
         vertex += 1;
     }
-    places
+    shuffle_mask
 }
 
 /// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk is three planes per quad and `MODES` amounts; a group
@@ -97,7 +97,7 @@ const fn places(size: u8, group: u8) -> [u8; 32] {
 #[inline(always)]
 pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
-    chunks: [(&[Plane], [f32; MODES]); CHUNKS],
+    chunks: [(&[PackedWord], [f32; MODES]); CHUNKS],
     sums: &mut [f32],
 ) {
     let quads = sums.len() / (3 * QUAD);
@@ -124,17 +124,17 @@ pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, co
 #[inline(always)]
 fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
-    chunks: &[(&[Plane], [f32; MODES]); CHUNKS],
+    chunks: &[(&[PackedWord], [f32; MODES]); CHUNKS],
     quads: [usize; 2],
     sums: [&mut [f32; 2 * QUAD]; 3],
 ) {
     let [x, y, z] = sums;
     let mut axes: [__m256; 3] = [cast(*x), cast(*y), cast(*z)];
-    for (planes, amounts) in chunks {
-        let count = planes.len() / 3;
+    for (packed_words, amounts) in chunks {
+        let count = packed_words.len() / 3;
         // Groups are ordered by mode, then axis, so this is the order of the sum.
         for plane in 0..3 {
-            let two = [planes[plane * count + quads[0]], planes[plane * count + quads[1]]];
+            let two = [packed_words[plane * count + quads[0]], packed_words[plane * count + quads[1]]];
             let groups = D::decode(simd, cast(two));
             for (group, vector) in groups.iter().enumerate() {
                 let at = GROUPS * plane + group;

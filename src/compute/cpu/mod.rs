@@ -6,38 +6,38 @@
 //! step keep their vertices and normals. With a truncation budget, the result also depends on earlier steps, because
 //! the choice of truncated modes has hysteresis.
 
+mod bandwidth;
 #[cfg(test)]
 mod bench;
 mod changes;
 mod decode;
 mod deform;
-mod extent;
 #[cfg(target_arch = "x86_64")]
 mod fused;
-mod kept;
 mod normals;
-mod orient;
-mod rate;
+mod retained_modes;
+mod rigid_normals;
 mod simd;
 mod sum;
 mod tile;
+mod tile_bounds;
 
 use std::sync::Arc;
 use std::time::Instant;
 
 use rayon::prelude::*;
 
-pub use rate::read_rate;
+pub use bandwidth::read_bandwidth;
 
-use crate::storage::{Tiles, Truncation};
-use changes::Changes;
-use deform::{Inputs, TILE};
-use extent::Extent;
-use kept::Kept;
-use modalcast_model::deform::{Backend, Deformed, Deformer, Surface};
+use crate::storage::{TiledModes, Truncation};
+use changes::ChangeTracker;
+use deform::{DeformInputs, MAX_TILE_VERTICES};
+use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, Scene, State};
-use tile::{Packed, PerTile, Work};
+use modalcast_model::scene::{Bounds, Scene, SceneState};
+use retained_modes::RetainedModes;
+use tile::{PackedOutput, PerTileOutput, WorkList};
+use tile_bounds::TileBounds;
 
 /// Maximum number of corners of a tile.
 const CORNER_TILE: usize = 256;
@@ -47,15 +47,15 @@ const CORNER_TILE: usize = 256;
 pub struct CpuDeformer {
     scene: Arc<Scene>,
     /// Per shape.
-    shapes: Vec<Tiles>,
-    every_chunk: Vec<u16>,
-    kept: Option<Kept>,
-    changes: Changes,
-    vertex_work: Work,
-    corner_work: Work,
+    shapes: Vec<TiledModes>,
+    all_chunks: Vec<u16>,
+    retained_modes: Option<RetainedModes>,
+    changes: ChangeTracker,
+    vertex_work: WorkList,
+    corner_work: WorkList,
     /// Per tile of vertices.
-    extents: Vec<Extent>,
-    surface: Surface,
+    extents: Vec<TileBounds>,
+    surface: DeformedSurface,
 }
 
 impl CpuDeformer {
@@ -64,19 +64,19 @@ impl CpuDeformer {
         let layout = &scene.layout;
         let tangents = if scene.needs.normal_maps { 4 * layout.corners } else { 0 };
         let storage = scene.deformation.storage;
-        let shapes: Vec<Tiles> = scene.shapes.par_iter().map(|shape| Tiles::new(shape, storage)).collect();
-        let most_chunks = shapes.iter().map(Tiles::chunks).max().unwrap_or(0);
-        let vertex_work = Work::new(layout.slots.iter().map(|slot| slot.vertices), TILE);
+        let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
+        let most_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
+        let vertex_work = WorkList::new(layout.slots.iter().map(|slot| slot.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
-            every_chunk: (0..most_chunks as u16).collect(),
-            kept: Kept::new(scene),
-            changes: Changes::default(),
-            extents: vec![Extent::EMPTY; vertex_work.len()],
+            all_chunks: (0..most_chunks as u16).collect(),
+            retained_modes: RetainedModes::new(scene),
+            changes: ChangeTracker::default(),
+            extents: vec![TileBounds::EMPTY; vertex_work.len()],
             shapes,
             vertex_work,
-            corner_work: Work::new(layout.slots.iter().map(|slot| slot.corners), CORNER_TILE),
-            surface: Surface {
+            corner_work: WorkList::new(layout.slots.iter().map(|slot| slot.corners), CORNER_TILE),
+            surface: DeformedSurface {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],
                 tangents: vec![0.0; tangents],
@@ -93,30 +93,30 @@ impl CpuDeformer {
 
     /// The truncated modes of a domain in the last step; `None` for a scene without a truncation budget.
     pub fn truncation(&self, domain: usize) -> Option<&Truncation> {
-        self.kept.as_ref().map(|kept| kept.truncation(domain))
+        self.retained_modes.as_ref().map(|retained_modes| retained_modes.truncation(domain))
     }
 
-    fn deform_positions(&mut self, state: &State) {
-        let inputs = Inputs {
+    fn deform_positions(&mut self, state: &SceneState) {
+        let inputs = DeformInputs {
             scene: &self.scene,
             state,
             shapes: &self.shapes,
-            kept: self.kept.as_ref(),
-            every_chunk: &self.every_chunk,
+            retained_modes: self.retained_modes.as_ref(),
+            all_chunks: &self.all_chunks,
         };
-        let Surface { positions, displacements, .. } = &mut self.surface;
-        let displacements = self.scene.needs.displacements.then(|| Packed::new(3, displacements));
-        let outputs = (Packed::new(3, positions), PerTile::new(&mut self.extents), displacements);
+        let DeformedSurface { positions, displacements, .. } = &mut self.surface;
+        let displacements = self.scene.needs.displacements.then(|| PackedOutput::new(3, displacements));
+        let outputs = (PackedOutput::new(3, positions), PerTileOutput::new(&mut self.extents), displacements);
         deform::deform(inputs, self.vertex_work.of(&self.changes), outputs);
     }
 
     /// Updates the boxes of the domains that changed, from those of their tiles; does nothing if the scene keeps no
     /// boxes.
-    fn keep_boxes(&mut self) {
+    fn update_boxes(&mut self) {
         let (changes, work, extents) = (&self.changes, &self.vertex_work, &self.extents);
         self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, all)| {
-            if changes.is(domain) {
-                *all = Extent::of_domain(&extents[work.tiles_of(domain)]);
+            if changes.is_changed(domain) {
+                *all = TileBounds::of_domain(&extents[work.tiles_of(domain)]);
             }
         });
     }
@@ -127,26 +127,26 @@ impl Deformer for CpuDeformer {
         Backend::Cpu
     }
 
-    fn deform(&mut self, state: &State) -> Result<Deformed> {
+    fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         let begin = Instant::now();
-        self.changes.follow(&self.scene, state);
-        if let Some(kept) = &mut self.kept {
-            kept.follow(&self.scene, state, &self.changes);
+        self.changes.update(&self.scene, state);
+        if let Some(retained_modes) = &mut self.retained_modes {
+            retained_modes.update(&self.scene, state, &self.changes);
         }
         self.deform_positions(state);
-        self.keep_boxes();
+        self.update_boxes();
         // Both kinds of normals depend only on the domain's own positions and T.
         let corners = self.corner_work.of(&self.changes);
         if self.scene.needs.exact_normals {
             normals::normals(&self.scene, state, corners, &mut self.surface);
         } else {
-            orient::orient(&self.scene, state, corners, &mut self.surface);
+            rigid_normals::rigid_normals(&self.scene, state, corners, &mut self.surface);
         }
-        let light = self.scene.light_axes().map(|axes| Extent::along(&self.extents, &axes));
-        Ok(Deformed { bounds: Extent::all(&self.extents), light, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        let light = self.scene.light_axes().map(|axes| TileBounds::along(&self.extents, &axes));
+        Ok(DeformSummary { bounds: TileBounds::all(&self.extents), light, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
-    fn surface(&mut self) -> Result<&Surface> {
+    fn surface(&mut self) -> Result<&DeformedSurface> {
         Ok(&self.surface)
     }
 }

@@ -6,11 +6,11 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::orient::{self, cofactors};
-use super::tile::{self, Packed, Tile};
-use modalcast_model::deform::Surface;
-use modalcast_model::domain::{RING_START, Smoothing};
-use modalcast_model::scene::{Scene, State};
+use super::rigid_normals::{self, cofactors};
+use super::tile::{self, DomainTile, PackedOutput};
+use modalcast_model::deform::DeformedSurface;
+use modalcast_model::domain::{RING_START, SmoothingGroups};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// As in the twin: the part of B that an area must exceed.
 const RESOLUTION: f64 = 1.0 / 262_144.0;
@@ -20,66 +20,71 @@ const OPPOSITE: f64 = 1e-10;
 
 /// Writes the normals of these tiles, three f32 per corner, and the tangents, four f32 per corner, if the scene has
 /// normal maps. Reads the surface's positions.
-pub(super) fn normals(scene: &Scene, state: &State, tiles: &[Tile], surface: &mut Surface) {
-    let Surface { positions, normals, tangents, .. } = surface;
+pub(super) fn normals(scene: &Scene, state: &SceneState, tiles: &[DomainTile], surface: &mut DeformedSurface) {
+    let DeformedSurface { positions, normals, tangents, .. } = surface;
     let positions = positions.as_slice();
     // In a scene without tangents, a tile has zero numbers of them.
-    let tangents = Packed::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);
-    tile::spread(tiles, (Packed::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
+    let tangents = PackedOutput::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);
+    tile::run_parallel(tiles, (PackedOutput::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
         for tile in tiles {
             let (normals, tangents) = (normals.of(tile), tangents.of(tile));
-            orient::orient_normals(scene, state, tile, normals);
+            rigid_normals::write_rigid_normals(scene, state, tile, normals);
             if !tangents.is_empty() {
-                orient::orient_tangents(scene, state, tile, tangents);
+                rigid_normals::write_rigid_tangents(scene, state, tile, tangents);
             }
-            follow(&Bent::new(scene, state, tile.domain(), positions), tile.first(), normals, tangents);
+            rotate_to_surface(
+                &DeformedDomain::new(scene, state, tile.domain(), positions),
+                tile.first(),
+                normals,
+                tangents,
+            );
         }
     });
 }
 
 /// Rotates the rigid normals and tangents of a domain's corners, from `first` on, with the surface.
-fn follow(bent: &Bent, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
+fn rotate_to_surface(bent: &DeformedDomain, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
     let Some(smoothing) = bent.smoothing else { return };
     let mut tangents = tangents.chunks_exact_mut(4);
     for (group, normal) in smoothing.members()[first..].iter().zip(normals.chunks_exact_mut(3)) {
         let tangent = tangents.next();
-        let Some(turn) = bent.turn(smoothing, *group as usize) else { continue };
-        let carried = turn.carry(vector(normal)).try_normalize(0.0).unwrap_or(turn.to);
+        let Some(surface_rotation) = bent.surface_rotation(smoothing, *group as usize) else { continue };
+        let carried = surface_rotation.rotate(vector(normal)).try_normalize(0.0).unwrap_or(surface_rotation.to);
         normal.copy_from_slice(carried.cast::<f32>().as_slice());
         if let Some(tangent) = tangent.filter(|tangent| tangent[3] != 0.0) {
-            let flat = beside(turn.carry(vector(tangent)), carried);
+            let flat = orthogonalize(surface_rotation.rotate(vector(tangent)), carried);
             tangent[..3].copy_from_slice(flat.cast::<f32>().as_slice());
         }
     }
 }
 
 /// The deformed surface of a domain.
-struct Bent<'a> {
-    smoothing: Option<&'a Smoothing>,
+struct DeformedDomain<'a> {
+    smoothing: Option<&'a SmoothingGroups>,
     /// Three f32 per vertex of the domain.
     positions: &'a [f32],
     /// Transforms area vectors from rest to world.
-    area_turn: Matrix3<f64>,
+    area_transform: Matrix3<f64>,
 }
 
-impl<'a> Bent<'a> {
-    fn new(scene: &'a Scene, state: &State, domain: usize, positions: &'a [f32]) -> Self {
+impl<'a> DeformedDomain<'a> {
+    fn new(scene: &'a Scene, state: &SceneState, domain: usize, positions: &'a [f32]) -> Self {
         let slot = scene.layout.slots[domain];
         Self {
             smoothing: scene.shape_of(domain).smoothing(),
             positions: &positions[3 * slot.first_vertex..][..3 * slot.vertices],
-            area_turn: cofactors(&state.composed(scene, domain).linear()),
+            area_transform: cofactors(&state.composed_transform(scene, domain).linear()),
         }
     }
 
     /// The rotation of the surface around a group; `None` where it cannot be determined.
-    fn turn(&self, smoothing: &Smoothing, group: usize) -> Option<Turn> {
+    fn surface_rotation(&self, smoothing: &SmoothingGroups, group: usize) -> Option<ShortestArc> {
         let (sum, rounding) = self.area(smoothing.ring(group));
         let resolved = sum.norm() > RESOLUTION * rounding;
-        let from = self.area_turn * Vector3::from(smoothing.normals()[group]).cast();
+        let from = self.area_transform * Vector3::from(smoothing.normals()[group]).cast();
         // Scaled first, because the square of cofactors of tiny entries may underflow.
         let largest = from.amax();
-        (resolved && largest > 0.0).then(|| Turn { from: (from / largest).normalize(), to: sum.normalize() })
+        (resolved && largest > 0.0).then(|| ShortestArc { from: (from / largest).normalize(), to: sum.normalize() })
     }
 
     /// The sum of the area vectors around a ring, and its rounding scale B as the twin defines it.
@@ -104,14 +109,14 @@ impl<'a> Bent<'a> {
 }
 
 /// The rotation of a surface, as its unit directions before and after.
-struct Turn {
+struct ShortestArc {
     from: Vector3<f64>,
     to: Vector3<f64>,
 }
 
-impl Turn {
+impl ShortestArc {
     /// Applies the smallest rotation that takes `from` to `to`.
-    fn carry(&self, rigid: Vector3<f64>) -> Vector3<f64> {
+    fn rotate(&self, rigid: Vector3<f64>) -> Vector3<f64> {
         let along = self.from.dot(&rigid);
         let across = rigid - self.from * along;
         let middle = self.from + self.to;
@@ -122,7 +127,7 @@ impl Turn {
 }
 
 /// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
-fn beside(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
+fn orthogonalize(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
     let flat = tangent - normal * normal.dot(&tangent);
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     flat.try_normalize(1e-6).unwrap_or_else(|| normal.cross(&axis).normalize())

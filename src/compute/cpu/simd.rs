@@ -6,7 +6,7 @@ use pulp::NullaryFnOnce;
 /// `mul_add` rounds once on every machine. Functions that the work calls must be `#[inline(always)]`; otherwise they
 /// remain compiled for the baseline target.
 #[inline(always)]
-pub(super) fn vectorized<W: NullaryFnOnce>(work: W) -> W::Output {
+pub(super) fn run_vectorized<W: NullaryFnOnce>(work: W) -> W::Output {
     #[cfg(target_arch = "x86_64")]
     if let Some(wide) = pulp::x86::V3::try_new() {
         return wide.vectorize(work);

@@ -5,27 +5,27 @@ use cudarc::driver::sys::CUfunction_attribute;
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
 
 use super::device::Device;
-use super::inputs::Values;
+use super::inputs::InputAddresses;
 use super::layout::BatchArgs;
 use super::memory::{address, upload};
-use super::plan::{Kernel, KernelSource, Launch, Source, storage_define};
-use super::work::batches::{Batched, MOST};
+use super::plan::{KernelDescriptor, KernelKind, KernelSource, KernelText, storage_define};
+use super::work::batches::{BatchTables, MAX_BATCH_SIZE};
 use crate::storage::modes_per_chunk;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::Scene;
 
 /// Smaller maximum group sizes (vectors q_b) that the kernel can be compiled for, with their macros; the default is
-/// [`MOST`].
-const FEWER: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
+/// [`MAX_BATCH_SIZE`].
+const SMALLER_BATCHES: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
 
 /// Warps per block, and bytes of shared memory: per warp, and per vector without its q.
 const WARPS: usize = 2;
-const OWN: usize = 9984 + 72;
-const VECTOR: usize = 64;
+const WARP_BYTES: usize = 9984 + 72;
+const MEMBER_BYTES: usize = 64;
 
 /// The kernel and its work list.
 #[derive(Debug)]
-pub(super) struct Batch {
+pub(super) struct BatchKernel {
     pub function: CudaFunction,
     config: LaunchConfig,
     blocks: CudaSlice<u8>,
@@ -35,23 +35,23 @@ pub(super) struct Batch {
 
 /// Device addresses of buffers that belong to `deform`.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Shared {
+pub(super) struct SharedTables {
     pub words: u64,
     pub rest: u64,
     pub scales: u64,
     pub boxes: u64,
 }
 
-impl Batch {
+impl BatchKernel {
     /// Compiles the kernel and uploads its work list.
-    pub(super) fn new(device: &Device, kernel: &Kernel, batched: &Batched) -> Result<Self> {
+    pub(super) fn new(device: &Device, kernel: &KernelDescriptor, batched: &BatchTables) -> Result<Self> {
         let function = device.function(kernel.name, kernel.source.0, &kernel.defines)?;
         let shared = shared_bytes(batched, &kernel.defines);
         // Give all of the L1 cache to shared memory, so that registers alone limit the number of resident blocks.
         let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
         let most = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
         for (attribute, value) in [(carveout, 100), (most, shared as i32)] {
-            function.set_attribute(attribute, value).map_err(during("batch"))?;
+            function.set_attribute(attribute, value).map_err(fault_in("batch"))?;
         }
         Ok(Self {
             function,
@@ -67,8 +67,8 @@ impl Batch {
     }
 
     /// Starts the kernel; the header among `values` has the output addresses.
-    pub(super) fn launch(&self, device: &Device, values: Values, shared: Shared) -> Result<()> {
-        let Shared { words, rest, scales, boxes } = shared;
+    pub(super) fn launch(&self, device: &Device, values: InputAddresses, shared: SharedTables) -> Result<()> {
+        let SharedTables { words, rest, scales, boxes } = shared;
         let at = |buffer: &CudaSlice<u8>| address(device, buffer);
         let args = BatchArgs {
             header: values.header,
@@ -79,54 +79,54 @@ impl Batch {
             rest,
             scales,
             transforms: values.transforms,
-            following: values.following,
+            transform_links: values.transform_links,
             frames: values.frames,
             q: values.q,
             boxes,
         };
         let mut launch = device.stream().launch_builder(&self.function);
         // SAFETY: `BatchArgs` is the kernel's only argument. Blocks refer to groups and groups to members. Groups and
-        // members refer to the words, x0, scales, transforms, q and boxes of `Work`, from which the buffers were made.
+        // members refer to the words, x0, scales, transforms, q and boxes of `WorkList`, from which the buffers were made.
         // A group has no more members than the kernel was compiled for, shared memory has capacity for the longest
-        // group, and the header's positions have the size that `Output` checked.
-        unsafe { launch.arg(&args).launch(self.config) }.map_err(during("batch"))?;
+        // group, and the header's positions have the size that `OutputBuffers` checked.
+        unsafe { launch.arg(&args).launch(self.config) }.map_err(fault_in("batch"))?;
         Ok(())
     }
 }
 
 /// The kernel of a scene with batches.
-pub(super) fn kernel(scene: &Scene, batched: &Batched, source: KernelSource) -> Kernel {
-    let vectors = FEWER.iter().find(|(vectors, _)| batched.most <= *vectors).map(|(_, name)| *name);
+pub(super) fn kernel(scene: &Scene, batched: &BatchTables, source: KernelSource) -> KernelDescriptor {
+    let vectors = SMALLER_BATCHES.iter().find(|(vectors, _)| batched.max_members <= *vectors).map(|(_, name)| *name);
     let follows = scene.needs.followers.then_some("FOLLOWERS");
-    Kernel {
-        launch: Launch::Batch,
+    KernelDescriptor {
+        kind: KernelKind::Batch,
         name: source.name,
         defines: storage_define(scene.deformation.storage).into_iter().chain(vectors).chain(follows).collect(),
         blocks: batched.blocks.len() as u32,
         threads: 32 * WARPS as u32,
-        source: Source(source.source),
+        source: KernelText(source.source),
     }
 }
 
 /// Device bytes of the work list.
-pub(super) fn bytes(batched: &Batched) -> u64 {
-    let Batched { groups, members, blocks, .. } = batched;
+pub(super) fn bytes(batched: &BatchTables) -> u64 {
+    let BatchTables { groups, members, blocks, .. } = batched;
     let sizes = [size_of_val(groups.as_slice()), size_of_val(members.as_slice()), size_of_val(blocks.as_slice())];
     sizes.iter().sum::<usize>() as u64
 }
 
 /// Maximum group size of the kernel compiled with these macros.
-fn vectors_of(defines: &[&str]) -> usize {
-    FEWER.iter().find(|(_, name)| defines.contains(name)).map_or(MOST, |(vectors, _)| *vectors)
+fn batch_size_of(defines: &[&str]) -> usize {
+    SMALLER_BATCHES.iter().find(|(_, name)| defines.contains(name)).map_or(MAX_BATCH_SIZE, |(vectors, _)| *vectors)
 }
 
 /// Shared memory of a block: the part of each warp, T and the members of all vectors, and q.
-fn shared_bytes(batched: &Batched, defines: &[&str]) -> usize {
-    let storages = modalcast_model::scene::Storage::ALL.into_iter();
+fn shared_bytes(batched: &BatchTables, defines: &[&str]) -> usize {
+    let storages = modalcast_model::scene::StorageType::ALL.into_iter();
     let storage =
         storages.into_iter().find(|storage| storage_define(*storage).is_some_and(|own| defines.contains(&own)));
-    let (vectors, modes) = (vectors_of(defines), batched.chunks * modes_per_chunk(storage.unwrap_or_default()));
-    WARPS * OWN + VECTOR * vectors + 4 * vectors * modes
+    let (vectors, modes) = (batch_size_of(defines), batched.chunks * modes_per_chunk(storage.unwrap_or_default()));
+    WARPS * WARP_BYTES + MEMBER_BYTES * vectors + 4 * vectors * modes
 }
 
 #[cfg(test)]
@@ -136,23 +136,24 @@ mod warp;
 mod tests {
     use std::sync::Arc;
 
-    use super::super::pack::tests::alike;
-    use super::super::plan::{Role, plan};
-    use super::super::work::{Coordinates, Work};
+    use super::super::normal_tables::tests::corners_match;
+    use super::super::plan::{BufferRole, plan};
+    use super::super::work::{CoordinateLayout, WorkList};
     use super::warp::{Tables, Warp};
     use super::*;
-    use crate::testing::{Noise, scene_and_state, transformed_axis};
-    use modalcast_model::scene::{Batches, Deformation, Parts, State, Storage};
+    use crate::testing::{TestRng, scene_and_state, transformed_axis};
+    use modalcast_model::scene::{BatchPolicy, DeformationSettings, SceneParts, SceneState, StorageType};
 
     /// A scene with shapes of so many vertices and modes, each used by `instances` domains, and a random state of it.
-    fn ensemble(storage: Storage, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, State) {
+    fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
         let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
-        let mut parts = Parts::named("ensemble");
+        let mut parts = SceneParts::named("ensemble");
         (parts.shapes, parts.materials) = (one.shapes.clone(), one.materials.clone());
-        parts.deformation = Deformation { storage, batches: Batches::Always, ..Deformation::default() };
+        parts.deformation =
+            DeformationSettings { storage, batches: BatchPolicy::Always, ..DeformationSettings::default() };
         parts.domains = (0..instances * shapes.len()).map(|at| one.domains[at % shapes.len()].clone()).collect();
         let scene = Scene::new(parts).expect("a scene");
-        let (mut random, mut state) = (Noise(instances as u64), State::rest(&scene));
+        let (mut random, mut state) = (TestRng(instances as u64), SceneState::rest(&scene));
         state.q.iter_mut().for_each(|coordinate| *coordinate = random.next());
         state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.next()));
         (scene, state)
@@ -176,7 +177,7 @@ mod tests {
     }
 
     /// x of a vertex by the same arithmetic, directly from the U of the shape.
-    fn x_of(scene: &Scene, state: &State, domain: usize, vertex: usize) -> [f32; 3] {
+    fn x_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f32; 3] {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
         let rest = shape.mesh.rest()[vertex];
         let bent = [0, 1, 2].map(|axis| {
@@ -199,7 +200,7 @@ mod tests {
     #[test]
     fn every_number_of_a_batch_is_written_once_and_has_the_bits_of_the_plain_sum() {
         for (shapes, instances) in LOADS {
-            let (scene, state) = ensemble(Storage::F32, shapes, instances);
+            let (scene, state) = ensemble(StorageType::F32, shapes, instances);
             let got = twin_of_batch(&Tables::of(&scene, &state));
             for (domain, slot) in scene.layout.slots.iter().enumerate() {
                 for vertex in 0..slot.vertices {
@@ -219,7 +220,7 @@ mod tests {
 
     #[test]
     fn every_storage_finds_its_entries_scales_and_factors_in_a_batch() {
-        for (storage, tolerance) in Storage::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
+        for (storage, tolerance) in StorageType::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
             for (shapes, instances) in LOADS {
                 let (scene, state) = ensemble(storage, shapes, instances);
                 let got = twin_of_batch(&Tables::of(&scene, &state));
@@ -237,21 +238,25 @@ mod tests {
 
     #[test]
     fn groups_are_as_large_as_each_other_and_side_by_side_in_each_tile() {
-        let (scene, _) = ensemble(Storage::F32, &[(261, 12)], 40);
-        let work = Work::new(&scene, &Coordinates::new(&scene));
+        let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
+        let work = WorkList::new(&scene, &CoordinateLayout::new(&scene));
         let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.members).collect();
         assert_eq!(sizes, [14, 14, 12]);
         let blocks: Vec<(u32, u32)> = work.batched.blocks.iter().map(|block| (block.tile, block.group)).collect();
         assert_eq!(blocks, [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]);
-        assert_eq!((work.launched, work.tiles.len()), (120, 240), "three tiles of corners and three of vertices each");
+        assert_eq!(
+            (work.full_step_tiles, work.tiles.len()),
+            (120, 240),
+            "three tiles of corners and three of vertices each"
+        );
         let members: Vec<u32> = work.batched.members.iter().map(|member| member.first_tile).collect();
         assert!(members.iter().zip(&work.spans).all(|(first, spans)| *first == spans[0].0), "boxes lie by tiles");
     }
 
     #[test]
     fn blocks_of_large_scenes_have_runs_of_tiles_that_cover_each_shape_once() {
-        let (scene, _) = ensemble(Storage::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
-        let batched = Work::new(&scene, &Coordinates::new(&scene)).batched;
+        let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
+        let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene)).batched;
         assert!(batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))), "9001 tiles");
         for (group, tiles) in [6001, 3000].into_iter().enumerate() {
             let own = batched.blocks.iter().filter(|block| block.group == group as u32);
@@ -263,25 +268,25 @@ mod tests {
     #[test]
     fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
         let defines = |instances: usize| {
-            let plan = plan(&ensemble(Storage::F16, &[(261, 12)], instances).0);
-            let kernel = plan.kernel(Launch::Batch).expect("a batch").clone();
+            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0);
+            let kernel = plan.kernel(KernelKind::Batch).expect("a batch").clone();
             (kernel.defines.join(" "), kernel.blocks)
         };
         assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
         assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
         assert_eq!(defines(17), ("STORE_F16".into(), 6));
-        let none = plan(&alike(&[(261, 12)]));
-        assert!(none.kernel(Launch::Batch).is_none(), "too few to pay");
-        assert_eq!(none.bytes(Role::Batches), 0);
+        let none = plan(&corners_match(&[(261, 12)]));
+        assert!(none.kernel(KernelKind::Batch).is_none(), "too few to pay");
+        assert_eq!(none.bytes(BufferRole::Batches), 0);
     }
 
     #[test]
     fn shared_memory_holds_all_modes_of_every_batch() {
-        let longest = Batched { chunks: modalcast_model::domain::MAX_RANK, ..Batched::default() };
+        let longest = BatchTables { chunks: modalcast_model::domain::MAX_RANK, ..BatchTables::default() };
         // 64 KiB is the shared memory of the smallest supported device.
         assert!(shared_bytes(&longest, &[]) <= 64 << 10);
-        assert_eq!(shared_bytes(&Batched::default(), &["BATCH_4"]), 2 * OWN + 64 * 4);
-        let chunks = Batched { chunks: 3, ..Batched::default() };
-        assert_eq!(shared_bytes(&chunks, &["STORE_INT8"]) - shared_bytes(&Batched::default(), &[]), 4 * 16 * 12);
+        assert_eq!(shared_bytes(&BatchTables::default(), &["BATCH_4"]), 2 * WARP_BYTES + 64 * 4);
+        let chunks = BatchTables { chunks: 3, ..BatchTables::default() };
+        assert_eq!(shared_bytes(&chunks, &["STORE_INT8"]) - shared_bytes(&BatchTables::default(), &[]), 4 * 16 * 12);
     }
 }

@@ -4,35 +4,40 @@
 use cudarc::driver::{CudaFunction, LaunchConfig};
 use nalgebra::Vector3;
 
-use super::boxes::Boxes;
-use super::chain;
+use super::boxes::DomainBoxes;
 use super::deform::config;
+use super::dependent_launch;
 use super::device::Device;
-use super::inputs::Values;
-use super::layout::{BoundsArgs, Piece};
-use super::plan::Kernel;
+use super::inputs::InputAddresses;
+use super::layout::{BoundsArgs, BoxSegment};
+use super::plan::KernelDescriptor;
 use modalcast_model::error::Result;
-use modalcast_model::scene::{LightBounds, Scene};
+use modalcast_model::scene::{LightSpaceBox, Scene};
 
 /// The kernel and its buffers.
 #[derive(Debug)]
-pub struct Bounds {
+pub struct BoundsKernel {
     pub function: CudaFunction,
     config: LaunchConfig,
     /// The axes of light space, if the scene has a shadow.
     light: Option<[Vector3<f64>; 3]>,
     /// Only in a scene that keeps boxes.
-    pub(super) boxes: Option<Boxes>,
+    pub(super) boxes: Option<DomainBoxes>,
 }
 
-impl Bounds {
-    /// With `pieces`, the kernel also computes a box of each domain.
-    pub fn new(device: &Device, scene: &Scene, kernel: &Kernel, pieces: Option<&[Piece]>) -> Result<Self> {
+impl BoundsKernel {
+    /// With `segments`, the kernel also computes a box of each domain.
+    pub fn new(
+        device: &Device,
+        scene: &Scene,
+        kernel: &KernelDescriptor,
+        segments: Option<&[BoxSegment]>,
+    ) -> Result<Self> {
         Ok(Self {
             function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
             config: config(kernel),
             light: scene.light_axes(),
-            boxes: pieces.map(|pieces| Boxes::new(device, pieces)).transpose()?,
+            boxes: segments.map(|segments| DomainBoxes::new(device, segments)).transpose()?,
         })
     }
 
@@ -42,29 +47,30 @@ impl Bounds {
     }
 
     /// Starts the kernel on `count` boxes; it writes its result into the header among `values`.
-    pub fn launch(&self, device: &Device, values: Values, (boxes, count): (u64, u32)) -> Result<()> {
-        let (pieces, piece_boxes, piece_count) = self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
-        let Values { header, stamps, .. } = values;
+    pub fn launch(&self, device: &Device, values: InputAddresses, (boxes, count): (u64, u32)) -> Result<()> {
+        let (segments, segment_boxes, segment_count) =
+            self.boxes.as_ref().map_or((0, 0, 0), |boxes| boxes.addresses(device));
+        let InputAddresses { header, change_steps, .. } = values;
         let args = BoundsArgs {
             header,
             boxes,
-            pieces,
-            stamps,
-            piece_boxes,
+            segments,
+            change_steps,
+            segment_boxes,
             count,
-            piece_count,
-            light: narrow(self.light),
+            segment_count,
+            light: axes_to_f32(self.light),
             reserved: 0,
         };
         // SAFETY: `BoundsArgs` is the kernel's only argument; `boxes` has six words for each of `count`, as `Deform`
-        // allocated them, and `piece_boxes` has six for each piece. Pieces refer to boxes, vertices and domains of the
+        // allocated them, and `segment_boxes` has six for each piece. Pieces refer to boxes, vertices and domains of the
         // same scene. The kernel calls `await_previous` before it accesses memory.
-        unsafe { chain::launch(device, &self.function, self.config, &args) }
+        unsafe { dependent_launch::launch(device, &self.function, self.config, &args) }
     }
 }
 
 /// The axes as arguments of the kernel.
-fn narrow(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
+fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
     let axes = axes.unwrap_or_default();
     std::array::from_fn(|at| axes[at / 3][at % 3] as f32)
 }
@@ -74,26 +80,26 @@ fn narrow(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
 /// The kernel rounds its sums outward, but its axes are f32. A component of a unit vector in f32 has an error of at
 /// most 2^-25, so an end of the bounds has an error of at most 2^-25 times the sum of the largest coordinates. This
 /// function widens the bounds by twice that.
-pub(super) fn light_of(keys: &[u32]) -> Option<LightBounds> {
+pub(super) fn light_bounds_from_keys(keys: &[u32]) -> Option<LightSpaceBox> {
     let (world, light) = keys.split_at_checked(6).filter(|(_, light)| light.len() == 6)?;
-    let world = bounds_of(world);
+    let world = bounds_from_keys(world);
     let farthest: f64 = world.min.iter().zip(&world.max).map(|(min, max)| min.abs().max(max.abs())).sum();
-    Some(LightBounds(bounds_of(light)).widened(farthest * f64::from(f32::EPSILON) / 2.0))
+    Some(LightSpaceBox(bounds_from_keys(light)).expanded_by(farthest * f64::from(f32::EPSILON) / 2.0))
 }
 
 /// The bounds that six keys encode.
-pub(super) fn bounds_of(keys: &[u32]) -> modalcast_model::scene::Bounds {
+pub(super) fn bounds_from_keys(keys: &[u32]) -> modalcast_model::scene::Bounds {
     let mut bounds = modalcast_model::scene::Bounds::EMPTY;
     for axis in 0..3 {
-        bounds.min[axis] = -f64::from(number_of(keys[axis]));
-        bounds.max[axis] = f64::from(number_of(keys[3 + axis]));
+        bounds.min[axis] = -f64::from(ordered_to_float(keys[axis]));
+        bounds.max[axis] = f64::from(ordered_to_float(keys[3 + axis]));
     }
     bounds
 }
 
-/// `unordered` of `kernels/ordered.cuh`, the inverse of `ordered`. The key 0, which encodes no number, gives a NaN like
+/// `ordered_to_float` of `kernels/ordered_float.cuh`, the inverse of `float_to_ordered`. The key 0, which encodes no number, gives a NaN like
 /// the key of NaN.
-fn number_of(key: u32) -> f32 {
+fn ordered_to_float(key: u32) -> f32 {
     f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
 }
 
@@ -101,8 +107,8 @@ fn number_of(key: u32) -> f32 {
 mod tests {
     use super::*;
 
-    /// `ordered` of the kernel, branch by branch.
-    fn ordered(x: f32) -> u32 {
+    /// `float_to_ordered` of the kernel, branch by branch.
+    fn float_to_ordered(x: f32) -> u32 {
         match x {
             x if x.is_nan() => u32::MAX,
             x if x.is_sign_negative() => !x.to_bits(),
@@ -112,10 +118,10 @@ mod tests {
 
     #[test]
     fn light_bounds_are_the_last_six_keys_and_hold_what_the_axes_lost_in_f32() {
-        let world = [1000.0_f32, 10.0, 1.0, 2000.0, 10.0, -0.5].map(ordered);
-        let light = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(ordered);
-        assert_eq!(light_of(&world), None, "without a shadow there are six");
-        let LightBounds(got) = light_of(&[world, light].concat()).expect("twelve");
+        let world = [1000.0_f32, 10.0, 1.0, 2000.0, 10.0, -0.5].map(float_to_ordered);
+        let light = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(float_to_ordered);
+        assert_eq!(light_bounds_from_keys(&world), None, "without a shadow there are six");
+        let LightSpaceBox(got) = light_bounds_from_keys(&[world, light].concat()).expect("twelve");
         let margin = (2000.0 + 10.0 + 1.0) * 2.0_f64.powi(-24);
         for (end, want) in [(got.min, [-1.0, 2.0, 0.0]), (got.max, [4.0, 5.0, 6.0])] {
             let out = |axis: usize| if want[axis] == end[axis] { 0.0 } else { (want[axis] - end[axis]).abs() };
@@ -123,9 +129,9 @@ mod tests {
         }
         assert!(got.min[0] < -1.0 && got.max[2] > 6.0, "outwards");
         let mut lost = light;
-        lost[4] = ordered(f32::NAN);
-        assert!(!light_of(&[world, lost].concat()).is_some_and(|light| light.is_sound()));
-        assert!(!light_of(&[0; 12]).is_some_and(|light| light.is_sound()), "nothing was measured");
+        lost[4] = float_to_ordered(f32::NAN);
+        assert!(!light_bounds_from_keys(&[world, lost].concat()).is_some_and(|light| light.is_valid()));
+        assert!(!light_bounds_from_keys(&[0; 12]).is_some_and(|light| light.is_valid()), "nothing was measured");
     }
 
     #[test]
@@ -135,33 +141,36 @@ mod tests {
             let angle = 0.1 * f64::from(step);
             let sun = Vector3::new(angle.sin(), (1.7 * angle).cos(), (0.3 * angle).sin()).normalize();
             let axes = modalcast_model::scene::light_axes(sun, modalcast_model::scene::UpAxis::Y);
-            for (axis, narrow) in axes.iter().zip(narrow(Some(axes)).chunks_exact(3)) {
-                (0..3).for_each(|at| worst = worst.max((axis[at] - f64::from(narrow[at])).abs()));
+            for (axis, axes_to_f32) in axes.iter().zip(axes_to_f32(Some(axes)).chunks_exact(3)) {
+                (0..3).for_each(|at| worst = worst.max((axis[at] - f64::from(axes_to_f32[at])).abs()));
             }
         }
         assert!(worst <= 2.0_f64.powi(-25) && worst > 2.0_f64.powi(-28), "{worst}");
-        assert_eq!(narrow(None), [0.0; 9]);
+        assert_eq!(axes_to_f32(None), [0.0; 9]);
     }
 
     #[test]
     fn keys_keep_the_order_of_numbers_and_a_nan_or_nothing_is_not_finite() {
         let rising = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
         for pair in rising.windows(2) {
-            assert!(ordered(pair[0]) < ordered(pair[1]), "{pair:?}");
-            assert!(ordered(pair[0]) > 0);
+            assert!(float_to_ordered(pair[0]) < float_to_ordered(pair[1]), "{pair:?}");
+            assert!(float_to_ordered(pair[0]) > 0);
         }
         for number in rising {
-            assert_eq!(number_of(ordered(number)).to_bits(), number.to_bits());
+            assert_eq!(ordered_to_float(float_to_ordered(number)).to_bits(), number.to_bits());
         }
-        assert!(number_of(ordered(f32::NAN)).is_nan());
-        assert!(number_of(0).is_nan());
-        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(ordered);
-        assert_eq!(bounds_of(&good), modalcast_model::scene::Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
+        assert!(ordered_to_float(float_to_ordered(f32::NAN)).is_nan());
+        assert!(ordered_to_float(0).is_nan());
+        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(float_to_ordered);
+        assert_eq!(
+            bounds_from_keys(&good),
+            modalcast_model::scene::Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] }
+        );
         for bad in [f32::NAN, f32::INFINITY] {
             let mut keys = good;
-            keys[4] = ordered(bad);
-            assert!(!bounds_of(&keys).is_finite());
+            keys[4] = float_to_ordered(bad);
+            assert!(!bounds_from_keys(&keys).is_finite());
         }
-        assert!(!bounds_of(&[0; 6]).is_finite());
+        assert!(!bounds_from_keys(&[0; 6]).is_finite());
     }
 }

@@ -6,48 +6,48 @@
 
 use cudarc::driver::{CudaSlice, PinnedHostSlice};
 
-use super::bounds::bounds_of;
+use super::bounds::bounds_from_keys;
 use super::device::Device;
-use super::layout::{Piece, TILE_LAST};
-use super::memory::{address, download, room, upload};
-use super::work::Work;
-use modalcast_model::error::{Result, during};
+use super::layout::{BoxSegment, TILE_LAST};
+use super::memory::{address, alloc_zeroed, download, upload};
+use super::work::WorkList;
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Bounds, Scene};
 
 /// Maximum number of tiles of a piece; each tile has four boxes.
-const PIECE_TILES: u32 = 32;
+const MAX_SEGMENT_TILES: u32 = 32;
 
 /// Keys of a box.
-const SIDES: usize = 6;
+const BOX_KEYS: usize = 6;
 
 /// The pieces of all domains, in the order of the domains.
-pub(super) fn pieces(scene: &Scene, work: &Work) -> Vec<Piece> {
-    let mut pieces = Vec::with_capacity(scene.domains.len());
+pub(super) fn segments(scene: &Scene, work: &WorkList) -> Vec<BoxSegment> {
+    let mut segments = Vec::with_capacity(scene.domains.len());
     for (index, ([(first, count), _], slot)) in work.spans.iter().zip(&scene.layout.slots).enumerate() {
         let domain = index as u32;
         if work.tiles[*first as usize].kind & TILE_LAST == 0 {
             let (first, count) = (slot.first_vertex as u32, slot.vertices as u32);
-            pieces.push(Piece { first, count, domain, of_vertices: 1 });
+            segments.push(BoxSegment { first, count, domain, from_vertices: 1 });
             continue;
         }
         let part = |tile: u32| {
-            let tiles = PIECE_TILES.min(first + count - tile);
-            Piece { first: 4 * tile, count: 4 * tiles, domain, of_vertices: 0 }
+            let tiles = MAX_SEGMENT_TILES.min(first + count - tile);
+            BoxSegment { first: 4 * tile, count: 4 * tiles, domain, from_vertices: 0 }
         };
-        pieces.extend((*first..first + count).step_by(PIECE_TILES as usize).map(part));
+        segments.extend((*first..first + count).step_by(MAX_SEGMENT_TILES as usize).map(part));
     }
-    pieces
+    segments
 }
 
 /// Device bytes of so many pieces, and of their boxes.
-pub(super) const fn bytes(pieces: usize) -> (u64, u64) {
-    ((pieces * size_of::<Piece>()) as u64, (pieces * 4 * SIDES) as u64)
+pub(super) const fn bytes(segments: usize) -> (u64, u64) {
+    ((segments * size_of::<BoxSegment>()) as u64, (segments * 4 * BOX_KEYS) as u64)
 }
 
 /// Pieces and their boxes on the device.
 #[derive(Debug)]
-pub(super) struct Boxes {
-    pieces: CudaSlice<u8>,
+pub(super) struct DomainBoxes {
+    segments: CudaSlice<u8>,
     boxes: CudaSlice<u8>,
     /// The domain of each piece.
     domains: Vec<u32>,
@@ -55,16 +55,16 @@ pub(super) struct Boxes {
     keys: Option<PinnedHostSlice<u32>>,
 }
 
-impl Boxes {
-    pub(super) fn new(device: &Device, list: &[Piece]) -> Result<Self> {
+impl DomainBoxes {
+    pub(super) fn new(device: &Device, list: &[BoxSegment]) -> Result<Self> {
         let (_, boxes) = bytes(list.len());
         let domains = list.iter().map(|piece| piece.domain).collect();
-        Ok(Self { pieces: upload(device, list)?, boxes: room(device, boxes)?, domains, keys: None })
+        Ok(Self { segments: upload(device, list)?, boxes: alloc_zeroed(device, boxes)?, domains, keys: None })
     }
 
     /// Addresses of the pieces and their boxes, and the number of pieces.
     pub(super) fn addresses(&self, device: &Device) -> (u64, u64, u32) {
-        (address(device, &self.pieces), address(device, &self.boxes), self.domains.len() as u32)
+        (address(device, &self.segments), address(device, &self.boxes), self.domains.len() as u32)
     }
 
     /// Copies the boxes of all domains, and waits for the copy.
@@ -74,23 +74,23 @@ impl Boxes {
             Some(keys) => keys,
             none => {
                 // SAFETY: the memory is uninitialized; the copy below writes all of it before it is read.
-                let pinned = unsafe { device.context().alloc_pinned_with_flags(SIDES * self.domains.len(), 0) };
-                none.insert(pinned.map_err(during("allocate"))?)
+                let pinned = unsafe { device.context().alloc_pinned_with_flags(BOX_KEYS * self.domains.len(), 0) };
+                none.insert(pinned.map_err(fault_in("allocate"))?)
             }
         };
-        let keys = keys.as_mut_slice().map_err(during("download"))?;
+        let keys = keys.as_mut_slice().map_err(fault_in("download"))?;
         // SAFETY: the boxes have six words for each piece, and so does `keys`.
         unsafe { download(device, from, keys) }?;
-        unite(&self.domains, keys, to);
+        union_per_domain(&self.domains, keys, to);
         Ok(())
     }
 }
 
 /// One box for each domain, from the keys of its pieces.
-fn unite(domains: &[u32], keys: &[u32], to: &mut Vec<Bounds>) {
+fn union_per_domain(domains: &[u32], keys: &[u32], to: &mut Vec<Bounds>) {
     to.clear();
-    for (domain, keys) in domains.iter().zip(keys.chunks_exact(SIDES)) {
-        let piece = bounds_of(keys);
+    for (domain, keys) in domains.iter().zip(keys.chunks_exact(BOX_KEYS)) {
+        let piece = bounds_from_keys(keys);
         match to.get_mut(*domain as usize) {
             Some(all) => *all = all.union(piece),
             None => to.push(piece),
@@ -101,17 +101,17 @@ fn unite(domains: &[u32], keys: &[u32], to: &mut Vec<Bounds>) {
 #[cfg(test)]
 mod tests {
     use super::super::layout::TILE_VERTICES;
-    use super::super::pack::tests::{scene, used_once};
-    use super::super::work::Coordinates;
+    use super::super::normal_tables::tests::{scene, used_once};
+    use super::super::work::CoordinateLayout;
     use super::*;
 
     /// How many pieces contain each vertex of a domain.
-    fn seen(scene: &Scene, work: &Work, domain: usize) -> Vec<u32> {
+    fn seen(scene: &Scene, work: &WorkList, domain: usize) -> Vec<u32> {
         let slot = scene.layout.slots[domain];
         let mut seen = vec![0; slot.vertices];
-        for piece in pieces(scene, work).iter().filter(|piece| piece.domain as usize == domain) {
+        for piece in segments(scene, work).iter().filter(|piece| piece.domain as usize == domain) {
             let range = piece.first as usize..(piece.first + piece.count) as usize;
-            if piece.of_vertices == 1 {
+            if piece.from_vertices == 1 {
                 range.for_each(|vertex| seen[vertex - slot.first_vertex] += 1);
                 continue;
             }
@@ -130,11 +130,11 @@ mod tests {
     fn every_vertex_lies_in_one_piece_of_its_domain_whatever_its_tiles() {
         let sizes = [(7, 2), (64, 0), (65, 3), (128, 1), (129, 0), (9_000, 4), (1, 1)];
         for scene in [scene(&sizes, false, false), used_once(&sizes)] {
-            let work = Work::new(&scene, &Coordinates::new(&scene));
-            let list = pieces(&scene, &work);
-            assert!(list.iter().any(|piece| piece.of_vertices == 1) && list.len() > scene.domains.len());
+            let work = WorkList::new(&scene, &CoordinateLayout::new(&scene));
+            let list = segments(&scene, &work);
+            assert!(list.iter().any(|piece| piece.from_vertices == 1) && list.len() > scene.domains.len());
             assert!(list.is_sorted_by_key(|piece| piece.domain));
-            assert!(list.iter().all(|piece| piece.of_vertices == 1 || piece.count <= 4 * PIECE_TILES));
+            assert!(list.iter().all(|piece| piece.from_vertices == 1 || piece.count <= 4 * MAX_SEGMENT_TILES));
             for (domain, slot) in scene.layout.slots.iter().enumerate() {
                 assert_eq!(seen(&scene, &work, domain), vec![1; slot.vertices], "domain {domain}");
             }
@@ -143,16 +143,16 @@ mod tests {
 
     #[test]
     fn boxes_of_pieces_unite_to_those_of_domains_and_a_nan_stays() {
-        // Keys of -x and x: `ordered` sets the sign bit of positive numbers and inverts all bits of negative ones.
+        // Keys of -x and x: `float_to_ordered` sets the sign bit of positive numbers and inverts all bits of negative ones.
         let key = |x: f32| if x.is_sign_negative() { !x.to_bits() } else { x.to_bits() | 1 << 31 };
         let cube = |low: f32, high: f32| [[key(-low); 3], [key(high); 3]].concat();
         let keys = [cube(-1.0, 2.0), cube(0.5, 0.75), cube(-3.0, 0.25)].concat();
         let mut boxes = vec![Bounds::EMPTY; 7];
-        unite(&[0, 1, 1], &keys, &mut boxes);
+        union_per_domain(&[0, 1, 1], &keys, &mut boxes);
         let want = |low: f64, high: f64| Bounds { min: [low; 3], max: [high; 3] };
         assert_eq!(boxes, [want(-1.0, 2.0), want(-3.0, 0.75)]);
         let spoilt = [&keys[..17], &[u32::MAX]].concat();
-        unite(&[0, 1, 1], &spoilt, &mut boxes);
+        union_per_domain(&[0, 1, 1], &spoilt, &mut boxes);
         assert!(boxes[0].is_finite() && !boxes[1].is_finite());
     }
 }

@@ -6,10 +6,10 @@ use cudarc::driver::{CudaContext, CudaFunction, CudaModule, CudaStream, DriverEr
 use cudarc::nvrtc::Ptx;
 
 use super::compile::{cubin, nvrtc};
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// Minimum CUDA driver version, as cuDriverGetVersion counts (12.0).
-const OLDEST_DRIVER: i32 = 12_000;
+const MIN_DRIVER_VERSION: i32 = 12_000;
 
 /// A CUDA device with its context current on this thread. All work is ordered by one stream. Only the readback of
 /// vertices has a stream of its own, which is ordered by events.
@@ -29,7 +29,7 @@ impl Device {
     /// `Unavailable` with the missing library and how to install it; never a panic.
     pub fn open(ordinal: usize) -> Result<Arc<Self>> {
         let version = driver_version()?;
-        if version < OLDEST_DRIVER {
+        if version < MIN_DRIVER_VERSION {
             let reason = format!("the driver knows CUDA {}.{}", version / 1000, version % 1000 / 10);
             return Err(Error::Unavailable { what: "CUDA 12.0", reason, remedy: UPDATE.into() });
         }
@@ -43,7 +43,7 @@ impl Device {
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
         // SAFETY: event tracking orders accesses from several streams. All work on this device goes through the one
-        // stream below, which orders it; `fetch` has a second stream and orders its copies by its own events.
+        // stream below, which orders it; `readback` has a second stream and orders its copies by its own events.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;
@@ -71,7 +71,7 @@ impl Device {
     /// # Errors
     /// `Fault` when the driver reports one.
     pub fn memory(&self) -> Result<(usize, usize)> {
-        self.context.mem_get_info().map_err(during("device"))
+        self.context.mem_get_info().map_err(fault_in("device"))
     }
 
     /// Checks that kernels can be compiled for this device, so that a server can choose another backend before it loads
@@ -80,7 +80,7 @@ impl Device {
     /// # Errors
     /// `Unavailable` with the remedy when NVRTC is missing or does not fit the driver.
     pub fn check_compiler(&self) -> Result<()> {
-        fits_driver(nvrtc()?.version, driver_version()?)
+        check_driver(nvrtc()?.version, driver_version()?)
     }
 
     pub const fn context(&self) -> &Arc<CudaContext> {
@@ -97,7 +97,7 @@ impl Device {
     /// `Unavailable` when NVRTC is missing or does not fit the driver; `Fault` when compiling or loading fails.
     pub fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
         let module = self.module(name, source, defines)?;
-        module.load_function(name).map_err(during("load kernel"))
+        module.load_function(name).map_err(fault_in("load kernel"))
     }
 
     /// Several functions of a source that is compiled once; the first function names the module.
@@ -106,13 +106,13 @@ impl Device {
     /// As [`Self::function`].
     pub(super) fn functions(&self, names: &[&str], source: &str, defines: &[&str]) -> Result<Vec<CudaFunction>> {
         let module = self.module(names.first().unwrap_or(&""), source, defines)?;
-        names.iter().map(|name| module.load_function(name).map_err(during("load kernel"))).collect()
+        names.iter().map(|name| module.load_function(name).map_err(fault_in("load kernel"))).collect()
     }
 
     fn module(&self, name: &str, source: &str, defines: &[&str]) -> Result<Arc<CudaModule>> {
         self.check_compiler()?;
         let cubin = cubin(name, source, defines, self.capability)?;
-        self.context.load_module(Ptx::from_binary(cubin)).map_err(during("load kernel"))
+        self.context.load_module(Ptx::from_binary(cubin)).map_err(fault_in("load kernel"))
     }
 }
 
@@ -147,7 +147,7 @@ pub(super) fn driver_version() -> Result<i32> {
 }
 
 /// Checks the NVRTC version: the driver does not load machine code of a newer major version.
-fn fits_driver(nvrtc: (i32, i32), driver: i32) -> Result<()> {
+fn check_driver(nvrtc: (i32, i32), driver: i32) -> Result<()> {
     if nvrtc.0 <= driver / 1000 {
         return Ok(());
     }
@@ -169,9 +169,9 @@ mod tests {
 
     #[test]
     fn an_nvrtc_of_a_newer_major_version_than_the_driver_is_refused_with_both_versions() {
-        fits_driver((12, 9), 13_000).expect("older machine code loads");
-        fits_driver((13, 1), 13_000).expect("minor versions are compatible");
-        let refusal = fits_driver((13, 0), 12_040).expect_err("newer machine code does not").to_string();
+        check_driver((12, 9), 13_000).expect("older machine code loads");
+        check_driver((13, 1), 13_000).expect("minor versions are compatible");
+        let refusal = check_driver((13, 0), 12_040).expect_err("newer machine code does not").to_string();
         assert!(refusal.contains("13.0") && refusal.contains("CUDA 12"), "{refusal}");
     }
 }

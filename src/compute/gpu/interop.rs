@@ -5,7 +5,7 @@
 //! complete before CUDA work that is submitted to the stream after it. CUDA work submitted before an unmap completes
 //! before OpenGL commands that are issued after it. A frame may therefore be in flight when the next step is submitted:
 //! the step waits on the device until the frame is drawn and its pixels are read back. A step never runs concurrently
-//! with a frame that uses its buffers, and this wait is not part of the step's time (`flight`).
+//! with a frame that uses its buffers, and this wait is not part of the step's time (`step_slot`).
 
 use std::ffi::{c_int, c_uint};
 use std::sync::Arc;
@@ -14,46 +14,46 @@ use cudarc::driver::sys::{self, CUgraphicsResource, CUresult};
 use cudarc::driver::{CudaContext, DriverError};
 use libloading::Library;
 
-use super::GlBuffers;
+use super::GlVertexBuffers;
 use super::device::Device;
-use super::output::Addresses;
-use modalcast_model::error::{Error, Result, during};
+use super::output::OutputAddresses;
+use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::GlBuffer;
 
 const STAGE: &str = "interop";
 
 /// `CU_GL_DEVICE_LIST_ALL`: every CUDA device that the current OpenGL context uses.
-const ALL_DEVICES: c_uint = 1;
+const GL_DEVICE_LIST_ALL: c_uint = 1;
 
 /// Maximum number of buffers that are mapped together.
-const MOST: usize = 3;
+const MAX_MAPPED_BUFFERS: usize = 3;
 
 type RegisterBuffer = unsafe extern "C" fn(*mut CUgraphicsResource, c_uint, c_uint) -> CUresult;
 type GetDevices = unsafe extern "C" fn(*mut c_uint, *mut c_int, c_uint, c_uint) -> CUresult;
 
-/// Purpose of a mapping. With `WriteAll` the driver may discard the old contents of the buffer.
+/// Purpose of a mapping. With `WriteDiscard` the driver may discard the old contents of the buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Access {
-    WriteAll,
-    WriteSome,
+pub(super) enum MapAccess {
+    WriteDiscard,
+    ReadWrite,
     Read,
 }
 
 /// Registers buffers of the OpenGL context that is current on this thread.
 #[derive(Debug)]
-pub(super) struct Sharing {
+pub(super) struct GlInterop {
     register: RegisterBuffer,
     /// Keeps `register` loaded.
     _library: Library,
 }
 
-impl Sharing {
+impl GlInterop {
     /// Checks that the current OpenGL context draws on this device.
     ///
     /// # Errors
     /// `Fault` with the reason why nothing can be shared.
     pub(super) fn open(device: &Device) -> Result<Self> {
-        let fail = during(STAGE);
+        let fail = fault_in(STAGE);
         // SAFETY: the driver library is already loaded, so this only increments its reference count and runs no
         // initializer.
         let library = unsafe { Library::new("libcuda.so.1") }.map_err(|error| fail(error.to_string()))?;
@@ -68,39 +68,39 @@ impl Sharing {
     ///
     /// # Errors
     /// `Fault` with the name of the buffer that the driver refused.
-    pub(super) fn register(&self, device: &Device, buffer: GlBuffer) -> Result<Registered> {
+    pub(super) fn register(&self, device: &Device, buffer: GlBuffer) -> Result<RegisteredBuffer> {
         let mut resource = std::ptr::null_mut();
         // SAFETY: `resource` is a live pointer; the driver refuses an unknown buffer name.
         let answer = unsafe { (self.register)(&mut resource, buffer.name, 0) };
-        answer.result().map_err(|error| during(STAGE)(format!("buffer {}: {error}", buffer.name)))?;
-        Ok(Registered { resource, buffer, access: None, context: Arc::clone(device.context()) })
+        answer.result().map_err(|error| fault_in(STAGE)(format!("buffer {}: {error}", buffer.name)))?;
+        Ok(RegisteredBuffer { resource, buffer, access: None, context: Arc::clone(device.context()) })
     }
 }
 
 /// An OpenGL buffer that CUDA may map; unregistered on drop.
 #[derive(Debug)]
-pub(super) struct Registered {
+pub(super) struct RegisteredBuffer {
     resource: CUgraphicsResource,
     buffer: GlBuffer,
-    access: Option<Access>,
+    access: Option<MapAccess>,
     context: Arc<CudaContext>,
 }
 
-impl Registered {
+impl RegisteredBuffer {
     pub(super) const fn buffer(&self) -> GlBuffer {
         self.buffer
     }
 
     /// Announces the purpose of the next mapping to the driver, if it differs from the last one.
-    fn announce(&mut self, access: Access) -> Result<(), DriverError> {
+    fn set_map_flags(&mut self, access: MapAccess) -> Result<(), DriverError> {
         use sys::CUgraphicsMapResourceFlags_enum as Flags;
         if self.access == Some(access) {
             return Ok(());
         }
         let flags = match access {
-            Access::WriteAll => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_WRITE_DISCARD,
-            Access::WriteSome => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_NONE,
-            Access::Read => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_READ_ONLY,
+            MapAccess::WriteDiscard => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_WRITE_DISCARD,
+            MapAccess::ReadWrite => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_NONE,
+            MapAccess::Read => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_READ_ONLY,
         };
         self.access = None;
         // SAFETY: the resource is registered and unmapped.
@@ -114,7 +114,7 @@ impl Registered {
     /// # Errors
     /// `Fault` when the buffer is smaller than expected.
     fn address(&self) -> Result<u64> {
-        let fail = during(STAGE);
+        let fail = fault_in(STAGE);
         let GlBuffer { name, bytes: expected } = self.buffer;
         let (mut place, mut bytes) = (0, 0);
         // SAFETY: both pointers are live and the resource is a mapped buffer.
@@ -128,7 +128,7 @@ impl Registered {
     }
 }
 
-impl Drop for Registered {
+impl Drop for RegisteredBuffer {
     fn drop(&mut self) {
         // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
         self.context.bind_to_thread().ok();
@@ -142,19 +142,19 @@ impl Drop for Registered {
 ///
 /// # Errors
 /// The error of `work`, or a `Fault` of mapping.
-pub(super) fn mapped(
+pub(super) fn with_mapped(
     device: &Device,
-    uses: &mut [(&mut Registered, Access)],
-    work: impl FnOnce([u64; MOST]) -> Result<()>,
+    uses: &mut [(&mut RegisteredBuffer, MapAccess)],
+    work: impl FnOnce([u64; MAX_MAPPED_BUFFERS]) -> Result<()>,
 ) -> Result<()> {
-    let fail = during(STAGE);
-    let mut resources = [std::ptr::null_mut(); MOST];
+    let fail = fault_in(STAGE);
+    let mut resources = [std::ptr::null_mut(); MAX_MAPPED_BUFFERS];
     for (place, (registered, access)) in resources.iter_mut().zip(uses.iter_mut()) {
-        registered.announce(*access).map_err(&fail)?;
+        registered.set_map_flags(*access).map_err(&fail)?;
         *place = registered.resource;
     }
     let stream = device.stream().cu_stream();
-    let (count, resources) = (uses.len().min(MOST) as c_uint, resources.as_mut_ptr());
+    let (count, resources) = (uses.len().min(MAX_MAPPED_BUFFERS) as c_uint, resources.as_mut_ptr());
     // SAFETY: all resources are registered and unmapped, and the stream belongs to the same device. OpenGL frames that
     // read the buffers complete before later work on the stream.
     unsafe { sys::cuGraphicsMapResources(count, resources, stream) }.result().map_err(&fail)?;
@@ -164,8 +164,8 @@ pub(super) fn mapped(
     worked.and(unmapped.map_err(fail))
 }
 
-fn addresses(uses: &[(&mut Registered, Access)]) -> Result<[u64; MOST]> {
-    let mut list = [0; MOST];
+fn addresses(uses: &[(&mut RegisteredBuffer, MapAccess)]) -> Result<[u64; MAX_MAPPED_BUFFERS]> {
+    let mut list = [0; MAX_MAPPED_BUFFERS];
     for (place, (registered, _)) in list.iter_mut().zip(uses) {
         *place = registered.address()?;
     }
@@ -174,22 +174,22 @@ fn addresses(uses: &[(&mut Registered, Access)]) -> Result<[u64; MOST]> {
 
 /// OpenGL buffers of positions, normals and optionally tangents, registered with CUDA.
 #[derive(Debug)]
-pub(super) struct Interop {
-    positions: Registered,
-    normals: Registered,
-    tangents: Option<Registered>,
+pub(super) struct RegisteredOutputs {
+    positions: RegisteredBuffer,
+    normals: RegisteredBuffer,
+    tangents: Option<RegisteredBuffer>,
 }
 
-impl Interop {
+impl RegisteredOutputs {
     /// Registers the buffers of the OpenGL context that is current on this thread. `sizes`: bytes of positions, normals
     /// and tangents; 0 bytes of tangents means no tangents.
     ///
     /// # Errors
     /// `Fault` with the refused resource; nothing remains registered.
-    pub(super) fn register(device: &Device, buffers: GlBuffers, sizes: [u64; 3]) -> Result<Self> {
-        let missing = || during(STAGE)("the renderer gave no buffer for tangents");
+    pub(super) fn register(device: &Device, buffers: GlVertexBuffers, sizes: [u64; 3]) -> Result<Self> {
+        let missing = || fault_in(STAGE)("the renderer gave no buffer for tangents");
         let [positions, normals, tangents] = sizes;
-        let sharing = Sharing::open(device)?;
+        let sharing = GlInterop::open(device)?;
         let register = |name, bytes| sharing.register(device, GlBuffer { name, bytes });
         let mut interop = Self {
             positions: register(buffers.positions, positions)?,
@@ -199,7 +199,7 @@ impl Interop {
                 bytes => Some(register(buffers.tangents.ok_or_else(missing)?, bytes)?),
             },
         };
-        interop.mapped(device, Access::Read, |_| Ok(()))?;
+        interop.with_mapped(device, MapAccess::Read, |_| Ok(()))?;
         Ok(interop)
     }
 
@@ -208,17 +208,21 @@ impl Interop {
     ///
     /// # Errors
     /// The error of `work`, or a `Fault` of mapping.
-    pub(super) fn mapped(
+    pub(super) fn with_mapped(
         &mut self,
         device: &Device,
-        access: Access,
-        work: impl FnOnce(Addresses) -> Result<()>,
+        access: MapAccess,
+        work: impl FnOnce(OutputAddresses) -> Result<()>,
     ) -> Result<()> {
         let Self { positions, normals, tangents } = self;
-        let work = |[positions, normals, tangents]: [u64; MOST]| work(Addresses { positions, normals, tangents });
+        let work = |[positions, normals, tangents]: [u64; MAX_MAPPED_BUFFERS]| {
+            work(OutputAddresses { positions, normals, tangents })
+        };
         match tangents {
-            None => mapped(device, &mut [(positions, access), (normals, access)], work),
-            Some(tangents) => mapped(device, &mut [(positions, access), (normals, access), (tangents, access)], work),
+            None => with_mapped(device, &mut [(positions, access), (normals, access)], work),
+            Some(tangents) => {
+                with_mapped(device, &mut [(positions, access), (normals, access), (tangents, access)], work)
+            }
         }
     }
 }
@@ -232,7 +236,7 @@ fn check_device(library: &Library, device: &Device) -> Result<()> {
     let get = get.map_err(|error| refused(error.to_string()))?;
     let (mut count, mut devices) = (0, [0; 16]);
     // SAFETY: `devices` has as many elements as the call receives in its third argument.
-    let answer = unsafe { get(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, ALL_DEVICES) };
+    let answer = unsafe { get(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, GL_DEVICE_LIST_ALL) };
     answer.result().map_err(|error| refused(format!("no current OpenGL context of a CUDA device: {error}")))?;
     let drawing = &devices[..devices.len().min(count as usize)];
     if drawing.contains(&device.context().cu_device()) {

@@ -6,7 +6,7 @@ use cudarc::driver::DeviceRepr;
 
 use crate::storage::TILE_QUADS;
 use modalcast_model::domain::RING_START;
-use modalcast_model::scene::Movers;
+use modalcast_model::scene::TransformRoots;
 
 /// Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
 pub(super) const BLOCK: u32 = 256;
@@ -18,9 +18,9 @@ pub(super) const NO_TANGENTS: u32 = u32::MAX;
 pub(super) const NO_GROUPS: u32 = u32::MAX;
 
 /// `frame` of a domain that follows no other domain.
-pub(super) const NO_FRAME: u32 = Movers::NO_FRAME;
+pub(super) const NO_FRAME: u32 = TransformRoots::NO_FRAME;
 
-/// Bit fields of [`Tile::kind`]: the number of items of the last quad (0 in a mixed tile), and flags for whether the
+/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and flags for whether the
 /// tile computes vertices and corners.
 pub(super) const TILE_LAST: u8 = 7;
 pub(super) const TILE_VERTICES: u8 = 8;
@@ -34,11 +34,11 @@ pub struct Header {
     pub normals: u64,
     pub tangents: u64,
     pub displacements: u64,
-    pub since: u32,
-    pub everything: u32,
+    pub output_step: u32,
+    pub last_full_step: u32,
     pub step: u32,
     pub changed: u32,
-    pub stale: u32,
+    pub dirty_tiles: u32,
     pub reserved: [u32; 3],
     pub bounds: [u32; 12],
 }
@@ -46,7 +46,7 @@ pub struct Header {
 /// The work of one warp of `deform`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Tile {
+pub(super) struct WarpTile {
     pub first_word: u64,
     pub first: u32,
     pub rest: u32,
@@ -61,7 +61,7 @@ pub(super) struct Tile {
 /// A quad of a mixed tile.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Lane {
+pub(super) struct MixedQuad {
     pub item: u32,
     pub rest: u32,
     pub domain: u32,
@@ -81,8 +81,8 @@ pub(super) struct Change {
 /// The transform root of a domain and its frame relative to that root; only in scenes with followers.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Following {
-    pub mover: u32,
+pub(super) struct TransformLink {
+    pub root: u32,
     pub frame: u32,
 }
 
@@ -92,21 +92,21 @@ pub(super) struct Following {
 pub(super) struct DeformArgs {
     pub header: u64,
     pub tiles: u64,
-    pub lanes: u64,
+    pub mixed_quads: u64,
     pub words: u64,
     pub rest: u64,
     pub rest_normals: u64,
     pub rest_tangents: u64,
-    pub corner_shifts: u64,
+    pub corner_offsets: u64,
     pub scales: u64,
-    pub lane_scales: u64,
+    pub mixed_quad_scales: u64,
     pub transforms: u64,
-    pub following: u64,
+    pub transform_links: u64,
     pub frames: u64,
     pub q: u64,
     pub list: u64,
-    pub kept_counts: u64,
-    pub kept: u64,
+    pub retained_counts: u64,
+    pub retained: u64,
     pub boxes: u64,
     pub count: u32,
     pub reserved: u32,
@@ -115,7 +115,7 @@ pub(super) struct DeformArgs {
 /// Domains of one shape, for which `batch` reads U once.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Group {
+pub(super) struct BatchGroup {
     pub first_word: u64,
     pub rest: u32,
     pub first_scale: u32,
@@ -125,10 +125,10 @@ pub(super) struct Group {
     pub members: u32,
 }
 
-/// A domain of a [`Group`].
+/// A domain of a [`BatchGroup`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Member {
+pub(super) struct BatchMember {
     pub first: u32,
     pub first_q: u32,
     pub domain: u32,
@@ -138,7 +138,7 @@ pub(super) struct Member {
 /// The work of one block of `batch`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub(super) struct Block {
+pub(super) struct BatchBlock {
     pub group: u32,
     pub tile: u32,
     pub end: u32,
@@ -157,7 +157,7 @@ pub(super) struct BatchArgs {
     pub rest: u64,
     pub scales: u64,
     pub transforms: u64,
-    pub following: u64,
+    pub transform_links: u64,
     pub frames: u64,
     pub q: u64,
     pub boxes: u64,
@@ -166,11 +166,11 @@ pub(super) struct BatchArgs {
 /// A part of a domain that `bounds` reduces to one box.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-pub struct Piece {
+pub struct BoxSegment {
     pub first: u32,
     pub count: u32,
     pub domain: u32,
-    pub of_vertices: u32,
+    pub from_vertices: u32,
 }
 
 /// Arguments of `bounds`.
@@ -179,11 +179,11 @@ pub struct Piece {
 pub(super) struct BoundsArgs {
     pub header: u64,
     pub boxes: u64,
-    pub pieces: u64,
-    pub stamps: u64,
-    pub piece_boxes: u64,
+    pub segments: u64,
+    pub change_steps: u64,
+    pub segment_boxes: u64,
     pub count: u32,
-    pub piece_count: u32,
+    pub segment_count: u32,
     pub light: [f32; 9],
     pub reserved: u32,
 }
@@ -196,11 +196,11 @@ pub(super) struct ApplyArgs {
     pub changes: u64,
     pub new_transforms: u64,
     pub new_q: u64,
-    pub stale: u64,
-    pub following: u64,
+    pub dirty_tiles: u64,
+    pub transform_links: u64,
     pub transforms: u64,
     pub q: u64,
-    pub stamps: u64,
+    pub change_steps: u64,
     pub list: u64,
 }
 
@@ -225,11 +225,11 @@ pub(super) struct NormalsArgs {
     pub rest_normals: u64,
     pub rest_tangents: u64,
     pub transforms: u64,
-    pub following: u64,
+    pub transform_links: u64,
     pub frames: u64,
-    pub stamps: u64,
+    pub change_steps: u64,
     pub members: u64,
-    pub begins: u64,
+    pub ring_offsets: u64,
     pub rings: u64,
     pub group_normals: u64,
     pub corners: u32,
@@ -239,16 +239,16 @@ pub(super) struct NormalsArgs {
 }
 
 const _: () = assert!(size_of::<Header>() == 112, "Header differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Tile>() == 32, "Tile differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Lane>() == 16, "Lane differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<WarpTile>() == 32, "WarpTile differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<MixedQuad>() == 16, "MixedQuad differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Following>() == 8, "Following differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<TransformLink>() == 8, "TransformLink differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Group>() == 32, "Group differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Member>() == 16, "Member differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Block>() == 16, "Block differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchGroup>() == 32, "BatchGroup differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchMember>() == 16, "BatchMember differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchBlock>() == 16, "BatchBlock differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BatchArgs>() == 96, "BatchArgs differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<Piece>() == 16, "Piece differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoxSegment>() == 16, "BoxSegment differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BoundsArgs>() == 88, "BoundsArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
@@ -267,18 +267,18 @@ unsafe impl DeviceRepr for NormalsArgs {}
 
 /// A size, offset or constant that must be the same on host and device.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Agreement {
-    /// The C++ expression, e.g. `OFFSET(Tile, rest)`.
+pub struct LayoutConstant {
+    /// The C++ expression, e.g. `OFFSET(WarpTile, rest)`.
     pub expression: String,
     /// Its value on the host.
     pub host: u32,
 }
 
-macro_rules! agreements {
+macro_rules! layout_constants {
     ($($of:ident { $($field:ident),* })*) => {
         vec![$(
-            Agreement { expression: concat!("sizeof(", stringify!($of), ")").into(), host: size_of::<$of>() as u32 },
-            $(Agreement {
+            LayoutConstant { expression: concat!("sizeof(", stringify!($of), ")").into(), host: size_of::<$of>() as u32 },
+            $(LayoutConstant {
                 expression: concat!("OFFSET(", stringify!($of), ", ", stringify!($field), ")").into(),
                 host: std::mem::offset_of!($of, $field) as u32,
             },)*
@@ -287,43 +287,43 @@ macro_rules! agreements {
 }
 
 /// Every size, offset and constant that host and device share, with the host's value.
-pub fn agreements() -> Vec<Agreement> {
-    let mut list = agreements! {
+pub fn layout_constants() -> Vec<LayoutConstant> {
+    let mut list = layout_constants! {
         Header {
-            positions, normals, tangents, displacements, since, everything, step, changed, stale, reserved, bounds
+            positions, normals, tangents, displacements, output_step, last_full_step, step, changed, dirty_tiles, reserved, bounds
         }
-        Tile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
-        Lane { item, rest, domain, first_q }
+        WarpTile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
+        MixedQuad { item, rest, domain, first_q }
         Change { domain, first_q, count, source }
-        Following { mover, frame }
+        TransformLink { root, frame }
         DeformArgs {
-            header, tiles, lanes, words, rest, rest_normals, rest_tangents, corner_shifts, scales, lane_scales,
-            transforms, following, frames, q, list, kept_counts, kept, boxes, count, reserved
+            header, tiles, mixed_quads, words, rest, rest_normals, rest_tangents, corner_offsets, scales, mixed_quad_scales,
+            transforms, transform_links, frames, q, list, retained_counts, retained, boxes, count, reserved
         }
-        Group { first_word, rest, first_scale, vertices, first_member, chunks, members }
-        Member { first, first_q, domain, first_tile }
-        Block { group, tile, end, reserved }
+        BatchGroup { first_word, rest, first_scale, vertices, first_member, chunks, members }
+        BatchMember { first, first_q, domain, first_tile }
+        BatchBlock { group, tile, end, reserved }
         BatchArgs {
-            header, blocks, groups, members, words, rest, scales, transforms, following, frames, q, boxes
+            header, blocks, groups, members, words, rest, scales, transforms, transform_links, frames, q, boxes
         }
-        Piece { first, count, domain, of_vertices }
-        BoundsArgs { header, boxes, pieces, stamps, piece_boxes, count, piece_count, light, reserved }
-        ApplyArgs { header, changes, new_transforms, new_q, stale, following, transforms, q, stamps, list }
+        BoxSegment { first, count, domain, from_vertices }
+        BoundsArgs { header, boxes, segments, change_steps, segment_boxes, count, segment_count, light, reserved }
+        ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {
-            header, slots, first_domains, rest_normals, rest_tangents, transforms, following, frames, stamps, members,
-            begins, rings, group_normals, corners, rest_corners, groups, reserved
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, frames, change_steps, members,
+            ring_offsets, rings, group_normals, corners, rest_corners, groups, reserved
         }
     };
     for (name, host) in [("TILE_LAST", TILE_LAST), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)] {
-        list.push(Agreement { expression: name.into(), host: u32::from(host) });
+        list.push(LayoutConstant { expression: name.into(), host: u32::from(host) });
     }
-    list.push(Agreement { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
-    list.push(Agreement { expression: "BLOCK".into(), host: BLOCK });
-    list.push(Agreement { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
-    list.push(Agreement { expression: "NO_GROUPS".into(), host: NO_GROUPS });
-    list.push(Agreement { expression: "NO_FRAME".into(), host: NO_FRAME });
-    list.push(Agreement { expression: "RING_START".into(), host: RING_START });
+    list.push(LayoutConstant { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
+    list.push(LayoutConstant { expression: "BLOCK".into(), host: BLOCK });
+    list.push(LayoutConstant { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
+    list.push(LayoutConstant { expression: "NO_GROUPS".into(), host: NO_GROUPS });
+    list.push(LayoutConstant { expression: "NO_FRAME".into(), host: NO_FRAME });
+    list.push(LayoutConstant { expression: "RING_START".into(), host: RING_START });
     list
 }
 
@@ -331,10 +331,10 @@ pub fn agreements() -> Vec<Agreement> {
 pub(super) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
 
 /// Source of a kernel `report` that writes the device's value of every agreement, in order, to its only argument.
-pub(super) fn report_source() -> String {
-    let line = |(index, agreement): (usize, &Agreement)| {
+pub(super) fn layout_kernel_source() -> String {
+    let line = |(index, agreement): (usize, &LayoutConstant)| {
         format!("    values[{index}] = (unsigned)({});\n", agreement.expression)
     };
-    let lines: String = agreements().iter().enumerate().map(line).collect();
-    format!("{PRELUDE}extern \"C\" __global__ void report(unsigned* values) {{\n{lines}}}\n")
+    let lines: String = layout_constants().iter().enumerate().map(line).collect();
+    format!("{PRELUDE}extern \"C\" __global__ void layout_values(unsigned* values) {{\n{lines}}}\n")
 }

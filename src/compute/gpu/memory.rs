@@ -7,19 +7,19 @@ use bytemuck::Pod;
 use cudarc::driver::{CudaContext, CudaSlice, DevicePtr as _, result, sys};
 
 use super::device::Device;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 
 /// Allocates zeroed bytes on the device.
-pub fn room(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
+pub fn alloc_zeroed(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
     // The driver refuses an allocation of zero bytes, and a kernel that reads nothing still needs a valid address.
-    let bytes = usize::try_from(bytes.max(16)).map_err(during("allocate"))?;
-    device.stream().alloc_zeros(bytes).map_err(during("allocate"))
+    let bytes = usize::try_from(bytes.max(16)).map_err(fault_in("allocate"))?;
+    device.stream().alloc_zeros(bytes).map_err(fault_in("allocate"))
 }
 
 /// Uploads a list into a new device buffer.
 pub fn upload<T: Pod>(device: &Device, list: &[T]) -> Result<CudaSlice<u8>> {
-    let mut buffer = room(device, size_of_val(list) as u64)?;
-    device.stream().memcpy_htod(bytemuck::cast_slice::<T, u8>(list), &mut buffer).map_err(during("upload"))?;
+    let mut buffer = alloc_zeroed(device, size_of_val(list) as u64)?;
+    device.stream().memcpy_htod(bytemuck::cast_slice::<T, u8>(list), &mut buffer).map_err(fault_in("upload"))?;
     Ok(buffer)
 }
 
@@ -40,7 +40,7 @@ pub unsafe fn download<T: Pod>(device: &Device, from: u64, to: &mut [T]) -> Resu
     // SAFETY: the caller guarantees `from`; `to` remains borrowed until the stream is synchronized.
     let copied = unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) };
     let waited = stream.synchronize();
-    copied.and(waited).map_err(during("download"))
+    copied.and(waited).map_err(fault_in("download"))
 }
 
 /// Host memory that is page-locked in place, so that the device copies into it at full speed.
@@ -57,9 +57,9 @@ impl PageLock {
     /// The list is neither moved nor freed before the lock is dropped.
     pub(super) unsafe fn new(device: &Device, list: &mut [f32]) -> Option<Self> {
         // Smaller lists share their pages with other allocations, and copying them is fast anyway.
-        const WORTH_IT: usize = 1 << 20;
+        const MIN_LOCKED_BYTES: usize = 1 << 20;
         let bytes = size_of_val(list);
-        if bytes < WORTH_IT {
+        if bytes < MIN_LOCKED_BYTES {
             return None;
         }
         let address = list.as_mut_ptr().cast();

@@ -14,59 +14,59 @@
 //! | file | content |
 //! |---|---|
 //! | `plan` | derives the kernels with their macros, the buffers and the launches from the scene |
-//! | `work`, `pack`, `rings`, `layout` | derive the tables that the kernels read from the scene; pure |
+//! | `work`, `normal_tables`, `rings`, `layout` | derive the tables that the kernels read from the scene; pure |
 //! | `inputs`, `staging` | the input values of a step and their upload |
 //! | `apply`, `batch`, `deform`, `bounds`, `normals` | the launchers |
-//! | `chain` | programmatic dependent launch: a launch that overlaps the end of the kernel before it |
-//! | `deformer`, `flight` | the graph of a step, its pinned memory and the readback of its bounds |
+//! | `dependent_launch` | programmatic dependent launch: a launch that overlaps the end of the kernel before it |
+//! | `deformer`, `step_slot` | the graph of a step, its pinned memory and the readback of its bounds |
 //! | `output`, `interop` | the output buffers |
 //! | `boxes` | a bounding box per domain, if the scene asks for them |
-//! | `rotation` | double buffering of the outputs: which one a step writes and which domains it lacks; pure |
-//! | `fetch` | asynchronous readback of vertices, concurrent with the next step |
+//! | `output_ring` | double buffering of the outputs: which one a step writes and which domains it lacks; pure |
+//! | `readback` | asynchronous readback of vertices, concurrent with the next step |
 //! | `raster` | compute rasterizer: triangles to samples in OpenGL's buffers, next to OpenGL's own rasterizer |
 //! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
-//! | `probe`, `report` | device capabilities; check that host and device agree on struct layouts |
-//! | `trials` | benchmark kernels |
+//! | `probe`, `layout_check` | device capabilities; check that host and device agree on struct layouts |
+//! | `benchmarks` | benchmark kernels |
 
 pub mod apply;
 mod batch;
 pub mod bounds;
 mod boxes;
-mod chain;
 mod compile;
 pub mod deform;
 mod deformer;
+mod dependent_launch;
 mod device;
-mod fetch;
-mod flight;
 pub mod inputs;
 mod interop;
 pub mod layout;
+mod layout_check;
 pub mod memory;
+mod normal_tables;
 pub mod normals;
 mod output;
-mod pack;
+mod output_ring;
 pub mod plan;
 mod probe;
 pub mod raster;
-mod report;
+mod readback;
 mod rings;
-mod rotation;
 pub mod staging;
+mod step_slot;
 pub mod work;
 
 #[cfg(any(test, feature = "testing"))]
-pub use compile::{Assembled, assert_compiles};
-pub use deformer::{CudaDeformer, MOST_UNDER_WAY};
+pub use compile::{CompiledVariant, assert_compiles};
+pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
 pub use device::Device;
-pub use layout::{Agreement, agreements};
-pub use plan::{Buffer, Kernel, Launch, LeftOut, Plan, Role, plan};
+pub use layout::{LayoutConstant, layout_constants};
+pub use layout_check::device_layout_values;
+pub use plan::{BufferDescriptor, BufferRole, DeformPlan, KernelDescriptor, KernelKind, OmittedFeature, plan};
 pub use probe::{DeviceInfo, Probe, probe};
-pub use raster::{GlRaster, RasterForm, Spread};
-pub use report::device_values;
+pub use raster::{CudaRasterizer, RasterGranularity, RasterVariant};
 /// Names of the OpenGL buffers that receive the output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct GlBuffers {
+pub struct GlVertexBuffers {
     /// 3 f32 per vertex.
     pub positions: u32,
     /// 3 f32 per corner.

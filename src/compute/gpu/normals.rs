@@ -2,21 +2,21 @@
 
 use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig};
 
-use super::chain;
 use super::deform::config;
+use super::dependent_launch;
 use super::device::Device;
-use super::inputs::Values;
+use super::inputs::InputAddresses;
 use super::layout::NormalsArgs;
 use super::memory::{address, upload};
-use super::pack;
-use super::plan::Kernel;
-use super::rings::{self, Rings};
+use super::normal_tables;
+use super::plan::KernelDescriptor;
+use super::rings::{self, RingTables};
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 
 /// The kernel and its constant tables.
 #[derive(Debug)]
-pub struct Normals {
+pub struct NormalsKernel {
     pub function: CudaFunction,
     config: LaunchConfig,
     slots: CudaSlice<u8>,
@@ -24,7 +24,7 @@ pub struct Normals {
     rest_normals: CudaSlice<u8>,
     rest_tangents: Option<CudaSlice<u8>>,
     members: CudaSlice<u8>,
-    begins: CudaSlice<u8>,
+    ring_offsets: CudaSlice<u8>,
     rings: CudaSlice<u8>,
     group_normals: CudaSlice<u8>,
     corners: u32,
@@ -32,32 +32,32 @@ pub struct Normals {
     groups: u32,
 }
 
-impl Normals {
-    pub fn new(device: &Device, scene: &Scene, kernel: &Kernel) -> Result<Self> {
+impl NormalsKernel {
+    pub fn new(device: &Device, scene: &Scene, kernel: &KernelDescriptor) -> Result<Self> {
         let slots = rings::slots(scene);
-        let firsts = pack::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners);
-        let tangents = || upload(device, &pack::rest_tangents(scene));
-        let tables = Rings::new(scene);
+        let firsts = normal_tables::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners);
+        let tangents = || upload(device, &normal_tables::rest_tangents(scene));
+        let tables = RingTables::new(scene);
         Ok(Self {
             function: device.function(kernel.name, kernel.source.0, &kernel.defines)?,
             config: config(kernel),
             slots: upload(device, &slots)?,
             first_domains: upload(device, &firsts)?,
-            rest_normals: upload(device, &pack::rest_normals(scene))?,
+            rest_normals: upload(device, &normal_tables::rest_normals(scene))?,
             rest_tangents: scene.needs.normal_maps.then(tangents).transpose()?,
             members: upload(device, &tables.members)?,
-            begins: upload(device, &tables.begins)?,
+            ring_offsets: upload(device, &tables.ring_offsets)?,
             rings: upload(device, &tables.rings)?,
             group_normals: upload(device, &tables.normals)?,
             corners: scene.layout.corners as u32,
-            rest_corners: pack::rest_corners(scene) as u32,
+            rest_corners: normal_tables::rest_corners(scene) as u32,
             groups: (tables.normals.len() / 3) as u32,
         })
     }
 
     /// Starts the kernel after the one that writes the positions. The header among `values` has the addresses of the
     /// positions, normals and tangents.
-    pub fn launch(&self, device: &Device, values: Values) -> Result<()> {
+    pub fn launch(&self, device: &Device, values: InputAddresses) -> Result<()> {
         let args = NormalsArgs {
             header: values.header,
             slots: address(device, &self.slots),
@@ -65,11 +65,11 @@ impl Normals {
             rest_normals: address(device, &self.rest_normals),
             rest_tangents: self.rest_tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
             transforms: values.transforms,
-            following: values.following,
+            transform_links: values.transform_links,
             frames: values.frames,
-            stamps: values.stamps,
+            change_steps: values.change_steps,
             members: address(device, &self.members),
-            begins: address(device, &self.begins),
+            ring_offsets: address(device, &self.ring_offsets),
             rings: address(device, &self.rings),
             group_normals: address(device, &self.group_normals),
             corners: self.corners,
@@ -78,10 +78,10 @@ impl Normals {
             reserved: 0,
         };
         // SAFETY: `NormalsArgs` is the kernel's only argument, and the kernel calls `await_previous` before it accesses
-        // memory. The tables come from `pack` and `rings`: members refer to groups, rings refer to vertices of their
+        // memory. The tables come from `normal_tables` and `rings`: members refer to groups, rings refer to vertices of their
         // shape, and slots lie inside the rest normals, tangents, positions and transforms of the same scene. The
-        // header's outputs have the sizes that `Output` checked. Tangents are read and written only by a kernel that
+        // header's outputs have the sizes that `OutputBuffers` checked. Tangents are read and written only by a kernel that
         // was compiled for a scene with normal maps.
-        unsafe { chain::launch(device, &self.function, self.config, &args) }
+        unsafe { dependent_launch::launch(device, &self.function, self.config, &args) }
     }
 }

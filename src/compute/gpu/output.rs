@@ -2,17 +2,17 @@
 
 use cudarc::driver::CudaSlice;
 
-use super::GlBuffers;
+use super::GlVertexBuffers;
 use super::device::Device;
-use super::interop::{Access, Interop};
-use super::memory::{address, download, room};
-use super::plan::{Plan, Role};
-use modalcast_model::deform::Surface;
+use super::interop::{MapAccess, RegisteredOutputs};
+use super::memory::{address, alloc_zeroed, download};
+use super::plan::{BufferRole, DeformPlan};
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Result;
 
 /// Device addresses of the outputs, valid while the outputs are mapped; `tangents` is 0 when the scene has none.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Addresses {
+pub(super) struct OutputAddresses {
     pub positions: u64,
     pub normals: u64,
     pub tangents: u64,
@@ -20,16 +20,16 @@ pub(super) struct Addresses {
 
 /// The three output buffers; each has at least the bytes of the plan.
 #[derive(Debug)]
-pub(super) enum Output {
+pub(super) enum OutputBuffers {
     /// One set, or two after a step was submitted while the host reads the other set.
-    Own(Vec<Buffers>),
+    Owned(Vec<OutputSet>),
     /// Buffers that OpenGL draws from, so there is one set.
-    Shared(Interop),
+    Shared(RegisteredOutputs),
 }
 
 /// A set of owned buffers.
 #[derive(Debug)]
-pub(super) struct Buffers {
+pub(super) struct OutputSet {
     positions: CudaSlice<u8>,
     normals: CudaSlice<u8>,
     tangents: Option<CudaSlice<u8>>,
@@ -37,28 +37,28 @@ pub(super) struct Buffers {
 
 /// An access to an output set.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Use {
+pub(super) struct OutputAccess {
     pub set: usize,
-    pub access: Access,
+    pub access: MapAccess,
 }
 
 /// Bytes of positions, normals and tangents.
-pub(super) fn sizes(plan: &Plan) -> [u64; 3] {
-    [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role))
+pub(super) fn output_sizes(plan: &DeformPlan) -> [u64; 3] {
+    [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents].map(|role| plan.bytes(role))
 }
 
-impl Buffers {
-    fn new(device: &Device, plan: &Plan) -> Result<Self> {
-        let [positions, normals, tangents] = sizes(plan);
+impl OutputSet {
+    fn new(device: &Device, plan: &DeformPlan) -> Result<Self> {
+        let [positions, normals, tangents] = output_sizes(plan);
         Ok(Self {
-            positions: room(device, positions)?,
-            normals: room(device, normals)?,
-            tangents: (tangents > 0).then(|| room(device, tangents)).transpose()?,
+            positions: alloc_zeroed(device, positions)?,
+            normals: alloc_zeroed(device, normals)?,
+            tangents: (tangents > 0).then(|| alloc_zeroed(device, tangents)).transpose()?,
         })
     }
 
-    fn addresses(&self, device: &Device) -> Addresses {
-        Addresses {
+    fn addresses(&self, device: &Device) -> OutputAddresses {
+        OutputAddresses {
             positions: address(device, &self.positions),
             normals: address(device, &self.normals),
             tangents: self.tangents.as_ref().map_or(0, |buffer| address(device, buffer)),
@@ -66,15 +66,15 @@ impl Buffers {
     }
 }
 
-impl Output {
+impl OutputBuffers {
     /// Uses OpenGL's buffers if they are given and the driver registers them. A refusal is logged, not returned.
-    pub(super) fn new(device: &Device, plan: &Plan, gl: Option<GlBuffers>) -> Result<Self> {
-        match gl.map(|buffers| Interop::register(device, buffers, sizes(plan))) {
+    pub(super) fn new(device: &Device, plan: &DeformPlan, gl: Option<GlVertexBuffers>) -> Result<Self> {
+        match gl.map(|buffers| RegisteredOutputs::register(device, buffers, output_sizes(plan))) {
             Some(Ok(interop)) => return Ok(Self::Shared(interop)),
             Some(Err(error)) => tracing::warn!(%error, "vertices are copied: CUDA cannot write into OpenGL's buffers"),
             None => {}
         }
-        Ok(Self::Own(vec![Buffers::new(device, plan)?]))
+        Ok(Self::Owned(vec![OutputSet::new(device, plan)?]))
     }
 
     pub(super) const fn is_shared(&self) -> bool {
@@ -82,14 +82,14 @@ impl Output {
     }
 
     /// Maximum number of sets.
-    pub(super) const fn most(&self) -> usize {
+    pub(super) const fn max_sets(&self) -> usize {
         if self.is_shared() { 1 } else { 2 }
     }
 
     /// Number of allocated sets.
     pub(super) fn count(&self) -> usize {
         match self {
-            Self::Own(sets) => sets.len(),
+            Self::Owned(sets) => sets.len(),
             Self::Shared(_) => 1,
         }
     }
@@ -98,10 +98,10 @@ impl Output {
     ///
     /// # Errors
     /// `Fault` when the device has not enough memory; the existing sets remain unchanged.
-    pub(super) fn ensure(&mut self, device: &Device, plan: &Plan, set: usize) -> Result<()> {
+    pub(super) fn ensure_set(&mut self, device: &Device, plan: &DeformPlan, set: usize) -> Result<()> {
         match self {
-            Self::Own(sets) if sets.len() <= set => {
-                sets.push(Buffers::new(device, plan)?);
+            Self::Owned(sets) if sets.len() <= set => {
+                sets.push(OutputSet::new(device, plan)?);
                 Ok(())
             }
             _ => Ok(()),
@@ -109,8 +109,8 @@ impl Output {
     }
 
     /// Copies a set into `surface`, whose lists have the right lengths, and waits for the copies.
-    pub(super) fn read(&mut self, device: &Device, set: usize, surface: &mut Surface) -> Result<()> {
-        self.with(device, Use { set, access: Access::Read }, |from| {
+    pub(super) fn read(&mut self, device: &Device, set: usize, surface: &mut DeformedSurface) -> Result<()> {
+        self.with_addresses(device, OutputAccess { set, access: MapAccess::Read }, |from| {
             // SAFETY: the outputs have the bytes of the plan, from which the lists have their lengths.
             unsafe {
                 download(device, from.positions, &mut surface.positions)?;
@@ -122,15 +122,15 @@ impl Output {
 
     /// Runs `work` with the addresses of an existing set, mapped if it is shared. `work` submits to the device's
     /// stream.
-    pub(super) fn with(
+    pub(super) fn with_addresses(
         &mut self,
         device: &Device,
-        Use { set, access }: Use,
-        work: impl FnOnce(Addresses) -> Result<()>,
+        OutputAccess { set, access }: OutputAccess,
+        work: impl FnOnce(OutputAddresses) -> Result<()>,
     ) -> Result<()> {
         match self {
-            Self::Shared(interop) => interop.mapped(device, access, work),
-            Self::Own(sets) => work(sets[set].addresses(device)),
+            Self::Shared(interop) => interop.with_mapped(device, access, work),
+            Self::Owned(sets) => work(sets[set].addresses(device)),
         }
     }
 }

@@ -8,37 +8,37 @@
 //!
 //! | file | content |
 //! |---|---|
-//! | [`form`] | the variants of the kernels |
+//! | [`variant`] | the variants of the kernels |
 //! | [`check`] | validation of meshes |
 //! | [`mod@cut_out`] | texture coordinates, surfaces and images of cut-outs |
-//! | [`opengl`] | positions and samples in OpenGL's buffers |
+//! | [`cuda_rasterizer`] | positions and samples in OpenGL's buffers |
 
 mod check;
+mod cuda_rasterizer;
 mod cut_out;
-mod form;
-mod opengl;
+mod variant;
 
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::sys::{self, CUdevice_attribute};
 use cudarc::driver::{CudaFunction, CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
 pub use self::check::{check, check_cut_outs};
-use self::cut_out::Cut;
-pub(super) use self::form::{FUNCTIONS, SOURCE, WHOLE};
-pub use self::form::{RasterForm, Spread};
-pub use self::opengl::GlRaster;
+pub use self::cuda_rasterizer::CudaRasterizer;
+use self::cut_out::CutOutBuffers;
+pub(super) use self::variant::{FUNCTIONS, OPAQUE_FUNCTIONS, SOURCE};
+pub use self::variant::{RasterGranularity, RasterVariant};
 use super::device::Device;
-use super::memory::{address, download, room, upload};
-use modalcast_model::error::{Result, during};
+use super::memory::{address, alloc_zeroed, download, upload};
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::CutOuts;
-use modalcast_model::scene::{Faces, Group, Window};
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 /// Threads per block, and resident blocks per multiprocessor for kernels that loop over a queue.
 const BLOCK: u32 = 128;
-const RESIDENT: u32 = 16;
+const BLOCKS_PER_SM: u32 = 16;
 
 /// Clear value of a sample.
-const NOTHING: u32 = u32::MAX;
+const EMPTY_SAMPLE: u32 = u32::MAX;
 
 /// Arguments of all kernels; pointers are device addresses.
 #[repr(C)]
@@ -49,10 +49,10 @@ struct RasterArgs {
     target: u64,
     medium: u64,
     large: u64,
-    tally: u64,
+    counters: u64,
     uvs: u64,
-    surfaces: u64,
-    table: u64,
+    material_indices: u64,
+    materials: u64,
     clip: [f32; 16],
     half: [f32; 2],
     guard: [f32; 2],
@@ -60,7 +60,7 @@ struct RasterArgs {
     first: u32,
     count: u32,
     faces: u32,
-    cut: u32,
+    first_cut_out: u32,
 }
 
 const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from kernels/raster.cuh");
@@ -71,50 +71,51 @@ unsafe impl DeviceRepr for RasterArgs {}
 /// Lengths of the queues, and triangle counts by path.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
-struct Tally {
+struct RasterCounters {
     medium: u32,
     pad: u32,
     large: u64,
     counts: [u32; 8],
 }
 
-const _: () = assert!(size_of::<Tally>() == 48, "Tally differs from kernels/raster.cuh");
+const _: () = assert!(size_of::<RasterCounters>() == 48, "RasterCounters differs from kernels/raster.cuh");
 
 /// Bytes per entry of the large queue.
-const LARGE: u64 = 16;
+const LARGE_ENTRY_BYTES: u64 = 16;
 
 /// The compiled kernels of one form.
 #[derive(Debug)]
-pub struct Functions {
-    form: RasterForm,
+pub struct RasterFunctions {
+    variant: RasterVariant,
     raster: CudaFunction,
     /// Only for meshes with cut-outs.
-    raster_cut: Option<CudaFunction>,
+    raster_cut_outs: Option<CudaFunction>,
     raster_warps: CudaFunction,
     raster_tiles: CudaFunction,
 }
 
-impl Functions {
+impl RasterFunctions {
     /// Compiles the kernels of a form, or takes them from the cache.
     ///
     /// # Errors
     /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
-    pub fn new(device: &Device, form: RasterForm, cut: bool) -> Result<Self> {
-        let names: &[&str] = if cut { &FUNCTIONS } else { &WHOLE };
-        let mut list = device.functions(names, SOURCE, &form.defines(cut))?.into_iter();
-        let mut next = || list.next().ok_or_else(|| during("load kernel")("a function is missing"));
+    pub fn new(device: &Device, variant: RasterVariant, cut: bool) -> Result<Self> {
+        let names: &[&str] = if cut { &FUNCTIONS } else { &OPAQUE_FUNCTIONS };
+        let mut list = device.functions(names, SOURCE, &variant.defines(cut))?.into_iter();
+        let mut next = || list.next().ok_or_else(|| fault_in("load kernel")("a function is missing"));
         Ok(Self {
-            form,
+            variant,
             raster: next()?,
-            raster_cut: if cut { Some(next()?) } else { None },
+            raster_cut_outs: if cut { Some(next()?) } else { None },
             raster_warps: next()?,
             raster_tiles: next()?,
         })
     }
 
     /// The functions with their names.
-    pub fn named(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
-        let list = [Some(&self.raster), self.raster_cut.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
+    pub fn with_names(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
+        let list =
+            [Some(&self.raster), self.raster_cut_outs.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
         FUNCTIONS.into_iter().zip(list).filter_map(|(name, function)| function.map(|function| (name, function)))
     }
 }
@@ -122,47 +123,47 @@ impl Functions {
 /// The inputs of one pass. `positions` and `target` are device addresses, of the vertices that [`check`] was called
 /// with and of one sample per pixel.
 #[derive(Debug, Clone, Copy)]
-pub struct Pass<'a> {
-    pub functions: &'a Functions,
-    pub groups: &'a [Group],
-    pub window: &'a Window,
+pub struct RasterPass<'a> {
+    pub functions: &'a RasterFunctions,
+    pub groups: &'a [DrawRange],
+    pub window: &'a Viewport,
     pub positions: u64,
     pub target: u64,
 }
 
 /// A mesh's triangles on the device, and the queues between the kernels.
 #[derive(Debug)]
-pub struct Core {
+pub struct RasterPipeline {
     triangles: CudaSlice<u8>,
     medium: CudaSlice<u8>,
     large: CudaSlice<u8>,
-    tally: CudaSlice<u8>,
-    cut: Option<Cut>,
+    counters: CudaSlice<u8>,
+    cut: Option<CutOutBuffers>,
     /// Blocks of the kernels that loop over a queue.
     blocks: u32,
 }
 
-impl Core {
+impl RasterPipeline {
     /// Uploads triangles and cut-outs, which [`check`] and [`check_cut_outs`] must have accepted.
     ///
     /// # Errors
     /// `Fault` when the device refuses.
     pub fn new(device: &Device, triangles: &[[u32; 3]], cut_outs: Option<&CutOuts>) -> Result<Self> {
         let units = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT);
-        let units = u32::try_from(units.map_err(during("device"))?).unwrap_or(1);
+        let units = u32::try_from(units.map_err(fault_in("device"))?).unwrap_or(1);
         let count = triangles.len() as u64;
         Ok(Self {
             triangles: upload(device, triangles.as_flattened())?,
-            medium: room(device, 4 * count)?,
-            large: room(device, LARGE * count)?,
-            tally: room(device, size_of::<Tally>() as u64)?,
-            cut: cut_outs.map(|cut_outs| Cut::new(device, cut_outs)).transpose()?,
-            blocks: RESIDENT * units,
+            medium: alloc_zeroed(device, 4 * count)?,
+            large: alloc_zeroed(device, LARGE_ENTRY_BYTES * count)?,
+            counters: alloc_zeroed(device, size_of::<RasterCounters>() as u64)?,
+            cut: cut_outs.map(|cut_outs| CutOutBuffers::new(device, cut_outs)).transpose()?,
+            blocks: BLOCKS_PER_SM * units,
         })
     }
 
     /// Whether its passes need the functions for cut-outs.
-    pub const fn is_cut(&self) -> bool {
+    pub const fn has_cut_outs(&self) -> bool {
         self.cut.is_some()
     }
 
@@ -170,14 +171,14 @@ impl Core {
     ///
     /// # Errors
     /// `Fault` when the device refuses.
-    pub fn draw(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
+    pub fn draw(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         self.clear(device, pass)?;
         let (args, functions) = (self.args(device, pass), pass.functions);
         for group in pass.groups {
             let (whole, cut) = self.split(*group);
-            for (function, own) in [(Some(&functions.raster), whole), (functions.raster_cut.as_ref(), cut)] {
+            for (function, own) in [(Some(&functions.raster), whole), (functions.raster_cut_outs.as_ref(), cut)] {
                 if let Some(function) = function.filter(|_| own.triangles > 0) {
-                    let faces = u32::from(own.faces == Faces::Fronts);
+                    let faces = u32::from(own.faces == CullMode::Back);
                     let args = RasterArgs { first: own.first, count: own.triangles, faces, ..args };
                     start(device, function, own.triangles.div_ceil(BLOCK), args)?;
                 }
@@ -188,8 +189,8 @@ impl Core {
     }
 
     /// Number of launches of a pass over these groups.
-    pub fn launches(&self, groups: &[Group]) -> usize {
-        let of_group = |group: &Group| {
+    pub fn launches(&self, groups: &[DrawRange]) -> usize {
+        let of_group = |group: &DrawRange| {
             let (whole, cut) = self.split(*group);
             usize::from(whole.triangles > 0) + usize::from(cut.triangles > 0)
         };
@@ -197,11 +198,11 @@ impl Core {
     }
 
     /// Splits a group before the first cut-out.
-    fn split(&self, group: Group) -> (Group, Group) {
+    fn split(&self, group: DrawRange) -> (DrawRange, DrawRange) {
         let first = self.cut.as_ref().map_or(u32::MAX, |cut| cut.first);
         let whole = first.saturating_sub(group.first).min(group.triangles);
-        let cut = Group { first: group.first + whole, triangles: group.triangles - whole, ..group };
-        (Group { triangles: whole, ..group }, cut)
+        let cut = DrawRange { first: group.first + whole, triangles: group.triangles - whole, ..group };
+        (DrawRange { triangles: whole, ..group }, cut)
     }
 
     /// Triangle counts of the last pass, indexed by `Path` of the kernels; zeros unless the form counts.
@@ -209,13 +210,13 @@ impl Core {
     /// # Errors
     /// `Fault` when the device fails.
     pub fn counts(&self, device: &Device) -> Result<[u32; 8]> {
-        let mut tally = [Tally::zeroed()];
-        // SAFETY: the buffer has the size of one `Tally`.
-        unsafe { download(device, address(device, &self.tally), &mut tally) }?;
-        Ok(tally[0].counts)
+        let mut counters = [RasterCounters::zeroed()];
+        // SAFETY: the buffer has the size of one `RasterCounters`.
+        unsafe { download(device, address(device, &self.counters), &mut counters) }?;
+        Ok(counters[0].counts)
     }
 
-    fn args(&self, device: &Device, pass: &Pass<'_>) -> RasterArgs {
+    fn args(&self, device: &Device, pass: &RasterPass<'_>) -> RasterArgs {
         let cut = self.cut.as_ref();
         let addresses = cut.map(|cut| cut.addresses(device)).unwrap_or_default();
         RasterArgs {
@@ -224,30 +225,30 @@ impl Core {
             target: pass.target,
             medium: address(device, &self.medium),
             large: address(device, &self.large),
-            tally: address(device, &self.tally),
+            counters: address(device, &self.counters),
             clip: *pass.window.clip(),
             half: pass.window.half(),
             guard: pass.window.guard(),
             size: pass.window.size(),
             uvs: addresses.uvs,
-            surfaces: addresses.surfaces,
-            table: addresses.table,
-            cut: cut.map_or(u32::MAX, |cut| cut.first),
+            material_indices: addresses.material_indices,
+            materials: addresses.materials,
+            first_cut_out: cut.map_or(u32::MAX, |cut| cut.first),
             ..RasterArgs::zeroed()
         }
     }
 
     /// Empties the queues and clears the samples.
-    fn clear(&self, device: &Device, pass: &Pass<'_>) -> Result<()> {
-        let form = pass.functions.form;
-        let nothing = if form.depth_only { 1.0_f32.to_bits() } else { NOTHING };
-        let words = form.bytes(pass.window) / 4;
-        let tally = (address(device, &self.tally), 0, size_of::<Tally>() as u64 / 4);
-        for (buffer, word, words) in [(pass.target, nothing, words), tally] {
+    fn clear(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
+        let variant = pass.functions.variant;
+        let nothing = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
+        let words = variant.bytes(pass.window) / 4;
+        let counters = (address(device, &self.counters), 0, size_of::<RasterCounters>() as u64 / 4);
+        for (buffer, word, words) in [(pass.target, nothing, words), counters] {
             let stream = device.stream().cu_stream();
             // SAFETY: the buffer has at least this many words. The stream orders the write before its readers.
             let set = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
-            set.result().map_err(during("raster"))?;
+            set.result().map_err(fault_in("raster"))?;
         }
         Ok(())
     }
@@ -259,6 +260,6 @@ fn start(device: &Device, function: &CudaFunction, blocks: u32, args: RasterArgs
     // SAFETY: `RasterArgs` is the kernels' only argument. `check` verified that triangles refer to existing vertices
     // and groups to existing triangles. The queues have capacity for each triangle, and the target has a sample for
     // each pixel.
-    unsafe { launch.arg(&args).launch(config) }.map_err(during("raster"))?;
+    unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("raster"))?;
     Ok(())
 }

@@ -1,17 +1,17 @@
 //! Tables of `normals` for smoothing groups: the ring of vertices around each group. Pure.
 
 use super::layout::{NO_GROUPS, NormalSlot};
-use super::pack;
-use modalcast_model::domain::{Shape, Smoothing};
+use super::normal_tables;
+use modalcast_model::domain::{Shape, SmoothingGroups};
 use modalcast_model::scene::Scene;
 
 /// The tables; groups are numbered through all shapes.
 #[derive(Debug, Default)]
-pub(super) struct Rings {
+pub(super) struct RingTables {
     /// The group of each corner of the shapes that have groups.
     pub members: Vec<u32>,
     /// Offset of each group's ring, and the end of the last one.
-    pub begins: Vec<u32>,
+    pub ring_offsets: Vec<u32>,
     pub rings: Vec<u32>,
     /// Geometric normals at rest, one plane per axis.
     pub normals: Vec<f32>,
@@ -19,17 +19,17 @@ pub(super) struct Rings {
 
 /// Lengths of the tables.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Counts {
+pub(super) struct RingCounts {
     pub members: u64,
     pub groups: u64,
     pub rings: u64,
 }
 
-fn smoothings(scene: &Scene) -> impl Iterator<Item = &Smoothing> {
+fn smoothings(scene: &Scene) -> impl Iterator<Item = &SmoothingGroups> {
     scene.shapes.iter().filter_map(Shape::smoothing)
 }
 
-impl Counts {
+impl RingCounts {
     pub(super) fn of(scene: &Scene) -> Self {
         smoothings(scene).fold(Self::default(), |sum, smoothing| Self {
             members: sum.members + smoothing.members().len() as u64,
@@ -40,24 +40,24 @@ impl Counts {
 
     /// Bytes that the members would need in a scene with exact normals. The size of its rings is unknown until they are
     /// built.
-    pub(super) fn bytes_of_possible_members(scene: &Scene) -> u64 {
+    pub(super) fn possible_corner_group_bytes(scene: &Scene) -> u64 {
         let shapes = scene.shapes.iter().filter(|shape| shape.modes.rank() > 0);
         shapes.map(|shape| 4 * shape.mesh.corners().vertices.len() as u64).sum()
     }
 }
 
-impl Rings {
+impl RingTables {
     pub(super) fn new(scene: &Scene) -> Self {
         let mut all = Self::default();
         for smoothing in smoothings(scene) {
             // Every index fits: a scene has at most `MAX_RING_TRIANGLES` triangles in rings.
-            let (group, ring) = (all.begins.len() as u32, all.rings.len() as u32);
+            let (group, ring) = (all.ring_offsets.len() as u32, all.rings.len() as u32);
             all.members.extend(smoothing.members().iter().map(|member| member + group));
-            all.begins.extend(smoothing.begins()[..smoothing.groups()].iter().map(|begin| begin + ring));
+            all.ring_offsets.extend(smoothing.ring_offsets()[..smoothing.groups()].iter().map(|begin| begin + ring));
             all.rings.extend_from_slice(smoothing.rings());
         }
-        all.begins.push(all.rings.len() as u32);
-        let plane = |axis: usize| smoothings(scene).flat_map(Smoothing::normals).map(move |normal| normal[axis]);
+        all.ring_offsets.push(all.rings.len() as u32);
+        let plane = |axis: usize| smoothings(scene).flat_map(SmoothingGroups::normals).map(move |normal| normal[axis]);
         all.normals = (0..3).flat_map(plane).collect();
         all
     }
@@ -75,8 +75,8 @@ pub(super) fn slots(scene: &Scene) -> Vec<NormalSlot> {
     };
     let first_members: Vec<u32> = scene.shapes.iter().map(first_member).collect();
     let slot = |(corner, (domain, slot)): (
-        super::pack::CornerSlot,
-        (&modalcast_model::domain::Domain, &modalcast_model::scene::Slot),
+        super::normal_tables::CornerSlot,
+        (&modalcast_model::domain::Domain, &modalcast_model::scene::DomainLayout),
     )| {
         NormalSlot {
             first: corner.first,
@@ -87,20 +87,20 @@ pub(super) fn slots(scene: &Scene) -> Vec<NormalSlot> {
         }
     };
     let domains = scene.domains.iter().zip(&scene.layout.slots);
-    pack::corner_slots(scene).into_iter().zip(domains).map(slot).collect()
+    normal_tables::corner_slots(scene).into_iter().zip(domains).map(slot).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::pack::tests::exact;
+    use super::super::normal_tables::tests::exact;
     use super::*;
 
     #[test]
     fn every_corner_finds_the_ring_and_the_normal_of_its_group_and_rigid_shapes_have_none() {
         let scene = exact(&[(7, 2), (300, 0), (8, 5), (513, 1)]);
-        let (rings, slots, counts) = (Rings::new(&scene), slots(&scene), Counts::of(&scene));
+        let (rings, slots, counts) = (RingTables::new(&scene), slots(&scene), RingCounts::of(&scene));
         assert_eq!(counts.members as usize, rings.members.len());
-        assert_eq!((counts.groups as usize + 1, counts.rings as usize), (rings.begins.len(), rings.rings.len()));
+        assert_eq!((counts.groups as usize + 1, counts.rings as usize), (rings.ring_offsets.len(), rings.rings.len()));
         assert_eq!(slots[2].first_member, NO_GROUPS);
         assert_eq!(slots[4].first_member, slots[5].first_member, "instances share");
         for (domain, slot) in slots.iter().enumerate() {
@@ -108,7 +108,7 @@ mod tests {
             let Some(smoothing) = scene.shape_of(domain).smoothing() else { continue };
             for (corner, member) in smoothing.members().iter().enumerate() {
                 let group = rings.members[slot.first_member as usize + corner] as usize;
-                let ring = &rings.rings[rings.begins[group] as usize..rings.begins[group + 1] as usize];
+                let ring = &rings.rings[rings.ring_offsets[group] as usize..rings.ring_offsets[group + 1] as usize];
                 assert_eq!(ring, smoothing.ring(*member as usize));
                 let normal = [0, 1, 2].map(|axis| rings.normals[axis * counts.groups as usize + group]);
                 assert_eq!(normal, smoothing.normals()[*member as usize]);

@@ -6,14 +6,14 @@ use bytemuck::Pod;
 use rayon::prelude::*;
 
 /// Bytes from which several cores write. `report deform` measures both ways below and above this limit (`host_writes`).
-pub const PARALLEL: usize = 1 << 20;
+pub const PARALLEL_THRESHOLD: usize = 1 << 20;
 /// Words per parallel part: long runs, but enough parts for many cores.
-const PART: usize = 1 << 15;
+const PART_WORDS: usize = 1 << 15;
 
 /// The unwritten rest of a list, written from its front.
-pub(super) struct Front<'a>(&'a mut [f32]);
+pub(super) struct SliceWriter<'a>(&'a mut [f32]);
 
-impl<'a> Front<'a> {
+impl<'a> SliceWriter<'a> {
     pub(super) const fn new(list: &'a mut [f32]) -> Self {
         Self(list)
     }
@@ -33,25 +33,25 @@ impl<'a> Front<'a> {
 
 /// Copies on several cores if the list is large enough.
 fn copy(to: &mut [f32], from: &[f32]) {
-    if size_of_val(from) < PARALLEL { to.copy_from_slice(from) } else { copy_on_all_cores(to, from) }
+    if size_of_val(from) < PARALLEL_THRESHOLD { to.copy_from_slice(from) } else { parallel_copy(to, from) }
 }
 
 /// Copies part by part; both lists have the same length.
-pub fn copy_on_all_cores(to: &mut [f32], from: &[f32]) {
-    to.par_chunks_mut(PART).zip(from.par_chunks(PART)).for_each(|(to, from)| to.copy_from_slice(from));
+pub fn parallel_copy(to: &mut [f32], from: &[f32]) {
+    to.par_chunks_mut(PART_WORDS).zip(from.par_chunks(PART_WORDS)).for_each(|(to, from)| to.copy_from_slice(from));
 }
 
 /// Fills a list of items, whose first words `firsts` ascend, by `fill(items, part)`. A large list is cut at item
 /// boundaries into parts that several cores fill.
 pub(super) fn fill_parts(list: &mut [f32], firsts: &[u32], fill: impl Fn(Range<usize>, &mut [f32]) + Sync) {
-    if size_of_val(list) < PARALLEL {
+    if size_of_val(list) < PARALLEL_THRESHOLD {
         fill(0..firsts.len(), list);
         return;
     }
     let (mut parts, mut rest, mut begin) = (Vec::new(), list, 0);
     let mut done = firsts.first().map_or(0, |first| *first as usize);
     while begin < firsts.len() {
-        let end = firsts.partition_point(|first| (*first as usize) < done + PART).max(begin + 1);
+        let end = firsts.partition_point(|first| (*first as usize) < done + PART_WORDS).max(begin + 1);
         let until = firsts.get(end).map_or(done + rest.len(), |first| *first as usize);
         let (part, after) = rest.split_at_mut(until - done);
         parts.push((begin..end, part));
@@ -66,10 +66,17 @@ mod tests {
 
     #[test]
     fn short_and_long_lists_arrive_in_their_order() {
-        for words in [0, 1, PARALLEL / 4 - 1, PARALLEL / 4, PARALLEL / 4 + 1, PARALLEL + 3] {
+        for words in [
+            0,
+            1,
+            PARALLEL_THRESHOLD / 4 - 1,
+            PARALLEL_THRESHOLD / 4,
+            PARALLEL_THRESHOLD / 4 + 1,
+            PARALLEL_THRESHOLD + 3,
+        ] {
             let numbers: Vec<f32> = (0..words).map(|at| at as f32).collect();
             let mut list = vec![-1.0; words + 3];
-            let mut front = Front::new(&mut list);
+            let mut front = SliceWriter::new(&mut list);
             front.put(&[7_u32]);
             front.put(&numbers);
             front.take(1).fill(9.0);

@@ -1,15 +1,15 @@
 //! x = T (x0 + U q), equation 3.9 of the thesis, for every vertex of every domain. Twin of `kernels/deform.cu`.
 
 use modalcast_model::domain::Shape;
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// World positions relative to their domains' cells, three f64 per vertex, in the packed order of the scene's layout.
-pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
+pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut positions = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {
         let shape = scene.shape_of(domain);
         let q = state.q_of(scene, domain);
-        let world_from_domain = state.composed(scene, domain).exact();
+        let world_from_domain = state.composed_transform(scene, domain).exact();
         for (vertex, rest) in shape.mesh.rest().iter().enumerate() {
             let mut bent = rest.map(f64::from);
             add_modes(shape, q, vertex, &mut bent);
@@ -23,7 +23,7 @@ pub fn deform(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
 }
 
 /// u = U q of every vertex in the frame of its domain, three f64 each, in the packed order of the scene's layout.
-pub fn displacements(scene: &Scene, state: &State) -> Vec<[f64; 3]> {
+pub fn displacements(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut displacements = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));

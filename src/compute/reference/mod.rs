@@ -2,36 +2,36 @@
 
 mod deform;
 mod normals;
-mod orient;
 pub mod raster;
+mod rigid_normals;
 
 use std::sync::Arc;
 use std::time::Instant;
 
 pub use deform::{deform, displacements};
 pub use normals::{exact_normals, exact_tangents};
-pub use orient::{orient_normals, orient_tangents};
+pub use rigid_normals::{rigid_normals, rigid_tangents};
 
-use modalcast_model::deform::{Backend, Deformed, Deformer, Surface};
+use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, LightBounds, Scene, Slot, State};
+use modalcast_model::scene::{Bounds, DomainLayout, LightSpaceBox, Scene, SceneState};
 
 /// The deformer of the `reference` backend: computes in f64 and rounds once.
 #[derive(Debug)]
 pub struct ReferenceDeformer {
     scene: Arc<Scene>,
-    surface: Surface,
+    surface: DeformedSurface,
 }
 
 impl ReferenceDeformer {
     /// Creates a deformer of one scene.
     pub fn new(scene: &Arc<Scene>) -> Self {
-        Self { scene: Arc::clone(scene), surface: Surface::default() }
+        Self { scene: Arc::clone(scene), surface: DeformedSurface::default() }
     }
 
     /// Computes displacements and boxes if the scene keeps them. A displacement that overflows f32 makes the bounds
     /// NaN.
-    fn keep(&mut self, state: &State, bounds: &mut Bounds) {
+    fn compute_attributes(&mut self, state: &SceneState, bounds: &mut Bounds) {
         let (scene, surface) = (&self.scene, &mut self.surface);
         if scene.needs.displacements {
             surface.displacements = round(displacements(scene, state));
@@ -40,7 +40,9 @@ impl ReferenceDeformer {
             }
         }
         if scene.needs.boxes {
-            let box_of = |slot: &Slot| Bounds::of(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
+            let box_of = |slot: &DomainLayout| {
+                Bounds::from_positions(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices])
+            };
             surface.boxes = scene.layout.slots.iter().map(box_of).collect();
         }
     }
@@ -51,27 +53,27 @@ impl Deformer for ReferenceDeformer {
         Backend::Reference
     }
 
-    fn deform(&mut self, state: &State) -> Result<Deformed> {
+    fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         let begin = Instant::now();
         let positions = deform(&self.scene, state);
         let light = self.scene.light_axes().map(|axes| {
-            let one = |position: &[f64; 3]| LightBounds::of_box(&axes, &Bounds { min: *position, max: *position });
-            positions.iter().map(one).fold(LightBounds::EMPTY, LightBounds::union)
+            let one = |position: &[f64; 3]| LightSpaceBox::enclosing(&axes, &Bounds { min: *position, max: *position });
+            positions.iter().map(one).fold(LightSpaceBox::EMPTY, LightSpaceBox::union)
         });
         let (normals, tangents) = if self.scene.needs.exact_normals {
             (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
         } else {
-            (orient_normals(&self.scene, state), orient_tangents(&self.scene, state))
+            (rigid_normals(&self.scene, state), rigid_tangents(&self.scene, state))
         };
         self.surface.positions = round(positions);
         self.surface.normals = round(normals);
         self.surface.tangents = round(tangents);
-        let mut bounds = Bounds::of(&self.surface.positions);
-        self.keep(state, &mut bounds);
-        Ok(Deformed { bounds, light, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        let mut bounds = Bounds::from_positions(&self.surface.positions);
+        self.compute_attributes(state, &mut bounds);
+        Ok(DeformSummary { bounds, light, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
-    fn surface(&mut self) -> Result<&Surface> {
+    fn surface(&mut self) -> Result<&DeformedSurface> {
         Ok(&self.surface)
     }
 }

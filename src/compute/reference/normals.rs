@@ -1,9 +1,9 @@
 //! Normals and tangents that follow the deformed triangles. Twin of `kernels/normals.cu`.
 //!
 //! # Definition
-//! Around each smoothing group (see [`modalcast_model::domain::Smoothing`]) the area vectors (b - a) x (c - a) of its
+//! Around each smoothing group (see [`modalcast_model::domain::SmoothingGroups`]) the area vectors (b - a) x (c - a) of its
 //! triangles are summed twice: at rest, transformed by the cofactors of A as area vectors are, and over the positions x
-//! of this step. The exact normal is the rigid normal of `reference/orient.rs`, rotated by the smallest rotation that
+//! of this step. The exact normal is the rigid normal of `reference/rigid_normals.rs`, rotated by the smallest rotation that
 //! takes the first direction to the second. It follows that
 //! - at q = 0 it is the rigid normal, whatever the author intended (smoothed, weighted, deliberately bent);
 //! - where rest normals are those of the triangles, it is the area-weighted normal of the deformed triangles, and where
@@ -31,9 +31,9 @@
 
 use nalgebra::Vector3;
 
-use super::orient::{cofactors, orient_normals, orient_tangents};
+use super::rigid_normals::{cofactors, rigid_normals, rigid_tangents};
 use modalcast_model::domain::Mesh;
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// 2^-18: the part of B that an area must exceed.
 const RESOLUTION: f64 = 1.0 / 262_144.0;
@@ -42,26 +42,26 @@ const RESOLUTION: f64 = 1.0 / 262_144.0;
 const OPPOSITE: f64 = 1e-10;
 
 /// World unit normals, one per corner, of a surface at `positions` (the result of `deform` for the same state).
-pub fn exact_normals(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> Vec<[f64; 3]> {
-    let mut normals = orient_normals(scene, state);
-    for_each_turned(scene, state, positions, |corner, turn| {
-        normals[corner] = turned_normal(turn, normals[corner]).into()
+pub fn exact_normals(scene: &Scene, state: &SceneState, positions: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    let mut normals = rigid_normals(scene, state);
+    for_each_rotated_corner(scene, state, positions, |corner, turn| {
+        normals[corner] = rotated_normal(turn, normals[corner]).into()
     });
     normals
 }
 
 /// World unit tangents and bitangent signs, one per corner; empty when the scene has no normal map. A shape without
 /// tangents gives zeros.
-pub fn exact_tangents(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> Vec<[f64; 4]> {
-    let mut tangents = orient_tangents(scene, state);
+pub fn exact_tangents(scene: &Scene, state: &SceneState, positions: &[[f64; 3]]) -> Vec<[f64; 4]> {
+    let mut tangents = rigid_tangents(scene, state);
     if tangents.is_empty() {
         return tangents;
     }
-    let rigid = orient_normals(scene, state);
-    for_each_turned(scene, state, positions, |corner, turn| {
+    let rigid = rigid_normals(scene, state);
+    for_each_rotated_corner(scene, state, positions, |corner, turn| {
         let [x, y, z, sign] = tangents[corner];
         if sign != 0.0 {
-            let flat = beside(turn.carry(Vector3::new(x, y, z)), turned_normal(turn, rigid[corner]));
+            let flat = orthogonalize(turn.rotate(Vector3::new(x, y, z)), rotated_normal(turn, rigid[corner]));
             tangents[corner] = [flat.x, flat.y, flat.z, sign];
         }
     });
@@ -69,15 +69,15 @@ pub fn exact_tangents(scene: &Scene, state: &State, positions: &[[f64; 3]]) -> V
 }
 
 /// The rotation of a group's surface, as its unit directions before and after.
-struct Turn {
+struct ShortestArc {
     from: Vector3<f64>,
     to: Vector3<f64>,
 }
 
-impl Turn {
+impl ShortestArc {
     /// Applies the smallest rotation that takes `from` to `to`: the component along `from` is moved to `to`, the rest
     /// is reflected at the plane perpendicular to their bisector.
-    fn carry(&self, vector: Vector3<f64>) -> Vector3<f64> {
+    fn rotate(&self, vector: Vector3<f64>) -> Vector3<f64> {
         let along = self.from.dot(&vector);
         let across = vector - self.from * along;
         let middle = self.from + self.to;
@@ -88,32 +88,37 @@ impl Turn {
     }
 }
 
-fn turned_normal(turn: &Turn, rigid: [f64; 3]) -> Vector3<f64> {
-    direction(turn.carry(rigid.into())).unwrap_or(turn.to)
+fn rotated_normal(turn: &ShortestArc, rigid: [f64; 3]) -> Vector3<f64> {
+    direction(turn.rotate(rigid.into())).unwrap_or(turn.to)
 }
 
 /// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
-fn beside(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
+fn orthogonalize(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
     let flat = tangent - normal * normal.dot(&tangent);
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     if flat.norm() > 1e-6 { flat.normalize() } else { normal.cross(&axis).normalize() }
 }
 
 /// Calls `act` with each packed corner for which the rotation of the surface can be determined.
-fn for_each_turned(scene: &Scene, state: &State, positions: &[[f64; 3]], mut act: impl FnMut(usize, &Turn)) {
+fn for_each_rotated_corner(
+    scene: &Scene,
+    state: &SceneState,
+    positions: &[[f64; 3]],
+    mut act: impl FnMut(usize, &ShortestArc),
+) {
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
         let shape = scene.shape_of(domain);
         let Some(smoothing) = shape.smoothing() else { continue };
         let rest = areas(&shape.mesh, smoothing.members(), |vertex| shape.mesh.rest()[vertex].map(f64::from));
         let now = areas(&shape.mesh, smoothing.members(), |vertex| positions[slot.first_vertex + vertex]);
-        let area_turn = cofactors(&state.composed(scene, domain).linear());
+        let area_transform = cofactors(&state.composed_transform(scene, domain).linear());
         for (corner, group) in smoothing.members().iter().enumerate() {
             let group = *group as usize;
             let has_normal = smoothing.normals()[group] != [0.0; 3];
             let resolved = now[group].sum.norm() > RESOLUTION * now[group].rounding;
-            let ends = (direction(area_turn * rest[group].sum), direction(now[group].sum));
+            let ends = (direction(area_transform * rest[group].sum), direction(now[group].sum));
             if let (true, (Some(from), Some(to))) = (has_normal && resolved, ends) {
-                act(slot.first_corner + corner, &Turn { from, to });
+                act(slot.first_corner + corner, &ShortestArc { from, to });
             }
         }
     }

@@ -7,7 +7,7 @@
 //! error of a compensated sum is at most u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot
 //! Product, 2005, proposition 5.5), plus 5 k 2^-149.
 //!
-//! T of a follower is a product T_m F, rounded as [`Composed::rounded`] defines: three roundings per entry. The error
+//! T of a follower is a product T_m F, rounded as [`ComposedTransform::to_f32`] defines: three roundings per entry. The error
 //! of its linear part is at most gamma_3 |T_m| |F| per entry, that of its translation gamma_3 (|T_m| |f| + |t_m|).
 //!
 //! A bound is a length, the maximum error of a vertex position in scene units. It holds for sums without overflow, and
@@ -15,9 +15,9 @@
 
 use rayon::prelude::*;
 
-use super::{Products, Tiles};
-use modalcast_model::domain::{Composed, Shape, Transform};
-use modalcast_model::scene::Storage;
+use super::{TensorCoreError, TiledModes};
+use modalcast_model::domain::{ComposedTransform, Shape, Transform};
+use modalcast_model::scene::StorageType;
 
 /// Safety factor, slightly more than the few thousand f64 operations of a bound can lose.
 const ROUND_UP: f64 = 1.0 + 1e-12;
@@ -29,7 +29,7 @@ const SQRT_3: f64 = 1.732_050_807_568_878;
 
 /// Maximum error of a vertex of one tile or domain by source, in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
-pub struct Bound {
+pub struct ErrorBound {
     /// Rounding of the entries of U to the storage type: for r modes `sum_j |q_j| step_j / 2` per axis.
     pub storage: f64,
     /// q times the factor or scale of a mode, rounded to f32.
@@ -44,7 +44,7 @@ pub struct Bound {
     pub frame: f64,
 }
 
-impl Bound {
+impl ErrorBound {
     /// The sum of all sources.
     pub fn total(&self) -> f64 {
         (self.storage + self.coordinates + self.accumulation + self.rest + self.transform + self.frame) * ROUND_UP
@@ -65,17 +65,17 @@ impl Bound {
 
 /// Inputs of a bound besides the shape.
 #[derive(Debug, Clone, Copy)]
-pub struct Step<'a> {
+pub struct ErrorBoundInput<'a> {
     /// Coordinates of the domain; zero for truncated modes.
     pub q: &'a [f32],
-    /// As returned by [`modalcast_model::scene::State::composed`].
-    pub transform: Composed,
+    /// As returned by [`modalcast_model::scene::SceneState::composed`].
+    pub transform: ComposedTransform,
     pub compensated: bool,
 }
 
 /// Bounds of a mode in a tile.
 #[derive(Debug, Clone, Copy, Default)]
-struct Reach {
+struct ModeErrorTerms {
     /// The longest row of its vertices, as stored.
     length: f64,
     /// Maximum rounding error of an entry.
@@ -86,17 +86,17 @@ struct Reach {
 
 /// Tables of one shape in one storage type from which bounds are computed.
 #[derive(Debug, Clone)]
-pub struct Reaches {
+pub struct ShapeErrorModel {
     rank: usize,
     /// `[tile][mode]`.
-    modes: Vec<Reach>,
+    modes: Vec<ModeErrorTerms>,
     /// The longest x0 per tile.
     rest: Vec<f64>,
 }
 
-impl Reaches {
+impl ShapeErrorModel {
     /// Reads every entry of `shape`, from which `tiles` were made.
-    pub fn new(shape: &Shape, tiles: &Tiles) -> Self {
+    pub fn new(shape: &Shape, tiles: &TiledModes) -> Self {
         let modes = |tile: usize| (0..tiles.rank()).map(move |mode| reach(shape, tiles, tile, mode));
         let rest = |tile: usize| {
             let place = tiles.tile(tile);
@@ -111,7 +111,7 @@ impl Reaches {
     }
 
     /// Bounds of the vertices of tile `tile`.
-    pub fn tile(&self, tile: usize, step: &Step) -> Bound {
+    pub fn tile(&self, tile: usize, step: &ErrorBoundInput) -> ErrorBound {
         let modes = &self.modes[self.rank * tile..][..self.rank];
         let (mut storage, mut lost, mut moved, mut terms) = (0.0, 0.0, 0.0, 0.0);
         for (reach, q) in modes.iter().zip(step.q) {
@@ -121,20 +121,20 @@ impl Reaches {
                 continue;
             }
             // The product of two f32 is exact in f64, so its rounding error in f32 is known.
-            let (exact, rounded) = (amount * f64::from(reach.factor), f64::from(q.abs() * reach.factor));
-            lost += stored_length(reach) * (exact - rounded).abs();
-            moved += stored_length(reach) * rounded;
+            let (exact, to_f32) = (amount * f64::from(reach.factor), f64::from(q.abs() * reach.factor));
+            lost += stored_length(reach) * (exact - to_f32).abs();
+            moved += stored_length(reach) * to_f32;
             terms += 1.0;
         }
         self.finish(tile, step, [SQRT_3 * storage, lost, moved, terms])
     }
 
     /// Additional error of the vertices of tile `tile` when its sums are computed by tensor cores, scene units.
-    pub fn products(&self, tile: usize, step: &Step, products: Products) -> f64 {
+    pub fn products(&self, tile: usize, step: &ErrorBoundInput, products: TensorCoreError) -> f64 {
         let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(step.q);
-        let amount = |(reach, q): (&Reach, &f32)| f64::from(q.abs() * reach.factor);
-        let largest = modes().map(amount).fold(Products::least(), f64::max);
-        let one = |(reach, q): (&Reach, &f32)| {
+        let amount = |(reach, q): (&ModeErrorTerms, &f32)| f64::from(q.abs() * reach.factor);
+        let largest = modes().map(amount).fold(TensorCoreError::least(), f64::max);
+        let one = |(reach, q): (&ModeErrorTerms, &f32)| {
             let own = amount((reach, q)) * (products.coordinate + products.sum);
             stored_length(reach) * (own + products.floor * largest)
         };
@@ -142,18 +142,18 @@ impl Reaches {
     }
 
     /// Bounds of all vertices.
-    pub fn domain(&self, step: &Step) -> Bound {
-        (0..self.rest.len()).map(|tile| self.tile(tile, step)).fold(Bound::default(), Bound::max)
+    pub fn domain(&self, step: &ErrorBoundInput) -> ErrorBound {
+        (0..self.rest.len()).map(|tile| self.tile(tile, step)).fold(ErrorBound::default(), ErrorBound::max)
     }
 
     /// Maximum error of u at the vertices of a tile, in scene units of the domain; independent of x0 and T.
     pub fn displacement(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
-        let step = Step { q, transform: Transform::IDENTITY.into(), compensated };
-        let Bound { storage, coordinates, accumulation, .. } = self.tile(tile, &step);
+        let step = ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated };
+        let ErrorBound { storage, coordinates, accumulation, .. } = self.tile(tile, &step);
         (storage + coordinates + accumulation) * ROUND_UP
     }
 
-    fn finish(&self, tile: usize, step: &Step, parts: [f64; 4]) -> Bound {
+    fn finish(&self, tile: usize, step: &ErrorBoundInput, parts: [f64; 4]) -> ErrorBound {
         let [storage, lost, moved, terms] = parts.map(|part| part * ROUND_UP);
         let accumulation = match step.compensated {
             false => gamma(terms) * moved + 2.0 * SQRT_3 * terms * UNDERFLOW,
@@ -161,7 +161,7 @@ impl Reaches {
         };
         let bent = self.rest[tile] + moved + accumulation;
         let rest = if terms > 0.0 { UNIT * bent } else { 0.0 };
-        let (own, stretch) = (step.transform.rounded(), norm(&step.transform));
+        let (own, stretch) = (step.transform.to_f32(), norm(&step.transform));
         let entries = own.linear().norm() * ROUND_UP;
         let offset = own.translation().norm() * ROUND_UP;
         let [turned, moved] = rounding(&step.transform);
@@ -169,16 +169,18 @@ impl Reaches {
         let transform = gamma(3.0) * (entries * (bent + rest) + offset) + 6.0 * SQRT_3 * UNDERFLOW;
         let [storage, coordinates, accumulation, rest] =
             [storage, lost, accumulation, rest].map(|part| part * stretch * ROUND_UP);
-        Bound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP, frame }
+        ErrorBound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP, frame }
     }
 }
 
-/// Maximum difference of the linear part (in the Frobenius norm) and of the translation of [`Composed::rounded`] from
+/// Maximum difference of the linear part (in the Frobenius norm) and of the translation of [`ComposedTransform::to_f32`] from
 /// the exact product; zeros for a transform root.
-fn rounding(transform: &Composed) -> [f64; 2] {
+fn rounding(transform: &ComposedTransform) -> [f64; 2] {
     let Some(frame) = transform.frame else { return [0.0; 2] };
-    let sizes =
-        Composed { mover: Transform(transform.mover.0.map(f32::abs)), frame: Some(Transform(frame.0.map(f32::abs))) };
+    let sizes = ComposedTransform {
+        root: Transform(transform.root.0.map(f32::abs)),
+        frame: Some(Transform(frame.0.map(f32::abs))),
+    };
     let entries = sizes.exact();
     let length = |of: &mut dyn Iterator<Item = f64>| {
         of.map(|entry| (gamma(3.0) * entry + 3.0 * UNDERFLOW).powi(2)).sum::<f64>().sqrt() * ROUND_UP
@@ -191,9 +193,9 @@ fn rounding(transform: &Composed) -> [f64; 2] {
 
 /// Upper bound of `||A||_2` of the linear part, exact and as deformers round it. Too large by at most a relative 1e-7,
 /// and for a follower by the rounding error that the product with its frame may add.
-pub fn norm(transform: &Composed) -> f64 {
+pub fn norm(transform: &ComposedTransform) -> f64 {
     let [turned, _] = rounding(transform);
-    (norm_of(&transform.rounded()) + turned) * ROUND_UP
+    (norm_of(&transform.to_f32()) + turned) * ROUND_UP
 }
 
 /// Upper bound of `||A||_2`, too large by at most a relative 1e-7. The root of the largest eigenvalue of A^T A, by the
@@ -228,13 +230,13 @@ fn length(vector: [f64; 3]) -> f64 {
     vector.iter().map(|number| number * number).sum::<f64>().sqrt()
 }
 
-fn reach(shape: &Shape, tiles: &Tiles, tile: usize, mode: usize) -> Reach {
+fn reach(shape: &Shape, tiles: &TiledModes, tile: usize, mode: usize) -> ModeErrorTerms {
     let place = tiles.tile(tile);
-    let row = |vertex| length([0, 1, 2].map(|axis| tiles.decoded(vertex, axis, mode)));
+    let row = |vertex| length([0, 1, 2].map(|axis| tiles.decode_entry(vertex, axis, mode)));
     let longest = (place.first_vertex..place.first_vertex + place.vertices).map(row).fold(0.0, f64::max);
     let entries = &shape.modes.column(mode)[3 * place.first_vertex..][..3 * place.vertices];
     let largest = entries.iter().fold(0.0, |largest: f32, entry| largest.max(entry.abs()));
-    Reach {
+    ModeErrorTerms {
         length: longest * ROUND_UP,
         half_step: half_step(tiles, tile, mode, largest),
         factor: factor(tiles, tile, mode),
@@ -242,30 +244,30 @@ fn reach(shape: &Shape, tiles: &Tiles, tile: usize, mode: usize) -> Reach {
 }
 
 /// The longest row in units of the factor; 0 for a mode of zeros.
-fn stored_length(reach: &Reach) -> f64 {
+fn stored_length(reach: &ModeErrorTerms) -> f64 {
     if reach.factor > 0.0 { reach.length / f64::from(reach.factor) } else { 0.0 }
 }
 
-fn factor(tiles: &Tiles, tile: usize, mode: usize) -> f32 {
+fn factor(tiles: &TiledModes, tile: usize, mode: usize) -> f32 {
     match tiles.storage() {
-        Storage::F32 => 1.0,
-        Storage::F16 | Storage::Bf16 => tiles.factors()[mode],
-        Storage::Int8 => tiles.scales()[tiles.tile(tile).first_scale + mode],
+        StorageType::F32 => 1.0,
+        StorageType::F16 | StorageType::Bf16 => tiles.factors()[mode],
+        StorageType::Int8 => tiles.scales()[tiles.tile(tile).first_scale + mode],
     }
 }
 
 /// Maximum rounding error of an entry of a tile in the storage type; `largest` is the tile's largest entry.
-fn half_step(tiles: &Tiles, tile: usize, mode: usize, largest: f32) -> f64 {
+fn half_step(tiles: &TiledModes, tile: usize, mode: usize, largest: f32) -> f64 {
     let factor = f64::from(factor(tiles, tile, mode));
     // Half the spacing: 2^-11 of the power of two below for f16, 2^-8 for bf16; both types have a smallest spacing.
-    let below = f64::exp2(f64::from(super::pack::exponent(largest)));
+    let below = f64::exp2(f64::from(super::quantize::exponent(largest)));
     match tiles.storage() {
         _ if largest == 0.0 => 0.0,
-        Storage::F32 => 0.0,
-        Storage::F16 => (below * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
+        StorageType::F32 => 0.0,
+        StorageType::F16 => (below * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
         // A whole smallest step: the value may be rounded twice, first to f32.
-        Storage::Bf16 => (below * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
-        Storage::Int8 => factor / 2.0 * ROUND_UP,
+        StorageType::Bf16 => (below * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
+        StorageType::Int8 => factor / 2.0 * ROUND_UP,
     }
 }
 

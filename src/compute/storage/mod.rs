@@ -11,16 +11,16 @@
 //! of quads and chunks is zero. Numbers have the machine's byte order.
 
 pub mod bound;
-mod halves;
-mod pack;
+mod quantize;
+mod split_coordinates;
 mod tiles;
 mod truncation;
 
-pub use halves::{Halves, Products};
-pub use tiles::{Plane, Tile, Tiles};
-pub use truncation::{Amounts, Truncation, reaches};
+pub use split_coordinates::{SplitCoordinates, TensorCoreError};
+pub use tiles::{PackedWord, TileLayout, TiledModes};
+pub use truncation::{Truncation, TruncationInput, max_row_norms};
 
-use modalcast_model::scene::Storage;
+use modalcast_model::scene::StorageType;
 
 /// Vertices per quad.
 pub const QUAD: usize = 4;
@@ -29,10 +29,10 @@ pub const QUAD: usize = 4;
 pub const TILE_QUADS: usize = 32;
 
 /// Number of modes whose entries for a quad take 48 bytes.
-pub const fn modes_per_chunk(storage: Storage) -> usize {
+pub const fn modes_per_chunk(storage: StorageType) -> usize {
     match storage {
-        Storage::F32 => 1,
-        Storage::F16 | Storage::Bf16 => 2,
-        Storage::Int8 => 4,
+        StorageType::F32 => 1,
+        StorageType::F16 | StorageType::Bf16 => 2,
+        StorageType::Int8 => 4,
     }
 }

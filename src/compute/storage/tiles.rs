@@ -4,18 +4,18 @@ use std::ops::Range;
 
 use half::{bf16, f16};
 
-use super::{QUAD, TILE_QUADS, modes_per_chunk, pack};
+use super::{QUAD, TILE_QUADS, modes_per_chunk, quantize};
 use modalcast_model::domain::Shape;
-use modalcast_model::scene::Storage;
+use modalcast_model::scene::StorageType;
 
 /// 16 bytes of a quad's chunk: the unit that one lane loads at once.
 #[repr(C, align(16))]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
-pub struct Plane(pub [u8; 16]);
+pub struct PackedWord(pub [u8; 16]);
 
 /// Offsets and sizes of one tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Tile {
+pub struct TileLayout {
     /// The first quad in the shape, and the number W of quads.
     pub first_quad: usize,
     pub quads: usize,
@@ -23,56 +23,56 @@ pub struct Tile {
     pub first_vertex: usize,
     pub vertices: usize,
     /// The first of its `3 C W` planes.
-    pub first_plane: usize,
+    pub first_packed_word: usize,
     /// The first of its `C K` scales, if the storage has scales.
     pub first_scale: usize,
 }
 
 /// U and x0 of one shape in tiles. The module documentation describes the layout.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Tiles {
-    storage: Storage,
+pub struct TiledModes {
+    storage: StorageType,
     vertices: usize,
     rank: usize,
-    planes: Vec<Plane>,
+    packed_words: Vec<PackedWord>,
     scales: Vec<f32>,
     factors: Vec<f32>,
     rest: Vec<[f32; 12]>,
 }
 
-impl Tiles {
+impl TiledModes {
     /// Rounds a shape's U to the storage type.
     ///
     /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15) or in
     /// [1, 2). `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
-    pub fn new(shape: &Shape, storage: Storage) -> Self {
+    pub fn new(shape: &Shape, storage: StorageType) -> Self {
         let rest = shape.mesh.rest();
         let rank = shape.modes.rank();
         let mut tiles = Self {
             storage,
             vertices: rest.len(),
             rank,
-            planes: Vec::new(),
+            packed_words: Vec::new(),
             scales: Vec::new(),
-            factors: pack::factors(&shape.modes, storage),
-            rest: rest.chunks(QUAD).map(pack::rest_quad).collect(),
+            factors: quantize::factors(&shape.modes, storage),
+            rest: rest.chunks(QUAD).map(quantize::rest_quad).collect(),
         };
-        tiles.planes = bytemuck::zeroed_vec(3 * tiles.chunks() * tiles.quads());
+        tiles.packed_words = bytemuck::zeroed_vec(3 * tiles.chunks() * tiles.quads());
         if rank == 0 {
             return tiles;
         }
-        let places: Vec<Tile> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
-        if storage == Storage::Int8 {
+        let places: Vec<TileLayout> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
+        if storage == StorageType::Int8 {
             tiles.scales = vec![0.0; tiles.count() * tiles.chunks() * modes_per_chunk(storage)];
-            pack::fill_codes(&shape.modes, &places, &mut tiles.planes, &mut tiles.scales);
+            quantize::encode_int8(&shape.modes, &places, &mut tiles.packed_words, &mut tiles.scales);
         } else {
-            pack::fill_floats(&shape.modes, &places, (storage, &tiles.factors), &mut tiles.planes);
+            quantize::encode_floats(&shape.modes, &places, (storage, &tiles.factors), &mut tiles.packed_words);
         }
         tiles
     }
 
     /// The storage type of the entries.
-    pub const fn storage(&self) -> Storage {
+    pub const fn storage(&self) -> StorageType {
         self.storage
     }
 
@@ -102,34 +102,34 @@ impl Tiles {
     }
 
     /// Offsets of tile `tile`.
-    pub fn tile(&self, tile: usize) -> Tile {
+    pub fn tile(&self, tile: usize) -> TileLayout {
         let first_quad = TILE_QUADS * tile;
         let quads = TILE_QUADS.min(self.quads() - first_quad);
         let first_vertex = QUAD * first_quad;
-        Tile {
+        TileLayout {
             first_quad,
             quads,
             first_vertex,
             vertices: (QUAD * quads).min(self.vertices - first_vertex),
-            first_plane: 3 * self.chunks() * first_quad,
+            first_packed_word: 3 * self.chunks() * first_quad,
             first_scale: tile * self.chunks() * modes_per_chunk(self.storage),
         }
     }
 
     /// All planes, tile after tile without gaps: `48 C Q` bytes.
-    pub fn planes(&self) -> &[Plane] {
-        &self.planes
+    pub fn packed_words(&self) -> &[PackedWord] {
+        &self.packed_words
     }
 
     /// The planes as bytes, for the upload to a device.
     pub fn bytes(&self) -> &[u8] {
-        bytemuck::cast_slice(&self.planes)
+        bytemuck::cast_slice(&self.packed_words)
     }
 
     /// The range of tile `tile` in [`Self::bytes`].
     pub fn byte_range(&self, tile: usize) -> Range<usize> {
         let place = self.tile(tile);
-        let first = 16 * place.first_plane;
+        let first = 16 * place.first_packed_word;
         first..first + 48 * self.chunks() * place.quads
     }
 
@@ -149,20 +149,20 @@ impl Tiles {
     }
 
     /// The stored entry of vertex `vertex`, axis `axis`, mode `mode`: exact in f64.
-    pub fn decoded(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
+    pub fn decode_entry(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
         let per_chunk = modes_per_chunk(self.storage);
         let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
         let place = self.tile(tile);
         let element = (mode % per_chunk * 3 + axis) * QUAD + vertex % QUAD;
         let size = 4 / per_chunk;
         let (plane, within) = (element * size / 16, element * size % 16);
-        let at = place.first_plane + (mode / per_chunk * 3 + plane) * place.quads + quad - place.first_quad;
-        let bytes = &self.planes[at].0[within..within + size];
+        let at = place.first_packed_word + (mode / per_chunk * 3 + plane) * place.quads + quad - place.first_quad;
+        let bytes = &self.packed_words[at].0[within..within + size];
         match self.storage {
-            Storage::F32 => f64::from(bytemuck::pod_read_unaligned::<f32>(bytes)),
-            Storage::F16 => f16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
-            Storage::Bf16 => bf16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
-            Storage::Int8 => (f64::from(bytes[0]) - 128.0) * f64::from(self.scales[place.first_scale + mode]),
+            StorageType::F32 => f64::from(bytemuck::pod_read_unaligned::<f32>(bytes)),
+            StorageType::F16 => f16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
+            StorageType::Bf16 => bf16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
+            StorageType::Int8 => (f64::from(bytes[0]) - 128.0) * f64::from(self.scales[place.first_scale + mode]),
         }
     }
 }
@@ -170,7 +170,7 @@ impl Tiles {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Noise, shape};
+    use crate::testing::{TestRng, shape};
 
     const SIZES: [(usize, usize); 12] = [
         (1, 1),
@@ -188,31 +188,31 @@ mod tests {
     ];
 
     /// Half the spacing of the storage type at an entry, in units of the entry's mode.
-    fn half_step(tiles: &Tiles, tile: Tile, mode: usize, entry: f64) -> f64 {
+    fn half_step(tiles: &TiledModes, tile: TileLayout, mode: usize, entry: f64) -> f64 {
         let exponent = |value: f64| value.abs().log2().floor();
         match tiles.storage() {
-            Storage::F32 => 0.0,
-            Storage::F16 => {
+            StorageType::F32 => 0.0,
+            StorageType::F16 => {
                 let factor = f64::from(tiles.factors()[mode]);
                 f64::exp2((exponent(entry / factor) - 11.0).max(-25.0)) * factor
             }
-            Storage::Bf16 => f64::exp2(exponent(entry) - 8.0),
-            Storage::Int8 => f64::from(tiles.scales()[tile.first_scale + mode]) * 0.5 * (1.0 + 1e-12),
+            StorageType::Bf16 => f64::exp2(exponent(entry) - 8.0),
+            StorageType::Int8 => f64::from(tiles.scales()[tile.first_scale + mode]) * 0.5 * (1.0 + 1e-12),
         }
     }
 
     #[test]
     fn every_entry_is_the_nearest_that_its_storage_can_hold() {
-        let mut noise = Noise(1);
+        let mut noise = TestRng(1);
         for (vertices, rank) in SIZES {
             let shape = shape(vertices, rank, &mut noise);
-            for storage in Storage::ALL {
-                let tiles = Tiles::new(&shape, storage);
+            for storage in StorageType::ALL {
+                let tiles = TiledModes::new(&shape, storage);
                 for vertex in 0..vertices {
                     let tile = tiles.tile(vertex / QUAD / TILE_QUADS);
                     for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
                         let entry = f64::from(shape.modes.at(vertex, axis, mode));
-                        let error = (tiles.decoded(vertex, axis, mode) - entry).abs();
+                        let error = (tiles.decode_entry(vertex, axis, mode) - entry).abs();
                         let allowed = half_step(&tiles, tile, mode, entry);
                         assert!(error <= allowed, "{storage:?} {vertices} {rank}: {error} of {entry} over {allowed}");
                     }
@@ -223,11 +223,11 @@ mod tests {
 
     #[test]
     fn tiles_follow_each_other_without_gaps_and_what_fills_up_is_zero() {
-        let mut noise = Noise(2);
+        let mut noise = TestRng(2);
         for (vertices, rank) in SIZES {
             let shape = shape(vertices, rank, &mut noise);
-            for storage in Storage::ALL {
-                let tiles = Tiles::new(&shape, storage);
+            for storage in StorageType::ALL {
+                let tiles = TiledModes::new(&shape, storage);
                 assert_eq!(tiles.bytes().len(), 48 * tiles.chunks() * tiles.quads());
                 let ends = (0..tiles.count()).fold((0, 0, 0), |(byte, quad, vertex), tile| {
                     let place = tiles.tile(tile);
@@ -239,14 +239,17 @@ mod tests {
                 let filled = tiles.chunks() * modes_per_chunk(storage);
                 for vertex in vertices..QUAD * tiles.quads() {
                     for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
-                        assert_eq!(tiles.decoded(vertex, axis, mode), 0.0);
+                        assert_eq!(tiles.decode_entry(vertex, axis, mode), 0.0);
                     }
                 }
-                if storage == Storage::Int8 && filled > rank {
+                if storage == StorageType::Int8 && filled > rank {
                     let place = tiles.tile(0);
                     assert!(tiles.scales()[rank..filled].iter().all(|scale| *scale == 0.0));
                     // The last byte of the last chunk is vertex 3, axis 2 of a padding mode.
-                    assert_eq!(tiles.planes()[place.first_plane + (3 * tiles.chunks() - 1) * place.quads].0[15], 128);
+                    assert_eq!(
+                        tiles.packed_words()[place.first_packed_word + (3 * tiles.chunks() - 1) * place.quads].0[15],
+                        128
+                    );
                 }
             }
         }
@@ -254,21 +257,21 @@ mod tests {
 
     #[test]
     fn bytes_lie_where_the_page_says() {
-        let shape = shape(9, 5, &mut Noise(3));
-        let tiles = Tiles::new(&shape, Storage::F32);
+        let shape = shape(9, 5, &mut TestRng(3));
+        let tiles = TiledModes::new(&shape, StorageType::F32);
         let float = |at: usize| f32::from_ne_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
         // Three quads: mode 2, axis 1, vertex 6 is in quad 1 at position 2.
         assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.at(6, 1, 2));
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest()[6][1]);
         assert_eq!(tiles.rest()[2][1], 0.0);
-        let tiles = Tiles::new(&shape, Storage::Int8);
+        let tiles = TiledModes::new(&shape, StorageType::Int8);
         // Chunk 0, mode 2 is group 7 of 4 vertices: plane 1, bytes 12 to 15.
-        let code = tiles.planes()[3 + 1].0[12 + 2];
+        let code = tiles.packed_words()[3 + 1].0[12 + 2];
         let want = (shape.modes.at(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
         assert_eq!(f32::from(code), want);
-        let tiles = Tiles::new(&shape, Storage::F16);
+        let tiles = TiledModes::new(&shape, StorageType::F16);
         // Mode 3 is the second mode of chunk 1: its group 4 is plane 2, bytes 0 to 7.
-        let bytes = &tiles.planes()[9 + 2 * 3 + 1].0[4..6];
+        let bytes = &tiles.packed_words()[9 + 2 * 3 + 1].0[4..6];
         let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
         assert_eq!(f16::from_f32(shape.modes.at(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);
     }

@@ -26,7 +26,7 @@ pub struct Material {
     /// 0 (invisible) to 1 (opaque).
     pub alpha: f32,
     /// Index into the scene's textures. The texture multiplies diffuse, ambient and alpha; its colors are sRGB.
-    pub colour_texture: Option<usize>,
+    pub color_texture: Option<usize>,
     /// Index into the scene's textures. A tangent-space normal map with +Y up (OpenGL's convention) and linear values.
     pub normal_texture: Option<usize>,
     pub alpha_mode: AlphaMode,
@@ -43,7 +43,7 @@ impl Default for Material {
             specular: [0.0; 3],
             shininess: 1.0,
             alpha: 1.0,
-            colour_texture: None,
+            color_texture: None,
             normal_texture: None,
             alpha_mode: AlphaMode::Opaque,
             double_sided: false,
@@ -56,13 +56,13 @@ impl Material {
     ///
     /// # Errors
     /// `Invalid` with the material and the field.
-    pub fn checked(self) -> Result<Self> {
+    pub fn validated(self) -> Result<Self> {
         let unit = |field: &str, value: f32| match value {
             0.0..=1.0 => Ok(()),
             _ => Err(invalid(format!("material '{}': {field}", self.name), "0 to 1", value)),
         };
-        for (field, colour) in [("ambient", self.ambient), ("diffuse", self.diffuse), ("specular", self.specular)] {
-            colour.into_iter().try_for_each(|channel| unit(field, channel))?;
+        for (field, color) in [("ambient", self.ambient), ("diffuse", self.diffuse), ("specular", self.specular)] {
+            color.into_iter().try_for_each(|channel| unit(field, channel))?;
         }
         unit("alpha", self.alpha)?;
         if let AlphaMode::Mask { cutoff } = self.alpha_mode {
@@ -81,10 +81,10 @@ mod tests {
 
     #[test]
     fn an_alpha_of_seven_is_refused_with_field_expected_and_given() {
-        let refusal = Material { alpha: 7.0, ..Material::default() }.checked().expect_err("7 is no alpha");
+        let refusal = Material { alpha: 7.0, ..Material::default() }.validated().expect_err("7 is no alpha");
         assert_eq!(refusal.to_string(), "material 'white': alpha: expected 0 to 1, given 7");
         let nan = Material { diffuse: [0.0, f32::NAN, 0.0], ..Material::default() };
-        assert!(nan.checked().is_err());
-        assert!(Material::default().checked().is_ok());
+        assert!(nan.validated().is_err());
+        assert!(Material::default().validated().is_ok());
     }
 }

@@ -59,7 +59,7 @@ impl Mesh {
     ///
     /// # Errors
     /// As for [`Self::new`].
-    pub fn indexed(
+    pub fn from_indexed(
         rest: Vec<[f32; 3]>,
         normals: Vec<[f32; 3]>,
         uvs: Vec<[f32; 2]>,

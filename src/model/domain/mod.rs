@@ -4,20 +4,20 @@
 //! Positions are in scene units. The constructors of this module check lengths, indices and numbers; code that uses the
 //! constructed values does not check them again.
 
-mod composed;
+mod composed_transform;
 mod material;
 mod mesh;
 mod modes;
-mod smoothing;
+mod smoothing_groups;
 mod tangents;
 mod texture;
 mod transform;
 
-pub use composed::Composed;
+pub use composed_transform::ComposedTransform;
 pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};
-pub use smoothing::{MAX_RING_TRIANGLES, RING_START, Smoothing};
+pub use smoothing_groups::{MAX_RING_TRIANGLES, RING_START, SmoothingGroups};
 pub use texture::Texture;
 pub use transform::Transform;
 
@@ -31,7 +31,7 @@ pub struct Shape {
     /// Per corner, the unit tangent and the sign of the bitangent. Empty unless a normal map needs them.
     pub(crate) tangents: Vec<[f32; 4]>,
     /// `None` unless normals are computed from the deformed triangles.
-    smoothing: Option<Smoothing>,
+    smoothing: Option<SmoothingGroups>,
 }
 
 impl Shape {
@@ -58,18 +58,18 @@ impl Shape {
     /// Computes the tangents (Lengyel's method) unless they already exist.
     pub(crate) fn add_tangents(&mut self) {
         if self.tangents.is_empty() {
-            self.tangents = tangents::lengyel(&self.mesh);
+            self.tangents = tangents::lengyel_tangents(&self.mesh);
         }
     }
 
     /// Smoothing groups and the triangles around them; `None` if normals only rotate with the domain.
-    pub const fn smoothing(&self) -> Option<&Smoothing> {
+    pub const fn smoothing(&self) -> Option<&SmoothingGroups> {
         self.smoothing.as_ref()
     }
 
     /// Computes the smoothing groups unless they already exist.
     pub(crate) fn add_smoothing(&mut self) {
-        self.smoothing.get_or_insert_with(|| Smoothing::of(&self.mesh));
+        self.smoothing.get_or_insert_with(|| SmoothingGroups::of(&self.mesh));
     }
 }
 
@@ -96,7 +96,7 @@ pub struct Attachment {
 
 /// A constant frame on another domain, T = T_parent F. The modes of the parent do not affect it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Follow {
+pub struct FollowConstraint {
     /// Index of the followed domain, smaller than that of the follower. The followed domain may be a follower itself.
     pub parent: usize,
     /// F, `parent_from_child`.
@@ -105,7 +105,7 @@ pub struct Follow {
 
 /// The first triangle of a material within a domain. The run ends at the next one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Run {
+pub struct MaterialRange {
     pub first_triangle: usize,
     /// Index into the scene's materials.
     pub material: usize,
@@ -121,12 +121,12 @@ pub struct Domain {
     pub material: usize,
     /// Runs of triangles with different materials, ascending, the first at triangle 0. Empty if all triangles have
     /// `material`.
-    pub runs: Vec<Run>,
+    pub material_ranges: Vec<MaterialRange>,
     /// `world_from_domain` at rest. For a follower it is computed from the frame, and the given value is ignored.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
     /// For a domain that moves with another one; steps cannot set the transform of such a domain.
-    pub follows: Option<Follow>,
+    pub follows: Option<FollowConstraint>,
     /// The coordinates at rest. The length is the rank, or 0 for all zeros.
     pub rest_q: Vec<f32>,
     /// A domain with a smaller index and the same rank whose coordinates this domain shares (glTF node weights).
@@ -137,7 +137,7 @@ pub struct Domain {
 impl Domain {
     /// Indices of the materials of its triangles, one per run.
     pub fn materials(&self) -> impl Iterator<Item = usize> + '_ {
-        let only = self.runs.is_empty().then_some(self.material);
-        only.into_iter().chain(self.runs.iter().map(|run| run.material))
+        let only = self.material_ranges.is_empty().then_some(self.material);
+        only.into_iter().chain(self.material_ranges.iter().map(|run| run.material))
     }
 }

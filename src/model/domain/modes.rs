@@ -86,7 +86,7 @@ impl Modes {
 
     /// The 3 x r block of U at a point of a triangle, row-major: the rows of the three vertices, weighted by the
     /// barycentric coordinates `shares` in f64 and rounded once.
-    pub fn at_point(&self, vertices: [u32; 3], shares: [f64; 3]) -> Vec<f32> {
+    pub fn block_at_point(&self, vertices: [u32; 3], shares: [f64; 3]) -> Vec<f32> {
         let entry = |component: usize, mode: usize| {
             let of_vertex =
                 |(vertex, share): (&u32, f64)| share * f64::from(self.at(*vertex as usize, component, mode));
@@ -120,10 +120,10 @@ mod tests {
     #[test]
     fn the_block_at_a_point_is_the_mean_of_its_corners_and_at_a_corner_its_rows() {
         let modes = Modes::from_columns(9, 2, (0..18).map(|entry| entry as f32).collect()).expect("fits");
-        assert_eq!(modes.at_point([2, 0, 1], [0.0, 1.0, 0.0]), [0.0, 9.0, 1.0, 10.0, 2.0, 11.0]);
+        assert_eq!(modes.block_at_point([2, 0, 1], [0.0, 1.0, 0.0]), [0.0, 9.0, 1.0, 10.0, 2.0, 11.0]);
         let third = [1.0 / 3.0; 3];
-        assert_eq!(modes.at_point([0, 1, 2], third), [3.0, 12.0, 4.0, 13.0, 5.0, 14.0]);
-        assert!(Modes::rigid().at_point([0, 1, 2], third).is_empty());
+        assert_eq!(modes.block_at_point([0, 1, 2], third), [3.0, 12.0, 4.0, 13.0, 5.0, 14.0]);
+        assert!(Modes::rigid().block_at_point([0, 1, 2], third).is_empty());
     }
 
     #[test]

@@ -9,7 +9,7 @@ use super::Mesh;
 /// Each triangle adds its uv gradients to its three corners; the sum is orthogonalized against the normal. A corner
 /// without a usable gradient (no uv, zero area) gets an arbitrary unit vector orthogonal to its normal and a positive
 /// sign.
-pub(super) fn lengyel(mesh: &Mesh) -> Vec<[f32; 4]> {
+pub(super) fn lengyel_tangents(mesh: &Mesh) -> Vec<[f32; 4]> {
     let corners = mesh.corners();
     let mut along_u = vec![Vector3::<f64>::zeros(); corners.vertices.len()];
     let mut along_v = along_u.clone();
@@ -65,21 +65,21 @@ mod tests {
 
     fn square(uvs: Vec<[f32; 2]>) -> Mesh {
         let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
-        Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square")
+        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square")
     }
 
     #[test]
     fn the_tangent_of_an_upright_image_is_plus_x_and_a_mirrored_image_flips_the_sign() {
         let upright = square(vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]);
-        assert_eq!(lengyel(&upright), [[1.0, 0.0, 0.0, 1.0]; 4]);
+        assert_eq!(lengyel_tangents(&upright), [[1.0, 0.0, 0.0, 1.0]; 4]);
         let mirrored = square(vec![[1.0, 1.0], [0.0, 1.0], [0.0, 0.0], [1.0, 0.0]]);
-        assert_eq!(lengyel(&mirrored), [[-1.0, 0.0, 0.0, -1.0]; 4]);
+        assert_eq!(lengyel_tangents(&mirrored), [[-1.0, 0.0, 0.0, -1.0]; 4]);
     }
 
     #[test]
     fn missing_and_degenerate_uvs_give_finite_unit_tangents() {
         for mesh in [square(vec![]), square(vec![[0.5, 0.5]; 4])] {
-            for [x, y, z, sign] in lengyel(&mesh) {
+            for [x, y, z, sign] in lengyel_tangents(&mesh) {
                 let length = (x * x + y * y + z * z).sqrt();
                 assert!((length - 1.0).abs() < 1e-6, "length {length}");
                 assert!((z.abs() < 1e-6) && (sign == 1.0));

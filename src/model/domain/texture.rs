@@ -3,7 +3,7 @@
 use crate::error::{Result, invalid};
 
 /// The largest width or height of a texture in pixels.
-pub(super) const MAX_SIDE: u32 = 8192;
+pub(super) const MAX_TEXTURE_SIDE: u32 = 8192;
 
 /// An image of `width` x `height` RGBA8 pixels, top row first.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,9 +21,13 @@ impl Texture {
     /// `Invalid` if a side is 0 or above 8192, or the number of bytes is not 4 x width x height.
     pub fn new(name: impl Into<String>, width: u32, height: u32, rgba: Vec<u8>) -> Result<Self> {
         let name = name.into();
-        if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+        if width == 0 || height == 0 || width > MAX_TEXTURE_SIDE || height > MAX_TEXTURE_SIDE {
             let field = format!("texture '{name}': size");
-            return Err(invalid(field, format!("1 to {MAX_SIDE} pixels a side"), format!("{width} x {height}")));
+            return Err(invalid(
+                field,
+                format!("1 to {MAX_TEXTURE_SIDE} pixels a side"),
+                format!("{width} x {height}"),
+            ));
         }
         if rgba.len() != 4 * width as usize * height as usize {
             return Err(invalid(format!("texture '{name}': bytes"), format!("4 x {width} x {height}"), rgba.len()));
@@ -40,8 +44,8 @@ impl Texture {
         let refuse = |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
         let mut reader = image::ImageReader::new(std::io::Cursor::new(bytes));
         let mut limits = image::Limits::default();
-        limits.max_image_width = Some(MAX_SIDE);
-        limits.max_image_height = Some(MAX_SIDE);
+        limits.max_image_width = Some(MAX_TEXTURE_SIDE);
+        limits.max_image_height = Some(MAX_TEXTURE_SIDE);
         reader.limits(limits);
         let reader = reader.with_guessed_format().map_err(|error| refuse(&error))?;
         let image = reader.decode().map_err(|error| refuse(&error))?.into_rgba8();

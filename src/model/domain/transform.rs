@@ -71,7 +71,7 @@ impl Transform {
     }
 
     /// `a_from_c = a_from_b * b_from_c`, computed in f64 and rounded once.
-    pub fn then(self, b_from_c: Self) -> Self {
+    pub fn compose(self, b_from_c: Self) -> Self {
         Self::from_matrix(&(self.to_matrix() * b_from_c.to_matrix()))
     }
 
@@ -98,7 +98,7 @@ mod tests {
     fn a_transform_times_its_inverse_is_the_identity() {
         let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
         let transform = Transform::from_parts(&(turn * 2.0), &Vector3::new(1.0, -2.0, 3.0));
-        let unit = transform.then(transform.inverse().expect("regular"));
+        let unit = transform.compose(transform.inverse().expect("regular"));
         for (got, want) in unit.0.iter().zip(Transform::IDENTITY.0) {
             assert!((got - want).abs() <= 1e-6, "{got} is not {want}");
         }

@@ -12,21 +12,21 @@
 //! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
 //! - OBJ and glTF have Y up and plants Z up, and units are meters, unless `scene.toml` says otherwise.
 
-mod files;
+mod asset_dir;
+#[cfg(test)]
+mod dataset_tests;
 mod gltf;
-mod images;
 mod manifest;
 mod modes;
 mod obj;
 mod plant;
-#[cfg(test)]
-mod real;
 mod repository;
 mod source;
-mod vega;
+mod texture_cache;
+mod vega_config;
 
-pub use modes::{Array, parse_numpy};
-pub use repository::Repository;
+pub use modes::{NpyArray, parse_numpy};
+pub use repository::SceneRepository;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -40,5 +40,5 @@ use crate::scene::Scene;
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub fn open(source: &str) -> Result<Arc<Scene>> {
-    Scene::new(source::read(&files::Files::anywhere(Path::new(".")), source)?)
+    Scene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
 }

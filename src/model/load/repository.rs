@@ -3,23 +3,23 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::files::{Files, Kind};
+use super::asset_dir::{AssetDir, EntryKind};
 use super::{manifest, source};
 use crate::error::{Error, Result};
 use crate::scene::Scene;
 
 /// Depth of folders, below the root, up to which scenes are listed. Deeper scenes can still be opened by their path.
-const DEPTH: usize = 4;
+const MAX_LIST_DEPTH: usize = 4;
 /// The largest number of listed names.
-const MOST: usize = 4096;
+const MAX_LISTED: usize = 4096;
 
 /// The server's folder of scenes. Every path stays inside it, after symbolic links are resolved.
 #[derive(Debug, Clone)]
-pub struct Repository {
+pub struct SceneRepository {
     root: Option<PathBuf>,
 }
 
-impl Repository {
+impl SceneRepository {
     /// A repository with the built-in scenes and those in `root`.
     ///
     /// # Errors
@@ -44,7 +44,7 @@ impl Repository {
     /// As for [`super::open`], and `Invalid` for a path that leaves the repository.
     pub fn open(&self, source: &str) -> Result<Arc<Scene>> {
         match &self.root {
-            Some(root) => Scene::new(source::read(&Files::confined(root), source)?),
+            Some(root) => Scene::new(source::read(&AssetDir::confined_to(root), source)?),
             None if source::BUILT_IN.contains(&source) => super::open(source),
             None => Err(Error::NotFound { what: "scene", given: source.into() }),
         }
@@ -56,7 +56,7 @@ impl Repository {
         let mut names: Vec<String> = source::BUILT_IN.map(str::to_owned).to_vec();
         if let Some(root) = &self.root {
             let mut found = Vec::new();
-            collect(&Files::confined(root), "", DEPTH, &mut found);
+            collect(&AssetDir::confined_to(root), "", MAX_LIST_DEPTH, &mut found);
             found.sort();
             names.append(&mut found);
         }
@@ -64,21 +64,21 @@ impl Repository {
     }
 }
 
-fn collect(folder: &Files, prefix: &str, depth: usize, found: &mut Vec<String>) {
+fn collect(folder: &AssetDir, prefix: &str, depth: usize, found: &mut Vec<String>) {
     let entries = folder.entries();
-    let is_manifest = entries.contains(&(manifest::FILE.to_owned(), Kind::File));
+    let is_manifest = entries.contains(&(manifest::MANIFEST_FILE.to_owned(), EntryKind::File));
     if is_manifest || source::models(folder).len() == 1 {
         found.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
     }
     for (name, kind) in entries {
         // Skip hidden entries: uploads in progress, version control.
-        if found.len() >= MOST || name.starts_with('.') {
+        if found.len() >= MAX_LISTED || name.starts_with('.') {
             continue;
         }
         let path = format!("{prefix}{name}");
         match kind {
-            Kind::File if source::recognised(&name).is_some() => found.push(path),
-            Kind::Folder if depth > 0 => {
+            EntryKind::File if source::recognize_model(&name).is_some() => found.push(path),
+            EntryKind::Directory if depth > 0 => {
                 if let Ok(sub) = folder.within(&name) {
                     collect(&sub, &format!("{path}/"), depth - 1, found);
                 }
@@ -94,14 +94,14 @@ mod tests {
 
     const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
 
-    fn repository(files: &[(&str, &str)]) -> (tempfile::TempDir, Repository) {
+    fn repository(files: &[(&str, &str)]) -> (tempfile::TempDir, SceneRepository) {
         let outer = tempfile::tempdir().expect("a folder");
         for (name, text) in files {
             let path = outer.path().join("root").join(name);
             std::fs::create_dir_all(path.parent().expect("a parent")).expect("made");
             std::fs::write(path, text).expect("written");
         }
-        let repository = Repository::new(Some(&outer.path().join("root"))).expect("there");
+        let repository = SceneRepository::new(Some(&outer.path().join("root"))).expect("there");
         (outer, repository)
     }
 
@@ -167,8 +167,8 @@ mod tests {
         assert_eq!(ambiguous, "folder 'two': expected scene.toml, or one model to choose, given 2: b.obj, c.obj");
         let empty = repository.open("none").expect_err("no model").to_string();
         assert!(empty.ends_with("given none among: x.txt"), "{empty}");
-        assert!(matches!(Repository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
-        let built_in = Repository::new(None).expect("built-in scenes only");
+        assert!(matches!(SceneRepository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
+        let built_in = SceneRepository::new(None).expect("built-in scenes only");
         assert_eq!(built_in.list(), ["tree"]);
         assert!(matches!(built_in.open("two"), Err(Error::NotFound { .. })));
     }

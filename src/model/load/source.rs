@@ -1,17 +1,17 @@
 //! Resolves a SCENE argument: a built-in name, a folder with `scene.toml`, a model file, or a folder with one model.
 
-use super::files::{Files, Kind, name_of, parent_of};
-use super::obj::Source;
+use super::asset_dir::{AssetDir, EntryKind, file_name_of, parent_of};
+use super::obj::ModesSource;
 use super::{gltf, manifest, obj, plant};
 use crate::error::{Error, Result, invalid};
-use crate::scene::Parts;
+use crate::scene::SceneParts;
 
 /// Names of procedural scenes. A folder with such a name can be opened as `./NAME`.
 pub(super) const BUILT_IN: [&str; 1] = ["tree"];
 
 /// A model in a folder, by the name of its main file or, for a plant, its stem.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Model {
+pub(super) enum ModelFile {
     Gltf(String),
     Obj(String),
     /// `STEM.obj`, `STEM.structure.json` and `STEM_object_id.dat`.
@@ -22,24 +22,24 @@ pub(super) enum Model {
 ///
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn read(files: &Files, source: &str) -> Result<Parts> {
+pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneParts> {
     if BUILT_IN.contains(&source) {
-        return crate::tree::grow(&crate::tree::Recipe::default());
+        return crate::tree::generate(&crate::tree::TreeParameters::default());
     }
     match files.kind(source)? {
         None => Err(Error::NotFound { what: "scene", given: source.into() }),
-        Some(Kind::File) if source.ends_with(".toml") => {
+        Some(EntryKind::File) if source.ends_with(".toml") => {
             let folder = parent_of(source);
-            manifest::read(&files.within(folder)?, name_of(source), &files.own_name(folder))
+            manifest::read(&files.within(folder)?, file_name_of(source), &files.resolved_name(folder))
         }
-        Some(Kind::Folder) => {
+        Some(EntryKind::Directory) => {
             let folder = files.within(source)?;
-            match folder.kind(manifest::FILE)? {
-                Some(Kind::File) => manifest::read(&folder, manifest::FILE, &files.own_name(source)),
-                _ => model(files, source, Source::Beside),
+            match folder.kind(manifest::MANIFEST_FILE)? {
+                Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
+                _ => model(files, source, ModesSource::Sidecar),
             }
         }
-        Some(Kind::File) => model(files, source, Source::Beside),
+        Some(EntryKind::File) => model(files, source, ModesSource::Sidecar),
     }
 }
 
@@ -47,67 +47,67 @@ pub(super) fn read(files: &Files, source: &str) -> Result<Parts> {
 ///
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn model(files: &Files, path: &str, modes: Source) -> Result<Parts> {
+pub(super) fn model(files: &AssetDir, path: &str, modes: ModesSource) -> Result<SceneParts> {
     match files.kind(path)? {
-        Some(Kind::Folder) => {
+        Some(EntryKind::Directory) => {
             let folder = files.within(path)?;
-            let mut parts = read_model(&folder, &the_one_model(&folder, path)?, modes)?;
-            parts.name = files.own_name(path);
+            let mut parts = read_model(&folder, &single_model(&folder, path)?, modes)?;
+            parts.name = files.resolved_name(path);
             Ok(parts)
         }
-        Some(Kind::File) => {
+        Some(EntryKind::File) => {
             let folder = files.within(parent_of(path))?;
-            let found = recognised(name_of(path))
+            let found = recognize_model(file_name_of(path))
                 .ok_or_else(|| invalid(format!("file '{path}'"), "a file ending in .glb, .gltf or .obj", "another"))?;
-            let found = in_company(found, &names_of(&folder));
+            let found = detect_plant(found, &file_names(&folder));
             read_model(&folder, &found, modes)
         }
         None => Err(invalid(format!("file '{path}'"), "a model that is there", "nothing of that name")),
     }
 }
 
-fn read_model(folder: &Files, model: &Model, modes: Source) -> Result<Parts> {
+fn read_model(folder: &AssetDir, model: &ModelFile, modes: ModesSource) -> Result<SceneParts> {
     match model {
-        Model::Gltf(name) => gltf::read(folder, name),
-        Model::Obj(name) => obj::read(folder, name, modes),
-        Model::Plant(stem) => plant::read(folder, stem),
+        ModelFile::Gltf(name) => gltf::read(folder, name),
+        ModelFile::Obj(name) => obj::read(folder, name, modes),
+        ModelFile::Plant(stem) => plant::read(folder, stem),
     }
 }
 
 /// The model whose main file has this name, by its extension.
-pub(super) fn recognised(name: &str) -> Option<Model> {
+pub(super) fn recognize_model(name: &str) -> Option<ModelFile> {
     match name.rsplit_once('.')?.1.to_ascii_lowercase().as_str() {
-        "glb" | "gltf" => Some(Model::Gltf(name.into())),
-        "obj" => Some(Model::Obj(name.into())),
+        "glb" | "gltf" => Some(ModelFile::Gltf(name.into())),
+        "obj" => Some(ModelFile::Obj(name.into())),
         _ => None,
     }
 }
 
 /// All models in a folder.
-pub(super) fn models(folder: &Files) -> Vec<Model> {
-    let names = names_of(folder);
-    names.iter().filter_map(|name| recognised(name)).map(|model| in_company(model, &names)).collect()
+pub(super) fn models(folder: &AssetDir) -> Vec<ModelFile> {
+    let names = file_names(folder);
+    names.iter().filter_map(|name| recognize_model(name)).map(|model| detect_plant(model, &names)).collect()
 }
 
 /// Turns an OBJ file into a plant if the files of a plant's structure are next to it.
-fn in_company(model: Model, names: &[String]) -> Model {
+fn detect_plant(model: ModelFile, names: &[String]) -> ModelFile {
     let stem = match &model {
-        Model::Obj(name) => name.strip_suffix(".obj"),
+        ModelFile::Obj(name) => name.strip_suffix(".obj"),
         _ => None,
     };
     let is_plant = |stem: &&str| {
         let company = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
         company.iter().all(|name| names.contains(name))
     };
-    stem.filter(is_plant).map(|stem| Model::Plant(stem.into())).unwrap_or(model)
+    stem.filter(is_plant).map(|stem| ModelFile::Plant(stem.into())).unwrap_or(model)
 }
 
 /// Names of the files in a folder.
-fn names_of(folder: &Files) -> Vec<String> {
-    folder.entries().into_iter().filter(|(_, kind)| *kind == Kind::File).map(|(name, _)| name).collect()
+fn file_names(folder: &AssetDir) -> Vec<String> {
+    folder.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect()
 }
 
-fn the_one_model(folder: &Files, path: &str) -> Result<Model> {
+fn single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
     let mut found = models(folder);
     let shown = |names: Vec<String>| names.into_iter().take(16).collect::<Vec<_>>().join(", ");
     let field = format!("folder '{path}'");
@@ -119,8 +119,8 @@ fn the_one_model(folder: &Files, path: &str) -> Result<Model> {
         }
         count => {
             let name = |model| match model {
-                Model::Gltf(name) | Model::Obj(name) => name,
-                Model::Plant(stem) => format!("{stem} (a plant)"),
+                ModelFile::Gltf(name) | ModelFile::Obj(name) => name,
+                ModelFile::Plant(stem) => format!("{stem} (a plant)"),
             };
             let given = shown(found.into_iter().map(name).collect());
             Err(invalid(field, "scene.toml, or one model to choose", format!("{count}: {given}")))

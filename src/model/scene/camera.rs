@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3x4, Matrix4, Point3, Vector3};
 
-use super::{Rectangle, Scene};
+use super::{PixelRect, Scene};
 use crate::error::{Result, invalid};
 
 /// An axis-aligned bounding box in scene units. Empty if `min > max`.
@@ -16,7 +16,7 @@ impl Bounds {
     pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
 
     /// The bounding box of packed positions, three numbers each.
-    pub fn of(positions: &[f32]) -> Self {
+    pub fn from_positions(positions: &[f32]) -> Self {
         let mut bounds = Self::EMPTY;
         let points = positions.chunks_exact(3);
         points.for_each(|point| bounds.include([0, 1, 2].map(|axis| f64::from(point[axis]))));
@@ -45,7 +45,7 @@ impl Bounds {
         self.min.iter().chain(&self.max).all(|number| number.is_finite())
     }
 
-    pub fn centre(&self) -> Point3<f64> {
+    pub fn center(&self) -> Point3<f64> {
         nalgebra::center(&Point3::from(self.min), &Point3::from(self.max))
     }
 
@@ -88,7 +88,7 @@ pub enum Lens {
 }
 
 /// The fraction of the half image that a framed scene may fill.
-const MARGIN: f64 = 0.94;
+const FRAMING_MARGIN: f64 = 0.94;
 
 /// A camera. `near` and `far` are distances in scene units; if both are 0, they are fitted to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -102,24 +102,24 @@ pub struct Camera {
 impl Camera {
     /// A camera that views the scene's rest bounds from the front, slightly from above and from the side. The bounds
     /// fill an image of this size up to a margin.
-    pub fn framing(scene: &Scene, width: u32, height: u32) -> Self {
+    pub fn fit_to_scene(scene: &Scene, width: u32, height: u32) -> Self {
         let up = scene.up.vector();
-        let aside = scene.up.from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
+        let aside = scene.up.rotation_from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
         let (bounds, degrees) = (scene.rest_bounds, 28.0_f64);
-        let slope = MARGIN * (degrees / 2.0).to_radians().tan();
+        let slope = FRAMING_MARGIN * (degrees / 2.0).to_radians().tan();
         let aspect = f64::from(width.max(1)) / f64::from(height.max(1));
         let right = up.cross(&aside).normalize();
         let above = aside.cross(&right);
         // A corner that is nearer by `depth` must stay inside the view frustum, so it requires that much more distance.
         let distance = |corner: &Point3<f64>| {
-            let offset = corner - bounds.centre();
+            let offset = corner - bounds.center();
             let wide = offset.dot(&right).abs() / (slope * aspect);
             offset.dot(&aside) + wide.max(offset.dot(&above).abs() / slope)
         };
         let distance = bounds.corners().iter().map(distance).fold(0.0, f64::max);
         let distance = if distance > 0.0 { distance } else { 1.0 };
-        let eye = bounds.centre() + aside * distance;
-        let view = View::LookAt { eye: eye.coords.into(), target: bounds.centre().coords.into(), up: up.into() };
+        let eye = bounds.center() + aside * distance;
+        let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
         Self { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
     }
 
@@ -127,7 +127,7 @@ impl Camera {
     ///
     /// # Errors
     /// `Invalid` with the field.
-    pub fn checked(self) -> Result<Self> {
+    pub fn validated(self) -> Result<Self> {
         if let View::LookAt { eye, target, up } = self.view {
             let ahead = Vector3::from(target) - Vector3::from(eye);
             let aside = ahead.cross(&Vector3::from(up)).norm();
@@ -212,17 +212,17 @@ impl Camera {
         }
     }
 
-    /// The camera whose image is, pixel for pixel, the rectangle `rectangle` of this camera's image of size `picture`.
+    /// The camera whose image is, pixel for pixel, the rectangle `pixel_rect` of this camera's image of size `picture`.
     #[must_use]
-    pub fn cropped(self, picture: [u32; 2], rectangle: Rectangle) -> Self {
+    pub fn cropped_to(self, picture: [u32; 2], pixel_rect: PixelRect) -> Self {
         let [fx, fy, cx, cy] = self.intrinsics(picture);
-        let (cx, cy) = (cx - f64::from(rectangle.x()), cy - f64::from(rectangle.y()));
+        let (cx, cy) = (cx - f64::from(pixel_rect.x()), cy - f64::from(pixel_rect.y()));
         Self { lens: Lens::Intrinsics { fx, fy, cx, cy }, ..self }
     }
 
     /// `clip_from_camera` for an image of `width` x `height` pixels. Fitted near and far planes enclose `bounds`.
     pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &Bounds) -> Matrix4<f64> {
-        let (near, far) = self.range(bounds);
+        let (near, far) = self.depth_range(bounds);
         let [fx, fy, cx, cy] = self.intrinsics([width, height]);
         let (width, height) = (f64::from(width), f64::from(height));
         let mut clip = Matrix4::zeros();
@@ -237,7 +237,7 @@ impl Camera {
     }
 
     /// Near and far distances: as given, or fitted to `bounds` and the ground around them.
-    fn range(&self, bounds: &Bounds) -> (f64, f64) {
+    fn depth_range(&self, bounds: &Bounds) -> (f64, f64) {
         if self.far > 0.0 {
             return (self.near, self.far);
         }
@@ -279,14 +279,14 @@ mod tests {
         for (size, width, height) in [([1.0, 8.0, 1.0], 1280, 720), ([9.0, 1.0, 2.0], 1280, 720), ([1.0; 3], 200, 900)]
         {
             let scene = block(size);
-            let camera = Camera::framing(&scene, width, height);
+            let camera = Camera::fit_to_scene(&scene, width, height);
             let clip = camera.clip_from_camera(width, height, &scene.rest_bounds) * camera.camera_from_world();
             let reach = scene.rest_bounds.corners().map(|corner| {
                 let point = clip.transform_point(&corner);
                 point.x.abs().max(point.y.abs())
             });
             let reach = reach.into_iter().fold(0.0, f64::max);
-            assert!((reach - MARGIN).abs() < 1e-6, "{size:?} reaches {reach}");
+            assert!((reach - FRAMING_MARGIN).abs() < 1e-6, "{size:?} reaches {reach}");
         }
     }
 
@@ -300,7 +300,7 @@ mod tests {
         let origin = [1e7, 0.0, -1e7];
         let beside = View::LookAt { eye: [0.125, 2.0, 3.0], target: [0.0, 2.25, 0.0], up };
         let want = Camera { view: beside, ..look }.camera_from_world();
-        let error = |camera: Camera| (camera.checked().expect("good").camera_from_world() - want).abs().max();
+        let error = |camera: Camera| (camera.validated().expect("good").camera_from_world() - want).abs().max();
         assert!(error(look.relative_to(origin)) < 1e-12);
         assert!(error(Camera { view: View::Pose(pose), ..look }.relative_to(origin)) < 1e-7);
         let rounded = View::Pose(pose.map(|number| f64::from(number as f32)));
@@ -308,15 +308,15 @@ mod tests {
         for bad in [f64::NAN, f64::INFINITY] {
             let mut pose = pose;
             pose[7] = bad;
-            assert!(Camera { view: View::Pose(pose), ..look }.checked().is_err());
+            assert!(Camera { view: View::Pose(pose), ..look }.validated().is_err());
         }
     }
 
     fn block(size: [f32; 3]) -> std::sync::Arc<Scene> {
         use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
         let rest = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];
-        let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a mesh");
-        let mut parts = crate::scene::Parts::named("block");
+        let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a mesh");
+        let mut parts = crate::scene::SceneParts::named("block");
         parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
         parts.materials = vec![Material::default()];
         parts.domains = vec![Domain {
@@ -326,7 +326,7 @@ mod tests {
             placement: Transform::IDENTITY,
             attachment: None,
             follows: None,
-            runs: vec![],
+            material_ranges: vec![],
             rest_q: vec![],
             shares_q_with: None,
             metadata: Metadata::default(),

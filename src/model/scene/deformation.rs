@@ -6,7 +6,7 @@ use crate::error::{Result, invalid};
 /// The storage type of the entries of U. Sums are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Storage {
+pub enum StorageType {
     /// 4 bytes, exact.
     #[default]
     F32,
@@ -18,7 +18,7 @@ pub enum Storage {
     Int8,
 }
 
-impl Storage {
+impl StorageType {
     /// All storage types.
     pub const ALL: [Self; 4] = [Self::F32, Self::F16, Self::Bf16, Self::Int8];
 
@@ -36,7 +36,7 @@ impl Storage {
 /// How normals and tangents of a deformed surface are computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Normals {
+pub enum NormalMethod {
     /// Normals of the rest state, transformed by T alone (equation 3.8 of the thesis).
     #[default]
     Rigid,
@@ -48,7 +48,7 @@ pub enum Normals {
 /// bit-identical.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Batches {
+pub enum BatchPolicy {
     /// Batches where they are known to be faster.
     #[default]
     Auto,
@@ -61,9 +61,9 @@ pub enum Batches {
 /// Options that trade accuracy for time, and additional outputs. The default is exact.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Deformation {
-    pub storage: Storage,
-    pub normals: Normals,
+pub struct DeformationSettings {
+    pub storage: StorageType,
+    pub normals: NormalMethod,
     /// Error bound in meters: modes that together move no vertex by more than this distance are skipped.
     pub truncation: Option<f64>,
     /// Sum modes with error compensation. Useful for modes that nearly cancel.
@@ -73,10 +73,10 @@ pub struct Deformation {
     /// Store an axis-aligned bounding box of each domain's deformed positions.
     pub boxes: bool,
     /// Batching in the CUDA deformer. Not available with truncation, compensated sums or stored displacements.
-    pub batches: Batches,
+    pub batches: BatchPolicy,
 }
 
-impl Deformation {
+impl DeformationSettings {
     pub(super) fn check(&self) -> Result<()> {
         match self.truncation {
             Some(budget) if !(budget.is_finite() && budget > 0.0) => {

@@ -7,7 +7,7 @@ use crate::error::{Result, invalid};
 
 /// The packed ranges of one domain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Slot {
+pub struct DomainLayout {
     /// First vertex in the packed positions, and the number n of vertices.
     pub first_vertex: usize,
     pub vertices: usize,
@@ -25,14 +25,14 @@ pub struct Slot {
 /// The packed ranges of all domains and the totals.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
-    pub slots: Vec<Slot>,
+    pub slots: Vec<DomainLayout>,
     pub vertices: usize,
     pub corners: usize,
     pub triangles: usize,
     /// Length of the packed q.
     pub coordinates: usize,
     /// Domains of rank above 0 that share coordinates, ascending, by `first_q`. Empty if no domain shares coordinates.
-    pub sharers: BTreeMap<usize, Vec<u32>>,
+    pub domains_sharing_q: BTreeMap<usize, Vec<u32>>,
 }
 
 impl Layout {
@@ -43,13 +43,13 @@ impl Layout {
             corners: 0,
             triangles: 0,
             coordinates: 0,
-            sharers: BTreeMap::new(),
+            domains_sharing_q: BTreeMap::new(),
         };
         for (index, domain) in domains.iter().enumerate() {
             let shape = &shapes[domain.shape];
             let rank = shape.modes.rank();
             let shared = domain.shares_q_with.map(|twin| layout.slots[twin].first_q);
-            let slot = Slot {
+            let slot = DomainLayout {
                 first_vertex: layout.vertices,
                 vertices: shape.mesh.rest().len(),
                 first_corner: layout.corners,
@@ -65,7 +65,7 @@ impl Layout {
             layout.coordinates += if shared.is_some() { 0 } else { rank };
             if let Some(twin) = domain.shares_q_with.filter(|_| rank > 0) {
                 // Only the owner of the coordinates inserts itself: a twin of a twin finds an existing list.
-                layout.sharers.entry(slot.first_q).or_insert_with(|| vec![twin as u32]).push(index as u32);
+                layout.domains_sharing_q.entry(slot.first_q).or_insert_with(|| vec![twin as u32]).push(index as u32);
             }
             layout.slots.push(slot);
         }

@@ -4,36 +4,36 @@
 //! domain begin; every deformer and the renderer use it.
 
 mod camera;
-mod cells;
 mod deformation;
+mod features;
+mod floating_origin;
 mod layout;
-mod light;
-mod look;
-mod movers;
-mod needs;
-mod post;
-mod raster;
-mod rectangle;
-mod rigid;
+mod light_space;
+mod pixel_rect;
+mod post_processing;
+mod raster_input;
+mod render_settings;
 mod shadow;
 mod state;
-mod update;
+mod step_update;
+mod transform_format;
+mod transform_roots;
 
 pub use camera::{Bounds, Camera, Lens, View};
-pub use cells::{Cells, GRID, REACH, nearest_cell};
-pub use deformation::{Batches, Deformation, Normals, Storage};
-pub use layout::{Layout, Slot};
-pub use light::{LightBounds, light_axes};
-pub use look::{Culling, Ground, Look, MAX_FRAGMENTS, Rastering, Transparency, UpAxis};
-pub use movers::Movers;
-pub use needs::Needs;
-pub use post::{Antialias, Bloom, Tone};
-pub use raster::{Faces, Group, MAX_SIDE, Window};
-pub use rectangle::Rectangle;
-pub use rigid::TransformFormat;
-pub use shadow::{Blurring, Fit, Moments, Shadow, ShadowMethod};
-pub use state::{Changed, State};
-pub use update::{RawUpdate, Update};
+pub use deformation::{BatchPolicy, DeformationSettings, NormalMethod, StorageType};
+pub use features::SceneFeatures;
+pub use floating_origin::{FloatingOrigins, ORIGIN_GRID, ORIGIN_REACH, snap_to_origin_grid};
+pub use layout::{DomainLayout, Layout};
+pub use light_space::{LightSpaceBox, light_axes};
+pub use pixel_rect::PixelRect;
+pub use post_processing::{Antialiasing, Bloom, ToneMapping};
+pub use raster_input::{CullMode, DrawRange, MAX_VIEWPORT_SIDE, Viewport};
+pub use render_settings::{Culling, Ground, MAX_FRAGMENTS, RasterPolicy, RenderSettings, Transparency, UpAxis};
+pub use shadow::{BlurMethod, MomentFormat, ShadowFit, ShadowMethod, ShadowSettings};
+pub use state::{DirtyDomains, SceneState};
+pub use step_update::{RawStepUpdate, StepUpdate};
+pub use transform_format::TransformFormat;
+pub use transform_roots::TransformRoots;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -46,15 +46,15 @@ pub const MAX_DOMAINS: usize = 1 << 20;
 
 /// The most bytes of a domain's name, and of all its notes together. The limits keep the description of a domain within
 /// one message.
-const MAX_NAME: usize = 4 << 10;
-const MAX_NOTES: usize = 64 << 10;
+const MAX_NAME_BYTES: usize = 4 << 10;
+const MAX_NOTES_BYTES: usize = 64 << 10;
 
 /// The largest number of parent vertices that define an attachment frame.
 const MAX_ATTACHMENT_ROWS: usize = 4096;
 
 /// The input of [`Scene::new`], as a loader produces it.
 #[derive(Debug, Clone, Default)]
-pub struct Parts {
+pub struct SceneParts {
     pub name: String,
     pub shapes: Vec<Shape>,
     pub materials: Vec<Material>,
@@ -65,8 +65,8 @@ pub struct Parts {
     pub unit: f64,
     /// World position, in meters, of the frame in which all transforms are given.
     pub origin: [f64; 3],
-    pub look: Look,
-    pub deformation: Deformation,
+    pub look: RenderSettings,
+    pub deformation: DeformationSettings,
     /// Declares that no step will shear or non-uniformly scale a domain; a step that does is rejected.
     pub rigid_transforms: bool,
     /// Warnings of the loader about input that it could not use, for `inspect` and the log.
@@ -84,21 +84,21 @@ pub struct Scene {
     pub up: UpAxis,
     pub unit: f64,
     pub origin: [f64; 3],
-    pub look: Look,
-    pub deformation: Deformation,
+    pub look: RenderSettings,
+    pub deformation: DeformationSettings,
     pub rigid_transforms: bool,
     pub remarks: Vec<String>,
     pub layout: Layout,
-    pub movers: Movers,
-    pub needs: Needs,
+    pub movers: TransformRoots,
+    pub needs: SceneFeatures,
     /// Bounds of the rest state in scene units.
     pub rest_bounds: Bounds,
 }
 
 impl Scene {
     /// The parts of which this scene was built, for building a modified scene.
-    pub fn parts(&self) -> Parts {
-        Parts {
+    pub fn parts(&self) -> SceneParts {
+        SceneParts {
             name: self.name.clone(),
             shapes: self.shapes.clone(),
             materials: self.materials.clone(),
@@ -118,7 +118,7 @@ impl Scene {
     ///
     /// # Errors
     /// `Invalid` with the domain and the field.
-    pub fn new(mut parts: Parts) -> Result<Arc<Self>> {
+    pub fn new(mut parts: SceneParts) -> Result<Arc<Self>> {
         if parts.domains.is_empty() || parts.domains.len() > MAX_DOMAINS {
             return Err(invalid("scene.domains", format!("1 to {MAX_DOMAINS}"), parts.domains.len()));
         }
@@ -128,18 +128,18 @@ impl Scene {
         if !parts.origin.iter().all(|number| number.is_finite()) {
             return Err(invalid("scene.origin", "finite numbers", format!("{:?}", parts.origin)));
         }
-        parts.materials = parts.materials.into_iter().map(Material::checked).collect::<Result<_>>()?;
+        parts.materials = parts.materials.into_iter().map(Material::validated).collect::<Result<_>>()?;
         check_textures(&parts)?;
         for index in 0..parts.domains.len() {
-            check_domain(&parts, index).map_err(|error| error.within(&format!("domain {index}")))?;
+            check_domain(&parts, index).map_err(|error| error.prefix_field(&format!("domain {index}")))?;
         }
-        let movers = Movers::new(&mut parts.domains)?;
+        let movers = TransformRoots::new(&mut parts.domains)?;
         parts.look.check()?;
         parts.deformation.check()?;
-        leave_out_unplaced_textures(&mut parts);
+        drop_textures_without_uvs(&mut parts);
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
-        let needs = Needs::of(&parts);
+        let needs = SceneFeatures::from_parts(&parts);
         if needs.exact_normals {
             add_smoothing(&mut parts)?;
         }
@@ -203,9 +203,9 @@ impl Scene {
     }
 }
 
-fn check_textures(parts: &Parts) -> Result<()> {
+fn check_textures(parts: &SceneParts) -> Result<()> {
     for material in &parts.materials {
-        for texture in [material.colour_texture, material.normal_texture].into_iter().flatten() {
+        for texture in [material.color_texture, material.normal_texture].into_iter().flatten() {
             if texture >= parts.textures.len() {
                 let field = format!("material '{}': texture", material.name);
                 return Err(invalid(field, format!("an index below {}", parts.textures.len()), texture));
@@ -215,7 +215,7 @@ fn check_textures(parts: &Parts) -> Result<()> {
     Ok(())
 }
 
-fn check_domain(parts: &Parts, index: usize) -> Result<()> {
+fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     let domain = &parts.domains[index];
     let below = |field: &str, given: usize, limit: usize| match given < limit {
         true => Ok(()),
@@ -227,10 +227,10 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
     check_texts(domain)?;
     if let Some(follow) = &domain.follows {
         below("follows.parent", follow.parent, index)?;
-        crate::domain::Transform::new(follow.frame.0).map_err(|error| error.within("follows.frame"))?;
+        crate::domain::Transform::new(follow.frame.0).map_err(|error| error.prefix_field("follows.frame"))?;
     }
     let rank = parts.shapes[domain.shape].modes.rank();
-    crate::domain::Transform::new(domain.placement.0).map_err(|error| error.within("placement"))?;
+    crate::domain::Transform::new(domain.placement.0).map_err(|error| error.prefix_field("placement"))?;
     if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
         return Err(invalid("rest_q", format!("none or {rank} coordinates"), domain.rest_q.len()));
     }
@@ -260,20 +260,20 @@ fn check_domain(parts: &Parts, index: usize) -> Result<()> {
 }
 
 fn check_texts(domain: &Domain) -> Result<()> {
-    if domain.name.len() > MAX_NAME {
-        return Err(invalid("name", format!("at most {MAX_NAME} bytes"), domain.name.len()));
+    if domain.name.len() > MAX_NAME_BYTES {
+        return Err(invalid("name", format!("at most {MAX_NAME_BYTES} bytes"), domain.name.len()));
     }
     let bytes: usize = domain.metadata.notes.iter().map(|(name, text)| name.len() + text.len()).sum();
-    if bytes > MAX_NOTES {
-        return Err(invalid("notes", format!("at most {MAX_NOTES} bytes in all"), bytes));
+    if bytes > MAX_NOTES_BYTES {
+        return Err(invalid("notes", format!("at most {MAX_NOTES_BYTES} bytes in all"), bytes));
     }
     Ok(())
 }
 
-fn check_runs(parts: &Parts, domain: &Domain) -> Result<()> {
+fn check_runs(parts: &SceneParts, domain: &Domain) -> Result<()> {
     let triangles = parts.shapes[domain.shape].mesh.triangles().len();
-    for (index, run) in domain.runs.iter().enumerate() {
-        let before = index.checked_sub(1).map(|before| domain.runs[before].first_triangle);
+    for (index, run) in domain.material_ranges.iter().enumerate() {
+        let before = index.checked_sub(1).map(|before| domain.material_ranges[before].first_triangle);
         let in_order = before.map_or(run.first_triangle == 0, |before| run.first_triangle > before);
         if !in_order || run.first_triangle >= triangles {
             let expected = format!("0 for the first, then ascending, below {triangles}");
@@ -289,14 +289,14 @@ fn check_runs(parts: &Parts, domain: &Domain) -> Result<()> {
 
 /// Removes textures from shapes without texture coordinates, where they would show one texel everywhere. Affected
 /// domains get an untextured copy of their material, and a remark is recorded.
-fn leave_out_unplaced_textures(parts: &mut Parts) {
+fn drop_textures_without_uvs(parts: &mut SceneParts) {
     let mut copies: BTreeMap<usize, usize> = BTreeMap::new();
-    let Parts { shapes, materials, domains, remarks, .. } = parts;
+    let SceneParts { shapes, materials, domains, remarks, .. } = parts;
     for domain in domains.iter_mut().filter(|domain| shapes[domain.shape].mesh.corners().uvs.is_empty()) {
-        let runs = domain.runs.iter_mut().map(|run| &mut run.material);
-        for material in std::iter::once(&mut domain.material).chain(runs) {
+        let material_ranges = domain.material_ranges.iter_mut().map(|run| &mut run.material);
+        for material in std::iter::once(&mut domain.material).chain(material_ranges) {
             let textured = &materials[*material];
-            if textured.colour_texture.is_none() && textured.normal_texture.is_none() {
+            if textured.color_texture.is_none() && textured.normal_texture.is_none() {
                 continue;
             }
             let textured = textured.clone();
@@ -307,7 +307,7 @@ fn leave_out_unplaced_textures(parts: &mut Parts) {
                     AlphaMode::Mask { cutoff } if textured.alpha >= cutoff => AlphaMode::Opaque,
                     kept => kept,
                 };
-                let plain = Material { colour_texture: None, normal_texture: None, alpha_mode, ..textured };
+                let plain = Material { color_texture: None, normal_texture: None, alpha_mode, ..textured };
                 materials.push(plain);
                 materials.len() - 1
             });
@@ -316,7 +316,7 @@ fn leave_out_unplaced_textures(parts: &mut Parts) {
 }
 
 /// Computes tangents of shapes that are used with a normal map.
-fn add_tangents(parts: &mut Parts) {
+fn add_tangents(parts: &mut SceneParts) {
     for domain in &parts.domains {
         let shape = &mut parts.shapes[domain.shape];
         let mapped = domain.materials().any(|material| parts.materials[material].normal_texture.is_some());
@@ -327,7 +327,7 @@ fn add_tangents(parts: &mut Parts) {
 }
 
 /// Computes smoothing groups of shapes with modes. Normals of rigid shapes only rotate with their domain.
-fn add_smoothing(parts: &mut Parts) -> Result<()> {
+fn add_smoothing(parts: &mut SceneParts) -> Result<()> {
     let mut triangles = 0;
     for domain in &parts.domains {
         let shape = &mut parts.shapes[domain.shape];
@@ -343,7 +343,7 @@ fn add_smoothing(parts: &mut Parts) -> Result<()> {
     Ok(())
 }
 
-impl Parts {
+impl SceneParts {
     /// Empty parts with default conventions: meters, origin at zero, default look.
     pub fn named(name: impl Into<String>) -> Self {
         Self { name: name.into(), unit: 1.0, ..Self::default() }
@@ -362,17 +362,18 @@ impl Parts {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Attachment, Mesh, Modes, Run, Transform};
+    use crate::domain::{Attachment, MaterialRange, Mesh, Modes, Transform};
 
     /// One domain of two triangles, with an opaque and a blended material.
-    fn square(runs: Vec<Run>) -> Parts {
+    fn square(material_ranges: Vec<MaterialRange>) -> SceneParts {
         let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
-        let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+        let mesh =
+            Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
         let domain = Domain {
             name: "square".into(),
             shape: 0,
             material: 0,
-            runs,
+            material_ranges,
             placement: Transform::IDENTITY,
             attachment: None,
             follows: None,
@@ -380,7 +381,7 @@ mod tests {
             shares_q_with: None,
             metadata: crate::domain::Metadata::default(),
         };
-        let mut parts = Parts::named("square");
+        let mut parts = SceneParts::named("square");
         parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
         parts.materials = vec![Material::default(), Material { alpha_mode: AlphaMode::Blend, ..Material::default() }];
         parts.domains.push(domain);
@@ -392,27 +393,27 @@ mod tests {
         let textured = || {
             let mut parts = square(vec![]);
             parts.textures = vec![Texture::new("leaf", 1, 1, vec![0; 4]).expect("a texture")];
-            parts.materials[0].colour_texture = Some(0);
+            parts.materials[0].color_texture = Some(0);
             parts.materials[0].alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
             parts
         };
         let scene = Scene::new(textured()).expect("a scene");
         let shown = &scene.materials[scene.domains[0].material];
-        assert_eq!((shown.colour_texture, shown.alpha_mode), (None, AlphaMode::Opaque));
+        assert_eq!((shown.color_texture, shown.alpha_mode), (None, AlphaMode::Opaque));
         assert!(!scene.needs.textures && !scene.needs.mask);
         assert!(scene.remarks[0].contains("no texture coordinates"), "{:?}", scene.remarks);
         let mut placed = textured();
         let mesh = &placed.shapes[0].mesh;
         let corners = mesh.corners().clone();
         let uvs = vec![[0.0, 0.0]; 4];
-        let mesh = Mesh::indexed(mesh.rest().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
+        let mesh = Mesh::from_indexed(mesh.rest().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
         placed.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
         let scene = Scene::new(placed).expect("a scene");
         assert!(scene.needs.textures && scene.needs.mask && scene.remarks.is_empty());
     }
 
-    fn run(first_triangle: usize, material: usize) -> Run {
-        Run { first_triangle, material }
+    fn run(first_triangle: usize, material: usize) -> MaterialRange {
+        MaterialRange { first_triangle, material }
     }
 
     #[test]
@@ -441,13 +442,13 @@ mod tests {
 
     #[test]
     fn runs_out_of_order_or_out_of_range_are_refused_by_name() {
-        for (runs, field) in [
+        for (material_ranges, field) in [
             (vec![run(1, 0)], "domain 0: runs[0].first_triangle"),
             (vec![run(0, 0), run(0, 1)], "domain 0: runs[1].first_triangle"),
             (vec![run(0, 0), run(2, 1)], "domain 0: runs[1].first_triangle"),
             (vec![run(0, 2)], "domain 0: runs[0].material"),
         ] {
-            let refusal = Scene::new(square(runs)).expect_err(field).to_string();
+            let refusal = Scene::new(square(material_ranges)).expect_err(field).to_string();
             assert!(refusal.starts_with(field), "{refusal}");
         }
     }

@@ -17,13 +17,14 @@ pub enum ShadowMethod {
     /// Percentage-closer filtering: the fraction of surrounding depths behind the receiver, weighted by the Gaussian of
     /// `blur`. Soft edges, half dark within half a texel of the true edge, no light bleeding, at the cost of
     /// (6 blur + 2)^2 depths per pixel. As with `Standard`, an occluder closer than one texel side casts no shadow.
-    Filtered,
+    #[serde(rename = "filtered")]
+    PercentageCloser,
 }
 
 /// The storage type of a variance map's moments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Moments {
+pub enum MomentFormat {
     #[default]
     F32,
     /// Half the memory, but insufficient precision: the second moment is rounded by up to 2^-14, thirty times the
@@ -35,7 +36,7 @@ pub enum Moments {
 /// What the light's view volume is fitted to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Fit {
+pub enum ShadowFit {
     /// Bounds of the vertices in light space. Compared with `Corners`, the texels of a tree have a third of the area,
     /// and its leaves cover three times as many of them.
     #[default]
@@ -47,10 +48,10 @@ pub enum Fit {
 
 /// The implementation of the moments' blur. All of them yield the same map up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Blurring {
+pub enum BlurMethod {
     /// `Tiles` on hardware, `Rows` on software implementations.
     #[default]
-    Fitting,
+    Auto,
     /// One compute pass. It works on strips with sums in registers; for a blur above 8, whose radius is too
     /// large for this, on tiles in shared memory.
     Tiles,
@@ -63,7 +64,7 @@ pub enum Blurring {
 /// Settings of the shadow map.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Shadow {
+pub struct ShadowSettings {
     pub method: ShadowMethod,
     /// Side of the square map in texels, 16 to 16384.
     pub size: u32,
@@ -77,18 +78,18 @@ pub struct Shadow {
     pub bleeding: f32,
     /// The alpha from which blended materials cast a shadow (t_alpha of the thesis).
     pub alpha_threshold: f32,
-    pub moments: Moments,
+    pub moments: MomentFormat,
     /// Number of cascades, 1 to 4, each with a map of `size`, split by distance from the camera. Nearer cascades have
     /// finer texels; the last one covers the whole scene. `blur` is in texels of each cascade, so that shadows are
     /// sharper nearby.
     pub splits: u32,
-    pub fit: Fit,
+    pub fit: ShadowFit,
     /// For benchmarks only; not part of the file format.
     #[serde(skip)]
-    pub blurring: Blurring,
+    pub blur_method: BlurMethod,
 }
 
-impl Default for Shadow {
+impl Default for ShadowSettings {
     fn default() -> Self {
         Self {
             method: ShadowMethod::default(),
@@ -97,18 +98,18 @@ impl Default for Shadow {
             least_variance: 2e-6,
             bleeding: 0.2,
             alpha_threshold: 0.5,
-            moments: Moments::default(),
+            moments: MomentFormat::default(),
             splits: 1,
-            fit: Fit::default(),
-            blurring: Blurring::default(),
+            fit: ShadowFit::default(),
+            blur_method: BlurMethod::default(),
         }
     }
 }
 
 /// The largest number of texels of all cascades together.
-const MOST_TEXELS: u64 = 16384 * 16384;
+const MAX_TEXELS: u64 = 16384 * 16384;
 
-impl Shadow {
+impl ShadowSettings {
     /// Whether the map stores moments of depth, which are blurred.
     pub const fn has_moments(&self) -> bool {
         matches!(self.method, ShadowMethod::Variance)
@@ -124,7 +125,7 @@ impl Shadow {
 
     /// Standard deviation, in texels, of the filter that a soft map applies to depths: the blur and the bilinear
     /// lookup, a tent of variance 1/6.
-    pub fn deviation(&self) -> f64 {
+    pub fn filter_deviation(&self) -> f64 {
         (f64::from(self.blur).powi(2) + 1.0 / 6.0).sqrt()
     }
 
@@ -151,8 +152,8 @@ impl Shadow {
             return Err(invalid("look.shadow", "alpha_threshold and least_variance of 0 to 1", format!("{self:?}")));
         }
         let texels = u64::from(self.size) * u64::from(self.size) * u64::from(self.splits);
-        if !(1..=4).contains(&self.splits) || texels > MOST_TEXELS {
-            let expected = format!("1 to 4 maps of together {MOST_TEXELS} texels at most");
+        if !(1..=4).contains(&self.splits) || texels > MAX_TEXELS {
+            let expected = format!("1 to 4 maps of together {MAX_TEXELS} texels at most");
             return Err(invalid("look.shadow.splits", expected, format!("{} of {} a side", self.splits, self.size)));
         }
         Ok(())
@@ -165,15 +166,15 @@ mod tests {
 
     #[test]
     fn maps_out_of_range_are_refused_by_field() {
-        let good = Shadow::default();
+        let good = ShadowSettings::default();
         good.check().expect("good");
         let bad = [
-            (Shadow { size: 15, ..good }, "size"),
-            (Shadow { blur: f32::NAN, ..good }, "blur"),
-            (Shadow { bleeding: 1.0, ..good }, "bleeding"),
-            (Shadow { splits: 0, ..good }, "splits"),
-            (Shadow { splits: 5, ..good }, "splits"),
-            (Shadow { splits: 2, size: 16384, ..good }, "splits"),
+            (ShadowSettings { size: 15, ..good }, "size"),
+            (ShadowSettings { blur: f32::NAN, ..good }, "blur"),
+            (ShadowSettings { bleeding: 1.0, ..good }, "bleeding"),
+            (ShadowSettings { splits: 0, ..good }, "splits"),
+            (ShadowSettings { splits: 5, ..good }, "splits"),
+            (ShadowSettings { splits: 2, size: 16384, ..good }, "splits"),
         ];
         for (shadow, field) in bad {
             let refusal = shadow.check().expect_err(field).to_string();
@@ -182,7 +183,7 @@ mod tests {
     }
 
     /// Blurs moments of equal depths m twice in f32, as the shaders do. Returns the largest |M2 - M1^2|.
-    fn spurious(shadow: &Shadow) -> f32 {
+    fn spurious(shadow: &ShadowSettings) -> f32 {
         let reach = shadow.reach() as i32;
         let bell = |step: i32| (-0.5 * (f64::from(step) / f64::from(shadow.blur)).powi(2)).exp();
         let sum: f64 = (-reach..=reach).map(bell).sum();
@@ -198,11 +199,11 @@ mod tests {
     #[test]
     fn the_floor_holds_what_rounding_makes_of_no_variance_and_not_a_hundred_times_more() {
         for blur in [0.5, 1.5, 4.0, 16.0] {
-            let shadow = Shadow { blur, ..Shadow::default() };
+            let shadow = ShadowSettings { blur, ..ShadowSettings::default() };
             let (worst, floor) = (spurious(&shadow), shadow.floor());
             assert!(worst <= floor && floor < 100.0 * worst, "blur {blur}: {worst} of {floor}");
         }
-        let default = Shadow::default();
+        let default = ShadowSettings::default();
         assert!(default.floor() < default.least_variance, "the default least variance is above its floor");
     }
 }

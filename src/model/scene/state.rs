@@ -4,12 +4,12 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use super::{Cells, Movers, Scene, Update};
-use crate::domain::{Composed, Transform};
+use super::{FloatingOrigins, Scene, StepUpdate, TransformRoots};
+use crate::domain::{ComposedTransform, Transform};
 
 /// The domains that differ from the state with the previous serial number.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub enum Changed {
+pub enum DirtyDomains {
     /// Possibly all domains.
     #[default]
     All,
@@ -20,7 +20,7 @@ pub enum Changed {
 
 /// The complete state after a step.
 #[derive(Debug, Clone)]
-pub struct State {
+pub struct SceneState {
     /// Number of the run: each new writer starts a run, and step numbers belong to one run. 0 before the first.
     pub run: u64,
     /// The step number that the writer assigned.
@@ -29,31 +29,31 @@ pub struct State {
     pub time: f64,
     /// All coordinates, packed as in [`super::Layout`].
     pub q: Vec<f32>,
-    /// `world_from_domain` of each transform root ([`super::Movers`]); without followers, every domain is one. Relative
-    /// to the domain's cell ([`Self::cell_of`]), which is the scene's origin unless a step with f64 translations moved
+    /// `world_from_domain` of each transform root ([`super::TransformRoots`]); without followers, every domain is one. Relative
+    /// to the domain's cell ([`Self::origin_of`]), which is the scene's origin unless a step with f64 translations moved
     /// the domain far from it.
     pub transforms: Vec<Transform>,
     /// f64 translations and cells; present after the first step with f64 translations.
-    pub cells: Option<Arc<Cells>>,
+    pub origins: Option<Arc<FloatingOrigins>>,
     /// Number of updates of this state; 0 at rest. A deformer that computed serial s and receives s + 1 needs to
     /// compute only the domains in `changed`. For any other pair of serials, including equal ones, and after an error
     /// of its own, it must compute all domains.
     pub serial: u64,
     /// The domains that the last update changed.
-    pub changed: Changed,
+    pub changed: DirtyDomains,
 }
 
 /// Equality ignores how the state came about (`serial`, `changed`).
-impl PartialEq for State {
+impl PartialEq for SceneState {
     fn eq(&self, other: &Self) -> bool {
         (self.run, self.step, self.time) == (other.run, other.step, other.time)
             && self.q == other.q
             && self.transforms == other.transforms
-            && self.cells == other.cells
+            && self.origins == other.origins
     }
 }
 
-impl State {
+impl SceneState {
     /// The state before any step.
     pub fn rest(scene: &Scene) -> Self {
         let mut q = vec![0.0; scene.layout.coordinates];
@@ -61,13 +61,13 @@ impl State {
             q[slot.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
         }
         let transforms = scene.movers.domains().map(|domain| scene.domains[domain as usize].placement).collect();
-        Self { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
+        Self { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
     }
 
     /// Applies a whole step. Domains that the step does not name keep their values. The cost is proportional to the
     /// number of named domains, their followers, and the domains that share their q. Exceptions are the first step with
     /// f64 translations and the rare steps that search a new shared cell: they make a pass over all transform roots.
-    pub fn apply(&mut self, scene: &Scene, update: &Update) {
+    pub fn apply(&mut self, scene: &Scene, update: &StepUpdate) {
         self.step = update.number;
         self.time = update.time;
         self.serial += 1;
@@ -75,8 +75,8 @@ impl State {
         for (domain, q) in update.coordinates() {
             let slot = scene.layout.slots[domain];
             self.q[slot.first_q..][..slot.rank].copy_from_slice(q);
-            match scene.layout.sharers.get(&slot.first_q) {
-                Some(sharers) if slot.rank > 0 => changed.extend_from_slice(sharers),
+            match scene.layout.domains_sharing_q.get(&slot.first_q) {
+                Some(domains_sharing_q) if slot.rank > 0 => changed.extend_from_slice(domains_sharing_q),
                 _ => changed.push(domain as u32),
             }
         }
@@ -86,54 +86,54 @@ impl State {
         }
         changed.sort_unstable();
         changed.dedup();
-        let anew = self.place(&scene.movers, update);
-        self.changed = if anew { Changed::All } else { Changed::Some(changed) };
+        let anew = self.apply_transforms(&scene.movers, update);
+        self.changed = if anew { DirtyDomains::All } else { DirtyDomains::Some(changed) };
     }
 
     /// Sets the named transforms. Returns true if transforms of other domains were rebased to a new cell.
-    fn place(&mut self, movers: &Movers, update: &Update) -> bool {
-        let begins = self.cells.is_none() && update.has_f64();
+    fn apply_transforms(&mut self, movers: &TransformRoots, update: &StepUpdate) -> bool {
+        let begins = self.origins.is_none() && update.has_f64_translations();
         if begins {
-            self.cells = Some(Arc::new(Cells::of(&self.transforms)));
+            self.origins = Some(Arc::new(FloatingOrigins::of(&self.transforms)));
         }
         if update.transforms.is_empty() {
             return false;
         }
-        let Some(cells) = self.cells.as_mut().map(Arc::make_mut) else {
+        let Some(origins) = self.origins.as_mut().map(Arc::make_mut) else {
             for (domain, transform) in &update.transforms {
                 self.transforms[movers.of(*domain as usize)] = *transform;
             }
             return false;
         };
-        let anew = begins && !cells.is_one();
-        for (domain, transform, translation) in update.placements() {
-            let mover = movers.of(domain);
-            cells.set(mover, translation);
-            self.transforms[mover] = cells.express(mover, transform);
+        let anew = begins && !origins.is_uniform();
+        for (domain, transform, translation) in update.transform_updates() {
+            let root = movers.of(domain);
+            origins.set(root, translation);
+            self.transforms[root] = origins.rebase_transform(root, transform);
         }
-        let anew = cells.follow() || anew;
+        let anew = origins.update_shared_origin() || anew;
         if anew {
-            for (mover, transform) in self.transforms.iter_mut().enumerate() {
-                *transform = cells.express(mover, *transform);
+            for (root, transform) in self.transforms.iter_mut().enumerate() {
+                *transform = origins.rebase_transform(root, *transform);
             }
         }
         anew
     }
 
     /// The f64 reference point of a transform root: its transform, its vertices and those of its followers are relative
-    /// to this point, which is in scene units from the scene's origin. `mover` is an index into `transforms`.
-    pub fn cell_of(&self, mover: usize) -> [f64; 3] {
-        self.cells.as_ref().map_or([0.0; 3], |cells| cells.cell_of(mover))
+    /// to this point, which is in scene units from the scene's origin. `root` is an index into `transforms`.
+    pub fn origin_of(&self, root: usize) -> [f64; 3] {
+        self.origins.as_ref().map_or([0.0; 3], |origins| origins.origin_of(root))
     }
 
     /// The transform of a domain's root and, for a follower, its constant frame; relative to the cell of the root.
-    pub fn composed(&self, scene: &Scene, domain: usize) -> Composed {
-        Composed { mover: self.transforms[scene.movers.of(domain)], frame: scene.movers.frame_of(domain) }
+    pub fn composed_transform(&self, scene: &Scene, domain: usize) -> ComposedTransform {
+        ComposedTransform { root: self.transforms[scene.movers.of(domain)], frame: scene.movers.frame_of(domain) }
     }
 
-    /// `world_from_domain` of a domain in f32, as deformers use it ([`Composed::rounded`]).
+    /// `world_from_domain` of a domain in f32, as deformers use it ([`ComposedTransform::to_f32`]).
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> Transform {
-        self.composed(scene, domain).rounded()
+        self.composed_transform(scene, domain).to_f32()
     }
 
     /// `world_from_domain` of every domain. Borrows `transforms` if the scene has no followers.
@@ -146,9 +146,9 @@ impl State {
 
     /// Marks the whole state as changed. Call it after writing `q` or `transforms` directly, because `changed` does not
     /// list such writes.
-    pub fn touch(&mut self) {
+    pub fn mark_all_dirty(&mut self) {
         self.serial += 1;
-        self.changed = Changed::All;
+        self.changed = DirtyDomains::All;
     }
 
     /// The coordinates of one domain.

@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::noise::{Noise, blend, smooth_step};
-use super::random::Random;
+use super::noise::{GradientNoise, lerp_color, smoothstep};
+use super::random::SplitMix64;
 use crate::domain::Texture;
 use crate::error::Result;
 
@@ -23,39 +23,39 @@ const LICHEN: [f32; 3] = [126.0, 126.0, 92.0];
 ///
 /// # Errors
 /// None in practice, because the sizes are constants.
-pub(super) fn textures(random: &mut Random) -> Result<[Texture; 2]> {
-    let layers = Layers::new(random);
+pub(super) fn textures(random: &mut SplitMix64) -> Result<[Texture; 2]> {
+    let layers = BarkLayers::new(random);
     let rows = |row: usize| (0..SIDE).map(move |column| (column, row));
     let heights: Vec<f32> = (0..SIDE * SIDE)
         .into_par_iter()
         .with_min_len(SIDE)
         .map(|pixel| layers.height((pixel % SIDE) as f32 / SIDE as f32, (pixel / SIDE) as f32 / SIDE as f32))
         .collect();
-    let mut colours = Vec::with_capacity(4 * SIDE * SIDE);
+    let mut colors = Vec::with_capacity(4 * SIDE * SIDE);
     let mut normals = Vec::with_capacity(4 * SIDE * SIDE);
     for (column, row) in (0..SIDE).flat_map(rows) {
         let (u, v) = (column as f32 / SIDE as f32, row as f32 / SIDE as f32);
-        let colour = layers.colour(u, v, heights[row * SIDE + column]);
-        colours.extend(colour.map(|channel| channel.clamp(0.0, 255.0) as u8));
+        let color = layers.color(u, v, heights[row * SIDE + column]);
+        colors.extend(color.map(|channel| channel.clamp(0.0, 255.0) as u8));
         normals.extend(normal(&heights, column, row).map(|axis| ((0.5 * axis + 0.5) * 255.0).round() as u8));
-        colours.push(255);
+        colors.push(255);
         normals.push(255);
     }
     let side = SIDE as u32;
-    Ok([Texture::new("bark", side, side, colours)?, Texture::new("bark normals", side, side, normals)?])
+    Ok([Texture::new("bark", side, side, colors)?, Texture::new("bark normals", side, side, normals)?])
 }
 
-struct Layers {
-    warps: [Noise; 2],
-    furrows: [Noise; 2],
-    cracks: Noise,
-    grain: [Noise; 2],
-    tint: Noise,
+struct BarkLayers {
+    warps: [GradientNoise; 2],
+    furrows: [GradientNoise; 2],
+    cracks: GradientNoise,
+    grain: [GradientNoise; 2],
+    tint: GradientNoise,
 }
 
-impl Layers {
-    fn new(random: &mut Random) -> Self {
-        let mut noise = |across, along| Noise { cells: [across, along], seed: random.bits() };
+impl BarkLayers {
+    fn new(random: &mut SplitMix64) -> Self {
+        let mut noise = |across, along| GradientNoise { cells: [across, along], seed: random.bits() };
         Self {
             warps: [noise(4, 3), noise(9, 7)],
             furrows: [noise(15, 3), noise(27, 5)],
@@ -69,22 +69,22 @@ impl Layers {
     fn height(&self, u: f32, v: f32) -> f32 {
         let bent = u + 0.035 * self.warps[0].at(u, v) + 0.012 * self.warps[1].at(u, v);
         // The zero crossings of the noise form long, wavering furrows; the finer ones are shallow.
-        let deep = smooth_step(0.0, 0.34, self.furrows[0].at(bent, v).abs());
-        let fine = smooth_step(0.0, 0.36, self.furrows[1].at(bent, v).abs());
-        let crack = smooth_step(0.0, 0.16, self.cracks.at(bent, v + 0.02 * self.warps[1].at(v, u)).abs());
+        let deep = smoothstep(0.0, 0.34, self.furrows[0].at(bent, v).abs());
+        let fine = smoothstep(0.0, 0.36, self.furrows[1].at(bent, v).abs());
+        let crack = smoothstep(0.0, 0.16, self.cracks.at(bent, v + 0.02 * self.warps[1].at(v, u)).abs());
         let grain = 0.6 * self.grain[0].at(bent, v) + 0.4 * self.grain[1].at(u, v);
         let plate = deep.powf(0.7) * (0.58 + 0.42 * fine) * (0.80 + 0.20 * crack);
         plate * (0.93 + 0.07 * grain) + 0.045 * grain
     }
 
     /// sRGB color at a position of the given height.
-    fn colour(&self, u: f32, v: f32, height: f32) -> [f32; 3] {
+    fn color(&self, u: f32, v: f32, height: f32) -> [f32; 3] {
         let grain = self.grain[0].at(u, v);
         let tint = self.tint.at(u, v);
-        let body = blend(FURROW, RIDGE, smooth_step(0.02, 0.6, height));
-        let crest = blend(body, CREST, 0.75 * smooth_step(0.55, 1.0, height + 0.12 * grain));
-        let mossy = 0.45 * smooth_step(0.05, 0.6, tint) * smooth_step(0.3, 0.9, height);
-        let lichen = blend(crest, LICHEN, mossy);
+        let body = lerp_color(FURROW, RIDGE, smoothstep(0.02, 0.6, height));
+        let crest = lerp_color(body, CREST, 0.75 * smoothstep(0.55, 1.0, height + 0.12 * grain));
+        let mossy = 0.45 * smoothstep(0.05, 0.6, tint) * smoothstep(0.3, 0.9, height);
+        let lichen = lerp_color(crest, LICHEN, mossy);
         lichen.map(|channel| channel * (1.0 + 0.07 * grain + 0.05 * tint))
     }
 }
@@ -111,10 +111,10 @@ mod tests {
 
     #[test]
     fn the_normal_map_looks_up_on_average_and_the_colour_is_a_warm_brown() {
-        let [colour, normals] = textures(&mut Random::new(1)).expect("made");
+        let [color, normals] = textures(&mut SplitMix64::new(1)).expect("made");
         let [x, y, z] = mean(&normals);
         assert!((x - 127.5).abs() < 2.0 && (y - 127.5).abs() < 2.0 && z > 215.0, "{x} {y} {z}");
-        let [red, green, blue] = mean(&colour);
+        let [red, green, blue] = mean(&color);
         assert!(red > green && green > blue && (70.0..160.0).contains(&red), "{red} {green} {blue}");
         // The map is not flat.
         let tilted = normals.rgba().chunks_exact(4).filter(|pixel| pixel[2] < 240).count();
@@ -123,8 +123,8 @@ mod tests {
 
     #[test]
     fn the_images_tile_edges_differ_no_more_than_neighbours_within() {
-        let [colour, _] = textures(&mut Random::new(2)).expect("made");
-        let red = |column: usize, row: usize| f64::from(colour.rgba()[4 * (row * SIDE + column)]);
+        let [color, _] = textures(&mut SplitMix64::new(2)).expect("made");
+        let red = |column: usize, row: usize| f64::from(color.rgba()[4 * (row * SIDE + column)]);
         let step = |a: usize, b: usize| (0..SIDE).map(|row| (red(a, row) - red(b, row)).abs()).sum::<f64>();
         let drop = |a: usize, b: usize| (0..SIDE).map(|column| (red(column, a) - red(column, b)).abs()).sum::<f64>();
         assert!(step(SIDE - 1, 0) < 3.0 * step(100, 101) + 1.0);

@@ -2,24 +2,24 @@
 
 use nalgebra::{Rotation3, Unit, Vector3};
 
-use super::centreline::{Centreline, Growth};
-use super::element::Wood;
+use super::centerline::{Centerline, GrowthParameters};
+use super::element::ElasticConstants;
 use super::leaf_image::{LEAF_SPAN, STEM_U};
-use super::mold::{Kind, Mold};
-use super::random::Random;
-use super::sheet::{Blade, Sheet, Wrap, between};
+use super::random::SplitMix64;
+use super::skin::{Blade, SkinBuilder, UvMapping, between};
+use super::template::{PartKind, PartTemplate};
 
 /// Green shoots are softer than wood.
-const SHOOT: Wood = Wood { youngs_modulus: 3.0e9, shear_modulus: 2.0e8, density: 850.0 };
+const SHOOT: ElasticConstants = ElasticConstants { youngs_modulus: 3.0e9, shear_modulus: 2.0e8, density: 850.0 };
 
 /// Fresh mass of a leaf in kg per m^2 of one side.
 const LEAF_MASS: f64 = 0.17;
 
 /// The fraction of a card's area that the leaf outline covers.
-const COVER: f64 = 0.55;
+const LEAF_COVERAGE: f64 = 0.55;
 
 /// Ratio of width to length of a leaf's card.
-const SLIMNESS: f64 = 0.62;
+const LEAF_ASPECT: f64 = 0.62;
 
 /// The clusters: whether it bends, length of the shoot (m), number of leaves, length of a leaf (m).
 const CLUSTERS: [(bool, f64, usize, f64); 8] = [
@@ -34,12 +34,12 @@ const CLUSTERS: [(bool, f64, usize, f64); 8] = [
 ];
 
 /// The templates of all clusters.
-pub(super) fn clusters(random: &mut Random) -> Vec<Mold> {
+pub(super) fn leaf_clusters(random: &mut SplitMix64) -> Vec<PartTemplate> {
     CLUSTERS.iter().map(|cluster| grow(*cluster, &mut random.fork())).collect()
 }
 
-fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Random) -> Mold {
-    let growth = Growth {
+fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut SplitMix64) -> PartTemplate {
+    let growth = GrowthParameters {
         length,
         elements: 4,
         rings: 1,
@@ -50,27 +50,30 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Ran
         rise: 0.10,
         wander: 0.12,
     };
-    let line = Centreline::grow(&growth, random);
-    let count = line.points.len();
-    let radii = (0..count).map(|ring| 0.0036 - 0.0022 * line.fraction(ring)).collect();
-    let mut mold = Mold {
-        kind: Kind::Leaf,
+    let centerline = Centerline::grow(&growth, random);
+    let count = centerline.points.len();
+    let radii = (0..count).map(|ring| 0.0036 - 0.0022 * centerline.fraction(ring)).collect();
+    let mut mold = PartTemplate {
+        kind: PartKind::Leaf,
         level: 0,
-        line,
+        centerline,
         radii,
         sides: 3,
-        sheet: Sheet::default(),
-        wood: SHOOT,
+        sheet: SkinBuilder::default(),
+        elastic: SHOOT,
         damping: 0.12,
-        loads: vec![],
-        buds: vec![],
+        point_masses: vec![],
+        children: vec![],
         rank: if bends { 2 } else { 0 },
         leaf_area: 0.0,
     };
-    mold.add_skin(Wrap::Strip { u: STEM_U }, |_, _| 1.0);
+    mold.add_skin(UvMapping::Strip { u: STEM_U }, |_, _| 1.0);
     for leaf in 0..leaves {
-        let along =
-            if leaf + 1 == leaves { 1.0 } else { 0.16 + 0.84 * (leaf as f64 + random.unit() * 0.6) / leaves as f64 };
+        let along = if leaf + 1 == leaves {
+            1.0
+        } else {
+            0.16 + 0.84 * (leaf as f64 + random.next_unit() * 0.6) / leaves as f64
+        };
         let azimuth = if bends { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
         add_leaf(&mut mold, along, azimuth + random.spread(0.7), size * random.between(0.78, 1.12), random);
     }
@@ -78,8 +81,8 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Ran
 }
 
 /// Adds a leaf at a fraction of the shoot. Azimuth 0 is to the right of the shoot; light comes from +Z.
-fn add_leaf(mold: &mut Mold, along: f64, azimuth: f64, length: f64, random: &mut Random) {
-    let (station, base, tangent) = between(&mold.line, along);
+fn add_leaf(mold: &mut PartTemplate, along: f64, azimuth: f64, length: f64, random: &mut SplitMix64) {
+    let (station, base, tangent) = between(&mold.centerline, along);
     let right = tangent.cross(&Vector3::z()).normalize();
     let over = right.cross(&tangent);
     // Leaves point sideways rather than up or down; the last leaf continues the shoot.
@@ -96,14 +99,14 @@ fn add_leaf(mold: &mut Mold, along: f64, azimuth: f64, length: f64, random: &mut
         forward,
         normal: twist * normal,
         length,
-        width: length * SLIMNESS * random.between(0.92, 1.08),
+        width: length * LEAF_ASPECT * random.between(0.92, 1.08),
         curl: random.between(0.25, 0.95),
         fold: random.between(0.12, 0.42),
         span: LEAF_SPAN,
     };
-    let area = COVER * blade.length * blade.width;
+    let area = LEAF_COVERAGE * blade.length * blade.width;
     mold.sheet.add_blade(&blade, station);
-    mold.loads.push((station, LEAF_MASS * area));
+    mold.point_masses.push((station, LEAF_MASS * area));
     mold.leaf_area += area;
 }
 
@@ -113,14 +116,14 @@ mod tests {
 
     #[test]
     fn some_clusters_bend_with_two_modes_and_some_are_rigid() {
-        let molds = clusters(&mut Random::new(2));
+        let molds = leaf_clusters(&mut SplitMix64::new(2));
         let ranks: Vec<usize> = molds.iter().map(|mold| mold.cast().expect("solved").0.modes.rank()).collect();
         assert!(ranks.contains(&2) && ranks.contains(&0), "{ranks:?}");
     }
 
     #[test]
     fn shoots_flutter_at_a_few_hertz_and_carry_their_leaves() {
-        for mold in clusters(&mut Random::new(2)).into_iter().filter(|mold| mold.rank > 0) {
+        for mold in leaf_clusters(&mut SplitMix64::new(2)).into_iter().filter(|mold| mold.rank > 0) {
             let (_, metadata) = mold.cast().expect("solved");
             let hertz = metadata.eigenvalues[0].sqrt() / std::f64::consts::TAU;
             assert!((1.5..12.0).contains(&hertz), "{hertz} Hz");
@@ -130,7 +133,7 @@ mod tests {
 
     #[test]
     fn upper_faces_look_to_the_light_on_the_whole() {
-        for mold in clusters(&mut Random::new(9)) {
+        for mold in leaf_clusters(&mut SplitMix64::new(9)) {
             let mesh = mold.sheet.mesh().expect("finite");
             let blades = &mesh.corners().normals[5 * 4 + 3..];
             let mean = blades.iter().map(|normal| normal[2]).sum::<f32>() / blades.len() as f32;

@@ -10,7 +10,7 @@ pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
 
 /// Elastic constants (Pa) and density (kg/m^3) of the wood.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Wood {
+pub(super) struct ElasticConstants {
     pub(super) youngs_modulus: f64,
     pub(super) shear_modulus: f64,
     pub(super) density: f64,
@@ -34,7 +34,7 @@ impl Section {
 }
 
 /// The local axes of an element between two nodes, as rows.
-pub(super) fn axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f64> {
+pub(super) fn element_axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f64> {
     let x = (to - from).normalize();
     let helper = if x.x.abs() < 0.7 { Vector3::x() } else { Vector3::z() };
     let z = x.cross(&helper).normalize();
@@ -42,17 +42,22 @@ pub(super) fn axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f64> {
 }
 
 /// Stiffness and consistent mass in the frame of the nodes.
-pub(super) fn matrices(from: &Vector3<f64>, to: &Vector3<f64>, section: &Section, wood: &Wood) -> (Matrix12, Matrix12) {
+pub(super) fn element_matrices(
+    from: &Vector3<f64>,
+    to: &Vector3<f64>,
+    section: &Section,
+    wood: &ElasticConstants,
+) -> (Matrix12, Matrix12) {
     let length = (to - from).norm();
     let mut turn = Matrix12::zeros();
     for block in 0..4 {
-        turn.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&axes(from, to));
+        turn.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&element_axes(from, to));
     }
     let (stiffness, mass) = (local_stiffness(length, section, wood), local_mass(length, section, wood));
     (turn.transpose() * stiffness * turn, turn.transpose() * mass * turn)
 }
 
-fn local_stiffness(l: f64, section: &Section, wood: &Wood) -> Matrix12 {
+fn local_stiffness(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let ends = [1.0, -1.0, -1.0, 1.0];
     add_linear(&mut matrix, 0, ends.map(|end| end * wood.youngs_modulus * section.area / l));
@@ -68,7 +73,7 @@ fn local_stiffness(l: f64, section: &Section, wood: &Wood) -> Matrix12 {
     matrix
 }
 
-fn local_mass(l: f64, section: &Section, wood: &Wood) -> Matrix12 {
+fn local_mass(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let ends = [2.0, 1.0, 1.0, 2.0];
     add_linear(&mut matrix, 0, ends.map(|end| end * wood.density * section.area * l / 6.0));
@@ -107,7 +112,7 @@ fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
 mod tests {
     use super::*;
 
-    const WOOD: Wood = Wood { youngs_modulus: 8e9, shear_modulus: 5e8, density: 800.0 };
+    const WOOD: ElasticConstants = ElasticConstants { youngs_modulus: 8e9, shear_modulus: 5e8, density: 800.0 };
 
     fn oblique() -> (Vector3<f64>, Vector3<f64>) {
         (Vector3::new(0.2, -0.1, 0.4), Vector3::new(0.5, 0.3, 0.1))
@@ -117,7 +122,7 @@ mod tests {
     fn rigid_motions_cost_no_energy_and_translations_weigh_the_mass() {
         let (from, to) = oblique();
         let section = Section::of_cone(0.03, 0.02);
-        let (stiffness, mass) = matrices(&from, &to, &section, &WOOD);
+        let (stiffness, mass) = element_matrices(&from, &to, &section, &WOOD);
         let weight = WOOD.density * section.area * (to - from).norm();
         for axis in 0..3 {
             let turn = Vector3::ith(axis, 1.0);
@@ -140,7 +145,7 @@ mod tests {
     #[test]
     fn matrices_are_symmetric_and_the_mass_is_positive() {
         let (from, to) = oblique();
-        let (stiffness, mass) = matrices(&from, &to, &Section::of_cone(0.01, 0.01), &WOOD);
+        let (stiffness, mass) = element_matrices(&from, &to, &Section::of_cone(0.01, 0.01), &WOOD);
         assert!((stiffness - stiffness.transpose()).norm() <= 1e-12 * stiffness.norm());
         assert!((mass - mass.transpose()).norm() <= 1e-12 * mass.norm());
         assert!(mass.cholesky().is_some());

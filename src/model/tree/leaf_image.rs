@@ -1,8 +1,8 @@
 //! Procedural leaf texture from a seed: a 256 x 256 sRGB image. Alpha is the outline of the leaf with its tip at the
 //! top; at the right edge is an opaque strip for stems.
 
-use super::noise::{Noise, blend, smooth_step};
-use super::random::Random;
+use super::noise::{GradientNoise, lerp_color, smoothstep};
+use super::random::SplitMix64;
 use crate::domain::Texture;
 use crate::error::Result;
 
@@ -28,7 +28,7 @@ const TEETH: f32 = 19.0;
 
 /// sRGB colors, 0 to 255.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Palette {
+pub(super) struct LeafColors {
     pub(super) blade: [f32; 3],
     pub(super) edge: [f32; 3],
     pub(super) vein: [f32; 3],
@@ -39,23 +39,24 @@ pub(super) struct Palette {
 ///
 /// # Errors
 /// None in practice, because the sizes are constants.
-pub(super) fn texture(name: &str, palette: &Palette, random: &mut Random) -> Result<Texture> {
-    let mottle = [Noise { cells: [7, 9], seed: random.bits() }, Noise { cells: [31, 37], seed: random.bits() }];
+pub(super) fn texture(name: &str, palette: &LeafColors, random: &mut SplitMix64) -> Result<Texture> {
+    let mottle =
+        [GradientNoise { cells: [7, 9], seed: random.bits() }, GradientNoise { cells: [31, 37], seed: random.bits() }];
     let mut rgba = Vec::with_capacity(4 * SIDE * SIDE);
     for pixel in 0..SIDE * SIDE {
         let u = ((pixel % SIDE) as f32 + 0.5) / SIDE as f32;
         let v = ((pixel / SIDE) as f32 + 0.5) / SIDE as f32;
         let shade = 1.0 + 0.08 * mottle[0].at(u, v) + 0.05 * mottle[1].at(u, v);
         let across = (u - LEAF_SPAN[0]) / (LEAF_SPAN[1] - LEAF_SPAN[0]) - 0.5;
-        let (colour, cover) = if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, across, 1.0 - v) };
-        rgba.extend(colour.map(|channel| (shade * channel).clamp(0.0, 255.0) as u8));
+        let (color, cover) = if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, across, 1.0 - v) };
+        rgba.extend(color.map(|channel| (shade * channel).clamp(0.0, 255.0) as u8));
         rgba.push((255.0 * cover).round() as u8);
     }
     Texture::new(name, SIDE as u32, SIDE as u32, rgba)
 }
 
 /// Color and coverage at distance `x` from the midrib and `y` above the base of the petiole.
-fn leaf(palette: &Palette, x: f32, y: f32) -> ([f32; 3], f32) {
+fn leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     let along = (y - PETIOLE) / (0.985 - PETIOLE);
     let off = x.abs();
     let pixel = 1.2 / SIDE as f32;
@@ -67,19 +68,19 @@ fn leaf(palette: &Palette, x: f32, y: f32) -> ([f32; 3], f32) {
     let half = half_width(along);
     let cover = ((half - off) / (1.6 * pixel) + 0.5).clamp(0.0, 1.0).max(on_stalk);
     let across = (off / half.max(1e-3)).min(1.2);
-    let body = blend(palette.blade, palette.edge, smooth_step(0.35, 1.1, across));
+    let body = lerp_color(palette.blade, palette.edge, smoothstep(0.35, 1.1, across));
     // Between two side veins the blade bulges and appears lighter.
     let (vein, bulge) = side_vein(along, off, across);
     let bulged = body.map(|channel| channel * (0.93 + 0.14 * bulge));
-    let veined = blend(bulged, palette.vein, 0.75 * vein);
-    (blend(veined, palette.vein, smooth_step(1.9 * stalk, 0.6 * stalk, off)), cover)
+    let veined = lerp_color(bulged, palette.vein, 0.75 * vein);
+    (lerp_color(veined, palette.vein, smoothstep(1.9 * stalk, 0.6 * stalk, off)), cover)
 }
 
 /// Half-width of the blade: egg-shaped with an elongated tip and forward-pointing teeth.
 fn half_width(along: f32) -> f32 {
     let t = along.clamp(0.0, 1.0);
     let egg = (std::f32::consts::PI * t.powf(0.74)).sin().max(0.0).powf(0.72);
-    let tip = 1.0 - 0.42 * smooth_step(0.70, 0.96, t);
+    let tip = 1.0 - 0.42 * smoothstep(0.70, 0.96, t);
     let tooth = (t * TEETH).fract();
     HALF_WIDTH * egg * tip * (0.93 + 0.07 * tooth * tooth.sqrt())
 }
@@ -90,15 +91,15 @@ fn side_vein(along: f32, off: f32, across: f32) -> (f32, f32) {
     let phase = (along - 0.62 * off - 0.35 * off * off) * 8.5;
     let from_vein = (phase - phase.round()).abs();
     let width = 0.10 * (1.0 - 0.75 * across.min(1.0));
-    let vein = smooth_step(width, 0.35 * width, from_vein) * smooth_step(1.05, 0.75, across);
-    (vein, smooth_step(0.0, 0.5, from_vein))
+    let vein = smoothstep(width, 0.35 * width, from_vein) * smoothstep(1.05, 0.75, across);
+    (vein, smoothstep(0.0, 0.5, from_vein))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const PALETTE: Palette = Palette {
+    const PALETTE: LeafColors = LeafColors {
         blade: [90.0, 130.0, 50.0],
         edge: [80.0, 120.0, 45.0],
         vein: [150.0, 170.0, 90.0],
@@ -107,7 +108,7 @@ mod tests {
 
     #[test]
     fn the_outline_covers_a_part_of_the_image_and_the_stem_strip_all_of_its_own() {
-        let image = texture("leaf", &PALETTE, &mut Random::new(1)).expect("made");
+        let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("made");
         let opaque = |pixel: usize| image.rgba()[4 * pixel + 3] >= 128;
         let share = (0..SIDE * SIDE).filter(|pixel| opaque(*pixel)).count() as f64 / (SIDE * SIDE) as f64;
         assert!((0.2..0.8).contains(&share), "{share} of the image is leaf");
@@ -127,7 +128,7 @@ mod tests {
 
     #[test]
     fn transparent_pixels_are_green_too_so_that_smaller_copies_get_no_dark_rim() {
-        let image = texture("leaf", &PALETTE, &mut Random::new(1)).expect("made");
+        let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("made");
         let hidden = image.rgba().chunks_exact(4).filter(|pixel| pixel[3] == 0);
         assert!(hidden.clone().count() > 1000);
         assert!(hidden.into_iter().all(|pixel| pixel[1] > 70));

@@ -10,33 +10,33 @@
 
 mod bark;
 mod beam;
-mod centreline;
+mod centerline;
 mod cluster;
 mod element;
 mod leaf_image;
-mod lift;
-mod mold;
 mod noise;
-mod plan;
 mod random;
-mod sheet;
+mod skin;
+mod skin_modes;
+mod species;
+mod template;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
 use crate::domain::{AlphaMode, Attachment, Domain, Material, Metadata, Transform};
 use crate::error::Result;
-use crate::scene::{Look, Parts};
-use mold::{Bud, Kind, Mold};
-use random::Random;
+use crate::scene::{RenderSettings, SceneParts};
+use random::SplitMix64;
+use template::{ChildJoint, PartKind, PartTemplate};
 
 /// Parameters of the tree.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Recipe {
+pub struct TreeParameters {
     pub seed: u64,
 }
 
-impl Default for Recipe {
+impl Default for TreeParameters {
     fn default() -> Self {
         Self { seed: 7 }
     }
@@ -46,10 +46,10 @@ impl Default for Recipe {
 const BARK: usize = 0;
 
 /// The two leaf materials: shaded and sunlit leaves.
-const LEAVES: [(&str, leaf_image::Palette); 2] = [
+const LEAVES: [(&str, leaf_image::LeafColors); 2] = [
     (
         "leaf",
-        leaf_image::Palette {
+        leaf_image::LeafColors {
             blade: [92.0, 133.0, 52.0],
             edge: [78.0, 118.0, 44.0],
             vein: [150.0, 176.0, 96.0],
@@ -58,7 +58,7 @@ const LEAVES: [(&str, leaf_image::Palette); 2] = [
     ),
     (
         "light leaf",
-        leaf_image::Palette {
+        leaf_image::LeafColors {
             blade: [124.0, 156.0, 58.0],
             edge: [106.0, 142.0, 50.0],
             vein: [176.0, 194.0, 110.0],
@@ -71,31 +71,35 @@ const LEAVES: [(&str, leaf_image::Palette); 2] = [
 ///
 /// # Errors
 /// `Fault` if the eigenproblem of a beam does not converge.
-pub fn grow(recipe: &Recipe) -> Result<Parts> {
-    let mut random = Random::new(recipe.seed);
-    let mut parts = Parts::named("tree");
+pub fn generate(recipe: &TreeParameters) -> Result<SceneParts> {
+    let mut random = SplitMix64::new(recipe.seed);
+    let mut parts = SceneParts::named("tree");
     parts.rigid_transforms = true;
     // Leaves and bark are dark, so strong sunlight does not overexpose them.
-    parts.look =
-        Look { sun: [0.52, 0.74, 0.62], sunlight: [1.15, 1.06, 0.92], skylight: [0.30, 0.34, 0.39], ..Look::default() };
+    parts.look = RenderSettings {
+        sun: [0.52, 0.74, 0.62],
+        sunlight: [1.15, 1.06, 0.92],
+        skylight: [0.30, 0.34, 0.39],
+        ..RenderSettings::default()
+    };
     add_materials(&mut parts, &mut random.fork())?;
-    let molds = plan::plan(&mut random.fork());
-    let cast = molds.par_iter().map(Mold::cast).collect::<Result<Vec<_>>>()?;
+    let templates = species::plan(&mut random.fork());
+    let cast = templates.par_iter().map(PartTemplate::cast).collect::<Result<Vec<_>>>()?;
     let (shapes, metadata): (Vec<_>, Vec<_>) = cast.into_iter().unzip();
     parts.shapes = shapes;
-    let mut planter = Planter { molds: &molds, metadata: &metadata, domains: vec![], random: random.fork() };
-    planter.plant();
+    let mut planter = PartPlacer { templates: &templates, metadata: &metadata, domains: vec![], random: random.fork() };
+    planter.place_trunk();
     parts.domains = planter.domains;
     Ok(parts)
 }
 
-fn add_materials(parts: &mut Parts, random: &mut Random) -> Result<()> {
+fn add_materials(parts: &mut SceneParts, random: &mut SplitMix64) -> Result<()> {
     parts.textures.extend(bark::textures(random)?);
     parts.materials.push(Material {
         name: "bark".into(),
         specular: [0.04; 3],
         shininess: 8.0,
-        colour_texture: Some(0),
+        color_texture: Some(0),
         normal_texture: Some(1),
         ..Material::default()
     });
@@ -104,7 +108,7 @@ fn add_materials(parts: &mut Parts, random: &mut Random) -> Result<()> {
             name: (*name).into(),
             specular: [0.10, 0.11, 0.08],
             shininess: 22.0,
-            colour_texture: Some(parts.textures.len()),
+            color_texture: Some(parts.textures.len()),
             alpha_mode: AlphaMode::Mask { cutoff: 0.5 },
             double_sided: true,
             ..Material::default()
@@ -114,43 +118,43 @@ fn add_materials(parts: &mut Parts, random: &mut Random) -> Result<()> {
     Ok(())
 }
 
-/// Places instances of the templates ([`Mold`]), parents before children.
-struct Planter<'a> {
-    molds: &'a [Mold],
+/// Places instances of the templates ([`PartTemplate`]), parents before children.
+struct PartPlacer<'a> {
+    templates: &'a [PartTemplate],
     metadata: &'a [Metadata],
     domains: Vec<Domain>,
-    random: Random,
+    random: SplitMix64,
 }
 
-impl Planter<'_> {
+impl PartPlacer<'_> {
     /// Places the trunk, which is the last template, and everything attached to it.
-    fn plant(&mut self) {
-        let trunk = self.molds.len() - 1;
+    fn place_trunk(&mut self) {
+        let trunk = self.templates.len() - 1;
         self.domains.push(self.domain("trunk".into(), trunk, BARK, Transform::IDENTITY));
-        self.dress(0, trunk, &Isometry3::identity());
+        self.place_children(0, trunk, &Isometry3::identity());
     }
 
     /// Places the children of a domain, recursively.
-    fn dress(&mut self, parent: usize, mold: usize, world_from_parent: &Isometry3<f64>) {
-        let molds = self.molds;
-        for (number, bud) in molds[mold].buds.iter().enumerate() {
-            let parent_from_child = joint(&molds[mold], bud, world_from_parent);
+    fn place_children(&mut self, parent: usize, mold: usize, world_from_parent: &Isometry3<f64>) {
+        let templates = self.templates;
+        for (number, bud) in templates[mold].children.iter().enumerate() {
+            let parent_from_child = joint(&templates[mold], bud, world_from_parent);
             let world_from_child = world_from_parent * parent_from_child;
-            let child = &molds[bud.mold];
+            let child = &templates[bud.mold];
             let path = self.domains[parent].name.split_once(' ').map_or(String::new(), |(_, path)| format!("{path}."));
             let (kind, material) = match child.kind {
-                Kind::Leaf => ("leaf", BARK + 1 + usize::from(self.random.unit() < 0.35)),
-                Kind::Trunk | Kind::Branch => ("branch", BARK),
+                PartKind::Leaf => ("leaf", BARK + 1 + usize::from(self.random.next_unit() < 0.35)),
+                PartKind::Trunk | PartKind::Branch => ("branch", BARK),
             };
             let placement = Transform::from_matrix(&world_from_child.to_homogeneous());
             let mut domain = self.domain(format!("{kind} {path}{}", number + 1), bud.mold, material, placement);
             domain.attachment = Some(Attachment {
                 parent,
                 frame: Transform::from_matrix(&parent_from_child.to_homogeneous()),
-                rows: molds[mold].ring_rows(bud.ring),
+                rows: templates[mold].ring_rows(bud.ring),
             });
             self.domains.push(domain);
-            self.dress(self.domains.len() - 1, bud.mold, &world_from_child);
+            self.place_children(self.domains.len() - 1, bud.mold, &world_from_child);
         }
     }
 
@@ -162,7 +166,7 @@ impl Planter<'_> {
             placement,
             attachment: None,
             follows: None,
-            runs: vec![],
+            material_ranges: vec![],
             rest_q: vec![],
             shares_q_with: None,
             metadata: self.metadata[mold].clone(),
@@ -171,11 +175,11 @@ impl Planter<'_> {
 }
 
 /// `parent_from_child`: the origin is the ring's center, +Y the bud's direction, and +Z points towards the sky.
-fn joint(parent: &Mold, bud: &Bud, world_from_parent: &Isometry3<f64>) -> Isometry3<f64> {
+fn joint(parent: &PartTemplate, bud: &ChildJoint, world_from_parent: &Isometry3<f64>) -> Isometry3<f64> {
     let turn = world_from_parent.rotation;
-    let child = centreline::frame(&(turn * bud.direction), &Vector3::y());
+    let child = centerline::frame(&(turn * bud.direction), &Vector3::y());
     let rotation = turn.inverse() * UnitQuaternion::from_rotation_matrix(&child);
-    Isometry3::from_parts(Translation3::from(parent.line.points[bud.ring]), rotation)
+    Isometry3::from_parts(Translation3::from(parent.centerline.points[bud.ring]), rotation)
 }
 
 #[cfg(test)]
@@ -183,8 +187,8 @@ mod tests {
     use super::*;
     use crate::scene::Scene;
 
-    fn grown(seed: u64) -> Parts {
-        grow(&Recipe { seed }).expect("every beam is solved")
+    fn grown(seed: u64) -> SceneParts {
+        generate(&TreeParameters { seed }).expect("every beam is solved")
     }
 
     fn note<'a>(domain: &'a Domain, name: &str) -> &'a str {
@@ -194,10 +198,12 @@ mod tests {
     #[test]
     fn a_seed_grows_the_same_tree_twice_and_another_seed_another_tree() {
         let (one, two, other) = (grown(7), grown(7), grown(8));
-        let rest = |parts: &Parts| parts.shapes.iter().flat_map(|shape| shape.mesh.rest().to_vec()).collect::<Vec<_>>();
-        let modes =
-            |parts: &Parts| parts.shapes.iter().flat_map(|shape| shape.modes.columns().to_vec()).collect::<Vec<_>>();
-        let frames = |parts: &Parts| parts.domains.iter().map(|domain| domain.placement).collect::<Vec<_>>();
+        let rest =
+            |parts: &SceneParts| parts.shapes.iter().flat_map(|shape| shape.mesh.rest().to_vec()).collect::<Vec<_>>();
+        let modes = |parts: &SceneParts| {
+            parts.shapes.iter().flat_map(|shape| shape.modes.columns().to_vec()).collect::<Vec<_>>()
+        };
+        let frames = |parts: &SceneParts| parts.domains.iter().map(|domain| domain.placement).collect::<Vec<_>>();
         assert_eq!(rest(&one), rest(&two));
         assert_eq!(modes(&one), modes(&two));
         assert_eq!(frames(&one), frames(&two));
@@ -249,8 +255,8 @@ mod tests {
             let rest = parts.shapes[parent.shape].mesh.rest();
             let mean = |rows: &[u32]| {
                 let sum: Vector3<f64> = rows.iter().map(|row| Vector3::from(rest[*row as usize]).cast::<f64>()).sum();
-                let centre = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
-                (centre.coords - domain.placement.translation()).norm()
+                let center = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
+                (center.coords - domain.placement.translation()).norm()
             };
             assert!(mean(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, mean(&attachment.rows));
             // Counterexample: the center of the ring below differs.
@@ -269,7 +275,7 @@ mod tests {
             assert!((linear.transpose() * linear - nalgebra::Matrix3::identity()).abs().max() < 1e-5);
             assert!((linear.determinant() - 1.0).abs() < 1e-5);
             let Some(attachment) = &domain.attachment else { continue };
-            let composed = parts.domains[attachment.parent].placement.then(attachment.frame);
+            let composed = parts.domains[attachment.parent].placement.compose(attachment.frame);
             for (got, want) in composed.0.iter().zip(domain.placement.0) {
                 assert!((got - want).abs() <= 1e-5, "{}: {got} is not {want}", domain.name);
             }

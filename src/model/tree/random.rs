@@ -2,9 +2,9 @@
 
 /// `SplitMix64` (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
 #[derive(Debug, Clone)]
-pub(super) struct Random(u64);
+pub(super) struct SplitMix64(u64);
 
-impl Random {
+impl SplitMix64 {
     pub(super) const fn new(seed: u64) -> Self {
         Self(seed)
     }
@@ -12,17 +12,17 @@ impl Random {
     /// The next 64 bits.
     pub(super) const fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        mix(self.0)
+        mix64(self.0)
     }
 
     /// Uniform in `[0, 1)`.
-    pub(super) fn unit(&mut self) -> f64 {
+    pub(super) fn next_unit(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1_u64 << 53) as f64
     }
 
     /// Uniform in `[low, high)`.
     pub(super) fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.unit()
+        low + (high - low) * self.next_unit()
     }
 
     /// Uniform in `[-spread, spread)`.
@@ -37,7 +37,7 @@ impl Random {
 }
 
 /// The finalizer of `SplitMix64`: every input bit affects about half of the output bits.
-pub(super) const fn mix(mut bits: u64) -> u64 {
+pub(super) const fn mix64(mut bits: u64) -> u64 {
     bits = (bits ^ (bits >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     bits = (bits ^ (bits >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
     bits ^ (bits >> 31)
@@ -50,17 +50,17 @@ mod tests {
     #[test]
     fn a_seed_repeats_its_numbers_and_another_seed_differs() {
         let draw =
-            |seed| (0..4).map(|_| 0).scan(Random::new(seed), |random, _| Some(random.bits())).collect::<Vec<_>>();
+            |seed| (0..4).map(|_| 0).scan(SplitMix64::new(seed), |random, _| Some(random.bits())).collect::<Vec<_>>();
         assert_eq!(draw(1), draw(1));
         assert_ne!(draw(1), draw(2));
         // The published first output for seed 0.
-        assert_eq!(Random::new(0).bits(), 0xE220_A839_7B1D_CDAF);
+        assert_eq!(SplitMix64::new(0).bits(), 0xE220_A839_7B1D_CDAF);
     }
 
     #[test]
     fn units_fill_their_interval_evenly() {
-        let mut random = Random::new(3);
-        let draws: Vec<f64> = (0..4000).map(|_| random.unit()).collect();
+        let mut random = SplitMix64::new(3);
+        let draws: Vec<f64> = (0..4000).map(|_| random.next_unit()).collect();
         assert!(draws.iter().all(|draw| (0.0..1.0).contains(draw)));
         let mean = draws.iter().sum::<f64>() / 4000.0;
         assert!((mean - 0.5).abs() < 0.02, "mean {mean}");

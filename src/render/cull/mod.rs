@@ -29,7 +29,7 @@
 //! transformed vertices: without an index buffer, each vertex would be transformed three times. Fragments find the id
 //! of their triangle with one texel fetch, which is uniform over a triangle.
 
-mod layout;
+mod blocks;
 mod pyramid;
 mod run;
 mod sources;
@@ -39,59 +39,59 @@ mod tests;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-pub(super) use self::layout::command;
-use self::layout::{GROUPS, Groups};
-pub(super) use self::pyramid::Pyramid;
-pub(super) use self::run::{begin, camera, remember, sun};
-use super::geometry::{Group, Kind, groups};
+pub(super) use self::blocks::command_offset;
+use self::blocks::{CullUniforms, MAX_GROUPS};
+pub(super) use self::pyramid::DepthPyramid;
+pub(super) use self::run::{clear_counters, cull_for_camera, cull_shadow_casters, record_visible};
+use super::geometry::{BlendMode, DrawGroup, groups};
 use super::gl::{self, Buffer, Gl, Limits, Program, Texture, VertexArray};
-use super::plan::{Allocation, Plan};
-use super::programs::Compile;
-use super::shaders::Options;
+use super::plan::{Allocation, RenderPlan};
+use super::programs::ProgramCompiler;
+use super::shaders::ShaderOptions;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, Scene};
 
 /// The buffer of listed triangles, three indices each.
-pub(super) const LISTED: &str = "listed triangles";
+pub(super) const VISIBLE_INDICES: &str = "visible indices";
 /// The pass that builds the lists of shadow casters.
 pub(super) const SHADOW_CULL: &str = "shadow cull";
 /// Words of the counts: five verdicts for the camera, five for the sun.
-const COUNTS: usize = 10;
-pub(super) const COUNT_BYTES: usize = 4 * COUNTS;
+const COUNTER_WORDS: usize = 10;
+pub(super) const COUNTER_BYTES: usize = 4 * COUNTER_WORDS;
 /// The buffer of the counts.
-pub(super) const COUNTED: &str = "cull counts";
+pub(super) const COUNTERS: &str = "cull counters";
 /// Number of triangles from which a scene is culled on hardware by default; lies between the measurements given at
-/// `chosen`.
-const MANY: usize = 1 << 20;
+/// `select_culling`.
+const MIN_TRIANGLES: usize = 1 << 20;
 
 /// Culling result of one view. For the sun, the counts add up over all cascades; they are zero in frames that reuse a
 /// shadow map.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct Sifted {
+pub struct CullStats {
     /// Passed on to the rasterizer.
-    pub listed: u32,
+    pub visible: u32,
     /// Outside the view volume, or outside the box of the shadow map.
-    pub outside: u32,
+    pub outside_view: u32,
     /// Back faces of single-sided materials.
-    pub facing: u32,
+    pub back_facing: u32,
     /// Triangles that cover no sample or have no area.
     pub no_sample: u32,
     /// Behind the depth of the triangles that the last frame saw.
-    pub hidden: u32,
+    pub occluded: u32,
 }
 
 /// Culling results of a frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct Culled {
-    pub camera: Sifted,
+pub struct FrameCullStats {
+    pub camera: CullStats,
     /// Casters of the shadow map.
-    pub sun: Sifted,
+    pub shadow: CullStats,
 }
 
-impl Sifted {
+impl CullStats {
     /// Triangles that the rasterizer does not process.
-    pub const fn left_out(&self) -> u32 {
-        self.outside + self.facing + self.no_sample + self.hidden
+    pub const fn culled(&self) -> u32 {
+        self.outside_view + self.back_facing + self.no_sample + self.occluded
     }
 }
 
@@ -106,29 +106,29 @@ impl Sifted {
 /// In software it does not pay either: on two cores, the visibility pass of the almond tree (37,560 triangles, 1080p,
 /// four samples) takes 83 ms instead of 80 ms when the 3 % of triangles without a sample are culled, and four times as
 /// long with occlusion culling.
-pub(super) fn chosen(scene: &Scene, limits: &Limits) -> Culling {
+pub(super) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
     let software = limits.software;
     let wanted = match scene.look.culling {
-        Culling::Fitting if software || scene.layout.triangles < MANY => Culling::None,
-        Culling::Fitting => Culling::Triangles,
-        Culling::Depth if software && centroids(scene) => Culling::Triangles,
+        Culling::Auto if software || scene.layout.triangles < MIN_TRIANGLES => Culling::None,
+        Culling::Auto => Culling::Triangles,
+        Culling::Occlusion if software && interpolates_at_centroid(scene) => Culling::Triangles,
         named => named,
     };
-    let fits = allocations(scene, wanted).iter().all(|part| part.bytes <= limits.max_storage);
+    let fits = allocations(scene, wanted).iter().all(|part| part.bytes <= limits.max_storage_bytes);
     if fits { wanted } else { Culling::None }
 }
 
 /// Whether cut-outs sample a texture at the centroid of their covered samples. Mesa's rasterizer takes the centroid of
 /// the samples that also pass the depth test. Hidden triangles drawn earlier thus move the centroid, and about one
 /// pixel in a million differs when they are culled.
-fn centroids(scene: &Scene) -> bool {
-    scene.look.samples_a_pixel() > 1 && scene.needs.mask && scene.needs.textures
+fn interpolates_at_centroid(scene: &Scene) -> bool {
+    scene.look.samples_per_pixel() > 1 && scene.needs.mask && scene.needs.textures
 }
 
 /// Culling method of a plan.
-pub(super) fn of(plan: &Plan) -> Culling {
-    match (plan.defines("CULLED"), plan.defines("REMEMBERS")) {
-        (_, true) => Culling::Depth,
+pub(super) fn culling_of(plan: &RenderPlan) -> Culling {
+    match (plan.defines("CULLED"), plan.defines("OCCLUSION_CULLING")) {
+        (_, true) => Culling::Occlusion,
         (true, false) => Culling::Triangles,
         (false, false) => Culling::None,
     }
@@ -137,9 +137,9 @@ pub(super) fn of(plan: &Plan) -> Culling {
 /// The passes of the camera's lists, in execution order.
 pub(super) fn passes(culling: Culling) -> Vec<&'static str> {
     match culling {
-        Culling::Depth => vec!["occluders", "cull"],
+        Culling::Occlusion => vec!["occluders", "cull"],
         Culling::Triangles => vec!["cull"],
-        Culling::None | Culling::Fitting => vec![],
+        Culling::None | Culling::Auto => vec![],
     }
 }
 
@@ -148,16 +148,16 @@ pub(super) fn allocations(scene: &Scene, culling: Culling) -> Vec<Allocation> {
     if culling == Culling::None {
         return Vec::new();
     }
-    let (numbers, triangles) = (Groups::new(&groups(scene).0, 0.0), scene.layout.triangles);
-    let bits = numbers.bit_bytes();
-    let seen = (culling == Culling::Depth).then_some(("cull seen", bits));
+    let (uniforms, triangles) = (CullUniforms::new(&groups(scene).0, 0.0), scene.layout.triangles);
+    let bits = uniforms.mask_bytes();
+    let seen = (culling == Culling::Occlusion).then_some(("cull previously visible", bits));
     let all = [
-        ("cull groups", size_of::<Groups>()),
-        ("cull ledger", numbers.ledger_bytes()),
-        (COUNTED, COUNT_BYTES),
-        ("cull bits", bits),
-        ("listed names", 4 * triangles),
-        (LISTED, 12 * triangles),
+        ("cull uniforms", size_of::<CullUniforms>()),
+        ("cull draws", uniforms.draws_bytes()),
+        (COUNTERS, COUNTER_BYTES),
+        ("cull visible bits", bits),
+        ("visible triangle ids", 4 * triangles),
+        (VISIBLE_INDICES, 12 * triangles),
     ];
     let named = |(name, bytes): (&str, usize)| Allocation { name: name.into(), bytes: bytes as u64 };
     all.into_iter().chain(seen).map(named).collect()
@@ -166,29 +166,33 @@ pub(super) fn allocations(scene: &Scene, culling: Culling) -> Vec<Allocation> {
 /// Programs of the camera's lists, for one number of samples per pixel.
 #[derive(Debug, Clone)]
 pub(super) struct CullPrograms {
-    sift: Rc<Program>,
-    list: Rc<Program>,
+    cull_triangles: Rc<Program>,
+    compact: Rc<Program>,
     /// Programs of occlusion culling.
-    remembered: Option<Rc<Program>>,
-    remember: Option<Rc<Program>>,
+    cull_previous: Option<Rc<Program>>,
+    record_visible: Option<Rc<Program>>,
     pyramid: Option<[Rc<Program>; 2]>,
 }
 
 impl CullPrograms {
-    pub(super) fn compile(options: &Options, samples: u32, compile: &mut Compile<'_>) -> Result<Option<Self>> {
-        if !options.culls() {
+    pub(super) fn compile(
+        options: &ShaderOptions,
+        samples: u32,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Option<Self>> {
+        if !options.has_culling() {
             return Ok(None);
         }
         let mut own = Self {
-            sift: compile(options.sift(samples))?,
-            list: compile(options.list())?,
-            remembered: None,
-            remember: None,
+            cull_triangles: compile(options.cull_triangles(samples))?,
+            compact: compile(options.compact())?,
+            cull_previous: None,
+            record_visible: None,
             pyramid: None,
         };
-        if options.hides() {
-            own.remembered = Some(compile(options.sift_remembered())?);
-            own.remember = Some(compile(options.remember(samples))?);
+        if options.has_occlusion_culling() {
+            own.cull_previous = Some(compile(options.cull_previously_visible())?);
+            own.record_visible = Some(compile(options.record_visible(samples))?);
             own.pyramid = Some([compile(options.pyramid(samples, true))?, compile(options.pyramid(samples, false))?]);
         }
         Ok(Some(own))
@@ -197,61 +201,62 @@ impl CullPrograms {
 
 /// Programs of the shadow casters' lists.
 #[derive(Debug)]
-pub(super) struct SunPrograms {
-    sift: Rc<Program>,
-    list: Rc<Program>,
+pub(super) struct ShadowCullPrograms {
+    cull_triangles: Rc<Program>,
+    compact: Rc<Program>,
 }
 
-impl SunPrograms {
-    pub(super) fn compile(options: &Options, compile: &mut Compile<'_>) -> Result<Self> {
-        Ok(Self { sift: compile(options.sift_sun())?, list: compile(options.list())? })
+impl ShadowCullPrograms {
+    pub(super) fn compile(options: &ShaderOptions, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+        Ok(Self { cull_triangles: compile(options.cull_casters())?, compact: compile(options.compact())? })
     }
 }
 
 /// The lists of a culled scene, one per group, and the vertex arrays that draw them.
 #[derive(Debug)]
-pub(super) struct Culler {
-    numbers: Groups,
-    names: Texture,
-    solids: VertexArray,
+pub(super) struct TriangleCuller {
+    uniforms: CullUniforms,
+    triangle_ids: Texture,
+    position_array: VertexArray,
     corners: Option<VertexArray>,
 }
 
-impl Culler {
+impl TriangleCuller {
     /// Creates the lists of a scene whose plan has buffers for them; none otherwise. The vertex arrays index the lists.
     pub(super) fn new(
         gl: &Rc<Gl>,
         buffers: &BTreeMap<String, Buffer>,
-        groups: &[Group],
-        (solids, corners): (VertexArray, Option<VertexArray>),
+        groups: &[DrawGroup],
+        (position_array, corners): (VertexArray, Option<VertexArray>),
     ) -> Result<Option<Self>> {
-        let (Some(own), Some(names)) = (buffers.get("cull groups"), buffers.get("listed names")) else {
+        let (Some(own), Some(triangle_ids)) = (buffers.get("cull uniforms"), buffers.get("visible triangle ids"))
+        else {
             return Ok(None);
         };
-        debug_assert!(groups.len() <= GROUPS);
-        let numbers = Groups::new(groups, gl.grid());
-        own.write(bytemuck::bytes_of(&numbers));
-        if let Some(seen) = buffers.get("cull seen") {
-            seen.write(&vec![0; numbers.bit_bytes()]);
+        debug_assert!(groups.len() <= MAX_GROUPS);
+        let uniforms = CullUniforms::new(groups, gl.subpixel_step());
+        own.write(bytemuck::bytes_of(&uniforms));
+        if let Some(seen) = buffers.get("cull previously visible") {
+            seen.write(&vec![0; uniforms.mask_bytes()]);
         }
-        Ok(Some(Self { numbers, names: gl.view(names, gl::R32UI)?, solids, corners }))
+        Ok(Some(Self { uniforms, triangle_ids: gl.buffer_texture(triangle_ids, gl::R32UI)?, position_array, corners }))
     }
 
     /// Vertex array of one kind of listed triangle.
-    pub(super) const fn array(&self, kind: Kind) -> Option<&VertexArray> {
-        match kind {
-            Kind::Opaque => Some(&self.solids),
-            Kind::Mask | Kind::Blend => self.corners.as_ref(),
+    pub(super) const fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
+        match blend_mode {
+            BlendMode::Opaque => Some(&self.position_array),
+            BlendMode::Mask | BlendMode::Blend => self.corners.as_ref(),
         }
     }
 }
 
 /// Culling results of a frame, from its counts.
-pub(super) fn told(counts: &[u8]) -> Culled {
+pub(super) fn parse_stats(counts: &[u8]) -> FrameCullStats {
     let words: Vec<u32> = bytemuck::pod_collect_to_vec(counts);
     let sifted = |first: usize| {
         let at = |index: usize| words.get(first + index).copied().unwrap_or_default();
-        Sifted { listed: at(0), outside: at(1), facing: at(2), no_sample: at(3), hidden: at(4) }
+        CullStats { visible: at(0), outside_view: at(1), back_facing: at(2), no_sample: at(3), occluded: at(4) }
     };
-    Culled { camera: sifted(sources::CAMERA_COUNTS), sun: sifted(sources::SUN_COUNTS) }
+    FrameCullStats { camera: sifted(sources::CAMERA_COUNTERS), shadow: sifted(sources::SHADOW_COUNTERS) }
 }

@@ -3,21 +3,21 @@
 use std::rc::Rc;
 
 use super::super::gl::{self, Buffer, Framebuffer, Gl, Texture};
-use super::super::programs::Sampled;
+use super::super::programs::SampleCountPrograms;
 use super::super::shaders::DEPTH_UNIT;
-use super::super::target::Form;
+use super::super::target::TargetDesc;
 use modalcast_model::error::Result;
 
 /// The coarsest level: squares of 2^8 pixels.
-pub(super) const TOP: u32 = 8;
+pub(super) const MAX_LEVEL: u32 = 8;
 /// Levels that one dispatch adds to its first level, and the side of the square of texels that a workgroup reduces.
-const TURN: u32 = 4;
-const SIDE: u32 = 1 << TURN;
+const LEVELS_PER_PASS: u32 = 4;
+const WORKGROUP_SIDE: u32 = 1 << LEVELS_PER_PASS;
 const PYRAMID: u32 = 4;
 
 /// Framebuffer of the occluders and the pyramid of their depth, for frames of one form.
 #[derive(Debug)]
-pub(crate) struct Pyramid {
+pub(crate) struct DepthPyramid {
     /// Framebuffer with the frame's depth only.
     pub(super) occluders: Framebuffer,
     depths: Buffer,
@@ -26,29 +26,29 @@ pub(crate) struct Pyramid {
 /// Texels of all levels.
 fn texels([mut width, mut height]: [u32; 2]) -> u64 {
     let mut sum = 0;
-    for _ in 0..=TOP {
+    for _ in 0..=MAX_LEVEL {
         sum += u64::from(width) * u64::from(height);
         (width, height) = (width.div_ceil(2), height.div_ceil(2));
     }
     sum
 }
 
-impl Pyramid {
-    pub(crate) fn new(gl: &Rc<Gl>, form: Form, depth: &Texture) -> Result<Self> {
-        let depths = gl.buffer(4 * texels([form.width, form.height]), gl::STREAM_COPY, None)?;
+impl DepthPyramid {
+    pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc, depth: &Texture) -> Result<Self> {
+        let depths = gl.buffer(4 * texels([desc.width, desc.height]), gl::STREAM_COPY, None)?;
         Ok(Self { occluders: gl.framebuffer(None, depth)?, depths })
     }
 
     /// Builds all levels from the current depth.
-    pub(super) fn build(&self, gl: &Gl, (depth, form): (&Texture, Form), sampled: &Sampled) {
-        let Some([fine, coarse]) = sampled.cull.as_ref().and_then(|cull| cull.pyramid.as_ref()) else { return };
-        let groups = [form.width, form.height].map(|side| side.div_ceil(SIDE));
+    pub(super) fn build(&self, gl: &Gl, (depth, desc): (&Texture, TargetDesc), sample_programs: &SampleCountPrograms) {
+        let Some([fine, coarse]) = sample_programs.cull.as_ref().and_then(|cull| cull.pyramid.as_ref()) else { return };
+        let groups = [desc.width, desc.height].map(|side| side.div_ceil(WORKGROUP_SIDE));
         self.bind();
         depth.bind(DEPTH_UNIT);
-        fine.bind(Some(packed(form)));
+        fine.bind(Some(pack_size(desc)));
         gl.dispatch(groups[0], groups[1]);
-        coarse.bind(Some(packed(form)));
-        gl.dispatch(groups[0].div_ceil(SIDE), groups[1].div_ceil(SIDE));
+        coarse.bind(Some(pack_size(desc)));
+        gl.dispatch(groups[0].div_ceil(WORKGROUP_SIDE), groups[1].div_ceil(WORKGROUP_SIDE));
     }
 
     pub(super) fn bind(&self) {
@@ -57,8 +57,8 @@ impl Pyramid {
 }
 
 /// Width and height in one word, as the shaders expect them.
-pub(super) const fn packed(form: Form) -> u32 {
-    form.width | form.height << 16
+pub(super) const fn pack_size(desc: TargetDesc) -> u32 {
+    desc.width | desc.height << 16
 }
 
 #[cfg(test)]
@@ -67,7 +67,7 @@ mod tests {
 
     #[test]
     fn two_turns_reach_the_top_and_each_level_is_half_as_wide() {
-        assert_eq!(2 * TURN, TOP);
+        assert_eq!(2 * LEVELS_PER_PASS, MAX_LEVEL);
         assert_eq!(texels([1, 1]), 9);
         assert_eq!(texels([256, 256]), (0..=8).map(|level| 1 << (2 * level)).sum::<u64>());
         assert_eq!(texels([3, 5]), 15 + 6 + 2 + 6);

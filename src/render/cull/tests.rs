@@ -5,11 +5,11 @@ use std::sync::Arc;
 
 use super::super::geometry::tests::squares;
 use super::super::gl::Limits;
-use super::super::plan::planned;
-use super::super::shaders::Source;
-use super::super::{Prefer, Renderer, SceneBuffers, Shot};
-use super::{LISTED, allocations, chosen};
-use modalcast_model::deform::Surface;
+use super::super::plan::plan_for_device;
+use super::super::shaders::ProgramSource;
+use super::super::{DevicePreference, FrameParams, Renderer, SceneBuffers};
+use super::{VISIBLE_INDICES, allocations, select_culling};
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};
 
@@ -26,22 +26,22 @@ fn sheets() -> Arc<Scene> {
         }
     }
     let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
-    let mesh = Mesh::indexed(rest, normals, vec![], indices).expect("sheets");
+    let mesh = Mesh::from_indexed(rest, normals, vec![], indices).expect("sheets");
     let mut parts = squares(vec![Material::default()]);
     parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
-    parts.look.culling = Culling::Depth;
+    parts.look.culling = Culling::Occlusion;
     (parts.look.shadow, parts.look.ground) = (None, None);
     Scene::new(parts).expect("good")
 }
 
 /// The second frame of a scene whose culling shader has `greedy` in place of `just`.
 fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
-    let mut renderer = Renderer::open(Prefer::Any).expect("EGL and OpenGL 4.3");
-    let (gl, places) = (Rc::clone(&renderer.gl), renderer.sample_places.clone());
+    let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
+    let (gl, places) = (Rc::clone(&renderer.gl), renderer.sample_positions.clone());
     let mut found = false;
-    let compile = &mut |mut source: Source| {
+    let compile = &mut |mut source: ProgramSource| {
         for (_, text) in &mut source.stages {
-            found |= source.label.starts_with("sift, 4") && text.contains(just);
+            found |= source.label.starts_with("cull triangles, 4") && text.contains(just);
             *text = text.replace(just, greedy);
         }
         renderer.program(source)
@@ -50,33 +50,34 @@ fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
     assert!(found, "the shader says no '{just}'");
     let corners = scene.shapes[0].mesh.corners();
     let (positions, normals) = (scene.shapes[0].mesh.rest().as_flattened(), corners.normals.as_flattened());
-    let surface = Surface { positions: positions.to_vec(), normals: normals.to_vec(), ..Surface::default() };
+    let surface =
+        DeformedSurface { positions: positions.to_vec(), normals: normals.to_vec(), ..DeformedSurface::default() };
     renderer.upload(&buffers, &surface).expect("uploads");
     let view = View::LookAt { eye: [0.3, 0.2, 4.0], target: [0.1, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
     let camera = Camera { view, lens, near: 0.0, far: 0.0 };
-    let shot = Shot { camera, width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+    let shot = FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light: None };
     renderer.draw(&buffers, &shot).expect("draws");
     let second = renderer.draw(&buffers, &shot).expect("draws").rgba;
-    assert!(renderer.ran().culled.is_some_and(|culled| culled.camera.left_out() > 0));
+    assert!(renderer.stats().culled.is_some_and(|culled| culled.camera.culled() > 0));
     second
 }
 
 #[test]
 fn a_scene_whose_lists_are_larger_than_a_buffer_may_be_is_not_culled_and_says_so() {
     let mut parts = squares(vec![Material::default()]);
-    for culling in [Culling::Triangles, Culling::Depth] {
+    for culling in [Culling::Triangles, Culling::Occlusion] {
         parts.look.culling = culling;
         let scene = Scene::new(parts.clone()).expect("good");
         let named = allocations(&scene, culling);
         let largest = named.iter().map(|part| part.bytes).max().expect("lists");
-        let listed = named.iter().find(|part| part.name == LISTED).expect("listed").bytes;
+        let listed = named.iter().find(|part| part.name == VISIBLE_INDICES).expect("listed").bytes;
         assert_eq!(listed, 12 * scene.layout.triangles as u64);
-        let on = |max_storage: u64| chosen(&scene, &Limits { max_storage, ..Limits::default() });
+        let on = |max_storage_bytes: u64| select_culling(&scene, &Limits { max_storage_bytes, ..Limits::default() });
         assert_eq!((on(largest), on(largest - 1)), (culling, Culling::None));
-        let plan = planned(&scene, &Limits { max_storage: largest - 1, ..Limits::default() });
+        let plan = plan_for_device(&scene, &Limits { max_storage_bytes: largest - 1, ..Limits::default() });
         assert!(!plan.defines("CULLED") && !plan.passes.contains(&"cull"));
-        assert!(plan.left_out.iter().any(|saving| saving.feature == "culling"));
+        assert!(plan.omitted.iter().any(|saving| saving.feature == "culling"));
     }
 }
 

@@ -2,44 +2,44 @@
 
 use glow::HasContext as _;
 
-use super::super::region::{Region, Touched};
+use super::super::region::{DirtyRegion, Region};
 use super::{Framebuffer, Gl};
 
 /// Dirty regions of an id image and its depth image.
 #[derive(Debug, Default)]
-pub(crate) struct Traces {
-    pub(crate) ids: Touched,
-    pub(crate) depth: Touched,
+pub(crate) struct VisibilityDirty {
+    pub(crate) ids: DirtyRegion,
+    pub(crate) depth: DirtyRegion,
 }
 
 /// How a pass initializes its framebuffer. With a known dirty region only that is cleared, else the whole image.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Clear<'a> {
+pub(crate) enum ClearOp<'a> {
     /// Depth to 1.
-    Depth(Option<&'a Touched>),
+    Depth(Option<&'a DirtyRegion>),
     /// Depth to 1 and ids to 0.
-    DepthAndIds(Option<&'a Traces>),
-    Colour([f32; 4], &'a Touched),
+    DepthAndIds(Option<&'a VisibilityDirty>),
+    Color([f32; 4], &'a DirtyRegion),
     /// Integer words to 0; there is no depth.
-    Words(&'a Touched),
+    Uint(&'a DirtyRegion),
     /// The content is kept.
-    Nothing,
+    Load,
 }
 
 /// The value that pixels are cleared to.
 #[derive(Debug, Clone, Copy)]
-enum Fill {
+enum ClearValue {
     /// Depth of 1.
-    Far,
+    FarDepth,
     /// Words of 0.
     Zero,
-    Colour([f32; 4]),
+    Color([f32; 4]),
 }
 
 impl Gl {
     /// Binds a framebuffer, clears it and sets the scissor: later draws reach only `part`.
-    pub(crate) fn begin(&self, into: &Framebuffer, part: Region, clear: Clear<'_>) {
-        let gl = self.on();
+    pub(crate) fn begin_pass(&self, into: &Framebuffer, part: Region, clear: ClearOp<'_>) {
+        let gl = self.current();
         let [width, height] = part.frame().map(|side| side as i32);
         // SAFETY: sets state with a complete framebuffer.
         unsafe {
@@ -49,36 +49,36 @@ impl Gl {
             gl.depth_mask(true);
         }
         match clear {
-            Clear::Depth(touched) => self.fill(part, touched, Fill::Far),
-            Clear::DepthAndIds(touched) => {
-                self.fill(part, touched.map(|both| &both.depth), Fill::Far);
-                self.fill(part, touched.map(|both| &both.ids), Fill::Zero);
+            ClearOp::Depth(dirty) => self.fill(part, dirty, ClearValue::FarDepth),
+            ClearOp::DepthAndIds(dirty) => {
+                self.fill(part, dirty.map(|both| &both.depth), ClearValue::FarDepth);
+                self.fill(part, dirty.map(|both| &both.ids), ClearValue::Zero);
             }
-            Clear::Words(touched) => self.fill(part, Some(touched), Fill::Zero),
-            Clear::Colour(colour, touched) => self.fill(part, Some(touched), Fill::Colour(colour)),
-            Clear::Nothing => {}
+            ClearOp::Uint(dirty) => self.fill(part, Some(dirty), ClearValue::Zero),
+            ClearOp::Color(color, dirty) => self.fill(part, Some(dirty), ClearValue::Color(color)),
+            ClearOp::Load => {}
         }
-        self.cut(part);
+        self.set_scissor(part);
     }
 
     /// Clears the dirty region of an attachment and marks `part` as dirty.
-    fn fill(&self, part: Region, touched: Option<&Touched>, with: Fill) {
-        let last = touched.and_then(|touched| touched.replace(part));
-        self.cut(last.unwrap_or_else(|| Region::whole(part.frame())));
-        let gl = self.on();
+    fn fill(&self, part: Region, dirty: Option<&DirtyRegion>, with: ClearValue) {
+        let last = dirty.and_then(|dirty| dirty.replace(part));
+        self.set_scissor(last.unwrap_or_else(|| Region::whole(part.frame())));
+        let gl = self.current();
         // SAFETY: a clear of a complete framebuffer.
         unsafe {
             match with {
-                Fill::Far => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
-                Fill::Zero => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
-                Fill::Colour(colour) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &colour),
+                ClearValue::FarDepth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
+                ClearValue::Zero => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
+                ClearValue::Color(color) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &color),
             }
         }
     }
 
-    fn cut(&self, to: Region) {
-        let [x, y, width, height] = to.part().map(|number| number as i32);
+    fn set_scissor(&self, to: Region) {
+        let [x, y, width, height] = to.rect().map(|number| number as i32);
         // SAFETY: sets state; no memory is accessed.
-        unsafe { self.on().scissor(x, y, width, height) };
+        unsafe { self.current().scissor(x, y, width, height) };
     }
 }

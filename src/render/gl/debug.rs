@@ -15,17 +15,17 @@ type Key = [u32; 3];
 
 /// Whether the log accepts the messages of a debug context: target `opengl` at `debug` or below
 /// (`RUST_LOG=opengl=debug`).
-pub(crate) fn is_wanted() -> bool {
+pub(crate) fn is_enabled() -> bool {
     tracing::enabled!(target: "opengl", Level::DEBUG)
 }
 
 /// Sends the driver's messages to the log of this thread, on whatever thread the driver calls back. The callback lives
 /// as long as `gl`, which removes it from the context when dropped.
-pub(super) fn listen(gl: &mut glow::Context) {
+pub(super) fn install_debug_callback(gl: &mut glow::Context) {
     if !gl.supports_debug() {
         return;
     }
-    let (log, heard) = (dispatcher::get_default(Clone::clone), Repeats::default());
+    let (log, heard) = (dispatcher::get_default(Clone::clone), MessageCounts::default());
     // SAFETY: the callback owns all its data, may be called on any thread and does not panic; if a log subscriber
     // panics, glow catches it at the callback.
     unsafe {
@@ -33,8 +33,8 @@ pub(super) fn listen(gl: &mut glow::Context) {
         // Asynchronous output: the driver need not stop for its messages.
         gl.disable(glow::DEBUG_OUTPUT_SYNCHRONOUS);
         gl.debug_message_callback(move |source, kind, id, severity, text| {
-            if let Some(times) = heard.again([source, kind, id]) {
-                dispatcher::with_default(&log, || tell((source, kind, id), severity, times, text));
+            if let Some(times) = heard.record([source, kind, id]) {
+                dispatcher::with_default(&log, || log_message((source, kind, id), severity, times, text));
             }
         });
     }
@@ -42,12 +42,12 @@ pub(super) fn listen(gl: &mut glow::Context) {
 
 /// Number of occurrences of each message.
 #[derive(Debug, Default)]
-struct Repeats(Mutex<HashMap<Key, u64>>);
+struct MessageCounts(Mutex<HashMap<Key, u64>>);
 
-impl Repeats {
+impl MessageCounts {
     /// Counts a message. Returns the count when it is to be logged, at 1, 2, 4, 8 and so on, so that a driver that
     /// repeats a message in each frame does not flood the log.
-    fn again(&self, key: Key) -> Option<u64> {
+    fn record(&self, key: Key) -> Option<u64> {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let key = if counts.len() < KINDS || counts.contains_key(&key) { key } else { [0; 3] };
         let times = counts.entry(key).or_default();
@@ -56,7 +56,7 @@ impl Repeats {
     }
 }
 
-fn tell((source, kind, id): (u32, u32, u32), severity: u32, times: u64, text: &str) {
+fn log_message((source, kind, id): (u32, u32, u32), severity: u32, times: u64, text: &str) {
     let (source, kind, text) = (name_of_source(source), name_of_type(kind), text.trim_end());
     match severity {
         glow::DEBUG_SEVERITY_HIGH => tracing::error!(target: "opengl", source, kind, id, times, "{text}"),
@@ -80,8 +80,8 @@ const fn name_of_source(source: u32) -> &'static str {
 const fn name_of_type(kind: u32) -> &'static str {
     match kind {
         glow::DEBUG_TYPE_ERROR => "error",
-        glow::DEBUG_TYPE_DEPRECATED_BEHAVIOR => "deprecated behaviour",
-        glow::DEBUG_TYPE_UNDEFINED_BEHAVIOR => "undefined behaviour",
+        glow::DEBUG_TYPE_DEPRECATED_BEHAVIOR => "deprecated behavior",
+        glow::DEBUG_TYPE_UNDEFINED_BEHAVIOR => "undefined behavior",
         glow::DEBUG_TYPE_PORTABILITY => "portability",
         glow::DEBUG_TYPE_PERFORMANCE => "performance",
         glow::DEBUG_TYPE_MARKER => "marker",
@@ -96,7 +96,7 @@ mod tests {
 
     use tracing::Dispatch;
 
-    use super::super::super::{Prefer, device};
+    use super::super::super::{DevicePreference, device};
     use super::*;
 
     #[derive(Clone, Default)]
@@ -118,7 +118,7 @@ mod tests {
     /// `tracing` asks each thread. The callsite is registered before the second subscriber is created.
     fn keep_a_second_log() {
         static SECOND: OnceLock<Dispatch> = OnceLock::new();
-        is_wanted();
+        is_enabled();
         SECOND.get_or_init(|| Dispatch::new(tracing_subscriber::registry()));
     }
 
@@ -133,14 +133,14 @@ mod tests {
             .with_writer(move || writer.clone())
             .finish();
         tracing::subscriber::with_default(log, || {
-            let (gl, _) = device::open(Prefer::Any).expect("EGL");
+            let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
             for _ in 0..wrong {
                 // SAFETY: the flag does not exist, and OpenGL rejects it.
-                unsafe { gl.on().enable(0xFFFF) }
+                unsafe { gl.current().enable(0xFFFF) }
                 assert!(gl.check("test").is_err(), "the error is seen without the log too");
             }
             // SAFETY: waits for the commands, so that a driver with delayed messages has sent them.
-            unsafe { gl.on().finish() }
+            unsafe { gl.current().finish() }
         });
         String::from_utf8(lines.0.lock().expect("whole").clone()).expect("text")
     }
@@ -177,8 +177,8 @@ mod tests {
 
     #[test]
     fn no_number_of_different_messages_fills_the_memory() {
-        let heard = Repeats::default();
-        let told = (0..10_000).filter(|id| heard.again([1, 2, *id]).is_some()).count();
+        let heard = MessageCounts::default();
+        let told = (0..10_000).filter(|id| heard.record([1, 2, *id]).is_some()).count();
         assert!(heard.0.lock().expect("whole").len() <= KINDS + 1);
         assert!(told < KINDS + 20, "{told}");
     }

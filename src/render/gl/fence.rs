@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use glow::HasContext as _;
 
 use super::Gl;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 
 /// Signaled once all commands before it are complete.
 #[derive(Debug)]
@@ -18,10 +18,10 @@ pub(crate) struct Fence {
 impl Gl {
     /// Inserts a fence after all commands so far and flushes them to the device.
     pub(crate) fn fence(self: &Rc<Self>, stage: &'static str) -> Result<Fence> {
-        let gl = self.on();
+        let gl = self.current();
         // SAFETY: a new fence, owned by the returned value.
         let name = unsafe {
-            let name = gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0).map_err(during(stage))?;
+            let name = gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0).map_err(fault_in(stage))?;
             gl.flush();
             name
         };
@@ -31,12 +31,12 @@ impl Gl {
 
 impl Fence {
     /// Whether the commands are complete or will never be; in the second case [`Self::wait`] returns the reason.
-    pub(crate) fn is_over(&self) -> bool {
-        self.is_over_within(Duration::ZERO)
+    pub(crate) fn is_done(&self) -> bool {
+        self.is_done_within(Duration::ZERO)
     }
 
-    /// Like [`Self::is_over`], after waiting at most `limit`.
-    pub(crate) fn is_over_within(&self, limit: Duration) -> bool {
+    /// Like [`Self::is_done`], after waiting at most `limit`.
+    pub(crate) fn is_done_within(&self, limit: Duration) -> bool {
         self.state(limit) != glow::TIMEOUT_EXPIRED
     }
 
@@ -51,9 +51,9 @@ impl Fence {
                 glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => return Ok(()),
                 glow::TIMEOUT_EXPIRED if begin.elapsed() < limit => {}
                 glow::TIMEOUT_EXPIRED => {
-                    return Err(during(stage)(format!("the device did not finish within {limit:?}")));
+                    return Err(fault_in(stage)(format!("the device did not finish within {limit:?}")));
                 }
-                _ => return Err(during(stage)("the device was lost")),
+                _ => return Err(fault_in(stage)("the device was lost")),
             }
         }
     }
@@ -63,14 +63,14 @@ impl Fence {
         // One second fits into glow's 32-bit nanoseconds.
         let slice = limit.min(Duration::from_secs(1)).as_nanos() as i32;
         // SAFETY: the fence lives as long as this value.
-        unsafe { self.gl.on().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) }
+        unsafe { self.gl.current().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) }
     }
 }
 
 impl Drop for Fence {
     fn drop(&mut self) {
         // SAFETY: this value owns the name, which is not used afterwards.
-        unsafe { self.gl.on().delete_sync(self.name) }
+        unsafe { self.gl.current().delete_sync(self.name) }
     }
 }
 
@@ -80,22 +80,22 @@ impl Gl {
     pub(crate) fn lost_fence(self: &Rc<Self>) -> Fence {
         let fence = self.fence("test").expect("a fence");
         // SAFETY: using a deleted name is an OpenGL error without other effects.
-        unsafe { self.on().delete_sync(fence.name) }
+        unsafe { self.current().delete_sync(fence.name) }
         fence
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::target::{Form, image};
-    use super::super::super::{Prefer, device};
+    use super::super::super::target::{TargetDesc, create_image};
+    use super::super::super::{DevicePreference, device};
     use super::*;
 
     /// Draws a picture that takes long; in software, on threads of the driver.
     fn draw_for_long(gl: &Rc<Gl>, turns: u32) {
-        let form = Form { width: 2048, height: 2048, samples: 1, ..Form::EMPTY };
-        let colour = image(gl, form, glow::RGBA8).expect("an image");
-        let into = gl.colour_framebuffer(&colour).expect("complete");
+        let desc = TargetDesc { width: 2048, height: 2048, samples: 1, ..TargetDesc::EMPTY };
+        let color = create_image(gl, desc, glow::RGBA8).expect("an image");
+        let into = gl.color_framebuffer(&color).expect("complete");
         let vertex = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \
                       0, 1); }";
         let fragment = format!(
@@ -104,22 +104,22 @@ mod tests {
         );
         let stages = [(glow::VERTEX_SHADER, vertex), (glow::FRAGMENT_SHADER, &fragment)];
         let program = gl.program("long", &stages).expect("compiles");
-        let nothing = gl.vertex_array(None, &[]).expect("an array");
-        gl.set(super::super::Fixed::default());
+        let empty_vertex_array = gl.vertex_array(None, &[]).expect("an array");
+        gl.set_pipeline_state(super::super::PipelineState::default());
         program.bind(None);
-        gl.cover(&into, 2048, &nothing);
+        gl.draw_fullscreen_triangle(&into, 2048, &empty_vertex_array);
     }
 
     #[test]
     fn what_takes_too_long_is_an_error_with_its_name_and_no_hang() {
-        let (gl, _) = device::open(Prefer::Any).expect("EGL");
+        let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
         draw_for_long(&gl, if gl.limits.software { 400 } else { 40_000 });
         let fence = gl.fence("long").expect("a fence");
-        assert!(!fence.is_over(), "it has only begun");
+        assert!(!fence.is_done(), "it has only begun");
         let late = fence.wait("long", Duration::from_millis(1)).expect_err("too late").to_string();
         assert!(late.contains("long") && late.contains("the device did not finish within 1ms"), "{late}");
         fence.wait("long", Duration::from_secs(60)).expect("it ends");
-        assert!(fence.is_over() && fence.is_over_within(Duration::from_secs(9)));
+        assert!(fence.is_done() && fence.is_done_within(Duration::from_secs(9)));
         fence.wait("long", Duration::ZERO).expect("what is over is never late");
         let lost = gl.lost_fence().wait("gone", Duration::from_secs(60)).expect_err("lost").to_string();
         assert!(lost.contains("gone") && lost.contains("the device was lost"), "{lost}");

@@ -12,16 +12,16 @@ pub(crate) struct Limits {
     /// Samples per pixel that color, depth and integer images all support.
     pub(crate) max_samples: u32,
     /// Textures that one compute shader can read.
-    pub(crate) max_reads: u32,
+    pub(crate) max_compute_textures: u32,
     pub(crate) max_layers: u32,
     /// Texels of the largest buffer texture.
     pub(crate) max_texels: u64,
     /// Bytes of the largest buffer that shaders can write.
-    pub(crate) max_storage: u64,
+    pub(crate) max_storage_bytes: u64,
     /// Whether fragments can read their coverage after the depth test.
-    pub(crate) post_depth: bool,
+    pub(crate) post_depth_coverage: bool,
     /// Whether buffers can stay mapped while the device writes them (OpenGL 4.4).
-    pub(crate) persistent: bool,
+    pub(crate) persistent_mapping: bool,
     /// Largest anisotropy; 1 if it is not supported or runs on the CPU.
     pub(crate) anisotropy: f32,
 }
@@ -50,12 +50,12 @@ impl Limits {
                 .map(number)
                 .into_iter()
                 .fold(u32::MAX, u32::min),
-                max_reads: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
+                max_compute_textures: number(glow::MAX_COMPUTE_TEXTURE_IMAGE_UNITS),
                 max_layers: number(glow::MAX_ARRAY_TEXTURE_LAYERS),
                 max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
-                max_storage: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
-                persistent: is_persistent(gl),
-                post_depth: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
+                max_storage_bytes: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
+                persistent_mapping: is_persistent(gl),
+                post_depth_coverage: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
                 anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
             }
         }

@@ -5,7 +5,7 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::Gl;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 
 /// A buffer object of fixed size.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ pub(crate) struct Buffer {
 
 /// Storage parameters of a texture.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct TextureKind {
+pub(crate) struct TextureDesc {
     pub(crate) target: u32,
     pub(crate) format: u32,
     pub(crate) width: u32,
@@ -32,7 +32,7 @@ pub(crate) struct TextureKind {
 pub(crate) struct Texture {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Texture,
-    pub(crate) kind: TextureKind,
+    pub(crate) desc: TextureDesc,
 }
 
 #[derive(Debug)]
@@ -61,7 +61,7 @@ impl Buffer {
 
     /// Overwrites the first `data.len()` bytes.
     pub(crate) fn write(&self, data: &[u8]) {
-        let gl = self.gl.on();
+        let gl = self.gl.current();
         // SAFETY: OpenGL rejects data that is larger than the buffer.
         unsafe {
             gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(self.name));
@@ -71,14 +71,14 @@ impl Buffer {
 
     /// Copies the first bytes to the host. Waits for pending writes.
     pub(crate) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
-        let gl = self.gl.on();
+        let gl = self.gl.current();
         let bytes = bytes.min(self.bytes as usize);
         // SAFETY: the mapped range is inside the buffer, is only read, and is unmapped before any other use.
         unsafe {
             gl.bind_buffer(glow::COPY_READ_BUFFER, Some(self.name));
             let mapped = gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, bytes as i32, glow::MAP_READ_BIT);
             if mapped.is_null() {
-                return Err(during("read")("the pixels cannot be mapped"));
+                return Err(fault_in("read")("the pixels cannot be mapped"));
             }
             let copied = std::slice::from_raw_parts(mapped, bytes).to_vec();
             gl.unmap_buffer(glow::COPY_READ_BUFFER);
@@ -88,14 +88,14 @@ impl Buffer {
 
     pub(crate) fn bind_storage(&self, binding: u32) {
         // SAFETY: binding points below the eight that every context has.
-        unsafe { self.gl.on().bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.name)) }
+        unsafe { self.gl.current().bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.name)) }
     }
 
     /// Binds `bytes` bytes from `offset`, a multiple of 256.
     pub(crate) fn bind_uniform(&self, binding: u32, offset: usize, bytes: usize) {
         let (offset, bytes) = (offset as i32, bytes as i32);
         // SAFETY: binding points below the 36 that every context has; OpenGL rejects ranges outside the buffer.
-        unsafe { self.gl.on().bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.name), offset, bytes) }
+        unsafe { self.gl.current().bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.name), offset, bytes) }
     }
 }
 
@@ -104,42 +104,42 @@ impl Texture {
     pub(crate) fn fill(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
-            return Err(during("texture")(format!("{} bytes for {width} x {height} pixels", rgba.len())));
+            return Err(fault_in("texture")(format!("{} bytes for {width} x {height} pixels", rgba.len())));
         }
-        let gl = self.gl.on();
+        let gl = self.gl.current();
         let pixels = glow::PixelUnpackData::Slice(Some(rgba));
         let (level, layer) = (level as i32, layer as i32);
         // SAFETY: the pixels fill the box (checked above), which OpenGL checks against the storage.
         unsafe {
-            gl.bind_texture(self.kind.target, Some(self.name));
+            gl.bind_texture(self.desc.target, Some(self.name));
             gl.pixel_store_i32(glow::UNPACK_ALIGNMENT, 1);
             let (format, ty) = (glow::RGBA, glow::UNSIGNED_BYTE);
-            gl.tex_sub_image_3d(self.kind.target, level, 0, 0, layer, width, height, 1, format, ty, pixels);
+            gl.tex_sub_image_3d(self.desc.target, level, 0, 0, layer, width, height, 1, format, ty, pixels);
         }
         self.gl.check("texture")
     }
 
     /// Sets sampler parameters: pairs of OpenGL parameter and value.
-    pub(crate) fn sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
-        let gl = self.gl.on();
+    pub(crate) fn set_sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
+        let gl = self.gl.current();
         // SAFETY: plain parameters of a texture of this context.
         unsafe {
-            gl.bind_texture(self.kind.target, Some(self.name));
+            gl.bind_texture(self.desc.target, Some(self.name));
             for (parameter, value) in parameters {
-                gl.tex_parameter_i32(self.kind.target, *parameter, *value as i32);
+                gl.tex_parameter_i32(self.desc.target, *parameter, *value as i32);
             }
             if anisotropy > 1.0 {
-                gl.tex_parameter_f32(self.kind.target, glow::TEXTURE_MAX_ANISOTROPY_EXT, anisotropy);
+                gl.tex_parameter_f32(self.desc.target, glow::TEXTURE_MAX_ANISOTROPY_EXT, anisotropy);
             }
         }
     }
 
     pub(crate) fn bind(&self, unit: u32) {
-        let gl = self.gl.on();
+        let gl = self.gl.current();
         // SAFETY: units below the 96 that every context has over all stages.
         unsafe {
             gl.active_texture(glow::TEXTURE0 + unit);
-            gl.bind_texture(self.kind.target, Some(self.name));
+            gl.bind_texture(self.desc.target, Some(self.name));
         }
     }
 
@@ -149,16 +149,16 @@ impl Texture {
     }
 
     /// Binds the texture as an image that a compute shader reads and writes.
-    pub(crate) fn bind_image_both_ways(&self, unit: u32) {
+    pub(crate) fn bind_image_read_write(&self, unit: u32) {
         self.bind_image_for(unit, glow::READ_WRITE);
     }
 
     fn bind_image_for(&self, unit: u32, access: u32) {
         // SAFETY: level 0 of a texture whose format the shader declares.
         unsafe {
-            let gl = self.gl.on();
-            let layered = self.kind.target == glow::TEXTURE_2D_ARRAY;
-            gl.bind_image_texture(unit, Some(self.name), 0, layered, 0, access, self.kind.format);
+            let gl = self.gl.current();
+            let layered = self.desc.target == glow::TEXTURE_2D_ARRAY;
+            gl.bind_image_texture(unit, Some(self.name), 0, layered, 0, access, self.desc.format);
         }
     }
 }
@@ -167,7 +167,7 @@ impl Program {
     /// Makes the program current. `number`, for example the first triangle, goes to location 0 of programs that declare
     /// one.
     pub(crate) fn bind(&self, number: Option<u32>) {
-        let gl = self.gl.on();
+        let gl = self.gl.current();
         // SAFETY: a linked program; shaders that get a number declare location 0.
         unsafe {
             gl.use_program(Some(self.name));
@@ -180,15 +180,15 @@ impl Program {
 
 impl Program {
     /// Sets the first triangle of the next draw (location 0). This must be the bound program.
-    pub(crate) fn first(&self, number: u32) {
+    pub(crate) fn set_first_triangle(&self, number: u32) {
         // SAFETY: shaders that get a number declare location 0.
-        unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
+        unsafe { self.gl.current().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
     }
 
     /// Sets the phase of a program with several phases (location 1). This must be the bound program.
-    pub(crate) fn turn(&self, turn: i32) {
+    pub(crate) fn set_phase(&self, phase: i32) {
         // SAFETY: a linked, bound program; shaders with several phases declare location 1.
-        unsafe { self.gl.on().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), turn) }
+        unsafe { self.gl.current().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), phase) }
     }
 }
 
@@ -197,7 +197,7 @@ macro_rules! freed_by {
         impl Drop for $object {
             fn drop(&mut self) {
                 // SAFETY: this value owns the name, which is not used afterwards.
-                unsafe { self.gl.on().$delete(self.name) }
+                unsafe { self.gl.current().$delete(self.name) }
             }
         }
     )*};

@@ -10,11 +10,11 @@ use std::time::Duration;
 use glow::HasContext as _;
 
 use super::{Buffer, Gl};
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
-pub(crate) struct Staging {
+pub(crate) struct StagingBuffer {
     pub(crate) buffer: ManuallyDrop<Buffer>,
     /// Address of the persistent mapping; none where the context does not support it.
     mapped: Option<*const u8>,
@@ -23,12 +23,12 @@ pub(crate) struct Staging {
 }
 
 /// A dropped staging buffer that a reader still uses.
-pub(super) type Retired = (Buffer, Receiver<()>);
+pub(super) type RetiredBuffer = (Buffer, Receiver<()>);
 
 /// Bytes of a staging buffer that any thread may copy. While this value exists, the bytes stay mapped and the device
 /// does not write them, so it must be short-lived.
 #[derive(Debug)]
-pub(crate) enum Lent {
+pub(crate) enum ReadbackView {
     /// Address and length of the mapped bytes. Dropping the sender tells the staging buffer that the reader is done.
     Mapped {
         first: *const u8,
@@ -40,23 +40,23 @@ pub(crate) enum Lent {
 
 // SAFETY: the memory is mapped for reading only. Nothing writes it before the staging buffer sees that this value was
 // dropped, and it is unmapped after that or never.
-unsafe impl Send for Lent {}
+unsafe impl Send for ReadbackView {}
 
 impl Gl {
     /// Creates a staging buffer of `bytes` bytes, persistently mapped if possible.
-    pub(crate) fn staging(self: &Rc<Self>, bytes: u64) -> Result<Staging> {
-        self.bury(Duration::ZERO);
+    pub(crate) fn staging(self: &Rc<Self>, bytes: u64) -> Result<StagingBuffer> {
+        self.free_retired_buffers(Duration::ZERO);
         let reader = RefCell::default();
-        if !self.limits.persistent {
+        if !self.limits.persistent_mapping {
             let buffer = ManuallyDrop::new(self.buffer(bytes, glow::STREAM_READ, None)?);
-            return Ok(Staging { buffer, mapped: None, reader });
+            return Ok(StagingBuffer { buffer, mapped: None, reader });
         }
-        let size = i32::try_from(bytes).map_err(during("readback"))?;
+        let size = i32::try_from(bytes).map_err(fault_in("readback"))?;
         let kept = glow::MAP_READ_BIT | glow::MAP_PERSISTENT_BIT | glow::MAP_COHERENT_BIT;
-        let gl = self.on();
+        let gl = self.current();
         // SAFETY: a new buffer with immutable storage, mapped as a whole for reading, for as long as it exists.
         let (buffer, mapped) = unsafe {
-            let name = gl.create_buffer().map_err(during("readback"))?;
+            let name = gl.create_buffer().map_err(fault_in("readback"))?;
             let buffer = Buffer { gl: Rc::clone(self), name, bytes };
             gl.bind_buffer(glow::COPY_READ_BUFFER, Some(name));
             gl.buffer_storage(glow::COPY_READ_BUFFER, size, None, kept | glow::CLIENT_STORAGE_BIT);
@@ -64,57 +64,57 @@ impl Gl {
         };
         self.check("readback")?;
         if mapped.is_null() {
-            return Err(during("readback")(format!("{bytes} bytes cannot be mapped")));
+            return Err(fault_in("readback")(format!("{bytes} bytes cannot be mapped")));
         }
-        Ok(Staging { buffer: ManuallyDrop::new(buffer), mapped: Some(mapped.cast_const()), reader })
+        Ok(StagingBuffer { buffer: ManuallyDrop::new(buffer), mapped: Some(mapped.cast_const()), reader })
     }
 
     /// Frees the retired buffers whose readers are done, after waiting for each reader at most `limit`. Buffers that
     /// are still read survive, and with them the context: a leak is better than a read of unmapped memory.
-    pub(crate) fn bury(&self, limit: Duration) {
+    pub(crate) fn free_retired_buffers(&self, limit: Duration) {
         let mut retired = mem::take(&mut *self.retired.borrow_mut());
-        retired.retain(|(_, reader)| !is_over(reader, limit));
+        retired.retain(|(_, reader)| !is_done(reader, limit));
         self.retired.borrow_mut().extend(retired);
     }
 }
 
-impl Staging {
+impl StagingBuffer {
     /// The first bytes. Call it once a fence after the last command that writes them has passed; no command may write
     /// the buffer while the bytes are lent.
     ///
     /// # Errors
     /// `Fault` when the buffer cannot be mapped.
-    pub(crate) fn lend(&self, bytes: usize) -> Result<Lent> {
-        let Some(first) = self.mapped else { return self.buffer.read(bytes).map(Lent::Copied) };
+    pub(crate) fn view(&self, bytes: usize) -> Result<ReadbackView> {
+        let Some(first) = self.mapped else { return self.buffer.read(bytes).map(ReadbackView::Copied) };
         // No message is ever sent; the reader signals with the disconnect alone.
         let (done, reader) = mpsc::sync_channel(1);
         self.reader.replace(Some(reader));
-        Ok(Lent::Mapped { first, bytes: bytes.min(self.buffer.bytes as usize), _done: done })
+        Ok(ReadbackView::Mapped { first, bytes: bytes.min(self.buffer.bytes as usize), _done: done })
     }
 
     /// Waits at most `limit` for the reader and returns whether it is done.
     pub(crate) fn is_read(&self, limit: Duration) -> bool {
         let mut reader = self.reader.borrow_mut();
-        let over = reader.as_ref().is_none_or(|reader| is_over(reader, limit));
+        let over = reader.as_ref().is_none_or(|reader| is_done(reader, limit));
         if over {
             *reader = None;
         }
         over
     }
 
-    /// Copies a range of bytes, under the same conditions as [`Self::lend`].
+    /// Copies a range of bytes, under the same conditions as [`Self::view`].
     pub(crate) fn read(&self, range: std::ops::Range<usize>) -> Result<Vec<u8>> {
-        let lent = self.lend(range.end)?;
+        let lent = self.view(range.end)?;
         Ok(lent.bytes().get(range).unwrap_or_default().to_vec())
     }
 }
 
-impl Drop for Staging {
+impl Drop for StagingBuffer {
     /// Does not wait for the reader, which may run on this thread.
     fn drop(&mut self) {
         // SAFETY: taken once, here, and not used afterwards.
         let buffer = unsafe { ManuallyDrop::take(&mut self.buffer) };
-        if let Some(reader) = self.reader.take().filter(|reader| !is_over(reader, Duration::ZERO)) {
+        if let Some(reader) = self.reader.take().filter(|reader| !is_done(reader, Duration::ZERO)) {
             let gl = Rc::clone(&buffer.gl);
             gl.retired.borrow_mut().push((buffer, reader));
         }
@@ -122,14 +122,14 @@ impl Drop for Staging {
 }
 
 /// Whether the reader is done, after waiting at most `limit`. The disconnect signals its end.
-fn is_over(reader: &Receiver<()>, limit: Duration) -> bool {
+fn is_done(reader: &Receiver<()>, limit: Duration) -> bool {
     match limit {
         Duration::ZERO => reader.try_recv() == Err(TryRecvError::Disconnected),
         limit => reader.recv_timeout(limit) == Err(RecvTimeoutError::Disconnected),
     }
 }
 
-impl Lent {
+impl ReadbackView {
     pub(crate) fn bytes(&self) -> &[u8] {
         match self {
             // SAFETY: the range is inside the mapping, which stays mapped and unwritten while this value exists.

@@ -3,52 +3,54 @@
 
 use std::fmt::Write as _;
 
-use super::super::geometry::Kind;
+use super::super::geometry::BlendMode;
 use super::super::gl;
-use super::super::shaders::{CASTER, DRAWN, FRAME, LANES, Options, Slopes, Source, drawn};
-use super::strip::Strip;
-use modalcast_model::scene::{Blurring, Moments, Shadow, ShadowMethod};
+use super::super::shaders::{
+    FRAME, ProgramSource, SHADOW_CASTER, ShaderOptions, TRIANGLE_ID, UvDerivatives, WORKGROUP_SIZE, vertex_and_fragment,
+};
+use super::blur_strip::BlurStrip;
+use modalcast_model::scene::{BlurMethod, MomentFormat, ShadowMethod, ShadowSettings};
 
-const SUN: &str = include_str!("../../../shaders/shared/sun.glsl");
-const SPLITS: &str = include_str!("../../../shaders/shared/splits.glsl");
-const MOMENTS: &str = include_str!("../../../shaders/shared/moments.glsl");
+const SUN_VISIBILITY: &str = include_str!("../../../shaders/shared/sun_visibility.glsl");
+const CASCADES: &str = include_str!("../../../shaders/shared/shadow_cascades.glsl");
+const VSM_MOMENTS: &str = include_str!("../../../shaders/shared/vsm_moments.glsl");
 
 /// Consecutive texels that one invocation of the blur writes, along its direction.
-pub(crate) const RUN: u32 = 8;
+pub(crate) const TEXELS_PER_INVOCATION: u32 = 8;
 /// Lanes of a workgroup that blurs a tile.
-const TILE_LANES: u32 = 256;
+const TILE_WORKGROUP_SIZE: u32 = 256;
 /// Bytes of shared memory that every device gives a workgroup.
 pub(super) const SHARED_BYTES: u32 = 32 << 10;
 
 /// Defines of a shadow method.
-pub(crate) fn defines(shadow: &Shadow) -> impl Iterator<Item = &'static str> {
+pub(crate) fn defines(shadow: &ShadowSettings) -> impl Iterator<Item = &'static str> {
     let method = match shadow.method {
-        ShadowMethod::Variance => "VARIANCE",
-        ShadowMethod::Standard => "STANDARD",
-        ShadowMethod::Filtered => "FILTERED",
+        ShadowMethod::Variance => "SHADOW_VARIANCE",
+        ShadowMethod::Standard => "SHADOW_STANDARD",
+        ShadowMethod::PercentageCloser => "SHADOW_FILTERED",
     };
-    let splits = ["SPLITS 2", "SPLITS 3", "SPLITS 4"].get((shadow.splits as usize).wrapping_sub(2)).copied();
+    let splits = ["CASCADES 2", "CASCADES 3", "CASCADES 4"].get((shadow.splits as usize).wrapping_sub(2)).copied();
     ["SHADOWS", method].into_iter().chain(splits)
 }
 
 /// Columns and rows of the map that one workgroup writes when both directions are blurred in one pass.
-pub(crate) fn made_at_once(shadow: &Shadow) -> [u32; 2] {
-    let tile = Tile::of(shadow);
-    Strip::of(shadow).map_or([tile.wide, tile.tall], |strip| [strip.wide, strip.tall])
+pub(crate) fn texels_per_workgroup(shadow: &ShadowSettings) -> [u32; 2] {
+    let tile = BlurTile::of(shadow);
+    BlurStrip::of(shadow).map_or([tile.wide, tile.tall], |strip| [strip.wide, strip.tall])
 }
 
 /// The tile of a workgroup: its width and height in texels, and the number of depth rows that it holds at once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Tile {
+struct BlurTile {
     wide: u32,
     tall: u32,
     band: u32,
     reach: u32,
 }
 
-impl Tile {
+impl BlurTile {
     /// The first of these sizes that fits into shared memory; a wider blur kernel needs smaller tiles.
-    fn of(shadow: &Shadow) -> Self {
+    fn of(shadow: &ShadowSettings) -> Self {
         let reach = shadow.reach();
         let sizes = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
         // All rows at once if they fit: a second band would leave most lanes idle.
@@ -71,24 +73,24 @@ impl Tile {
     }
 }
 
-impl Options {
+impl ShaderOptions {
     /// Source of `lit`, the share of the sun's light that reaches a point.
     pub(crate) fn sun(&self) -> String {
         let mut text = String::new();
-        if self.has("VARIANCE") {
-            writeln!(text, "const float DEVIATION = {:?};", self.shadow.deviation() as f32).ok();
+        if self.has("SHADOW_VARIANCE") {
+            writeln!(text, "const float DEVIATION = {:?};", self.shadow.filter_deviation() as f32).ok();
         }
-        if self.has("FILTERED") {
-            let taps = weights(self.shadow.blur);
-            writeln!(text, "#define REACH {}", taps.len() - 1).ok();
+        if self.has("SHADOW_FILTERED") {
+            let taps = gaussian_weights(self.shadow.blur);
+            writeln!(text, "#define RADIUS {}", taps.len() - 1).ok();
             let list: String = taps.iter().map(|weight| format!("{weight:?}, ")).collect();
-            writeln!(text, "const float TAPS[REACH + 2] = float[]({list}0.0);").ok();
+            writeln!(text, "const float TAPS[RADIUS + 2] = float[]({list}0.0);").ok();
         }
-        text + self.splits() + SUN
+        text + self.splits() + SUN_VISIBILITY
     }
 
     pub(crate) fn splits(&self) -> &'static str {
-        if self.shadow.splits > 1 && self.has("SHADOWS") { SPLITS } else { "" }
+        if self.shadow.splits > 1 && self.has("SHADOWS") { CASCADES } else { "" }
     }
 
     fn has(&self, define: &str) -> bool {
@@ -96,84 +98,90 @@ impl Options {
     }
 
     /// Draws one kind of triangle into the shadow map; opaque ones need no fragment shader.
-    pub(crate) fn shadow(&self, kind: Kind) -> Source {
-        let label = format!("shadow, {kind:?}");
+    pub(crate) fn shadow(&self, blend_mode: BlendMode) -> ProgramSource {
+        let label = format!("shadow, {blend_mode:?}");
         let vertex = |head: &str| [head, FRAME, self.splits(), include_str!("../../../shaders/shadow.vert")].concat();
-        if kind == Kind::Opaque {
-            return Source { label, stages: vec![(gl::VERTEX_SHADER, vertex(&self.head(&["SOLID"])))] };
+        if blend_mode == BlendMode::Opaque {
+            return ProgramSource { label, stages: vec![(gl::VERTEX_SHADER, vertex(&self.head(&["POSITION_ONLY"])))] };
         }
-        let head = self.head(if kind == Kind::Mask { &["MASK"] } else { &[] }) + &self.branches(&[kind]);
-        let lookups = self.lookups(&[kind], Slopes::OfTheQuad);
+        let head = self.head(if blend_mode == BlendMode::Mask { &["MASK"] } else { &[] })
+            + &self.material_defines(&[blend_mode]);
+        let material_lookups = self.material_lookups(&[blend_mode], UvDerivatives::Implicit);
         let body = include_str!("../../../shaders/shadow.frag");
-        let fragment = [&head, FRAME, &lookups, DRAWN, CASTER, body].concat();
-        Source { label, stages: drawn(vertex(&head), fragment) }
+        let fragment = [&head, FRAME, &material_lookups, TRIANGLE_ID, SHADOW_CASTER, body].concat();
+        ProgramSource { label, stages: vertex_and_fragment(vertex(&head), fragment) }
     }
 
     /// The programs that blur the moments of depth, in execution order.
-    pub(crate) fn blur(&self) -> Vec<Source> {
-        match self.shadow.blurring {
-            Blurring::Fitting | Blurring::Tiles => vec![self.blur_at_once()],
-            Blurring::Rows | Blurring::Fragments => vec![self.blur_along(true), self.blur_along(false)],
+    pub(crate) fn blur(&self) -> Vec<ProgramSource> {
+        match self.shadow.blur_method {
+            BlurMethod::Auto | BlurMethod::Tiles => vec![self.blur_single_pass()],
+            BlurMethod::Rows | BlurMethod::Fragments => vec![self.blur_separable(true), self.blur_separable(false)],
         }
     }
 
     /// The first blur program, for depth in a storage buffer; none without a blur.
-    pub(crate) fn blur_of_buffer(&self) -> Option<Source> {
-        let Source { label, stages } = self.blur().into_iter().next().filter(|_| self.has("VARIANCE"))?;
-        let version = |text: String| text.replacen('\n', "\n#define OF_BUFFER\n", 1);
+    pub(crate) fn blur_from_buffer(&self) -> Option<ProgramSource> {
+        let ProgramSource { label, stages } = self.blur().into_iter().next().filter(|_| self.has("SHADOW_VARIANCE"))?;
+        let version = |text: String| text.replacen('\n', "\n#define DEPTH_IN_BUFFER\n", 1);
         let stages = stages.into_iter().map(|(stage, text)| (stage, version(text))).collect();
-        Some(Source { label: label + ", of a buffer", stages })
+        Some(ProgramSource { label: label + ", of a buffer", stages })
     }
 
     fn blur_head(&self, more: &[&str], lanes: u32, run: u32) -> String {
         let mut head = self.head(more);
-        let format = if self.shadow.moments == Moments::F16 { "rg16f" } else { "rg32f" };
-        writeln!(head, "#define LANES {lanes}\n#define RUN {run}\n#define FORMAT {format}").ok();
-        [&head, FRAME, self.splits(), MOMENTS].concat()
+        let format = if self.shadow.moments == MomentFormat::F16 { "rg16f" } else { "rg32f" };
+        writeln!(head, "#define WORKGROUP_SIZE {lanes}\n#define TEXELS_PER_INVOCATION {run}\n#define FORMAT {format}")
+            .ok();
+        [&head, FRAME, self.splits(), VSM_MOMENTS].concat()
     }
 
     /// One direction of the blur; the first direction also converts depth to moments.
-    fn blur_along(&self, first: bool) -> Source {
-        let more: &[&str] = if first { &["FIRST"] } else { &[] };
-        let fragments = self.shadow.blurring == Blurring::Fragments;
-        let run = if fragments { 1 } else { RUN };
+    fn blur_separable(&self, first: bool) -> ProgramSource {
+        let more: &[&str] = if first { &["FROM_DEPTH"] } else { &[] };
+        let fragments = self.shadow.blur_method == BlurMethod::Fragments;
+        let run = if fragments { 1 } else { TEXELS_PER_INVOCATION };
         let arguments = "ivec2 at, ivec2 along, int side";
-        let taps = taps("blur", arguments, &weights(self.shadow.blur), run, |tap| {
-            format!("moments(at + {tap} * along, side)")
+        let taps = taps("blur", arguments, &gaussian_weights(self.shadow.blur), run, |tap| {
+            format!("load_moments(at + {tap} * along, side)")
         });
-        let head = self.blur_head(more, LANES, run) + &taps;
+        let head = self.blur_head(more, WORKGROUP_SIZE, run) + &taps;
         let label = format!("blur, {}", if first { "x" } else { "y" });
         if !fragments {
-            let body = head + include_str!("../../../shaders/blur.comp");
-            return Source { label, stages: vec![(gl::COMPUTE_SHADER, body)] };
+            let body = head + include_str!("../../../shaders/vsm_blur.comp");
+            return ProgramSource { label, stages: vec![(gl::COMPUTE_SHADER, body)] };
         }
-        let vertex = String::from("#version 430 core\n") + include_str!("../../../shaders/whole.vert");
-        let fragment = head + include_str!("../../../shaders/blur.frag");
-        Source { label, stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
+        let vertex = String::from("#version 430 core\n") + include_str!("../../../shaders/fullscreen.vert");
+        let fragment = head + include_str!("../../../shaders/vsm_blur.frag");
+        ProgramSource { label, stages: vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)] }
     }
 
     /// Both directions of the blur in one pass: by strips if the kernel is small enough, else by tiles.
-    fn blur_at_once(&self) -> Source {
-        let weights = weights(self.shadow.blur);
-        let Some(strip) = Strip::of(&self.shadow) else { return self.blur_tiles(&weights) };
-        let text = self.blur_head(&["FIRST"], strip.wide, 1) + &strip.text(&weights);
-        Source { label: "blur, strips".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    fn blur_single_pass(&self) -> ProgramSource {
+        let weights = gaussian_weights(self.shadow.blur);
+        let Some(strip) = BlurStrip::of(&self.shadow) else { return self.blur_tiles(&weights) };
+        let text = self.blur_head(&["FROM_DEPTH"], strip.wide, 1) + &strip.text(&weights);
+        ProgramSource { label: "blur, strips".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
     /// Both directions of the blur, tile by tile.
-    fn blur_tiles(&self, weights: &[f32]) -> Source {
-        let tile = Tile::of(&self.shadow);
-        let Tile { wide, tall, band, reach } = tile;
-        let mut text = self.blur_head(&["FIRST"], TILE_LANES, RUN);
-        writeln!(text, "#define WIDE {wide}\n#define TALL {tall}\n#define BAND {band}\n#define REACH {reach}").ok();
-        writeln!(text, "#define PITCH {}\n#define DEPTH_PITCH {}", tile.pitch(), tile.depth_pitch()).ok();
-        writeln!(text, "shared float depths[BAND * DEPTH_PITCH];").ok();
-        writeln!(text, "shared vec2 rows[(TALL + 2 * REACH) * PITCH];").ok();
-        writeln!(text, "vec2 pair(float m) {{ return vec2(m, m * m); }}").ok();
-        text += &taps("across", "int at", weights, RUN, |tap| format!("pair(depths[at + {tap}])"));
-        text += &taps("down", "int at", weights, RUN, |tap| format!("rows[at + {tap} * PITCH]"));
-        text += include_str!("../../../shaders/blur_tile.comp");
-        Source { label: "blur, tiles".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    fn blur_tiles(&self, weights: &[f32]) -> ProgramSource {
+        let tile = BlurTile::of(&self.shadow);
+        let BlurTile { wide, tall, band, reach } = tile;
+        let mut text = self.blur_head(&["FROM_DEPTH"], TILE_WORKGROUP_SIZE, TEXELS_PER_INVOCATION);
+        writeln!(text, "#define OUTPUT_COLUMNS {wide}\n#define OUTPUT_ROWS {tall}\n#define BAND_ROWS {band}\n#define RADIUS {reach}").ok();
+        writeln!(text, "#define ROW_PITCH {}\n#define DEPTH_PITCH {}", tile.pitch(), tile.depth_pitch()).ok();
+        writeln!(text, "shared float depths[BAND_ROWS * DEPTH_PITCH];").ok();
+        writeln!(text, "shared vec2 rows[(OUTPUT_ROWS + 2 * RADIUS) * ROW_PITCH];").ok();
+        writeln!(text, "vec2 to_moments(float m) {{ return vec2(m, m * m); }}").ok();
+        text += &taps("blur_row", "int at", weights, TEXELS_PER_INVOCATION, |tap| {
+            format!("to_moments(depths[at + {tap}])")
+        });
+        text += &taps("blur_column", "int at", weights, TEXELS_PER_INVOCATION, |tap| {
+            format!("rows[at + {tap} * ROW_PITCH]")
+        });
+        text += include_str!("../../../shaders/vsm_blur_tile.comp");
+        ProgramSource { label: "blur, tiles".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 }
 
@@ -181,7 +189,7 @@ impl Options {
 /// sums that use it.
 fn taps(name: &str, arguments: &str, weights: &[f32], run: u32, fetch: impl Fn(i32) -> String) -> String {
     let reach = weights.len() as i32 - 1;
-    let mut text = format!("void {name}({arguments}, out vec2 sums[RUN]) {{\n    vec2 texel;\n");
+    let mut text = format!("void {name}({arguments}, out vec2 sums[TEXELS_PER_INVOCATION]) {{\n    vec2 texel;\n");
     for index in 0..run {
         writeln!(text, "    sums[{index}] = vec2(0.0);").ok();
     }
@@ -198,10 +206,10 @@ fn taps(name: &str, arguments: &str, weights: &[f32], run: u32, fetch: impl Fn(i
 
 /// One half of a normalized Gaussian (equation 3.11 in one dimension), center first, cut off at three standard
 /// deviations.
-pub(crate) fn weights(deviation: f32) -> Vec<f32> {
-    let deviation = f64::from(deviation);
-    let reach = (3.0 * deviation).ceil() as i32;
-    let bell = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / deviation).powi(2)).exp() };
+pub(crate) fn gaussian_weights(filter_deviation: f32) -> Vec<f32> {
+    let filter_deviation = f64::from(filter_deviation);
+    let reach = (3.0 * filter_deviation).ceil() as i32;
+    let bell = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / filter_deviation).powi(2)).exp() };
     let sum: f64 = (-reach..=reach).map(bell).sum();
     (0..=reach).map(|step| (bell(step) / sum) as f32).collect()
 }
@@ -212,53 +220,53 @@ mod tests {
 
     #[test]
     fn blur_weights_are_a_normalised_bell() {
-        for deviation in [0.0, 0.3, 2.0, 16.0] {
-            let weights = weights(deviation);
+        for filter_deviation in [0.0, 0.3, 2.0, 16.0] {
+            let weights = gaussian_weights(filter_deviation);
             let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
-            assert!((sum - 1.0).abs() < 1e-5, "{deviation}: {sum}");
+            assert!((sum - 1.0).abs() < 1e-5, "{filter_deviation}: {sum}");
             assert!(weights.is_sorted_by(|near, far| near >= far));
-            let shadow = Shadow { blur: deviation, ..Shadow::default() };
+            let shadow = ShadowSettings { blur: filter_deviation, ..ShadowSettings::default() };
             assert_eq!(shadow.reach() as usize, weights.len() - 1);
         }
-        assert_eq!(weights(0.0), [1.0]);
+        assert_eq!(gaussian_weights(0.0), [1.0]);
     }
 
     #[test]
     fn a_tile_fits_into_shared_memory_whatever_the_blur() {
         for step in 0..=160 {
-            let tile = Tile::of(&Shadow { blur: step as f32 / 10.0, ..Shadow::default() });
+            let tile = BlurTile::of(&ShadowSettings { blur: step as f32 / 10.0, ..ShadowSettings::default() });
             assert!(tile.bytes() <= SHARED_BYTES, "{tile:?}: {} bytes", tile.bytes());
-            assert!(tile.wide.is_multiple_of(RUN) && tile.tall.is_multiple_of(RUN));
+            assert!(tile.wide.is_multiple_of(TEXELS_PER_INVOCATION) && tile.tall.is_multiple_of(TEXELS_PER_INVOCATION));
         }
-        let default = Tile::of(&Shadow::default());
+        let default = BlurTile::of(&ShadowSettings::default());
         assert_eq!((default.tall, default.band), (64, 74), "the default blur has the largest tile, in one band");
     }
 
     #[test]
     fn only_what_the_scene_names_is_compiled() {
-        let all = ["VARIANCE", "STANDARD", "FILTERED"];
+        let all = ["SHADOW_VARIANCE", "SHADOW_STANDARD", "SHADOW_FILTERED"];
         for (method, own) in
-            [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::Filtered].into_iter().zip(all)
+            [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::PercentageCloser].into_iter().zip(all)
         {
-            let shadow = Shadow { method, ..Shadow::default() };
+            let shadow = ShadowSettings { method, ..ShadowSettings::default() };
             let names: Vec<&str> = defines(&shadow).collect();
             assert_eq!(names, ["SHADOWS", own]);
-            let options = Options {
+            let options = ShaderOptions {
                 defines: names,
                 used: vec![],
                 shadow,
-                sample_places: vec![],
-                resolve: String::new(),
-                post_depth: false,
+                sample_positions: vec![],
+                sample_resolve: String::new(),
+                post_depth_coverage: false,
             };
-            assert_eq!(options.sun().contains("const float TAPS"), own == "FILTERED");
+            assert_eq!(options.sun().contains("const float TAPS"), own == "SHADOW_FILTERED");
             assert!(
-                !options.sun().contains("SplitBlock")
-                    && !options.shadow(Kind::Opaque).stages[0].1.contains("SplitBlock")
+                !options.sun().contains("CascadeBlock")
+                    && !options.shadow(BlendMode::Opaque).stages[0].1.contains("CascadeBlock")
             );
-            let split = Options { shadow: Shadow { splits: 3, ..shadow }, ..options };
-            assert!(split.sun().contains("SplitBlock"));
+            let split = ShaderOptions { shadow: ShadowSettings { splits: 3, ..shadow }, ..options };
+            assert!(split.sun().contains("CascadeBlock"));
         }
-        assert_eq!(defines(&Shadow { splits: 4, ..Shadow::default() }).last(), Some("SPLITS 4"));
+        assert_eq!(defines(&ShadowSettings { splits: 4, ..ShadowSettings::default() }).last(), Some("CASCADES 4"));
     }
 }

@@ -6,9 +6,9 @@ use std::thread;
 use std::time::Duration;
 
 use super::super::geometry::tests::squares;
-use super::super::ring::FRAMES_UNDER_WAY;
-use super::super::{Image, Prefer, Renderer, SceneBuffers, Shot};
-use modalcast_model::deform::Surface;
+use super::super::readback_ring::MAX_FRAMES_IN_FLIGHT;
+use super::super::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, Scene, Transparency};
@@ -16,7 +16,7 @@ use modalcast_model::scene::{Camera, Scene, Transparency};
 /// A renderer that times its passes with queries on any device, so that its frames are in flight after they were
 /// submitted.
 fn open() -> Renderer {
-    let mut renderer = Renderer::open(Prefer::Any).expect("EGL");
+    let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL");
     Rc::get_mut(&mut renderer.gl).expect("not shared yet").limits.software = false;
     renderer
 }
@@ -26,21 +26,21 @@ fn scene() -> Arc<Scene> {
     let glass = Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, double_sided: true, ..Material::default() };
     let red = Material { diffuse: [0.9, 0.2, 0.1], double_sided: true, ..Material::default() };
     let mut parts = squares(vec![red, glass]);
-    parts.look.transparency = Transparency::Exact;
+    parts.look.transparency = Transparency::OrderIndependent;
     Scene::new(parts).expect("good")
 }
 
 /// Both squares; the glass is wider by `by`.
-fn surface(by: f32) -> Surface {
+fn surface(by: f32) -> DeformedSurface {
     let square = |z: f32, wide: f32| [[0.0, 0.0, z], [wide, 0.0, z], [wide, 1.0, z], [0.0, 1.0, z]];
     let positions = [square(0.0, 1.0), square(0.3, 0.25 + by)].concat();
     let normals = [0.0, 0.0, 1.0].repeat(positions.len());
-    Surface { positions: positions.as_flattened().to_vec(), normals, ..Surface::default() }
+    DeformedSurface { positions: positions.as_flattened().to_vec(), normals, ..DeformedSurface::default() }
 }
 
-fn shot(scene: &Scene, side: u32) -> Shot {
-    let camera = Camera::framing(scene, side, side);
-    Shot { camera, width: side, height: side, bounds: scene.rest_bounds, light: None }
+fn shot(scene: &Scene, side: u32) -> FrameParams {
+    let camera = Camera::fit_to_scene(scene, side, side);
+    FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light: None }
 }
 
 /// The picture of one surface drawn alone, and its number of blended fragments.
@@ -49,7 +49,7 @@ fn alone(by: f32) -> (Vec<u8>, u64) {
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, &surface(by)).expect("uploads");
     let image = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws");
-    (image.rgba, renderer.ran().lists.expect("exact").fragments)
+    (image.rgba, renderer.stats().oit.expect("exact").fragments)
 }
 
 fn loaded() -> (Renderer, Arc<Scene>, SceneBuffers) {
@@ -72,10 +72,10 @@ fn each_frame_under_way_keeps_its_vertices_camera_and_counts_whatever_comes_afte
     let mut seen = Vec::new();
     for by in moved.into_iter().rev() {
         let ticket = tickets.pop().expect("as many");
-        let image = renderer.collect(ticket).expect("draws");
+        let image = renderer.read_image(ticket).expect("draws");
         let (rgba, fragments) = alone(by);
         assert!(image.rgba == rgba, "{by}");
-        assert_eq!(renderer.ran().lists.expect("exact").fragments, fragments);
+        assert_eq!(renderer.stats().oit.expect("exact").fragments, fragments);
         let names: Vec<&str> = image.passes.iter().map(|(name, _)| *name).collect();
         assert_eq!(names[..3], ["shadow", "blur", "draw"]);
         assert!(image.passes.iter().all(|(_, ms)| ms.is_finite() && *ms >= 0.0), "{:?}", image.passes);
@@ -88,31 +88,31 @@ fn each_frame_under_way_keeps_its_vertices_camera_and_counts_whatever_comes_afte
 fn a_fourth_frame_of_a_form_is_refused_and_a_scene_that_is_read_at_once_has_one_buffer() {
     let (mut renderer, scene, buffers) = loaded();
     let shot = shot(&scene, 64);
-    let made = |renderer: &Renderer| renderer.targets.last().expect("drawn").ring.count();
+    let made = |renderer: &Renderer| renderer.targets.last().expect("drawn").readback_ring.count();
     for _ in 0..5 {
         renderer.draw(&buffers, &shot).expect("draws");
     }
     assert_eq!(made(&renderer), 1);
     let unread: Vec<_> =
-        (0..5).map(|_| renderer.submit_unread(&buffers, &shot).expect("as many as one likes")).collect();
+        (0..5).map(|_| renderer.submit_without_readback(&buffers, &shot).expect("as many as one likes")).collect();
     for ticket in unread {
-        assert!(renderer.collect(ticket).expect("draws").rgba.is_empty());
+        assert!(renderer.read_image(ticket).expect("draws").rgba.is_empty());
     }
     assert_eq!(made(&renderer), 1, "what nobody reads takes none");
     let mut tickets: Vec<_> = (0..3).map(|_| renderer.submit(&buffers, &shot).expect("has room")).collect();
-    assert_eq!((made(&renderer), FRAMES_UNDER_WAY), (3, 3));
+    assert_eq!((made(&renderer), MAX_FRAMES_IN_FLIGHT), (3, 3));
     let refusal = renderer.submit(&buffers, &shot).expect_err("full");
-    assert_eq!(refusal, Error::Busy { queue: "frames under way", limit: 3 });
-    let smaller = Shot { width: 32, height: 32, ..shot };
+    assert_eq!(refusal, Error::Busy { queue: "frames in flight", limit: 3 });
+    let smaller = FrameParams { width: 32, height: 32, ..shot };
     renderer.draw(&buffers, &smaller).expect("another form has its own");
-    let first = renderer.collect(tickets.remove(0)).expect("draws");
+    let first = renderer.read_image(tickets.remove(0)).expect("draws");
     tickets.push(renderer.submit(&buffers, &shot).expect("there is room again"));
     drop(tickets.remove(0));
     tickets.push(renderer.submit(&buffers, &shot).expect("one that was given up makes room"));
     for ticket in tickets {
-        assert!(renderer.collect(ticket).expect("draws").rgba == first.rgba);
+        assert!(renderer.read_image(ticket).expect("draws").rgba == first.rgba);
     }
-    assert!(!renderer.seen().expect("beside the ring").is_empty());
+    assert!(!renderer.read_visibility().expect("beside the ring").is_empty());
 }
 
 #[test]
@@ -126,11 +126,11 @@ fn a_frame_that_does_not_end_is_an_error_with_the_name_of_the_pass_and_the_next_
         let names: Vec<&str> = ticket.passes.iter().map(|(name, _)| *name).collect();
         assert_eq!(names, passes);
         ticket.fence = renderer.gl.lost_fence();
-        for (_, stopwatch) in &mut ticket.passes[stuck..] {
-            *stopwatch = renderer.gl.stopped_watch();
+        for (_, timer) in &mut ticket.passes[stuck..] {
+            *timer = renderer.gl.unstarted_timer();
         }
         assert!(ticket.is_ready(), "to be given up");
-        let Err(Error::Fault { stage, reason }) = renderer.collect(ticket) else { panic!("no fault") };
+        let Err(Error::Fault { stage, reason }) = renderer.read_image(ticket) else { panic!("no fault") };
         assert_eq!(stage, passes[stuck]);
         let last = if stuck == 0 { "none".to_owned() } else { format!("'{}'", passes[stuck - 1]) };
         assert!(reason.ends_with(&format!("the last pass that it finished: {last}")), "{reason}");
@@ -155,11 +155,11 @@ fn a_frame_that_fails_halfway_leaves_no_images_of_which_nobody_knows_what_they_h
 #[test]
 fn a_frame_that_is_late_by_more_than_the_limit_is_ready_to_be_given_up() {
     let (mut renderer, scene, buffers) = loaded();
-    renderer.watchdog = Duration::from_millis(5);
-    let ticket = renderer.submit_unread(&buffers, &shot(&scene, 64)).expect("submits");
+    renderer.frame_timeout = Duration::from_millis(5);
+    let ticket = renderer.submit_without_readback(&buffers, &shot(&scene, 64)).expect("submits");
     ticket.is_ready();
     thread::sleep(Duration::from_millis(6));
-    assert!(ticket.left().is_zero() && ticket.is_ready_within(Duration::from_secs(60)));
+    assert!(ticket.time_left().is_zero() && ticket.is_ready_within(Duration::from_secs(60)));
 }
 
 #[test]
@@ -169,8 +169,8 @@ fn a_frame_comes_back_when_the_images_of_its_form_were_freed_meanwhile() {
     for side in 32..40 {
         renderer.draw(&buffers, &shot(&scene, side)).expect("draws");
     }
-    assert!(renderer.targets.iter().all(|target| target.form.width != 64));
-    let pixels = renderer.retrieve(early).expect("draws");
+    assert!(renderer.targets.iter().all(|target| target.desc.width != 64));
+    let pixels = renderer.map_pixels(early).expect("draws");
     renderer.draw(&buffers, &shot(&scene, 41)).expect("draws while somebody reads what was freed");
     assert_eq!(renderer.gl.retired(), 1);
     assert!(pixels.into_image().rgba == alone(0.0).0);
@@ -182,7 +182,7 @@ fn a_frame_comes_back_when_the_images_of_its_form_were_freed_meanwhile() {
 fn pixels_outlive_a_renderer_whose_thread_holds_them() {
     let (mut renderer, scene, buffers) = loaded();
     let ticket = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
-    let pixels = renderer.retrieve(ticket).expect("draws");
+    let pixels = renderer.map_pixels(ticket).expect("draws");
     drop(renderer);
     drop(buffers);
     assert!(pixels.into_image().rgba == alone(0.0).0);
@@ -195,7 +195,7 @@ fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_go
     let shot = shot(&scene, 64);
     let slow = |renderer: &mut Renderer, buffers: &SceneBuffers| {
         let ticket = renderer.submit(buffers, &shot).expect("has room");
-        let pixels = renderer.retrieve(ticket).expect("draws");
+        let pixels = renderer.map_pixels(ticket).expect("draws");
         thread::spawn(move || {
             thread::sleep(Duration::from_millis(50));
             pixels.into_image()
@@ -206,7 +206,7 @@ fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_go
     renderer.unload(buffers);
     drop(renderer);
     for reader in readers {
-        let Image { rgba, .. } = reader.join().expect("lives");
+        let FrameImage { rgba, .. } = reader.join().expect("lives");
         assert!(rgba == want);
     }
 }
@@ -214,17 +214,17 @@ fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_go
 #[test]
 fn pixels_that_are_held_for_too_long_refuse_frames_and_block_none_for_ever() {
     let (mut renderer, scene, buffers) = loaded();
-    renderer.watchdog = Duration::from_secs(20);
+    renderer.frame_timeout = Duration::from_secs(20);
     let shot = shot(&scene, 64);
     let mut held = Vec::new();
     for _ in 0..3 {
         let ticket = renderer.submit(&buffers, &shot).expect("has room");
-        held.push(renderer.retrieve(ticket).expect("draws"));
+        held.push(renderer.map_pixels(ticket).expect("draws"));
     }
-    renderer.watchdog = Duration::from_millis(20);
+    renderer.frame_timeout = Duration::from_millis(20);
     assert!(matches!(renderer.submit(&buffers, &shot), Err(Error::Busy { .. })));
-    renderer.watchdog = Duration::from_secs(20);
-    let images: Vec<Image> = held.into_iter().map(super::Pixels::into_image).collect();
+    renderer.frame_timeout = Duration::from_secs(20);
+    let images: Vec<FrameImage> = held.into_iter().map(super::MappedPixels::into_image).collect();
     let after = renderer.draw(&buffers, &shot).expect("there is room again");
     assert!(images.iter().all(|image| image.rgba == after.rgba));
 }

@@ -6,13 +6,13 @@
 //! that of level 0. Alpha is clamped to 1, so a level with raised alpha falls short by what the clamp removes, and a
 //! level of one texel cannot keep a shape.
 
-use super::Linear;
+use super::LinearImage;
 
 /// Minimum number of samples along each side of a level.
-const APART: u32 = 256;
+const MIN_SAMPLES_PER_SIDE: u32 = 256;
 
 /// Scales the alpha of all levels but the first.
-pub(super) fn keep(chain: &mut [Linear], cutoff: f32) {
+pub(super) fn preserve_coverage(chain: &mut [LinearImage], cutoff: f32) {
     let Some((first, rest)) = chain.split_first_mut() else { return };
     let share = coverage(first, cutoff);
     for level in rest {
@@ -25,14 +25,14 @@ pub(super) fn keep(chain: &mut [Linear], cutoff: f32) {
 }
 
 /// Share of an image whose alpha is at or above the cutoff.
-pub(super) fn coverage(image: &Linear, cutoff: f32) -> f32 {
+pub(super) fn coverage(image: &LinearImage, cutoff: f32) -> f32 {
     let samples = samples(image);
     samples.iter().filter(|alpha| **alpha >= cutoff).count() as f32 / samples.len() as f32
 }
 
 /// The alpha that exactly this share of an image reaches: the middle between the lowest alpha that counts and the
 /// highest that does not, so that plateaus stay clear of the cutoff.
-fn threshold(image: &Linear, share: f32) -> f32 {
+fn threshold(image: &LinearImage, share: f32) -> f32 {
     let mut samples = samples(image);
     let rank = (share * samples.len() as f32).round() as usize;
     let Some(last) = rank.checked_sub(1) else {
@@ -44,9 +44,9 @@ fn threshold(image: &Linear, share: f32) -> f32 {
 }
 
 /// Alpha interpolated on an even grid with at least one sample per texel.
-fn samples(image: &Linear) -> Vec<f32> {
+fn samples(image: &LinearImage) -> Vec<f32> {
     let (width, height) = (image.width, image.height);
-    let fine = APART.div_ceil(width.min(height)).max(1);
+    let fine = MIN_SAMPLES_PER_SIDE.div_ceil(width.min(height)).max(1);
     let mut samples = Vec::with_capacity((width * fine) as usize * (height * fine) as usize);
     let along = |step: u32, count: u32| {
         let place = (step as f32 + 0.5) / fine as f32 - 0.5;
@@ -67,19 +67,19 @@ fn samples(image: &Linear) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Array, Use, levels};
+    use super::super::{TextureArray, TextureRole, mip_levels};
     use super::*;
     use modalcast_model::domain::Texture;
-    use modalcast_model::scene::Parts;
+    use modalcast_model::scene::SceneParts;
 
     /// Covered share of each level, computed from its bytes.
     fn shares(texture: &Texture, cutoff: f32, kept: bool) -> Vec<f32> {
-        let array = Array { width: texture.width(), height: texture.height(), layers: vec![0] };
-        let chain = levels(texture, &array, Use::Colour, kept.then_some(cutoff));
+        let array = TextureArray { width: texture.width(), height: texture.height(), layers: vec![0] };
+        let chain = mip_levels(texture, &array, TextureRole::Color, kept.then_some(cutoff));
         let share = |(level, rgba): (usize, &Vec<u8>)| {
             let side = |side: u32| (side >> level).max(1);
             let rgba = Texture::new("level", side(array.width), side(array.height), rgba.clone()).expect("fits");
-            coverage(&Linear::new(&rgba, Use::Colour), cutoff)
+            coverage(&LinearImage::new(&rgba, TextureRole::Color), cutoff)
         };
         chain.iter().enumerate().map(share).collect()
     }
@@ -119,10 +119,10 @@ mod tests {
             let material = |(alpha_mode, alpha): &(AlphaMode, f32)| Material {
                 alpha_mode: *alpha_mode,
                 alpha: *alpha,
-                colour_texture: Some(0),
+                color_texture: Some(0),
                 ..Material::default()
             };
-            let mut parts: Parts = squares(modes.iter().map(material).collect());
+            let mut parts: SceneParts = squares(modes.iter().map(material).collect());
             parts.textures.push(disc(0.5));
             super::super::cutoff(&modalcast_model::scene::Scene::new(parts).expect("good"), 0)
         };

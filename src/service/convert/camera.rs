@@ -21,7 +21,7 @@ pub(super) fn parse(framing: Camera, camera: v1::Camera) -> Result<Camera> {
         Some(v1::camera::Lens::FieldOfView(degrees)) => Lens::FieldOfView(degrees),
         Some(v1::camera::Lens::Intrinsics(v1::Intrinsics { fx, fy, cx, cy })) => Lens::Intrinsics { fx, fy, cx, cy },
     };
-    Camera { view, lens, near: camera.near, far: camera.far }.checked()
+    Camera { view, lens, near: camera.near, far: camera.far }.validated()
 }
 
 fn exactly<const N: usize>(field: &str, list: &[f64]) -> Result<[f64; N]> {

@@ -27,17 +27,17 @@
 #endif
 
 #if defined(BATCH_8)
-constexpr unsigned VECTORS = 8;
-constexpr unsigned RESIDENT = 4;
+constexpr unsigned BATCH_SIZE = 8;
+constexpr unsigned MIN_BLOCKS_PER_SM = 4;
 #elif defined(BATCH_32)
-constexpr unsigned VECTORS = 32;
-constexpr unsigned RESIDENT = 2;
+constexpr unsigned BATCH_SIZE = 32;
+constexpr unsigned MIN_BLOCKS_PER_SM = 2;
 #else
-constexpr unsigned VECTORS = 16;
-constexpr unsigned RESIDENT = 3;
+constexpr unsigned BATCH_SIZE = 16;
+constexpr unsigned MIN_BLOCKS_PER_SM = 3;
 #endif
 constexpr unsigned MOST = 32;
-constexpr unsigned EIGHTS = VECTORS / 8;
+constexpr unsigned EIGHTS = BATCH_SIZE / 8;
 
 // A warp covers eight quads of a tile of 32; a step is eight chunks of two modes.
 constexpr unsigned WARPS = 4;
@@ -66,7 +66,7 @@ struct BatchMmaArgs {
 static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
 
 #if __CUDA_ARCH__ >= 800
-__device__ __forceinline__ unsigned lane_of() {
+__device__ __forceinline__ unsigned lane_id() {
     return threadIdx.x % 32;
 }
 
@@ -84,7 +84,7 @@ __device__ __forceinline__ Part part_of(const BatchMmaArgs& args) {
     const unsigned tile = TILE * blockIdx.x, before = QUADS * (threadIdx.x / 32);
     Part part;
     part.width = min(TILE, (args.vertices + 3) / 4 - tile);
-    const unsigned quad = min(before + lane_of() / 4, part.width - 1);
+    const unsigned quad = min(before + lane_id() / 4, part.width - 1);
     part.words = args.words + 3 * (size_t)args.chunks * tile + quad;
     part.rest = tile + quad;
     part.first = 4 * (tile + before);
@@ -116,7 +116,7 @@ struct Step {
 };
 
 __device__ __forceinline__ void load(Step& step, const BatchMmaArgs& args, const Part& part, unsigned index) {
-    const unsigned chunk = STEP_CHUNKS * index + lane_of() % 4;
+    const unsigned chunk = STEP_CHUNKS * index + lane_id() % 4;
     load(step.low, args, part, chunk);
     load(step.high, args, part, chunk + 4);
 }
@@ -136,7 +136,7 @@ __device__ __forceinline__ void add(Sums& sums, const Step& step, const uint4* h
     uint4 q[EIGHTS];
 #pragma unroll
     for (unsigned eight = 0; eight < EIGHTS; ++eight) {
-        q[eight] = __ldg(halves + 32 * eight + lane_of());
+        q[eight] = __ldg(halves + 32 * eight + lane_id());
     }
 #pragma unroll
     for (unsigned row = 0; row < 6; ++row) {
@@ -174,7 +174,7 @@ __device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const Part& 
     }
 }
 
-__device__ __forceinline__ float placed(const float4& row, float x, float y, float z) {
+__device__ __forceinline__ float transform_row(const float4& row, float x, float y, float z) {
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
@@ -191,9 +191,9 @@ __device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&r
     for (unsigned vertex = 0; vertex < 4; ++vertex) {
         const float x = x0[0][vertex] + u[0][vertex] * shrink, y = x0[1][vertex] + u[1][vertex] * shrink,
                     z = x0[2][vertex] + u[2][vertex] * shrink;
-        world[3 * vertex] = placed(a, x, y, z);
-        world[3 * vertex + 1] = placed(b, x, y, z);
-        world[3 * vertex + 2] = placed(c, x, y, z);
+        world[3 * vertex] = transform_row(a, x, y, z);
+        world[3 * vertex + 1] = transform_row(b, x, y, z);
+        world[3 * vertex + 2] = transform_row(c, x, y, z);
     }
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
@@ -205,7 +205,7 @@ __device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&r
 // into 128 bytes.
 __device__ __forceinline__ void store(const BatchMmaArgs& args, const Part& part, unsigned domain,
                                       const float4* staged) {
-    const unsigned own = lane_of() / 8;
+    const unsigned own = lane_id() / 8;
     domain += 2 * own;
     if (domain >= args.domains) {
         return;
@@ -213,7 +213,7 @@ __device__ __forceinline__ void store(const BatchMmaArgs& args, const Part& part
     float* to = args.positions + 3 * ((size_t)args.first[domain] + part.first);
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
-        const unsigned four = 8 * i + lane_of() % 8;
+        const unsigned four = 8 * i + lane_id() % 8;
         const float4 numbers = staged[STRIDE * own + four];
         if (args.aligned && 4 * four + 4 <= part.numbers) {
             __stcs((float4*)to + four, numbers);
@@ -235,7 +235,7 @@ __device__ __forceinline__ void place(const BatchMmaArgs& args, const Part& part
     for (unsigned axis = 0; axis < 3; ++axis) {
         rest[axis] = __ldg(args.rest + 3 * (size_t)part.rest + axis);
     }
-    const unsigned quad = lane_of() / 4, pair = lane_of() % 4;
+    const unsigned quad = lane_id() / 4, pair = lane_id() % 4;
 #pragma unroll
     for (unsigned eight = 0; eight < EIGHTS; ++eight) {
 #pragma unroll
@@ -255,7 +255,7 @@ __device__ __forceinline__ void place(const BatchMmaArgs& args, const Part& part
 }
 #endif
 
-extern "C" __global__ void __launch_bounds__(32 * WARPS, RESIDENT) batch_mma(const __grid_constant__ BatchMmaArgs args) {
+extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) batch_mma(const __grid_constant__ BatchMmaArgs args) {
 #if __CUDA_ARCH__ >= 800
     __shared__ float4 staged[WARPS][4 * STRIDE];
     const Part part = part_of(args);

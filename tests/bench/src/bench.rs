@@ -4,22 +4,22 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::Ingest;
-use super::ingredients::Stock;
-use super::loads::Load;
-use super::offers;
-use super::variant::{Driven, Label, Variant};
+use super::UploadTiming;
+use super::cuda_variants;
+use super::error_model::ErrorModelCache;
+use super::variant::{DeformerVariant, Variant, VariantLabel};
+use super::workloads::Workload;
 use crate::kernels;
-use modalcast_compute::cpu::{CpuDeformer, read_rate};
+use modalcast_compute::cpu::{CpuDeformer, read_bandwidth};
 use modalcast_compute::gpu::{CudaDeformer, Device};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Deformation, Normals, Scene, State, Storage};
+use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneState, StorageType};
 
 /// Memory rates measured in the same run, in 10^9 bytes per second; `None` where they were not measured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Roofs {
+pub struct MemoryBandwidth {
     /// Best copy rate: bytes read plus bytes written.
     pub copy_gbs: Option<f64>,
     /// Best rate of a pure read.
@@ -32,29 +32,29 @@ pub struct Roofs {
 }
 
 /// Predicate: whether the request selects a variant of this name.
-pub type Wanted<'a> = &'a dyn Fn(&str) -> bool;
+pub type VariantFilter<'a> = &'a dyn Fn(&str) -> bool;
 
 /// A variant, or the reason why it could not be created.
-pub type Offer = (Label, Result<Box<dyn Variant>>);
+pub type VariantCandidate = (VariantLabel, Result<Box<dyn Variant>>);
 
 /// Source of variants and of reference rates; the tests have one of their own.
-pub trait Bench {
+pub trait BenchTarget {
     /// The variants for a load. A variant that `wanted` rejects need not be created.
-    fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer>;
+    fn variants(&self, load: &Workload, wanted: VariantFilter<'_>) -> Vec<VariantCandidate>;
 
     /// Memory rates of a backend.
-    fn roofs(&self, _backend: Backend) -> Roofs {
-        Roofs::default()
+    fn roofs(&self, _backend: Backend) -> MemoryBandwidth {
+        MemoryBandwidth::default()
     }
 
     /// Upload of a step's values to the device; `None` without a device.
-    fn ingest(&self, _load: &Load, _replays: usize) -> Option<Ingest> {
+    fn ingest(&self, _load: &Workload, _replays: usize) -> Option<UploadTiming> {
         None
     }
 
     /// Runs steps with readback of the vertices, serially and overlapped. `None` without a device; the error is that of
     /// a failed run.
-    fn overlap(&self, _load: &Load, _states: &[State], _steps: usize) -> Option<Result<kernels::Overlap>> {
+    fn overlap(&self, _load: &Workload, _states: &[SceneState], _steps: usize) -> Option<Result<kernels::Overlap>> {
         None
     }
 
@@ -77,17 +77,17 @@ const MOST_OF_REFERENCE: usize = 1 << 23;
 
 /// The deformers of this machine: the CPU, the slow f64 reference, and CUDA if a device opens.
 #[derive(Debug)]
-pub struct Machine {
+pub struct LocalMachine {
     device: Result<Arc<Device>>,
-    cuda: Roofs,
-    cpu: Roofs,
+    cuda: MemoryBandwidth,
+    cpu: MemoryBandwidth,
 }
 
 /// Bytes over which the read rate of all cores is measured: more than the caches of any one socket hold.
 const READ: usize = 1 << 29;
 const READS: usize = 5;
 
-impl Machine {
+impl LocalMachine {
     /// Looks for a CUDA device with a working compiler, and measures the memory rates of device and CPU.
     pub fn open() -> Self {
         let usable = |device: Arc<Device>| {
@@ -96,27 +96,28 @@ impl Machine {
                 kernels::roofs(&device)?;
             let [copy_gbs, read_gbs, empty_us] = [copy_gbs, read_gbs, empty_us].map(Some);
             let [pinned_h2d_gbs, pinned_d2h_gbs] = [pinned_h2d_gbs, pinned_d2h_gbs].map(Some);
-            Ok((device, Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs }))
+            Ok((device, MemoryBandwidth { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs }))
         };
-        let cpu = Roofs { read_gbs: Some(read_rate(READ, READS)), ..Roofs::default() };
+        let cpu = MemoryBandwidth { read_gbs: Some(read_bandwidth(READ, READS)), ..MemoryBandwidth::default() };
         match Device::open(0).and_then(usable) {
             Ok((device, cuda)) => Self { device: Ok(device), cuda, cpu },
-            Err(error) => Self { device: Err(error), cuda: Roofs::default(), cpu },
+            Err(error) => Self { device: Err(error), cuda: MemoryBandwidth::default(), cpu },
         }
     }
 }
 
-impl Bench for Machine {
-    fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
+impl BenchTarget for LocalMachine {
+    fn variants(&self, load: &Workload, wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
         let scene = &load.scene;
-        let stock = Stock::new(scene);
-        let driven = |name: &str, backend: Backend, deformation: Deformation, make: &dyn Fn(&Arc<Scene>) -> Made| {
-            let label = Label { name: name.into(), backend, deformation };
-            offer(wanted, label, |label| {
-                let scene = stock.scene(deformation)?;
-                Ok(Driven::sharing(label, &scene, stock.ingredients(&scene), make(&scene)?))
-            })
-        };
+        let stock = ErrorModelCache::new(scene);
+        let driven =
+            |name: &str, backend: Backend, deformation: DeformationSettings, make: &dyn Fn(&Arc<Scene>) -> Made| {
+                let label = VariantLabel { name: name.into(), backend, deformation };
+                make_candidate(wanted, label, |label| {
+                    let scene = stock.scene(deformation)?;
+                    Ok(DeformerVariant::sharing(label, &scene, stock.ingredients(&scene), make(&scene)?))
+                })
+            };
         let cpu = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CpuDeformer::new(scene))) };
         let reference = |scene: &Arc<Scene>| -> Made { Ok(Box::new(ReferenceDeformer::new(scene))) };
         let plain = scene.deformation;
@@ -134,27 +135,34 @@ impl Bench for Machine {
             if let Some(exact) = exact_normals(scene) {
                 offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            for (name, short) in shortcuts(scene).into_iter().filter(|(_, short)| offers::is_summed_otherwise(short)) {
+            for (name, short) in
+                shortcuts(scene).into_iter().filter(|(_, short)| cuda_variants::is_summed_otherwise(short))
+            {
                 offers.push(driven(&format!("cuda {name} step"), Backend::Cuda, short, &cuda));
-                offers.push(offers::positions(device, &stock, wanted, (format!("cuda {name} positions"), short)));
+                offers.push(cuda_variants::positions(
+                    device,
+                    &stock,
+                    wanted,
+                    (format!("cuda {name} positions"), short),
+                ));
             }
-            offers.extend(offers::trials(device, &stock, scene, wanted));
+            offers.extend(cuda_variants::trials(device, &stock, scene, wanted));
         }
         offers
     }
 
-    fn roofs(&self, backend: Backend) -> Roofs {
+    fn roofs(&self, backend: Backend) -> MemoryBandwidth {
         if backend == Backend::Cuda { self.cuda } else { self.cpu }
     }
 
-    fn ingest(&self, load: &Load, replays: usize) -> Option<Ingest> {
+    fn ingest(&self, load: &Workload, replays: usize) -> Option<UploadTiming> {
         let device = self.device.as_ref().ok()?;
-        let (bytes, timing) = kernels::ingest(device, &load.scene, &State::rest(&load.scene), replays).ok()?;
+        let (bytes, timing) = kernels::ingest(device, &load.scene, &SceneState::rest(&load.scene), replays).ok()?;
         let expected = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
-        Some(Ingest { bytes, median_us: timing.median_us, of_pinned: timing.median_us / expected })
+        Some(UploadTiming { bytes, median_us: timing.median_us, of_pinned: timing.median_us / expected })
     }
 
-    fn overlap(&self, load: &Load, states: &[State], steps: usize) -> Option<Result<kernels::Overlap>> {
+    fn overlap(&self, load: &Workload, states: &[SceneState], steps: usize) -> Option<Result<kernels::Overlap>> {
         Some(kernels::overlap(self.device.as_ref().ok()?, &load.scene, states, steps))
     }
 
@@ -174,31 +182,36 @@ const BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4
 
 /// The approximate or compensated deformations that a scene with modes can choose, by name; empty when the scene itself
 /// already chooses.
-fn shortcuts(scene: &Scene) -> Vec<(String, Deformation)> {
+fn shortcuts(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     let plain = scene.deformation;
-    if !scene.needs.modes || plain != Deformation::default() {
+    if !scene.needs.modes || plain != DeformationSettings::default() {
         return Vec::new();
     }
     let diagonal = scene.unit * scene.rest_bounds.diagonal();
-    let store = |storage: &Storage| (storage.name().to_owned(), Deformation { storage: *storage, ..plain });
+    let store = |storage: &StorageType| (storage.name().to_owned(), DeformationSettings { storage: *storage, ..plain });
     let truncate = |(name, share): &(&str, f64)| {
-        (format!("f32 truncated {name}"), Deformation { truncation: Some(share * diagonal), ..plain })
+        (format!("f32 truncated {name}"), DeformationSettings { truncation: Some(share * diagonal), ..plain })
     };
-    let compensated = ("f32 compensated".to_owned(), Deformation { compensated: true, ..plain });
+    let compensated = ("f32 compensated".to_owned(), DeformationSettings { compensated: true, ..plain });
     let exact = exact_normals(scene).map(|exact| ("f32 exact normals".to_owned(), exact));
-    let stored = Storage::ALL[1..].iter().map(store);
+    let stored = StorageType::ALL[1..].iter().map(store);
     stored.chain(BUDGETS.iter().map(truncate)).chain([compensated]).chain(exact).collect()
 }
 
 /// The deformation with exact normals of the deformed surface, for scenes with modes and normals that use rigid
 /// normals.
-fn exact_normals(scene: &Scene) -> Option<Deformation> {
-    let rigid = scene.needs.modes && offers::has_normals(scene) && scene.deformation.normals == Normals::Rigid;
-    rigid.then_some(Deformation { normals: Normals::Exact, ..scene.deformation })
+fn exact_normals(scene: &Scene) -> Option<DeformationSettings> {
+    let rigid =
+        scene.needs.modes && cuda_variants::has_normals(scene) && scene.deformation.normals == NormalMethod::Rigid;
+    rigid.then_some(DeformationSettings { normals: NormalMethod::Exact, ..scene.deformation })
 }
 
 /// Creates a variant if it is wanted; otherwise, and on failure, keeps the reason.
-pub fn offer<V: Variant + 'static>(wanted: Wanted<'_>, label: Label, make: impl FnOnce(Label) -> Result<V>) -> Offer {
+pub fn make_candidate<V: Variant + 'static>(
+    wanted: VariantFilter<'_>,
+    label: VariantLabel,
+    make: impl FnOnce(VariantLabel) -> Result<V>,
+) -> VariantCandidate {
     if !wanted(&label.name) {
         let given = label.name.clone();
         return (label, Err(Error::NotFound { what: "variant that is asked for", given }));
@@ -213,27 +226,30 @@ fn entries(scene: &Scene) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::loads::{Kind, Size};
+    use crate::workloads::{Size, WorkloadKind};
 
     #[test]
     fn offers_cpu_variants_and_explains_missing_cuda() {
-        let machine = Machine::open();
-        let load = Kind::C.build(Size::Quick).expect("built");
-        let names: Vec<String> = machine.variants(&load, &|_| true).into_iter().map(|(label, _)| label.name).collect();
+        let provenance = LocalMachine::open();
+        let load = WorkloadKind::TinyDomains.build(Size::Quick).expect("built");
+        let names: Vec<String> =
+            provenance.variants(&load, &|_| true).into_iter().map(|(label, _)| label.name).collect();
         for name in
             ["cpu f32", "cpu f16", "cpu int8", "cpu f32 truncated 1e-5", "cpu f32 exact normals", "reference f64"]
         {
             assert!(names.iter().any(|own| own == name), "{name} is not among {names:?}");
         }
-        assert!(machine.roofs(Backend::Cpu).read_gbs.is_some_and(|rate| rate > 0.0));
-        assert_eq!(machine.remarks().is_empty(), names.iter().any(|name| name.starts_with("cuda")));
-        let remarks = machine.remarks();
+        assert!(provenance.roofs(Backend::Cpu).read_gbs.is_some_and(|rate| rate > 0.0));
+        assert_eq!(provenance.remarks().is_empty(), names.iter().any(|name| name.starts_with("cuda")));
+        let remarks = provenance.remarks();
         assert!(remarks.iter().all(|remark| remark.starts_with("no CUDA variants: ")), "{remarks:?}");
     }
 
     #[test]
     fn skips_reference_on_large_scenes() {
-        let large = Kind::Single { power: 18, rank: 20 }.build(Size::Full).expect("built");
-        assert!(Machine::open().variants(&large, &|_| true).iter().all(|(label, _)| label.name != "reference f64"));
+        let large = WorkloadKind::Single { power: 18, rank: 20 }.build(Size::Full).expect("built");
+        assert!(
+            LocalMachine::open().variants(&large, &|_| true).iter().all(|(label, _)| label.name != "reference f64")
+        );
     }
 }

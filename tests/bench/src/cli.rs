@@ -6,11 +6,11 @@ use std::path::PathBuf;
 
 use clap::{CommandFactory as _, Parser, Subcommand};
 
-use crate::bench::Machine;
-use crate::loads::{Kind, Size};
-use crate::{Progress, Report, Request, Source, deform};
-use modalcast::cli::options::working;
-use modalcast::cli::{EXIT_CODES, Outcome, finish, say};
+use crate::bench::LocalMachine;
+use crate::workloads::{Size, WorkloadKind};
+use crate::{DeformReport, DeformReportOptions, Progress, WorkloadSource, deform};
+use modalcast::cli::options::with_spinner;
+use modalcast::cli::{EXIT_CODES, Outcome, finish, print_line};
 use modalcast_model::error::Result;
 
 /// Measures error against run time on this machine and writes tables and plots.
@@ -91,10 +91,10 @@ struct DeformArgs {
 pub fn run() -> u8 {
     let cli = Cli::parse();
     if cli.build {
-        say(modalcast::BUILD);
+        print_line(modalcast::BUILD);
         return 0;
     }
-    modalcast::telemetry::log_to_stderr();
+    modalcast::telemetry::init_logging();
     finish(match &cli.what {
         Some(What::Deform(args)) => run_deform(args),
         Some(What::Render(args)) => render::run(args),
@@ -108,32 +108,32 @@ pub fn run() -> u8 {
 fn run_deform(args: &DeformArgs) -> Outcome {
     let request = request(args)?;
     let hear = |told: Progress<'_>| match told {
-        Progress::Begins(what) => {
+        Progress::Started(what) => {
             tracing::info!(load = what, "measuring");
             Ok(())
         }
         Progress::Measured(report) => report.write(&args.out),
     };
-    let report = working("measuring", || deform(&request, &Machine::open(), hear))?;
-    lines(&report).into_iter().for_each(say);
-    say(format!("written to {}", args.out.display()));
+    let report = with_spinner("measuring", || deform(&request, &LocalMachine::open(), hear))?;
+    lines(&report).into_iter().for_each(print_line);
+    print_line(format!("written to {}", args.out.display()));
     Ok(report.passed())
 }
 
-fn request(args: &DeformArgs) -> Result<Request> {
+fn request(args: &DeformArgs) -> Result<DeformReportOptions> {
     let mut sources = Vec::new();
     if let Some(source) = &args.scene {
-        sources.push(Source::Scene { source: source.clone(), record: args.trajectory.clone() });
+        sources.push(WorkloadSource::Scene { source: source.clone(), record: args.trajectory.clone() });
     }
     for name in &args.loads {
-        sources.extend(Kind::named(name)?.into_iter().map(Source::Synthetic));
+        sources.extend(WorkloadKind::parse(name)?.into_iter().map(WorkloadSource::Synthetic));
     }
     if sources.is_empty() {
-        sources.extend(Kind::all().into_iter().map(Source::Synthetic));
+        sources.extend(WorkloadKind::all().into_iter().map(WorkloadSource::Synthetic));
     }
     let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
     let number = |given: Option<u32>, usual: usize| given.map_or(usual, |given| given as usize);
-    Ok(Request {
+    Ok(DeformReportOptions {
         sources,
         seeds: number(args.seeds, seeds),
         replays: number(args.replays, replays),
@@ -143,7 +143,7 @@ fn request(args: &DeformArgs) -> Result<Request> {
     })
 }
 
-fn lines(report: &Report) -> Vec<String> {
+fn lines(report: &DeformReport) -> Vec<String> {
     let mut lines = report.remarks.clone();
     lines.push(format!(
         "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
@@ -160,7 +160,7 @@ fn lines(report: &Report) -> Vec<String> {
             row.cache.name(),
             show(row.timing.map(|timing| timing.median_us), 2),
             show(row.gbs, 2),
-            errors.map_or("-".into(), |errors| format!("{:.3e}", errors.metres.largest)),
+            errors.map_or("-".into(), |errors| format!("{:.3e}", errors.meters.largest)),
             show(errors.map(|errors| errors.of_bound), 4),
             match (row.passed, row.left_out) {
                 (true, _) => "yes",
@@ -195,7 +195,10 @@ mod tests {
     #[test]
     fn defaults_to_all_loads_and_quick_to_fewer_states() {
         let all = request(&args()).expect("fits");
-        assert_eq!((all.sources.len(), all.seeds, all.replays, all.size), (Kind::all().len(), 100, 100, Size::Full));
+        assert_eq!(
+            (all.sources.len(), all.seeds, all.replays, all.size),
+            (WorkloadKind::all().len(), 100, 100, Size::Full)
+        );
         let quick = request(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("fits");
         assert_eq!((quick.seeds, quick.replays, quick.size), (3, 20, Size::Quick));
     }

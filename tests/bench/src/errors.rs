@@ -4,15 +4,15 @@ use nalgebra::{Matrix4, Point3, Vector3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::exact::Judged;
+use super::exact_positions::ReferenceVertex;
 use modalcast_model::scene::{Camera, Scene};
 
 /// Image size in which pixel errors are measured: width, height.
-pub const IMAGE: (u32, u32) = (1920, 1080);
+pub const IMAGE_SIZE: (u32, u32) = (1920, 1080);
 
 /// Conversion of errors in scene units into meters and pixels.
 #[derive(Debug, Clone)]
-pub struct Yardstick {
+pub struct ErrorScale {
     /// Meters per scene unit.
     unit: f64,
     /// Diagonal of the scene at rest, meters.
@@ -20,10 +20,10 @@ pub struct Yardstick {
     clip_from_world: Matrix4<f64>,
 }
 
-impl Yardstick {
-    /// Conversion for a scene seen by a camera in an image of [`IMAGE`] pixels.
+impl ErrorScale {
+    /// Conversion for a scene seen by a camera in an image of [`IMAGE_SIZE`] pixels.
     pub fn new(scene: &Scene, camera: &Camera) -> Self {
-        let clip = camera.clip_from_camera(IMAGE.0, IMAGE.1, &scene.rest_bounds) * camera.camera_from_world();
+        let clip = camera.clip_from_camera(IMAGE_SIZE.0, IMAGE_SIZE.1, &scene.rest_bounds) * camera.camera_from_world();
         Self { unit: scene.unit, diagonal: scene.unit * scene.rest_bounds.diagonal(), clip_from_world: clip }
     }
 
@@ -36,7 +36,7 @@ impl Yardstick {
     fn pixels(&self, one: [f64; 3], other: [f64; 3]) -> Option<f64> {
         let place = |point: [f64; 3]| {
             let clip = self.clip_from_world * Point3::from(point).to_homogeneous();
-            let half = [f64::from(IMAGE.0) / 2.0, f64::from(IMAGE.1) / 2.0];
+            let half = [f64::from(IMAGE_SIZE.0) / 2.0, f64::from(IMAGE_SIZE.1) / 2.0];
             (clip.w > 0.0).then(|| [clip.x / clip.w * half[0], clip.y / clip.w * half[1]])
         };
         let (one, other) = (place(one)?, place(other)?);
@@ -46,20 +46,20 @@ impl Yardstick {
 
 /// Maximum and root mean square of a quantity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Spread {
+pub struct ErrorNorms {
     pub largest: f64,
     pub rms: f64,
 }
 
-/// Accumulator for a [`Spread`].
+/// Accumulator for a [`ErrorNorms`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Collect {
+pub(super) struct NormAccumulator {
     largest: f64,
     squares: f64,
     count: f64,
 }
 
-impl Collect {
+impl NormAccumulator {
     pub(super) fn add(&mut self, value: f64) {
         self.largest = self.largest.max(value);
         self.squares += value * value;
@@ -75,25 +75,28 @@ impl Collect {
     }
 
     /// The result, times `scale`; `None` when no value was added.
-    pub(super) fn spread(self, scale: f64) -> Option<Spread> {
+    pub(super) fn spread(self, scale: f64) -> Option<ErrorNorms> {
         let rms = (self.squares / self.count).sqrt();
-        (self.count > 0.0).then_some(Spread { largest: self.largest * scale, rms: rms * scale })
+        (self.count > 0.0).then_some(ErrorNorms { largest: self.largest * scale, rms: rms * scale })
     }
 }
 
 /// Position errors over all vertices and all validated states.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Errors {
+pub struct PositionErrors {
     /// Lengths of the error vectors.
-    pub metres: Spread,
+    #[serde(rename = "metres")]
+    pub meters: ErrorNorms,
     /// The same as fractions of the diagonal of the scene at rest.
-    pub of_diagonal: Spread,
-    /// The same in pixels of an image of [`IMAGE`] pixels that frames the scene.
-    pub pixels: Option<Spread>,
+    pub of_diagonal: ErrorNorms,
+    /// The same in pixels of an image of [`IMAGE_SIZE`] pixels that frames the scene.
+    pub pixels: Option<ErrorNorms>,
     /// Mean signed error along each axis, meters.
-    pub bias_metres: [f64; 3],
+    #[serde(rename = "bias_metres")]
+    pub bias_meters: [f64; 3],
     /// Largest a-priori bound, meters.
-    pub bound_metres: f64,
+    #[serde(rename = "bound_metres")]
+    pub bound_meters: f64,
     /// Largest quotient of a vertex's error and its own bound; the variant fails if it exceeds 1.
     pub of_bound: f64,
     /// Coordinates that are not finite.
@@ -102,11 +105,11 @@ pub struct Errors {
     pub states: usize,
 }
 
-/// Accumulator for [`Errors`], in scene units.
+/// Accumulator for [`PositionErrors`], in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Tally {
-    length: Collect,
-    pixels: Collect,
+pub struct PositionErrorAccumulator {
+    length: NormAccumulator,
+    pixels: NormAccumulator,
     bias: [f64; 3],
     bound: f64,
     of_bound: f64,
@@ -114,16 +117,16 @@ pub struct Tally {
     states: usize,
 }
 
-impl Tally {
+impl PositionErrorAccumulator {
     /// Adds one state. `got`: three f32 per vertex; `want`: reference and bound per vertex.
-    pub fn add(&mut self, yardstick: &Yardstick, got: &[f32], want: &[Judged]) {
+    pub fn add(&mut self, yardstick: &ErrorScale, got: &[f32], want: &[ReferenceVertex]) {
         let got = got.as_chunks::<3>().0;
         let vertex = |at: usize, tally: &mut Self| tally.vertex(yardstick, got[at], &want[at]);
         let sum = in_pieces(got.len().min(want.len()), vertex, Self::join);
         *self = Self { states: 1, ..sum }.join(*self);
     }
 
-    fn vertex(&mut self, yardstick: &Yardstick, got: [f32; 3], want: &Judged) {
+    fn vertex(&mut self, yardstick: &ErrorScale, got: [f32; 3], want: &ReferenceVertex) {
         let got = got.map(f64::from);
         let broken = got.iter().filter(|number| !number.is_finite()).count();
         self.not_finite += broken as u64;
@@ -153,16 +156,16 @@ impl Tally {
         }
     }
 
-    /// The accumulated position errors in the units of [`Errors`].
-    pub fn errors(&self, yardstick: &Yardstick) -> Errors {
-        let metres = self.length.spread(yardstick.unit).unwrap_or_default();
+    /// The accumulated position errors in the units of [`PositionErrors`].
+    pub fn errors(&self, yardstick: &ErrorScale) -> PositionErrors {
+        let meters = self.length.spread(yardstick.unit).unwrap_or_default();
         let share = |length: f64| if yardstick.diagonal > 0.0 { length / yardstick.diagonal } else { 0.0 };
-        Errors {
-            metres,
-            of_diagonal: Spread { largest: share(metres.largest), rms: share(metres.rms) },
+        PositionErrors {
+            meters,
+            of_diagonal: ErrorNorms { largest: share(meters.largest), rms: share(meters.rms) },
             pixels: self.pixels.spread(1.0),
-            bias_metres: self.bias.map(|sum| yardstick.unit * sum / self.length.count.max(1.0)),
-            bound_metres: self.bound * yardstick.unit,
+            bias_meters: self.bias.map(|sum| yardstick.unit * sum / self.length.count.max(1.0)),
+            bound_meters: self.bound * yardstick.unit,
             of_bound: self.of_bound,
             not_finite: self.not_finite,
             states: self.states,
@@ -170,7 +173,7 @@ impl Tally {
     }
 }
 
-impl Errors {
+impl PositionErrors {
     /// Whether every number is finite and every error is within its vertex's own bound.
     pub fn passed(&self) -> bool {
         self.not_finite == 0 && self.of_bound <= 1.0
@@ -178,7 +181,7 @@ impl Errors {
 }
 
 /// Error of the displacement x(k + 1) - x(k) between consecutive states, scene units.
-pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
+pub(super) fn step_errors(got: [&[f32]; 2], want: [&[ReferenceVertex]; 2]) -> NormAccumulator {
     let [before, after] = got.map(|got| got.as_chunks::<3>().0);
     let [from, to] = want;
     let error = |at: usize| -> f64 {
@@ -188,7 +191,7 @@ pub(super) fn step_errors(got: [&[f32]; 2], want: [&[Judged]; 2]) -> Collect {
         norm(std::array::from_fn(step))
     };
     let count = before.len().min(after.len()).min(from.len()).min(to.len());
-    in_pieces(count, |at, collect: &mut Collect| collect.add(error(at)), Collect::join)
+    in_pieces(count, |at, collect: &mut NormAccumulator| collect.add(error(at)), NormAccumulator::join)
 }
 
 /// Parallel reduction of items 0 to `count`. Pieces have a fixed size and are joined in order, so that the result does
@@ -212,29 +215,29 @@ const PIECE: usize = 4096;
 
 /// Errors of normals and tangents, in degrees.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Orientation {
+pub struct OrientationErrors {
     /// Against the normals that the variant's deformation defines: rigid ones (by T), or those of the deformed surface.
-    pub normals_degrees: Option<Spread>,
+    pub normals_degrees: Option<ErrorNorms>,
     /// Against the normals of the deformed surface, whichever normals the variant defines.
-    pub normals_to_surface_degrees: Option<Spread>,
-    pub tangents_degrees: Option<Spread>,
+    pub normals_to_surface_degrees: Option<ErrorNorms>,
+    pub tangents_degrees: Option<ErrorNorms>,
     /// |n . t|, which is 0 when they are orthogonal.
-    pub normal_dot_tangent: Option<Spread>,
+    pub normal_dot_tangent: Option<ErrorNorms>,
     /// Directions that are not finite or have a length of at most 0.5, and bitangent signs that are wrong.
     pub broken: u64,
 }
 
-/// Accumulator for [`Orientation`].
+/// Accumulator for [`OrientationErrors`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Turned {
-    normals: Collect,
-    to_surface: Collect,
-    tangents: Collect,
-    dots: Collect,
+pub struct OrientationErrorAccumulator {
+    normals: NormAccumulator,
+    to_surface: NormAccumulator,
+    tangents: NormAccumulator,
+    dots: NormAccumulator,
     broken: u64,
 }
 
-impl Turned {
+impl OrientationErrorAccumulator {
     /// Adds normals, three f32 per corner. Does nothing when `got` is empty.
     pub fn add_normals(&mut self, got: &[f32], want: &[[f64; 3]]) {
         let got = got.as_chunks::<3>().0;
@@ -287,8 +290,8 @@ impl Turned {
     }
 
     /// The accumulated errors of directions.
-    pub fn orientation(&self) -> Orientation {
-        Orientation {
+    pub fn orientation(&self) -> OrientationErrors {
+        OrientationErrors {
             normals_degrees: self.normals.spread(1.0),
             normals_to_surface_degrees: self.to_surface.spread(1.0),
             tangents_degrees: self.tangents.spread(1.0),
@@ -316,46 +319,46 @@ mod tests {
     use modalcast_model::scene::{Lens, View};
 
     /// A yardstick for which one pixel is a hundredth of a unit at the target.
-    fn yardstick() -> Yardstick {
+    fn yardstick() -> ErrorScale {
         let scene = modalcast_model::load::open("tree").expect("the tree");
         let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-        let (width, height) = (f64::from(IMAGE.0), f64::from(IMAGE.1));
+        let (width, height) = (f64::from(IMAGE_SIZE.0), f64::from(IMAGE_SIZE.1));
         let lens = Lens::Intrinsics { fx: 1000.0, fy: 1000.0, cx: width / 2.0, cy: height / 2.0 };
-        let yardstick = Yardstick::new(&scene, &Camera { view, lens, near: 1.0, far: 100.0 });
-        Yardstick { unit: 2.0, diagonal: 20.0, ..yardstick }
+        let yardstick = ErrorScale::new(&scene, &Camera { view, lens, near: 1.0, far: 100.0 });
+        ErrorScale { unit: 2.0, diagonal: 20.0, ..yardstick }
     }
 
-    fn judged(at: [f64; 3], bound: f64) -> Judged {
-        Judged { at, bound, condition: 1.0 }
+    fn judged(at: [f64; 3], bound: f64) -> ReferenceVertex {
+        ReferenceVertex { at, bound, condition: 1.0 }
     }
 
     #[test]
     fn hand_made_surface_has_the_expected_errors() {
         let yardstick = yardstick();
-        let mut tally = Tally::default();
+        let mut tally = PositionErrorAccumulator::default();
         // The error vectors are (3, 4, 0) and zero: lengths 5 and 0.
         tally.add(&yardstick, &[3.0, 4.0, 0.0, 1.0, 1.0, 1.0], &[judged([0.0; 3], 10.0), judged([1.0; 3], 1.0)]);
         let errors = tally.errors(&yardstick);
-        assert_eq!((errors.metres.largest, errors.metres.rms), (10.0, 2.0 * 12.5_f64.sqrt()));
+        assert_eq!((errors.meters.largest, errors.meters.rms), (10.0, 2.0 * 12.5_f64.sqrt()));
         assert_eq!(errors.of_diagonal.largest, 0.5);
-        assert_eq!(errors.bias_metres, [3.0, 4.0, 0.0]);
-        assert_eq!((errors.bound_metres, errors.of_bound, errors.states), (20.0, 0.5, 1));
+        assert_eq!(errors.bias_meters, [3.0, 4.0, 0.0]);
+        assert_eq!((errors.bound_meters, errors.of_bound, errors.states), (20.0, 0.5, 1));
         assert!((errors.pixels.expect("in sight").largest - 500.0).abs() < 1e-9, "{errors:?}");
         assert!(errors.passed());
         // The mirrored error cancels the bias and changes nothing else.
         tally.add(&yardstick, &[-3.0, -4.0, 0.0, 1.0, 1.0, 1.0], &[judged([0.0; 3], 10.0), judged([1.0; 3], 1.0)]);
         let both = tally.errors(&yardstick);
-        assert_eq!((both.bias_metres, both.metres, both.states), ([0.0; 3], errors.metres, 2));
+        assert_eq!((both.bias_meters, both.meters, both.states), ([0.0; 3], errors.meters, 2));
     }
 
     #[test]
     fn error_above_its_own_bound_fails_despite_larger_bounds() {
         let yardstick = yardstick();
-        let mut tally = Tally::default();
+        let mut tally = PositionErrorAccumulator::default();
         let want = [judged([0.0; 3], 1.0), judged([0.0; 3], 100.0)];
         tally.add(&yardstick, &[1.1, 0.0, 0.0, 0.0, 0.0, 0.0], &want);
         assert!(!tally.errors(&yardstick).passed());
-        let mut broken = Tally::default();
+        let mut broken = PositionErrorAccumulator::default();
         broken.add(&yardstick, &[f32::NAN, 0.0, 0.0, 0.0, f32::INFINITY, 0.0], &want);
         assert_eq!((broken.errors(&yardstick).not_finite, broken.errors(&yardstick).passed()), (2, false));
     }
@@ -372,17 +375,17 @@ mod tests {
     fn constant_offset_gives_no_step_error() {
         let want = [[judged([0.0; 3], 1.0)], [judged([1.0, 0.0, 0.0], 1.0)]];
         let steps = |got: [[f32; 3]; 2]| step_errors([&got[0], &got[1]], [&want[0], &want[1]]).spread(1.0);
-        assert_eq!(steps([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]]), Some(Spread::default()));
+        assert_eq!(steps([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]]), Some(ErrorNorms::default()));
         assert_eq!(steps([[0.0; 3], [1.5, 0.0, 0.0]]).map(|spread| spread.largest), Some(0.5));
     }
 
     #[test]
     fn measures_tiny_angles_in_degrees() {
-        let mut turned = Turned::default();
+        let mut turned = OrientationErrorAccumulator::default();
         turned.add_normals(&[0.0, 1.0, 0.0, 1.0, 1e-7, 0.0], &[[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]);
         let normals = turned.orientation().normals_degrees.expect("two");
         assert_eq!(normals.largest, 90.0);
-        let mut small = Turned::default();
+        let mut small = OrientationErrorAccumulator::default();
         small.add_normals(&[1.0, 1e-7, 0.0], &[[1.0, 0.0, 0.0]]);
         let angle = small.orientation().normals_degrees.expect("one").largest;
         assert!((angle / 1e-7f64.to_degrees() - 1.0).abs() < 1e-6, "{angle}");
@@ -390,13 +393,13 @@ mod tests {
 
     #[test]
     fn counts_broken_directions_but_not_absent_tangents() {
-        let mut turned = Turned::default();
+        let mut turned = OrientationErrorAccumulator::default();
         let want = [[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0; 4]];
         let got = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0];
         turned.add_tangents(&got, &want, &[0.6, 0.8, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
         turned.add_normals(&[f32::NAN, 0.0, 0.0], &[[1.0, 0.0, 0.0]]);
         let found = turned.orientation();
-        assert_eq!((found.broken, found.tangents_degrees), (2, Some(Spread::default())));
+        assert_eq!((found.broken, found.tangents_degrees), (2, Some(ErrorNorms::default())));
         let dot = found.normal_dot_tangent.expect("dots").largest;
         assert!((dot - f64::from(0.6_f32)).abs() < 1e-12, "{dot}");
     }

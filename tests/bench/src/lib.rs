@@ -6,58 +6,58 @@
 //!
 //! - [`loads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms; [`record`]: recorded
 //!   trajectories.
-//! - [`exact`], [`ingredients`] and `double`: reference positions in f64 with single terms of the error model
+//! - [`exact`], [`ingredients`] and `double_double`: reference positions in f64 with single terms of the error model
 //!   exchanged, and a-priori bounds. [`errors`] and [`sources`] measure variants against them.
 //! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and a
-//!   [`bench::Bench`] offers it.
-//! - [`table`], [`peers`], [`plot`]: the output.
+//!   [`bench::BenchTarget`] offers it.
+//! - [`table`], [`thesis_comparison`], [`plot`]: the output.
 
 pub mod bench;
 pub mod cli;
-mod double;
+mod cuda_variants;
+mod double_double;
+pub mod error_model;
+pub mod error_sources;
 pub mod errors;
-pub mod exact;
-pub mod ingredients;
+pub mod exact_positions;
 pub mod kernels;
-pub mod loads;
-pub mod machine;
+mod markdown;
+pub mod memory_traffic;
 pub mod motion;
-mod offers;
-mod page;
-pub mod peers;
 pub mod plot;
-pub mod record;
+pub mod provenance;
+pub mod recorded_trajectory;
 pub mod render;
-pub mod sources;
 pub mod table;
 #[cfg(test)]
 mod testing;
 pub mod thesis;
+pub mod thesis_comparison;
 pub mod timing;
-pub mod traffic;
 pub mod validate;
 pub mod variant;
+pub mod workloads;
 
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
 use crate::kernels::{HostWrite, Overlap};
-use bench::{Bench, Roofs};
-use loads::{Kind, Load, Size};
-use machine::Provenance;
+use bench::{BenchTarget, MemoryBandwidth};
 use modalcast_model::deform::Backend;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::load;
-use motion::Motion;
-use peers::Peers;
-use record::Record;
-use table::Row;
-use timing::Cache;
-use validate::Condition;
+use motion::WorkloadMotion;
+use provenance::Provenance;
+use recorded_trajectory::RecordedTrajectory;
+use table::DeformRow;
+use thesis_comparison::ThesisComparison;
+use timing::CacheState;
+use validate::ConditionNumbers;
 use variant::Variant;
+use workloads::{Size, Workload, WorkloadKind};
 
-/// Name under which [`Request::variants`] selects the overlap benchmark: device-to-host readback of a step while the
+/// Name under which [`DeformReportOptions::variants`] selects the overlap benchmark: device-to-host readback of a step while the
 /// next step runs.
 const OVERLAP: &str = "cuda overlap";
 
@@ -66,8 +66,8 @@ const ROTATING: usize = 8;
 
 /// Settings of a report: scenes, sample counts and variants.
 #[derive(Debug, Clone)]
-pub struct Request {
-    pub sources: Vec<Source>,
+pub struct DeformReportOptions {
+    pub sources: Vec<WorkloadSource>,
     /// Random states per load.
     pub seeds: usize,
     /// Repetitions per median.
@@ -79,7 +79,7 @@ pub struct Request {
     pub size: Size,
 }
 
-impl Request {
+impl DeformReportOptions {
     fn wants(&self, name: &str) -> bool {
         wants(&self.variants, name)
     }
@@ -93,8 +93,8 @@ fn wants(list: &[String], name: &str) -> bool {
 
 /// Source of a scene.
 #[derive(Debug, Clone)]
-pub enum Source {
-    Synthetic(Kind),
+pub enum WorkloadSource {
+    Synthetic(WorkloadKind),
     /// A scene given on the command line and its recorded trajectory. Without `record`, a recording next to the scene
     /// is used if there is one.
     Scene {
@@ -103,7 +103,7 @@ pub enum Source {
     },
 }
 
-impl Source {
+impl WorkloadSource {
     /// Name for messages.
     fn name(&self) -> String {
         match self {
@@ -115,7 +115,7 @@ impl Source {
 
 /// Facts of one load in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Entry {
+pub struct WorkloadSummary {
     pub name: String,
     /// Whether the load has the full size that its name states; false for `--quick` builds and for scenes of the user.
     pub full: bool,
@@ -125,20 +125,21 @@ pub struct Entry {
     pub triangles: usize,
     pub domains: usize,
     pub coordinates: usize,
-    pub diagonal_metres: f64,
+    #[serde(rename = "diagonal_metres")]
+    pub diagonal_meters: f64,
     /// Steps of the trajectory.
     pub steps: usize,
     pub recorded: bool,
-    pub condition: Condition,
+    pub condition: ConditionNumbers,
     /// Upload of one whole step to the CUDA device: bytes and time.
-    pub ingest: Option<Ingest>,
+    pub ingest: Option<UploadTiming>,
     /// Steps with readback of the vertices on the CUDA device, serial against overlapped.
     pub overlap: Option<Overlap>,
 }
 
 /// Host-to-device upload of one step, timed alone.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Ingest {
+pub struct UploadTiming {
     pub bytes: u64,
     pub median_us: f64,
     /// Measured time divided by the time that the same bytes take at this run's pinned host-to-device rate.
@@ -147,19 +148,19 @@ pub struct Ingest {
 
 /// All results of one run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Report {
+pub struct DeformReport {
     pub made: Provenance,
     /// Missing capabilities and the reasons, for the reader.
     pub remarks: Vec<String>,
     pub seeds: usize,
-    pub roofs: Vec<(Backend, Roofs)>,
+    pub roofs: Vec<(Backend, MemoryBandwidth)>,
     /// Host write rates into the pinned memory from which the CUDA device reads a step's values.
     pub host_writes: Vec<HostWrite>,
-    pub loads: Vec<Entry>,
+    pub loads: Vec<WorkloadSummary>,
     /// Requested loads that are not measured yet; empty when the report is complete.
     pub missing: Vec<String>,
-    pub rows: Vec<Row>,
-    pub thesis: Peers,
+    pub rows: Vec<DeformRow>,
+    pub thesis: ThesisComparison,
     /// Failed variants, each as `load: variant: reason`.
     pub failed: Vec<String>,
 }
@@ -168,9 +169,9 @@ pub struct Report {
 #[derive(Debug)]
 pub enum Progress<'a> {
     /// Description of the measurement that starts now.
-    Begins(&'a str),
+    Started(&'a str),
     /// All results so far: one load more than in the previous event.
-    Measured(&'a Report),
+    Measured(&'a DeformReport),
 }
 
 /// Measures all requested loads and returns the report. `progress` is called when a load starts and after each load.
@@ -178,11 +179,11 @@ pub enum Progress<'a> {
 /// # Errors
 /// Errors of loading a scene and of `progress`. Failures of a variant are recorded in the report instead.
 pub fn deform(
-    request: &Request,
-    bench: &dyn Bench,
+    request: &DeformReportOptions,
+    bench: &dyn BenchTarget,
     mut progress: impl FnMut(Progress<'_>) -> Result<()>,
-) -> Result<Report> {
-    let mut made = Made::default();
+) -> Result<DeformReport> {
+    let mut made = Measurements::default();
     if request.wants(OVERLAP) {
         made.host_writes = bench.host_writes(request.replays);
     }
@@ -190,13 +191,13 @@ pub fn deform(
     for source in &request.sources {
         let (load, motion) = open(source, request.size)?;
         let (vertices, domains) = (load.scene.layout.vertices, load.scene.domains.len());
-        progress(Progress::Begins(&format!("{}: {vertices} vertices, {domains} domains", load.name)))?;
+        progress(Progress::Started(&format!("{}: {vertices} vertices, {domains} domains", load.name)))?;
         let (condition, measured) = measure(request, bench, &load, &motion);
         made.rows.extend(measured);
-        let full = request.size == Size::Full && matches!(source, Source::Synthetic(_));
+        let full = request.size == Size::Full && matches!(source, WorkloadSource::Synthetic(_));
         let entry = entry(&load, &motion, condition, full);
         let overlap = overlap(request, bench, &load, &motion, &mut made.failed);
-        made.loads.push(Entry { ingest: bench.ingest(&load, request.replays), overlap, ..entry });
+        made.loads.push(WorkloadSummary { ingest: bench.ingest(&load, request.replays), overlap, ..entry });
         report = gathered(request, bench, &made);
         progress(Progress::Measured(&report))?;
     }
@@ -205,33 +206,33 @@ pub fn deform(
 
 /// Results so far.
 #[derive(Default)]
-struct Made {
+struct Measurements {
     host_writes: Vec<HostWrite>,
-    loads: Vec<Entry>,
-    rows: Vec<Row>,
+    loads: Vec<WorkloadSummary>,
+    rows: Vec<DeformRow>,
     /// Failures that belong to no row, such as those of the overlap benchmark.
     failed: Vec<String>,
 }
 
 /// Assembles the report from the loads measured so far. They are the first ones of `request.sources`.
-fn gathered(request: &Request, bench: &dyn Bench, made: &Made) -> Report {
-    let Made { loads, rows, .. } = made;
-    let full = |name: &str| loads.iter().any(|load: &Entry| load.name == name && load.full);
-    let thesis = Peers::of(rows, full);
-    let name = |row: &Row| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
+fn gathered(request: &DeformReportOptions, bench: &dyn BenchTarget, made: &Measurements) -> DeformReport {
+    let Measurements { loads, rows, .. } = made;
+    let full = |name: &str| loads.iter().any(|load: &WorkloadSummary| load.name == name && load.full);
+    let thesis = ThesisComparison::of(rows, full);
+    let name = |row: &DeformRow| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
     let mut failed = made.failed.clone();
     failed.extend(rows.iter().filter(|row| !row.passed && !row.left_out).map(name));
     // The rows for warm and cold caches repeat the same failure of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
-    Report {
+    DeformReport {
         made: Provenance::here(),
         remarks: bench.remarks(),
         seeds: request.seeds,
         roofs,
         host_writes: made.host_writes.clone(),
         loads: loads.clone(),
-        missing: request.sources[loads.len()..].iter().map(Source::name).collect(),
+        missing: request.sources[loads.len()..].iter().map(WorkloadSource::name).collect(),
         rows: rows.clone(),
         thesis,
         failed,
@@ -240,10 +241,10 @@ fn gathered(request: &Request, bench: &dyn Bench, made: &Made) -> Report {
 
 /// Runs the overlap benchmark if it is requested. The report fails if its vertices differ from those of serial steps.
 fn overlap(
-    request: &Request,
-    bench: &dyn Bench,
-    load: &Load,
-    motion: &Motion,
+    request: &DeformReportOptions,
+    bench: &dyn BenchTarget,
+    load: &Workload,
+    motion: &WorkloadMotion,
     failed: &mut Vec<String>,
 ) -> Option<Overlap> {
     if !request.wants(OVERLAP) {
@@ -264,30 +265,30 @@ fn overlap(
     }
 }
 
-fn open(source: &Source, size: Size) -> Result<(Load, Motion)> {
+fn open(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion)> {
     match source {
-        Source::Synthetic(kind) => {
+        WorkloadSource::Synthetic(kind) => {
             let load = kind.build(size)?;
-            let motion = Motion::new(&load, None);
+            let motion = WorkloadMotion::new(&load, None);
             Ok((load, motion))
         }
-        Source::Scene { source, record } => {
+        WorkloadSource::Scene { source, record } => {
             let scene = load::open(source)?;
             let record = match record {
-                Some(path) => Some(Record::read(path, &scene)?),
-                None => Record::beside(source, &scene)?,
+                Some(path) => Some(RecordedTrajectory::read(path, &scene)?),
+                None => RecordedTrajectory::beside(source, &scene)?,
             };
             let remarks = scene.remarks.clone();
-            let load = Load { name: scene.name.clone(), scene, paired: false, species: None, remarks };
-            let motion = Motion::new(&load, record);
+            let load = Workload { name: scene.name.clone(), scene, paired: false, species: None, remarks };
+            let motion = WorkloadMotion::new(&load, record);
             Ok((load, motion))
         }
     }
 }
 
-fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entry {
+fn entry(load: &Workload, motion: &WorkloadMotion, condition: ConditionNumbers, full: bool) -> WorkloadSummary {
     let (scene, layout) = (&load.scene, &load.scene.layout);
-    Entry {
+    WorkloadSummary {
         name: load.name.clone(),
         full,
         remarks: load.remarks.clone(),
@@ -296,7 +297,7 @@ fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entr
         triangles: layout.triangles,
         domains: scene.domains.len(),
         coordinates: layout.coordinates,
-        diagonal_metres: scene.unit * scene.rest_bounds.diagonal(),
+        diagonal_meters: scene.unit * scene.rest_bounds.diagonal(),
         steps: motion.steps(),
         recorded: motion.is_recorded(),
         condition,
@@ -306,19 +307,24 @@ fn entry(load: &Load, motion: &Motion, condition: Condition, full: bool) -> Entr
 }
 
 /// Validates all variants of a load together, then times the passing ones one after the other.
-fn measure(request: &Request, bench: &dyn Bench, load: &Load, motion: &Motion) -> (Condition, Vec<Row>) {
-    let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<Row>) = (Vec::new(), Vec::new());
+fn measure(
+    request: &DeformReportOptions,
+    bench: &dyn BenchTarget,
+    load: &Workload,
+    motion: &WorkloadMotion,
+) -> (ConditionNumbers, Vec<DeformRow>) {
+    let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<DeformRow>) = (Vec::new(), Vec::new());
     let wanted = |name: &str| request.wants(name);
     for (label, made) in bench.variants(load, &wanted).into_iter().filter(|(label, _)| wanted(&label.name)) {
         match made {
             Ok(variant) => variants.push(variant),
-            Err(error) => rows.push(Row::unmade(&load.name, &label, &error)),
+            Err(error) => rows.push(DeformRow::unmade(&load.name, &label, &error)),
         }
     }
     let (found, condition) = validate::validate(load, motion, &mut variants, (request.seeds, request.steps));
     let states: Vec<_> = (0..ROTATING).map(|seed| motion.seed(seed).state()).collect();
     for (variant, found) in variants.iter_mut().zip(found) {
-        for cache in [Cache::Warm, Cache::Cold] {
+        for cache in [CacheState::Warm, CacheState::Cold] {
             let mut found = found.clone();
             let timing = match found.passed() {
                 true => variant.time(&states, cache, request.replays),
@@ -330,14 +336,14 @@ fn measure(request: &Request, bench: &dyn Bench, load: &Load, motion: &Motion) -
             });
             let (label, traffic) = (variant.label(), variant.traffic());
             let (launches, kernels) = variant.kernels();
-            let row = Row::new(&load.name, label, found, traffic, (cache, timing));
-            rows.push(Row { launches, kernels, ..row.under(bench.roofs(label.backend)) });
+            let row = DeformRow::new(&load.name, label, found, traffic, (cache, timing));
+            rows.push(DeformRow { launches, kernels, ..row.under(bench.roofs(label.backend)) });
         }
     }
     (condition, rows)
 }
 
-impl Report {
+impl DeformReport {
     /// Whether every variant passed.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()
@@ -347,18 +353,20 @@ impl Report {
     /// Each file is written under a temporary name and then renamed, so that an interrupted run leaves only complete
     /// files.
     pub fn write(&self, folder: &Path) -> Result<()> {
-        std::fs::create_dir_all(folder).map_err(during("report"))?;
+        std::fs::create_dir_all(folder).map_err(fault_in("report"))?;
         let svg = plot::svg(self);
         let files = [
-            ("report.json", serde_json::to_vec_pretty(self).map_err(during("report"))?),
+            ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
             ("report.csv", table::csv(&self.rows)?),
-            ("report.md", page::markdown(self).into_bytes()),
+            ("report.md", markdown::markdown(self).into_bytes()),
             ("report.png", plot::png(&svg)?),
             ("report.svg", svg.into_bytes()),
         ];
         for (name, bytes) in files {
             let (place, beside) = (folder.join(name), folder.join(format!("{name}.part")));
-            std::fs::write(&beside, bytes).and_then(|()| std::fs::rename(&beside, place)).map_err(during("report"))?;
+            std::fs::write(&beside, bytes)
+                .and_then(|()| std::fs::rename(&beside, place))
+                .map_err(fault_in("report"))?;
         }
         Ok(())
     }

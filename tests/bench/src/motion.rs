@@ -9,10 +9,10 @@ use fastrand::Rng;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use rayon::prelude::*;
 
-use super::loads::Load;
-use super::record::Record;
+use super::recorded_trajectory::RecordedTrajectory;
+use super::workloads::Workload;
 use modalcast_model::domain::Transform;
-use modalcast_model::scene::{Changed, Scene, State};
+use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 
 /// Standard deviation of the first mode's largest displacement component, as a fraction of its domain's diagonal.
 const SHARE: f64 = 0.05;
@@ -26,24 +26,24 @@ const SLOWEST: f64 = 1.0;
 
 /// A state in f64, as a physics process computes it before rounding; relative to the scene's origin.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Truth {
+pub struct ExactState {
     /// Packed coordinates.
     pub q: Vec<f64>,
-    /// `world_from_domain` of each mover ([`modalcast_model::scene::Movers`]), 3x4 row-major.
+    /// `world_from_domain` of each mover ([`modalcast_model::scene::TransformRoots`]), 3x4 row-major.
     pub transforms: Vec<[f64; 12]>,
 }
 
-impl Truth {
+impl ExactState {
     /// The state that a deformer receives: every number rounded to f32.
-    pub fn state(&self) -> State {
+    pub fn state(&self) -> SceneState {
         let transforms = self.transforms.iter().map(|entries| Transform(entries.map(|entry| entry as f32)));
         let q = self.q.iter().map(|number| *number as f32).collect();
         let transforms = transforms.collect();
-        State { run: 0, step: 0, time: 0.0, q, transforms, cells: None, serial: 0, changed: Changed::All }
+        SceneState { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
     }
 
     /// A truth that equals a state exactly.
-    pub fn of(state: &State) -> Self {
+    pub fn of(state: &SceneState) -> Self {
         Self {
             q: state.q.iter().map(|number| f64::from(*number)).collect(),
             transforms: state.transforms.iter().map(|transform| transform.0.map(f64::from)).collect(),
@@ -80,18 +80,18 @@ fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
 
 /// All motions of one load.
 #[derive(Debug, Clone)]
-pub struct Motion {
+pub struct WorkloadMotion {
     scene: Arc<Scene>,
     paired: bool,
     /// Per packed coordinate: standard deviation, and frequency relative to the domain's slowest mode.
     spread: Vec<(f64, f64)>,
-    record: Option<Record>,
+    record: Option<RecordedTrajectory>,
 }
 
-impl Motion {
+impl WorkloadMotion {
     /// Motions for a load. Amplitudes decrease with frequency as those of a stiff object do: from the eigenvalues where
     /// the scene has them, otherwise as 1 / j.
-    pub fn new(load: &Load, record: Option<Record>) -> Self {
+    pub fn new(load: &Workload, record: Option<RecordedTrajectory>) -> Self {
         let scene = &load.scene;
         let mut spread = vec![(0.0, 1.0); scene.layout.coordinates];
         let parts: Vec<_> = (0..scene.domains.len()).into_par_iter().map(|domain| spread_of(scene, domain)).collect();
@@ -104,7 +104,7 @@ impl Motion {
     /// The random state of a seed: Gaussian coordinates and small rigid motions. Odd seeds nearly cancel: in pairs
     /// where modes are paired, otherwise in one random row per domain, where the mode with the largest entry cancels
     /// the sum of all others.
-    pub fn seed(&self, seed: usize) -> Truth {
+    pub fn seed(&self, seed: usize) -> ExactState {
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let mut q: Vec<f64> = self.spread.iter().map(|(spread, _)| spread * gauss(&mut rng)).collect();
         if seed % 2 == 1 {
@@ -112,12 +112,12 @@ impl Motion {
         }
         let movers = self.scene.movers.domains();
         let transforms = movers.map(|domain| self.moved(domain as usize, &mut rng)).collect();
-        Truth { q, transforms }
+        ExactState { q, transforms }
     }
 
     /// Number of steps of the trajectory.
     pub fn steps(&self) -> usize {
-        self.record.as_ref().map_or(STEPS, Record::steps)
+        self.record.as_ref().map_or(STEPS, RecordedTrajectory::steps)
     }
 
     /// Whether the trajectory was recorded.
@@ -126,7 +126,7 @@ impl Motion {
     }
 
     /// A step of the trajectory: the recorded one, otherwise independent oscillations of all modes.
-    pub fn step(&self, step: usize) -> Truth {
+    pub fn step(&self, step: usize) -> ExactState {
         if let Some(record) = &self.record {
             return record.step(&self.scene, step);
         }
@@ -142,7 +142,7 @@ impl Motion {
             let axis = Vector3::new(phase.sin(), 1.0, phase.cos()) * (TURN * (TAU * SLOWEST * time + phase).sin());
             place(&self.scene, domain, &Rotation3::new(axis * 0.5).into_inner(), &Vector3::zeros())
         };
-        Truth { q, transforms: self.scene.movers.domains().map(turn).collect() }
+        ExactState { q, transforms: self.scene.movers.domains().map(turn).collect() }
     }
 
     fn moved(&self, domain: usize, rng: &mut Rng) -> [f64; 12] {
@@ -212,10 +212,10 @@ fn gauss(rng: &mut Rng) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::loads::{Kind, Size};
+    use crate::workloads::{Size, WorkloadKind};
 
-    fn motion(kind: Kind) -> Motion {
-        Motion::new(&kind.build(Size::Quick).expect("built"), None)
+    fn motion(kind: WorkloadKind) -> WorkloadMotion {
+        WorkloadMotion::new(&kind.build(Size::Quick).expect("built"), None)
     }
 
     #[test]
@@ -229,17 +229,17 @@ mod tests {
 
     #[test]
     fn seeds_are_deterministic_and_not_representable_in_f32() {
-        let motion = motion(Kind::B);
+        let motion = motion(WorkloadKind::ManyDomains);
         assert_eq!(motion.seed(3), motion.seed(3));
         assert_ne!(motion.seed(3), motion.seed(5));
         let truth = motion.seed(0);
-        assert_ne!(Truth::of(&truth.state()), truth, "rounding shows");
+        assert_ne!(ExactState::of(&truth.state()), truth, "rounding shows");
         assert!(truth.state().transforms.iter().all(|transform| transform.is_similarity()));
     }
 
     #[test]
     fn only_odd_seeds_cancel_in_one_row() {
-        let motion = motion(Kind::Single { power: 10, rank: 10 });
+        let motion = motion(WorkloadKind::Single { power: 10, rank: 10 });
         let modes = &motion.scene.shapes[0].modes;
         let condition = |seed: usize| {
             let q = motion.seed(seed).q;
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn slow_modes_are_large_and_steps_are_close() {
-        let motion = motion(Kind::A { dressed: false });
+        let motion = motion(WorkloadKind::OneDomain { dressed: false });
         assert!(motion.spread[0].0 > 10.0 * motion.spread[31].0);
         let [first, second] = [0, 1].map(|step| motion.step(step));
         assert_ne!(first, second);

@@ -3,28 +3,29 @@
 use serde::Serialize;
 use serde_json::Value;
 
-use super::bench::Roofs;
-use super::timing::{Cache, Timing};
-use super::traffic::{self, Part};
-use super::validate::Found;
-use super::variant::Label;
-use crate::kernels::KernelFacts;
+use super::bench::MemoryBandwidth;
+use super::memory_traffic::{self, Operand};
+use super::timing::{CacheState, Timing};
+use super::validate::ValidationResult;
+use super::variant::VariantLabel;
+use crate::kernels::KernelAttributes;
 use modalcast_model::deform::Backend;
-use modalcast_model::error::{Error, Result, during};
-use modalcast_model::scene::{Normals, Storage};
+use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::scene::{NormalMethod, StorageType};
 
 /// Results of one variant on one load with one cache state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Row {
+pub struct DeformRow {
     pub load: String,
     pub name: String,
     pub backend: Backend,
-    pub storage: Storage,
+    pub storage: StorageType,
     /// Error budget of mode truncation, meters.
-    pub truncation_metres: Option<f64>,
-    pub normals: Normals,
+    #[serde(rename = "truncation_metres")]
+    pub truncation_meters: Option<f64>,
+    pub normals: NormalMethod,
     pub compensated: bool,
-    pub cache: Cache,
+    pub cache: CacheState,
     pub passed: bool,
     /// Reasons why it failed.
     pub faults: Vec<String>,
@@ -34,7 +35,7 @@ pub struct Row {
     /// `None` when it failed, or cannot be timed with this cache.
     pub timing: Option<Timing>,
     pub bytes: u64,
-    pub traffic: Vec<Part>,
+    pub traffic: Vec<Operand>,
     /// Bytes divided by the median time, 10^9 per second.
     pub gbs: Option<f64>,
     /// `gbs` divided by the best copy rate of the same run.
@@ -44,16 +45,22 @@ pub struct Row {
     /// Kernel launches per step; 0 on the CPU.
     pub launches: usize,
     /// The driver's facts about each kernel; empty on the CPU.
-    pub kernels: Vec<KernelFacts>,
+    pub kernels: Vec<KernelAttributes>,
     /// `None` when the variant could not be created.
-    pub found: Option<Found>,
+    pub found: Option<ValidationResult>,
 }
 
-impl Row {
+impl DeformRow {
     /// The row of a validated variant.
-    pub fn new(load: &str, label: &Label, found: Found, traffic: Vec<Part>, time: (Cache, Option<Timing>)) -> Self {
+    pub fn new(
+        load: &str,
+        label: &VariantLabel,
+        found: ValidationResult,
+        traffic: Vec<Operand>,
+        time: (CacheState, Option<Timing>),
+    ) -> Self {
         let (cache, timing) = time;
-        let bytes = traffic::total(&traffic);
+        let bytes = memory_traffic::total(&traffic);
         Self {
             cache,
             passed: found.passed(),
@@ -69,21 +76,21 @@ impl Row {
     }
 
     /// The row of a variant that could not be created.
-    pub fn unmade(load: &str, label: &Label, error: &Error) -> Self {
+    pub fn unmade(load: &str, label: &VariantLabel, error: &Error) -> Self {
         let left_out = matches!(error, Error::Unavailable { .. });
         Self { faults: vec![error.to_string()], left_out, ..Self::blank(load, label) }
     }
 
-    fn blank(load: &str, label: &Label) -> Self {
+    fn blank(load: &str, label: &VariantLabel) -> Self {
         Self {
             load: load.into(),
             name: label.name.clone(),
             backend: label.backend,
             storage: label.deformation.storage,
-            truncation_metres: label.deformation.truncation,
+            truncation_meters: label.deformation.truncation,
             normals: label.deformation.normals,
             compensated: label.deformation.compensated,
-            cache: Cache::Warm,
+            cache: CacheState::Warm,
             passed: false,
             faults: Vec::new(),
             left_out: false,
@@ -100,7 +107,7 @@ impl Row {
     }
 
     /// The row with its rate divided by the rates of the machine.
-    pub fn under(mut self, roofs: Roofs) -> Self {
+    pub fn under(mut self, roofs: MemoryBandwidth) -> Self {
         let share = |roof: Option<f64>| Some(self.gbs? / roof.filter(|roof| *roof > 0.0)?);
         (self.of_copy, self.of_read) = (share(roofs.copy_gbs), share(roofs.read_gbs));
         self
@@ -178,21 +185,21 @@ const COLUMNS: [(&str, &str); 56] = [
 ///
 /// # Errors
 /// `Fault` when writing into memory fails.
-pub fn csv(rows: &[Row]) -> Result<Vec<u8>> {
+pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
     let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(COLUMNS.map(|(name, _)| name)).map_err(during("report"))?;
+    writer.write_record(COLUMNS.map(|(name, _)| name)).map_err(fault_in("report"))?;
     for row in rows {
-        let value = serde_json::to_value(row).map_err(during("report"))?;
+        let value = serde_json::to_value(row).map_err(fault_in("report"))?;
         let cell = |(name, place): (&str, &str)| match (name, value.pointer(place)) {
-            ("bytes_by_formula", _) => traffic::line(&row.traffic),
+            ("bytes_by_formula", _) => memory_traffic::line(&row.traffic),
             ("faults", _) => row.faults.join("; "),
             (_, None | Some(Value::Null)) => String::new(),
             (_, Some(Value::String(text))) => text.clone(),
             (_, Some(other)) => other.to_string(),
         };
-        writer.write_record(COLUMNS.map(cell)).map_err(during("report"))?;
+        writer.write_record(COLUMNS.map(cell)).map_err(fault_in("report"))?;
     }
-    writer.into_inner().map_err(during("report"))
+    writer.into_inner().map_err(fault_in("report"))
 }
 
 /// Pareto front: indices of the points that no other point beats in both numbers, by ascending first number.
@@ -212,35 +219,35 @@ pub fn pareto(points: &[(f64, f64)]) -> Vec<usize> {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::errors::{Errors, Orientation, Spread};
-    use crate::sources::Sources;
+    use crate::error_sources::ErrorSources;
+    use crate::errors::{ErrorNorms, OrientationErrors, PositionErrors};
 
     /// A row with these numbers; everything else is zero or empty.
-    pub(crate) fn row(load: &str, name: &str, cache: Cache, (us, error): (f64, f64)) -> Row {
-        let label = Label { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
-        let spread = Spread { largest: error, rms: error / 2.0 };
-        let errors = Errors {
-            metres: spread,
+    pub(crate) fn row(load: &str, name: &str, cache: CacheState, (us, error): (f64, f64)) -> DeformRow {
+        let label = VariantLabel { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
+        let spread = ErrorNorms { largest: error, rms: error / 2.0 };
+        let errors = PositionErrors {
+            meters: spread,
             of_diagonal: spread,
             pixels: None,
-            bias_metres: [0.5, -0.5, 0.0],
-            bound_metres: 1.0,
+            bias_meters: [0.5, -0.5, 0.0],
+            bound_meters: 1.0,
             of_bound: 0.5,
             not_finite: 0,
             states: 1,
         };
-        let found = Found {
+        let found = ValidationResult {
             errors,
-            step_metres: spread,
-            sources: Sources::default(),
-            orientation: Orientation::default(),
+            step_meters: spread,
+            sources: ErrorSources::default(),
+            orientation: OrientationErrors::default(),
             repeatable: true,
             faults: Vec::new(),
             left_out: false,
         };
         let timing = Timing { median_us: us, q1_us: us, q3_us: us, replays: 20 };
-        let traffic = vec![Part { name: "U", formula: "4 x sum 3 n r", bytes: 2_000 }];
-        Row::new(load, &label, found, traffic, (cache, Some(timing)))
+        let traffic = vec![Operand { name: "U", formula: "4 x sum 3 n r", bytes: 2_000 }];
+        DeformRow::new(load, &label, found, traffic, (cache, Some(timing)))
     }
 
     #[test]
@@ -253,17 +260,17 @@ pub(super) mod tests {
 
     #[test]
     fn rates_are_bytes_per_time_and_fractions_of_roofs() {
-        let row = row("a", "x", Cache::Warm, (2.0, 0.1));
+        let row = row("a", "x", CacheState::Warm, (2.0, 0.1));
         assert_eq!((row.gbs, row.of_copy), (Some(1.0), None));
-        let under = row.under(Roofs { copy_gbs: Some(4.0), ..Roofs::default() });
+        let under = row.under(MemoryBandwidth { copy_gbs: Some(4.0), ..MemoryBandwidth::default() });
         assert_eq!((under.of_copy, under.of_read), (Some(0.25), None));
     }
 
     #[test]
     fn csv_reads_back_all_columns_and_quoted_text() {
-        let mut odd = row("a", "odd, \"name\"", Cache::Cold, (3.0, 1e-9));
+        let mut odd = row("a", "odd, \"name\"", CacheState::Cold, (3.0, 1e-9));
         odd.faults = vec!["one".into(), "two, three".into()];
-        let rows = [row("a", "x", Cache::Warm, (2.0, 0.125)), odd];
+        let rows = [row("a", "x", CacheState::Warm, (2.0, 0.125)), odd];
         let bytes = csv(&rows).expect("written");
         let mut reader = csv::Reader::from_reader(bytes.as_slice());
         let header = reader.headers().expect("a header").clone();
@@ -284,16 +291,16 @@ pub(super) mod tests {
 
     #[test]
     fn every_column_pointer_resolves_in_a_full_row() {
-        let mut full = row("a", "x", Cache::Warm, (2.0, 0.125)).under(Roofs {
+        let mut full = row("a", "x", CacheState::Warm, (2.0, 0.125)).under(MemoryBandwidth {
             copy_gbs: Some(1.0),
             read_gbs: Some(1.0),
-            ..Roofs::default()
+            ..MemoryBandwidth::default()
         });
-        full.truncation_metres = Some(1e-3);
+        full.truncation_meters = Some(1e-3);
         let found = full.found.as_mut().expect("found");
-        let spread = Some(Spread::default());
+        let spread = Some(ErrorNorms::default());
         found.errors.pixels = spread;
-        found.orientation = Orientation {
+        found.orientation = OrientationErrors {
             normals_degrees: spread,
             normals_to_surface_degrees: spread,
             tangents_degrees: spread,

@@ -2,31 +2,31 @@
 
 use std::sync::Arc;
 
-use super::exact::{Take, positions};
-use super::ingredients::Ingredients;
-use super::motion::Truth;
-use super::timing::{Cache, Timing};
-use super::traffic::Part;
-use super::variant::{Label, Variant};
-use modalcast_model::deform::Surface;
+use super::error_model::ErrorModel;
+use super::exact_positions::{ErrorModelTerms, positions};
+use super::memory_traffic::Operand;
+use super::motion::ExactState;
+use super::timing::{CacheState, Timing};
+use super::variant::{Variant, VariantLabel};
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// Wraps another variant and adds an error to its last coordinate.
 pub(super) struct Damaged<V> {
     inner: V,
     damage: f32,
-    surface: Surface,
+    surface: DeformedSurface,
 }
 
 impl<V: Variant> Damaged<V> {
     pub(super) fn new(inner: V, damage: f32) -> Self {
-        Self { inner, damage, surface: Surface::default() }
+        Self { inner, damage, surface: DeformedSurface::default() }
     }
 }
 
 impl<V: Variant> Variant for Damaged<V> {
-    fn label(&self) -> &Label {
+    fn label(&self) -> &VariantLabel {
         self.inner.label()
     }
 
@@ -34,39 +34,39 @@ impl<V: Variant> Variant for Damaged<V> {
         self.inner.scene()
     }
 
-    fn ingredients(&self) -> &Ingredients {
+    fn ingredients(&self) -> &ErrorModel {
         self.inner.ingredients()
     }
 
-    fn traffic(&self) -> Vec<Part> {
+    fn traffic(&self) -> Vec<Operand> {
         self.inner.traffic()
     }
 
-    fn surface(&mut self, at: usize, state: &State) -> Result<&Surface> {
+    fn surface(&mut self, at: usize, state: &SceneState) -> Result<&DeformedSurface> {
         self.surface = self.inner.surface(at, state)?.clone();
         let last = self.surface.positions.last_mut().expect("a vertex");
         *last += self.damage;
         Ok(&self.surface)
     }
 
-    fn time(&mut self, states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>> {
+    fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
         self.inner.time(states, cache, replays)
     }
 }
 
 /// Emulates storage and truncation in f64 and rounds only the positions.
 pub(super) struct Emulated {
-    pub(super) label: Label,
+    pub(super) label: VariantLabel,
     pub(super) scene: Arc<Scene>,
     /// Error model that it applies.
-    pub(super) does: Ingredients,
+    pub(super) does: ErrorModel,
     /// Error model that it declares, which gives its bounds.
-    pub(super) says: Ingredients,
-    pub(super) surface: Surface,
+    pub(super) says: ErrorModel,
+    pub(super) surface: DeformedSurface,
 }
 
 impl Variant for Emulated {
-    fn label(&self) -> &Label {
+    fn label(&self) -> &VariantLabel {
         &self.label
     }
 
@@ -74,24 +74,24 @@ impl Variant for Emulated {
         &self.scene
     }
 
-    fn ingredients(&self) -> &Ingredients {
+    fn ingredients(&self) -> &ErrorModel {
         &self.says
     }
 
-    fn traffic(&self) -> Vec<Part> {
+    fn traffic(&self) -> Vec<Operand> {
         Vec::new()
     }
 
-    fn surface(&mut self, _at: usize, state: &State) -> Result<&Surface> {
+    fn surface(&mut self, _at: usize, state: &SceneState) -> Result<&DeformedSurface> {
         self.does.follow(state);
         self.says.follow(state);
-        let take = Take { storage: Some(&self.does), truncation: Some(&self.does) };
-        let positions = positions(&self.scene, &Truth::of(state), take);
+        let take = ErrorModelTerms { storage: Some(&self.does), truncation: Some(&self.does) };
+        let positions = positions(&self.scene, &ExactState::of(state), take);
         self.surface.positions = positions.as_flattened().iter().map(|number| *number as f32).collect();
         Ok(&self.surface)
     }
 
-    fn time(&mut self, _states: &[State], _cache: Cache, _replays: usize) -> Result<Option<Timing>> {
+    fn time(&mut self, _states: &[SceneState], _cache: CacheState, _replays: usize) -> Result<Option<Timing>> {
         Ok(None)
     }
 }

@@ -1,38 +1,42 @@
 use super::*;
-use bench::{Offer, Wanted, offer};
+use bench::{VariantCandidate, VariantFilter, make_candidate};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::error::invalid;
 use testing::Damaged;
-use variant::{Driven, Label};
+use variant::{DeformerVariant, VariantLabel};
 
 /// A bench with the CPU deformer, intact and damaged, and a variant that cannot be created.
 struct Mixed {
     damage: f32,
 }
 
-impl Bench for Mixed {
-    fn variants(&self, load: &Load, wanted: Wanted<'_>) -> Vec<Offer> {
-        let label = |name: &str| Label::new(name, Backend::Cpu, &load.scene);
-        let cpu = |label: Label| Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
-        let bad = |label: Label| Ok(Damaged::new(cpu(label), self.damage));
-        vec![offer(wanted, label("good"), |label| Ok(cpu(label))), offer(wanted, label("bad"), bad)]
+impl BenchTarget for Mixed {
+    fn variants(&self, load: &Workload, wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+        let label = |name: &str| VariantLabel::new(name, Backend::Cpu, &load.scene);
+        let cpu =
+            |label: VariantLabel| DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
+        let bad = |label: VariantLabel| Ok(Damaged::new(cpu(label), self.damage));
+        vec![make_candidate(wanted, label("good"), |label| Ok(cpu(label))), make_candidate(wanted, label("bad"), bad)]
     }
 
-    fn roofs(&self, _backend: Backend) -> Roofs {
-        Roofs { copy_gbs: Some(10.0), read_gbs: Some(12.0), ..Roofs::default() }
+    fn roofs(&self, _backend: Backend) -> MemoryBandwidth {
+        MemoryBandwidth { copy_gbs: Some(10.0), read_gbs: Some(12.0), ..MemoryBandwidth::default() }
     }
 }
 
-fn request(sources: Vec<Source>) -> Request {
-    Request { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
+fn request(sources: Vec<WorkloadSource>) -> DeformReportOptions {
+    DeformReportOptions { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
 }
 
-fn report(damage: f32) -> Report {
-    let sources = vec![Source::Synthetic(Kind::Plant(1)), Source::Synthetic(Kind::Single { power: 14, rank: 10 })];
+fn report(damage: f32) -> DeformReport {
+    let sources = vec![
+        WorkloadSource::Synthetic(WorkloadKind::Plant(1)),
+        WorkloadSource::Synthetic(WorkloadKind::Single { power: 14, rank: 10 }),
+    ];
     let mut heard = Vec::new();
     let hear = |told: Progress<'_>| {
         heard.push(match told {
-            Progress::Begins(what) => what.to_owned(),
+            Progress::Started(what) => what.to_owned(),
             Progress::Measured(report) => format!("{} {:?}", report.rows.len(), report.missing),
         });
         Ok(())
@@ -46,18 +50,18 @@ fn report(damage: f32) -> Report {
 #[test]
 fn interrupted_run_keeps_results_and_names_missing_loads() {
     let folder = tempfile::tempdir().expect("a folder");
-    let absent = Source::Scene { source: "absent".into(), record: None };
-    let request = request(vec![Source::Synthetic(Kind::C), absent]);
+    let absent = WorkloadSource::Scene { source: "absent".into(), record: None };
+    let request = request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains), absent]);
     let keep = |told: Progress<'_>| match told {
         Progress::Measured(report) => report.write(folder.path()),
-        Progress::Begins(_) => Ok(()),
+        Progress::Started(_) => Ok(()),
     };
     deform(&request, &Mixed { damage: 0.0 }, keep).expect_err("no such scene");
     let json = std::fs::read(folder.path().join("report.json")).expect("written");
     let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
     assert_eq!((&json["missing"][0], json["rows"].as_array().map(Vec::len)), (&"absent".into(), Some(4)));
-    let page = std::fs::read_to_string(folder.path().join("report.md")).expect("written");
-    assert!(page.contains("Not measured yet: absent."), "{page}");
+    let markdown = std::fs::read_to_string(folder.path().join("report.md")).expect("written");
+    assert!(markdown.contains("Not measured yet: absent."), "{markdown}");
     let mut names = std::fs::read_dir(folder.path()).expect("listed").map(|entry| entry.expect("one").file_name());
     assert!(
         names.all(|name| name.to_string_lossy().starts_with("report.") && !name.to_string_lossy().ends_with("part"))
@@ -100,13 +104,14 @@ fn damaged_variant_fails_report_and_is_not_timed() {
 #[test]
 fn variant_that_cannot_be_created_fails_report() {
     struct Broken;
-    impl Bench for Broken {
-        fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
-            let label = Label::new("lost", Backend::Cuda, &load.scene);
+    impl BenchTarget for Broken {
+        fn variants(&self, load: &Workload, _wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+            let label = VariantLabel::new("lost", Backend::Cuda, &load.scene);
             vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
         }
     }
-    let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Broken, |_| Ok(())).expect("a report");
+    let report = deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &Broken, |_| Ok(()))
+        .expect("a report");
     assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, given none"]);
     assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
 }
@@ -114,14 +119,15 @@ fn variant_that_cannot_be_created_fails_report() {
 #[test]
 fn unavailable_variant_is_skipped_without_failing_report() {
     struct Lacking;
-    impl Bench for Lacking {
-        fn variants(&self, load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
-            let label = Label::new("peer", Backend::Cuda, &load.scene);
+    impl BenchTarget for Lacking {
+        fn variants(&self, load: &Workload, _wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+            let label = VariantLabel::new("peer", Backend::Cuda, &load.scene);
             let (reason, remedy) = ("not found".into(), "install it".into());
             vec![(label, Err(modalcast_model::error::Error::Unavailable { what: "a library", reason, remedy }))]
         }
     }
-    let report = deform(&request(vec![Source::Synthetic(Kind::C)]), &Lacking, |_| Ok(())).expect("a report");
+    let report = deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &Lacking, |_| Ok(()))
+        .expect("a report");
     assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
     assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
 }
@@ -129,15 +135,15 @@ fn unavailable_variant_is_skipped_without_failing_report() {
 #[test]
 fn overlap_fails_report_only_when_vertices_differ() {
     struct Beside(usize);
-    impl Bench for Beside {
-        fn variants(&self, _load: &Load, _wanted: Wanted<'_>) -> Vec<Offer> {
+    impl BenchTarget for Beside {
+        fn variants(&self, _load: &Workload, _wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
             Vec::new()
         }
 
         fn overlap(
             &self,
-            _load: &Load,
-            states: &[modalcast_model::scene::State],
+            _load: &Workload,
+            states: &[modalcast_model::scene::SceneState],
             steps: usize,
         ) -> Option<Result<Overlap>> {
             assert_eq!(states.len(), ROTATING);
@@ -167,25 +173,26 @@ fn overlap_fails_report_only_when_vertices_differ() {
     }
     let made = |differing, variants: &[&str]| {
         let variants = variants.iter().map(|name| (*name).to_owned()).collect();
-        let request = Request { variants, ..request(vec![Source::Synthetic(Kind::C)]) };
+        let request =
+            DeformReportOptions { variants, ..request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]) };
         deform(&request, &Beside(differing), |_| Ok(())).expect("a report")
     };
     assert_eq!(made(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
     let good = made(0, &["cuda overlap"]);
     assert!(good.passed());
-    assert!(page::markdown(&good).contains("50.0 one after the other, 37.5"));
+    assert!(markdown::markdown(&good).contains("50.0 one after the other, 37.5"));
     assert_eq!(made(3, &["cpu*"]).loads[0].overlap, None, "not asked for");
 }
 
 #[test]
 fn user_scene_is_measured_under_its_own_name() {
-    let source = Source::Scene { source: "tree".into(), record: None };
+    let source = WorkloadSource::Scene { source: "tree".into(), record: None };
     let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| Ok(())).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);
     assert_eq!((report.loads[0].name.as_str(), report.loads[0].recorded), ("tree", false));
     assert!(
         deform(
-            &request(vec![Source::Scene { source: "absent".into(), record: None }]),
+            &request(vec![WorkloadSource::Scene { source: "absent".into(), record: None }]),
             &Mixed { damage: 0.0 },
             |_| Ok(())
         )

@@ -16,7 +16,7 @@ pub const CPU_OVER_GPU: [[f64; 5]; 3] =
 
 /// One plant of tables 4.5 to 4.7. Times are milliseconds, occupations are fractions of the frame time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Species {
+pub struct ThesisPlant {
     pub name: &'static str,
     /// Table 4.5, v: render vertices.
     pub vertices: usize,
@@ -45,12 +45,12 @@ pub struct Species {
     pub cpu_occupation: f64,
     /// Table 4.7, `O_uq` of the GPU.
     pub gpu_occupation: f64,
-    pub drawn: Drawn,
+    pub drawn: ThesisRenderTimes,
 }
 
 /// The rendering columns of tables 4.6 and 4.7.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Drawn {
+pub struct ThesisRenderTimes {
     /// Table 4.6, FPS and `t_vbr` (vertex updating with rendering) of the CPU.
     pub cpu_fps: f64,
     pub cpu_vbr_ms: f64,
@@ -72,11 +72,17 @@ type Times = [f64; 6];
 /// FPS and `t_vbr` of the CPU, FPS, `t_vbr` and s of the GPU (table 4.6), `O_vbr` of both in per cent (table 4.7).
 type Rendering = [f64; 7];
 
-const fn species(name: &'static str, counts: Counts, kernels: usize, times: Times, rendering: Rendering) -> Species {
+const fn species(
+    name: &'static str,
+    counts: Counts,
+    kernels: usize,
+    times: Times,
+    rendering: Rendering,
+) -> ThesisPlant {
     let [vertices, faces, unfolded, domains, deformable, modes, rows] = counts;
     let [cpu_uq_ms, gpu_uq_ms, gpu_update_ms, speedup_uq, cpu_percent, gpu_percent] = times;
     let [cpu_fps, cpu_vbr_ms, gpu_fps, gpu_vbr_ms, gpu_mb, cpu_vbr_percent, gpu_vbr_percent] = rendering;
-    Species {
+    ThesisPlant {
         name,
         vertices,
         faces,
@@ -92,7 +98,7 @@ const fn species(name: &'static str, counts: Counts, kernels: usize, times: Time
         speedup_uq,
         cpu_occupation: cpu_percent / 100.0,
         gpu_occupation: gpu_percent / 100.0,
-        drawn: Drawn {
+        drawn: ThesisRenderTimes {
             cpu_fps,
             cpu_vbr_ms,
             gpu_fps,
@@ -106,7 +112,7 @@ const fn species(name: &'static str, counts: Counts, kernels: usize, times: Time
 
 /// The twelve plants, in the order of the tables.
 #[rustfmt::skip]
-pub const PLANTS: [Species; 12] = [
+pub const PLANTS: [ThesisPlant; 12] = [
     species("Pansy", [7_987, 15_372, 46_476, 22, 22, 324, 106_882], 2, [0.323, 0.189, 1.73, 1.71, 9.37, 1.42], [290.0, 2.606, 75.0, 2.248, 9.7, 75.57, 16.86]),
     species("Conifer", [7_543, 7_517, 22_551, 644, 43, 360, 41_652], 1, [0.261, 0.165, 1.059, 1.58, 1.57, 0.91], [60.0, 5.886, 55.0, 1.693, 5.8, 35.32, 9.31]),
     species("Weed willow", [291_914, 313_230, 939_690, 32_623, 98, 958, 362_084], 2, [8.066, 1.12, 5.766, 7.20, 2.42, 1.79], [3.0, 261.926, 16.0, 6.483, 129.8, 78.58, 10.37]),
@@ -137,8 +143,8 @@ mod tests {
     fn printed_occupations_equal_t_vbr_times_fps() {
         let speedups = [1.16, 3.48, 40.40, 15.54, 11.41, 27.29, 16.23, 24.96, 19.34, 79.36, 47.58, 19.71];
         for (plant, speedup) in PLANTS.iter().zip(speedups) {
-            let Drawn { cpu_vbr_ms, cpu_fps, cpu_vbr_occupation, .. } = plant.drawn;
-            let Drawn { gpu_vbr_ms, gpu_fps, gpu_vbr_occupation, .. } = plant.drawn;
+            let ThesisRenderTimes { cpu_vbr_ms, cpu_fps, cpu_vbr_occupation, .. } = plant.drawn;
+            let ThesisRenderTimes { gpu_vbr_ms, gpu_fps, gpu_vbr_occupation, .. } = plant.drawn;
             assert!((cpu_vbr_ms / gpu_vbr_ms - speedup).abs() <= 0.006, "{}", plant.name);
             assert!((cpu_vbr_ms / 1e3 * cpu_fps - cpu_vbr_occupation).abs() <= 1e-4, "{}", plant.name);
             assert!((gpu_vbr_ms / 1e3 * gpu_fps - gpu_vbr_occupation).abs() <= 1e-4, "{}", plant.name);

@@ -10,14 +10,14 @@ use modalcast_model::error::Result;
 /// State of the caches when a step begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Cache {
+pub enum CacheState {
     /// The previous step's data.
     Warm,
     /// No data of the step: a buffer larger than the last-level cache was written before.
     Cold,
 }
 
-impl Cache {
+impl CacheState {
     /// The name in tables.
     pub const fn name(self) -> &'static str {
         match self {
@@ -37,9 +37,9 @@ pub struct Timing {
 }
 
 /// Minimum of repetitions for a median.
-pub const FEWEST: usize = 20;
-/// Time limit in seconds, after which no repetition beyond [`FEWEST`] starts.
-const PATIENCE: f64 = 5.0;
+pub const MIN_REPETITIONS: usize = 20;
+/// Time limit in seconds, after which no repetition beyond [`MIN_REPETITIONS`] starts.
+const TIME_BUDGET_S: f64 = 5.0;
 /// Minimum size of the sweep in bytes, also for machines that do not report their caches.
 const SWEEP: usize = 64 << 20;
 
@@ -56,20 +56,20 @@ impl Timing {
         Some(Self { median_us: at(0.5), q1_us: at(0.25), q3_us: at(0.75), replays: times.len() })
     }
 
-    /// Times `step`, called with 0, 1, 2, ..., by the wall clock: one untimed run, then [`FEWEST`] to `replays` runs.
+    /// Times `step`, called with 0, 1, 2, ..., by the wall clock: one untimed run, then [`MIN_REPETITIONS`] to `replays` runs.
     ///
     /// # Errors
     /// Errors of `step`.
     pub fn by_wall_clock(
-        cache: Cache,
+        cache: CacheState,
         replays: usize,
         mut step: impl FnMut(usize) -> Result<()>,
     ) -> Result<Option<Self>> {
-        let mut sweep = (cache == Cache::Cold).then(Sweep::new);
+        let mut sweep = (cache == CacheState::Cold).then(CacheFlush::new);
         step(0)?;
         let (start, mut times) = (Instant::now(), Vec::new());
-        for replay in 0..replays.max(FEWEST) {
-            if replay >= FEWEST && start.elapsed().as_secs_f64() > PATIENCE {
+        for replay in 0..replays.max(MIN_REPETITIONS) {
+            if replay >= MIN_REPETITIONS && start.elapsed().as_secs_f64() > TIME_BUDGET_S {
                 break;
             }
             if let Some(sweep) = &mut sweep {
@@ -84,9 +84,9 @@ impl Timing {
 }
 
 /// A buffer larger than the caches.
-struct Sweep(Vec<u64>);
+struct CacheFlush(Vec<u64>);
 
-impl Sweep {
+impl CacheFlush {
     fn new() -> Self {
         // Every socket has its own last-level cache; twice its size, but at least [`SWEEP`], is enough in practice.
         Self(vec![1; (2 * largest_cache()).max(SWEEP) / 8])
@@ -130,7 +130,8 @@ mod tests {
 
     #[test]
     fn times_at_least_20_runs_after_one_warm_up() {
-        for (cache, replays, want) in [(Cache::Warm, 3, 20), (Cache::Warm, 31, 31), (Cache::Cold, 1, 20)] {
+        for (cache, replays, want) in [(CacheState::Warm, 3, 20), (CacheState::Warm, 31, 31), (CacheState::Cold, 1, 20)]
+        {
             let mut runs = Vec::new();
             let timing = Timing::by_wall_clock(cache, replays, |run| {
                 runs.push(run);
@@ -144,6 +145,6 @@ mod tests {
     #[test]
     fn failing_step_ends_timing() {
         let fault = modalcast_model::error::invalid("x", "y", "z");
-        assert_eq!(Timing::by_wall_clock(Cache::Warm, 20, |_| Err(fault.clone())), Err(fault));
+        assert_eq!(Timing::by_wall_clock(CacheState::Warm, 20, |_| Err(fault.clone())), Err(fault));
     }
 }

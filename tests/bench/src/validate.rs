@@ -6,24 +6,27 @@ use std::sync::{Arc, OnceLock};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::errors::{Collect, Errors, IMAGE, Orientation, Spread, Tally, Turned, Yardstick, step_errors};
-use super::exact::{Judged, judge, widen};
-use super::loads::{Load, restated};
-use super::motion::Motion;
-use super::offers::has_normals;
-use super::sources::{Origin, Sources, Split};
+use super::cuda_variants::has_normals;
+use super::error_sources::{ErrorSources, ErrorSourcesAccumulator, SharedErrorSources};
+use super::errors::{
+    ErrorNorms, ErrorScale, IMAGE_SIZE, NormAccumulator, OrientationErrorAccumulator, OrientationErrors,
+    PositionErrorAccumulator, PositionErrors, step_errors,
+};
+use super::exact_positions::{ReferenceVertex, reference_vertices, widen};
+use super::motion::WorkloadMotion;
 use super::variant::Variant;
+use super::workloads::{Workload, with_deformation};
 use modalcast_compute::reference;
-use modalcast_model::deform::Surface;
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Error;
-use modalcast_model::scene::{Camera, Deformation, Normals, Scene, State};
+use modalcast_model::scene::{Camera, DeformationSettings, NormalMethod, Scene, SceneState};
 
 /// Number of seeds for which the error is split into its sources. Each split costs five evaluations in f64.
 const SPLIT: usize = 4;
 
 /// Condition numbers of the modal sums of a load: sum |U q| / |u| per vertex.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Condition {
+pub struct ConditionNumbers {
     /// Largest finite condition number.
     pub largest: f64,
     /// Median over the states of the median over the vertices that have modes.
@@ -34,12 +37,13 @@ pub struct Condition {
 
 /// Validation result of one variant.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Found {
-    pub errors: Errors,
+pub struct ValidationResult {
+    pub errors: PositionErrors,
     /// Error of x(k + 1) - x(k) along the trajectory, meters.
-    pub step_metres: Spread,
-    pub sources: Sources,
-    pub orientation: Orientation,
+    #[serde(rename = "step_metres")]
+    pub step_meters: ErrorNorms,
+    pub sources: ErrorSources,
+    pub orientation: OrientationErrors,
     /// Whether the same state gives bit-identical results when it is evaluated again.
     pub repeatable: bool,
     /// Reasons why the variant failed; empty when it passed.
@@ -48,39 +52,39 @@ pub struct Found {
     pub left_out: bool,
 }
 
-impl Found {
+impl ValidationResult {
     /// Whether the variant passed validation, so that it may be timed.
     pub fn passed(&self) -> bool {
         self.faults.is_empty()
     }
 }
 
-/// Accumulator for the [`Found`] of one variant.
-struct Case<'a> {
+/// Accumulator for the [`ValidationResult`] of one variant.
+struct VariantCheck<'a> {
     variant: &'a mut dyn Variant,
-    tally: Tally,
-    turned: Turned,
-    split: Split,
-    steps: Collect,
-    before: Option<(Vec<f32>, Arc<Vec<Judged>>)>,
+    tally: PositionErrorAccumulator,
+    turned: OrientationErrorAccumulator,
+    split: ErrorSourcesAccumulator,
+    steps: NormAccumulator,
+    before: Option<(Vec<f32>, Arc<Vec<ReferenceVertex>>)>,
     /// The variant's most recent surface. The buffers are reused.
-    held: Surface,
-    first: Surface,
+    held: DeformedSurface,
+    first: DeformedSurface,
     repeatable: bool,
     fault: Option<String>,
     left_out: bool,
 }
 
 /// One state to validate, with the reference values that all variants share.
-struct Look<'a> {
+struct StateSample<'a> {
     at: usize,
     scenes: &'a Scenes<'a>,
-    state: &'a State,
+    state: &'a SceneState,
     /// Exact positions, with the bounds of a deformer that stores U exactly and sums all modes.
-    judged: Arc<Vec<Judged>>,
-    partial: Partial,
+    judged: Arc<Vec<ReferenceVertex>>,
+    partial: StateCondition,
     /// Present for the states whose error is split into its sources.
-    origin: Option<Origin>,
+    origin: Option<SharedErrorSources>,
     rigid: OnceLock<Directions>,
     exact: OnceLock<Directions>,
     along: bool,
@@ -100,19 +104,19 @@ struct Scenes<'a> {
 }
 
 impl<'a> Scenes<'a> {
-    fn new(load: &'a Load) -> Self {
-        let exact_normals = Deformation { normals: Normals::Exact, ..load.scene.deformation };
+    fn new(load: &'a Workload) -> Self {
+        let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..load.scene.deformation };
         let bends = load.scene.needs.modes && has_normals(&load.scene);
-        let bent = bends.then(|| restated(&load.scene, exact_normals)).and_then(Result::ok);
+        let bent = bends.then(|| with_deformation(&load.scene, exact_normals)).and_then(Result::ok);
         Self { rigid: &load.scene, bent }
     }
 }
 
-impl<'a> Look<'a> {
-    fn new(scenes: &'a Scenes<'a>, at: usize, state: &'a State, along: bool) -> Self {
-        let judged = Arc::new(judge(scenes.rigid, state));
+impl<'a> StateSample<'a> {
+    fn new(scenes: &'a Scenes<'a>, at: usize, state: &'a SceneState, along: bool) -> Self {
+        let judged = Arc::new(reference_vertices(scenes.rigid, state));
         let (rigid, exact) = (OnceLock::new(), OnceLock::new());
-        Self { at, scenes, state, partial: Partial::of(&judged), judged, origin: None, rigid, exact, along }
+        Self { at, scenes, state, partial: StateCondition::of(&judged), judged, origin: None, rigid, exact, along }
     }
 
     /// Reference directions: by T alone, or, if `exact`, of the deformed surface. Computed at the first call and
@@ -127,9 +131,9 @@ impl<'a> Look<'a> {
                 Directions { normals, tangents }
             }),
             false => self.rigid.get_or_init(|| {
-                let normals = || reference::orient_normals(self.scenes.rigid, self.state);
+                let normals = || reference::rigid_normals(self.scenes.rigid, self.state);
                 let (normals, tangents) =
-                    rayon::join(normals, || reference::orient_tangents(self.scenes.rigid, self.state));
+                    rayon::join(normals, || reference::rigid_tangents(self.scenes.rigid, self.state));
                 Directions { normals, tangents }
             }),
         }
@@ -143,31 +147,32 @@ const AT_ONCE: usize = 1 << 24;
 /// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every
 /// vertex and corner. The reference values are computed once for all variants, in parallel over several states.
 pub fn validate(
-    load: &Load,
-    motion: &Motion,
+    load: &Workload,
+    motion: &WorkloadMotion,
     variants: &mut [Box<dyn Variant>],
     (seeds, steps): (usize, usize),
-) -> (Vec<Found>, Condition) {
-    let camera = Camera::framing(&load.scene, IMAGE.0, IMAGE.1);
-    let yardstick = Yardstick::new(&load.scene, &camera);
+) -> (Vec<ValidationResult>, ConditionNumbers) {
+    let camera = Camera::fit_to_scene(&load.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
+    let yardstick = ErrorScale::new(&load.scene, &camera);
     let truth = |at: usize| if at < seeds { motion.seed(at) } else { motion.step(at - seeds) };
     let count = seeds + motion.steps().min(steps);
-    let states: Vec<State> = (0..count).into_par_iter().map(|at| truth(at).state()).collect();
-    let mut cases: Vec<Case<'_>> = variants.iter_mut().map(|variant| Case::new(variant.as_mut(), &states)).collect();
-    let (scenes, mut conditions) = (Scenes::new(load), Conditions::default());
+    let states: Vec<SceneState> = (0..count).into_par_iter().map(|at| truth(at).state()).collect();
+    let mut cases: Vec<VariantCheck<'_>> =
+        variants.iter_mut().map(|variant| VariantCheck::new(variant.as_mut(), &states)).collect();
+    let (scenes, mut conditions) = (Scenes::new(load), ConditionAccumulator::default());
     // Which directions the variants needed at the first state. For the other states these are computed beforehand, in
     // parallel.
     let mut asked = [false; 2];
     for group in groups(count, load.scene.layout.vertices + load.scene.layout.corners) {
         let look = |at: usize| {
-            let look = Look::new(&scenes, at, &states[at], at >= seeds);
+            let look = StateSample::new(&scenes, at, &states[at], at >= seeds);
             for exact in [false, true].into_iter().filter(|exact| asked[usize::from(*exact)]) {
                 look.directions(exact);
             }
             let split = at < SPLIT.min(seeds);
-            Look { origin: split.then(|| Origin::new(&load.scene, truth(at), &states[at])), ..look }
+            StateSample { origin: split.then(|| SharedErrorSources::new(&load.scene, truth(at), &states[at])), ..look }
         };
-        let looks: Vec<Look<'_>> = group.into_par_iter().map(look).collect();
+        let looks: Vec<StateSample<'_>> = group.into_par_iter().map(look).collect();
         for look in looks {
             conditions.add(&look.partial);
             cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
@@ -189,27 +194,27 @@ fn groups(count: usize, items: usize) -> impl Iterator<Item = Range<usize>> {
     std::iter::once(0..count.min(1)).chain(rest)
 }
 
-impl<'a> Case<'a> {
-    fn new(variant: &'a mut dyn Variant, states: &[State]) -> Self {
+impl<'a> VariantCheck<'a> {
+    fn new(variant: &'a mut dyn Variant, states: &[SceneState]) -> Self {
         let fault = variant.prepare(states).err();
         let left_out = matches!(fault, Some(Error::Unavailable { .. }));
         let fault = fault.map(|error| error.to_string());
         Self {
             variant,
-            tally: Tally::default(),
-            turned: Turned::default(),
-            split: Split::default(),
-            steps: Collect::default(),
+            tally: PositionErrorAccumulator::default(),
+            turned: OrientationErrorAccumulator::default(),
+            split: ErrorSourcesAccumulator::default(),
+            steps: NormAccumulator::default(),
             before: None,
-            held: Surface::default(),
-            first: Surface::default(),
+            held: DeformedSurface::default(),
+            first: DeformedSurface::default(),
             repeatable: true,
             fault,
             left_out,
         }
     }
 
-    fn look(&mut self, yardstick: &Yardstick, look: &Look<'_>) {
+    fn look(&mut self, yardstick: &ErrorScale, look: &StateSample<'_>) {
         if self.fault.is_some() {
             return;
         }
@@ -240,7 +245,7 @@ impl<'a> Case<'a> {
     }
 
     /// Error of the step from the previous state.
-    fn step(&mut self, look: &Look<'_>) {
+    fn step(&mut self, look: &StateSample<'_>) {
         if let Some((positions, before)) = &self.before {
             self.steps = self.steps.join(step_errors([positions, &self.held.positions], [before, &look.judged]));
         }
@@ -256,7 +261,7 @@ impl<'a> Case<'a> {
 
     /// Evaluates the first state again, after all others. Variants with truncation are exempt: their choice of modes
     /// may depend on earlier states.
-    fn repeat(&mut self, states: &[State]) {
+    fn repeat(&mut self, states: &[SceneState]) {
         if self.fault.is_none() && !self.variant.ingredients().truncates() {
             let again = self.variant.surface(0, &states[0]);
             self.repeatable = again.is_ok_and(|again| bits(again).eq(bits(&self.first)));
@@ -264,7 +269,7 @@ impl<'a> Case<'a> {
     }
 
     /// The exact positions with this variant's own bounds.
-    fn judged(&self, look: &Look<'_>) -> Arc<Vec<Judged>> {
+    fn judged(&self, look: &StateSample<'_>) -> Arc<Vec<ReferenceVertex>> {
         let ingredients = self.variant.ingredients();
         match ingredients.is_exact() {
             true => Arc::clone(&look.judged),
@@ -272,8 +277,8 @@ impl<'a> Case<'a> {
         }
     }
 
-    fn orient(&mut self, look: &Look<'_>) {
-        let Surface { normals, tangents, .. } = &self.held;
+    fn orient(&mut self, look: &StateSample<'_>) {
+        let DeformedSurface { normals, tangents, .. } = &self.held;
         if normals.is_empty() {
             return;
         }
@@ -285,19 +290,19 @@ impl<'a> Case<'a> {
         self.turned.add_tangents(tangents, &want.tangents, normals);
     }
 
-    fn found(self, yardstick: &Yardstick) -> Found {
+    fn found(self, yardstick: &ErrorScale) -> ValidationResult {
         let (errors, orientation) = (self.tally.errors(yardstick), self.turned.orientation());
         let mut faults: Vec<String> = self.fault.into_iter().collect();
         if !errors.passed() {
-            let Errors { of_bound, not_finite, .. } = errors;
+            let PositionErrors { of_bound, not_finite, .. } = errors;
             faults.push(format!("{of_bound:.3} times its a-priori bound, {not_finite} coordinates not finite"));
         }
         if orientation.broken > 0 {
             faults.push(format!("{} normals or tangents are no directions", orientation.broken));
         }
-        Found {
+        ValidationResult {
             errors,
-            step_metres: self.steps.spread(yardstick.unit()).unwrap_or_default(),
+            step_meters: self.steps.spread(yardstick.unit()).unwrap_or_default(),
             sources: self.split.sources(yardstick.unit()),
             orientation,
             repeatable: self.repeatable,
@@ -308,31 +313,31 @@ impl<'a> Case<'a> {
 }
 
 /// Copies a surface into the buffers of another.
-fn copy(to: &mut Surface, from: &Surface) {
+fn copy(to: &mut DeformedSurface, from: &DeformedSurface) {
     to.positions.clone_from(&from.positions);
     to.normals.clone_from(&from.normals);
     to.tangents.clone_from(&from.tangents);
 }
 
-fn places(judged: &[Judged]) -> Vec<[f64; 3]> {
+fn places(judged: &[ReferenceVertex]) -> Vec<[f64; 3]> {
     judged.par_iter().map(|judged| judged.at).collect()
 }
 
-fn bits(surface: &Surface) -> impl Iterator<Item = u32> + '_ {
+fn bits(surface: &DeformedSurface) -> impl Iterator<Item = u32> + '_ {
     let lists = [&surface.positions, &surface.normals, &surface.tangents];
     lists.into_iter().flatten().map(|number| number.to_bits())
 }
 
 /// Condition numbers of one state: largest finite one, median, and number of infinite ones.
 #[derive(Debug, Default)]
-struct Partial {
+struct StateCondition {
     largest: f64,
     median: Option<f64>,
     infinite: u64,
 }
 
-impl Partial {
-    fn of(judged: &[Judged]) -> Self {
+impl StateCondition {
+    fn of(judged: &[ReferenceVertex]) -> Self {
         let all = judged.iter().map(|judged| judged.condition).filter(|condition| *condition > 0.0);
         let mut all: Vec<f64> = all.collect();
         let count = all.len();
@@ -342,24 +347,24 @@ impl Partial {
     }
 }
 
-/// Accumulator for [`Condition`].
+/// Accumulator for [`ConditionNumbers`].
 #[derive(Debug, Default)]
-struct Conditions {
+struct ConditionAccumulator {
     largest: f64,
     infinite: u64,
     medians: Vec<f64>,
 }
 
-impl Conditions {
-    fn add(&mut self, state: &Partial) {
+impl ConditionAccumulator {
+    fn add(&mut self, state: &StateCondition) {
         self.infinite += state.infinite;
         self.largest = self.largest.max(state.largest);
         self.medians.extend(state.median);
     }
 
-    fn condition(mut self) -> Condition {
+    fn condition(mut self) -> ConditionNumbers {
         let median = median(&mut self.medians).unwrap_or(0.0);
-        Condition { largest: self.largest, median, infinite: self.infinite }
+        ConditionNumbers { largest: self.largest, median, infinite: self.infinite }
     }
 }
 
@@ -371,42 +376,44 @@ fn median(numbers: &mut [f64]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ingredients::Ingredients;
-    use crate::loads::{Kind, Size};
+    use crate::error_model::ErrorModel;
     use crate::testing::{Damaged, Emulated};
-    use crate::variant::{Driven, Label};
+    use crate::variant::{DeformerVariant, VariantLabel};
+    use crate::workloads::{Size, WorkloadKind};
     use modalcast_compute::cpu::CpuDeformer;
     use modalcast_model::deform::Backend;
-    use modalcast_model::scene::Storage;
+    use modalcast_model::scene::StorageType;
 
-    fn find(kind: Kind, damage: f32) -> (Found, Condition) {
+    fn find(kind: WorkloadKind, damage: f32) -> (ValidationResult, ConditionNumbers) {
         let load = kind.build(Size::Quick).expect("built");
-        let label = Label::new("cpu", Backend::Cpu, &load.scene);
-        let cpu = Driven::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
+        let label = VariantLabel::new("cpu", Backend::Cpu, &load.scene);
+        let cpu = DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(Damaged::new(cpu, damage))];
-        let motion = Motion::new(&load, None);
+        let motion = WorkloadMotion::new(&load, None);
         let (mut found, condition) = validate(&load, &motion, &mut variants, (4, usize::MAX));
         (found.remove(0), condition)
     }
 
     #[test]
     fn cpu_passes_all_loads_and_fills_all_figures() {
-        let (found, condition) = find(Kind::A { dressed: true }, 0.0);
+        let (found, condition) = find(WorkloadKind::OneDomain { dressed: true }, 0.0);
         assert!(found.passed() && found.repeatable, "{:?}", found.faults);
         assert_eq!(found.errors.states, 4 + 24);
-        assert!(found.errors.metres.largest > 0.0 && found.errors.of_diagonal.largest < 1e-6, "{found:?}");
-        assert!(found.step_metres.largest > 0.0 && found.step_metres.largest < 2e-6, "{found:?}");
+        assert!(found.errors.meters.largest > 0.0 && found.errors.of_diagonal.largest < 1e-6, "{found:?}");
+        assert!(found.step_meters.largest > 0.0 && found.step_meters.largest < 2e-6, "{found:?}");
         let normals = found.orientation.normals_degrees.expect("normals");
         let tangents = found.orientation.tangents_degrees.expect("tangents");
         let to_surface = found.orientation.normals_to_surface_degrees.expect("normals");
         assert!(to_surface.largest > 0.1, "rigid normals do not follow the surface: {found:?}");
         assert!(normals.largest < 1e-4 && tangents.largest < 1e-4, "{found:?}");
         assert!(found.orientation.normal_dot_tangent.expect("dots").largest < 1e-6, "{found:?}");
-        let Sources { storage, q, accumulation, transform, origin, truncation } = found.sources;
-        assert_eq!([storage, truncation], [Spread::default(); 2]);
+        let ErrorSources { storage, q, accumulation, transform, origin, truncation } = found.sources;
+        assert_eq!([storage, truncation], [ErrorNorms::default(); 2]);
         assert!([q, accumulation, transform, origin].iter().all(|part| part.largest > 0.0), "{:?}", found.sources);
         assert!(condition.median > 1.0 && condition.largest > condition.median, "{condition:?}");
-        for kind in [Kind::B, Kind::C, Kind::Cancelling, Kind::Plant(1)] {
+        for kind in
+            [WorkloadKind::ManyDomains, WorkloadKind::TinyDomains, WorkloadKind::Cancelling, WorkloadKind::Plant(1)]
+        {
             let (found, _) = find(kind, 0.0);
             assert!(found.passed(), "{kind:?}: {:?}", found.faults);
         }
@@ -414,37 +421,38 @@ mod tests {
 
     #[test]
     fn damaged_variant_fails_with_a_reason() {
-        let (found, _) = find(Kind::B, 1e-3);
+        let (found, _) = find(WorkloadKind::ManyDomains, 1e-3);
         assert!(!found.passed() && found.faults[0].contains("times its a-priori bound"), "{:?}", found.faults);
-        let (found, _) = find(Kind::B, f32::NAN);
+        let (found, _) = find(WorkloadKind::ManyDomains, f32::NAN);
         assert!(found.faults[0].contains("not finite"), "{:?}", found.faults);
     }
 
     /// Validates an emulated deformer that computes by the deformation `does` but declares `says`, which gives its
     /// bounds.
-    fn emulate(does: Deformation, says: Deformation) -> Found {
-        let load = Kind::B.build(Size::Quick).expect("built");
-        let [done, said] = [does, says].map(|deformation| restated(&load.scene, deformation).expect("restated"));
-        let label = Label::new("emulated", Backend::Cpu, &said);
-        let (does, says) = (Ingredients::of(&done), Ingredients::of(&said));
-        let emulated = Emulated { label, scene: said, does, says, surface: Surface::default() };
+    fn emulate(does: DeformationSettings, says: DeformationSettings) -> ValidationResult {
+        let load = WorkloadKind::ManyDomains.build(Size::Quick).expect("built");
+        let [done, said] =
+            [does, says].map(|deformation| with_deformation(&load.scene, deformation).expect("restated"));
+        let label = VariantLabel::new("emulated", Backend::Cpu, &said);
+        let (does, says) = (ErrorModel::of(&done), ErrorModel::of(&said));
+        let emulated = Emulated { label, scene: said, does, says, surface: DeformedSurface::default() };
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
-        validate(&load, &Motion::new(&load, None), &mut variants, (3, usize::MAX)).0.remove(0)
+        validate(&load, &WorkloadMotion::new(&load, None), &mut variants, (3, usize::MAX)).0.remove(0)
     }
 
     #[test]
     fn approximate_deformers_meet_only_their_own_bounds() {
-        let storage = |storage| Deformation { storage, ..Deformation::default() };
-        let [half, brain, eighth] = [Storage::F16, Storage::Bf16, Storage::Int8].map(storage);
-        let short = Deformation { truncation: Some(1e-4), ..Deformation::default() };
-        for deformation in [half, brain, eighth, short, Deformation { truncation: Some(1e-4), ..eighth }] {
+        let storage = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
+        let [half, brain, eighth] = [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(storage);
+        let short = DeformationSettings { truncation: Some(1e-4), ..DeformationSettings::default() };
+        for deformation in [half, brain, eighth, short, DeformationSettings { truncation: Some(1e-4), ..eighth }] {
             let found = emulate(deformation, deformation);
             assert!(found.passed(), "{deformation:?}: {:?}", found.faults);
             assert!(found.errors.of_bound > 0.05, "{deformation:?} is judged by a bound of its size: {found:?}");
-            assert_eq!(found.sources.accumulation, Spread::default(), "{deformation:?}");
-            assert_eq!(found.sources.storage.largest > 0.0, deformation.storage != Storage::F32);
+            assert_eq!(found.sources.accumulation, ErrorNorms::default(), "{deformation:?}");
+            assert_eq!(found.sources.storage.largest > 0.0, deformation.storage != StorageType::F32);
             assert_eq!(found.sources.truncation.largest > 0.0, deformation.truncation.is_some());
-            assert!(!emulate(deformation, Deformation::default()).passed(), "{deformation:?} is not exact");
+            assert!(!emulate(deformation, DeformationSettings::default()).passed(), "{deformation:?} is not exact");
         }
         assert!(!emulate(eighth, half).passed() && !emulate(brain, half).passed(), "coarser than it says");
     }

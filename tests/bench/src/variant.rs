@@ -2,24 +2,24 @@
 
 use std::sync::Arc;
 
-use super::ingredients::Ingredients;
-use super::timing::{Cache, Timing};
-use super::traffic::{self, Part};
-use crate::kernels::KernelFacts;
-use modalcast_model::deform::{Backend, Deformer, Surface};
+use super::error_model::ErrorModel;
+use super::memory_traffic::{self, Operand};
+use super::timing::{CacheState, Timing};
+use crate::kernels::KernelAttributes;
+use modalcast_model::deform::{Backend, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Deformation, Scene, State};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState};
 
 /// Identity of a variant.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Label {
+pub struct VariantLabel {
     /// Unique among the variants of a load.
     pub name: String,
     pub backend: Backend,
-    pub deformation: Deformation,
+    pub deformation: DeformationSettings,
 }
 
-impl Label {
+impl VariantLabel {
     /// The label of a variant that uses this scene's deformation.
     pub fn new(name: impl Into<String>, backend: Backend, scene: &Scene) -> Self {
         Self { name: name.into(), backend, deformation: scene.deformation }
@@ -29,23 +29,23 @@ impl Label {
 /// A way to deform one scene. It owns all data that it needs of the scene.
 pub trait Variant {
     /// Name, backend and deformation.
-    fn label(&self) -> &Label;
+    fn label(&self) -> &VariantLabel;
 
     /// The scene with this variant's deformation, which defines the correct normals.
     fn scene(&self) -> &Arc<Scene>;
 
     /// The error model: what the variant replaces in x = T (x0 + U q). It gives the a-priori bound.
-    fn ingredients(&self) -> &Ingredients;
+    fn ingredients(&self) -> &ErrorModel;
 
     /// The minimum of bytes that a step moves, by part.
-    fn traffic(&self) -> Vec<Part>;
+    fn traffic(&self) -> Vec<Operand>;
 
     /// Receives all states that [`Self::surface`] will be called with.
     ///
     /// # Errors
     /// `Fault` when the device fails; `Unavailable` when something that the variant needs is missing; other errors of
     /// its construction.
-    fn prepare(&mut self, _states: &[State]) -> Result<()> {
+    fn prepare(&mut self, _states: &[SceneState]) -> Result<()> {
         Ok(())
     }
 
@@ -54,42 +54,47 @@ pub trait Variant {
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    fn surface(&mut self, at: usize, state: &State) -> Result<&Surface>;
+    fn surface(&mut self, at: usize, state: &SceneState) -> Result<&DeformedSurface>;
 
     /// Times steps over rotating states; `None` when the variant cannot be timed with this cache.
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    fn time(&mut self, states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>>;
+    fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>>;
 
     /// Kernel launches per step, and the driver's facts about each kernel; 0 and none on the CPU.
-    fn kernels(&self) -> (usize, Vec<KernelFacts>) {
+    fn kernels(&self) -> (usize, Vec<KernelAttributes>) {
         (0, Vec::new())
     }
 }
 
 /// A deformer of the server as a variant, timed by the wall clock from call to return.
-pub struct Driven {
-    label: Label,
+pub struct DeformerVariant {
+    label: VariantLabel,
     scene: Arc<Scene>,
-    ingredients: Ingredients,
+    ingredients: ErrorModel,
     deformer: Box<dyn Deformer>,
 }
 
-impl Driven {
+impl DeformerVariant {
     /// Wraps a deformer of this scene.
-    pub fn new(label: Label, scene: &Arc<Scene>, deformer: Box<dyn Deformer>) -> Self {
-        Self::sharing(label, scene, Ingredients::of(scene), deformer)
+    pub fn new(label: VariantLabel, scene: &Arc<Scene>, deformer: Box<dyn Deformer>) -> Self {
+        Self::sharing(label, scene, ErrorModel::of(scene), deformer)
     }
 
     /// The same, with an existing error model.
-    pub fn sharing(label: Label, scene: &Arc<Scene>, ingredients: Ingredients, deformer: Box<dyn Deformer>) -> Self {
+    pub fn sharing(
+        label: VariantLabel,
+        scene: &Arc<Scene>,
+        ingredients: ErrorModel,
+        deformer: Box<dyn Deformer>,
+    ) -> Self {
         Self { label, scene: Arc::clone(scene), ingredients, deformer }
     }
 }
 
-impl Variant for Driven {
-    fn label(&self) -> &Label {
+impl Variant for DeformerVariant {
+    fn label(&self) -> &VariantLabel {
         &self.label
     }
 
@@ -97,23 +102,23 @@ impl Variant for Driven {
         &self.scene
     }
 
-    fn ingredients(&self) -> &Ingredients {
+    fn ingredients(&self) -> &ErrorModel {
         &self.ingredients
     }
 
-    fn traffic(&self) -> Vec<Part> {
-        traffic::of_scene(&self.scene)
+    fn traffic(&self) -> Vec<Operand> {
+        memory_traffic::of_scene(&self.scene)
     }
 
-    fn surface(&mut self, _at: usize, state: &State) -> Result<&Surface> {
+    fn surface(&mut self, _at: usize, state: &SceneState) -> Result<&DeformedSurface> {
         self.ingredients.follow(state);
         self.deformer.deform(state)?;
         self.deformer.surface()
     }
 
-    fn time(&mut self, states: &[State], cache: Cache, replays: usize) -> Result<Option<Timing>> {
+    fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
         // The cold sweep evicts the caches of the CPU, not those of a device.
-        if cache == Cache::Cold && self.label.backend == Backend::Cuda {
+        if cache == CacheState::Cold && self.label.backend == Backend::Cuda {
             return Ok(None);
         }
         let deformer = &mut self.deformer;

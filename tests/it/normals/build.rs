@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_model::deform::{Deformer, Surface};
+use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::domain::{
     Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals,
 };
-use modalcast_model::scene::{Normals, Parts, Scene, State};
+use modalcast_model::scene::{NormalMethod, Scene, SceneParts, SceneState};
 use nalgebra::{Matrix3, Vector3};
 
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
@@ -26,7 +26,7 @@ pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
     let rest: Vec<_> = places.clone().map(|(x, y)| [x, y, 0.0]).collect();
     let uvs = places.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
     let normals = vec![UP; rest.len()];
-    Mesh::indexed(rest, normals, uvs, quads(columns, rows)).expect("a sheet")
+    Mesh::from_indexed(rest, normals, uvs, quads(columns, rows)).expect("a sheet")
 }
 
 /// Two triangles per cell of a grid, all split along the same diagonal.
@@ -89,7 +89,7 @@ pub(crate) fn sphere(level: u32) -> Mesh {
     let triangles: Vec<_> = triangles.into_iter().map(|triangle| triangle.map(&mut number)).collect();
     let vertices: Vec<u32> = (0..rest.len() as u32).collect();
     let normals = smooth_normals(&rest, &vertices, &triangles);
-    Mesh::indexed(rest, normals, vec![], triangles).expect("a sphere")
+    Mesh::from_indexed(rest, normals, vec![], triangles).expect("a sphere")
 }
 
 fn octants() -> Vec<[Vector3<f64>; 3]> {
@@ -103,11 +103,11 @@ fn octants() -> Vec<[Vector3<f64>; 3]> {
 
 /// A scene of shapes with exact normals; shapes with texture coordinates have a normal map.
 pub(crate) fn scene(shapes: Vec<Shape>) -> Arc<Scene> {
-    scene_with(shapes, Normals::Exact)
+    scene_with(shapes, NormalMethod::Exact)
 }
 
-pub(crate) fn scene_with(shapes: Vec<Shape>, normals: Normals) -> Arc<Scene> {
-    let mut parts = Parts::named("bent");
+pub(crate) fn scene_with(shapes: Vec<Shape>, normals: NormalMethod) -> Arc<Scene> {
+    let mut parts = SceneParts::named("bent");
     parts.deformation.normals = normals;
     parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
     parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
@@ -124,7 +124,7 @@ fn domain(shape: usize) -> Domain {
         placement: Transform::IDENTITY,
         attachment: None,
         follows: None,
-        runs: vec![],
+        material_ranges: vec![],
         rest_q: vec![],
         shares_q_with: None,
         metadata: Metadata::default(),
@@ -132,27 +132,27 @@ fn domain(shape: usize) -> Domain {
 }
 
 /// A state in which every coordinate is q and every transform has the given linear part and translation.
-pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> State {
-    let mut state = State::rest(scene);
+pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> SceneState {
+    let mut state = SceneState::rest(scene);
     state.q.fill(q);
     state.transforms.fill(Transform::from_parts(&linear, &translation.into()));
     state
 }
 
 /// The rest state with every coordinate set to q.
-pub(crate) fn bent(scene: &Scene, q: f32) -> State {
+pub(crate) fn bent(scene: &Scene, q: f32) -> SceneState {
     state(scene, q, Matrix3::identity(), [0.0; 3])
 }
 
 /// The surface that the CPU deformer computes for a state.
-pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &State) -> Surface {
+pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &SceneState) -> DeformedSurface {
     let mut cpu = CpuDeformer::new(scene);
     cpu.deform(state).expect("deforms");
     cpu.surface().expect("a surface").clone()
 }
 
 /// Exact normals and tangents of the reference.
-pub(crate) fn exact(scene: &Scene, state: &State) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
+pub(crate) fn exact(scene: &Scene, state: &SceneState) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
     let positions = modalcast_compute::reference::deform(scene, state);
     let tangents = modalcast_compute::reference::exact_tangents(scene, state, &positions);
     (modalcast_compute::reference::exact_normals(scene, state, &positions), tangents)

@@ -45,8 +45,8 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
         for linear in linear_parts() {
             let state = state(&scene, 1.0, linear, [0.0; 3]);
             let (normals, tangents) = exact(&scene, &state);
-            assert_eq!(normals, reference::orient_normals(&scene, &state));
-            assert_eq!(tangents, reference::orient_tangents(&scene, &state));
+            assert_eq!(normals, reference::rigid_normals(&scene, &state));
+            assert_eq!(tangents, reference::rigid_tangents(&scene, &state));
             let cpu = on_cpu(&scene, &state);
             assert!(largest_angle(&cpu.normals, &normals) < TOLERANCE);
             assert!(cpu.tangents.iter().all(|number| number.is_finite()));
@@ -71,7 +71,7 @@ fn zero_area_triangles_do_not_change_normals() {
     let of = |triangles: Vec<[u32; 3]>| {
         let corners = corners.clone();
         let mesh =
-            modalcast_model::domain::Mesh::indexed(mesh.rest().to_vec(), corners.normals, corners.uvs, triangles);
+            modalcast_model::domain::Mesh::from_indexed(mesh.rest().to_vec(), corners.normals, corners.uvs, triangles);
         scene(vec![with_mode(mesh.expect("a sheet"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
     let (dirty, clean) = (of(triangles), of(clean));
@@ -116,7 +116,7 @@ fn normals_far_from_the_origin_stay_within_their_bound() {
             let state = state(&scene, 0.3, linear * size, far);
             let positions = reference::deform(&scene, &state);
             let (normals, _) = exact(&scene, &state);
-            let rigid = reference::orient_normals(&scene, &state);
+            let rigid = reference::rigid_normals(&scene, &state);
             let cpu = on_cpu(&scene, &state).normals;
             assert_eq!(normals != rigid, follows, "size {size}");
             if follows {

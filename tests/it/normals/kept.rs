@@ -1,12 +1,12 @@
 //! Exact normals of unchanged domains are reused between steps and equal those of a fresh deformer.
 
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_model::deform::{Deformer, Surface};
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::deform::{DeformedSurface, Deformer};
+use modalcast_model::scene::{Scene, SceneState};
 
 use super::build::{cube, scene, sheet, sphere, state, tube, with_mode};
 use super::linear_parts;
-use crate::deformers::Noise;
+use crate::deformers::TestRng;
 
 /// A displacement that bends and shears.
 fn wave([x, y, z]: [f32; 3]) -> [f32; 3] {
@@ -18,18 +18,18 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
 }
 
 /// Positions, normals and tangents of a surface as bits.
-fn all(surface: &Surface) -> [Vec<u32>; 3] {
+fn all(surface: &DeformedSurface) -> [Vec<u32>; 3] {
     [&surface.positions, &surface.normals, &surface.tangents].map(|numbers| bits(numbers))
 }
 
 /// Normals of one domain as bits.
-fn normals_of(scene: &Scene, surface: &Surface, domain: usize) -> Vec<u32> {
+fn normals_of(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u32> {
     let slot = scene.layout.slots[domain];
     bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
 }
 
 /// Changes q of some domains, their transforms, or both, depending on the step. Returns the changed domains.
-fn change(scene: &Scene, state: &mut State, step: usize, noise: &mut Noise) -> Vec<usize> {
+fn change(scene: &Scene, state: &mut SceneState, step: usize, noise: &mut TestRng) -> Vec<usize> {
     let domains = match step {
         0 => vec![3],
         1 => vec![1],
@@ -57,7 +57,7 @@ fn unchanged_domains_keep_their_normals() {
     let mut state = state(&scene, 0.4, linear_parts()[2], [1.0, 2.0, 3.0]);
     let mut kept = CpuDeformer::new(&scene);
     kept.deform(&state).expect("deforms");
-    let (mut noise, mut before) = (Noise(3), kept.surface().expect("one").clone());
+    let (mut noise, mut before) = (TestRng(3), kept.surface().expect("one").clone());
     for step in 0..5 {
         let changed = change(&scene, &mut state, step, &mut noise);
         kept.deform(&state).expect("deforms");

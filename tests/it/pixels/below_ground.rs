@@ -5,18 +5,18 @@ use std::sync::Arc;
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{Material, Transform};
-use modalcast_model::scene::{Camera, Ground, Rectangle, Scene, State, View};
-use modalcast_render::{Field, Hit, Shot};
+use modalcast_model::scene::{Camera, Ground, PixelRect, Scene, SceneState, View};
+use modalcast_render::{Aov, FrameParams, PickHit};
 use nalgebra::{Matrix4, Vector3};
 
-use super::build::{Stage, camera, facing, open};
+use super::harness::{SceneBuilder, camera, facing, open};
 
 /// Side of the picture in pixels.
 const SIZE: u32 = 64;
 
 /// A wall of 40 x 30 pixels on the ground.
 fn wall(samples: u32, ground: Option<Ground>) -> Arc<Scene> {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     (stage.0.look.ground, stage.0.look.samples) = (ground, samples);
     stage.add(facing(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).scene()
 }
@@ -27,30 +27,27 @@ fn from_above() -> Camera {
 }
 
 /// Words of an AOV and the hits of all pixels, with the wall lowered by half of its height.
-fn measure(scene: &Arc<Scene>, field: Field) -> (Vec<u32>, Vec<Hit>) {
-    let mut state = State::rest(scene);
+fn measure(scene: &Arc<Scene>, field: Aov) -> (Vec<u32>, Vec<PickHit>) {
+    let mut state = SceneState::rest(scene);
     state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&state).expect("deforms").bounds;
     let mut renderer = open();
     let mut buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    renderer.upload_values(&mut buffers, &[0.25, 0.5, 0.75, 1.0]).expect("uploads");
-    let shot = Shot { camera: from_above(), width: SIZE, height: SIZE, bounds, light: None };
-    let words = bytemuck::pod_collect_to_vec(&renderer.survey(&buffers, &shot, field).expect("surveys").bytes);
-    let whole = Rectangle::within([SIZE; 2], [0; 2], [SIZE; 2]).expect("inside");
+    renderer.upload_vertex_values(&mut buffers, &[0.25, 0.5, 0.75, 1.0]).expect("uploads");
+    let shot = FrameParams { camera: from_above(), width: SIZE, height: SIZE, bounds, light: None };
+    let words = bytemuck::pod_collect_to_vec(&renderer.render_aov(&buffers, &shot, field).expect("surveys").bytes);
+    let whole = PixelRect::within([SIZE; 2], [0; 2], [SIZE; 2]).expect("inside");
     let pick = renderer.begin_pick(&buffers, &shot, whole).expect("begins");
     (words, renderer.finish_pick(pick).expect("ends"))
 }
 
 #[test]
 fn measurements_below_the_ground_equal_those_without_ground() {
-    for (samples, field) in [
-        (1, Field::Domains),
-        (1, Field::Normals),
-        (1, Field::Values { largest: 1.0 }),
-        (4, Field::Values { largest: 1.0 }),
-    ] {
+    for (samples, field) in
+        [(1, Aov::Domains), (1, Aov::Normals), (1, Aov::Values { largest: 1.0 }), (4, Aov::Values { largest: 1.0 })]
+    {
         let [with, without] = [Some(Ground::default()), None].map(|ground| measure(&wall(samples, ground), field));
         assert_eq!(with, without, "{field:?}, {samples} samples");
         assert!(with.1.len() > 900, "{field:?}: {} pixels picked", with.1.len());
@@ -61,7 +58,7 @@ fn measurements_below_the_ground_equal_those_without_ground() {
 
 #[test]
 fn depth_includes_the_ground() {
-    let [with, without] = [Some(Ground::default()), None].map(|ground| measure(&wall(1, ground), Field::Depth).0);
+    let [with, without] = [Some(Ground::default()), None].map(|ground| measure(&wall(1, ground), Aov::Depth).0);
     let infinite = |words: &[u32]| words.iter().filter(|word| f32::from_bits(**word) == f32::INFINITY).count();
     assert!(infinite(&without) > infinite(&with) + 1000, "the ground is seen beside the wall");
     let nearer = with.iter().zip(&without).filter(|(with, without)| {

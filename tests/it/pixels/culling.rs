@@ -3,40 +3,40 @@
 
 use std::sync::{Arc, OnceLock};
 
-use modalcast_model::deform::Surface;
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{
-    Camera, Culling, Ground, Lens, Rectangle, Scene, Shadow, ShadowMethod, Transparency, View,
+    Camera, Culling, Ground, Lens, PixelRect, Scene, ShadowMethod, ShadowSettings, Transparency, View,
 };
-use modalcast_render::{Culled, Field, Ran, Renderer, SceneBuffers, Seen, Shot};
+use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Renderer, SceneBuffers, VisibilityId};
 
-use super::build::{Stage, camera, facing, open};
+use super::harness::{SceneBuilder, camera, facing, open};
 
-const ALL: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Depth];
+const ALL: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Occlusion];
 const SIZE: u32 = 96;
 
 /// One frame: its pixels, the visibility of its samples, and its statistics.
 struct Frame {
     rgba: Vec<u8>,
-    seen: Vec<Seen>,
-    ran: Ran,
+    seen: Vec<VisibilityId>,
+    stats: FrameStats,
 }
 
 impl Frame {
-    fn culled(&self) -> Culled {
-        self.ran.culled.expect("a culled frame")
+    fn culled(&self) -> FrameCullStats {
+        self.stats.culled.expect("a culled frame")
     }
 }
 
 /// A scene with one culling mode, and its renderer.
-struct Show {
+struct CullHarness {
     renderer: Renderer,
     buffers: SceneBuffers,
     scene: Arc<Scene>,
 }
 
-impl Show {
-    fn new(mut stage: Stage, culling: Culling) -> Self {
+impl CullHarness {
+    fn new(mut stage: SceneBuilder, culling: Culling) -> Self {
         stage.0.look.culling = culling;
         let (scene, mut renderer) = (stage.scene(), open());
         let buffers = renderer.load(&scene).expect("loads");
@@ -47,7 +47,7 @@ impl Show {
 
     /// Moves every vertex to a function of its rest position.
     fn place(&mut self, to: impl Fn([f32; 3]) -> [f32; 3]) {
-        let mut surface = Surface::default();
+        let mut surface = DeformedSurface::default();
         for domain in &self.scene.domains {
             let mesh = &self.scene.shapes[domain.shape].mesh;
             surface.positions.extend(mesh.rest().iter().flat_map(|point| to(*point)));
@@ -57,10 +57,10 @@ impl Show {
     }
 
     fn frame(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
-        let shot = Shot { camera, width, height, bounds: self.scene.rest_bounds, light: None };
+        let shot = FrameParams { camera, width, height, bounds: self.scene.rest_bounds, light: None };
         let rgba = self.renderer.draw(&self.buffers, &shot).expect("draws").rgba;
-        let ran = self.renderer.ran().clone();
-        Frame { rgba, seen: self.renderer.seen().expect("ids"), ran }
+        let stats = self.renderer.stats().clone();
+        Frame { rgba, seen: self.renderer.read_visibility().expect("ids"), stats }
     }
 }
 
@@ -75,7 +75,7 @@ fn loose(triangles: &[[[f32; 3]; 3]]) -> Mesh {
     let count = rest.len() as u32;
     let uvs = (0..count).map(|corner| [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]][corner as usize % 3]).collect();
     let indices = (0..count / 3).map(|first| [3 * first, 3 * first + 1, 3 * first + 2]).collect();
-    Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("triangles")
+    Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("triangles")
 }
 
 /// Triangles of many sizes around the origin; some have no area.
@@ -93,8 +93,8 @@ fn soup(seed: u64, count: usize, spread: f32) -> Mesh {
     loose(&triangles)
 }
 
-fn material(alpha_mode: AlphaMode, double_sided: bool, colour: [f32; 3]) -> Material {
-    Material { alpha_mode, double_sided, diffuse: colour, ambient: colour, ..Material::default() }
+fn material(alpha_mode: AlphaMode, double_sided: bool, color: [f32; 3]) -> Material {
+    Material { alpha_mode, double_sided, diffuse: color, ambient: color, ..Material::default() }
 }
 
 /// Whether the OpenGL driver is a software renderer.
@@ -104,18 +104,18 @@ fn is_software() -> bool {
 }
 
 /// Every kind of material, single-sided and double-sided. The opaque triangles exist twice, so depths tie.
-fn mixed(samples: u32, transparency: Transparency) -> Stage {
-    let mut stage = Stage::new();
+fn mixed(samples: u32, transparency: Transparency) -> SceneBuilder {
+    let mut stage = SceneBuilder::new();
     (stage.0.look.samples, stage.0.look.transparency) = (samples, transparency);
     stage.0.look.ground = Some(Ground::default());
-    stage.0.look.shadow = Some(Shadow { size: 256, ..Shadow::default() });
+    stage.0.look.shadow = Some(ShadowSettings { size: 256, ..ShadowSettings::default() });
     let leaf = stage.texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
     let mask = AlphaMode::Mask { cutoff: 0.5 };
     for (seed, double_sided) in [(1, false), (2, true)] {
         // With several samples, a software renderer reads cut-out images at centroids that depend on hidden triangles;
-        // see `Culling::Depth`.
+        // see `Culling::Occlusion`.
         let image = (samples == 1 || !is_software()).then_some(leaf);
-        let leaves = Material { colour_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
+        let leaves = Material { color_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
         stage = stage
             .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
@@ -127,15 +127,15 @@ fn mixed(samples: u32, transparency: Transparency) -> Stage {
     stage
 }
 
-/// Frames of all culling modes, which must be identical. Returns those with [`Culling::Depth`].
-fn same(stage: &dyn Fn() -> Stage, frames: &dyn Fn(&mut Show) -> Vec<Frame>) -> Vec<Frame> {
-    let [none, triangles, depth] = ALL.map(|culling| frames(&mut Show::new(stage(), culling)));
+/// Frames of all culling modes, which must be identical. Returns those with [`Culling::Occlusion`].
+fn assert_same_frames(stage: &dyn Fn() -> SceneBuilder, frames: &dyn Fn(&mut CullHarness) -> Vec<Frame>) -> Vec<Frame> {
+    let [none, triangles, depth] = ALL.map(|culling| frames(&mut CullHarness::new(stage(), culling)));
     for (index, plain) in none.iter().enumerate() {
-        assert!(plain.ran.culled.is_none(), "control: nothing is culled");
+        assert!(plain.stats.culled.is_none(), "control: nothing is culled");
         for culled in [&triangles[index], &depth[index]] {
             assert!(culled.seen == plain.seen, "frame {index}: other triangles are seen");
             assert!(culled.rgba == plain.rgba, "frame {index}: other colours");
-            assert!(culled.ran.lists == plain.ran.lists, "frame {index}: other lists");
+            assert!(culled.stats.oit == plain.stats.oit, "frame {index}: other lists");
         }
     }
     depth
@@ -153,19 +153,21 @@ const CAMERAS: [([f64; 3], [f64; 3]); 5] = [
 /// Every triangle has exactly one verdict: listed, or culled for one reason.
 #[test]
 fn culled_frames_are_bit_identical_after_camera_moves() {
-    for (samples, transparency) in [(1, Transparency::Exact), (4, Transparency::Exact), (4, Transparency::TwoPass)] {
-        let frames = same(&|| mixed(samples, transparency), &|show| {
+    for (samples, transparency) in
+        [(1, Transparency::OrderIndependent), (4, Transparency::OrderIndependent), (4, Transparency::TwoPass)]
+    {
+        let frames = assert_same_frames(&|| mixed(samples, transparency), &|show| {
             let there = CAMERAS.into_iter().chain([CAMERAS[0]]);
             there.map(|(eye, target)| show.frame(at(eye, target), [SIZE, SIZE])).collect()
         });
         let camera: Vec<_> = frames.iter().map(|frame| frame.culled().camera).collect();
-        assert_eq!(camera[0].hidden, 0, "nothing is remembered yet");
-        assert!(camera[1].hidden > 100, "{camera:?}");
-        assert!(camera.iter().all(|sifted| sifted.listed > 0 && sifted.no_sample > 50), "{camera:?}");
-        assert!(camera[0].facing > 100 && camera[3].outside > 500, "{camera:?}");
+        assert_eq!(camera[0].occluded, 0, "nothing is remembered yet");
+        assert!(camera[1].occluded > 100, "{camera:?}");
+        assert!(camera.iter().all(|sifted| sifted.visible > 0 && sifted.no_sample > 50), "{camera:?}");
+        assert!(camera[0].back_facing > 100 && camera[3].outside_view > 500, "{camera:?}");
         assert!(frames[0].rgba == frames[5].rgba, "the same camera again");
-        let all = camera[0].listed + camera[0].left_out();
-        assert!(camera.iter().all(|sifted| sifted.listed + sifted.left_out() == all), "each has one verdict");
+        let all = camera[0].visible + camera[0].culled();
+        assert!(camera.iter().all(|sifted| sifted.visible + sifted.culled() == all), "each has one verdict");
         assert_eq!(all as usize, 2 * (700 + 400 + 60 + 700));
     }
 }
@@ -174,7 +176,7 @@ fn culled_frames_are_bit_identical_after_camera_moves() {
 #[test]
 fn long_triangle_lists_keep_their_order() {
     let field = || {
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.samples = 1;
         let mask = AlphaMode::Mask { cutoff: 0.5 };
         stage
@@ -182,12 +184,12 @@ fn long_triangle_lists_keep_their_order() {
             .add(soup(7, 20_000, 4.0), material(AlphaMode::Opaque, true, [0.2, 0.3, 0.9]))
             .add(soup(8, 17_000, 4.0), material(mask, true, [0.3, 0.8, 0.2]))
     };
-    let frames = same(&field, &|show| {
+    let frames = assert_same_frames(&field, &|show| {
         [0.0, 0.1, 0.2].map(|x| show.frame(at([x, 1.0, 14.0], [x, 0.0, 0.0]), [SIZE, SIZE])).into()
     });
     let camera = frames[2].culled().camera;
-    assert_eq!(camera.listed + camera.left_out(), 82_000);
-    assert!(camera.hidden > 10_000 && camera.listed < 40_000, "{camera:?}");
+    assert_eq!(camera.visible + camera.culled(), 82_000);
+    assert!(camera.occluded > 10_000 && camera.visible < 40_000, "{camera:?}");
 }
 
 #[test]
@@ -198,7 +200,7 @@ fn culled_frames_of_moving_scenes_are_bit_identical() {
             [x * cos - z * sin, y + 0.3 * (x + step as f32).sin(), x * sin + z * cos]
         }
     };
-    same(&|| mixed(4, Transparency::Exact), &|show| {
+    assert_same_frames(&|| mixed(4, Transparency::OrderIndependent), &|show| {
         let mut frames = Vec::new();
         for step in 0..5 {
             show.place(moved(step));
@@ -213,7 +215,7 @@ fn culling_handles_non_finite_and_huge_positions() {
     let spoil = |what: f32, every: u32| {
         move |[x, y, z]: [f32; 3]| if (x.to_bits() / 8).is_multiple_of(every) { [x, what, z] } else { [x, y, z] }
     };
-    same(&|| mixed(4, Transparency::Exact), &|show| {
+    assert_same_frames(&|| mixed(4, Transparency::OrderIndependent), &|show| {
         let mut frames = Vec::new();
         for what in [f32::NAN, f32::INFINITY, 3e38, -1e30, 1e19, 1e6] {
             for every in [1, 3] {
@@ -228,7 +230,7 @@ fn culling_handles_non_finite_and_huge_positions() {
 #[test]
 fn culling_handles_far_scenes_and_extreme_clip_planes() {
     for (shift, near, far) in [(1e4, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
-        same(&|| mixed(4, Transparency::Exact), &|show| {
+        assert_same_frames(&|| mixed(4, Transparency::OrderIndependent), &|show| {
             show.place(|[x, y, z]| [x + shift as f32, y, z]);
             let camera = Camera { near, far, ..at([shift, 1.0, 9.0], [shift, 0.0, 0.0]) };
             (0..3).map(|_| show.frame(camera, [SIZE, SIZE])).collect()
@@ -242,27 +244,28 @@ fn culling_keeps_huge_triangles_and_single_ones() {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
         let crossing = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
         let mesh = loose(&[wall(-2.0), wall(-2.5), crossing, [[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, 1e9, 0.0]]]);
-        Stage::new().add(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
+        SceneBuilder::new().add(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
     };
-    let one =
-        || Stage::new().add(loose(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]), Material::default());
-    for stage in [&huge as &dyn Fn() -> Stage, &one] {
-        let frames = same(stage, &|show| {
+    let one = || {
+        SceneBuilder::new().add(loose(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]), Material::default())
+    };
+    for stage in [&huge as &dyn Fn() -> SceneBuilder, &one] {
+        let frames = assert_same_frames(stage, &|show| {
             let camera = Camera { near: 0.01, far: 1e3, ..camera(64) };
             (0..3).map(|_| show.frame(camera, [64, 64])).collect()
         });
-        assert!(frames[2].seen.iter().any(|seen| matches!(seen, Seen::Triangle(_))));
+        assert!(frames[2].seen.iter().any(|seen| matches!(seen, VisibilityId::Triangle(_))));
     }
 }
 
 /// A square in front of a grid of 32 x 32 small triangles; it hides half of them.
-fn curtain(culling: Culling) -> Stage {
+fn curtain(culling: Culling) -> SceneBuilder {
     let small = |index: usize| {
         let (x, y) = ((index % 32) as f32 * 0.25 - 4.0, (index / 32) as f32 * 0.25 - 4.0);
         [[x + 0.02, y + 0.02, -1.0], [x + 0.22, y + 0.02, -1.0], [x + 0.02, y + 0.22, -1.0]]
     };
     let grid: Vec<_> = (0..32 * 32).map(small).collect();
-    let mut stage = Stage::new()
+    let mut stage = SceneBuilder::new()
         .add(loose(&grid), material(AlphaMode::Opaque, true, [0.9, 0.2, 0.1]))
         .add(facing(-4.5, -4.5, 0.0, 4.5, 0.0), material(AlphaMode::Opaque, false, [0.1, 0.2, 0.9]));
     (stage.0.look.samples, stage.0.look.culling) = (1, culling);
@@ -271,21 +274,21 @@ fn curtain(culling: Culling) -> Stage {
 
 #[test]
 fn hidden_count_equals_triangles_behind_the_square() {
-    let mut show = Show::new(curtain(Culling::Depth), Culling::Depth);
+    let mut show = CullHarness::new(curtain(Culling::Occlusion), Culling::Occlusion);
     let first = show.frame(camera(128), [128, 128]).culled().camera;
-    assert_eq!((first.hidden, first.listed), (0, 1024 + 2));
+    assert_eq!((first.occluded, first.visible), (0, 1024 + 2));
     let second = show.frame(camera(128), [128, 128]).culled().camera;
     // The grid is a tenth farther from the eye than the square, which hides everything left of x = 0. The column next
     // to its edge shares a pixel with visible triangles.
-    assert_eq!((second.outside, second.facing, second.no_sample), (0, 0, 0));
-    assert!((15 * 32..=16 * 32).contains(&second.hidden), "{second:?}");
-    assert_eq!(second.listed + second.hidden, 1024 + 2);
+    assert_eq!((second.outside_view, second.back_facing, second.no_sample), (0, 0, 0));
+    assert!((15 * 32..=16 * 32).contains(&second.occluded), "{second:?}");
+    assert_eq!(second.visible + second.occluded, 1024 + 2);
     // From behind, nothing is hidden, and the square faces away.
     let behind = show.frame(at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
-    assert_eq!((behind.facing, behind.hidden), (2, 0));
+    assert_eq!((behind.back_facing, behind.occluded), (2, 0));
     // A camera that looks away: everything is outside of the frustum.
     let aside = show.frame(at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
-    assert_eq!((aside.outside, aside.listed), (1026, 0));
+    assert_eq!((aside.outside_view, aside.visible), (1026, 0));
 }
 
 /// A triangle between the samples is culled; a triangle of the same size that contains a sample is drawn.
@@ -294,28 +297,29 @@ fn triangles_without_a_sample_are_culled() {
     let dot = |x: f32, y: f32| [[x, y, 0.0], [x + 0.002, y, 0.0], [x, y + 0.002, 0.0]];
     // Ten pixels per unit: pixel centers lie at 0.05 + 0.1 i. The second triangle contains one, the first none.
     let mesh = loose(&[dot(0.0, 0.0), dot(0.0492, 0.0492)]);
-    let mut stage = Stage::new().add(mesh, Material::default());
+    let mut stage = SceneBuilder::new().add(mesh, Material::default());
     stage.0.look.samples = 1;
-    let frame = Show::new(stage, Culling::Triangles).frame(camera(64), [64, 64]);
+    let frame = CullHarness::new(stage, Culling::Triangles).frame(camera(64), [64, 64]);
     let camera = frame.culled().camera;
-    assert_eq!((camera.no_sample, camera.listed), (1, 1), "{camera:?}");
-    assert_eq!(frame.seen.iter().filter(|seen| **seen == Seen::Triangle(1)).count(), 1, "control: it is seen");
+    assert_eq!((camera.no_sample, camera.visible), (1, 1), "{camera:?}");
+    assert_eq!(frame.seen.iter().filter(|seen| **seen == VisibilityId::Triangle(1)).count(), 1, "control: it is seen");
 }
 
 #[test]
 fn shadows_of_culled_casters_are_bit_identical() {
     for (method, splits) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
         let stage = || {
-            let mut stage = mixed(1, Transparency::Exact);
+            let mut stage = mixed(1, Transparency::OrderIndependent);
             stage.0.look.sun = [0.3, 0.8, 0.4];
-            stage.0.look.shadow = Some(Shadow { size: 128, method, splits, ..Shadow::default() });
+            stage.0.look.shadow = Some(ShadowSettings { size: 128, method, splits, ..ShadowSettings::default() });
             stage
         };
-        let frames =
-            same(&stage, &|show| (0..2).map(|_| show.frame(at([0.0, 4.0, 12.0], [0.0; 3]), [SIZE, SIZE])).collect());
-        let sun = frames[0].culled().sun;
-        assert!(sun.no_sample > 100 * splits && sun.facing == 0 && sun.hidden == 0, "{sun:?}");
-        assert_eq!(sun.listed + sun.left_out(), splits * 2 * (700 + 400 + 60 + 700));
+        let frames = assert_same_frames(&stage, &|show| {
+            (0..2).map(|_| show.frame(at([0.0, 4.0, 12.0], [0.0; 3]), [SIZE, SIZE])).collect()
+        });
+        let sun = frames[0].culled().shadow;
+        assert!(sun.no_sample > 100 * splits && sun.back_facing == 0 && sun.occluded == 0, "{sun:?}");
+        assert_eq!(sun.visible + sun.culled(), splits * 2 * (700 + 400 + 60 + 700));
     }
 }
 
@@ -328,12 +332,12 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
         (1, AlphaMode::Mask { cutoff: 0.5 }, false),
         (4, AlphaMode::Opaque, false),
     ] {
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.samples = samples;
         let image = Some(stage.texture(1, 1, |_, _| [255; 4]));
-        let paint = Material { colour_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
-        let mut show = Show::new(stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), paint), Culling::Depth);
-        let hides = show.frame(camera(64), [64, 64]).ran.passes.contains(&"occluders");
+        let paint = Material { color_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
+        let mut show = CullHarness::new(stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), paint), Culling::Occlusion);
+        let hides = show.frame(camera(64), [64, 64]).stats.passes.contains(&"occluders");
         assert_eq!(hides, !(falls && show.renderer.info().software));
     }
 }
@@ -341,18 +345,18 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
 #[test]
 fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
     let shown = ALL.map(|culling| {
-        let mut show = Show::new(mixed(4, Transparency::Exact), culling);
+        let mut show = CullHarness::new(mixed(4, Transparency::OrderIndependent), culling);
         let camera = at([0.0, 1.0, 9.0], [0.0; 3]);
-        let shot = Shot { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds, light: None };
+        let shot = FrameParams { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds, light: None };
         show.frame(camera, [SIZE, SIZE]);
-        let rectangle = Rectangle::within([SIZE; 2], [40; 2], [8; 2]).expect("inside");
+        let rectangle = PixelRect::within([SIZE; 2], [40; 2], [8; 2]).expect("inside");
         let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("picks");
         let hits = show.renderer.finish_pick(pick).expect("hits");
-        let depth = show.renderer.survey(&show.buffers, &shot, Field::Depth).expect("surveys").bytes;
+        let depth = show.renderer.render_aov(&show.buffers, &shot, Aov::Depth).expect("surveys").bytes;
         // Rebased positions: everything is shifted and has an origin of its own.
         let rest = show.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
         let aside: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
-        show.renderer.upload_apart(&mut show.buffers, &aside, [0.25, 0.0, 0.0]).expect("uploads");
+        show.renderer.upload_rebased(&mut show.buffers, &aside, [0.25, 0.0, 0.0]).expect("uploads");
         let apart = [show.frame(camera, [SIZE, SIZE]), show.frame(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
         (hits, depth, apart)
     });
@@ -363,19 +367,21 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
 /// A small scene with the default culling allocates no culling buffers.
 #[test]
 fn culled_draw_calls_do_not_grow_with_domains() {
-    let plain = Show::new(curtain(Culling::Fitting), Culling::Fitting);
-    assert!(plain.buffers.allocated().iter().all(|part| !part.name.contains("cull") && !part.name.contains("listed")));
-    let draws = |domains: usize| {
-        let mut stage = Stage::new();
+    let plain = CullHarness::new(curtain(Culling::Auto), Culling::Auto);
+    assert!(
+        plain.buffers.allocations().iter().all(|part| !part.name.contains("cull") && !part.name.contains("visible"))
+    );
+    let draw_calls = |domains: usize| {
+        let mut stage = SceneBuilder::new();
         for index in 0..domains {
             stage =
                 stage.add(facing(-1.0, -1.0, 1.0, 1.0, -(index as f32)), material(AlphaMode::Opaque, true, [0.5; 3]));
         }
-        let mut show = Show::new(stage, Culling::Depth);
+        let mut show = CullHarness::new(stage, Culling::Occlusion);
         let frame = show.frame(camera(64), [64, 64]);
-        assert_eq!(frame.ran.passes, show.buffers.plan().passes);
-        assert_eq!(frame.ran.draws, show.buffers.plan().draws);
-        frame.ran.draws
+        assert_eq!(frame.stats.passes, show.buffers.plan().passes);
+        assert_eq!(frame.stats.draw_calls, show.buffers.plan().draw_calls);
+        frame.stats.draw_calls
     };
-    assert_eq!((draws(1), draws(40)), (2, 2));
+    assert_eq!((draw_calls(1), draw_calls(40)), (2, 2));
 }

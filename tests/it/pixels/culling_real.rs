@@ -5,27 +5,29 @@ use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
-use modalcast_model::scene::{Camera, Culling, Look, Parts, Scene, Shadow, State, Transparency};
-use modalcast_render::{Culled, Renderer, Shot};
+use modalcast_model::scene::{
+    Camera, Culling, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, Transparency,
+};
+use modalcast_render::{FrameCullStats, FrameParams, Renderer};
 
-use super::build::open;
+use super::harness::open;
 
 const SIZE: [u32; 2] = [1920, 1080];
 const FRAMES: usize = 9;
 
 /// The same scene with another look.
-fn under(scene: &Scene, look: Look) -> Arc<Scene> {
-    Scene::new(Parts { look, ..scene.parts() }).expect("a good scene")
+fn under(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
+    Scene::new(SceneParts { look, ..scene.parts() }).expect("a good scene")
 }
 
 /// The picture, the median times of some passes in milliseconds, and the culling statistics.
-fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<Culled>) {
+fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<FrameCullStats>) {
     let mut deformer = ReferenceDeformer::new(scene);
-    let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let bounds = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let camera = Camera::framing(scene, SIZE[0], SIZE[1]);
-    let shot = Shot { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
+    let camera = Camera::fit_to_scene(scene, SIZE[0], SIZE[1]);
+    let shot = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
     let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("draws")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "frames differ");
     let median = |name: &'static str| {
@@ -35,7 +37,7 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
         (name, all[all.len() / 2])
     };
     let passes = ["shadow", "blur", "cull", "visibility", "blended", "draw"].map(median).to_vec();
-    let culled = renderer.ran().culled;
+    let culled = renderer.stats().culled;
     renderer.unload(buffers);
     (images[0].rgba.clone(), passes, culled)
 }
@@ -46,14 +48,18 @@ fn real_almond_with_culling_is_the_same_picture() {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
     let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond");
     let mut renderer = open();
-    for transparency in [Transparency::Exact, Transparency::TwoPass] {
-        let look = Look { transparency, shadow: Some(Shadow { size: 2048, ..Shadow::default() }), ..scene.look };
+    for transparency in [Transparency::OrderIndependent, Transparency::TwoPass] {
+        let look = RenderSettings {
+            transparency,
+            shadow: Some(ShadowSettings { size: 2048, ..ShadowSettings::default() }),
+            ..scene.look
+        };
         let mut plain = None;
-        for culling in [Culling::None, Culling::Triangles, Culling::Depth] {
-            let (rgba, passes, culled) = frames(&mut renderer, &under(&scene, Look { culling, ..look }));
+        for culling in [Culling::None, Culling::Triangles, Culling::Occlusion] {
+            let (rgba, passes, culled) = frames(&mut renderer, &under(&scene, RenderSettings { culling, ..look }));
             println!("{transparency:?}, {culling:?}: {passes:.3?} {culled:?}");
             assert!(plain.get_or_insert_with(|| rgba.clone()) == &rgba, "{culling:?} changes the picture");
-            assert_eq!(culled.is_some_and(|culled| culled.camera.left_out() > 0), culling != Culling::None);
+            assert_eq!(culled.is_some_and(|culled| culled.camera.culled() > 0), culling != Culling::None);
         }
     }
 }

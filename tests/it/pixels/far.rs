@@ -3,36 +3,37 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
-use modalcast::engine::Workbench;
+use modalcast::engine::DeviceContext;
 use modalcast_model::domain::Material;
 use modalcast_model::scene::{
-    Camera, GRID, Lens, Look, RawUpdate, Scene, Shadow, ShadowMethod, State, TransformFormat, Update, View,
+    Camera, Lens, ORIGIN_GRID, RawStepUpdate, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings,
+    StepUpdate, TransformFormat, View,
 };
-use modalcast_render::Image;
+use modalcast_render::FrameImage;
 
-use super::build::{Stage, facing, lying};
+use super::harness::{SceneBuilder, facing, floor_mesh};
 
 /// Far position: not on the grid of origin cells, and not representable in f32.
 const AWAY: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
-fn bench() -> Workbench {
-    Workbench::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("a renderer")
+fn bench() -> DeviceContext {
+    DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("a renderer")
 }
 
 /// The rest state with some domains moved by an f64 translation.
-fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> State {
+fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
     let one = || {
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
         rotation.chain([x, y, z].into_iter().flat_map(f64::to_le_bytes))
     };
-    let raw = RawUpdate {
+    let raw = RawStepUpdate {
         transform_domains: domains.to_vec(),
         transforms: domains.iter().flat_map(|_| one()).collect(),
         transform_format: TransformFormat::RigidF64,
-        ..RawUpdate::default()
+        ..RawStepUpdate::default()
     };
-    let mut state = State::rest(scene);
-    state.apply(scene, &Update::parse(scene, &raw).expect("a good step"));
+    let mut state = SceneState::rest(scene);
+    state.apply(scene, &StepUpdate::parse(scene, &raw).expect("a good step"));
     state
 }
 
@@ -43,26 +44,26 @@ fn camera(at: [f64; 3]) -> Camera {
     Camera { view, lens: Lens::FieldOfView(40.0), near: 0.0, far: 0.0 }
 }
 
-fn picture(bench: &mut Workbench, scene: &Arc<Scene>, state: &State, camera: &Camera) -> Image {
-    let mut staged = bench.stage(scene).expect("stages");
+fn picture(bench: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneState, camera: &Camera) -> FrameImage {
+    let mut staged = bench.load_scene(scene).expect("stages");
     staged.deform(state).expect("deforms");
     let image = bench.draw(&mut staged, camera, 96, 96).expect("draws");
-    bench.unstage(staged);
+    bench.unload_scene(staged);
     image
 }
 
 /// Largest difference of two pictures in levels, and number of pixels that differ by more than one level.
-fn difference(one: &Image, other: &Image) -> (u8, usize) {
+fn difference(one: &FrameImage, other: &FrameImage) -> (u8, usize) {
     let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
     let levels = |(a, b): (&[u8], &[u8])| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
     pairs.map(levels).fold((0, 0), |(most, count), levels| (most.max(levels), count + usize::from(levels > 1)))
 }
 
 /// A table over the ground, with the default look and the given shadow.
-fn table(shadow: Option<Shadow>) -> Arc<Scene> {
-    let mut stage = Stage::new();
-    stage.0.look = Look { shadow, ..Look::default() };
-    stage.add(lying(0.8, 0.5), Material::default()).add(lying(0.4, 0.0), Material::default()).scene()
+fn table(shadow: Option<ShadowSettings>) -> Arc<Scene> {
+    let mut stage = SceneBuilder::new();
+    stage.0.look = RenderSettings { shadow, ..RenderSettings::default() };
+    stage.add(floor_mesh(0.8, 0.5), Material::default()).add(floor_mesh(0.4, 0.0), Material::default()).scene()
 }
 
 /// With ground and every kind of shadow map.
@@ -71,28 +72,28 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
     let mut bench = bench();
     // Texels of a shadow map are aligned to a grid, so the edge of a shadow looks the same only after a move by
     // multiples of the grid.
-    let on_grid = [9766.0 * GRID, 0.0, -9767.0 * GRID];
+    let on_grid = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
     // Off the grid, positions round differently, by 1/500 pixel. A sample closer than that to an edge may change sides,
     // which affects at most one pixel in a thousand.
-    let base = Shadow::default();
+    let base = ShadowSettings::default();
     let kinds = [
         (Some(base), on_grid, 0),
-        (Some(Shadow { method: ShadowMethod::Standard, ..base }), on_grid, 0),
-        (Some(Shadow { method: ShadowMethod::Filtered, ..base }), on_grid, 0),
-        (Some(Shadow { splits: 3, ..base }), on_grid, 0),
+        (Some(ShadowSettings { method: ShadowMethod::Standard, ..base }), on_grid, 0),
+        (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }), on_grid, 0),
+        (Some(ShadowSettings { splits: 3, ..base }), on_grid, 0),
         (None, AWAY, 9),
     ];
     for (shadow, at, edges) in kinds {
         let scene = table(shadow);
-        let home = picture(&mut bench, &scene, &State::rest(&scene), &camera([0.0; 3]));
+        let home = picture(&mut bench, &scene, &SceneState::rest(&scene), &camera([0.0; 3]));
         let away = moved(&scene, &[0, 1], at);
-        assert!(away.cells.as_ref().is_some_and(|cells| cells.is_one()));
+        assert!(away.origins.as_ref().is_some_and(|origins| origins.is_uniform()));
         let far = picture(&mut bench, &scene, &away, &camera(at));
         let (most, count) = difference(&home, &far);
         assert!(count <= edges, "{count} pixels at {at:?}, by {most} levels at most");
     }
     let scene = table(None);
-    let home = picture(&mut bench, &scene, &State::rest(&scene), &camera([0.0; 3]));
+    let home = picture(&mut bench, &scene, &SceneState::rest(&scene), &camera([0.0; 3]));
     let away = moved(&scene, &[0, 1], AWAY);
     // Controls: a camera position rounded to f32 gives another picture, and so does a camera moved by 0.1 units.
     let rounded = AWAY.map(|number| f64::from(number as f32));
@@ -106,24 +107,24 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     let mut bench = bench();
     let square = |z: f32| facing(-0.7, -0.3, 0.6, 0.9, z);
     let red = Material { diffuse: [1.0, 0.1, 0.1], ambient: [1.0, 0.1, 0.1], ..Material::default() };
-    let scene = Stage::new().add(square(0.0), Material::default()).add(square(-0.1), red.clone()).scene();
-    let alone = |material: Material, z| Stage::new().add(square(z), material).scene();
-    let (grey, red) = (alone(Material::default(), 0.0), alone(red, -0.1));
-    let mut at_rest = |scene: &Arc<Scene>| picture(&mut bench, scene, &State::rest(scene), &camera([0.0; 3]));
-    let (grey, red, both) = (at_rest(&grey), at_rest(&red), at_rest(&scene));
+    let scene = SceneBuilder::new().add(square(0.0), Material::default()).add(square(-0.1), red.clone()).scene();
+    let alone = |material: Material, z| SceneBuilder::new().add(square(z), material).scene();
+    let (gray, red) = (alone(Material::default(), 0.0), alone(red, -0.1));
+    let mut at_rest = |scene: &Arc<Scene>| picture(&mut bench, scene, &SceneState::rest(scene), &camera([0.0; 3]));
+    let (gray, red, both) = (at_rest(&gray), at_rest(&red), at_rest(&scene));
     let apart = moved(&scene, &[1], AWAY);
-    assert!(apart.cells.as_ref().is_some_and(|cells| !cells.is_one()));
-    let mut staged = bench.stage(&scene).expect("stages");
-    let mut seen = |state: &State, at| {
+    assert!(apart.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
+    let mut staged = bench.load_scene(&scene).expect("stages");
+    let mut seen = |state: &SceneState, at| {
         staged.deform(state).expect("deforms");
         let image = bench.draw(&mut staged, &camera(at), 96, 96).expect("draws");
-        [&grey, &red, &both].map(|want| difference(&image, want).0)
+        [&gray, &red, &both].map(|want| difference(&image, want).0)
     };
     let is_only = |levels: [u8; 3], which: usize| (0..3).all(|at| (levels[at] <= 1) == (at == which));
     // Twice, because no frame may contain remains of an earlier one.
     for _ in 0..2 {
-        let levels = [seen(&apart, AWAY), seen(&apart, [0.0; 3]), seen(&State::rest(&scene), [0.0; 3])];
+        let levels = [seen(&apart, AWAY), seen(&apart, [0.0; 3]), seen(&SceneState::rest(&scene), [0.0; 3])];
         assert!(is_only(levels[0], 1) && is_only(levels[1], 0) && is_only(levels[2], 2), "{levels:?}");
     }
-    bench.unstage(staged);
+    bench.unload_scene(staged);
 }

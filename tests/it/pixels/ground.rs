@@ -2,30 +2,33 @@
 
 use std::sync::Arc;
 
-use modalcast_model::deform::Surface;
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Bloom, Bounds, Camera, Culling, Ground, Lens, Look, Scene, Shadow, Transparency, View};
-use modalcast_render::{Renderer, Seen, Shot};
+use modalcast_model::scene::{
+    Bloom, Bounds, Camera, Culling, Ground, Lens, RenderSettings, Scene, ShadowSettings, Transparency, View,
+};
+use modalcast_render::{FrameParams, Renderer, VisibilityId};
 
-use super::build::{Stage, facing, lying, open};
+use super::harness::{SceneBuilder, facing, floor_mesh, open};
 
 const SIZE: u32 = 96;
 
 /// A wall and a pane that stand on the ground, a mat that lies on it, and a leaf with holes above.
-fn stage(look: impl FnOnce(&mut Look)) -> Arc<Scene> {
-    let mut stage = Stage::new();
+fn stage(look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
+    let mut stage = SceneBuilder::new();
     let base = &mut stage.0.look;
     (base.zenith, base.horizon) = ([0.1, 0.3, 0.8], [0.7, 0.8, 0.9]);
     base.sun = [2.0, 3.0, 1.0];
-    base.ground = Some(Ground { colour: [0.5, 0.4, 0.3] });
+    base.ground = Some(Ground { color: [0.5, 0.4, 0.3] });
     look(base);
     let holes = stage.texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
     let painted = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..painted([0.2, 0.9, 0.3]) };
     let leaf =
-        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(holes), ..painted([1.0; 3]) };
-    let stage =
-        stage.add(lying(1.5, 0.0), painted([0.9, 0.2, 0.2])).add(facing(-2.0, 0.0, -0.5, 1.5, -0.3), painted([0.4; 3]));
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(holes), ..painted([1.0; 3]) };
+    let stage = stage
+        .add(floor_mesh(1.5, 0.0), painted([0.9, 0.2, 0.2]))
+        .add(facing(-2.0, 0.0, -0.5, 1.5, -0.3), painted([0.4; 3]));
     stage.add(facing(-1.0, 0.0, 2.5, 1.0, 0.8), glass).add(facing(0.5, 1.1, 1.5, 2.1, 0.0), leaf).scene()
 }
 
@@ -36,7 +39,7 @@ fn from(eye: [f64; 3]) -> Camera {
 
 struct Frame {
     rgba: Vec<u8>,
-    seen: Vec<Seen>,
+    seen: Vec<VisibilityId>,
     passes: Vec<&'static str>,
 }
 
@@ -54,13 +57,15 @@ impl Frame {
         };
         let (mut positions, normals) = (of_all(|mesh| mesh.rest()), of_all(|mesh| &mesh.corners().normals));
         positions.chunks_exact_mut(3).for_each(|vertex| vertex[1] -= sunk);
-        renderer.upload(&buffers, &Surface { positions, normals, ..Surface::default() }).expect("uploads");
+        renderer
+            .upload(&buffers, &DeformedSurface { positions, normals, ..DeformedSurface::default() })
+            .expect("uploads");
         let mut bounds = scene.rest_bounds;
         bounds.min[1] = lowest;
-        let shot = Shot { camera, width: SIZE, height: SIZE, bounds, light: None };
+        let shot = FrameParams { camera, width: SIZE, height: SIZE, bounds, light: None };
         let rgba = renderer.draw(&buffers, &shot).expect("draws").rgba;
-        let passes = renderer.ran().passes.clone();
-        let seen = renderer.seen().expect("reads");
+        let passes = renderer.stats().passes.clone();
+        let seen = renderer.read_visibility().expect("reads");
         renderer.unload(buffers);
         Self { rgba, seen, passes }
     }
@@ -82,12 +87,12 @@ const BELOW: f64 = -1e-5;
 
 #[test]
 fn analytic_ground_equals_drawn_ground() {
-    let looks: [fn(&mut Look); 6] = [
+    let looks: [fn(&mut RenderSettings); 6] = [
         |_| {},
         |look| look.samples = 1,
-        |look| look.shadow = Some(Shadow { size: 256, ..Shadow::default() }),
+        |look| look.shadow = Some(ShadowSettings { size: 256, ..ShadowSettings::default() }),
         |look| look.transparency = Transparency::TwoPass,
-        |look| look.culling = Culling::Depth,
+        |look| look.culling = Culling::Occlusion,
         |look| look.bloom = Some(Bloom::default()),
     ];
     let mut renderer = open();
@@ -99,13 +104,13 @@ fn analytic_ground_equals_drawn_ground() {
             assert_eq!([found.draws_ground(), drawn.draws_ground()], [false, true]);
             // The far edge of the ground has exactly the color of the sky at the horizon. Samples there may round
             // differently.
-            let [colours, ids] = found.against(&drawn);
+            let [colors, ids] = found.against(&drawn);
             assert!(
-                colours == 0 && ids <= 2,
-                "look {index} from {eye:?}: {colours} colours and {ids} ids of {}",
+                colors == 0 && ids <= 2,
+                "look {index} from {eye:?}: {colors} colours and {ids} ids of {}",
                 SIZE * SIZE
             );
-            let ground = found.seen.iter().filter(|seen| **seen == Seen::Ground).count();
+            let ground = found.seen.iter().filter(|seen| **seen == VisibilityId::Ground).count();
             assert!(ground > 500, "look {index} from {eye:?}: {ground} pixels of ground");
         }
     }
@@ -119,10 +124,10 @@ fn ground_hides_geometry_below_and_is_one_sided() {
     let mut frame = |eye: Camera, sunk: f32, lowest: f64| Frame::new(&mut renderer, &scene, eye, (sunk, lowest));
     let (right, wrong) = (frame(camera, 0.7, -0.7), frame(camera, 0.7, 0.0));
     assert_eq!([right.draws_ground(), wrong.draws_ground()], [true, false]);
-    let [colours, ids] = wrong.against(&right);
-    assert!(colours > 200 && ids > 100, "control: {colours} colours and {ids} ids tell who lies below");
+    let [colors, ids] = wrong.against(&right);
+    assert!(colors > 200 && ids > 100, "control: {colors} colours and {ids} ids tell who lies below");
     let from_below = frame(from([0.5, -1.0, 7.0]), 0.0, 0.0);
-    assert!(!from_below.draws_ground() && from_below.seen.iter().all(|seen| *seen != Seen::Ground));
+    assert!(!from_below.draws_ground() && from_below.seen.iter().all(|seen| *seen != VisibilityId::Ground));
     let nowhere = frame(camera, 0.0, f64::NAN);
     assert!(nowhere.draws_ground(), "bounds that overflowed tell nothing");
 }
@@ -135,8 +140,8 @@ fn geometry_on_the_ground_is_visible_despite_rounding() {
     let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, rounded));
     assert!(!frame.draws_ground());
     let drawn = Frame::new(&mut renderer, &scene, camera, (4e-7, BELOW));
-    let [colours, ids] = frame.against(&drawn);
-    assert!(drawn.draws_ground() && colours == 0 && ids <= 2, "{colours} colours and {ids} ids");
+    let [colors, ids] = frame.against(&drawn);
+    assert!(drawn.draws_ground() && colors == 0 && ids <= 2, "{colors} colours and {ids} ids");
     let red = frame.rgba.chunks_exact(4).filter(|pixel| pixel[0] > pixel[1].saturating_add(30)).count();
     assert!(red > 300, "{red} pixels of the mat");
 }

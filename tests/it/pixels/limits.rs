@@ -1,58 +1,69 @@
 //! Unused features allocate and run nothing; extreme sizes, cameras and vertices; determinism.
 
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
-use modalcast_model::scene::{Bounds, Camera, Look, State, View};
-use modalcast_render::{Prefer, Renderer, Shot, devices, plan};
+use modalcast_model::scene::{Bounds, Camera, RenderSettings, SceneState, View};
+use modalcast_render::{DevicePreference, FrameParams, Renderer, devices, plan};
 
-use super::build::{Stage, camera, draw, facing, lying, open, picture, planned_above};
+use super::harness::{SceneBuilder, camera, draw, facing, floor_mesh, open, picture, planned_above};
 
-fn full() -> Stage {
-    let mut stage = Stage::new();
-    stage.0.look = Look::default();
+fn full() -> SceneBuilder {
+    let mut stage = SceneBuilder::new();
+    stage.0.look = RenderSettings::default();
     stage
 }
 
 /// Allocated buffers and executed passes equal the plan of the scene.
 #[test]
 fn unused_features_allocate_and_run_nothing() {
-    let plain = picture(&full().add(lying(1.0, -0.5), Material::default()).scene());
+    let plain = picture(&full().add(floor_mesh(1.0, -0.5), Material::default()).scene());
     let names = |list: &[modalcast_render::Allocation]| {
         list.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
     };
     for absent in ["tangents", "uvs", "triangle materials"] {
-        assert!(!names(&plain.allocated).contains(&absent.to_string()), "{absent}");
+        assert!(!names(&plain.allocations).contains(&absent.to_string()), "{absent}");
     }
-    assert_eq!(plain.ran.passes, ["shadow", "blur", "visibility", "backdrop", "shade", "encode"]);
+    assert_eq!(plain.stats.passes, ["shadow", "blur", "visibility", "background", "shade", "encode"]);
 
     let mut stage = full();
     let image = stage.texture(1, 1, |_, _| [128, 128, 255, 255]);
     let mapped = Material { normal_texture: Some(image), ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
-    let mut stage = stage.add(lying(1.0, -0.5), mapped).add(lying(1.0, -0.3), glass);
+    let mut stage = stage.add(floor_mesh(1.0, -0.5), mapped).add(floor_mesh(1.0, -0.3), glass);
     for index in 0..8 {
-        stage = stage.add(lying(0.1, -0.2 + 0.01 * index as f32), Material::default());
+        stage = stage.add(floor_mesh(0.1, -0.2 + 0.01 * index as f32), Material::default());
     }
     let scene = stage.scene();
     let rich = picture(&scene);
     for present in ["tangents", "uvs", "triangle materials"] {
-        assert!(names(&rich.allocated).contains(&present.to_string()), "{present}");
+        assert!(names(&rich.allocations).contains(&present.to_string()), "{present}");
     }
     assert_eq!(
-        rich.ran.passes,
-        ["shadow", "blur", "visibility", "count", "scan", "fill", "resolve", "backdrop", "shade", "encode"]
+        rich.stats.passes,
+        [
+            "shadow",
+            "blur",
+            "visibility",
+            "oit count",
+            "oit allocate",
+            "oit fill",
+            "oit resolve",
+            "background",
+            "shade",
+            "encode"
+        ]
     );
     let mut planned = plan(&scene).buffers;
     planned.sort_by(|a, b| a.name.cmp(&b.name));
-    assert_eq!(rich.allocated, planned, "what is planned is what is allocated");
-    assert_eq!(rich.ran.passes, planned_above(&scene), "what is planned is what runs");
+    assert_eq!(rich.allocations, planned, "what is planned is what is allocated");
+    assert_eq!(rich.stats.passes, planned_above(&scene), "what is planned is what runs");
 }
 
 #[test]
 fn draw_calls_do_not_grow_with_domains_and_materials() {
-    let draws = |domains: usize| {
-        let mut stage = Stage::new();
+    let draw_calls = |domains: usize| {
+        let mut stage = SceneBuilder::new();
         for index in 0..domains {
             let double_sided = index % 2 == 1;
             stage = stage.add(
@@ -60,55 +71,56 @@ fn draw_calls_do_not_grow_with_domains_and_materials() {
                 Material { double_sided, ..Material::default() },
             );
         }
-        picture(&stage.scene()).ran.draws
+        picture(&stage.scene()).stats.draw_calls
     };
-    assert_eq!((draws(1), draws(2), draws(9), draws(60)), (1, 2, 2, 2));
+    assert_eq!((draw_calls(1), draw_calls(2), draw_calls(9), draw_calls(60)), (1, 2, 2, 2));
 }
 
 #[test]
 fn empty_and_oversized_frames_are_refused() {
-    let scene = Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
+    let scene = SceneBuilder::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
     let mut renderer = open();
     let buffers = renderer.load(&scene).expect("loads");
     let limit = renderer.info().max_side;
     for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
-        let shot = Shot { camera: camera(64), width, height, bounds: scene.rest_bounds, light: None };
+        let shot = FrameParams { camera: camera(64), width, height, bounds: scene.rest_bounds, light: None };
         let refusal = renderer.draw(&buffers, &shot).expect_err("refused").to_string();
         let expected = format!("frame.size: expected 1 to {limit} pixels a side, given {width} x {height}");
         assert_eq!(refusal, expected);
     }
-    let shot = Shot { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
+    let shot = FrameParams { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
     assert_eq!(renderer.draw(&buffers, &shot).expect("one pixel is a frame").rgba.len(), 4);
 }
 
 /// Cut-outs stay cut out.
 #[test]
 fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     let image = stage.texture(2, 1, |x, _| [255, 255, 255, 255 * x as u8]);
     let alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
-    let leaf = Material { colour_texture: Some(image), alpha_mode, ..Material::default() };
+    let leaf = Material { color_texture: Some(image), alpha_mode, ..Material::default() };
     let scene = stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), leaf).scene();
     let mut renderer = open();
     let side = 3400;
     let mut wide = camera(side);
     wide.lens = modalcast_model::scene::Lens::FieldOfView(12.0);
     let shown = draw(&mut renderer, &scene, wide, side);
-    assert_eq!(shown.ran.samples, 1);
+    assert_eq!(shown.stats.samples, 1);
     assert!(shown.at(side / 2 - 700, side / 2) == [0; 3] && shown.at(side / 2 + 700, side / 2) != [0; 3]);
 }
 
 #[test]
 fn frames_are_deterministic() {
-    let scene = full().add(lying(1.0, 0.5), Material::default()).add(lying(0.5, 1.0), Material::default()).scene();
+    let scene =
+        full().add(floor_mesh(1.0, 0.5), Material::default()).add(floor_mesh(0.5, 1.0), Material::default()).scene();
     let mut renderer = open();
-    let first = draw(&mut renderer, &scene, Camera::framing(&scene, 64, 64), 96);
-    assert!(first.image.rgba == draw(&mut renderer, &scene, Camera::framing(&scene, 64, 64), 96).image.rgba);
+    let first = draw(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96);
+    assert!(first.image.rgba == draw(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba);
     assert!(
-        first.image.rgba == draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 96).image.rgba,
+        first.image.rgba == draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba,
         "another context"
     );
-    let mut moved = Camera::framing(&scene, 64, 64);
+    let mut moved = Camera::fit_to_scene(&scene, 64, 64);
     moved.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
     assert!(first.image.rgba != draw(&mut renderer, &scene, moved, 96).image.rgba, "control");
 }
@@ -118,14 +130,14 @@ fn frames_are_deterministic() {
 fn degenerate_scenes_suns_and_cameras_are_drawn() {
     let line = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
     let triangles = vec![[0, 1, 2], [0, 0, 0], [0, 3, 1]];
-    let flat = Mesh::indexed(line, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("degenerate, yet a mesh");
+    let flat = Mesh::from_indexed(line, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("degenerate, yet a mesh");
     let mut stage = full();
     stage.0.look.sun = [0.0, 1.0, 0.0];
-    let scene = stage.add(flat, Material::default()).add(lying(2.0, 0.5), Material::default()).scene();
+    let scene = stage.add(flat, Material::default()).add(floor_mesh(2.0, 0.5), Material::default()).scene();
     let shown = picture(&scene);
     assert!(shown.count(|pixel| pixel != shown.at(0, 0)) > 100);
     let view = View::LookAt { eye: [0.1, 0.3, 0.1], target: [1.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
-    let inside = draw(&mut open(), &scene, Camera { view, ..Camera::framing(&scene, 64, 64) }, 64);
+    let inside = draw(&mut open(), &scene, Camera { view, ..Camera::fit_to_scene(&scene, 64, 64) }, 64);
     assert_eq!(inside.image.rgba.len(), 4 * 64 * 64);
 }
 
@@ -139,36 +151,37 @@ fn overflowed_vertices_leave_no_black_pixels() {
     for bad in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
         let mut positions: Vec<f32> = scene.shapes[0].mesh.rest().as_flattened().to_vec();
         positions[6..9].fill(bad);
-        let surface = Surface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..Surface::default() };
+        let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("uploads");
         let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
-        let shot = Shot { camera: camera(64), width: 64, height: 64, bounds, light: None };
+        let shot = FrameParams { camera: camera(64), width: 64, height: 64, bounds, light: None };
         let image = renderer.draw(&buffers, &shot).expect("draws");
         assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{bad}");
     }
-    let short = Surface { positions: vec![0.0; 3], ..Surface::default() };
+    let short = DeformedSurface { positions: vec![0.0; 3], ..DeformedSurface::default() };
     let refusal = renderer.upload(&buffers, &short).expect_err("three numbers of twelve").to_string();
     assert!(refusal.contains("3 numbers of positions, 12 expected"), "{refusal}");
 }
 
 #[test]
 fn scene_far_from_the_origin_is_rendered() {
-    let mut parts = full().add(lying(1.0, 1.0), Material::default()).add(lying(0.5, 0.0), Material::default()).0;
+    let mut parts =
+        full().add(floor_mesh(1.0, 1.0), Material::default()).add(floor_mesh(0.5, 0.0), Material::default()).0;
     for domain in &mut parts.domains {
         let mut place = Transform::IDENTITY;
         (place.0[3], place.0[7], place.0[11]) = (1e7, 1e7, -1e7);
         domain.placement = place;
     }
-    let scene = Stage(parts).scene();
-    let shown = draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 64);
+    let scene = SceneBuilder(parts).scene();
+    let shown = draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64);
     assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn renderers_work_on_many_threads_and_two_on_one() {
     let draw_one = || {
-        let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
-        draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 32).image.rgba
+        let scene = full().add(floor_mesh(1.0, 0.5), Material::default()).scene();
+        draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba
     };
     let first = draw_one();
     let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_one(), draw_one()])).collect();
@@ -176,14 +189,14 @@ fn renderers_work_on_many_threads_and_two_on_one() {
         assert!(thread.join().expect("lives").iter().all(|bytes| *bytes == first));
     }
     let (mut left, mut right) = (open(), open());
-    let scene = full().add(lying(1.0, 0.5), Material::default()).scene();
+    let scene = full().add(floor_mesh(1.0, 0.5), Material::default()).scene();
     let buffers = left.load(&scene).expect("loads");
-    assert!(draw(&mut right, &scene, Camera::framing(&scene, 64, 64), 32).image.rgba == first);
+    assert!(draw(&mut right, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba == first);
     drop(right);
     let mut deformer = ReferenceDeformer::new(&scene);
-    let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
     left.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = Shot { camera: Camera::framing(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
+    let shot = FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
     assert!(left.draw(&buffers, &shot).expect("draws").rgba == first, "two contexts on one thread keep apart");
 }
 
@@ -194,9 +207,9 @@ fn devices_are_listed_and_missing_ones_refused() {
     for device in &found {
         assert_eq!(device.renderer.is_none(), device.problem.is_some(), "{device:?}");
     }
-    let refusal = Renderer::open(Prefer::Cuda(4711)).expect_err("no such device").to_string();
+    let refusal = Renderer::open(DevicePreference::Cuda(4711)).expect_err("no such device").to_string();
     assert!(refusal.contains("CUDA device 4711") && refusal.contains("10_nvidia.json"), "{refusal}");
     if found.iter().any(|device| device.software && device.renderer.is_some()) {
-        assert!(Renderer::open(Prefer::Software).expect("software").info().software);
+        assert!(Renderer::open(DevicePreference::Software).expect("software").info().software);
     }
 }

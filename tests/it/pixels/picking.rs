@@ -3,26 +3,26 @@
 use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Transform};
-use modalcast_model::scene::{Bounds, Camera, Ground, Lens, Rectangle, Scene, State, View};
-use modalcast_render::{Hit, Renderer, SceneBuffers, Seen, Shot};
+use modalcast_model::scene::{Bounds, Camera, Ground, Lens, PixelRect, Scene, SceneState, View};
+use modalcast_render::{FrameParams, PickHit, Renderer, SceneBuffers, VisibilityId};
 use nalgebra::Vector3;
 
-use super::build::{Stage, camera, facing, lying, open};
+use super::harness::{SceneBuilder, camera, facing, floor_mesh, open};
 
 /// Ids are those of the frame unless an edge passes a sample by less than the rasterizer's 1/256 pixel. The hit
 /// position is computed in f64 on the f32 triangle, so in these scenes it is correct to a millionth of a unit.
 const NEAR: f64 = 1e-6;
 
-struct Board {
+struct PickHarness {
     renderer: Renderer,
     buffers: SceneBuffers,
     bounds: Bounds,
 }
 
-impl Board {
-    fn of(scene: &Arc<Scene>, state: &State) -> Self {
+impl PickHarness {
+    fn of(scene: &Arc<Scene>, state: &SceneState) -> Self {
         let mut renderer = open();
         let mut deformer = ReferenceDeformer::new(scene);
         let bounds = deformer.deform(state).expect("deforms").bounds;
@@ -32,16 +32,16 @@ impl Board {
     }
 
     fn rest(scene: &Arc<Scene>) -> Self {
-        Self::of(scene, &State::rest(scene))
+        Self::of(scene, &SceneState::rest(scene))
     }
 
-    fn shot(&self, camera: Camera, size: u32) -> Shot {
-        Shot { camera, width: size, height: size, bounds: self.bounds, light: None }
+    fn shot(&self, camera: Camera, size: u32) -> FrameParams {
+        FrameParams { camera, width: size, height: size, bounds: self.bounds, light: None }
     }
 
     /// Hits of a rectangle of a square picture, given by its corner and size.
-    fn pick(&mut self, camera: Camera, picture: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<Hit> {
-        let rectangle = Rectangle::within([picture; 2], corner, size).expect("inside");
+    fn pick(&mut self, camera: Camera, picture: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<PickHit> {
+        let rectangle = PixelRect::within([picture; 2], corner, size).expect("inside");
         let shot = self.shot(camera, picture);
         let pick = self.renderer.begin_pick(&self.buffers, &shot, rectangle).expect("begins");
         self.renderer.finish_pick(pick).expect("ends")
@@ -59,9 +59,9 @@ fn at(x: u32, y: u32) -> [f64; 3] {
 
 #[test]
 fn pick_has_domain_triangle_position_normal_and_depth() {
-    let stage = Stage::new().add(facing(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
+    let stage = SceneBuilder::new().add(facing(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
     let scene = stage.add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), Material::default()).scene();
-    let hits = Board::rest(&scene).pick(camera(64), 64, [40, 30], [1, 1]);
+    let hits = PickHarness::rest(&scene).pick(camera(64), 64, [40, 30], [1, 1]);
     let [hit] = &hits[..] else { panic!("{hits:?}") };
     let [x, y, _] = at(40, 30);
     assert_eq!((hit.pixel, hit.domain, hit.triangle, hit.vertices), ([40, 30], 1, 0, [0, 1, 2]));
@@ -69,22 +69,22 @@ fn pick_has_domain_triangle_position_normal_and_depth() {
     assert!((hit.depth - 10.0).abs() < NEAR);
     // Corners (-2, -1), (2, -1), (2, 1); the second barycentric coordinate is the remainder.
     let [first, third] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
-    assert!(off(hit.shares, [first, 1.0 - first - third, third]) < NEAR, "{hit:?}");
+    assert!(off(hit.barycentrics, [first, 1.0 - first - third, third]) < NEAR, "{hit:?}");
 }
 
 /// A hit on the back side has a flipped normal.
 #[test]
 fn mirrored_domains_keep_vertex_order_in_picks() {
     let double_sided = Material { double_sided: true, ..Material::default() };
-    let mut stage = Stage::new().add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), double_sided);
+    let mut stage = SceneBuilder::new().add(facing(-2.0, -1.0, 2.0, 1.0, 0.0), double_sided);
     stage.0.domains[0].placement.0[0] = -1.0;
     let scene = stage.scene();
-    let mut board = Board::rest(&scene);
+    let mut board = PickHarness::rest(&scene);
     let hit = board.pick(camera(64), 64, [24, 34], [1, 1]).remove(0);
     // The point on the mesh is mirrored in x.
     let [x, y, _] = at(24, 34);
     assert_eq!(hit.vertices, [0, 1, 2]);
-    assert!(off(hit.shares, [(2.0 + x) / 4.0, 1.0 - (2.0 + x) / 4.0 - (y + 1.0) / 2.0, (y + 1.0) / 2.0]) < NEAR);
+    assert!(off(hit.barycentrics, [(2.0 + x) / 4.0, 1.0 - (2.0 + x) / 4.0 - (y + 1.0) / 2.0, (y + 1.0) / 2.0]) < NEAR);
     let behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
     for (view, z) in [(camera(64).view, 1.0), (behind, -1.0)] {
         let hit = board.pick(Camera { view, ..camera(64) }, 64, [30, 30], [1, 1]).remove(0);
@@ -96,13 +96,13 @@ fn mirrored_domains_keep_vertex_order_in_picks() {
 fn pick_follows_the_deformed_surface() {
     let mesh = facing(-1.0, -1.0, 1.0, 1.0, 0.0);
     let columns = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
-    let mut stage = Stage::new().add(mesh.clone(), Material::default());
+    let mut stage = SceneBuilder::new().add(mesh.clone(), Material::default());
     stage.0.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, columns).expect("12 x 1")).expect("fits");
     let scene = stage.scene();
-    let mut state = State::rest(&scene);
+    let mut state = SceneState::rest(&scene);
     for q in [0.0, 2.0, -3.0_f32] {
         state.q[0] = q;
-        let hit = Board::of(&scene, &state).pick(camera(64), 64, [36, 27], [1, 1]).remove(0);
+        let hit = PickHarness::of(&scene, &state).pick(camera(64), 64, [36, 27], [1, 1]).remove(0);
         let (z, [x, y, _]) = (f64::from(q), at(36, 27));
         // The ray from (0, 0, 10) meets the plane at this z instead of the plane z = 0.
         let want = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
@@ -113,31 +113,31 @@ fn pick_follows_the_deformed_surface() {
 /// For rectangles of the largest size and at the border of the picture.
 #[test]
 fn picks_agree_with_the_visibility_of_the_frame() {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     stage.0.look.samples = 1;
     stage.0.look.ground = Some(Ground::default());
     let image = stage.texture(8, 8, |x, y| [200, 200, 200, if (x + y) % 2 == 0 { 255 } else { 0 }]);
     let leaf =
-        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(image), ..Material::default() };
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(image), ..Material::default() };
     let scene = stage
-        .add(lying(3.0, 0.0), Material::default())
+        .add(floor_mesh(3.0, 0.0), Material::default())
         .add(facing(-1.5, 0.3, 1.5, 2.5, 0.4), leaf)
         .add(facing(-0.9, 0.2, 2.0, 1.1, -0.7), Material::default())
         .scene();
-    let mut board = Board::rest(&scene);
+    let mut board = PickHarness::rest(&scene);
     let view = View::LookAt { eye: [3.0, 4.0, 9.0], target: [0.2, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
     for lens in [Lens::FieldOfView(40.0), Lens::Intrinsics { fx: 120.0, fy: 130.0, cx: 50.0, cy: 44.0 }] {
         let camera = Camera { view, lens, near: 0.0, far: 0.0 };
         let shot = board.shot(camera, 100);
         board.renderer.draw(&board.buffers, &shot).expect("draws");
-        let frame = board.renderer.seen().expect("reads");
+        let frame = board.renderer.read_visibility().expect("reads");
         let (mut differ, mut holes, mut seen) = (0, 0, [0; 3]);
         for (corner, size) in [([0, 0], [64, 64]), ([64, 0], [36, 64]), ([0, 64], [64, 36]), ([64, 64], [36, 36])] {
             let hits = board.pick(camera, 100, corner, size);
             for y in corner[1]..corner[1] + size[1] {
                 for x in corner[0]..corner[0] + size[0] {
                     let want = match frame[(100 * y + x) as usize] {
-                        Seen::Triangle(place) => board.buffers.triangle(place),
+                        VisibilityId::Triangle(place) => board.buffers.source_triangle(place),
                         _ => None,
                     };
                     let got = hits.iter().find(|hit| hit.pixel == [x, y]);
@@ -156,10 +156,10 @@ fn picks_agree_with_the_visibility_of_the_frame() {
 /// A surface behind a hole is hit.
 #[test]
 fn holes_glass_sky_and_ground_are_not_hit() {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     let image = stage.texture(2, 1, |x, _| [200, 200, 200, if x == 0 { 255 } else { 0 }]);
     let leaf =
-        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, colour_texture: Some(image), ..Material::default() };
+        Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(image), ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
     // The leaf is solid on its left half and open on its right half. The glass covers the upper half, in front of it.
     let scene = stage
@@ -167,27 +167,27 @@ fn holes_glass_sky_and_ground_are_not_hit() {
         .add(facing(-2.0, -2.0, 2.0, 0.0, -1.0), Material::default())
         .add(facing(-2.0, 0.0, 2.0, 2.0, 1.0), glass)
         .scene();
-    let mut board = Board::rest(&scene);
+    let mut board = PickHarness::rest(&scene);
     let mut at = |x: u32, y: u32| board.pick(camera(64), 64, [x, y], [1, 1]).first().map(|hit| hit.domain);
     assert_eq!([at(22, 22), at(42, 22), at(42, 42), at(2, 2)], [Some(0), None, Some(1), None]);
     let floor = Camera {
         view: View::LookAt { eye: [0.0, 2.0, 10.0], target: [0.0, -3.0, 0.0], up: [0.0, 1.0, 0.0] },
         ..camera(64)
     };
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     stage.0.look.ground = Some(Ground::default());
     let scene = stage.add(facing(-1.0, 0.0, 1.0, 1.0, 0.0), Material::default()).scene();
-    assert!(Board::rest(&scene).pick(floor, 64, [32, 60], [1, 1]).is_empty(), "the ground");
+    assert!(PickHarness::rest(&scene).pick(floor, 64, [32, 60], [1, 1]).is_empty(), "the ground");
 }
 
 #[test]
 fn concurrent_picks_finish_in_any_order() {
-    let scene = Stage::new().add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), Material::default()).scene();
-    let mut board = Board::rest(&scene);
+    let scene = SceneBuilder::new().add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), Material::default()).scene();
+    let mut board = PickHarness::rest(&scene);
     let shot = board.shot(camera(64), 64);
     let picks: Vec<_> = (10..50)
         .map(|x| {
-            let rectangle = Rectangle::within([64; 2], [x, 20], [1, 1]).expect("inside");
+            let rectangle = PixelRect::within([64; 2], [x, 20], [1, 1]).expect("inside");
             (x, board.renderer.begin_pick(&board.buffers, &shot, rectangle).expect("begins"))
         })
         .collect();
@@ -201,18 +201,19 @@ fn concurrent_picks_finish_in_any_order() {
 /// Normals that are zero or NaN give a zero normal.
 #[test]
 fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
-    let scene = Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
-    let mut board = Board::rest(&scene);
+    let scene = SceneBuilder::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
+    let mut board = PickHarness::rest(&scene);
     let away = [1e7, 0.0, -1e7];
-    board.buffers.relative_to(away);
+    board.buffers.set_origin(away);
     let view = View::LookAt { eye: [1e7, 0.0, 10.0 - 1e7], target: away, up: [0.0, 1.0, 0.0] };
     let hit = board.pick(Camera { view, ..camera(64) }, 64, [36, 30], [1, 1]).remove(0);
     let [x, y, _] = at(36, 30);
     assert!(off(hit.position, [1e7 + x, y, -1e7]) < 2e-6, "{hit:?}");
-    board.buffers.relative_to([0.0; 3]);
+    board.buffers.set_origin([0.0; 3]);
     for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
         let positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
-        let surface = Surface { positions, normals: normals.repeat(4), tangents: vec![], ..Surface::default() };
+        let surface =
+            DeformedSurface { positions, normals: normals.repeat(4), tangents: vec![], ..DeformedSurface::default() };
         board.renderer.upload(&board.buffers, &surface).expect("uploads");
         let hit = board.pick(camera(64), 64, [30, 30], [1, 1]).remove(0);
         assert_eq!(hit.normal.map(f64::abs), [0.0; 3]);
@@ -221,16 +222,16 @@ fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
 
 #[test]
 fn tiny_triangle_near_the_camera_is_picked() {
-    let mesh = Mesh::indexed(
+    let mesh = Mesh::from_indexed(
         vec![[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0]],
         vec![[0.0, 0.0, 1.0]; 3],
         vec![],
         vec![[0, 1, 2]],
     );
-    let mut stage = Stage::new().add(mesh.expect("a triangle"), Material::default());
+    let mut stage = SceneBuilder::new().add(mesh.expect("a triangle"), Material::default());
     stage.0.domains[0] = Domain { placement: Transform::IDENTITY, ..stage.0.domains[0].clone() };
     let view = View::LookAt { eye: [2e-7, 2e-7, 2e-6], target: [2e-7, 2e-7, 0.0], up: [0.0, 1.0, 0.0] };
     let near = Camera { view, near: 1e-6, far: 1e9, ..camera(64) };
-    let hit = Board::rest(&stage.scene()).pick(near, 64, [31, 31], [1, 1]).remove(0);
-    assert!((hit.depth - 2e-6).abs() < 1e-12 && (hit.shares.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{hit:?}");
+    let hit = PickHarness::rest(&stage.scene()).pick(near, 64, [31, 31], [1, 1]).remove(0);
+    assert!((hit.depth - 2e-6).abs() < 1e-12 && (hit.barycentrics.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{hit:?}");
 }

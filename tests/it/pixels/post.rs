@@ -1,16 +1,18 @@
 //! Tone curves, bloom, antialiasing and dithering, compared with arithmetic.
 
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
-use modalcast_model::scene::{Antialias, Bloom, Camera, Lens, Look, State, Tone};
-use modalcast_render::Shot;
+use modalcast_model::scene::{Antialiasing, Bloom, Camera, Lens, RenderSettings, SceneState, ToneMapping};
+use modalcast_render::FrameParams;
 
-use super::build::{Picture, Stage, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb};
+use super::harness::{
+    Picture, SceneBuilder, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb,
+};
 
 /// A stage with one sample per pixel whose white surfaces emit this linear light.
-fn glowing(light: [f32; 3], change: impl FnOnce(Look) -> Look) -> Stage {
-    let mut stage = Stage::new();
+fn glowing(light: [f32; 3], change: impl FnOnce(RenderSettings) -> RenderSettings) -> SceneBuilder {
+    let mut stage = SceneBuilder::new();
     stage.0.look.skylight = light;
     stage.0.look.samples = 1;
     stage.0.look = change(stage.0.look);
@@ -36,7 +38,7 @@ fn aces(light: f64) -> f64 {
 
 #[test]
 fn tone_curves_have_their_known_values() {
-    let shown = |light: [f32; 3], look: &dyn Fn(Look) -> Look| {
+    let shown = |light: [f32; 3], look: &dyn Fn(RenderSettings) -> RenderSettings| {
         picture(&glowing(light, look).add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), white()).scene()).at(32, 32)
     };
     // A threshold that only the light of 1e30 exceeds. The bloom pass inverts the tone curve and applies it again.
@@ -44,15 +46,18 @@ fn tone_curves_have_their_known_values() {
     for light in [[0.01, 0.18, 0.5], [1.0, 2.0, 8.0], [0.0, 30.0, 1e30]] {
         let wide = light.map(f64::from);
         for bloom in [None, idle] {
-            for (tone, want) in [(Tone::Reinhard, wide.map(reinhard)), (Tone::Aces, wide.map(aces)), (Tone::None, wide)]
-            {
+            for (tone, want) in [
+                (ToneMapping::Reinhard, wide.map(reinhard)),
+                (ToneMapping::Aces, wide.map(aces)),
+                (ToneMapping::None, wide),
+            ] {
                 let want = want.map(|value| if value.is_finite() { value } else { 1.0 });
-                let got = shown(light, &|look| Look { tone, bloom, ..look });
+                let got = shown(light, &|look| RenderSettings { tone, bloom, ..look });
                 assert!(close(got, want, 1.0), "{tone:?}, {bloom:?}, {light:?}: {got:?}");
             }
         }
     }
-    let got = shown([0.09, 0.25, 1.0], &|look| Look { tone: Tone::Aces, exposure: 2.0, ..look });
+    let got = shown([0.09, 0.25, 1.0], &|look| RenderSettings { tone: ToneMapping::Aces, exposure: 2.0, ..look });
     assert!(close(got, [0.18, 0.5, 2.0].map(aces), 1.0), "{got:?}");
     assert!(!close(got, [0.09, 0.25, 1.0].map(aces), 10.0), "control: exposure is seen");
     assert!(!close(got, [0.18, 0.5, 2.0].map(reinhard), 10.0), "control: the curves differ");
@@ -76,7 +81,7 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     let shown = |light: f32, bloom: Option<Bloom>, size: [u32; 2]| {
         // One pixel, the second from the center: x = 33, and y = 30 from the top.
         let pixel = facing(0.1, 0.1, 0.2, 0.2, 0.0);
-        let scene = glowing([light; 3], |look| Look { bloom, ..look }).add(pixel, white()).scene();
+        let scene = glowing([light; 3], |look| RenderSettings { bloom, ..look }).add(pixel, white()).scene();
         draw_sized(&mut open(), &scene, camera(64), size)
     };
     let all = |threshold: f32, levels: u32| Some(Bloom { threshold, strength: 1.0, levels });
@@ -99,9 +104,10 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
 #[test]
 fn bloom_is_symmetric_and_respects_its_threshold() {
     let four = facing(-0.1, -0.1, 0.1, 0.1, 0.0);
-    let bloom =
-        |threshold| Look { bloom: Some(Bloom { threshold, strength: 0.8, levels: 4 }), ..Look::default() }.bloom;
-    let stage = |threshold| glowing([30.0, 12.0, 5.0], |look| Look { bloom: bloom(threshold), ..look });
+    let bloom = |threshold| {
+        RenderSettings { bloom: Some(Bloom { threshold, strength: 0.8, levels: 4 }), ..RenderSettings::default() }.bloom
+    };
+    let stage = |threshold| glowing([30.0, 12.0, 5.0], |look| RenderSettings { bloom: bloom(threshold), ..look });
     let shown = picture(&stage(1.0).add(four.clone(), white()).scene());
     for (x, y) in (0..32).flat_map(|x| (0..32).map(move |y| (x, y))) {
         let here = shown.at(x, y);
@@ -124,7 +130,7 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
 #[test]
 fn bright_edges_stay_antialiased_with_bloom() {
     let shown = |bloom: Option<Bloom>| {
-        let stage = glowing([50.0; 3], |look| Look { bloom, samples: 4, ..look });
+        let stage = glowing([50.0; 3], |look| RenderSettings { bloom, samples: 4, ..look });
         let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white() };
         // The lamp covers the right half of the pixels of column 32. Its upper half is behind dark glass.
         let scene = stage.add(facing(0.05, -2.0, 2.0, 2.0, 0.0), white()).add(facing(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
@@ -132,7 +138,7 @@ fn bright_edges_stay_antialiased_with_bloom() {
     };
     let plain = shown(None);
     let idle = shown(Some(Bloom { strength: 0.0, ..Bloom::default() }));
-    assert_eq!(plain.ran.samples, 4);
+    assert_eq!(plain.stats.samples, 4);
     assert!(plain.image.rgba == idle.image.rgba, "a glow of no strength changes nothing");
     for y in [20, 40] {
         assert!(close(plain.at(32, y), [0.5; 3], 1.0) && plain.at(33, y) == [255; 3], "{:?}", plain.at(32, y));
@@ -141,10 +147,10 @@ fn bright_edges_stay_antialiased_with_bloom() {
 }
 
 /// A white rhombus with slanted edges on gray, `scale` times 64 pixels per side.
-fn slanted(antialias: Antialias, samples: u32, scale: u32) -> Picture {
+fn slanted(antialias: Antialiasing, samples: u32, scale: u32) -> Picture {
     let rest = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
-    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a rhomb");
-    let mut stage = glowing([0.9; 3], |look| Look { antialias, samples, ..look });
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a rhomb");
+    let mut stage = glowing([0.9; 3], |look| RenderSettings { antialias, samples, ..look });
     (stage.0.look.zenith, stage.0.look.horizon) = ([0.1; 3], [0.1; 3]);
     let middle = f64::from(32 * scale);
     let focal = f64::from(100 * scale);
@@ -164,13 +170,13 @@ fn error(shown: &Picture, fine: &Picture) -> f64 {
 
 #[test]
 fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
-    let fine = slanted(Antialias::None, 1, 8);
-    let (none, fxaa) = (slanted(Antialias::None, 1, 1), slanted(Antialias::Fxaa, 4, 1));
-    let [one, smoothed, four] = [&none, &fxaa, &slanted(Antialias::Samples, 4, 1)].map(|shown| error(shown, &fine));
-    assert_eq!((none.ran.samples, fxaa.ran.samples), (1, 1));
+    let fine = slanted(Antialiasing::None, 1, 8);
+    let (none, fxaa) = (slanted(Antialiasing::None, 1, 1), slanted(Antialiasing::Fxaa, 4, 1));
+    let [one, smoothed, four] = [&none, &fxaa, &slanted(Antialiasing::Msaa, 4, 1)].map(|shown| error(shown, &fine));
+    assert_eq!((none.stats.samples, fxaa.stats.samples), (1, 1));
     assert!(smoothed < 0.45 * one, "one sample {one}, smoothed {smoothed}, four samples {four} levels");
     assert!(four < 0.6 * one, "control: the judge favours four samples, {four} against {one}");
-    assert!(slanted(Antialias::Samples, 1, 1).image.rgba == none.image.rgba);
+    assert!(slanted(Antialiasing::Msaa, 1, 1).image.rgba == none.image.rgba);
     let mut changed = 0;
     for (x, y) in (1..63).flat_map(|x| (1..63).map(move |y| (x, y))) {
         let own = none.at(x, y);
@@ -183,7 +189,7 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
 
 /// A sky whose values lie between two levels in each channel.
 fn sky(dither: bool) -> Picture {
-    let mut stage = glowing([0.0; 3], |look| Look { dither, ..look });
+    let mut stage = glowing([0.0; 3], |look| RenderSettings { dither, ..look });
     (stage.0.look.zenith, stage.0.look.horizon) = ([0.2985, 0.06, 0.41], [0.2988, 0.0601, 0.4103]);
     picture(&stage.add(facing(-0.1, -3.2, 0.1, -3.1, 0.0), white()).scene())
 }
@@ -221,32 +227,39 @@ fn dithering_stays_within_one_level_and_keeps_the_mean() {
         assert!(kept < 0.1 && lost > 0.2, "channel {channel}: {kept} levels with dithering, {lost} without");
     }
     let flat = |dither| {
-        let stage = glowing([1.0, 0.0, 2.0], |look| Look { dither, ..look });
+        let stage = glowing([1.0, 0.0, 2.0], |look| RenderSettings { dither, ..look });
         picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), white()).scene()).image.rgba
     };
     assert!(flat(true) == flat(false), "what lies on a level stays");
 }
 
-fn everything(look: Look) -> Look {
+fn everything(look: RenderSettings) -> RenderSettings {
     let bloom = Some(Bloom { threshold: 0.3, ..Bloom::default() });
-    Look { bloom, tone: Tone::Aces, exposure: 1.3, antialias: Antialias::Fxaa, dither: true, ..look }
+    RenderSettings {
+        bloom,
+        tone: ToneMapping::Aces,
+        exposure: 1.3,
+        antialias: Antialiasing::Fxaa,
+        dither: true,
+        ..look
+    }
 }
 
 /// Only the post-processing passes that the scene names run.
 #[test]
 fn post_processing_is_deterministic() {
-    let scene = |look: Look| {
-        let mut stage = Stage::new();
+    let scene = |look: RenderSettings| {
+        let mut stage = SceneBuilder::new();
         stage.0.look = look;
         stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.3), white()).add(facing(-2.0, 0.5, 2.0, 0.6, 0.5), white()).scene()
     };
-    let rich = scene(everything(Look::default()));
+    let rich = scene(everything(RenderSettings::default()));
     let mut renderer = open();
     let first = draw(&mut renderer, &rich, camera(96), 96);
-    assert_eq!(first.ran.passes, planned_above(&rich));
-    assert!(first.ran.passes.contains(&"bloom"));
-    let plain = draw(&mut renderer, &scene(Look::default()), camera(96), 96);
-    assert!(!plain.ran.passes.contains(&"bloom"));
+    assert_eq!(first.stats.passes, planned_above(&rich));
+    assert!(first.stats.passes.contains(&"bloom"));
+    let plain = draw(&mut renderer, &scene(RenderSettings::default()), camera(96), 96);
+    assert!(!plain.stats.passes.contains(&"bloom"));
     assert!(draw(&mut renderer, &rich, camera(96), 96).image.rgba == first.image.rgba);
     assert!(draw(&mut open(), &rich, camera(96), 96).image.rgba == first.image.rgba, "another context");
     assert!(plain.image.rgba != first.image.rgba, "control");
@@ -254,9 +267,9 @@ fn post_processing_is_deterministic() {
 
 #[test]
 fn nan_and_infinite_light_affect_no_other_pixel() {
-    for tone in [Tone::None, Tone::Reinhard, Tone::Aces] {
+    for tone in [ToneMapping::None, ToneMapping::Reinhard, ToneMapping::Aces] {
         for bloom in [None, Some(Bloom { threshold: 0.9, strength: 1.0, levels: 8 })] {
-            let mut stage = glowing([0.25; 3], |look| Look { tone, bloom, ..look });
+            let mut stage = glowing([0.25; 3], |look| RenderSettings { tone, bloom, ..look });
             stage.0.look.sunlight = [3e38; 3];
             let lamp = Material { diffuse: [1.0; 3], specular: [1.0; 3], shininess: 1.0, ..white() };
             let scene = stage
@@ -265,25 +278,25 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
                 .scene();
             let mut renderer = open();
             let mut deformer = ReferenceDeformer::new(&scene);
-            let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+            let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
             let rest = deformer.surface().expect("there").clone();
             let shown = |normal: [f32; 3]| {
-                let mut surface = Surface { normals: rest.normals.clone(), ..rest.clone() };
+                let mut surface = DeformedSurface { normals: rest.normals.clone(), ..rest.clone() };
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));
                 let buffers = renderer.load(&scene).expect("loads");
                 renderer.upload(&buffers, &surface).expect("uploads");
-                let shot = Shot { camera: camera(64), width: 64, height: 64, bounds, light: None };
+                let shot = FrameParams { camera: camera(64), width: 64, height: 64, bounds, light: None };
                 let image = renderer.draw(&buffers, &shot).expect("draws");
-                Picture { image, ran: renderer.ran().clone(), allocated: vec![] }
+                Picture { image, stats: renderer.stats().clone(), allocations: vec![] }
             };
             let mut shown = shown;
             let lit = shown([0.0, 0.0, 1.0]);
             assert!(lit.at(7, 57).iter().all(|level| *level > 250), "{tone:?} {bloom:?}: {:?}", lit.at(7, 57));
             let dark = shown([f32::NAN; 3]);
             let want = match tone {
-                Tone::None => 0.25,
-                Tone::Reinhard => reinhard(0.25),
-                Tone::Aces => aces(0.25),
+                ToneMapping::None => 0.25,
+                ToneMapping::Reinhard => reinhard(0.25),
+                ToneMapping::Aces => aces(0.25),
             };
             assert!(close(dark.at(32, 32), [want; 3], 1.0), "{tone:?} {bloom:?}: {:?}", dark.at(32, 32));
             assert_eq!(dark.at(60, 3), [0; 3], "{tone:?} {bloom:?}");

@@ -4,14 +4,14 @@
 use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_compute::reference::raster::Raster;
+use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{Material, Mesh};
-use modalcast_model::scene::{Camera, Culling, Faces, Group, Lens, Scene, State, View, Window};
-use modalcast_render::{Seen, Shot};
+use modalcast_model::scene::{Camera, CullMode, Culling, DrawRange, Lens, Scene, SceneState, View, Viewport};
+use modalcast_render::{FrameParams, VisibilityId};
 use nalgebra::Matrix4;
 
-use super::build::{Stage, open};
+use super::harness::{SceneBuilder, open};
 use crate::both::exact::{Exact, compare};
 use crate::scenes::Random;
 
@@ -33,8 +33,8 @@ fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let triangles: Vec<[u32; 3]> = (0..rest.len() as u32 / 3).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect();
     let count = rest.len();
     let normals = vec![[0.0, 0.0, 1.0]; count];
-    let mesh = Mesh::indexed(rest, normals, vec![[0.0; 2]; count], triangles.clone()).expect("a mesh");
-    let mut stage = Stage::new();
+    let mesh = Mesh::from_indexed(rest, normals, vec![[0.0; 2]; count], triangles.clone()).expect("a mesh");
+    let mut stage = SceneBuilder::new();
     (stage.0.look.samples, stage.0.look.culling) = (1, Culling::None);
     (stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene(), triangles)
 }
@@ -47,26 +47,26 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let view = View::LookAt { eye, target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 40.0 };
         let mut deformer = ReferenceDeformer::new(&scene);
-        let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+        let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
         let surface = deformer.surface().expect("there").clone();
         let buffers = renderer.load(&scene).expect("loads");
         renderer.upload(&buffers, &surface).expect("uploads");
         let [width, height] = SIZE;
-        renderer.draw(&buffers, &Shot { camera, width, height, bounds, light: None }).expect("draws");
-        assert_eq!(renderer.ran().samples, 1);
-        let id = |seen: &Seen| match seen {
-            Seen::Triangle(place) => buffers.triangle(*place).map(|(_, triangle)| triangle as u32),
+        renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("draws");
+        assert_eq!(renderer.stats().samples, 1);
+        let id = |seen: &VisibilityId| match seen {
+            VisibilityId::Triangle(place) => buffers.source_triangle(*place).map(|(_, triangle)| triangle as u32),
             _ => None,
         };
-        let want: Vec<Option<u32>> = renderer.seen().expect("reads").iter().map(id).collect();
+        let want: Vec<Option<u32>> = renderer.read_visibility().expect("reads").iter().map(id).collect();
         renderer.unload(buffers);
 
         let clip = camera.clip_from_camera(width, height, &bounds) * camera.camera_from_world();
         let corner = |vertex: u32| std::array::from_fn(|axis| surface.positions[3 * vertex as usize + axis]);
         let exact: Vec<Exact> = triangles.iter().map(|own| Exact::new(&clip, SIZE, own.map(corner))).collect();
         let ids = |clip: &Matrix4<f64>| {
-            let mut raster = Raster::new(Window::new(clip, width, height).expect("a window"));
-            let group = Group { first: 0, triangles: triangles.len() as u32, faces: Faces::Both };
+            let mut raster = VisibilityBuffer::new(Viewport::new(clip, width, height).expect("a window"));
+            let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()
         };

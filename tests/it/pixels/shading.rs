@@ -4,7 +4,7 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Lens, Transparency, View};
 use nalgebra::Vector3;
 
-use super::build::{Stage, camera, close, draw, facing, open, picture};
+use super::harness::{SceneBuilder, camera, close, draw, facing, open, picture};
 
 fn plain(diffuse: [f32; 3]) -> Material {
     Material { diffuse, ambient: diffuse, ..Material::default() }
@@ -19,7 +19,7 @@ fn pixel_comparison_can_fail() {
 
 #[test]
 fn square_covers_exactly_its_pixels() {
-    let shown = picture(&Stage::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene());
+    let shown = picture(&SceneBuilder::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene());
     assert_eq!(shown.count(|pixel| pixel != [0; 3]), 400);
     assert_eq!((shown.at(21, 32), shown.at(42, 32)), ([0; 3], [0; 3]));
     for corner in [(22, 22), (41, 22), (22, 41), (41, 41)] {
@@ -32,7 +32,8 @@ fn square_covers_exactly_its_pixels() {
 fn top_row_comes_first_and_left_is_left() {
     let red = facing(-3.2, 2.2, -2.2, 3.2, 0.0);
     let green = facing(2.2, -3.2, 3.2, -2.2, 0.0);
-    let shown = picture(&Stage::new().add(red, plain([1.0, 0.0, 0.0])).add(green, plain([0.0, 1.0, 0.0])).scene());
+    let shown =
+        picture(&SceneBuilder::new().add(red, plain([1.0, 0.0, 0.0])).add(green, plain([0.0, 1.0, 0.0])).scene());
     assert!(close(shown.at(2, 2), [0.75, 0.0, 0.0], 1.0));
     assert!(close(shown.at(61, 61), [0.0, 0.75, 0.0], 1.0));
     assert_eq!((shown.at(61, 2), shown.at(2, 61)), ([0; 3], [0; 3]));
@@ -40,20 +41,20 @@ fn top_row_comes_first_and_left_is_left() {
 
 #[test]
 fn first_image_row_is_the_top_of_the_surface() {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     let image = stage.texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
-    let material = Material { colour_texture: Some(image), ..Material::default() };
+    let material = Material { color_texture: Some(image), ..Material::default() };
     let shown = picture(&stage.add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), material).scene());
     // Half a texel from the edge of the image, each texel has its own color.
-    for (x, y, colour) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
+    for (x, y, color) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
         let [r, g, b] = shown.at(x, y);
         assert!(b == 0, "{x} {y}");
-        assert!((f64::from(r) > 150.0) == (colour[0] > 0.5) && (f64::from(g) > 150.0) == (colour[1] > 0.5), "{x} {y}");
+        assert!((f64::from(r) > 150.0) == (color[0] > 0.5) && (f64::from(g) > 150.0) == (color[1] > 0.5), "{x} {y}");
     }
 }
 
 /// Equation 3.12 in f64 with clamped dot products and unshadowed ambient light, for a surface that faces +Z.
-fn phong(stage: &Stage, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
+fn phong(stage: &SceneBuilder, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
     let look = &stage.0.look;
     let sun = Vector3::from(look.sun).cast::<f64>().normalize();
     let normal = Vector3::z();
@@ -62,7 +63,7 @@ fn phong(stage: &Stage, material: &Material, point: Vector3<f64>, eye: Vector3<f
     let facing = normal.dot(&sun).max(0.0);
     let gleam = if facing > 0.0 { reflected.dot(&sun).max(0.0).powf(f64::from(material.shininess)) } else { 0.0 };
     std::array::from_fn(|channel| {
-        let of = |colour: [f32; 3]| f64::from(colour[channel]);
+        let of = |color: [f32; 3]| f64::from(color[channel]);
         of(look.skylight) * of(material.ambient)
             + of(look.sunlight) * (facing * of(material.diffuse) + gleam * of(material.specular))
     })
@@ -78,10 +79,10 @@ fn phong_shading_equals_f64_arithmetic() {
         ..Material::default()
     };
     for (sun, lit) in [([0.3, -0.5, 0.8], true), ([-0.4, 0.1, 0.9], true), ([0.3, 0.5, -0.8], false)] {
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.sun = sun;
         stage.0.look.sunlight = [0.6, 0.7, 0.8];
-        let mut probe = Stage::new();
+        let mut probe = SceneBuilder::new();
         probe.0.look = stage.0.look;
         let shown = picture(&stage.add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), material.clone()).scene());
         let mut highlights = 0;
@@ -99,7 +100,7 @@ fn phong_shading_equals_f64_arithmetic() {
 
 #[test]
 fn sky_gradient_equals_its_formula() {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     stage.0.look.zenith = [0.1, 0.3, 0.8];
     stage.0.look.horizon = [0.7, 0.8, 0.9];
     let shown = picture(&stage.add(facing(-0.1, -0.1, 0.1, 0.1, 0.0), plain([0.0; 3])).scene());
@@ -116,7 +117,7 @@ fn sky_gradient_equals_its_formula() {
 #[test]
 fn normal_map_changes_shading_and_a_flat_one_does_not() {
     let with = |pixel: Option<[u8; 4]>| {
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.sun = [0.6, 0.0, 0.8];
         let image = pixel.map(|pixel| stage.texture(4, 4, |_, _| pixel));
         let material = Material { normal_texture: image, ..plain([1.0; 3]) };
@@ -135,7 +136,7 @@ fn normal_map_changes_shading_and_a_flat_one_does_not() {
 #[test]
 fn plus_y_of_a_normal_map_points_up_the_image() {
     let with = |green: u8| {
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.sun = [0.0, 0.6, 0.8];
         let image = stage.texture(1, 1, |_, _| [128, green, 230, 255]);
         let material = Material { normal_texture: Some(image), ..plain([1.0; 3]) };
@@ -145,11 +146,11 @@ fn plus_y_of_a_normal_map_points_up_the_image() {
 }
 
 /// A red leaf in front of an empty background; the middle half of each of its axes is cut away.
-fn leaf(alpha_mode: AlphaMode) -> super::build::Picture {
-    let mut stage = Stage::new();
+fn leaf(alpha_mode: AlphaMode) -> super::harness::Picture {
+    let mut stage = SceneBuilder::new();
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
     let image = stage.texture(64, 64, |x, y| [255, 0, 0, if hole(x, y) { 0 } else { 255 }]);
-    let material = Material { colour_texture: Some(image), alpha_mode, ..Material::default() };
+    let material = Material { color_texture: Some(image), alpha_mode, ..Material::default() };
     picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), material).scene())
 }
 
@@ -170,7 +171,7 @@ fn two_blended_layers_equal_arithmetic() {
     let layers = |near: f32, far: f32, alpha_mode: AlphaMode| {
         let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..plain(diffuse) };
         // Blended in the order of the scene, the farther layer first.
-        let scene = Stage::new()
+        let scene = SceneBuilder::new()
             .add(facing(-3.0, -3.0, 3.0, 3.0, -2.0), plain([0.2, 0.2, 1.0]))
             .add(facing(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far))
             .add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), layer([1.0, 0.0, 0.0], near))
@@ -194,7 +195,7 @@ fn two_pass_blending_writes_no_depth() {
     let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..plain(diffuse) };
     let shown = |second: f32| {
         let first = facing(-2.0, -2.0, 2.0, 2.0, 0.0);
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.transparency = Transparency::TwoPass;
         let scene = stage
             .add(first, layer([1.0, 0.0, 0.0]))
@@ -212,7 +213,7 @@ fn two_pass_blending_writes_no_depth() {
 #[test]
 fn only_double_sided_back_faces_are_drawn() {
     let from_behind = |double_sided: bool| {
-        let mut stage = Stage::new();
+        let mut stage = SceneBuilder::new();
         stage.0.look.sun = [0.0, 0.0, -1.0];
         let scene = stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material { double_sided, ..plain([1.0; 3]) }).scene();
         let view = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
@@ -224,12 +225,12 @@ fn only_double_sided_back_faces_are_drawn() {
 
 #[test]
 fn images_of_many_sizes_keep_their_materials() {
-    let mut stage = Stage::new();
+    let mut stage = SceneBuilder::new();
     let mut expected = Vec::new();
     for index in 0..9_u32 {
         let shade = 20 + 25 * index as u8;
         let image = stage.texture(3 + 5 * index, 40 - 4 * index, |_, _| [shade, 255 - shade, 0, 255]);
-        let material = Material { colour_texture: Some(image), ..Material::default() };
+        let material = Material { color_texture: Some(image), ..Material::default() };
         let left = -2.7 + 0.6 * index as f32;
         stage = stage.add(facing(left, -1.0, left + 0.6, 1.0, 0.0), material);
         expected.push([shade, 255 - shade, 0]);
@@ -244,7 +245,7 @@ fn images_of_many_sizes_keep_their_materials() {
 
 #[test]
 fn intrinsics_set_principal_point_and_scale_per_axis() {
-    let scene = Stage::new().add(facing(0.0, 0.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene();
+    let scene = SceneBuilder::new().add(facing(0.0, 0.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene();
     let lens = Lens::Intrinsics { fx: 200.0, fy: 100.0, cx: 10.0, cy: 50.0 };
     let shown = draw(&mut open(), &scene, Camera { lens, ..camera(64) }, 64);
     assert_eq!(shown.count(|pixel| pixel != [0; 3]), 200);

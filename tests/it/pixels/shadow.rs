@@ -1,24 +1,24 @@
 //! The variance shadow map, as it appears on the ground.
 
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Camera, Ground, Lens, Shadow, UpAxis, View};
+use modalcast_model::scene::{Camera, Ground, Lens, ShadowSettings, UpAxis, View};
 
-use super::build::{Picture, Stage, close, draw, facing, lying, open};
+use super::harness::{Picture, SceneBuilder, close, draw, facing, floor_mesh, open};
 
 /// A stage for a camera at height 20 that looks down, with ten pixels per unit on the ground. The sun is straight above
 /// unless a test moves it.
-pub(super) fn stage() -> Stage {
-    let mut stage = Stage::new();
+pub(super) fn stage() -> SceneBuilder {
+    let mut stage = SceneBuilder::new();
     stage.0.look.sun = [0.0, 1.0, 0.0];
-    stage.0.look.ground = Some(Ground { colour: [0.8; 3] });
-    stage.0.look.shadow = Some(Shadow { size: 512, bleeding: 0.0, ..Shadow::default() });
+    stage.0.look.ground = Some(Ground { color: [0.8; 3] });
+    stage.0.look.shadow = Some(ShadowSettings { size: 512, bleeding: 0.0, ..ShadowSettings::default() });
     // Two pegs outside of the picture keep the ground at height 0 and widen the bounds.
     stage
         .add(facing(5.0, 0.0, 5.1, 0.1, 5.0), Material::default())
         .add(facing(-5.1, 0.0, -5.0, 0.1, -5.0), Material::default())
 }
 
-fn from_above(stage: Stage) -> Picture {
+fn from_above(stage: SceneBuilder) -> Picture {
     let camera = Camera {
         view: View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] },
         lens: Lens::Intrinsics { fx: 200.0, fy: 200.0, cx: 32.0, cy: 32.0 },
@@ -30,22 +30,22 @@ fn from_above(stage: Stage) -> Picture {
 
 /// A picture from above of a floating square of two units and its shadow. The sun comes from the side, so the square
 /// does not hide its shadow.
-fn aside(stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Picture {
+fn aside(stage: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> Picture {
     from_above(with_square(stage, alpha_mode, alpha))
 }
 
 /// Adds the square, whose shadow on the ground covers x and z of -1 to 1.
-pub(super) fn with_square(mut stage: Stage, alpha_mode: AlphaMode, alpha: f32) -> Stage {
+pub(super) fn with_square(mut stage: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> SceneBuilder {
     stage.0.look.sun = [3.0, 4.0, 0.0];
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
     let image = stage.texture(64, 64, |x, y| [255, 255, 255, if hole(x, y) { 0 } else { 255 }]);
     let material =
-        Material { alpha_mode, alpha, colour_texture: Some(image), double_sided: true, ..Material::default() };
-    let mut square = lying(1.0, 4.0).rest().to_vec();
+        Material { alpha_mode, alpha, color_texture: Some(image), double_sided: true, ..Material::default() };
+    let mut square = floor_mesh(1.0, 4.0).rest().to_vec();
     square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh =
-        modalcast_model::domain::Mesh::indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
+        modalcast_model::domain::Mesh::from_indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
     stage.add(mesh.expect("a square"), material)
 }
 
@@ -68,7 +68,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
     off.0.look.shadow = None;
     let unshaded = aside(off, AlphaMode::Opaque, 1.0);
     assert!(close(unshaded.at(32, 32), ground(1.0, 0.8), 2.0), "control: shadows off");
-    assert!(!unshaded.ran.passes.contains(&"shadow") && shaded.ran.passes.contains(&"shadow"));
+    assert!(!unshaded.stats.passes.contains(&"shadow") && shaded.stats.passes.contains(&"shadow"));
     let mut empty = stage();
     empty.0.look.sun = [3.0, 4.0, 0.0];
     assert!(close(from_above(empty).at(32, 32), ground(1.0, 0.8), 2.0), "control: no caster");
@@ -77,7 +77,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
 #[test]
 fn shadow_removes_everything_but_ambient_light() {
     let floor = Material { ambient: [0.9, 0.5, 0.2], specular: [0.5; 3], shininess: 1.0, ..Material::default() };
-    let shaded = aside(stage().add(lying(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+    let shaded = aside(stage().add(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
     assert!(close(shaded.at(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", shaded.at(32, 32));
     let [r, g, b] = shaded.at(32, 8);
     assert!(r > 190 && g > 190 && b > 190, "control: lit beside the shadow, {:?}", [r, g, b]);
@@ -90,9 +90,9 @@ fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
     // Without a highlight, equation 3.12 as printed is s_f I_l (C_a + (n . v_l) C_d): the sun also lights C_a, and the
     // shadow removes that light. In this renderer the sky lights C_a, and the shadow does not remove it.
     let (ambient, diffuse, facing) = ([0.4, 0.2, 0.1], [0.3_f32, 0.5, 0.7], 0.8);
-    let colour = |ambient_light: f64, sunlight: f64| {
+    let color = |ambient_light: f64, sunlight: f64| {
         std::array::from_fn(|channel| {
-            let [a, d] = [ambient, diffuse].map(|colour| f64::from(colour[channel]));
+            let [a, d] = [ambient, diffuse].map(|color| f64::from(color[channel]));
             ambient_light * a + sunlight * facing * d
         })
     };
@@ -100,9 +100,9 @@ fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
         let mut stage = stage();
         (stage.0.look.skylight, stage.0.look.sunlight) = ([skylight as f32; 3], [0.5; 3]);
         let floor = Material { ambient, diffuse, specular: [0.0; 3], ..Material::default() };
-        let shown = aside(stage.add(lying(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+        let shown = aside(stage.add(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
         for (share, pixel) in [(1.0, shown.at(32, 8)), (0.0, shown.at(32, 32))] {
-            let (printed, ours) = (colour(share * 0.5, share * 0.5), colour(skylight, share * 0.5));
+            let (printed, ours) = (color(share * 0.5, share * 0.5), color(skylight, share * 0.5));
             assert!(close(pixel, ours, 1.0), "sky {skylight}, sun {share}: {pixel:?}, expected {ours:?}");
             let same = skylight == 0.5 && share == 1.0;
             assert_eq!(close(pixel, printed, 1.0), same, "sky {skylight}, sun {share}: {pixel:?}, printed {printed:?}");
@@ -134,10 +134,11 @@ fn unblurred_texel_gives_the_chebyshev_bound() {
     // 14.97 beyond square and ground, rounded outwards to multiples of 1/8.
     let shown = |least_variance: f32, bleeding: f32| {
         let mut stage = stage();
-        stage.0.look.shadow = Some(Shadow { size: 64, blur: 0.0, least_variance, bleeding, ..Shadow::default() });
+        stage.0.look.shadow =
+            Some(ShadowSettings { size: 64, blur: 0.0, least_variance, bleeding, ..ShadowSettings::default() });
         let cover = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };
-        stage.0.look.shadow = stage.0.look.shadow.map(|shadow| Shadow { alpha_threshold: 0.0, ..shadow });
-        from_above(stage.add(lying(5.1, 4.0), cover)).at(32, 32)
+        stage.0.look.shadow = stage.0.look.shadow.map(|shadow| ShadowSettings { alpha_threshold: 0.0, ..shadow });
+        from_above(stage.add(floor_mesh(5.1, 4.0), cover)).at(32, 32)
     };
     let behind = 4.0 / (4.25 + 0.25);
     for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
@@ -155,7 +156,7 @@ fn unblurred_texel_gives_the_chebyshev_bound() {
 fn blur_widens_the_edge_of_a_shadow() {
     let penumbra = |blur: f32| {
         let mut stage = stage();
-        stage.0.look.shadow = Some(Shadow { size: 256, blur, bleeding: 0.0, ..Shadow::default() });
+        stage.0.look.shadow = Some(ShadowSettings { size: 256, blur, bleeding: 0.0, ..ShadowSettings::default() });
         let shown = aside(stage, AlphaMode::Opaque, 1.0);
         let row: Vec<f64> = (8..56).map(|y| f64::from(shown.at(32, y)[0])).collect();
         let (dark, light) = (row[24], row[0]);
@@ -172,7 +173,7 @@ fn lit_surface_does_not_shadow_itself() {
     for sun in [[0.0, 1.0, 0.0], [3.0, 4.0, 0.0], [1.0, 0.4, 0.6]] {
         let mut stage = stage();
         stage.0.look.sun = sun;
-        let shown = from_above(stage.add(lying(1.5, 2.0), Material::default()));
+        let shown = from_above(stage.add(floor_mesh(1.5, 2.0), Material::default()));
         let lit = nalgebra::Vector3::from(sun).cast::<f64>().normalize().y;
         for (x, y) in [(32, 32), (22, 24), (40, 42)] {
             let seen = shown.at(x, y);
@@ -184,7 +185,7 @@ fn lit_surface_does_not_shadow_itself() {
 #[test]
 fn floor_in_the_plane_of_the_ground_covers_it() {
     for height in [0.0, 1e-7] {
-        let shown = from_above(stage().add(lying(1.5, height), Material { ambient: [1.0, 0.0, 0.0], ..paint() }));
+        let shown = from_above(stage().add(floor_mesh(1.5, height), Material { ambient: [1.0, 0.0, 0.0], ..paint() }));
         let floor = shown.count(|[r, g, b]| r > 100 && g < 10 && b < 10);
         assert_eq!(floor, 900, "at {height}");
     }
@@ -198,18 +199,18 @@ fn paint() -> Material {
 #[test]
 fn every_up_axis_gives_the_same_picture() {
     let shown = |up: UpAxis| {
-        let turn = up.from_y_up();
-        let mut stage = Stage::new();
+        let turn = up.rotation_from_y_up();
+        let mut stage = SceneBuilder::new();
         stage.0.up = up;
-        stage.0.look = modalcast_model::scene::Look::default();
-        let mesh = lying(1.0, 1.0);
+        stage.0.look = modalcast_model::scene::RenderSettings::default();
+        let mesh = floor_mesh(1.0, 1.0);
         let rotate = |vector: &[f32; 3]| (turn * nalgebra::Vector3::from(*vector).cast::<f64>()).cast::<f32>().into();
-        let rest: Vec<[f32; 3]> = mesh.rest().iter().chain(lying(0.4, 0.0).rest()).map(rotate).collect();
+        let rest: Vec<[f32; 3]> = mesh.rest().iter().chain(floor_mesh(0.4, 0.0).rest()).map(rotate).collect();
         let normals = vec![rotate(&[0.0, 1.0, 0.0]); 8];
         let triangles = vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
-        let mesh = modalcast_model::domain::Mesh::indexed(rest, normals, vec![], triangles).expect("two squares");
+        let mesh = modalcast_model::domain::Mesh::from_indexed(rest, normals, vec![], triangles).expect("two squares");
         let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
-        draw(&mut open(), &scene, Camera::framing(&scene, 64, 64), 64)
+        draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64)
     };
     let upright = shown(UpAxis::Y);
     for up in [UpAxis::X, UpAxis::Z] {

@@ -3,48 +3,50 @@
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{Material, Mesh};
-use modalcast_model::scene::{Bounds, Camera, Lens, LightBounds, Look, Scene, Shadow, ShadowMethod, State, View};
-use modalcast_render::{Image, Shot};
+use modalcast_model::scene::{
+    Bounds, Camera, Lens, LightSpaceBox, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings, View,
+};
+use modalcast_render::{FrameImage, FrameParams};
 
-use super::build::{Stage, lying, open};
+use super::harness::{SceneBuilder, floor_mesh, open};
 
-fn kinds() -> [Shadow; 5] {
-    let base = Shadow { size: 128, ..Shadow::default() };
+fn kinds() -> [ShadowSettings; 5] {
+    let base = ShadowSettings { size: 128, ..ShadowSettings::default() };
     [
         base,
-        Shadow { method: ShadowMethod::Standard, ..base },
-        Shadow { method: ShadowMethod::Filtered, ..base },
-        Shadow { splits: 4, ..base },
-        Shadow { size: 16, blur: 16.0, splits: 2, method: ShadowMethod::Filtered, ..base },
+        ShadowSettings { method: ShadowMethod::Standard, ..base },
+        ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
+        ShadowSettings { splits: 4, ..base },
+        ShadowSettings { size: 16, blur: 16.0, splits: 2, method: ShadowMethod::PercentageCloser, ..base },
     ]
 }
 
 fn triangle(corners: [[f32; 3]; 3]) -> Mesh {
-    Mesh::indexed(corners.to_vec(), vec![[0.0, 1.0, 0.0]; 3], vec![], vec![[0, 1, 2]]).expect("a triangle")
+    Mesh::from_indexed(corners.to_vec(), vec![[0.0, 1.0, 0.0]; 3], vec![], vec![[0, 1, 2]]).expect("a triangle")
 }
 
 /// A picture of a scene with this sun and shadow map. The sky is bright and lights everything, so no valid pixel is
 /// black.
-fn picture(meshes: &[Mesh], sun: [f32; 3], shadow: Shadow, camera: Option<(f64, f64)>) -> Image {
-    let mut stage = Stage::new();
-    stage.0.look = Look { sun, shadow: Some(shadow), ..Look::default() };
+fn picture(meshes: &[Mesh], sun: [f32; 3], shadow: ShadowSettings, camera: Option<(f64, f64)>) -> FrameImage {
+    let mut stage = SceneBuilder::new();
+    stage.0.look = RenderSettings { sun, shadow: Some(shadow), ..RenderSettings::default() };
     for mesh in meshes {
         stage = stage.add(mesh.clone(), Material { double_sided: true, ..Material::default() });
     }
     let scene = stage.scene();
-    let mut shown = Camera::framing(&scene, 32, 32);
+    let mut shown = Camera::fit_to_scene(&scene, 32, 32);
     if let Some((near, far)) = camera {
         (shown.near, shown.far) = (near, far);
     }
     let mut deformer = ReferenceDeformer::new(&scene);
-    let bounds = deformer.deform(&State::rest(&scene)).expect("deforms").bounds;
+    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
     let mut renderer = open();
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    renderer.draw(&buffers, &Shot { camera: shown, width: 32, height: 32, bounds, light: None }).expect("draws")
+    renderer.draw(&buffers, &FrameParams { camera: shown, width: 32, height: 32, bounds, light: None }).expect("draws")
 }
 
-fn black(image: &Image) -> usize {
+fn black(image: &FrameImage) -> usize {
     image.rgba.chunks_exact(4).filter(|pixel| pixel[..3] == [0; 3]).count()
 }
 
@@ -54,7 +56,7 @@ fn extreme_suns_cameras_and_scenes_have_no_nan_pixel() {
     let point = [triangle([[5.0, 2.0, 5.0]; 3])];
     let upright = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
     let far = [triangle([[1e7, 0.5, 0.0], [1e7 + 2.0, 0.5, 0.0], [1e7, 1.0, 2.0]])];
-    let high = Vec::from([lying(2.0, 0.0), lying(1.0, 1.0)]);
+    let high = Vec::from([floor_mesh(2.0, 0.0), floor_mesh(1.0, 1.0)]);
     let scenes: [(&[Mesh], &str); 5] = [
         (&one, "one triangle"),
         (&point, "a point"),
@@ -79,14 +81,14 @@ fn extreme_suns_cameras_and_scenes_have_no_nan_pixel() {
 
 #[test]
 fn static_shadow_does_not_flicker_while_bounds_grow() {
-    let table = |shadow: Shadow| {
-        let mut stage = Stage::new();
-        stage.0.look = Look { shadow: Some(shadow), ..Look::default() };
-        stage.add(lying(1.0, 0.7), Material::default()).add(lying(0.1, 0.0), Material::default()).scene()
+    let table = |shadow: ShadowSettings| {
+        let mut stage = SceneBuilder::new();
+        stage.0.look = RenderSettings { shadow: Some(shadow), ..RenderSettings::default() };
+        stage.add(floor_mesh(1.0, 0.7), Material::default()).add(floor_mesh(0.1, 0.0), Material::default()).scene()
     };
-    let base = Shadow { size: 100, ..Shadow::default() };
-    for method in [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::Filtered] {
-        let scene = table(Shadow { method, ..base });
+    let base = ShadowSettings { size: 100, ..ShadowSettings::default() };
+    for method in [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::PercentageCloser] {
+        let scene = table(ShadowSettings { method, ..base });
         for is_lit in [false, true] {
             let steps = frames(&scene, is_lit);
             let changes: Vec<usize> = steps.windows(2).map(|pair| differing(&pair[0], &pair[1])).collect();
@@ -101,9 +103,9 @@ fn static_shadow_does_not_flicker_while_bounds_grow() {
 }
 
 /// Renders 60 frames of a scene at rest whose bounds grow. With `is_lit`, the shots contain light bounds too.
-fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<Image> {
+fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<FrameImage> {
     let mut deformer = ReferenceDeformer::new(scene);
-    let rest = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let rest = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
     let mut renderer = open();
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
@@ -117,15 +119,15 @@ fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<Image> {
     let mut frame = |step: u32| {
         let bounds = grown(step);
         // Slightly more than the box itself.
-        let light = LightBounds::of_box(&axes, &bounds).widened(0.02 * bounds.diagonal());
-        let shot = Shot { camera, width: 96, height: 96, bounds, light: is_lit.then_some(light) };
+        let light = LightSpaceBox::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
+        let shot = FrameParams { camera, width: 96, height: 96, bounds, light: is_lit.then_some(light) };
         renderer.draw(&buffers, &shot).expect("draws")
     };
     (0..60).map(&mut frame).collect()
 }
 
 /// Number of pixels that differ by more than one level.
-fn differing(one: &Image, other: &Image) -> usize {
+fn differing(one: &FrameImage, other: &FrameImage) -> usize {
     let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
     pairs.filter(|(a, b)| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > 1)).count()
 }

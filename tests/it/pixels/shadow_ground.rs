@@ -2,13 +2,13 @@
 //! the contact line of a wall.
 
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Blurring, Camera, Lens, Shadow, ShadowMethod, View};
+use modalcast_model::scene::{BlurMethod, Camera, Lens, ShadowMethod, ShadowSettings, View};
 
-use super::build::{Picture, close, draw, facing, open};
+use super::harness::{Picture, close, draw, facing, open};
 use super::shadow::{stage, with_square};
 
 /// The part of the ground that the map covers, seen from above, with the given shadow map or none.
-fn from_high_above(shadow: Option<Shadow>, caster: bool) -> Picture {
+fn from_high_above(shadow: Option<ShadowSettings>, caster: bool) -> Picture {
     let mut stage = stage();
     stage.0.look.sun = [3.0, 4.0, 0.0];
     stage.0.look.shadow = shadow;
@@ -20,13 +20,13 @@ fn from_high_above(shadow: Option<Shadow>, caster: bool) -> Picture {
 
 #[test]
 fn ground_is_lit_at_the_border_of_the_map() {
-    let base = Shadow { size: 64, blur: 4.0, bleeding: 0.2, ..Shadow::default() };
+    let base = ShadowSettings { size: 64, blur: 4.0, bleeding: 0.2, ..ShadowSettings::default() };
     let kinds = [
-        Shadow { blurring: Blurring::Rows, ..base },
-        Shadow { blurring: Blurring::Tiles, ..base },
-        Shadow { blurring: Blurring::Fragments, ..base },
-        Shadow { method: ShadowMethod::Filtered, ..base },
-        Shadow { splits: 2, ..base },
+        ShadowSettings { blur_method: BlurMethod::Rows, ..base },
+        ShadowSettings { blur_method: BlurMethod::Tiles, ..base },
+        ShadowSettings { blur_method: BlurMethod::Fragments, ..base },
+        ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
+        ShadowSettings { splits: 2, ..base },
     ];
     let bright = from_high_above(None, false);
     let darker = |shown: &Picture| {
@@ -40,7 +40,7 @@ fn ground_is_lit_at_the_border_of_the_map() {
 }
 
 /// Number of pixels of a wall on the ground that are not fully lit, and number that are not fully dark.
-fn on_the_wall(shadow: Shadow, shaded: bool) -> [usize; 2] {
+fn on_the_wall(shadow: ShadowSettings, shaded: bool) -> [usize; 2] {
     let mut stage = stage();
     stage.0.look.sun = [0.0, 3.0, 4.0];
     stage.0.look.shadow = Some(shadow);
@@ -64,8 +64,12 @@ fn on_the_wall(shadow: Shadow, shaded: bool) -> [usize; 2] {
 fn lit_wall_is_fully_lit_down_to_the_ground() {
     for blur in [0.0, 2.0, 4.0] {
         for size in [128, 512] {
-            let base = Shadow { size, blur, bleeding: 0.2, ..Shadow::default() };
-            for shadow in [base, Shadow { splits: 3, ..base }, Shadow { method: ShadowMethod::Filtered, ..base }] {
+            let base = ShadowSettings { size, blur, bleeding: 0.2, ..ShadowSettings::default() };
+            for shadow in [
+                base,
+                ShadowSettings { splits: 3, ..base },
+                ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
+            ] {
                 let [unlit, _] = on_the_wall(shadow, false);
                 assert_eq!(unlit, 0, "{shadow:?}");
             }

@@ -1,10 +1,10 @@
 //! Every kind of shadow map compared with the same arithmetic: the shadow of a straight edge on the ground.
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
-use modalcast_model::scene::{Blurring, Camera, Lens, Moments, Scene, Shadow, ShadowMethod, View};
+use modalcast_model::scene::{BlurMethod, Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
 use modalcast_render::plan;
 
-use super::build::{Picture, close, draw, lying, open, planned_above};
+use super::harness::{Picture, close, draw, floor_mesh, open, planned_above};
 use super::shadow::{stage, with_square};
 
 /// Pixels per unit of the ground in the picture of the edge.
@@ -13,24 +13,24 @@ const SCALE: f64 = 100.0;
 /// of 4 / 16.
 const HALF: f64 = 5.25;
 
-fn variance() -> Shadow {
-    Shadow { size: 256, blur: 2.0, bleeding: 0.0, ..Shadow::default() }
+fn variance() -> ShadowSettings {
+    ShadowSettings { size: 256, blur: 2.0, bleeding: 0.0, ..ShadowSettings::default() }
 }
 
 /// Side of a texel across the edge, in units. `rim` texels at each border of the map contain no caster.
-fn texel(shadow: &Shadow) -> f64 {
+fn texel(shadow: &ShadowSettings) -> f64 {
     let rim = f64::from(shadow.reach()) + 1.0;
     2.0 * HALF / (f64::from(shadow.size) - 2.0 * rim)
 }
 
-fn scene(shadow: Shadow) -> std::sync::Arc<Scene> {
+fn scene(shadow: ShadowSettings) -> std::sync::Arc<Scene> {
     let mut stage = stage();
     stage.0.look.shadow = Some(shadow);
     with_square(stage, AlphaMode::Opaque, 1.0).scene()
 }
 
 /// Picture from straight above of the edge at z = 1 of the shadow of the square.
-fn edge(shadow: Shadow) -> Picture {
+fn edge(shadow: ShadowSettings) -> Picture {
     let view = View::LookAt { eye: [0.0, 20.0, 1.0], target: [0.0, 0.0, 1.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 20.0 * SCALE, fy: 20.0 * SCALE, cx: 32.0, cy: 32.0 };
     draw(&mut open(), &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
@@ -54,7 +54,7 @@ fn profile(picture: &Picture, column: u32) -> Vec<f64> {
 
 /// Expected fraction of sunlight at z: texels whose center the square covers are dark. The result is blurred with the
 /// Gaussian and interpolated linearly between texels.
-fn expected(shadow: &Shadow, z: f64) -> f64 {
+fn expected(shadow: &ShadowSettings, z: f64) -> f64 {
     let (texel, reach) = (texel(shadow), shadow.reach() as i64);
     let bell = |step: i64| if step == 0 { 1.0 } else { (-0.5 * (step as f64 / f64::from(shadow.blur)).powi(2)).exp() };
     let sum: f64 = (-reach..=reach).map(bell).sum();
@@ -71,13 +71,13 @@ fn expected(shadow: &Shadow, z: f64) -> f64 {
 fn filtered_and_variance_maps_give_the_blurred_edge() {
     let base = variance();
     let kinds = [
-        Shadow { method: ShadowMethod::Filtered, ..base },
-        Shadow { method: ShadowMethod::Filtered, blur: 0.7, ..base },
-        Shadow { blurring: Blurring::Rows, ..base },
-        Shadow { blurring: Blurring::Tiles, ..base },
-        Shadow { blurring: Blurring::Tiles, blur: 0.0, ..base },
-        Shadow { blurring: Blurring::Tiles, blur: 4.0, ..base },
-        Shadow { blurring: Blurring::Fragments, ..base },
+        ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
+        ShadowSettings { method: ShadowMethod::PercentageCloser, blur: 0.7, ..base },
+        ShadowSettings { blur_method: BlurMethod::Rows, ..base },
+        ShadowSettings { blur_method: BlurMethod::Tiles, ..base },
+        ShadowSettings { blur_method: BlurMethod::Tiles, blur: 0.0, ..base },
+        ShadowSettings { blur_method: BlurMethod::Tiles, blur: 4.0, ..base },
+        ShadowSettings { blur_method: BlurMethod::Fragments, ..base },
     ];
     for shadow in kinds {
         let seen = profile(&edge(shadow), 32);
@@ -94,11 +94,11 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
 fn all_blur_implementations_agree() {
     // Blurs of up to 8 texels use strips, which are taller in larger maps; wider blurs use tiles.
     for (blur, size) in [(0.0, 200), (1.5, 200), (4.0, 200), (8.0, 200), (9.0, 200), (16.0, 200), (2.3, 1100)] {
-        let [tiles, rows, fragments] = [Blurring::Tiles, Blurring::Rows, Blurring::Fragments]
-            .map(|blurring| edge(Shadow { size, blur, blurring, ..variance() }).image.rgba);
+        let [tiles, rows, fragments] = [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments]
+            .map(|blur_method| edge(ShadowSettings { size, blur, blur_method, ..variance() }).image.rgba);
         let most = |other: &[u8]| tiles.iter().zip(other).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
         assert!(most(&rows) <= 1 && most(&fragments) <= 1, "blur {blur}: {} {}", most(&rows), most(&fragments));
-        let wider = edge(Shadow { size, blur: (blur + 1.0).min(15.0), ..variance() }).image.rgba;
+        let wider = edge(ShadowSettings { size, blur: (blur + 1.0).min(15.0), ..variance() }).image.rgba;
         assert!(most(&wider) > 1, "control: another blur is seen");
     }
 }
@@ -116,15 +116,15 @@ fn shadow_edges_are_within_their_stated_distance() {
     // The tolerance is half a texel, for the sampling of the caster. Bleeding reduction moves the edge outwards by
     // 0.2533 standard deviations of the blur.
     let kinds = [
-        (Shadow { method: ShadowMethod::Standard, ..base }, 0.0),
-        (Shadow { method: ShadowMethod::Filtered, ..base }, 0.0),
+        (ShadowSettings { method: ShadowMethod::Standard, ..base }, 0.0),
+        (ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }, 0.0),
         (base, 0.0),
-        (Shadow { bleeding: 0.2, ..base }, 0.2533 * 2.0),
-        (Shadow { moments: Moments::F16, ..base }, 0.0),
+        (ShadowSettings { bleeding: 0.2, ..base }, 0.2533 * 2.0),
+        (ShadowSettings { moments: MomentFormat::F16, ..base }, 0.0),
     ];
     for size in [64, 100, 256] {
         for (shadow, outwards) in kinds {
-            let shadow = Shadow { size, ..shadow };
+            let shadow = ShadowSettings { size, ..shadow };
             let off = (crossing(&profile(&edge(shadow), 32)) - 1.0) / texel(&shadow);
             let pixel = 1.0 / SCALE / texel(&shadow);
             assert!((off - outwards).abs() <= 0.5 + pixel, "{shadow:?}: {off} texels");
@@ -136,23 +136,23 @@ fn shadow_edges_are_within_their_stated_distance() {
 
 #[test]
 fn only_standard_maps_have_hard_edges() {
-    let between = |shadow: Shadow| {
+    let between = |shadow: ShadowSettings| {
         let picture = edge(shadow);
         (0..64).flat_map(|column| profile(&picture, column)).filter(|share| (0.05..0.95).contains(share)).count()
     };
-    assert_eq!(between(Shadow { method: ShadowMethod::Standard, ..variance() }), 0);
-    for method in [ShadowMethod::Filtered, ShadowMethod::Variance] {
-        assert!(between(Shadow { method, ..variance() }) > 500, "control: {method:?} is soft");
+    assert_eq!(between(ShadowSettings { method: ShadowMethod::Standard, ..variance() }), 0);
+    for method in [ShadowMethod::PercentageCloser, ShadowMethod::Variance] {
+        assert!(between(ShadowSettings { method, ..variance() }) > 500, "control: {method:?} is soft");
     }
 }
 
 /// Number of pixels of a lit square of six units per side that are darker than the sun makes them; the square casts and
 /// receives.
-fn self_shadowed(over: &[Mesh], shadow: Shadow, sun: [f32; 3]) -> usize {
+fn self_shadowed(over: &[Mesh], shadow: ShadowSettings, sun: [f32; 3]) -> usize {
     let mut stage = stage();
     (stage.0.look.shadow, stage.0.look.sun) = (Some(shadow), sun);
     let stage = over.iter().fold(stage, |stage, mesh| stage.add(mesh.clone(), Material::default()));
-    let scene = stage.add(lying(3.0, 2.0), Material::default()).scene();
+    let scene = stage.add(floor_mesh(3.0, 2.0), Material::default()).scene();
     let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 200.0, fy: 200.0, cx: 32.0, cy: 32.0 };
     let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
@@ -163,32 +163,33 @@ fn self_shadowed(over: &[Mesh], shadow: Shadow, sun: [f32; 3]) -> usize {
 
 #[test]
 fn no_method_shadows_a_lit_surface() {
-    let base = Shadow { size: 512, ..Shadow::default() };
+    let base = ShadowSettings { size: 512, ..ShadowSettings::default() };
     for sun in [[0.0, 1.0, 0.0], [3.0, 4.0, 0.0], [1.0, 0.4, 0.6], [1.0, 0.15, 0.3]] {
         let kinds = [
             base,
-            Shadow { method: ShadowMethod::Standard, ..base },
-            Shadow { method: ShadowMethod::Filtered, ..base },
-            Shadow { method: ShadowMethod::Filtered, blur: 4.0, ..base },
-            Shadow { splits: 4, ..base },
+            ShadowSettings { method: ShadowMethod::Standard, ..base },
+            ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
+            ShadowSettings { method: ShadowMethod::PercentageCloser, blur: 4.0, ..base },
+            ShadowSettings { splits: 4, ..base },
         ];
         for shadow in kinds {
             assert_eq!(self_shadowed(&[], shadow, sun), 0, "{sun:?} {shadow:?}");
         }
     }
-    let over = self_shadowed(&[lying(0.5, 3.0)], base, [1.0, 0.4, 0.6]);
+    let over = self_shadowed(&[floor_mesh(0.5, 3.0)], base, [1.0, 0.4, 0.6]);
     assert!(over > 20, "control: a caster over it darkens {over} pixels only");
 }
 
 /// Number of lit pixels in a strip of ground that is fully in the shadow of a square just above it.
-fn lit_in_the_umbra(moments: Moments) -> usize {
+fn lit_in_the_umbra(moments: MomentFormat) -> usize {
     let mut stage = stage();
-    stage.0.look.shadow = Some(Shadow { size: 2048, blur: 0.5, moments, ..Shadow::default() });
+    stage.0.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
     stage.0.look.sun = [3.0, 1.0, 0.0];
     // Far from the center of the depth range, where f16 is coarse. The shadow extends 0.09 beyond the square.
-    let mut rest = lying(1.0, 0.03).rest().to_vec();
+    let mut rest = floor_mesh(1.0, 0.03).rest().to_vec();
     rest.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
-    let mesh = Mesh::indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+    let mesh =
+        Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
     let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
     let view = View::LookAt { eye: [-3.545, 20.0, 0.0], target: [-3.545, 0.0, 0.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 2e4, fy: 2e4, cx: 32.0, cy: 32.0 };
@@ -200,8 +201,8 @@ fn lit_in_the_umbra(moments: Moments) -> usize {
 /// Moments in f32 leak none.
 #[test]
 fn f16_moments_leak_light_near_the_caster() {
-    assert_eq!(lit_in_the_umbra(Moments::F32), 0);
-    let failed = lit_in_the_umbra(Moments::F16);
+    assert_eq!(lit_in_the_umbra(MomentFormat::F32), 0);
+    let failed = lit_in_the_umbra(MomentFormat::F16);
     assert!(failed > 400, "f16 spoils {failed} of 4096 pixels only");
 }
 
@@ -209,7 +210,7 @@ fn f16_moments_leak_light_near_the_caster() {
 fn half_lit(splits: u32) -> usize {
     let view = View::LookAt { eye: [0.0, 2.0, 4.0], target: [0.0, 0.0, 1.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 400.0, fy: 400.0, cx: 64.0, cy: 64.0 };
-    let scene = scene(Shadow { size: 64, splits, ..variance() });
+    let scene = scene(ShadowSettings { size: 64, splits, ..variance() });
     let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
     let column: Vec<f64> = (0..128).map(|row| share(shown.at(64, row))).collect();
     assert!(column[0] < 0.1 && column[127] > 0.9, "dark behind the edge and lit before it, {splits} maps: {column:?}");
@@ -224,21 +225,21 @@ fn splits_give_near_shadows_finer_texels() {
 
 #[test]
 fn unused_shadow_resources_are_not_allocated() {
-    let made = |shadow: Shadow| {
+    let made = |shadow: ShadowSettings| {
         let scene = scene(shadow);
         let (shown, plan) = (edge(shadow), plan(&scene));
-        assert_eq!(shown.ran.passes, planned_above(&scene), "what is planned is what runs");
+        assert_eq!(shown.stats.passes, planned_above(&scene), "what is planned is what runs");
         let textures: Vec<String> = plan.textures.iter().map(|part| part.name.clone()).collect();
         let maps: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
-        let splits = shown.allocated.iter().any(|part| part.name == "splits");
-        (shown.ran.passes.contains(&"blur"), maps, splits)
+        let splits = shown.allocations.iter().any(|part| part.name == "shadow cascades");
+        (shown.stats.passes.contains(&"blur"), maps, splits)
     };
-    let base = Shadow { size: 64, ..Shadow::default() };
+    let base = ShadowSettings { size: 64, ..ShadowSettings::default() };
     let depth = vec!["shadow depth".to_string()];
-    for method in [ShadowMethod::Standard, ShadowMethod::Filtered] {
-        assert_eq!(made(Shadow { method, ..base }), (false, depth.clone(), false));
+    for method in [ShadowMethod::Standard, ShadowMethod::PercentageCloser] {
+        assert_eq!(made(ShadowSettings { method, ..base }), (false, depth.clone(), false));
     }
     let both = vec!["shadow depth".to_string(), "shadow moments".to_string()];
     assert_eq!(made(base), (true, both.clone(), false));
-    assert_eq!(made(Shadow { splits: 2, ..base }), (true, both, true));
+    assert_eq!(made(ShadowSettings { splits: 2, ..base }), (true, both, true));
 }

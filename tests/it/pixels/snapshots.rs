@@ -3,9 +3,9 @@
 
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, View};
-use modalcast_render::Image;
+use modalcast_render::FrameImage;
 
-use super::build::{draw_sized, open};
+use super::harness::{draw_sized, open};
 
 /// Mean, 99th percentile and maximum of the per-pixel difference of two pictures, in levels. The difference of a pixel
 /// is that of its worst channel.
@@ -19,7 +19,7 @@ fn difference(one: &[u8], other: &[u8]) -> (f64, u8, u8) {
 }
 
 /// The tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky.
-fn tree(eye: [f64; 3]) -> Image {
+fn tree(eye: [f64; 3]) -> FrameImage {
     let scene = load::open("tree").expect("built in");
     let view = View::LookAt { eye, target: [0.0, 1.8, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(45.0), near: 0.0, far: 0.0 };

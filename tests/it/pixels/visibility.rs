@@ -2,21 +2,21 @@
 
 use std::sync::Arc;
 
-use modalcast_model::deform::Surface;
+use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Ground, Lens, Scene, View};
-use modalcast_render::{Seen, Shot};
+use modalcast_render::{FrameParams, VisibilityId};
 use nalgebra::Vector3;
 
-use super::build::{Picture, Stage, camera, close, draw, facing, open, picture, srgb};
+use super::harness::{Picture, SceneBuilder, camera, close, draw, facing, open, picture, srgb};
 
 /// A material lit by ambient light alone, so that a texel of value v appears as v.
-fn painted(colour_texture: Option<usize>) -> Material {
-    Material { ambient: [1.0; 3], diffuse: [0.0; 3], colour_texture, ..Material::default() }
+fn painted(color_texture: Option<usize>) -> Material {
+    Material { ambient: [1.0; 3], diffuse: [0.0; 3], color_texture, ..Material::default() }
 }
 
-fn stage() -> Stage {
-    let mut stage = Stage::new();
+fn stage() -> SceneBuilder {
+    let mut stage = SceneBuilder::new();
     stage.0.look.skylight = [1.0; 3];
     stage
 }
@@ -37,10 +37,10 @@ fn edge_covers_the_samples_on_its_side() {
             picture(&stage.add(facing(-1.0, -1.0, 0.1 * edge, 1.0, 0.0), painted(None)).scene())
         };
         let four = shown(4);
-        assert_eq!(four.ran.samples, 4);
+        assert_eq!(four.stats.samples, 4);
         assert!(close(four.at(32, 30), [share; 3], 1.0), "{edge}: {:?}", four.at(32, 30));
         let one = shown(1);
-        assert_eq!(one.ran.samples, 1);
+        assert_eq!(one.stats.samples, 1);
         assert!([[0; 3], [255; 3]].contains(&one.at(32, 30)), "{edge}: {:?}", one.at(32, 30));
     }
 }
@@ -76,7 +76,7 @@ fn stripes(size: u32, turns: f32) -> Picture {
     let image = stage.texture(size, size, |x, _| if x % 4 < 2 { [255; 4] } else { [0, 0, 0, 255] });
     let rest = facing(-2.0, -2.0, 2.0, 2.0, 0.0).rest().to_vec();
     let uvs = vec![[0.0, turns], [turns, turns], [turns, 0.0], [0.0, 0.0]];
-    let mesh = Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
     picture(&stage.add(mesh, painted(Some(image))).scene())
 }
 
@@ -119,7 +119,7 @@ fn coordinates_are_perspective_correct_behind_the_camera() {
     let half = 40.0_f32;
     let rest = vec![[-half, 0.0, half], [half, 0.0, half], [half, 0.0, -half], [-half, 0.0, -half]];
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    let mesh = Mesh::indexed(rest, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a floor");
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a floor");
     let eye = Vector3::new(3.0, 5.0, 4.0);
     let view = View::LookAt { eye: eye.into(), target: [3.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 };
@@ -147,7 +147,7 @@ fn coordinates_are_perspective_correct_behind_the_camera() {
 fn equations_3_12_and_3_14_hold_as_corrected() {
     // Equation 3.12: with the sun from the left and the eye at the center, the highlight is on the left.
     let sun = Vector3::new(-0.3, 0.0, 1.0).normalize();
-    let mut shiny = Stage::new();
+    let mut shiny = SceneBuilder::new();
     shiny.0.look.sun = sun.cast::<f32>().into();
     let material =
         Material { diffuse: [0.0; 3], ambient: [0.0; 3], specular: [1.0; 3], shininess: 60.0, ..painted(None) };
@@ -182,21 +182,21 @@ fn every_pixel_sees_its_triangle_the_ground_or_nothing() {
     let scene =
         stage.add(facing(-2.0, 0.0, -1.0, 1.0, 0.0), leaf).add(facing(1.0, 0.0, 2.0, 1.0, 0.0), painted(None)).scene();
     let mut renderer = open();
-    renderer.seen().expect_err("no frame yet");
+    renderer.read_visibility().expect_err("no frame yet");
     let view = View::LookAt { eye: [0.0, 0.5, 10.0], target: [0.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
     let shown = draw(&mut renderer, &scene, Camera { view, ..camera(64) }, 64);
-    let seen = renderer.seen().expect("reads");
+    let seen = renderer.read_visibility().expect("reads");
     assert_eq!(seen.len(), 64 * 64);
     let buffers = renderer.load(&scene).expect("loads");
     let at = |x: usize, y: usize| match seen[64 * y + x] {
-        Seen::Triangle(place) => buffers.triangle(place),
+        VisibilityId::Triangle(place) => buffers.source_triangle(place),
         _ => None,
     };
     // The first triangle of each square is right of and below the diagonal.
     assert_eq!((at(19, 34), at(15, 29)), (Some((0, 0)), Some((0, 1))));
     assert_eq!((at(49, 34), at(45, 29)), (Some((1, 0)), Some((1, 1))));
-    assert_eq!((seen[64 * 5 + 32], seen[64 * 60 + 32]), (Seen::Nothing, Seen::Ground));
-    assert_eq!(buffers.triangle(4), None);
+    assert_eq!((seen[64 * 5 + 32], seen[64 * 60 + 32]), (VisibilityId::Background, VisibilityId::Ground));
+    assert_eq!(buffers.source_triangle(4), None);
     assert!(shown.at(19, 34) != shown.at(32, 5));
 }
 
@@ -210,7 +210,7 @@ fn five_hundred_and_twelve_images_are_drawn_in_one_call() {
         stage = stage.add(facing(left, bottom, left + 0.2, bottom + 0.4, 0.0), painted(Some(image)));
     }
     let shown = picture(&stage.scene());
-    assert_eq!(shown.ran.draws, 1);
+    assert_eq!(shown.stats.draw_calls, 1);
     for index in [0, 1, 100, 255, 256, 300, 511_u32] {
         let seen = shown.at(2 * (index % 32), 64 - 2 - 4 * (index / 32));
         let want = [(index % 256) as u8, 255 - (index % 256) as u8, (index / 2) as u8];
@@ -227,9 +227,14 @@ fn spoiled(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], flat: bool
         // Shrunk along x below the resolution of f32, so that the square has no area on the screen.
         positions.chunks_exact_mut(3).for_each(|vertex| vertex[0] *= 1e-30);
     }
-    let surface = Surface { positions, normals: normals.repeat(4), tangents: tangents.repeat(4), ..Surface::default() };
+    let surface = DeformedSurface {
+        positions,
+        normals: normals.repeat(4),
+        tangents: tangents.repeat(4),
+        ..DeformedSurface::default()
+    };
     renderer.upload(&buffers, &surface).expect("uploads");
-    let shot = Shot { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+    let shot = FrameParams { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
     renderer.draw(&buffers, &shot).expect("draws").rgba
 }
 

@@ -57,13 +57,13 @@ impl FakeDomain {
 
 /// The state after a step, as sent to subscribers.
 #[derive(Debug, Clone)]
-pub(crate) struct Shown {
+pub(crate) struct StepOutput {
     pub(crate) step: v1::StepId,
     pub(crate) positions: Vec<f32>,
 }
 
 /// The only scene of the fake server, `toy`, and the requests that it received.
-pub(crate) struct World {
+pub(crate) struct FakeServer {
     pub(crate) domains: Vec<FakeDomain>,
     pub(crate) bounds: [f64; 6],
     pub(crate) window: u32,
@@ -71,7 +71,7 @@ pub(crate) struct World {
     pub(crate) permits: Semaphore,
     pub(crate) steps: Mutex<Vec<v1::Step>>,
     pub(crate) uploads: Mutex<Vec<(String, Vec<u8>)>>,
-    pub(crate) shown: broadcast::Sender<Shown>,
+    pub(crate) shown: broadcast::Sender<StepOutput>,
     state: Mutex<State>,
 }
 
@@ -83,7 +83,7 @@ struct State {
     last: Option<v1::StepId>,
 }
 
-impl World {
+impl FakeServer {
     pub(crate) fn new(domains: Vec<FakeDomain>) -> Self {
         let q = domains.iter().map(|domain| vec![0.0; domain.wire.rank as usize]).collect();
         let transforms = domains.iter().map(|domain| floats(&domain.wire.placement)).collect();
@@ -180,7 +180,7 @@ impl World {
     }
 
     /// The state after the last step.
-    pub(crate) fn now(&self) -> Shown {
+    pub(crate) fn now(&self) -> StepOutput {
         let state = self.state.lock().unwrap();
         let q = |index: usize| {
             let owner = self.domains[index].wire.shares_q_with.map_or(index, |twin| twin as usize);
@@ -188,7 +188,7 @@ impl World {
         };
         let domains = self.domains.iter().enumerate();
         let positions = domains.flat_map(|(index, domain)| domain.positions(q(index), &state.transforms[index]));
-        Shown { step: state.last.unwrap_or_default(), positions: positions.collect() }
+        StepOutput { step: state.last.unwrap_or_default(), positions: positions.collect() }
     }
 }
 

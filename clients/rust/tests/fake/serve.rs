@@ -17,26 +17,26 @@ use v1::server_service_server::{ServerService, ServerServiceServer};
 use v1::step_service_server::{StepService, StepServiceServer};
 use v1::vertex_service_server::{VertexService, VertexServiceServer};
 
-use super::{Shown, World, pack, refuse, rejection};
+use super::{FakeServer, StepOutput, pack, refuse, rejection};
 
 const CHUNK: usize = 1 << 20;
 
 type Replies<T> = Pin<Box<dyn tokio_stream::Stream<Item = Result<T, Status>> + Send>>;
 
 /// Serves a world on a free loopback port. Returns its URL.
-pub(crate) async fn serve(world: Arc<World>) -> String {
+pub(crate) async fn serve(world: Arc<FakeServer>) -> String {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a free port");
     let url = format!("http://{}", listener.local_addr().expect("bound"));
     let server = tonic::transport::Server::builder();
-    tokio::spawn(server.serve_with_incoming(Router(Fake(world)), TcpListenerStream::new(listener)));
+    tokio::spawn(server.serve_with_incoming(Router(FakeService(world)), TcpListenerStream::new(listener)));
     url
 }
 
 #[derive(Clone)]
-struct Fake(Arc<World>);
+struct FakeService(Arc<FakeServer>);
 
 #[derive(Clone)]
-struct Router(Fake);
+struct Router(FakeService);
 
 impl Service<http::Request<tonic::body::Body>> for Router {
     type Response = http::Response<tonic::body::Body>;
@@ -60,7 +60,7 @@ impl Service<http::Request<tonic::body::Body>> for Router {
     }
 }
 
-impl Fake {
+impl FakeService {
     fn known(&self, scene: &str) -> Result<(), Status> {
         if scene == "toy" {
             return Ok(());
@@ -70,7 +70,7 @@ impl Fake {
 }
 
 #[tonic::async_trait]
-impl ServerService for Fake {
+impl ServerService for FakeService {
     async fn get_server_info(
         &self,
         _: Request<v1::GetServerInfoRequest>,
@@ -82,7 +82,7 @@ impl ServerService for Fake {
 }
 
 #[tonic::async_trait]
-impl SceneService for Fake {
+impl SceneService for FakeService {
     async fn open_scene(
         &self,
         request: Request<v1::OpenSceneRequest>,
@@ -176,7 +176,7 @@ impl SceneService for Fake {
 }
 
 #[tonic::async_trait]
-impl StepService for Fake {
+impl StepService for FakeService {
     type DriveSceneStream = Replies<v1::DriveSceneResponse>;
 
     async fn drive_scene(
@@ -192,31 +192,31 @@ impl StepService for Fake {
 
 type Answers = tokio::sync::mpsc::Sender<Result<v1::DriveSceneResponse, Status>>;
 
-impl Fake {
+impl FakeService {
     async fn drive(&self, mut requests: Streaming<v1::DriveSceneRequest>, answers: &Answers) {
-        use v1::drive_scene_request::Kind as Ask;
-        use v1::drive_scene_response::Kind as Answer;
+        use v1::drive_scene_request::Kind as RequestKind;
+        use v1::drive_scene_response::Kind as ResponseKind;
         let mut mine = false;
         while let Ok(Some(request)) = requests.message().await {
             let answer = match request.kind {
-                Some(Ask::Open(open)) if open.scene != "toy" => {
-                    Answer::Rejection(rejection(None, "scene", "an open scene", open.scene))
+                Some(RequestKind::Open(open)) if open.scene != "toy" => {
+                    ResponseKind::Rejection(rejection(None, "scene", "an open scene", open.scene))
                 }
-                Some(Ask::Open(open)) => match self.0.take() {
-                    Err(refusal) => Answer::Rejection(refusal),
+                Some(RequestKind::Open(open)) => match self.0.take() {
+                    Err(refusal) => ResponseKind::Rejection(refusal),
                     Ok(run) => {
                         mine = true;
                         let window = if open.window == 0 { self.0.window } else { open.window.min(self.0.window) };
                         let scene = Some(self.0.info());
-                        Answer::Opened(v1::Opened { run, policy: open.policy, window, scene })
+                        ResponseKind::Opened(v1::Opened { run, policy: open.policy, window, scene })
                     }
                 },
-                Some(Ask::Step(step)) => match self.0.apply(&step) {
-                    Err(refusal) => Answer::Rejection(refusal),
+                Some(RequestKind::Step(step)) => match self.0.apply(&step) {
+                    Err(refusal) => ResponseKind::Rejection(refusal),
                     Ok(()) => {
                         self.0.permits.acquire().await.expect("open").forget();
                         let stages = vec![v1::StageTime { stage: "deform".into(), milliseconds: 1.5 }];
-                        Answer::Ack(v1::Acknowledgement { step: step.number, skipped: 0, stages })
+                        ResponseKind::Ack(v1::Acknowledgement { step: step.number, skipped: 0, stages })
                     }
                 },
                 None => continue,
@@ -232,7 +232,7 @@ impl Fake {
 }
 
 #[tonic::async_trait]
-impl FrameService for Fake {
+impl FrameService for FakeService {
     type RenderFrameStream = Replies<v1::RenderFrameResponse>;
 
     async fn render_frame(
@@ -279,7 +279,7 @@ impl FrameService for Fake {
 }
 
 #[tonic::async_trait]
-impl VertexService for Fake {
+impl VertexService for FakeService {
     type GetVerticesStream = Replies<v1::GetVerticesResponse>;
 
     async fn get_vertices(
@@ -318,9 +318,9 @@ impl VertexService for Fake {
     }
 }
 
-impl Fake {
+impl FakeService {
     /// All positions, without normals.
-    fn vertices(&self, shown: &Shown) -> Vec<v1::VertexChunk> {
+    fn vertices(&self, shown: &StepOutput) -> Vec<v1::VertexChunk> {
         let bytes = pack(&shown.positions);
         let mut head = Some(v1::VertexHead {
             step: Some(shown.step),
@@ -338,7 +338,7 @@ impl Fake {
 }
 
 /// A raw picture in chunks. Every byte is the number of the step.
-fn frame(shown: &Shown, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
+fn frame(shown: &StepOutput, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
     let (width, height) = (picture.width.max(1), picture.height.max(1));
     let bytes = vec![shown.step.number as u8; 4 * (width * height) as usize];
     let mut head = Some(v1::FrameHead {

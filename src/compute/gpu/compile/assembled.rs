@@ -2,19 +2,19 @@
 
 #![allow(clippy::expect_used, clippy::panic, reason = "a test may fail")]
 
-use super::nvrtc::{Job, nvrtc};
+use super::nvrtc::{CompileJob, nvrtc};
 
 /// Machine code of one variant of a kernel, and the log of the assembler.
 #[derive(Debug)]
-pub struct Assembled {
+pub struct CompiledVariant {
     pub cubin: Vec<u8>,
     pub log: String,
 }
 
-impl Assembled {
+impl CompiledVariant {
     /// Compiles a source with macros and asks for what the assembler says of registers.
     pub fn new(name: &str, source: &str, defines: &[&str], capability: (i32, i32)) -> Self {
-        let mut job = Job::new(name, source, defines, capability);
+        let mut job = CompileJob::new(name, source, defines, capability);
         job.options.push("--ptxas-options=-v".into());
         let (cubin, log) = nvrtc().expect("NVRTC").compile_with_log(&job).expect("compiles");
         assert!(cubin.starts_with(b"\x7fELF"), "machine code is an ELF file");
@@ -22,12 +22,12 @@ impl Assembled {
     }
 
     /// Bytes that all functions together store for want of registers.
-    pub fn spilled(&self) -> usize {
-        spilled(&self.log)
+    pub fn spill_bytes(&self) -> usize {
+        spill_bytes(&self.log)
     }
 }
 
-pub(super) fn spilled(log: &str) -> usize {
+pub(super) fn spill_bytes(log: &str) -> usize {
     let stores: Vec<&str> = log.split(" bytes spill stores").collect();
     assert!(stores.len() > 1, "the assembler says what it spills: {log}");
     let number = |before: &&str| before.rsplit(' ').next().and_then(|word| word.parse::<usize>().ok());
@@ -39,11 +39,11 @@ pub(super) fn spilled(log: &str) -> usize {
 pub fn assert_compiles(source: &str, functions: &[&str], variants: &[&[&str]]) {
     for capability in [(7, 5), (8, 0), (9, 0), (12, 0)] {
         for defines in variants {
-            let compiled = Assembled::new(functions[0], source, defines, capability);
+            let compiled = CompiledVariant::new(functions[0], source, defines, capability);
             for function in functions {
                 assert!(compiled.log.contains(&format!("'{function}'")), "{function} is not in: {}", compiled.log);
             }
-            assert_eq!(compiled.spilled(), 0, "{defines:?} {capability:?}: {}", compiled.log);
+            assert_eq!(compiled.spill_bytes(), 0, "{defines:?} {capability:?}: {}", compiled.log);
         }
     }
 }

@@ -7,18 +7,18 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use sha2::{Digest as _, Sha256};
 
-const DIGEST: usize = 32;
+const DIGEST_BYTES: usize = 32;
 
 /// A folder of compiled kernels, or none.
 #[derive(Debug, Clone)]
-pub(super) struct Cache {
+pub(super) struct CubinCache {
     folder: Option<PathBuf>,
 }
 
-impl Cache {
+impl CubinCache {
     /// The folder that the environment selects: MODALCAST_CACHE, or `modalcast` in XDG_CACHE_HOME or `~/.cache`.
-    pub(super) fn of_environment() -> Self {
-        Self { folder: folder_of(|name| std::env::var_os(name)) }
+    pub(super) fn from_env() -> Self {
+        Self { folder: cache_folder_from(|name| std::env::var_os(name)) }
     }
 
     /// The folder of the compiled kernels.
@@ -29,11 +29,11 @@ impl Cache {
     /// The bytes stored under a key, if they exist and are not damaged.
     pub(super) fn get(&self, key: &str) -> Option<Vec<u8>> {
         let mut bytes = std::fs::read(self.path(key)?).ok()?;
-        if bytes.len() <= DIGEST || Sha256::digest(&bytes[DIGEST..]).as_slice() != &bytes[..DIGEST] {
+        if bytes.len() <= DIGEST_BYTES || Sha256::digest(&bytes[DIGEST_BYTES..]).as_slice() != &bytes[..DIGEST_BYTES] {
             tracing::warn!(key, "a cached kernel is damaged and will be compiled again");
             return None;
         }
-        Some(bytes.split_off(DIGEST))
+        Some(bytes.split_off(DIGEST_BYTES))
     }
 
     /// Stores bytes under a key. The file is renamed into place, so it appears complete or not at all, and several
@@ -61,16 +61,16 @@ impl Cache {
 }
 
 /// The key of a list of texts. It includes their lengths, so that no two lists share a key.
-pub(super) fn key_of(ingredients: &[&str]) -> String {
+pub(super) fn cache_key(cache_key_parts: &[&str]) -> String {
     let mut hash = Sha256::new();
-    for text in ingredients {
+    for text in cache_key_parts {
         hash.update((text.len() as u64).to_le_bytes());
         hash.update(text);
     }
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-fn folder_of(lookup: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+fn cache_folder_from(lookup: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     let named = |name: &str| lookup(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     named("MODALCAST_CACHE")
         .or_else(|| Some(named("XDG_CACHE_HOME")?.join("modalcast")))
@@ -84,7 +84,7 @@ mod tests {
     #[test]
     fn what_is_put_comes_back_and_what_is_damaged_does_not() {
         let folder = tempfile::tempdir().expect("a folder");
-        let cache = Cache { folder: Some(folder.path().join("deep/er")) };
+        let cache = CubinCache { folder: Some(folder.path().join("deep/er")) };
         assert_eq!(cache.get("key"), None);
         cache.put("key", b"machine code");
         assert_eq!(cache.get("key").as_deref(), Some(&b"machine code"[..]));
@@ -108,7 +108,7 @@ mod tests {
     fn an_unwritable_or_unnamed_folder_costs_nothing_but_time() {
         let file = tempfile::NamedTempFile::new().expect("a file");
         for folder in [None, Some(file.path().join("below a file"))] {
-            let cache = Cache { folder };
+            let cache = CubinCache { folder };
             cache.put("key", b"code");
             assert_eq!(cache.get("key"), None);
         }
@@ -116,9 +116,9 @@ mod tests {
 
     #[test]
     fn keys_tell_apart_what_differs_only_in_where_texts_end() {
-        assert_ne!(key_of(&["ab", "c"]), key_of(&["a", "bc"]));
-        assert_eq!(key_of(&["ab", "c"]), key_of(&["ab", "c"]));
-        assert_eq!(key_of(&[]).len(), 64);
+        assert_ne!(cache_key(&["ab", "c"]), cache_key(&["a", "bc"]));
+        assert_eq!(cache_key(&["ab", "c"]), cache_key(&["ab", "c"]));
+        assert_eq!(cache_key(&[]).len(), 64);
     }
 
     #[test]
@@ -128,8 +128,8 @@ mod tests {
             let lookup = |name: &str| {
                 all[skipped..].iter().find(|(known, _)| *known == name).map(|(_, value)| OsString::from(value))
             };
-            assert_eq!(folder_of(lookup), Some(PathBuf::from(expected)));
+            assert_eq!(cache_folder_from(lookup), Some(PathBuf::from(expected)));
         }
-        assert_eq!(folder_of(|_| Some(OsString::new())), None, "empty means unset");
+        assert_eq!(cache_folder_from(|_| Some(OsString::new())), None, "empty means unset");
     }
 }

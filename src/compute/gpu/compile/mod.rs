@@ -10,9 +10,9 @@ mod tests;
 use std::path::PathBuf;
 
 #[cfg(any(test, feature = "testing"))]
-pub use self::assembled::{Assembled, assert_compiles};
-use self::cache::{Cache, key_of};
-use self::nvrtc::Job;
+pub use self::assembled::{CompiledVariant, assert_compiles};
+use self::cache::{CubinCache, cache_key};
+use self::nvrtc::CompileJob;
 pub(super) use self::nvrtc::nvrtc;
 use modalcast_model::error::Result;
 
@@ -22,11 +22,11 @@ use modalcast_model::error::Result;
 /// `Unavailable` when NVRTC is missing or does not know the architecture; `Fault` with the compiler's log.
 pub(super) fn cubin(name: &str, source: &str, defines: &[&str], capability: (i32, i32)) -> Result<Vec<u8>> {
     let nvrtc = nvrtc()?;
-    let job = Job::new(name, source, defines, capability);
+    let job = CompileJob::new(name, source, defines, capability);
     let version = format!("{}.{}", nvrtc.version.0, nvrtc.version.1);
-    let mut ingredients = job.ingredients();
-    ingredients.push(&version);
-    let (cache, key) = (Cache::of_environment(), key_of(&ingredients));
+    let mut cache_key_parts = job.cache_key_parts();
+    cache_key_parts.push(&version);
+    let (cache, key) = (CubinCache::from_env(), cache_key(&cache_key_parts));
     if let Some(cubin) = cache.get(&key) {
         return Ok(cubin);
     }
@@ -37,5 +37,5 @@ pub(super) fn cubin(name: &str, source: &str, defines: &[&str], capability: (i32
 
 /// The folder of the kernel cache, if there is one.
 pub(super) fn folder() -> Option<PathBuf> {
-    Cache::of_environment().folder().map(PathBuf::from)
+    CubinCache::from_env().folder().map(PathBuf::from)
 }

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use libloading::Library;
 
-use modalcast_model::error::{Error, Result, during};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// How to install NVRTC.
 const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip install --target .tools/nvrtc \
@@ -16,46 +16,46 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
 const HEADERS: [(&str, &str); 11] = [
     ("layout.cuh", include_str!("../../../../kernels/layout.cuh")),
     ("batch_load.cuh", include_str!("../../../../kernels/batch_load.cuh")),
-    ("chain.cuh", include_str!("../../../../kernels/chain.cuh")),
+    ("dependent_launch.cuh", include_str!("../../../../kernels/dependent_launch.cuh")),
     ("chunk.cuh", include_str!("../../../../kernels/chunk.cuh")),
     ("cut_out.cuh", include_str!("../../../../kernels/cut_out.cuh")),
-    ("follow.cuh", include_str!("../../../../kernels/follow.cuh")),
-    ("ordered.cuh", include_str!("../../../../kernels/ordered.cuh")),
+    ("transform.cuh", include_str!("../../../../kernels/transform.cuh")),
+    ("ordered_float.cuh", include_str!("../../../../kernels/ordered_float.cuh")),
     ("raster.cuh", include_str!("../../../../kernels/raster.cuh")),
-    ("tile.cuh", include_str!("../../../../kernels/tile.cuh")),
-    ("orient.cuh", include_str!("../../../../kernels/orient.cuh")),
-    ("turn.cuh", include_str!("../../../../kernels/turn.cuh")),
+    ("warp_tile.cuh", include_str!("../../../../kernels/warp_tile.cuh")),
+    ("rigid_normals.cuh", include_str!("../../../../kernels/rigid_normals.cuh")),
+    ("direction.cuh", include_str!("../../../../kernels/direction.cuh")),
 ];
 
 /// The code of `NVRTC_ERROR_INVALID_OPTION`; here it means an architecture that this NVRTC does not support.
 const INVALID_OPTION: c_int = 5;
 
-type Program = *mut c_void;
+type ProgramHandle = *mut c_void;
 
 /// The NVRTC functions in use, and the library that they belong to.
-struct Functions {
+struct NvrtcApi {
     version: unsafe extern "C" fn(*mut c_int, *mut c_int) -> c_int,
     error: unsafe extern "C" fn(c_int) -> *const c_char,
     create: unsafe extern "C" fn(
-        *mut Program,
+        *mut ProgramHandle,
         *const c_char,
         *const c_char,
         c_int,
         *const *const c_char,
         *const *const c_char,
     ) -> c_int,
-    destroy: unsafe extern "C" fn(*mut Program) -> c_int,
-    compile: unsafe extern "C" fn(Program, c_int, *const *const c_char) -> c_int,
-    cubin_size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
-    cubin: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
-    log_size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
-    log: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
+    destroy: unsafe extern "C" fn(*mut ProgramHandle) -> c_int,
+    compile: unsafe extern "C" fn(ProgramHandle, c_int, *const *const c_char) -> c_int,
+    cubin_size: unsafe extern "C" fn(ProgramHandle, *mut usize) -> c_int,
+    cubin: unsafe extern "C" fn(ProgramHandle, *mut c_char) -> c_int,
+    log_size: unsafe extern "C" fn(ProgramHandle, *mut usize) -> c_int,
+    log: unsafe extern "C" fn(ProgramHandle, *mut c_char) -> c_int,
     _libraries: Vec<Library>,
 }
 
 /// A loaded NVRTC.
 pub(in super::super) struct Nvrtc {
-    functions: Functions,
+    functions: NvrtcApi,
     /// Path of the library, or the name that the loader resolved.
     pub path: PathBuf,
     /// Major and minor version.
@@ -70,13 +70,13 @@ impl std::fmt::Debug for Nvrtc {
 
 /// A source and its compiler options.
 #[derive(Debug)]
-pub(super) struct Job<'a> {
+pub(super) struct CompileJob<'a> {
     pub name: &'a str,
     pub source: &'a str,
     pub options: Vec<String>,
 }
 
-impl<'a> Job<'a> {
+impl<'a> CompileJob<'a> {
     /// Compiles `source` for compute capability `major.minor`, with the macros in `defines`.
     pub(super) fn new(name: &'a str, source: &'a str, defines: &[&str], capability: (i32, i32)) -> Self {
         let (major, minor) = capability;
@@ -91,7 +91,7 @@ impl<'a> Job<'a> {
     }
 
     /// Everything besides the compiler version that determines the machine code: the ingredients of the cache key.
-    pub(super) fn ingredients(&self) -> Vec<&str> {
+    pub(super) fn cache_key_parts(&self) -> Vec<&str> {
         let headers = HEADERS.iter().flat_map(|(name, text)| [*name, *text]);
         [self.name, self.source].into_iter().chain(headers).chain(self.options.iter().map(String::as_str)).collect()
     }
@@ -123,17 +123,17 @@ impl Nvrtc {
     }
 
     fn load(path: &Path) -> Result<Self> {
-        let fail = during("nvrtc");
+        let fail = fault_in("nvrtc");
         // SAFETY: NVRTC's initializers only set up the library; the operator chooses the name or path.
         let library = unsafe { Library::new(path) }.map_err(|error| fail(error.to_string()))?;
-        let functions = Functions::bind(library, builtins(path)).map_err(|error| fail(error.to_string()))?;
+        let functions = NvrtcApi::bind(library, builtins(path)).map_err(|error| fail(error.to_string()))?;
         let (mut major, mut minor) = (0, 0);
         // SAFETY: both pointers refer to live integers.
         let code = unsafe { (functions.version)(&mut major, &mut minor) };
         functions.check(code).map_err(fail)?;
         let nvrtc = Self { functions, path: path.to_path_buf(), version: (major, minor) };
         // Only a compilation shows whether NVRTC finds its builtins library.
-        nvrtc.compile(&Job { name: "nothing", source: "", options: Vec::new() })?;
+        nvrtc.compile(&CompileJob { name: "nothing", source: "", options: Vec::new() })?;
         Ok(nvrtc)
     }
 
@@ -141,16 +141,16 @@ impl Nvrtc {
     ///
     /// # Errors
     /// `Fault` with the compiler's log; `Unavailable` when this NVRTC does not know the architecture.
-    pub(super) fn compile(&self, job: &Job) -> Result<Vec<u8>> {
+    pub(super) fn compile(&self, job: &CompileJob) -> Result<Vec<u8>> {
         self.compile_with_log(job).map(|(cubin, _)| cubin)
     }
 
     /// Machine code (a cubin) of a job, and the compiler's log.
-    pub(super) fn compile_with_log(&self, job: &Job) -> Result<(Vec<u8>, String)> {
-        let fail = during("compile");
+    pub(super) fn compile_with_log(&self, job: &CompileJob) -> Result<(Vec<u8>, String)> {
+        let fail = fault_in("compile");
         let options = strings(job.options.iter().map(String::as_str))?;
         let pointers: Vec<_> = options.iter().map(|option| option.as_ptr()).collect();
-        let program = Running::create(&self.functions, job)?;
+        let program = NvrtcProgram::create(&self.functions, job)?;
         // SAFETY: the program is live, and `pointers` holds the stated number of NUL-terminated strings.
         let code = unsafe { (self.functions.compile)(program.handle, pointers.len() as c_int, pointers.as_ptr()) };
         let log = program.bytes(self.functions.log_size, self.functions.log).unwrap_or_default();
@@ -165,7 +165,7 @@ impl Nvrtc {
     }
 }
 
-impl Functions {
+impl NvrtcApi {
     fn bind(library: Library, companions: Vec<Library>) -> Result<Self, libloading::Error> {
         // SAFETY: the types match nvrtc.h of CUDA 11.1 to 13; the library is kept as long as the functions.
         unsafe {
@@ -194,13 +194,13 @@ impl Functions {
 }
 
 /// An NVRTC program; destroyed on drop.
-struct Running<'a> {
-    functions: &'a Functions,
-    handle: Program,
+struct NvrtcProgram<'a> {
+    functions: &'a NvrtcApi,
+    handle: ProgramHandle,
 }
 
-impl<'a> Running<'a> {
-    fn create(functions: &'a Functions, job: &Job) -> Result<Self> {
+impl<'a> NvrtcProgram<'a> {
+    fn create(functions: &'a NvrtcApi, job: &CompileJob) -> Result<Self> {
         let texts = strings([job.source, job.name])?;
         let names = strings(HEADERS.iter().map(|(name, _)| *name))?;
         let headers = strings(HEADERS.iter().map(|(_, text)| *text))?;
@@ -213,15 +213,15 @@ impl<'a> Running<'a> {
             let (source, name) = (texts[0].as_ptr(), texts[1].as_ptr());
             (functions.create)(&mut handle, source, name, count, headers.as_ptr(), names.as_ptr())
         };
-        functions.check(code).map_err(during("compile"))?;
+        functions.check(code).map_err(fault_in("compile"))?;
         Ok(Self { functions, handle })
     }
 
     /// Queries a size, then reads that many bytes.
     fn bytes(
         &self,
-        size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
-        read: unsafe extern "C" fn(Program, *mut c_char) -> c_int,
+        size: unsafe extern "C" fn(ProgramHandle, *mut usize) -> c_int,
+        read: unsafe extern "C" fn(ProgramHandle, *mut c_char) -> c_int,
     ) -> Result<Vec<u8>, String> {
         let mut length = 0;
         // SAFETY: the program is live and `length` is a live integer.
@@ -233,7 +233,7 @@ impl<'a> Running<'a> {
     }
 }
 
-impl Drop for Running<'_> {
+impl Drop for NvrtcProgram<'_> {
     fn drop(&mut self) {
         // SAFETY: the handle came from `create` and is destroyed once. After a failure no cleanup remains.
         let _ = unsafe { (self.functions.destroy)(&mut self.handle) };
@@ -253,7 +253,7 @@ fn builtins(nvrtc: &Path) -> Vec<Library> {
 }
 
 fn strings<'a>(texts: impl IntoIterator<Item = &'a str>) -> Result<Vec<CString>> {
-    texts.into_iter().map(|text| CString::new(text).map_err(during("compile"))).collect()
+    texts.into_iter().map(|text| CString::new(text).map_err(fault_in("compile"))).collect()
 }
 
 /// Candidate paths of NVRTC, best first. If MODALCAST_NVRTC is set, it is the only candidate: no fallback.
@@ -266,7 +266,7 @@ fn candidates() -> Vec<PathBuf> {
     let above = beside.iter().flat_map(|exe| exe.ancestors().skip(1).take(4));
     // Never search the working directory: starting the server in some folder must not execute a library in it.
     for folder in above {
-        find_below(&folder.join(".tools/nvrtc"), 5, &mut found);
+        find_libraries(&folder.join(".tools/nvrtc"), 5, &mut found);
     }
     for toolkit in entries(Path::new("/usr/local")) {
         if toolkit.file_name().is_some_and(|name| name.to_string_lossy().starts_with("cuda")) {
@@ -279,12 +279,12 @@ fn candidates() -> Vec<PathBuf> {
 }
 
 /// Adds every `libnvrtc.so.13` at most `depth` folders below `folder`.
-fn find_below(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) {
+fn find_libraries(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) {
     for entry in entries(folder) {
         if entry.file_name().is_some_and(|name| name == "libnvrtc.so.13") {
             found.push(entry);
         } else if depth > 0 && entry.is_dir() {
-            find_below(&entry, depth - 1, found);
+            find_libraries(&entry, depth - 1, found);
         }
     }
 }
@@ -310,7 +310,7 @@ mod tests {
         std::fs::create_dir_all(broken.parent().expect("a parent")).expect("a folder");
         std::fs::write(&broken, b"no library").expect("a file");
         let mut found = Vec::new();
-        find_below(folder.path(), 5, &mut found);
+        find_libraries(folder.path(), 5, &mut found);
         assert_eq!(found, std::slice::from_ref(&broken));
         let refusal = Nvrtc::find(&found).expect_err("broken").to_string();
         assert!(refusal.contains(&broken.display().to_string()), "{refusal}");

@@ -3,20 +3,20 @@
 use super::cut_out::size_of_level;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{AlphaImage, CutOuts};
-use modalcast_model::scene::Group;
+use modalcast_model::scene::DrawRange;
 
 /// Exclusive limit of triangles: 24 bits count queue entries, next to 40 bits of tiles.
-const MOST: usize = 1 << 24;
+const MAX_TRIANGLES: usize = 1 << 24;
 
 /// Refuses meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, or a triangle could
 /// be queued twice.
 ///
 /// # Errors
 /// `Invalid` with the name of the invalid field.
-pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[Group]) -> Result<()> {
+pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[DrawRange]) -> Result<()> {
     let count = triangles.len();
-    if count >= MOST {
-        return Err(invalid("triangles", format!("fewer than {MOST}"), count));
+    if count >= MAX_TRIANGLES {
+        return Err(invalid("triangles", format!("fewer than {MAX_TRIANGLES}"), count));
     }
     if let Some(vertex) = triangles.as_flattened().iter().find(|vertex| u64::from(**vertex) >= vertices) {
         return Err(invalid("triangles", format!("vertices below {vertices}"), vertex));
@@ -38,17 +38,17 @@ pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[Group]) -> Result<
 /// # Errors
 /// `Invalid` with the name of the invalid field.
 pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
-    let CutOuts { first, uvs, surfaces, table, images, anisotropy } = cut_outs;
+    let CutOuts { first, uvs, material_indices, materials, images, anisotropy } = cut_outs;
     let left = triangles.saturating_sub(*first as usize);
-    for (field, given) in [("texture coordinates", uvs.len()), ("surfaces", surfaces.len())] {
+    for (field, given) in [("texture coordinates", uvs.len()), ("surfaces", material_indices.len())] {
         if given != left {
             return Err(invalid(field, format!("{left}, one a triangle from {first} on"), given));
         }
     }
-    if let Some(surface) = surfaces.iter().find(|surface| **surface as usize >= table.len()) {
-        return Err(invalid("surfaces", format!("places below {}", table.len()), surface));
+    if let Some(surface) = material_indices.iter().find(|surface| **surface as usize >= materials.len()) {
+        return Err(invalid("surfaces", format!("places below {}", materials.len()), surface));
     }
-    let asked = table.iter().filter_map(|surface| surface.image);
+    let asked = materials.iter().filter_map(|surface| surface.image);
     if let Some(image) = asked.into_iter().find(|image| *image as usize >= images.len()) {
         return Err(invalid("surfaces", format!("images below {}", images.len()), image));
     }
@@ -77,8 +77,8 @@ fn check_image(image: &AlphaImage) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use modalcast_model::raster::Surface;
-    use modalcast_model::scene::Faces;
+    use modalcast_model::raster::AlphaMaterial;
+    use modalcast_model::scene::CullMode;
 
     #[test]
     fn cut_outs_that_would_be_read_out_of_bounds_are_refused() {
@@ -86,10 +86,10 @@ mod tests {
         let good = CutOuts {
             first: 2,
             uvs: vec![[[0.0; 2]; 3]; 2],
-            surfaces: vec![0, 1],
-            table: vec![
-                Surface { alpha: 1.0, least: 0.5, image: Some(0) },
-                Surface { alpha: 1.0, least: 0.5, image: None },
+            material_indices: vec![0, 1],
+            materials: vec![
+                AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) },
+                AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: None },
             ],
             images: vec![image.clone()],
             anisotropy: 1.0,
@@ -102,8 +102,8 @@ mod tests {
         };
         assert!(refused(3, |_| ()) && refused(5, |_| ()));
         assert!(refused(4, |own| own.first = 1));
-        assert!(refused(4, |own| own.surfaces[1] = 2));
-        assert!(refused(4, |own| own.table[1].image = Some(1)));
+        assert!(refused(4, |own| own.material_indices[1] = 2));
+        assert!(refused(4, |own| own.materials[1].image = Some(1)));
         assert!(refused(4, |own| own.anisotropy = f32::NAN) && refused(4, |own| own.anisotropy = 0.5));
         assert!(refused(4, |own| own.images[0].levels.truncate(1)));
         assert!(refused(4, |own| own.images[0].levels[1].push(0)));
@@ -113,8 +113,8 @@ mod tests {
 
     #[test]
     fn meshes_that_would_be_read_out_of_bounds_are_refused() {
-        let group = |first, triangles| Group { first, triangles, faces: Faces::Both };
-        let of = |triangles: &[[u32; 3]], groups: &[Group]| check(3, triangles, groups).is_ok();
+        let group = |first, triangles| DrawRange { first, triangles, faces: CullMode::None };
+        let of = |triangles: &[[u32; 3]], groups: &[DrawRange]| check(3, triangles, groups).is_ok();
         let two = [[0, 1, 2], [2, 1, 0]];
         assert!(of(&two, &[group(0, 1), group(1, 1)]) && of(&[], &[]));
         assert!(!of(&[[0, 1, 3]], &[]));
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn triangles_that_the_queues_cannot_count_are_refused() {
-        let list = vec![[0; 3]; MOST];
+        let list = vec![[0; 3]; MAX_TRIANGLES];
         assert!(check(1, &list[1..], &[]).is_ok());
         assert!(check(1, &list, &[]).is_err());
     }

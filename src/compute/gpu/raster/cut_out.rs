@@ -8,90 +8,90 @@ use cudarc::driver::{CudaContext, CudaSlice, DriverError};
 
 use super::super::device::Device;
 use super::super::memory::{address, upload};
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::{AlphaImage, CutOuts};
 
 /// Maximum anisotropy that the hardware supports.
-const MOST_ANISOTROPY: f32 = 16.0;
+const MAX_ANISOTROPY: f32 = 16.0;
 
 /// An entry of the surface table.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
-struct Surface {
+struct AlphaMaterial {
     image: u64,
     alpha: f32,
-    least: f32,
+    cutoff: f32,
 }
 
-const _: () = assert!(size_of::<Surface>() == 16, "Surface differs from kernels/cut_out.cuh");
+const _: () = assert!(size_of::<AlphaMaterial>() == 16, "AlphaMaterial differs from kernels/cut_out.cuh");
 
 /// Device tables that the kernels read with `CUT`.
 #[derive(Debug)]
-pub(super) struct Cut {
+pub(super) struct CutOutBuffers {
     /// The first cut-out triangle.
     pub(super) first: u32,
     uvs: CudaSlice<u8>,
-    surfaces: CudaSlice<u8>,
-    table: CudaSlice<u8>,
-    _images: Vec<Image>,
+    material_indices: CudaSlice<u8>,
+    materials: CudaSlice<u8>,
+    _images: Vec<AlphaTexture>,
 }
 
 /// Device addresses of the tables.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Addresses {
+pub(super) struct CutOutAddresses {
     pub(super) uvs: u64,
-    pub(super) surfaces: u64,
-    pub(super) table: u64,
+    pub(super) material_indices: u64,
+    pub(super) materials: u64,
 }
 
-impl Cut {
+impl CutOutBuffers {
     /// Uploads cut-outs, which `check_cut_outs` must have accepted.
     ///
     /// # Errors
     /// `Fault` when the device refuses, for example an image that exceeds its texture size.
     pub(super) fn new(device: &Device, cut_outs: &CutOuts) -> Result<Self> {
-        let image = |image| Image::new(device, image, cut_outs.anisotropy);
+        let image = |image| AlphaTexture::new(device, image, cut_outs.anisotropy);
         let images = cut_outs.images.iter().map(image).collect::<Result<Vec<_>>>()?;
         let handle = |place: u32| images[place as usize].texture;
-        let entry = |surface: &modalcast_model::raster::Surface| Surface {
+        let entry = |surface: &modalcast_model::raster::AlphaMaterial| AlphaMaterial {
             image: surface.image.map_or(0, handle),
             alpha: surface.alpha,
-            least: surface.least,
+            cutoff: surface.cutoff,
         };
-        let table: Vec<Surface> = cut_outs.table.iter().map(entry).collect();
+        let materials: Vec<AlphaMaterial> = cut_outs.materials.iter().map(entry).collect();
         let cut = Self {
             first: cut_outs.first,
             uvs: upload(device, cut_outs.uvs.as_flattened())?,
-            surfaces: upload(device, &cut_outs.surfaces)?,
-            table: upload(device, &table)?,
+            material_indices: upload(device, &cut_outs.material_indices)?,
+            materials: upload(device, &materials)?,
             _images: images,
         };
-        // Wait for the copies: the host memory of `table` and `cut_outs` may be freed after this call.
-        device.stream().synchronize().map_err(during("upload"))?;
+        // Wait for the copies: the host memory of `materials` and `cut_outs` may be freed after this call.
+        device.stream().synchronize().map_err(fault_in("upload"))?;
         Ok(cut)
     }
 
-    pub(super) fn addresses(&self, device: &Device) -> Addresses {
-        Addresses {
+    pub(super) fn addresses(&self, device: &Device) -> CutOutAddresses {
+        CutOutAddresses {
             uvs: address(device, &self.uvs),
-            surfaces: address(device, &self.surfaces),
-            table: address(device, &self.table),
+            material_indices: address(device, &self.material_indices),
+            materials: address(device, &self.materials),
         }
     }
 }
 
 /// An image as a texture. Drop it only when no work on the stream reads it.
 #[derive(Debug)]
-struct Image {
+struct AlphaTexture {
     /// 0 until the texture is created.
     texture: CUtexObject,
     array: CUmipmappedArray,
     context: Arc<CudaContext>,
 }
 
-impl Image {
+impl AlphaTexture {
     fn new(device: &Device, image: &AlphaImage, anisotropy: f32) -> Result<Self> {
-        let fail = during("texture");
+        let fail = fault_in("texture");
         let array = create(image).map_err(&fail)?;
         // From here on, dropping `own` destroys what was created.
         let mut own = Self { texture: 0, array, context: Arc::clone(device.context()) };
@@ -130,7 +130,7 @@ impl Image {
             WidthInBytes: width,
             Height: height,
         };
-        // SAFETY: `check_cut_outs` verified that each level has all its texels; `Cut::new` waits for the copy before
+        // SAFETY: `check_cut_outs` verified that each level has all its texels; `CutOutBuffers::new` waits for the copy before
         // they can be freed.
         unsafe { sys::cuMemcpy2DAsync_v2(&copy, device.stream().cu_stream()) }.result()
     }
@@ -150,7 +150,7 @@ impl Image {
             addressMode: [WRAP; 3],
             filterMode: LINEAR,
             flags: sys::CU_TRSF_NORMALIZED_COORDINATES,
-            maxAnisotropy: anisotropy.min(MOST_ANISOTROPY) as u32,
+            maxAnisotropy: anisotropy.min(MAX_ANISOTROPY) as u32,
             mipmapFilterMode: LINEAR,
             mipmapLevelBias: 0.0,
             minMipmapLevelClamp: 0.0,
@@ -186,7 +186,7 @@ pub(super) fn size_of_level(image: &AlphaImage, level: usize) -> [usize; 2] {
     [image.width, image.height].map(|side| (side as usize >> level).max(1))
 }
 
-impl Drop for Image {
+impl Drop for AlphaTexture {
     fn drop(&mut self) {
         // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
         self.context.bind_to_thread().ok();

@@ -1,20 +1,20 @@
 //! Tests that walk the work list of `deform` as the kernel does.
 
 use super::super::layout::TILE_LAST;
-use super::super::pack::tests::{scene, stored};
+use super::super::normal_tables::tests::{scene, stored};
 use super::*;
 use std::sync::Arc;
 
 /// Words, scales and x0 of a scene, as `deform` loads them.
 pub(in super::super) struct Loaded {
-    pub words: Vec<Plane>,
+    pub words: Vec<PackedWord>,
     pub scales: Vec<f32>,
     pub rest: Vec<[f32; 4]>,
     pub factors: Vec<Vec<f32>>,
 }
 
-pub(in super::super) fn load(scene: &Scene, work: &Work) -> Loaded {
-    let tiles = |shape: usize| Tiles::new(&scene.shapes[shape], scene.deformation.storage);
+pub(in super::super) fn load(scene: &Scene, work: &WorkList) -> Loaded {
+    let tiles = |shape: usize| TiledModes::new(&scene.shapes[shape], scene.deformation.storage);
     let mut loaded = Loaded {
         words: Vec::new(),
         scales: vec![0.0; work.scales as usize],
@@ -23,8 +23,8 @@ pub(in super::super) fn load(scene: &Scene, work: &Work) -> Loaded {
     };
     for source in &work.sources {
         match source {
-            Source::Shape(shape) => loaded.words.extend_from_slice(tiles(*shape).planes()),
-            Source::Mixed(shapes) => {
+            WordSource::Shape(shape) => loaded.words.extend_from_slice(tiles(*shape).packed_words()),
+            WordSource::Mixed(shapes) => {
                 loaded.words.extend(side_by_side(&shapes.iter().map(|shape| tiles(*shape)).collect::<Vec<_>>()));
             }
         }
@@ -38,7 +38,7 @@ pub(in super::super) fn load(scene: &Scene, work: &Work) -> Loaded {
 }
 
 /// A lane as the kernel sees it: domain, first item, number of items, first quad of x0, first q, first scale.
-fn lane(work: &Work, tile: &Tile, quad: usize) -> (usize, u32, usize, u32, u32, u32) {
+fn lane(work: &WorkList, tile: &WarpTile, quad: usize) -> (usize, u32, usize, u32, u32, u32) {
     let last = usize::from(tile.kind & TILE_LAST);
     if last > 0 {
         let count = if quad + 1 == usize::from(tile.width) { last } else { 4 };
@@ -47,17 +47,17 @@ fn lane(work: &Work, tile: &Tile, quad: usize) -> (usize, u32, usize, u32, u32, 
         (tile.domain as usize, item, count, tile.rest, tile.first_q, tile.first_scale)
     } else {
         let at = tile.first as usize + quad;
-        let lane = work.lanes[at];
-        let scale = work.lane_scales.get(at).copied().unwrap_or(0);
+        let lane = work.mixed_quads[at];
+        let scale = work.mixed_quad_scales.get(at).copied().unwrap_or(0);
         let (domain, count) = ((lane.domain / 4) as usize, 1 + lane.domain as usize % 4);
         (domain, lane.item, count, lane.rest, lane.first_q, scale)
     }
 }
 
 /// Counts the tiles that compute each packed corner, and checks the offset of its rest normal.
-fn check_corners(scene: &Scene, work: &Work) {
+fn check_corners(scene: &Scene, work: &WorkList) {
     let mut seen = vec![0; scene.layout.corners];
-    let shifts = &work.corner_shifts;
+    let shifts = &work.corner_offsets;
     for tile in work.tiles.iter().filter(|tile| tile.kind & TILE_CORNERS > 0) {
         for in_tile in 0..usize::from(tile.width) {
             let (domain, item, count, rest, ..) = lane(work, tile, in_tile);
@@ -71,7 +71,7 @@ fn check_corners(scene: &Scene, work: &Work) {
                 let own = usize::from(tile.kind & TILE_LAST) > 0;
                 let lane = if own { in_tile } else { 0 };
                 assert_eq!(rest as usize + lane, quad + (corner - slot.first_corner) / 4);
-                assert!(rest as u64 >= work.quads.directed && (rest as u64) < work.quads.end);
+                assert!(rest as u64 >= work.quads.first_with_normals && (rest as u64) < work.quads.end);
             }
         }
     }
@@ -79,9 +79,9 @@ fn check_corners(scene: &Scene, work: &Work) {
 }
 
 /// Walks the work list as the kernel does and checks that every vertex finds its x0, its entries and its q.
-fn check(scene: &Arc<Scene>) -> Work {
-    let coordinates = Coordinates::new(scene);
-    let work = Work::new(scene, &coordinates);
+fn check(scene: &Arc<Scene>) -> WorkList {
+    let coordinates = CoordinateLayout::new(scene);
+    let work = WorkList::new(scene, &coordinates);
     let loaded = load(scene, &work);
     assert_eq!(loaded.words.len() as u64, work.words);
     let per_chunk = modes_per_chunk(scene.deformation.storage);
@@ -113,10 +113,12 @@ fn check(scene: &Arc<Scene>) -> Work {
                         let bytes = &loaded.words[at].0[byte % 16..][..size];
                         let factor = loaded.factors[scene.domains[domain].shape].get(mode).copied();
                         let got = match scene.deformation.storage {
-                            Storage::F32 => bytemuck::pod_read_unaligned::<f32>(bytes),
-                            Storage::F16 => half::f16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
-                            Storage::Bf16 => half::bf16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
-                            Storage::Int8 => (f32::from(bytes[0]) - 128.0) * loaded.scales[first_scale as usize + mode],
+                            StorageType::F32 => bytemuck::pod_read_unaligned::<f32>(bytes),
+                            StorageType::F16 => half::f16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
+                            StorageType::Bf16 => half::bf16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
+                            StorageType::Int8 => {
+                                (f32::from(bytes[0]) - 128.0) * loaded.scales[first_scale as usize + mode]
+                            }
                         };
                         let (got, want) = (got * factor.unwrap_or(1.0), shape.modes.at(vertex, axis, mode));
                         assert!((got - want).abs() <= want.abs() / 100.0 + 1.0, "{got} is not {want}");
@@ -133,14 +135,14 @@ const SHAPES: [(usize, usize); 7] = [(7, 2), (300, 0), (1, 5), (513, 1), (130, 3
 
 #[test]
 fn every_vertex_finds_its_entries_whatever_the_storage_and_the_tile() {
-    for storage in Storage::ALL {
+    for storage in StorageType::ALL {
         check(&stored(&SHAPES, storage));
     }
 }
 
 #[test]
 fn small_rigid_domains_fill_tiles_together_and_those_with_modes_do_unless_they_share_them() {
-    let vertices = |work: &Work| -> Vec<Tile> {
+    let vertices = |work: &WorkList| -> Vec<WarpTile> {
         work.tiles.iter().filter(|tile| tile.kind & TILE_VERTICES > 0).copied().collect()
     };
     // Two instances of each shape: those with modes share U and have tiles of their own.
@@ -155,9 +157,9 @@ fn small_rigid_domains_fill_tiles_together_and_those_with_modes_do_unless_they_s
 
 #[test]
 fn corners_that_are_the_vertices_share_their_tiles_and_have_no_room_of_their_own() {
-    let work = check(&super::super::pack::tests::alike(&[(7, 2), (300, 0), (9, 0)]));
+    let work = check(&super::super::normal_tables::tests::corners_match(&[(7, 2), (300, 0), (9, 0)]));
     assert!(work.tiles.iter().all(|tile| tile.kind & (TILE_VERTICES | TILE_CORNERS) == TILE_VERTICES | TILE_CORNERS));
-    assert_eq!((work.quads.directed, work.quads.end), (0, work.quads.rest));
+    assert_eq!((work.quads.first_with_normals, work.quads.end), (0, work.quads.rest));
     let work = check(&single(&[(7, 2), (300, 0)]));
     assert!(
         work.tiles
@@ -168,7 +170,7 @@ fn corners_that_are_the_vertices_share_their_tiles_and_have_no_room_of_their_own
 
 /// Every shape used by one domain.
 fn single(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    super::super::pack::tests::used_once(shapes)
+    super::super::normal_tables::tests::used_once(shapes)
 }
 
 #[test]
@@ -182,8 +184,8 @@ fn tiles_with_the_most_modes_come_first() {
 #[test]
 fn coordinates_fill_whole_chunks_unless_chunks_are_single_modes() {
     let shapes = [(7, 3), (9, 5)];
-    let packed = Coordinates::new(&stored(&shapes, Storage::F32));
-    assert_eq!((packed.first.as_slice(), packed.total, packed.as_packed), ([0, 3, 6, 11].as_slice(), 16, true));
-    let chunked = Coordinates::new(&stored(&shapes, Storage::Int8));
+    let packed = CoordinateLayout::new(&stored(&shapes, StorageType::F32));
+    assert_eq!((packed.first.as_slice(), packed.total, packed.is_scene_order), ([0, 3, 6, 11].as_slice(), 16, true));
+    let chunked = CoordinateLayout::new(&stored(&shapes, StorageType::Int8));
     assert_eq!((chunked.first.as_slice(), chunked.total), ([0, 4, 8, 16].as_slice(), 24));
 }

@@ -8,7 +8,7 @@
 //! with lower precision, and anisotropically if requested.
 
 use modalcast_model::raster::{AlphaImage, CutOuts};
-use modalcast_model::scene::Window;
+use modalcast_model::scene::Viewport;
 
 /// A texture footprint: texture coordinates of a sample, and their derivatives by the pixel in x and y.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -20,7 +20,12 @@ pub struct Footprint {
 
 /// The footprint of a pixel's sample on a triangle with these corners in clip space. Zeros where it is not finite, as
 /// where w is outside 2^-50 to 2^50.
-pub fn footprint(window: &Window, corners: &[[f32; 4]; 3], uvs: &[[f32; 2]; 3], [column, row]: [i32; 2]) -> Footprint {
+pub fn footprint(
+    window: &Viewport,
+    corners: &[[f32; 4]; 3],
+    uvs: &[[f32; 2]; 3],
+    [column, row]: [i32; 2],
+) -> Footprint {
     let step = window.half().map(|half| 1.0 / half);
     let sample = [(column as f32 + 0.5) * step[0] - 1.0, 1.0 - (row as f32 + 0.5) * step[1]];
     let x = corners.map(|[x, _, _, w]| x - sample[0] * w);
@@ -51,26 +56,26 @@ pub fn footprint(window: &Window, corners: &[[f32; 4]; 3], uvs: &[[f32; 2]; 3], 
 
 /// Alpha of a cut-out triangle at a footprint.
 pub fn alpha(cut_outs: &CutOuts, triangle: u32, footprint: &Footprint) -> f32 {
-    let surface = &cut_outs.table[cut_outs.surfaces[(triangle - cut_outs.first) as usize] as usize];
-    let image = surface.image.map_or(1.0, |image| filtered(&cut_outs.images[image as usize], footprint));
+    let surface = &cut_outs.materials[cut_outs.material_indices[(triangle - cut_outs.first) as usize] as usize];
+    let image = surface.image.map_or(1.0, |image| sample_trilinear(&cut_outs.images[image as usize], footprint));
     surface.alpha * image
 }
 
 /// Whether a triangle keeps a pixel's sample; always true for triangles before the first cut-out.
-pub(super) fn keeps(
+pub(super) fn passes_alpha_test(
     cut_outs: &CutOuts,
-    window: &Window,
+    window: &Viewport,
     (triangle, corners): (u32, &[[f32; 4]; 3]),
     pixel: [i32; 2],
 ) -> bool {
     let Some(own) = triangle.checked_sub(cut_outs.first) else { return true };
     let footprint = footprint(window, corners, &cut_outs.uvs[own as usize], pixel);
-    let surface = &cut_outs.table[cut_outs.surfaces[own as usize] as usize];
-    alpha(cut_outs, triangle, &footprint) >= surface.least
+    let surface = &cut_outs.materials[cut_outs.material_indices[own as usize] as usize];
+    alpha(cut_outs, triangle, &footprint) >= surface.cutoff
 }
 
 /// Trilinear filtering: the two mip levels are those whose texels are about as long as the footprint's longer side.
-fn filtered(image: &AlphaImage, footprint: &Footprint) -> f32 {
+fn sample_trilinear(image: &AlphaImage, footprint: &Footprint) -> f32 {
     let size = [image.width as f32, image.height as f32];
     let length = |side: [f32; 2]| (side[0] * size[0]).hypot(side[1] * size[1]);
     let last = (image.levels.len() - 1) as f32;

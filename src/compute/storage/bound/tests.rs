@@ -1,14 +1,14 @@
 use super::*;
-use crate::testing::{Noise, shape, with_columns};
+use crate::testing::{TestRng, shape, with_columns};
 
 /// A random transform with shear, possibly mirroring.
-fn transform(noise: &mut Noise) -> Composed {
+fn transform(noise: &mut TestRng) -> ComposedTransform {
     Transform(std::array::from_fn(|_| 2.0 * noise.next())).into()
 }
 
 /// The sums that the module describes, in f32 on stored entries. Reads axis `axis + turn` in place of `axis`.
-fn chained(shape: &Shape, tiles: &Tiles, step: &Step, turn: usize) -> Vec<[f32; 3]> {
-    let t = step.transform.rounded().0;
+fn chained(shape: &Shape, tiles: &TiledModes, step: &ErrorBoundInput, turn: usize) -> Vec<[f32; 3]> {
+    let t = step.transform.to_f32().0;
     let position = |vertex: usize| {
         let place = vertex / crate::storage::QUAD / crate::storage::TILE_QUADS;
         let bent: [f32; 3] = std::array::from_fn(|axis| {
@@ -16,7 +16,7 @@ fn chained(shape: &Shape, tiles: &Tiles, step: &Step, turn: usize) -> Vec<[f32; 
             for (mode, q) in step.q.iter().enumerate() {
                 let factor = factor(tiles, place, mode);
                 if factor > 0.0 {
-                    let stored = tiles.decoded(vertex, (axis + turn) % 3, mode) / f64::from(factor);
+                    let stored = tiles.decode_entry(vertex, (axis + turn) % 3, mode) / f64::from(factor);
                     sum = (stored as f32).mul_add(q * factor, sum);
                 }
             }
@@ -30,7 +30,7 @@ fn chained(shape: &Shape, tiles: &Tiles, step: &Step, turn: usize) -> Vec<[f32; 
     (0..tiles.vertices()).map(position).collect()
 }
 
-fn exact(shape: &Shape, step: &Step) -> Vec<[f64; 3]> {
+fn exact(shape: &Shape, step: &ErrorBoundInput) -> Vec<[f64; 3]> {
     let t = step.transform.exact();
     let position = |vertex: usize| {
         let bent = [0, 1, 2].map(|axis| {
@@ -53,9 +53,9 @@ fn worst(got: &[[f32; 3]], want: &[[f64; 3]], bounds: impl Fn(usize) -> f64) -> 
 }
 
 /// Measured error over bound, for correct axes and for swapped axes.
-fn judge(shape: &Shape, storage: Storage, step: &Step) -> [f64; 2] {
-    let tiles = Tiles::new(shape, storage);
-    let reaches = Reaches::new(shape, &tiles);
+fn judge(shape: &Shape, storage: StorageType, step: &ErrorBoundInput) -> [f64; 2] {
+    let tiles = TiledModes::new(shape, storage);
+    let reaches = ShapeErrorModel::new(shape, &tiles);
     let want = exact(shape, step);
     let bounds = |tile: usize| reaches.tile(tile, step).total();
     assert!((0..tiles.count()).all(|tile| bounds(tile) <= reaches.domain(step).total()));
@@ -66,12 +66,12 @@ fn judge(shape: &Shape, storage: Storage, step: &Step) -> [f64; 2] {
 fn the_bound_holds_for_every_storage_size_and_seed_and_mistaken_axes_break_it() {
     let sizes = [(1, 1), (1, 512), (7, 3), (130, 31), (129, 33), (40, 5), (5, 512), (300, 1)];
     for seed in 0..120_u64 {
-        let mut noise = Noise(seed);
+        let mut noise = TestRng(seed);
         let (vertices, rank) = sizes[seed as usize % sizes.len()];
         let shape = shape(vertices, rank, &mut noise);
         let q: Vec<f32> = (0..rank).map(|_| noise.next() * f32::exp2(6.0 * noise.next())).collect();
-        let step = Step { q: &q, transform: transform(&mut noise), compensated: false };
-        for storage in Storage::ALL {
+        let step = ErrorBoundInput { q: &q, transform: transform(&mut noise), compensated: false };
+        for storage in StorageType::ALL {
             let [right, wrong] = judge(&shape, storage, &step);
             assert!(right <= 1.0, "{storage:?}, {vertices} x {rank}, seed {seed}: {right} of the bound");
             assert!(
@@ -86,22 +86,24 @@ fn the_bound_holds_for_every_storage_size_and_seed_and_mistaken_axes_break_it() 
 fn the_bound_of_a_follower_holds_for_every_seed_and_breaks_where_its_frame_is_left_out_or_rounds_more() {
     let (mut largest, mut coarser) = (0.0_f64, 0);
     for seed in 0..120_u64 {
-        let mut noise = Noise(500 + seed);
+        let mut noise = TestRng(500 + seed);
         let shape = shape(40, 3, &mut noise);
         let q: Vec<f32> = (0..3).map(|_| noise.next()).collect();
-        let (mover, frame) = (transform(&mut noise).mover, transform(&mut noise).mover);
-        let step = |transform| Step { q: &q, transform, compensated: false };
-        let follows = Composed { mover, frame: Some(frame) };
-        let tiles = Tiles::new(&shape, Storage::F32);
-        let bound = Reaches::new(&shape, &tiles).domain(&step(follows));
+        let (root, frame) = (transform(&mut noise).root, transform(&mut noise).root);
+        let step = |transform| ErrorBoundInput { q: &q, transform, compensated: false };
+        let follows = ComposedTransform { root, frame: Some(frame) };
+        let tiles = TiledModes::new(&shape, StorageType::F32);
+        let bound = ShapeErrorModel::new(&shape, &tiles).domain(&step(follows));
         let want = exact(&shape, &step(follows));
-        let part = |transform: Composed| worst(&chained(&shape, &tiles, &step(transform), 0), &want, |_| bound.total());
+        let part = |transform: ComposedTransform| {
+            worst(&chained(&shape, &tiles, &step(transform), 0), &want, |_| bound.total())
+        };
         largest = largest.max(part(follows));
         assert!(part(follows) <= 1.0, "seed {seed}: {} of the bound", part(follows));
-        assert!(part(mover.into()) > 1.0, "seed {seed}: without its frame at {}", part(mover.into()));
+        assert!(part(root.into()) > 1.0, "seed {seed}: without its frame at {}", part(root.into()));
         // A frame of ten bits, as if products were rounded to bf16.
         let coarse = Transform(frame.0.map(|entry| f32::from_bits(entry.to_bits() & 0xffff_e000)));
-        coarser += usize::from(part(Composed { mover, frame: Some(coarse) }) > 1.0);
+        coarser += usize::from(part(ComposedTransform { root, frame: Some(coarse) }) > 1.0);
     }
     assert!(largest > 0.01, "{largest} of the bound at most: it would be of no use");
     assert_eq!(coarser, 120);
@@ -110,11 +112,11 @@ fn the_bound_of_a_follower_holds_for_every_seed_and_breaks_where_its_frame_is_le
 #[test]
 fn rounding_the_product_of_a_frame_is_within_its_part_of_the_bound_and_the_norm_covers_both() {
     for seed in 0..200_u64 {
-        let mut noise = Noise(900 + seed);
+        let mut noise = TestRng(900 + seed);
         let scale = f32::exp2(40.0 * noise.next());
-        let mover = Transform(transform(&mut noise).mover.0.map(|entry| entry * scale));
-        let follows = Composed { mover, frame: Some(transform(&mut noise).mover) };
-        let (got, want, [turned, moved]) = (follows.rounded(), follows.exact(), rounding(&follows));
+        let root = Transform(transform(&mut noise).root.0.map(|entry| entry * scale));
+        let follows = ComposedTransform { root, frame: Some(transform(&mut noise).root) };
+        let (got, want, [turned, moved]) = (follows.to_f32(), follows.exact(), rounding(&follows));
         let error = |linear: bool| {
             let entries = (0..12).filter(|at| (at % 4 != 3) == linear);
             entries.map(|at| (f64::from(got.0[at]) - want[at]).powi(2)).sum::<f64>().sqrt()
@@ -131,24 +133,24 @@ fn rounding_the_product_of_a_frame_is_within_its_part_of_the_bound_and_the_norm_
 
 #[test]
 fn columns_that_differ_by_a_factor_of_1e12_keep_their_digits_in_f16_and_would_overflow_unscaled() {
-    let mut noise = Noise(9);
+    let mut noise = TestRng(9);
     let scale = |mode: usize| 10_f32.powi(6 - 4 * mode as i32);
     let columns: Vec<f32> =
         (0..4).flat_map(|mode| (0..600).map(move |_| mode)).map(|m| noise.next() * scale(m)).collect();
     let shape = with_columns(200, 4, columns, &mut noise);
     assert!(!half::f16::from_f32(shape.modes.column(0)[0]).is_finite());
-    let tiles = Tiles::new(&shape, Storage::F16);
+    let tiles = TiledModes::new(&shape, StorageType::F16);
     for mode in 0..4 {
         let alone: Vec<f32> = (0..4).map(|other| if other == mode { 1.0 / scale(mode) } else { 0.0 }).collect();
-        let step = Step { q: &alone, transform: Transform::IDENTITY.into(), compensated: false };
-        assert!(judge(&shape, Storage::F16, &step)[0] <= 1.0);
-        assert!(Reaches::new(&shape, &tiles).domain(&step).storage <= 1e-3, "mode {mode}");
+        let step = ErrorBoundInput { q: &alone, transform: Transform::IDENTITY.into(), compensated: false };
+        assert!(judge(&shape, StorageType::F16, &step)[0] <= 1.0);
+        assert!(ShapeErrorModel::new(&shape, &tiles).domain(&step).storage <= 1e-3, "mode {mode}");
     }
 }
 
 #[test]
 fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
-    let mut noise = Noise(11);
+    let mut noise = TestRng(11);
     // Mode 0 is denormal, mode 1 is zero in the first tile, mode 2 is zero everywhere. Mode 3 has one entry far below
     // the rest, and all of its second tile is too small for f16.
     let entry = |mode: usize, row: usize, value: f32| match mode {
@@ -168,8 +170,8 @@ fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
         [1e-38, 1e-45, 0.0, 1e-40],
         [3e38, 1e30, 1.0, -1e30],
     ] {
-        let step = Step { q: &q, transform: transform(&mut noise), compensated: false };
-        for storage in Storage::ALL {
+        let step = ErrorBoundInput { q: &q, transform: transform(&mut noise), compensated: false };
+        for storage in StorageType::ALL {
             let [right, wrong] = judge(&shape, storage, &step);
             assert!(right <= 1.0, "{storage:?} {q:?}: {right} of the bound");
             assert!(wrong > 1.0 || q[1] < 1e-40, "{storage:?} {q:?}: mistaken axes at {wrong}");
@@ -179,27 +181,28 @@ fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
 
 #[test]
 fn sources_are_zero_where_there_is_no_such_error() {
-    let mut noise = Noise(4);
+    let mut noise = TestRng(4);
     let shape = shape(50, 6, &mut noise);
     let q = [0.3; 6];
     let bound = |storage, q: &[f32]| {
-        let reaches = Reaches::new(&shape, &Tiles::new(&shape, storage));
-        reaches.domain(&Step { q, transform: Transform::IDENTITY.into(), compensated: false })
+        let reaches = ShapeErrorModel::new(&shape, &TiledModes::new(&shape, storage));
+        reaches.domain(&ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated: false })
     };
-    let plain = bound(Storage::F32, &q);
+    let plain = bound(StorageType::F32, &q);
     assert_eq!((plain.storage, plain.coordinates), (0.0, 0.0));
     assert!(plain.accumulation > 0.0 && plain.rest > 0.0 && plain.transform > 0.0);
-    assert_eq!(bound(Storage::F16, &q).coordinates, 0.0, "a power of two rounds nothing");
-    assert!(bound(Storage::Int8, &q).coordinates > 0.0);
-    let [f16, bf16, int8] = [Storage::F16, Storage::Bf16, Storage::Int8].map(|storage| bound(storage, &q).storage);
+    assert_eq!(bound(StorageType::F16, &q).coordinates, 0.0, "a power of two rounds nothing");
+    assert!(bound(StorageType::Int8, &q).coordinates > 0.0);
+    let [f16, bf16, int8] =
+        [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(|storage| bound(storage, &q).storage);
     assert!(f16 < bf16 && f16 < int8 && f16 > 0.0);
-    let still = bound(Storage::Int8, &[0.0; 6]);
+    let still = bound(StorageType::Int8, &[0.0; 6]);
     assert_eq!((still.storage, still.coordinates, still.accumulation, still.rest), (0.0, 0.0, 0.0, 0.0));
 }
 
 #[test]
 fn the_norm_is_not_below_the_largest_singular_value_and_hardly_above_it() {
-    let mut noise = Noise(6);
+    let mut noise = TestRng(6);
     let judge = |linear: nalgebra::Matrix3<f64>| {
         let transform = Transform::from_parts(&linear, &nalgebra::Vector3::zeros());
         let exact = transform.linear().singular_values().max();

@@ -3,9 +3,9 @@
 //! An accessor is first packed (its `count` elements without gaps, with sparse values applied), then its components are
 //! decoded. All offsets are computed with checked arithmetic.
 
-use super::at;
-use super::bytes::Bytes;
+use super::buffers::GltfBuffers;
 use super::document::{Accessor, Document, Sparse};
+use super::get_element;
 use crate::error::{Result, invalid};
 
 const U8: u64 = 5121;
@@ -15,7 +15,7 @@ const F32: u64 = 5126;
 
 /// The accepted formats of an attribute.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Form {
+pub(super) struct AttributeFormat {
     /// Whether normalized unsigned integers are accepted too.
     pub(super) integers: bool,
     /// The number of elements, if another accessor already determines it. Only then may the data be omitted (all zeros,
@@ -25,22 +25,22 @@ pub(super) struct Form {
 
 /// Decodes the accessors of one document.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Reader<'a> {
+pub(super) struct AccessorReader<'a> {
     pub(super) document: &'a Document,
-    pub(super) bytes: &'a Bytes<'a>,
+    pub(super) bytes: &'a GltfBuffers<'a>,
 }
 
-impl Reader<'_> {
+impl AccessorReader<'_> {
     /// Elements of `N` floats.
     ///
     /// # Errors
     /// `Invalid` with the accessor and the field.
-    pub(super) fn vectors<const N: usize>(&self, index: usize, form: Form) -> Result<Vec<[f32; N]>> {
-        let accessor = at(&self.document.accessors, index, "accessor")?;
-        self.vectors_of(accessor, form).map_err(|error| error.within(&format!("accessors[{index}]")))
+    pub(super) fn vectors<const N: usize>(&self, index: usize, form: AttributeFormat) -> Result<Vec<[f32; N]>> {
+        let accessor = get_element(&self.document.accessors, index, "accessor")?;
+        self.vectors_of(accessor, form).map_err(|error| error.prefix_field(&format!("accessors[{index}]")))
     }
 
-    fn vectors_of<const N: usize>(&self, accessor: &Accessor, form: Form) -> Result<Vec<[f32; N]>> {
+    fn vectors_of<const N: usize>(&self, accessor: &Accessor, form: AttributeFormat) -> Result<Vec<[f32; N]>> {
         expect_kind(accessor, ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1])?;
         let component = accessor.component_type;
         let integer = form.integers && accessor.normalized && matches!(component, U8 | U16);
@@ -57,7 +57,7 @@ impl Reader<'_> {
         }
         let packed = self.packed(accessor, N)?;
         // Four bytes per component whatever its type in the file.
-        self.bytes.spend(4 * N as u64 * accessor.count as u64)?;
+        self.bytes.charge_budget(4 * N as u64 * accessor.count as u64)?;
         Ok(match component {
             U8 => grouped(packed.iter().map(|byte| f32::from(*byte) / 255.0)),
             U16 => grouped(words::<2>(&packed).map(|word| f32::from(u16::from_le_bytes(word)) / 65535.0)),
@@ -70,8 +70,8 @@ impl Reader<'_> {
     /// # Errors
     /// `Invalid` with the accessor and the field.
     pub(super) fn indices(&self, index: usize, vertices: usize) -> Result<Vec<u32>> {
-        let accessor = at(&self.document.accessors, index, "accessor")?;
-        self.indices_of(accessor, vertices).map_err(|error| error.within(&format!("accessors[{index}]")))
+        let accessor = get_element(&self.document.accessors, index, "accessor")?;
+        self.indices_of(accessor, vertices).map_err(|error| error.prefix_field(&format!("accessors[{index}]")))
     }
 
     fn indices_of(&self, accessor: &Accessor, vertices: usize) -> Result<Vec<u32>> {
@@ -81,11 +81,15 @@ impl Reader<'_> {
         }
         index_size(accessor.component_type)?;
         let packed = self.packed(accessor, 1)?;
-        self.bytes.spend(4 * accessor.count as u64)?;
+        self.bytes.charge_budget(4 * accessor.count as u64)?;
         let indices = integers(&packed, accessor.component_type);
         match indices.iter().position(|index| *index as usize >= vertices) {
             None => Ok(indices),
-            Some(at) => Err(invalid(format!("element {at}"), format!("an index below {vertices}"), indices[at])),
+            Some(get_element) => Err(invalid(
+                format!("element {get_element}"),
+                format!("an index below {vertices}"),
+                indices[get_element],
+            )),
         }
     }
 
@@ -103,37 +107,37 @@ impl Reader<'_> {
                     return Err(invalid("bufferView.byteStride", format!("at least {size}"), stride));
                 }
                 let elements = elements(view, accessor.byte_offset, [stride, size], accessor.count)?;
-                self.bytes.spend(total as u64)?;
+                self.bytes.charge_budget(total as u64)?;
                 packed.reserve_exact(total);
                 elements.for_each(|element| packed.extend_from_slice(element));
             }
             None => {
-                self.bytes.spend(total as u64)?;
+                self.bytes.charge_budget(total as u64)?;
                 packed.resize(total, 0);
             }
         }
         if let Some(sparse) = &accessor.sparse {
-            self.overlay(&mut packed, sparse, size).map_err(|error| error.within("sparse"))?;
+            self.apply_sparse(&mut packed, sparse, size).map_err(|error| error.prefix_field("sparse"))?;
         }
         Ok(packed)
     }
 
     /// Replaces elements by the sparse values.
-    fn overlay(&self, packed: &mut [u8], sparse: &Sparse, size: usize) -> Result<()> {
+    fn apply_sparse(&self, packed: &mut [u8], sparse: &Sparse, size: usize) -> Result<()> {
         let count = packed.len() / size;
         if sparse.count == 0 || sparse.count > count {
             return Err(invalid("count", format!("1 to {count}"), sparse.count));
         }
-        let width = index_size(sparse.indices.component_type).map_err(|error| error.within("indices"))?;
-        let (view, _) = self.bytes.view(sparse.indices.buffer_view).map_err(|error| error.within("indices"))?;
+        let width = index_size(sparse.indices.component_type).map_err(|error| error.prefix_field("indices"))?;
+        let (view, _) = self.bytes.view(sparse.indices.buffer_view).map_err(|error| error.prefix_field("indices"))?;
         let places = elements(view, sparse.indices.byte_offset, [width; 2], sparse.count);
-        let places: Vec<u8> = places.map_err(|error| error.within("indices"))?.flatten().copied().collect();
-        let (view, _) = self.bytes.view(sparse.values.buffer_view).map_err(|error| error.within("values"))?;
+        let places: Vec<u8> = places.map_err(|error| error.prefix_field("indices"))?.flatten().copied().collect();
+        let (view, _) = self.bytes.view(sparse.values.buffer_view).map_err(|error| error.prefix_field("values"))?;
         let values = elements(view, sparse.values.byte_offset, [size; 2], sparse.count);
         let mut least = 0;
         for (place, value) in integers(&places, sparse.indices.component_type)
             .into_iter()
-            .zip(values.map_err(|error| error.within("values"))?)
+            .zip(values.map_err(|error| error.prefix_field("values"))?)
         {
             let place = place as usize;
             if place < least || place >= count {
@@ -167,7 +171,7 @@ fn elements(
 fn expect_kind(accessor: &Accessor, kind: &str) -> Result<()> {
     match accessor.kind == kind {
         true => Ok(()),
-        false => Err(invalid("type", kind, super::remarks::tidy(&accessor.kind, 20))),
+        false => Err(invalid("type", kind, super::warnings::sanitize(&accessor.kind, 20))),
     }
 }
 

@@ -168,8 +168,8 @@ pub(super) struct Sampler {
 #[serde(rename_all = "camelCase", default)]
 pub(super) struct Material {
     pub(super) name: Option<String>,
-    pub(super) pbr_metallic_roughness: Pbr,
-    pub(super) normal_texture: Option<TextureUse>,
+    pub(super) pbr_metallic_roughness: PbrMetallicRoughness,
+    pub(super) normal_texture: Option<TextureInfo>,
     pub(super) occlusion_texture: Option<IgnoredAny>,
     pub(super) emissive_texture: Option<IgnoredAny>,
     pub(super) emissive_factor: Option<[f32; 3]>,
@@ -180,15 +180,15 @@ pub(super) struct Material {
 
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase", default)]
-pub(super) struct Pbr {
+pub(super) struct PbrMetallicRoughness {
     pub(super) base_color_factor: [f32; 4],
-    pub(super) base_color_texture: Option<TextureUse>,
+    pub(super) base_color_texture: Option<TextureInfo>,
     pub(super) metallic_factor: f32,
     pub(super) roughness_factor: f32,
-    pub(super) metallic_roughness_texture: Option<TextureUse>,
+    pub(super) metallic_roughness_texture: Option<TextureInfo>,
 }
 
-impl Default for Pbr {
+impl Default for PbrMetallicRoughness {
     fn default() -> Self {
         Self {
             base_color_factor: [1.0; 4],
@@ -203,7 +203,7 @@ impl Default for Pbr {
 /// A material's reference to a texture.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(super) struct TextureUse {
+pub(super) struct TextureInfo {
     pub(super) index: usize,
     #[serde(default)]
     pub(super) tex_coord: u32,

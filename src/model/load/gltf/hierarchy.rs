@@ -3,14 +3,14 @@
 
 use nalgebra::{Matrix4, Quaternion, Rotation3, Scale3, Translation3, UnitQuaternion};
 
-use super::at;
 use super::document::{Document, Node};
-use super::remarks::Remarks;
+use super::get_element;
+use super::warnings::ImportWarnings;
 use crate::error::{Result, invalid};
 
 /// A node of the loaded scene.
 #[derive(Debug)]
-pub(super) struct Placed {
+pub(super) struct PlacedNode {
     /// Index in the document.
     pub(super) node: usize,
     /// Index of the parent in the list of placed nodes.
@@ -25,7 +25,7 @@ pub(super) struct Placed {
 ///
 /// # Errors
 /// `Invalid` with the node that has two parents, is its own ancestor or has an invalid transform.
-pub(super) fn place(document: &Document, remarks: &mut Remarks) -> Result<Vec<Placed>> {
+pub(super) fn flatten_hierarchy(document: &Document, remarks: &mut ImportWarnings) -> Result<Vec<PlacedNode>> {
     let parents = parents(document)?;
     let roots: Vec<usize> = (0..parents.len()).filter(|node| parents[*node].is_none()).collect();
     let forest = preorder(&document.nodes, &roots);
@@ -38,11 +38,11 @@ pub(super) fn place(document: &Document, remarks: &mut Remarks) -> Result<Vec<Pl
     let Some(scene) = document.scene.or((!document.scenes.is_empty()).then_some(0)) else {
         return with_matrices(document, &forest);
     };
-    let nodes = &at(&document.scenes, scene, "scene")?.nodes;
+    let nodes = &get_element(&document.scenes, scene, "scene")?.nodes;
     if document.scenes.len() > 1 {
         remarks.add(format!("of {} scenes only number {scene} is loaded", document.scenes.len()));
     }
-    check_roots(nodes, &parents).map_err(|error| error.within(&format!("scenes[{scene}]")))?;
+    check_roots(nodes, &parents).map_err(|error| error.prefix_field(&format!("scenes[{scene}]")))?;
     with_matrices(document, &preorder(&document.nodes, nodes))
 }
 
@@ -51,8 +51,8 @@ fn parents(document: &Document) -> Result<Vec<Option<usize>>> {
     let count = document.nodes.len();
     let mut parents = vec![None; count];
     for (parent, node) in document.nodes.iter().enumerate() {
-        for (place, child) in node.children.iter().enumerate() {
-            let field = || format!("nodes[{parent}].children[{place}]");
+        for (flatten_hierarchy, child) in node.children.iter().enumerate() {
+            let field = || format!("nodes[{parent}].children[{flatten_hierarchy}]");
             match parents.get_mut(*child) {
                 None => return Err(invalid(field(), format!("an index below {count}"), child)),
                 Some(Some(other)) => {
@@ -68,8 +68,8 @@ fn parents(document: &Document) -> Result<Vec<Option<usize>>> {
 
 fn check_roots(nodes: &[usize], parents: &[Option<usize>]) -> Result<()> {
     let mut listed = vec![false; parents.len()];
-    for (place, node) in nodes.iter().enumerate() {
-        let field = || format!("nodes[{place}]");
+    for (flatten_hierarchy, node) in nodes.iter().enumerate() {
+        let field = || format!("nodes[{flatten_hierarchy}]");
         match parents.get(*node) {
             None => return Err(invalid(field(), format!("an index below {}", parents.len()), node)),
             Some(Some(parent)) => {
@@ -88,19 +88,19 @@ fn preorder(nodes: &[Node], roots: &[usize]) -> Vec<(usize, Option<usize>)> {
     let mut order = Vec::new();
     let mut stack: Vec<(usize, Option<usize>)> = roots.iter().rev().map(|root| (*root, None)).collect();
     while let Some(next) = stack.pop() {
-        let place = order.len();
+        let flatten_hierarchy = order.len();
         order.push(next);
-        stack.extend(nodes[next.0].children.iter().rev().map(|child| (*child, Some(place))));
+        stack.extend(nodes[next.0].children.iter().rev().map(|child| (*child, Some(flatten_hierarchy))));
     }
     order
 }
 
-fn with_matrices(document: &Document, order: &[(usize, Option<usize>)]) -> Result<Vec<Placed>> {
-    let mut placed: Vec<Placed> = Vec::with_capacity(order.len());
+fn with_matrices(document: &Document, order: &[(usize, Option<usize>)]) -> Result<Vec<PlacedNode>> {
+    let mut placed: Vec<PlacedNode> = Vec::with_capacity(order.len());
     for (node, parent) in order.iter().copied() {
-        let local = local(&document.nodes[node]).map_err(|error| error.within(&format!("nodes[{node}]")))?;
+        let local = local(&document.nodes[node]).map_err(|error| error.prefix_field(&format!("nodes[{node}]")))?;
         let world = parent.map_or(local, |parent| placed[parent].world * local);
-        placed.push(Placed { node, parent, local, world });
+        placed.push(PlacedNode { node, parent, local, world });
     }
     Ok(placed)
 }

@@ -17,27 +17,27 @@
 
 use std::collections::HashMap;
 
-use super::at;
 use super::document::{self, Document};
-use super::remarks::{Remarks, tidy};
-use super::texture::Gallery;
+use super::get_element;
+use super::texture::TextureLoader;
+use super::warnings::{ImportWarnings, sanitize};
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
 
 /// Converts materials when primitives first use them.
 #[derive(Debug)]
-pub(super) struct Palette<'a> {
+pub(super) struct MaterialConverter<'a> {
     document: &'a Document,
-    pub(super) gallery: Gallery<'a>,
+    pub(super) texture_loader: TextureLoader<'a>,
     /// The converted materials.
     pub(super) materials: Vec<Material>,
     /// Indices in `materials`, by index in the document (`None` is the default material) and usability of textures.
     known: HashMap<(Option<usize>, bool), usize>,
 }
 
-impl<'a> Palette<'a> {
-    pub(super) fn new(document: &'a Document, gallery: Gallery<'a>) -> Self {
-        Self { document, gallery, materials: Vec::new(), known: HashMap::new() }
+impl<'a> MaterialConverter<'a> {
+    pub(super) fn new(document: &'a Document, texture_loader: TextureLoader<'a>) -> Self {
+        Self { document, texture_loader, materials: Vec::new(), known: HashMap::new() }
     }
 
     /// The set of texture coordinates of a material: that of the base color, else of the normal map, else 0.
@@ -46,7 +46,7 @@ impl<'a> Palette<'a> {
     /// `Invalid` if the material does not exist.
     pub(super) fn uv_set(&self, material: Option<usize>) -> Result<u32> {
         let Some(index) = material else { return Ok(0) };
-        let material = at(&self.document.materials, index, "material")?;
+        let material = get_element(&self.document.materials, index, "material")?;
         let base = material.pbr_metallic_roughness.base_color_texture.as_ref();
         Ok(base.or(material.normal_texture.as_ref()).map_or(0, |wanted| wanted.tex_coord))
     }
@@ -55,16 +55,21 @@ impl<'a> Palette<'a> {
     ///
     /// # Errors
     /// `Invalid` with the material and the field.
-    pub(super) fn mix(&mut self, wanted: Option<usize>, has_uvs: bool, remarks: &mut Remarks) -> Result<usize> {
+    pub(super) fn material_index(
+        &mut self,
+        wanted: Option<usize>,
+        has_uvs: bool,
+        remarks: &mut ImportWarnings,
+    ) -> Result<usize> {
         if let Some(known) = self.known.get(&(wanted, has_uvs)) {
             return Ok(*known);
         }
         let material = match wanted {
             None => Material::default(),
             Some(index) => {
-                let source = at(&self.document.materials, index, "material")?;
+                let source = get_element(&self.document.materials, index, "material")?;
                 let made = self.phong(source, index, has_uvs, remarks);
-                made.map_err(|error| error.within(&format!("materials[{index}]")))?
+                made.map_err(|error| error.prefix_field(&format!("materials[{index}]")))?
             }
         };
         self.materials.push(material);
@@ -77,19 +82,19 @@ impl<'a> Palette<'a> {
         source: &document::Material,
         index: usize,
         has_uvs: bool,
-        remarks: &mut Remarks,
+        remarks: &mut ImportWarnings,
     ) -> Result<Material> {
         let name = source.name.as_deref().filter(|name| !name.is_empty());
-        let name = name.map_or_else(|| format!("material {index}"), |name| tidy(name, 120));
+        let name = name.map_or_else(|| format!("material {index}"), |name| sanitize(name, 120));
         let pbr = &source.pbr_metallic_roughness;
         check_factors(pbr)?;
-        let colour = self.base_colour(pbr, &name, has_uvs, remarks)?;
+        let color = self.base_color(pbr, &name, has_uvs, remarks)?;
         let normal = self.normal_map(source, &name, has_uvs, remarks)?;
         let (metal, roughness) = self.metal_and_roughness(pbr, &name, remarks)?;
         if source.occlusion_texture.is_some() {
             remarks.add(format!("material '{name}': the occlusion texture is ignored"));
         }
-        if source.emissive_texture.is_some() || source.emissive_factor.is_some_and(|colour| colour != [0.0; 3]) {
+        if source.emissive_texture.is_some() || source.emissive_factor.is_some_and(|color| color != [0.0; 3]) {
             remarks.add(format!("material '{name}': emission is ignored"));
         }
         let [red, green, blue, alpha] = pbr.base_color_factor;
@@ -101,21 +106,21 @@ impl<'a> Palette<'a> {
             specular: base.map(|channel| ((0.04 * (1.0 - metal) + channel * metal) / (4.0 * square)).min(1.0)),
             shininess: ((2.0 / square - 2.0) / 4.0).clamp(1.0, 1e4),
             alpha,
-            colour_texture: colour,
+            color_texture: color,
             normal_texture: normal,
             alpha_mode: alpha_mode(source)?,
             double_sided: source.double_sided,
             name,
         }
-        .checked()
+        .validated()
     }
 
-    fn base_colour(
+    fn base_color(
         &mut self,
-        pbr: &document::Pbr,
+        pbr: &document::PbrMetallicRoughness,
         name: &str,
         has_uvs: bool,
-        remarks: &mut Remarks,
+        remarks: &mut ImportWarnings,
     ) -> Result<Option<usize>> {
         let Some(wanted) = &pbr.base_color_texture else { return Ok(None) };
         if !has_uvs {
@@ -123,7 +128,10 @@ impl<'a> Palette<'a> {
             remarks.add(format!("material '{name}': a primitive lacks TEXCOORD_{set}, its colour texture is left out"));
             return Ok(None);
         }
-        self.gallery.hang(wanted, remarks).map(Some).map_err(within("pbrMetallicRoughness.baseColorTexture"))
+        self.texture_loader
+            .texture_index(wanted, remarks)
+            .map(Some)
+            .map_err(within("pbrMetallicRoughness.baseColorTexture"))
     }
 
     fn normal_map(
@@ -131,7 +139,7 @@ impl<'a> Palette<'a> {
         source: &document::Material,
         name: &str,
         has_uvs: bool,
-        remarks: &mut Remarks,
+        remarks: &mut ImportWarnings,
     ) -> Result<Option<usize>> {
         let Some(wanted) = &source.normal_texture else { return Ok(None) };
         let base = source.pbr_metallic_roughness.base_color_texture.as_ref();
@@ -145,25 +153,32 @@ impl<'a> Palette<'a> {
         if let Some(scale) = wanted.scale.filter(|scale| *scale != 1.0) {
             remarks.add(format!("material '{name}': the normal map's scale of {scale} is ignored"));
         }
-        self.gallery.hang(wanted, remarks).map(Some).map_err(within("normalTexture"))
+        self.texture_loader.texture_index(wanted, remarks).map(Some).map_err(within("normalTexture"))
     }
 
     /// Metalness and roughness, 0 to 1. Their texture stores them in blue and green.
-    fn metal_and_roughness(&mut self, pbr: &document::Pbr, name: &str, remarks: &mut Remarks) -> Result<(f32, f32)> {
+    fn metal_and_roughness(
+        &mut self,
+        pbr: &document::PbrMetallicRoughness,
+        name: &str,
+        remarks: &mut ImportWarnings,
+    ) -> Result<(f32, f32)> {
         let factors = (pbr.metallic_factor, pbr.roughness_factor);
         let Some(wanted) = &pbr.metallic_roughness_texture else { return Ok(factors) };
-        let mean =
-            self.gallery.mean(wanted, remarks).map_err(within("pbrMetallicRoughness.metallicRoughnessTexture"))?;
+        let channel_means = self
+            .texture_loader
+            .channel_means(wanted, remarks)
+            .map_err(within("pbrMetallicRoughness.metallicRoughnessTexture"))?;
         remarks.add(format!("material '{name}': of the metallic-roughness texture only the mean is used"));
-        Ok((factors.0 * mean[2], factors.1 * mean[1]))
+        Ok((factors.0 * channel_means[2], factors.1 * channel_means[1]))
     }
 }
 
 fn within(place: &str) -> impl Fn(crate::error::Error) -> crate::error::Error {
-    move |error| error.within(place)
+    move |error| error.prefix_field(place)
 }
 
-fn check_factors(pbr: &document::Pbr) -> Result<()> {
+fn check_factors(pbr: &document::PbrMetallicRoughness) -> Result<()> {
     let [red, green, blue, alpha] = pbr.base_color_factor;
     let factors = [
         ("baseColorFactor[0]", red),
@@ -184,6 +199,6 @@ fn alpha_mode(source: &document::Material) -> Result<AlphaMode> {
         None | Some("OPAQUE") => Ok(AlphaMode::Opaque),
         Some("BLEND") => Ok(AlphaMode::Blend),
         Some("MASK") => Ok(AlphaMode::Mask { cutoff: source.alpha_cutoff.unwrap_or(0.5) }),
-        Some(other) => Err(invalid("alphaMode", "OPAQUE, MASK or BLEND", tidy(other, 40))),
+        Some(other) => Err(invalid("alphaMode", "OPAQUE, MASK or BLEND", sanitize(other, 40))),
     }
 }

@@ -1,9 +1,9 @@
 //! Converts a primitive to a shape: one vertex and one corner per element of POSITION, triangles from its topology, and
 //! U (3n x r) from the POSITION targets.
 
-use super::accessor::{Form, Reader};
+use super::accessor::{AccessorReader, AttributeFormat};
 use super::document::Primitive;
-use super::remarks::Remarks;
+use super::warnings::ImportWarnings;
 use crate::domain::{MAX_RANK, Mesh, Modes, Shape, smooth_normals};
 use crate::error::{Result, invalid};
 
@@ -15,10 +15,10 @@ const FAN: u64 = 6;
 /// # Errors
 /// `Invalid` with the attribute, the accessor and the field.
 pub(super) fn shape(
-    reader: Reader<'_>,
+    reader: AccessorReader<'_>,
     primitive: &Primitive,
     uv_set: u32,
-    remarks: &mut Remarks,
+    remarks: &mut ImportWarnings,
 ) -> Result<Option<Shape>> {
     if primitive.mode > FAN {
         return Err(invalid("mode", "0 to 6", primitive.mode));
@@ -29,8 +29,8 @@ pub(super) fn shape(
     }
     let positions = primitive.attributes.get("POSITION");
     let positions = *positions.ok_or_else(|| invalid("attributes.POSITION", "an accessor", "none"))?;
-    let form = Form { integers: false, count: None };
-    let rest = reader.vectors::<3>(positions, form).map_err(|error| error.within("attributes.POSITION"))?;
+    let form = AttributeFormat { integers: false, count: None };
+    let rest = reader.vectors::<3>(positions, form).map_err(|error| error.prefix_field("attributes.POSITION"))?;
     let modes = modes(reader, primitive, rest.len(), remarks)?;
     let mesh = mesh(reader, primitive, rest, uv_set)?;
     if primitive.attributes.contains_key("COLOR_0") {
@@ -39,29 +39,29 @@ pub(super) fn shape(
     Shape::new(mesh, modes).map(Some)
 }
 
-fn mesh(reader: Reader<'_>, primitive: &Primitive, rest: Vec<[f32; 3]>, uv_set: u32) -> Result<Mesh> {
+fn mesh(reader: AccessorReader<'_>, primitive: &Primitive, rest: Vec<[f32; 3]>, uv_set: u32) -> Result<Mesh> {
     let indices = match primitive.indices {
-        Some(accessor) => reader.indices(accessor, rest.len()).map_err(|error| error.within("indices"))?,
+        Some(accessor) => reader.indices(accessor, rest.len()).map_err(|error| error.prefix_field("indices"))?,
         None => (0..rest.len() as u32).collect(),
     };
     let triangles = triangles(&indices, primitive.mode)?;
-    let form = Form { integers: false, count: Some(rest.len()) };
+    let form = AttributeFormat { integers: false, count: Some(rest.len()) };
     let normals = match primitive.attributes.get("NORMAL") {
-        Some(accessor) => reader.vectors(*accessor, form).map_err(|error| error.within("attributes.NORMAL"))?,
+        Some(accessor) => reader.vectors(*accessor, form).map_err(|error| error.prefix_field("attributes.NORMAL"))?,
         None => {
             let vertices: Vec<u32> = (0..rest.len() as u32).collect();
             smooth_normals(&rest, &vertices, &triangles)
         }
     };
     let attribute = format!("TEXCOORD_{uv_set}");
-    let form = Form { integers: true, ..form };
+    let form = AttributeFormat { integers: true, ..form };
     let uvs = match primitive.attributes.get(&attribute) {
         Some(accessor) => {
-            reader.vectors(*accessor, form).map_err(|error| error.within(&format!("attributes.{attribute}")))?
+            reader.vectors(*accessor, form).map_err(|error| error.prefix_field(&format!("attributes.{attribute}")))?
         }
         None => Vec::new(),
     };
-    Mesh::indexed(rest, normals, uvs, triangles)
+    Mesh::from_indexed(rest, normals, uvs, triangles)
 }
 
 /// The triangles of a list, strip or fan. Degenerate triangles that join strips are omitted.
@@ -89,7 +89,12 @@ fn triangles(indices: &[u32], mode: u64) -> Result<Vec<[u32; 3]>> {
 }
 
 /// Column k of U is the POSITION of target k, or zero if the target has none.
-fn modes(reader: Reader<'_>, primitive: &Primitive, vertices: usize, remarks: &mut Remarks) -> Result<Modes> {
+fn modes(
+    reader: AccessorReader<'_>,
+    primitive: &Primitive,
+    vertices: usize,
+    remarks: &mut ImportWarnings,
+) -> Result<Modes> {
     let targets = &primitive.targets;
     if targets.len() > MAX_RANK {
         return Err(invalid("targets", format!("at most {MAX_RANK}"), targets.len()));
@@ -102,12 +107,12 @@ fn modes(reader: Reader<'_>, primitive: &Primitive, vertices: usize, remarks: &m
                 _ => format!("{other} targets are ignored"),
             });
         }
-        let form = Form { integers: false, count: Some(vertices) };
+        let form = AttributeFormat { integers: false, count: Some(vertices) };
         let column = match target.get("POSITION") {
             Some(accessor) => reader.vectors::<3>(*accessor, form),
-            None => reader.bytes.spend(12 * vertices as u64).map(|()| vec![[0.0; 3]; vertices]),
+            None => reader.bytes.charge_budget(12 * vertices as u64).map(|()| vec![[0.0; 3]; vertices]),
         };
-        let column = column.map_err(|error| error.within(&format!("targets[{at}].POSITION")))?;
+        let column = column.map_err(|error| error.prefix_field(&format!("targets[{at}].POSITION")))?;
         columns.extend_from_slice(column.as_flattened());
     }
     Ok(Modes::from_columns(3 * vertices, targets.len(), columns)?.without_zero_matrix())

@@ -2,26 +2,26 @@
 
 use std::collections::HashMap;
 
-use super::bytes::Bytes;
-use super::document::{Document, REPEAT, TextureUse};
-use super::remarks::{Remarks, tidy};
-use super::{at, bytes};
+use super::buffers::GltfBuffers;
+use super::document::{Document, REPEAT, TextureInfo};
+use super::warnings::{ImportWarnings, sanitize};
+use super::{buffers, get_element};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 
 /// Decodes images when materials first use them.
 #[derive(Debug)]
-pub(super) struct Gallery<'a> {
+pub(super) struct TextureLoader<'a> {
     document: &'a Document,
-    bytes: &'a bytes::Bytes<'a>,
+    bytes: &'a buffers::GltfBuffers<'a>,
     /// The decoded textures.
     pub(super) textures: Vec<Texture>,
     by_image: HashMap<usize, usize>,
     means: HashMap<usize, [f32; 4]>,
 }
 
-impl<'a> Gallery<'a> {
-    pub(super) fn new(document: &'a Document, bytes: &'a Bytes<'a>) -> Self {
+impl<'a> TextureLoader<'a> {
+    pub(super) fn new(document: &'a Document, bytes: &'a GltfBuffers<'a>) -> Self {
         Self { document, bytes, textures: Vec::new(), by_image: HashMap::new(), means: HashMap::new() }
     }
 
@@ -29,7 +29,7 @@ impl<'a> Gallery<'a> {
     ///
     /// # Errors
     /// `Invalid` if the texture does not exist or is not a PNG or JPEG image.
-    pub(super) fn hang(&mut self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<usize> {
+    pub(super) fn texture_index(&mut self, wanted: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
         let image = self.image_of(wanted, remarks)?;
         if let Some(known) = self.by_image.get(&image) {
             return Ok(*known);
@@ -43,8 +43,8 @@ impl<'a> Gallery<'a> {
     /// The mean of each of the four channels, 0 to 1. The texture itself is not kept.
     ///
     /// # Errors
-    /// As for [`Self::hang`].
-    pub(super) fn mean(&mut self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<[f32; 4]> {
+    /// As for [`Self::texture_index`].
+    pub(super) fn channel_means(&mut self, wanted: &TextureInfo, remarks: &mut ImportWarnings) -> Result<[f32; 4]> {
         let image = self.image_of(wanted, remarks)?;
         if let Some(known) = self.means.get(&image) {
             return Ok(*known);
@@ -61,11 +61,11 @@ impl<'a> Gallery<'a> {
     }
 
     /// The image of a texture. Unsupported sampler settings are recorded as remarks.
-    fn image_of(&self, wanted: &TextureUse, remarks: &mut Remarks) -> Result<usize> {
-        let texture = at(&self.document.textures, wanted.index, "index")?;
+    fn image_of(&self, wanted: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
+        let texture = get_element(&self.document.textures, wanted.index, "index")?;
         let place = format!("textures[{}]", wanted.index);
         if let Some(sampler) = texture.sampler {
-            let sampler = at(&self.document.samplers, sampler, &format!("{place}.sampler"))?;
+            let sampler = get_element(&self.document.samplers, sampler, &format!("{place}.sampler"))?;
             if (sampler.wrap_s, sampler.wrap_t) != (REPEAT, REPEAT) {
                 remarks.add("samplers that clamp or mirror are ignored: textures repeat".into());
             }
@@ -74,15 +74,15 @@ impl<'a> Gallery<'a> {
             remarks.add("KHR_texture_transform is not supported: texture coordinates stay as they are".into());
         }
         let source = texture.source.ok_or_else(|| invalid(format!("{place}.source"), "an image", "none"))?;
-        at(&self.document.images, source, &format!("{place}.source"))?;
+        get_element(&self.document.images, source, &format!("{place}.source"))?;
         Ok(source)
     }
 
     fn decode(&self, image: usize) -> Result<Texture> {
-        let within = |error: crate::error::Error| error.within(&format!("images[{image}]"));
+        let within = |error: crate::error::Error| error.prefix_field(&format!("images[{image}]"));
         let encoded = self.bytes.image(image).map_err(within)?;
         let texture = Texture::decode(self.name(image), &encoded).map_err(within)?;
-        self.bytes.spend(texture.rgba().len() as u64).map_err(within)?;
+        self.bytes.charge_budget(texture.rgba().len() as u64).map_err(within)?;
         Ok(texture)
     }
 
@@ -90,6 +90,6 @@ impl<'a> Gallery<'a> {
         let image = &self.document.images[index];
         let uri = image.uri.as_deref().filter(|uri| !uri.starts_with("data:"));
         let name = image.name.as_deref().filter(|name| !name.is_empty()).or(uri);
-        name.map_or_else(|| format!("image {index}"), |name| tidy(name, 120))
+        name.map_or_else(|| format!("image {index}"), |name| sanitize(name, 120))
     }
 }

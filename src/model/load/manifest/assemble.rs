@@ -4,35 +4,42 @@
 use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 
-use super::patch::{Gallery, Patch};
-use super::{Entry, Manifest, Transforms};
-use crate::domain::{Attachment, Domain, Follow, Material, Modes, Shape, Texture, Transform};
+use super::patch::{MaterialPatch, TextureLookup};
+use super::{DomainEntry, Manifest, TransformKind};
+use crate::domain::{Attachment, Domain, FollowConstraint, Material, Modes, Shape, Texture, Transform};
 use crate::error::{Result, invalid};
-use crate::load::files::Files;
-use crate::load::obj::Source;
-use crate::load::{images, modes, source};
-use crate::scene::{MAX_DOMAINS, Parts, UpAxis};
+use crate::load::asset_dir::AssetDir;
+use crate::load::obj::ModesSource;
+use crate::load::{modes, source, texture_cache};
+use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 
 /// Number of carrying vertices of a deformable parent for an entry without `rows`.
-const CARRIERS: usize = 8;
+const DEFAULT_ATTACHMENT_ROWS: usize = 8;
 
 /// The parts of the scene of all entries.
 ///
 /// # Errors
 /// `Invalid` with the entry.
-pub(super) fn assemble(files: &Files, manifest: &Manifest, entries: &[Entry], own_name: &str) -> Result<Parts> {
+pub(super) fn assemble(
+    files: &AssetDir,
+    manifest: &Manifest,
+    entries: &[DomainEntry],
+    own_name: &str,
+) -> Result<SceneParts> {
     let name = manifest.name.clone().unwrap_or_else(|| own_name.to_owned());
-    let mut assembly = Assembly {
+    let mut assembly = ManifestAssembler {
         files,
         manifest,
-        parts: Parts::named(name),
-        pictures: HashMap::new(),
+        parts: SceneParts::named(name),
+        texture_by_path: HashMap::new(),
         models: HashMap::new(),
         by_name: HashMap::new(),
         patched: HashSet::new(),
     };
     for (index, entry) in entries.iter().enumerate() {
-        assembly.add(index, entry).map_err(|error| error.within(&format!("domain {} ('{}')", index, entry.model)))?;
+        assembly
+            .add(index, entry)
+            .map_err(|error| error.prefix_field(&format!("domain {} ('{}')", index, entry.model)))?;
     }
     assembly.check_patches()?;
     let mut parts = assembly.parts;
@@ -51,35 +58,35 @@ pub(super) fn assemble(files: &Files, manifest: &Manifest, entries: &[Entry], ow
         Some(true) => parts.look.ground = Some(parts.look.ground.unwrap_or_default()),
         None => {}
     }
-    parts.rigid_transforms = manifest.transforms == Transforms::Rigid;
+    parts.rigid_transforms = manifest.transforms == TransformKind::Rigid;
     drop_unused(&mut parts);
     Ok(parts)
 }
 
 /// A model that was read. The indices in its domains refer to the lists of the whole scene, except indices of other
 /// domains, which are relative to the model.
-struct Loaded {
+struct LoadedModel {
     domains: Vec<Domain>,
 }
 
-struct Assembly<'a> {
-    files: &'a Files,
+struct ManifestAssembler<'a> {
+    files: &'a AssetDir,
     manifest: &'a Manifest,
-    parts: Parts,
-    pictures: HashMap<String, usize>,
-    models: HashMap<(PathBuf, Option<String>), Loaded>,
+    parts: SceneParts,
+    texture_by_path: HashMap<String, usize>,
+    models: HashMap<(PathBuf, Option<String>), LoadedModel>,
     by_name: HashMap<String, usize>,
     /// Names of all materials that were looked up in the overrides.
     patched: HashSet<String>,
 }
 
-impl Gallery for Assembly<'_> {
+impl TextureLookup for ManifestAssembler<'_> {
     fn index(&mut self, path: &str) -> Result<usize> {
-        if let Some(index) = self.pictures.get(path) {
+        if let Some(index) = self.texture_by_path.get(path) {
             return Ok(*index);
         }
-        self.parts.textures.push(images::decode(self.files, path)?);
-        self.pictures.insert(path.to_owned(), self.parts.textures.len() - 1);
+        self.parts.textures.push(texture_cache::decode(self.files, path)?);
+        self.texture_by_path.insert(path.to_owned(), self.parts.textures.len() - 1);
         Ok(self.parts.textures.len() - 1)
     }
 
@@ -88,8 +95,8 @@ impl Gallery for Assembly<'_> {
     }
 }
 
-impl Assembly<'_> {
-    fn add(&mut self, index: usize, entry: &Entry) -> Result<()> {
+impl ManifestAssembler<'_> {
+    fn add(&mut self, index: usize, entry: &DomainEntry) -> Result<()> {
         let path = self.files.resolve(&entry.model)?;
         let key = (path, entry.modes.clone());
         if !self.models.contains_key(&key) {
@@ -103,8 +110,8 @@ impl Assembly<'_> {
             return Err(invalid("domains", format!("at most {MAX_DOMAINS} in a scene"), first + domains.len()));
         }
         self.place(entry, &mut domains)?;
-        follow(entry, &mut domains)?;
-        self.paint(entry, &mut domains)?;
+        add_follow_constraints(entry, &mut domains)?;
+        self.apply_entry_material(entry, &mut domains)?;
         self.annotate(entry, &mut domains)?;
         for domain in &mut domains {
             domain.shares_q_with = domain.shares_q_with.map(|twin| twin + first);
@@ -115,8 +122,8 @@ impl Assembly<'_> {
     }
 
     /// Reads a model and appends its shapes, materials and textures to those of the scene.
-    fn load(&mut self, index: usize, entry: &Entry) -> Result<Loaded> {
-        let source = if entry.modes.is_some() { Source::None } else { Source::Beside };
+    fn load(&mut self, index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
+        let source = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
         let mut model = source::model(self.files, &entry.model, source)?;
         if let Some(file) = &entry.modes {
             replace_modes(self.files, file, &mut model)?;
@@ -134,12 +141,12 @@ impl Assembly<'_> {
         for domain in &mut model.domains {
             domain.shape += shapes;
             domain.material += materials;
-            domain.runs.iter_mut().for_each(|run| run.material += materials);
+            domain.material_ranges.iter_mut().for_each(|run| run.material += materials);
         }
         self.parts.shapes.append(&mut model.shapes);
         self.parts.textures.append(&mut model.textures);
         for mut material in model.materials {
-            for texture in [&mut material.colour_texture, &mut material.normal_texture] {
+            for texture in [&mut material.color_texture, &mut material.normal_texture] {
                 *texture = texture.map(|texture| texture + textures);
             }
             let manifest = self.manifest;
@@ -153,7 +160,7 @@ impl Assembly<'_> {
         }
         let remarks = model.remarks.into_iter().map(|remark| format!("model '{}': {remark}", entry.model));
         self.parts.remarks.extend(remarks);
-        Ok(Loaded { domains: model.domains })
+        Ok(LoadedModel { domains: model.domains })
     }
 
     fn check_patches(&self) -> Result<()> {
@@ -166,26 +173,27 @@ impl Assembly<'_> {
     }
 
     /// Places the domains, and attaches those without a parent to the entry's parent.
-    fn place(&self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+    fn place(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         let first = self.parts.domains.len();
         let said = |placement: &Option<super::Placement>, key: &str| match placement {
-            Some(placement) => placement.transform().map_err(|error| error.within(key)),
+            Some(placement) => placement.transform().map_err(|error| error.prefix_field(key)),
             None => Ok(Transform::IDENTITY),
         };
         let parent = self.parent(entry)?;
         let world_from_entry = match parent {
             Some(parent) if entry.frame.is_some() => {
-                self.parts.domains[parent].placement.then(said(&entry.frame, "frame")?)
+                self.parts.domains[parent].placement.compose(said(&entry.frame, "frame")?)
             }
             _ => said(&entry.placement, "placement")?,
         };
-        let world_from_model = world_from_entry.then(turned(entry.up, self.manifest.up.unwrap_or(self.parts.up)));
+        let world_from_model =
+            world_from_entry.compose(up_axis_rotation(entry.up, self.manifest.up.unwrap_or(self.parts.up)));
         for domain in domains {
-            domain.placement = world_from_model.then(domain.placement);
+            domain.placement = world_from_model.compose(domain.placement);
             match (&mut domain.attachment, parent) {
                 (Some(attachment), _) => {
                     attachment.parent += first;
-                    domain.follows.iter_mut().for_each(|follow| follow.parent += first);
+                    domain.follows.iter_mut().for_each(|add_follow_constraints| add_follow_constraints.parent += first);
                 }
                 (None, Some(parent)) => domain.attachment = Some(self.attach(entry, parent, domain.placement)?),
                 (None, None) => {}
@@ -194,7 +202,7 @@ impl Assembly<'_> {
         Ok(())
     }
 
-    fn parent(&self, entry: &Entry) -> Result<Option<usize>> {
+    fn parent(&self, entry: &DomainEntry) -> Result<Option<usize>> {
         let Some(name) = &entry.parent else {
             return match (&entry.frame, &entry.rows) {
                 (None, None) => Ok(None),
@@ -208,20 +216,20 @@ impl Assembly<'_> {
         found.map(Some).ok_or_else(|| invalid("parent", "the name of a domain of an earlier entry", name))
     }
 
-    fn attach(&self, entry: &Entry, parent: usize, world_from_child: Transform) -> Result<Attachment> {
+    fn attach(&self, entry: &DomainEntry, parent: usize, world_from_child: Transform) -> Result<Attachment> {
         let carrier = &self.parts.domains[parent];
         let parent_from_world = carrier.placement.inverse();
         let singular = || invalid("parent", "a parent whose placement has an inverse", &carrier.name);
-        let frame = parent_from_world.ok_or_else(singular)?.then(world_from_child);
+        let frame = parent_from_world.ok_or_else(singular)?.compose(world_from_child);
         let rows = match &entry.rows {
             Some(rows) => rows.clone(),
-            None => nearest(&self.parts.shapes[carrier.shape], frame),
+            None => nearest_vertices(&self.parts.shapes[carrier.shape], frame),
         };
         Ok(Attachment { parent, frame, rows })
     }
 
     /// Gives the entry its own copies of the materials that it overrides.
-    fn paint(&mut self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+    fn apply_entry_material(&mut self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         let Some(patch) = &entry.material else { return Ok(()) };
         let mut copies = HashMap::new();
         let mut used: Vec<usize> = domains.iter().flat_map(Domain::materials).collect();
@@ -229,19 +237,19 @@ impl Assembly<'_> {
         used.dedup();
         for index in used {
             let mut copy: Material = self.parts.materials[index].clone();
-            Patch::apply(patch, &mut copy, self)?;
+            MaterialPatch::apply(patch, &mut copy, self)?;
             self.parts.materials.push(copy);
             copies.insert(index, self.parts.materials.len() - 1);
         }
         let copied = |index: &mut usize| *index = copies.get(index).copied().unwrap_or(*index);
         for domain in domains {
             copied(&mut domain.material);
-            domain.runs.iter_mut().for_each(|run| copied(&mut run.material));
+            domain.material_ranges.iter_mut().for_each(|run| copied(&mut run.material));
         }
         Ok(())
     }
 
-    fn annotate(&self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+    fn annotate(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         if let Some(eigenvalues) = &entry.eigenvalues {
             let ranks: Vec<_> = domains.iter().map(|domain| self.parts.shapes[domain.shape].modes.rank()).collect();
             if ranks[..] != [eigenvalues.len()] || !eigenvalues.iter().all(|value| value.is_finite()) {
@@ -257,7 +265,7 @@ impl Assembly<'_> {
     }
 
     /// Gives every domain a unique name: the entry's name, as a prefix if the model has several domains.
-    fn name(&mut self, entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+    fn name(&mut self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         let single = domains.len() == 1;
         for (offset, domain) in domains.iter_mut().enumerate() {
             let index = self.parts.domains.len() + offset;
@@ -286,12 +294,12 @@ impl Assembly<'_> {
 }
 
 /// Makes the domains with the entry's name prefix followers of their parents, with their rest poses as frames.
-fn follow(entry: &Entry, domains: &mut [Domain]) -> Result<()> {
+fn add_follow_constraints(entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
     let Some(start) = &entry.follows else { return Ok(()) };
     let mut any = false;
     for domain in domains.iter_mut().filter(|domain| domain.name.starts_with(start.as_str())) {
-        let follow = |on: &Attachment| Follow { parent: on.parent, frame: on.frame };
-        domain.follows = domain.attachment.as_ref().map(follow).or(domain.follows);
+        let add_follow_constraints = |on: &Attachment| FollowConstraint { parent: on.parent, frame: on.frame };
+        domain.follows = domain.attachment.as_ref().map(add_follow_constraints).or(domain.follows);
         any |= domain.follows.is_some();
     }
     match any {
@@ -301,25 +309,25 @@ fn follow(entry: &Entry, domains: &mut [Domain]) -> Result<()> {
 }
 
 /// Replaces U of a model with one shape, and clears the rest coordinates, which belong to the old modes.
-fn replace_modes(files: &Files, file: &str, model: &mut Parts) -> Result<()> {
+fn replace_modes(files: &AssetDir, file: &str, model: &mut SceneParts) -> Result<()> {
     let [shape] = &mut model.shapes[..] else {
         return Err(invalid("modes", "a model of one domain", format!("one of {}", model.shapes.len())));
     };
     let found = if file.is_empty() { Modes::rigid() } else { modes::read(files, file)? };
-    *shape = Shape::new(shape.mesh.clone(), found).map_err(|error| error.within(&format!("file '{file}'")))?;
+    *shape = Shape::new(shape.mesh.clone(), found).map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
     model.domains.iter_mut().for_each(|domain| domain.rest_q.clear());
     Ok(())
 }
 
 /// The rotation from up axis `from` to `to`; the identity if `from` is `None`.
-fn turned(from: Option<UpAxis>, to: UpAxis) -> Transform {
+fn up_axis_rotation(from: Option<UpAxis>, to: UpAxis) -> Transform {
     let Some(from) = from.filter(|from| *from != to) else { return Transform::IDENTITY };
-    let turn = to.from_y_up() * from.from_y_up().inverse();
+    let turn = to.rotation_from_y_up() * from.rotation_from_y_up().inverse();
     Transform::from_parts(turn.matrix(), &nalgebra::Vector3::zeros())
 }
 
 /// The vertices of a deformable shape that are nearest to the origin of `frame`, ascending. Empty for a rigid shape.
-fn nearest(shape: &Shape, frame: Transform) -> Vec<u32> {
+fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
     if shape.modes.rank() == 0 {
         return Vec::new();
     }
@@ -328,35 +336,35 @@ fn nearest(shape: &Shape, frame: Transform) -> Vec<u32> {
     let distance = |vertex: u32| (nalgebra::Vector3::from(rest[vertex as usize]).cast::<f64>() - origin).norm_squared();
     let mut vertices: Vec<u32> = (0..rest.len() as u32).collect();
     vertices.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));
-    vertices.truncate(CARRIERS);
+    vertices.truncate(DEFAULT_ATTACHMENT_ROWS);
     vertices.sort_unstable();
     vertices
 }
 
 /// Removes unused materials and textures, for example replaced textures.
-fn drop_unused(parts: &mut Parts) {
+fn drop_unused(parts: &mut SceneParts) {
     let mut used = vec![false; parts.materials.len()];
     for domain in &parts.domains {
         used[domain.material] = true;
-        domain.runs.iter().for_each(|run| used[run.material] = true);
+        domain.material_ranges.iter().for_each(|run| used[run.material] = true);
     }
-    let new = keep(&mut parts.materials, &used);
+    let new = retain_used(&mut parts.materials, &used);
     for domain in &mut parts.domains {
         domain.material = new[domain.material];
-        domain.runs.iter_mut().for_each(|run| run.material = new[run.material]);
+        domain.material_ranges.iter_mut().for_each(|run| run.material = new[run.material]);
     }
     let mut used = vec![false; parts.textures.len()];
-    let textures = |material: &Material| [material.colour_texture, material.normal_texture];
+    let textures = |material: &Material| [material.color_texture, material.normal_texture];
     parts.materials.iter().flat_map(textures).flatten().for_each(|texture| used[texture] = true);
-    let new = keep(&mut parts.textures, &used);
+    let new = retain_used(&mut parts.textures, &used);
     for material in &mut parts.materials {
-        material.colour_texture = material.colour_texture.map(|texture| new[texture]);
+        material.color_texture = material.color_texture.map(|texture| new[texture]);
         material.normal_texture = material.normal_texture.map(|texture| new[texture]);
     }
 }
 
 /// Keeps the used elements, and returns the new index of each of them.
-fn keep<T>(list: &mut Vec<T>, used: &[bool]) -> Vec<usize> {
+fn retain_used<T>(list: &mut Vec<T>, used: &[bool]) -> Vec<usize> {
     let before: Vec<usize> =
         used.iter().scan(0, |kept, used| Some(std::mem::replace(kept, *kept + usize::from(*used)))).collect();
     let mut flags = used.iter();

@@ -64,17 +64,17 @@ mod placement;
 
 use std::collections::BTreeMap;
 
-use patch::Patch;
+use patch::MaterialPatch;
 use placement::Placement;
 
-use super::files::Files;
+use super::asset_dir::AssetDir;
 use crate::error::{Result, invalid};
-use crate::scene::{Deformation, Look, Parts, UpAxis};
+use crate::scene::{DeformationSettings, RenderSettings, SceneParts, UpAxis};
 
 /// The file name that makes a folder a scene.
-pub(super) const FILE: &str = "scene.toml";
+pub(super) const MANIFEST_FILE: &str = "scene.toml";
 /// The largest size of a `scene.toml` in bytes.
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_MANIFEST_BYTES: u64 = 1 << 20;
 
 #[derive(Debug, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -85,25 +85,25 @@ struct Manifest {
     #[serde(default)]
     origin: [f64; 3],
     #[serde(default)]
-    transforms: Transforms,
-    look: Option<Look>,
+    transforms: TransformKind,
+    look: Option<RenderSettings>,
     shadows: Option<bool>,
     ground: Option<bool>,
     #[serde(default)]
-    deform: Deformation,
+    deform: DeformationSettings,
     #[serde(default)]
-    material: BTreeMap<String, Patch>,
+    material: BTreeMap<String, MaterialPatch>,
     model: Option<String>,
     modes: Option<String>,
     follows: Option<String>,
     placement: Option<Placement>,
     #[serde(default)]
-    domain: Vec<Entry>,
+    domain: Vec<DomainEntry>,
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum Transforms {
+enum TransformKind {
     Rigid,
     #[default]
     Affine,
@@ -112,7 +112,7 @@ enum Transforms {
 /// One model and its placement.
 #[derive(Debug, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Entry {
+struct DomainEntry {
     model: String,
     name: Option<String>,
     modes: Option<String>,
@@ -124,7 +124,7 @@ struct Entry {
     rows: Option<Vec<u32>>,
     /// Name prefix of the domains that move rigidly with their parent.
     follows: Option<String>,
-    material: Option<Patch>,
+    material: Option<MaterialPatch>,
     /// Eigenvalues in (rad/s)^2, one per mode; stored for clients.
     eigenvalues: Option<Vec<f64>>,
     /// Stored for clients.
@@ -136,12 +136,12 @@ struct Entry {
 ///
 /// # Errors
 /// `Invalid` with the manifest, the line or entry, and the expected and given value.
-pub(super) fn read(files: &Files, file: &str, own_name: &str) -> Result<Parts> {
+pub(super) fn read(files: &AssetDir, file: &str, own_name: &str) -> Result<SceneParts> {
     let place = format!("file '{file}'");
-    let bytes = files.read(file, MOST_BYTES)?;
-    let mut manifest = parse(&bytes).map_err(|error| error.within(&place))?;
-    let entries = entries(&mut manifest).map_err(|error| error.within(&place))?;
-    assemble::assemble(files, &manifest, &entries, own_name).map_err(|error| error.within(&place))
+    let bytes = files.read(file, MAX_MANIFEST_BYTES)?;
+    let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&place))?;
+    let entries = entries(&mut manifest).map_err(|error| error.prefix_field(&place))?;
+    assemble::assemble(files, &manifest, &entries, own_name).map_err(|error| error.prefix_field(&place))
 }
 
 fn parse(bytes: &[u8]) -> Result<Manifest> {
@@ -153,13 +153,13 @@ fn parse(bytes: &[u8]) -> Result<Manifest> {
 }
 
 /// The entries. A top-level `model` is the only entry.
-fn entries(manifest: &mut Manifest) -> Result<Vec<Entry>> {
+fn entries(manifest: &mut Manifest) -> Result<Vec<DomainEntry>> {
     let entries = std::mem::take(&mut manifest.domain);
     match (manifest.model.take(), entries.is_empty()) {
         (Some(model), true) => {
             let (modes, placement) = (manifest.modes.take(), manifest.placement.take());
             let follows = manifest.follows.take();
-            Ok(vec![Entry { model, modes, placement, follows, ..Entry::default() }])
+            Ok(vec![DomainEntry { model, modes, placement, follows, ..DomainEntry::default() }])
         }
         (Some(_), false) => Err(invalid("model", "either one model or [[domain]] entries", "both")),
         (None, true) => Err(invalid("model", "a model, or [[domain]] entries", "neither")),

@@ -2,41 +2,42 @@
 
 use crate::domain::{AlphaMode, Material, Texture};
 use crate::error::{Result, invalid};
-use crate::load::obj::CUTOFF;
+use crate::load::obj::DEFAULT_ALPHA_CUTOFF;
 
 /// Overrides of a material. Missing keys keep the model's values; an empty texture name removes the texture.
 #[derive(Debug, Clone, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Patch {
+pub(super) struct MaterialPatch {
     ambient: Option<[f32; 3]>,
     diffuse: Option<[f32; 3]>,
     specular: Option<[f32; 3]>,
     shininess: Option<f32>,
     alpha: Option<f32>,
-    colour_texture: Option<String>,
+    #[serde(rename = "colour_texture")]
+    color_texture: Option<String>,
     normal_texture: Option<String>,
-    alpha_mode: Option<Mode>,
+    alpha_mode: Option<AlphaModeKey>,
     cutoff: Option<f32>,
     double_sided: Option<bool>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum Mode {
+enum AlphaModeKey {
     Opaque,
     Mask,
     Blend,
 }
 
 /// The textures of the scene whose materials are overridden.
-pub(super) trait Gallery {
+pub(super) trait TextureLookup {
     /// The index of the texture in a file, which is read on the first call.
     fn index(&mut self, path: &str) -> Result<usize>;
     /// The texture at an index.
     fn at(&self, index: usize) -> Option<&Texture>;
 }
 
-impl Patch {
+impl MaterialPatch {
     /// Applies the overrides to `material`.
     ///
     /// Without an `alpha_mode`, an opaque material becomes blended if its new alpha is below 1, or masked if its new
@@ -44,22 +45,22 @@ impl Patch {
     ///
     /// # Errors
     /// `Invalid` with the material and the key, for a texture that cannot be read or a cutoff without alpha mode mask.
-    pub(super) fn apply(&self, material: &mut Material, gallery: &mut impl Gallery) -> Result<()> {
+    pub(super) fn apply(&self, material: &mut Material, gallery: &mut impl TextureLookup) -> Result<()> {
         let place = |key: &str| format!("material '{}': {key}", material.name);
         let mut texture = |path: &str, key: &str| match path {
             "" => Ok(None),
-            path => gallery.index(path).map(Some).map_err(|error| error.within(&place(key))),
+            path => gallery.index(path).map(Some).map_err(|error| error.prefix_field(&place(key))),
         };
-        let colour = self.colour_texture.as_deref().map(|path| texture(path, "colour_texture")).transpose()?;
+        let color = self.color_texture.as_deref().map(|path| texture(path, "colour_texture")).transpose()?;
         let normal = self.normal_texture.as_deref().map(|path| texture(path, "normal_texture")).transpose()?;
-        let cut_out = colour.flatten().and_then(|index| gallery.at(index)).is_some_and(Texture::has_alpha);
+        let cut_out = color.flatten().and_then(|index| gallery.at(index)).is_some_and(Texture::has_alpha);
         let mode = match (self.alpha_mode, material.alpha_mode) {
-            (Some(Mode::Opaque), _) => AlphaMode::Opaque,
-            (Some(Mode::Blend), _) => AlphaMode::Blend,
-            (Some(Mode::Mask), AlphaMode::Mask { cutoff }) => AlphaMode::Mask { cutoff },
-            (Some(Mode::Mask), _) => AlphaMode::Mask { cutoff: CUTOFF },
+            (Some(AlphaModeKey::Opaque), _) => AlphaMode::Opaque,
+            (Some(AlphaModeKey::Blend), _) => AlphaMode::Blend,
+            (Some(AlphaModeKey::Mask), AlphaMode::Mask { cutoff }) => AlphaMode::Mask { cutoff },
+            (Some(AlphaModeKey::Mask), _) => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
             (None, AlphaMode::Opaque) if self.alpha.is_some_and(|alpha| alpha < 1.0) => AlphaMode::Blend,
-            (None, AlphaMode::Opaque) if cut_out => AlphaMode::Mask { cutoff: CUTOFF },
+            (None, AlphaMode::Opaque) if cut_out => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
             (None, kept) => kept,
         };
         let mode = match (mode, self.cutoff) {
@@ -73,7 +74,7 @@ impl Patch {
         material.specular = self.specular.unwrap_or(material.specular);
         material.shininess = self.shininess.unwrap_or(material.shininess);
         material.alpha = self.alpha.unwrap_or(material.alpha);
-        material.colour_texture = colour.unwrap_or(material.colour_texture);
+        material.color_texture = color.unwrap_or(material.color_texture);
         material.normal_texture = normal.unwrap_or(material.normal_texture);
         material.double_sided = self.double_sided.unwrap_or(material.double_sided);
         material.alpha_mode = mode;
@@ -87,7 +88,7 @@ mod tests {
 
     struct Two(Vec<Texture>);
 
-    impl Gallery for Two {
+    impl TextureLookup for Two {
         fn index(&mut self, path: &str) -> Result<usize> {
             let found = self.0.iter().position(|texture| texture.name == path);
             found.ok_or_else(|| invalid(format!("file '{path}'"), "a file that is there", "none"))
@@ -100,19 +101,19 @@ mod tests {
     fn patched(text: &str, before: Material) -> Result<Material> {
         let texture = |name: &str, alpha: u8| Texture::new(name, 1, 1, vec![1, 2, 3, alpha]).expect("a texel");
         let mut material = before;
-        let patch: Patch = toml::from_str(text).map_err(|error| invalid("toml", "a patch", error.message()))?;
+        let patch: MaterialPatch = toml::from_str(text).map_err(|error| invalid("toml", "a patch", error.message()))?;
         patch.apply(&mut material, &mut Two(vec![texture("solid", 255), texture("leaf", 0)]))?;
         Ok(material)
     }
 
     #[test]
     fn what_is_said_changes_and_what_is_not_stays() {
-        let before = || Material { colour_texture: Some(9), specular: [0.5; 3], ..Material::default() };
+        let before = || Material { color_texture: Some(9), specular: [0.5; 3], ..Material::default() };
         assert_eq!(patched("", before()).expect("nothing"), before());
         let after =
             patched("alpha = 0.5\ncolour_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'", before());
         let after = after.expect("good");
-        assert_eq!((after.colour_texture, after.normal_texture, after.alpha_mode), (None, Some(0), AlphaMode::Blend));
+        assert_eq!((after.color_texture, after.normal_texture, after.alpha_mode), (None, Some(0), AlphaMode::Blend));
         assert_eq!((after.diffuse, after.specular), ([1.0, 0.0, 0.0], [0.5; 3]));
     }
 

@@ -22,8 +22,8 @@ pub(super) struct Placement {
 #[derive(Debug, Clone, Copy, serde::Deserialize)]
 #[serde(untagged, expecting = "a number or three")]
 enum Scale {
-    Even(f64),
-    Each([f64; 3]),
+    Uniform(f64),
+    PerAxis([f64; 3]),
 }
 
 impl Placement {
@@ -41,17 +41,17 @@ impl Placement {
             None => {
                 let scale = match self.scale {
                     None => [1.0; 3],
-                    Some(Scale::Even(factor)) => [factor; 3],
-                    Some(Scale::Each(factors)) => factors,
+                    Some(Scale::Uniform(factor)) => [factor; 3],
+                    Some(Scale::PerAxis(factors)) => factors,
                 };
-                let linear = self.turn()?.into_inner() * Matrix3::from_diagonal(&scale.into());
+                let linear = self.rotation()?.into_inner() * Matrix3::from_diagonal(&scale.into());
                 Transform::from_parts(&linear, &self.translation.unwrap_or_default().into())
             }
         };
         Transform::new(transform.0)
     }
 
-    fn turn(&self) -> Result<Rotation3<f64>> {
+    fn rotation(&self) -> Result<Rotation3<f64>> {
         let length = |field: &str, squared: f64| match squared.is_finite() && squared > 1e-24 {
             true => Ok(()),
             false => Err(invalid(field, "finite numbers that are not all zero", format!("length {}", squared.sqrt()))),

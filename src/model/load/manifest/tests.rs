@@ -5,12 +5,13 @@ use std::path::Path;
 use super::*;
 use crate::domain::{AlphaMode, Transform};
 use crate::scene::{
-    Antialias, Batches, Bloom, Culling, Deformation, Moments, Normals, Rastering, Shadow, ShadowMethod, Storage, Tone,
+    Antialiasing, BatchPolicy, Bloom, Culling, DeformationSettings, MomentFormat, NormalMethod, RasterPolicy,
+    ShadowMethod, ShadowSettings, StorageType, ToneMapping,
 };
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
-fn scene(toml: &str) -> Result<Parts> {
+fn scene(toml: &str) -> Result<SceneParts> {
     let folder = tempfile::tempdir().expect("a folder");
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("written");
     write("a.obj", TRIANGLE);
@@ -22,8 +23,8 @@ fn scene(toml: &str) -> Result<Parts> {
         let image = image::RgbaImage::from_pixel(1, 1, image::Rgba([1, 2, 3, alpha]));
         image.save(folder.path().join(name)).expect("written");
     }
-    write(FILE, toml);
-    read(&Files::anywhere(folder.path()), FILE, "folder")
+    write(MANIFEST_FILE, toml);
+    read(&AssetDir::unrestricted(folder.path()), MANIFEST_FILE, "folder")
 }
 
 #[test]
@@ -41,22 +42,27 @@ fn one_model_with_everything_said_about_the_scene() {
     assert!(parts.look.shadow.is_none() && parts.look.ground.is_some());
     assert_eq!(parts.look.sunlight, [2.0; 3]);
     assert_eq!(parts.look.bloom, Some(Bloom { strength: 0.25, ..Bloom::default() }));
-    assert_eq!((parts.look.antialias, parts.look.tone), (Antialias::Fxaa, Tone::Aces));
-    assert_eq!((parts.look.exposure, parts.look.dither, parts.look.culling), (1.5, true, Culling::Depth));
-    assert_eq!(parts.look.raster, Rastering::Fastest);
-    let deformation = Deformation {
-        storage: Storage::Int8,
-        normals: Normals::Exact,
+    assert_eq!((parts.look.antialias, parts.look.tone), (Antialiasing::Fxaa, ToneMapping::Aces));
+    assert_eq!((parts.look.exposure, parts.look.dither, parts.look.culling), (1.5, true, Culling::Occlusion));
+    assert_eq!(parts.look.raster, RasterPolicy::Fastest);
+    let deformation = DeformationSettings {
+        storage: StorageType::Int8,
+        normals: NormalMethod::Exact,
         truncation: Some(1e-4),
-        ..Deformation::default()
+        ..DeformationSettings::default()
     };
-    let deformation = Deformation { displacements: true, batches: Batches::Never, ..deformation };
+    let deformation = DeformationSettings { displacements: true, batches: BatchPolicy::Never, ..deformation };
     assert_eq!(parts.deformation, deformation);
     assert_eq!(parts.shapes[0].modes.rank(), 2);
     assert_eq!(parts.domains[0].placement.translation(), nalgebra::Vector3::new(1.0, 2.0, 3.0));
     let shaded = "model = 'a.obj'\nlook.shadow = { method = 'filtered', size = 512, splits = 3, moments = 'f16' }\n";
-    let named =
-        Shadow { method: ShadowMethod::Filtered, size: 512, splits: 3, moments: Moments::F16, ..Shadow::default() };
+    let named = ShadowSettings {
+        method: ShadowMethod::PercentageCloser,
+        size: 512,
+        splits: 3,
+        moments: MomentFormat::F16,
+        ..ShadowSettings::default()
+    };
     assert_eq!(scene(shaded).expect("good").look.shadow, Some(named));
     for wrong in ["method = 'ray'", "splits = -1", "blurring = 'tiles'"] {
         let refusal = scene(&format!("model = 'a.obj'\nlook.shadow = {{ {wrong} }}\n")).expect_err(wrong).to_string();
@@ -64,7 +70,7 @@ fn one_model_with_everything_said_about_the_scene() {
     }
     let plain = scene("model = 'a.obj'\n").expect("good");
     assert_eq!((plain.name.as_str(), plain.up, plain.rigid_transforms), ("folder", UpAxis::Y, false));
-    assert_eq!(plain.deformation, Deformation::default());
+    assert_eq!(plain.deformation, DeformationSettings::default());
     let refusal = scene("model = 'a.obj'\ndeform.storage = 'int3'\n").expect_err("no such type").to_string();
     assert!(refusal.contains("int3"), "{refusal}");
 }
@@ -135,7 +141,7 @@ fn materials_are_changed_by_name_for_all_and_for_one_entry_and_replaced_textures
     assert_eq!((first.diffuse, second.diffuse), ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]));
     assert_eq!(parts.domains.iter().map(|domain| domain.material).collect::<Vec<_>>(), [0, 1]);
     assert_eq!(parts.textures.iter().map(|texture| texture.name.as_str()).collect::<Vec<_>>(), ["leaf.png"]);
-    assert_eq!((first.colour_texture, second.colour_texture), (Some(0), Some(0)));
+    assert_eq!((first.color_texture, second.color_texture), (Some(0), Some(0)));
 }
 
 #[test]

@@ -1,40 +1,40 @@
 //! Loaders of the modal matrix U: 3n rows, r columns, f32.
 
-mod numpy;
+mod npy;
+mod safetensors;
 mod sofa;
-mod tensors;
 mod vega;
 
-pub use numpy::{Array, parse as parse_numpy};
+pub use npy::{NpyArray, parse as parse_numpy};
 
-use super::files::{Files, Kind, MODEL_BYTES};
+use super::asset_dir::{AssetDir, EntryKind, MAX_MODEL_BYTES};
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
 /// Endings of mode files in order of preference: binary files before text, which has fewer digits.
-const ENDINGS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
+const EXTENSIONS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
 
 /// Reads the modes in `name`. The extension determines the format.
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
-pub(super) fn read(files: &Files, name: &str) -> Result<Modes> {
+pub(super) fn read(files: &AssetDir, name: &str) -> Result<Modes> {
     let parse = match name.rsplit_once('.').map(|(_, ending)| ending) {
         Some("float" | "double" | "U") => vega::parse,
-        Some("npy") => matrix,
-        Some("safetensors") => tensors::parse,
+        Some("npy") => parse_npy,
+        Some("safetensors") => safetensors::parse,
         Some("txt") => sofa::parse,
         _ => return Err(invalid("modes", "a file ending in .float, .double, .U, .npy, .safetensors or .txt", name)),
     };
-    parse(&files.read(name, MODEL_BYTES)?).map_err(|error| error.within(&format!("file '{name}'")))
+    parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(|error| error.prefix_field(&format!("file '{name}'")))
 }
 
-fn matrix(bytes: &[u8]) -> Result<Modes> {
-    let array = numpy::parse(bytes)?;
+fn parse_npy(bytes: &[u8]) -> Result<Modes> {
+    let array = npy::parse(bytes)?;
     let [rows, rank] = array.shape[..] else {
         return Err(invalid("shape", "two dimensions, 3n x r", format!("{:?}", array.shape)));
     };
-    match array.fortran {
+    match array.fortran_order {
         true => Modes::from_columns(rows, rank, array.entries),
         false => Modes::from_rows(rows, rank, &array.entries),
     }
@@ -43,28 +43,28 @@ fn matrix(bytes: &[u8]) -> Result<Modes> {
 /// Finds the modes of the OBJ file `name` in its folder, if any.
 ///
 /// The candidates have its name (without `.obj` and `.derived`), optionally `.U`, and one of the first four
-/// [`ENDINGS`], in that order. If the folder has no other OBJ file, any file with one of the [`ENDINGS`] is accepted,
+/// [`EXTENSIONS`], in that order. If the folder has no other OBJ file, any file with one of the [`EXTENSIONS`] is accepted,
 /// in that order too.
 ///
 /// # Errors
 /// `Invalid` with the candidates if two files have the same ending.
-pub(super) fn beside(files: &Files, name: &str) -> Result<Option<String>> {
+pub(super) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Option<String>> {
     let stem = name.strip_suffix(".obj").unwrap_or(name);
     let stem = stem.strip_suffix(".derived").unwrap_or(stem);
-    for ending in &ENDINGS[..4] {
+    for ending in &EXTENSIONS[..4] {
         for middle in ["", ".U"] {
             let candidate = format!("{stem}{middle}{ending}");
-            if files.kind(&candidate)? == Some(Kind::File) {
+            if files.kind(&candidate)? == Some(EntryKind::File) {
                 return Ok(Some(candidate));
             }
         }
     }
     let names: Vec<_> =
-        files.entries().into_iter().filter(|(_, kind)| *kind == Kind::File).map(|(name, _)| name).collect();
+        files.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect();
     if names.iter().filter(|name| name.ends_with(".obj")).count() != 1 {
         return Ok(None);
     }
-    for ending in ENDINGS {
+    for ending in EXTENSIONS {
         // `q.npy` and `*.q.npy` contain coordinates, not modes.
         let fits = |name: &&String| name.ends_with(ending) && *name != "q.npy" && !name.ends_with(".q.npy");
         let found: Vec<&String> = names.iter().filter(fits).collect();
@@ -89,7 +89,7 @@ mod tests {
         for name in names {
             std::fs::write(folder.path().join(name), "").expect("written");
         }
-        beside(&Files::anywhere(folder.path()), obj)
+        find_sidecar(&AssetDir::unrestricted(folder.path()), obj)
     }
 
     #[test]
@@ -119,7 +119,8 @@ mod tests {
 
     #[test]
     fn an_unknown_ending_is_refused_before_anything_is_read() {
-        let refusal = read(&Files::anywhere(std::path::Path::new(".")), "u.mat").expect_err("unknown").to_string();
+        let refusal =
+            read(&AssetDir::unrestricted(std::path::Path::new(".")), "u.mat").expect_err("unknown").to_string();
         assert!(refusal.ends_with(".npy, .safetensors or .txt, given u.mat"), "{refusal}");
     }
 }

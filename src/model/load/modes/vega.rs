@@ -21,8 +21,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     // The product of two 31-bit numbers and eight can exceed 64 bits.
     let entries = rows as u128 * rank as u128;
     let columns = match body.len() as u128 {
-        size if size == 4 * entries => four_bytes(body),
-        size if size == 8 * entries => eight_bytes(body),
+        size if size == 4 * entries => read_f32_le(body),
+        size if size == 8 * entries => read_f64_le_as_f32(body),
         size => {
             let expected = format!("{} bytes (f32) or {} (f64) for {rows} x {rank}", 8 + 4 * entries, 8 + 8 * entries);
             return Err(invalid("size", expected, 8 + size));
@@ -32,12 +32,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
 }
 
 /// Decodes little-endian f32 entries.
-pub(super) fn four_bytes(body: &[u8]) -> Vec<f32> {
+pub(super) fn read_f32_le(body: &[u8]) -> Vec<f32> {
     body.as_chunks().0.iter().map(|entry| f32::from_le_bytes(*entry)).collect()
 }
 
 /// Decodes little-endian f64 entries, rounded to f32.
-pub(super) fn eight_bytes(body: &[u8]) -> Vec<f32> {
+pub(super) fn read_f64_le_as_f32(body: &[u8]) -> Vec<f32> {
     body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry) as f32).collect()
 }
 

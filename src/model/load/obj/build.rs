@@ -2,27 +2,27 @@
 
 use std::collections::HashMap;
 
-use super::parse::{Corner, NONE, Obj};
+use super::parse::{Corner, NO_INDEX, ObjFile};
 use super::triangulate::triangulate;
-use crate::domain::{Corners, Mesh, Run, smooth_normals};
+use crate::domain::{Corners, MaterialRange, Mesh, smooth_normals};
 use crate::error::Result;
 
-/// A mesh and its runs of materials (indices into [`Obj::materials`]).
+/// A mesh and its runs of materials (indices into [`ObjFile::materials`]).
 #[derive(Debug)]
-pub(in crate::load) struct Piece {
+pub(in crate::load) struct ObjMesh {
     pub(in crate::load) mesh: Mesh,
     pub(in crate::load) material: usize,
     /// Empty if there is only one material.
-    pub(in crate::load) runs: Vec<Run>,
+    pub(in crate::load) material_ranges: Vec<MaterialRange>,
 }
 
 /// Builds a mesh from all faces. Its vertices are all `v` lines in file order, whether referenced or not.
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn whole(obj: &Obj) -> Result<Piece> {
+pub(in crate::load) fn build_all_faces(obj: &ObjFile) -> Result<ObjMesh> {
     let faces: Vec<usize> = (0..obj.faces.len()).collect();
-    let mut builder = Builder { rest: obj.positions.clone(), ..Builder::new(obj) };
+    let mut builder = ObjMeshBuilder { rest: obj.positions.clone(), ..ObjMeshBuilder::new(obj) };
     builder.add(&faces);
     builder.finish()
 }
@@ -31,26 +31,26 @@ pub(in crate::load) fn whole(obj: &Obj) -> Result<Piece> {
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn part(obj: &Obj, faces: &[usize], base: [f64; 3]) -> Result<Piece> {
-    let mut builder = Builder { local: Some((HashMap::new(), base)), ..Builder::new(obj) };
+pub(in crate::load) fn build_faces(obj: &ObjFile, faces: &[usize], base: [f64; 3]) -> Result<ObjMesh> {
+    let mut builder = ObjMeshBuilder { local: Some((HashMap::new(), base)), ..ObjMeshBuilder::new(obj) };
     builder.add(faces);
     builder.finish()
 }
 
-struct Builder<'a> {
-    obj: &'a Obj,
-    /// For [`part`]: the new index of each used vertex, by its index in the file, and the base.
+struct ObjMeshBuilder<'a> {
+    obj: &'a ObjFile,
+    /// For [`build_faces`]: the new index of each used vertex, by its index in the file, and the base.
     local: Option<(HashMap<u32, u32>, [f64; 3])>,
     rest: Vec<[f32; 3]>,
     corner_of: HashMap<Corner, u32>,
     corners: Vec<Corner>,
     vertices: Vec<u32>,
     triangles: Vec<[u32; 3]>,
-    runs: Vec<Run>,
+    material_ranges: Vec<MaterialRange>,
 }
 
-impl<'a> Builder<'a> {
-    fn new(obj: &'a Obj) -> Self {
+impl<'a> ObjMeshBuilder<'a> {
+    fn new(obj: &'a ObjFile) -> Self {
         Self {
             obj,
             local: None,
@@ -59,7 +59,7 @@ impl<'a> Builder<'a> {
             corners: Vec::new(),
             vertices: Vec::new(),
             triangles: Vec::new(),
-            runs: Vec::new(),
+            material_ranges: Vec::new(),
         }
     }
 
@@ -69,8 +69,8 @@ impl<'a> Builder<'a> {
         faces.sort_by_key(|face| self.obj.faces[*face].material);
         for face in faces {
             let material = self.obj.faces[face].material;
-            if self.runs.last().is_none_or(|run| run.material != material) {
-                self.runs.push(Run { first_triangle: self.triangles.len(), material });
+            if self.material_ranges.last().is_none_or(|run| run.material != material) {
+                self.material_ranges.push(MaterialRange { first_triangle: self.triangles.len(), material });
             }
             self.face(face);
         }
@@ -105,13 +105,13 @@ impl<'a> Builder<'a> {
         })
     }
 
-    fn finish(self) -> Result<Piece> {
+    fn finish(self) -> Result<ObjMesh> {
         let normals = self.normals();
-        let uvs = if self.corners.iter().all(|corner| corner.vt == NONE) { Vec::new() } else { self.uvs() };
-        let material = self.runs.first().map_or(0, |run| run.material);
-        let runs = if self.runs.len() > 1 { self.runs } else { Vec::new() };
+        let uvs = if self.corners.iter().all(|corner| corner.vt == NO_INDEX) { Vec::new() } else { self.uvs() };
+        let material = self.material_ranges.first().map_or(0, |run| run.material);
+        let material_ranges = if self.material_ranges.len() > 1 { self.material_ranges } else { Vec::new() };
         let mesh = Mesh::new(self.rest, Corners { vertices: self.vertices, normals, uvs }, self.triangles)?;
-        Ok(Piece { mesh, material, runs })
+        Ok(ObjMesh { mesh, material, material_ranges })
     }
 
     /// The file's normals. Corners with none or a zero normal get the smooth normal of their vertex.
@@ -138,14 +138,14 @@ mod tests {
     const SQUARES: &str = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\n\
         vt 0 0\nvt 1 1\nusemtl b\nf 2/1 3/1 4/1 5/1\nusemtl a\nf 6 7 8 9\nusemtl b\nf 2/2 3/2 4/2\n";
 
-    fn parsed() -> Obj {
-        Obj::parse(SQUARES.as_bytes()).expect("good")
+    fn parsed() -> ObjFile {
+        ObjFile::parse(SQUARES.as_bytes()).expect("good")
     }
 
     #[test]
     fn rows_follow_the_v_lines_with_unreferenced_and_coincident_vertices_kept() {
         let obj = parsed();
-        let mesh = whole(&obj).expect("good").mesh;
+        let mesh = build_all_faces(&obj).expect("good").mesh;
         assert_eq!(mesh.rest(), obj.positions);
         assert_eq!(mesh.corners().vertices, [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8], "v/1 and v/2 are corners of one vertex");
         assert_eq!(mesh.corners().uvs[4], [1.0, 0.0]);
@@ -156,17 +156,20 @@ mod tests {
     #[test]
     fn faces_of_one_material_make_one_run_and_one_material_makes_none() {
         let obj = parsed();
-        let piece = whole(&obj).expect("good");
+        let piece = build_all_faces(&obj).expect("good");
         assert_eq!(obj.materials, ["b", "a"]);
-        assert_eq!(piece.runs, [Run { first_triangle: 0, material: 0 }, Run { first_triangle: 3, material: 1 }]);
+        assert_eq!(
+            piece.material_ranges,
+            [MaterialRange { first_triangle: 0, material: 0 }, MaterialRange { first_triangle: 3, material: 1 }]
+        );
         assert_eq!(piece.mesh.triangles().len(), 5);
-        let only = part(&obj, &[1], [0.0; 3]).expect("good");
-        assert_eq!((only.material, only.runs.len()), (1, 0));
+        let only = build_faces(&obj, &[1], [0.0; 3]).expect("good");
+        assert_eq!((only.material, only.material_ranges.len()), (1, 0));
     }
 
     #[test]
     fn a_part_has_its_own_vertices_relative_to_its_base() {
-        let piece = part(&parsed(), &[1], [1.0, 0.0, 0.5]).expect("good");
+        let piece = build_faces(&parsed(), &[1], [1.0, 0.0, 0.5]).expect("good");
         let rest = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
         assert_eq!(piece.mesh.rest(), rest);
         assert!(piece.mesh.corners().uvs.is_empty());
@@ -175,7 +178,7 @@ mod tests {
     #[test]
     fn missing_and_zero_normals_are_computed_and_given_ones_kept() {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\nvn 0 0 0\nf 1//1 2//2 3\n";
-        let mesh = whole(&Obj::parse(text.as_bytes()).expect("good")).expect("good").mesh;
+        let mesh = build_all_faces(&ObjFile::parse(text.as_bytes()).expect("good")).expect("good").mesh;
         assert_eq!(mesh.corners().normals, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]);
     }
 }

@@ -1,13 +1,13 @@
 //! Converts MTL statements to Phong materials. Default colors: white for Kd, the value of Kd for Ka, black for Ks.
 
-use super::mtl::Statements;
+use super::mtl::MtlMaterial;
 use crate::domain::{AlphaMode, Material, Texture};
 use crate::error::Result;
-use crate::load::files::Files;
-use crate::load::images::Images;
+use crate::load::asset_dir::AssetDir;
+use crate::load::texture_cache::TextureCache;
 
 /// The alpha-test cutoff of materials whose alpha comes from an image.
-pub(in crate::load) const CUTOFF: f32 = 0.5;
+pub(in crate::load) const DEFAULT_ALPHA_CUTOFF: f32 = 0.5;
 
 /// The material of `statements`, with images read from `files`.
 ///
@@ -18,17 +18,19 @@ pub(in crate::load) const CUTOFF: f32 = 0.5;
 /// `Invalid` with the material and the statement: a missing or unreadable image, or a number out of range.
 pub(super) fn material(
     name: &str,
-    statements: &Statements,
-    files: &Files,
-    images: &mut Images,
+    statements: &MtlMaterial,
+    files: &AssetDir,
+    texture_cache: &mut TextureCache,
     remarks: &mut Vec<String>,
 ) -> Result<Material> {
     let place = |statement: &str| format!("material '{name}': {statement}");
     let diffuse = statements.diffuse.unwrap_or([1.0; 3]);
-    let colour_texture =
-        colour_texture(statements, files, images).map_err(|error| error.within(&place("map_Kd, map_d")))?;
+    let color_texture =
+        color_texture(statements, files, texture_cache).map_err(|error| error.prefix_field(&place("map_Kd, map_d")))?;
     let normal_texture = match &statements.normal_map {
-        Some(path) => normal_texture(path, files, images).map_err(|error| error.within(&place("normal map")))?,
+        Some(path) => {
+            normal_texture(path, files, texture_cache).map_err(|error| error.prefix_field(&place("normal map")))?
+        }
         None => None,
     };
     remarks.extend(statements.remarks.iter().cloned());
@@ -36,10 +38,10 @@ pub(super) fn material(
         remarks.push(place(&format!("'{path}' is a grey height map, not a normal map, and is not used")));
     }
     let alpha = statements.opacity.unwrap_or(1.0);
-    let cut_out = colour_texture.is_some_and(|index| images.list()[index].has_alpha());
+    let cut_out = color_texture.is_some_and(|index| texture_cache.list()[index].has_alpha());
     let alpha_mode = match () {
         () if alpha < 1.0 => AlphaMode::Blend,
-        () if cut_out => AlphaMode::Mask { cutoff: CUTOFF },
+        () if cut_out => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
         () => AlphaMode::Opaque,
     };
     let material = Material {
@@ -50,40 +52,46 @@ pub(super) fn material(
         // Below 1, the highlight would extend past the light's horizon; files use 0 for "not specified".
         shininess: statements.exponent.unwrap_or(1.0).clamp(1.0, 1e6),
         alpha,
-        colour_texture,
+        color_texture,
         normal_texture,
         alpha_mode,
         double_sided: true,
     };
-    material.checked()
+    material.validated()
 }
 
 /// The color image with the alpha of `map_d`, as far as they are given.
-fn colour_texture(statements: &Statements, files: &Files, images: &mut Images) -> Result<Option<usize>> {
-    match (&statements.colour_map, &statements.alpha_map) {
-        (Some(colour), Some(alpha)) if colour != alpha => {
-            let key = format!("{colour} with the alpha of {alpha}");
-            images.made(&key, || with_alpha(&key, Some(&decode(files, colour)?), &decode(files, alpha)?)).map(Some)
+fn color_texture(
+    statements: &MtlMaterial,
+    files: &AssetDir,
+    texture_cache: &mut TextureCache,
+) -> Result<Option<usize>> {
+    match (&statements.color_map, &statements.alpha_map) {
+        (Some(color), Some(alpha)) if color != alpha => {
+            let key = format!("{color} with the alpha of {alpha}");
+            texture_cache
+                .get_or_insert_with(&key, || with_alpha(&key, Some(&decode(files, color)?), &decode(files, alpha)?))
+                .map(Some)
         }
         (None, Some(alpha)) => {
             let key = format!("white with the alpha of {alpha}");
-            images.made(&key, || with_alpha(&key, None, &decode(files, alpha)?)).map(Some)
+            texture_cache.get_or_insert_with(&key, || with_alpha(&key, None, &decode(files, alpha)?)).map(Some)
         }
-        (Some(colour), _) => images.load(files, colour).map(Some),
+        (Some(color), _) => texture_cache.load(files, color).map(Some),
         (None, None) => Ok(None),
     }
 }
 
-fn decode(files: &Files, path: &str) -> Result<Texture> {
-    crate::load::images::decode(files, path)
+fn decode(files: &AssetDir, path: &str) -> Result<Texture> {
+    crate::load::texture_cache::decode(files, path)
 }
 
-/// Copies the alpha channel of `alpha`, or its red channel if it is opaque, to the texels of `colour` (nearest
+/// Copies the alpha channel of `alpha`, or its red channel if it is opaque, to the texels of `color` (nearest
 /// neighbor).
-fn with_alpha(name: &str, colour: Option<&Texture>, alpha: &Texture) -> Result<Texture> {
-    let (width, height) = colour.map_or((alpha.width(), alpha.height()), |image| (image.width(), image.height()));
+fn with_alpha(name: &str, color: Option<&Texture>, alpha: &Texture) -> Result<Texture> {
+    let (width, height) = color.map_or((alpha.width(), alpha.height()), |image| (image.width(), image.height()));
     let channel = if alpha.has_alpha() { 3 } else { 0 };
-    let mut rgba = colour.map_or_else(|| vec![255; alpha.rgba().len()], |image| image.rgba().to_vec());
+    let mut rgba = color.map_or_else(|| vec![255; alpha.rgba().len()], |image| image.rgba().to_vec());
     let mut texels = rgba.chunks_exact_mut(4);
     for row in 0..u64::from(height) {
         let from_row = row * u64::from(alpha.height()) / u64::from(height);
@@ -98,10 +106,11 @@ fn with_alpha(name: &str, colour: Option<&Texture>, alpha: &Texture) -> Result<T
 }
 
 /// Loads a normal map. `bump` may also name a gray height map, which is not supported and yields `None`.
-fn normal_texture(path: &str, files: &Files, images: &mut Images) -> Result<Option<usize>> {
-    let index = images.load(files, path)?;
-    let grey = images.list()[index].rgba().chunks_exact(4).all(|texel| texel[0] == texel[1] && texel[1] == texel[2]);
-    Ok((!grey).then_some(index))
+fn normal_texture(path: &str, files: &AssetDir, texture_cache: &mut TextureCache) -> Result<Option<usize>> {
+    let index = texture_cache.load(files, path)?;
+    let gray =
+        texture_cache.list()[index].rgba().chunks_exact(4).all(|texel| texel[0] == texel[1] && texel[1] == texel[2]);
+    Ok((!gray).then_some(index))
 }
 
 #[cfg(test)]
@@ -113,11 +122,11 @@ mod tests {
         image.save(folder.join(name)).expect("written");
     }
 
-    fn read(text: &str, folder: &std::path::Path) -> Result<(Material, Images, Vec<String>)> {
+    fn read(text: &str, folder: &std::path::Path) -> Result<(Material, TextureCache, Vec<String>)> {
         let all = super::super::mtl::parse(text.as_bytes())?;
-        let (mut images, mut remarks) = (Images::default(), Vec::new());
-        let material = material("m", &all["m"], &Files::anywhere(folder), &mut images, &mut remarks)?;
-        Ok((material, images, remarks))
+        let (mut texture_cache, mut remarks) = (TextureCache::default(), Vec::new());
+        let material = material("m", &all["m"], &AssetDir::unrestricted(folder), &mut texture_cache, &mut remarks)?;
+        Ok((material, texture_cache, remarks))
     }
 
     #[test]
@@ -146,9 +155,9 @@ mod tests {
             ("d 0.5", AlphaMode::Blend, None),
             ("map_Kd leaf.png\nTr 0.5", AlphaMode::Blend, Some(0)),
         ] {
-            let (material, images, _) = read(&format!("newmtl m\n{text}\n"), folder.path()).expect(text);
+            let (material, texture_cache, _) = read(&format!("newmtl m\n{text}\n"), folder.path()).expect(text);
             assert_eq!(material.alpha_mode, mode, "{text}");
-            let texel = material.colour_texture.map(|index| images.list()[index].rgba()[7]);
+            let texel = material.color_texture.map(|index| texture_cache.list()[index].rgba()[7]);
             assert_eq!(texel, alpha, "{text}");
         }
     }

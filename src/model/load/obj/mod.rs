@@ -8,22 +8,22 @@ mod triangulate;
 
 use std::collections::BTreeMap;
 
-pub(super) use build::part;
-pub(super) use material::CUTOFF;
-pub(super) use parse::Obj;
+pub(super) use build::build_faces;
+pub(super) use material::DEFAULT_ALPHA_CUTOFF;
+pub(super) use parse::ObjFile;
 
-use super::files::{Files, MODEL_BYTES, TEXT_BYTES, parent_of};
-use super::images::Images;
+use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of};
 use super::modes;
+use super::texture_cache::TextureCache;
 use crate::domain::{Domain, Material, Metadata, Modes, Shape, Transform};
 use crate::error::{Result, invalid};
-use crate::scene::Parts;
+use crate::scene::SceneParts;
 
 /// Where the modes of an OBJ file come from.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Source {
-    /// Files next to it, if any (see [`modes::beside`]).
-    Beside,
+pub(super) enum ModesSource {
+    /// Files next to it, if any (see [`modes::find_sidecar`]).
+    Sidecar,
     /// No modes: the caller provides them.
     None,
 }
@@ -32,30 +32,30 @@ pub(super) enum Source {
 ///
 /// # Errors
 /// `Invalid` with the file, the line or material, and the expected and given value.
-pub(super) fn read(files: &Files, name: &str, source: Source) -> Result<Parts> {
+pub(super) fn read(files: &AssetDir, name: &str, source: ModesSource) -> Result<SceneParts> {
     let obj = parse_file(files, name)?;
-    let mut parts = Parts::named(name.strip_suffix(".obj").unwrap_or(name));
+    let mut parts = SceneParts::named(name.strip_suffix(".obj").unwrap_or(name));
     add_materials(&obj, files, &mut parts)?;
-    let piece = build::whole(&obj).map_err(|error| error.within(&format!("file '{name}'")))?;
+    let piece = build::build_all_faces(&obj).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
     let modes_file = match source {
-        Source::Beside => modes::beside(files, name)?,
-        Source::None => None,
+        ModesSource::Sidecar => modes::find_sidecar(files, name)?,
+        ModesSource::None => None,
     };
     let found = modes_file.as_deref().map_or(Ok(Modes::rigid()), |file| modes::read(files, file))?;
     let shape = Shape::new(piece.mesh, found);
     let place = || format!("file '{}'", modes_file.as_deref().unwrap_or(name));
-    parts.shapes.push(shape.map_err(|error| error.within(&place()))?);
+    parts.shapes.push(shape.map_err(|error| error.prefix_field(&place()))?);
     parts.domains.push(Domain {
         name: parts.name.clone(),
         shape: 0,
         material: piece.material,
-        runs: piece.runs,
+        material_ranges: piece.material_ranges,
         placement: Transform::IDENTITY,
         attachment: None,
         follows: None,
         rest_q: Vec::new(),
         shares_q_with: None,
-        metadata: Metadata { eigenvalues: Vec::new(), notes: super::vega::notes(files, name)? },
+        metadata: Metadata { eigenvalues: Vec::new(), notes: super::vega_config::notes(files, name)? },
     });
     Ok(parts)
 }
@@ -64,21 +64,21 @@ pub(super) fn read(files: &Files, name: &str, source: Source) -> Result<Parts> {
 ///
 /// # Errors
 /// `Invalid` with the file, the line and the statement.
-pub(super) fn parse_file(files: &Files, name: &str) -> Result<Obj> {
-    Obj::parse(&files.read(name, MODEL_BYTES)?).map_err(|error| error.within(&format!("file '{name}'")))
+pub(super) fn parse_file(files: &AssetDir, name: &str) -> Result<ObjFile> {
+    ObjFile::parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(|error| error.prefix_field(&format!("file '{name}'")))
 }
 
-/// Adds the materials that the faces use, in the order of [`Obj::materials`], and their textures.
+/// Adds the materials that the faces use, in the order of [`ObjFile::materials`], and their textures.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement.
-pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Result<()> {
-    let mut images = Images::default();
+pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut SceneParts) -> Result<()> {
+    let mut texture_cache = TextureCache::default();
     let mut known = BTreeMap::new();
     for library in &obj.libraries {
         for path in library_paths(files, library)? {
-            let parsed = mtl::parse(&files.read(&path, TEXT_BYTES)?);
-            let parsed = parsed.map_err(|error| error.within(&format!("file '{path}'")))?;
+            let parsed = mtl::parse(&files.read(&path, MAX_TEXT_BYTES)?);
+            let parsed = parsed.map_err(|error| error.prefix_field(&format!("file '{path}'")))?;
             // Image names are relative to the library.
             let folder = files.within(parent_of(&path))?;
             known.extend(parsed.into_iter().map(|(name, statements)| (name, (statements, folder.clone()))));
@@ -89,11 +89,11 @@ pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Resu
     for name in &obj.materials {
         let made = match known.get(name) {
             Some((statements, folder)) => {
-                material::material(name, statements, folder, &mut images, &mut parts.remarks)?
+                material::material(name, statements, folder, &mut texture_cache, &mut parts.remarks)?
             }
             None if obj.libraries.is_empty() || name.is_empty() => {
                 undefined.push(format!("'{name}'"));
-                white(name)
+                white_material(name)
             }
             None => {
                 let names = known.keys().take(16).map(String::as_str).collect::<Vec<_>>().join(", ");
@@ -107,21 +107,21 @@ pub(super) fn add_materials(obj: &Obj, files: &Files, parts: &mut Parts) -> Resu
         undefined.truncate(8);
         parts.remarks.push(format!("{count} materials are not defined and white: {}", undefined.join(", ")));
     }
-    parts.textures.append(&mut images.into_list());
+    parts.textures.append(&mut texture_cache.into_textures());
     Ok(())
 }
 
-fn white(name: &str) -> Material {
+fn white_material(name: &str) -> Material {
     Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
 }
 
 /// The files of an `mtllib` statement. It may list several files, and a file name may contain spaces.
-fn library_paths(files: &Files, statement: &str) -> Result<Vec<String>> {
-    let whole = statement.replace('\\', "/");
-    if files.kind(&whole)?.is_some() || !whole.contains(' ') {
-        return Ok(vec![whole]);
+fn library_paths(files: &AssetDir, statement: &str) -> Result<Vec<String>> {
+    let build_all_faces = statement.replace('\\', "/");
+    if files.kind(&build_all_faces)?.is_some() || !build_all_faces.contains(' ') {
+        return Ok(vec![build_all_faces]);
     }
-    Ok(whole.split_ascii_whitespace().map(str::to_owned).collect())
+    Ok(build_all_faces.split_ascii_whitespace().map(str::to_owned).collect())
 }
 
 #[cfg(test)]
@@ -146,12 +146,12 @@ mod tests {
             ("a.mtl", "newmtl blue\nKd 0 0 1\nnewmtl red\nKd 1 0 0\nnewmtl unused\nmap_Kd absent.png\n"),
             ("modes.txt", "9 1\n1 0 0 0 0 0 0 0 2\n"),
         ]);
-        let parts = read(&Files::anywhere(folder.path()), "a.obj", Source::Beside).expect("good");
+        let parts = read(&AssetDir::unrestricted(folder.path()), "a.obj", ModesSource::Sidecar).expect("good");
         assert_eq!(parts.materials.iter().map(|material| material.name.as_str()).collect::<Vec<_>>(), ["red", "blue"]);
         assert_eq!(parts.domains.len(), 1);
-        assert_eq!(parts.domains[0].runs.len(), 2);
+        assert_eq!(parts.domains[0].material_ranges.len(), 2);
         assert_eq!(parts.shapes[0].modes.at(2, 2, 0), 2.0);
-        let rigid = read(&Files::anywhere(folder.path()), "a.obj", Source::None).expect("good");
+        let rigid = read(&AssetDir::unrestricted(folder.path()), "a.obj", ModesSource::None).expect("good");
         assert_eq!(rigid.shapes[0].modes.rank(), 0);
     }
 
@@ -166,17 +166,17 @@ mod tests {
         ]);
         let modes: Vec<u8> = [6i32, 1].iter().flat_map(|size| size.to_le_bytes()).chain([0; 24]).collect();
         std::fs::write(folder.path().join("rows.U.float"), modes).expect("written");
-        let files = Files::anywhere(folder.path());
+        let files = AssetDir::unrestricted(folder.path());
         for (name, refusal) in [
             ("lib.obj", "file 'no.mtl': expected a file that is there, given entity not found"),
             ("use.obj", "usemtl: expected a material of the libraries (red), given green"),
             ("bad.obj", "file 'bad.obj': line 4: f: index of v: expected 1 to 3, given 9"),
             ("rows.obj", "file 'rows.U.float': modes.rows: expected 9 (3 x 3 vertices), given 6"),
         ] {
-            assert_eq!(read(&files, name, Source::Beside).expect_err(name).to_string(), refusal);
+            assert_eq!(read(&files, name, ModesSource::Sidecar).expect_err(name).to_string(), refusal);
         }
-        let white = read(&files, "rows.obj", Source::None).expect("good");
-        assert_eq!(white.materials[0].diffuse, [1.0; 3]);
-        assert_eq!(white.remarks, ["1 materials are not defined and white: ''"]);
+        let white_material = read(&files, "rows.obj", ModesSource::None).expect("good");
+        assert_eq!(white_material.materials[0].diffuse, [1.0; 3]);
+        assert_eq!(white_material.remarks, ["1 materials are not defined and white: ''"]);
     }
 }

@@ -9,14 +9,14 @@ use crate::error::{Result, invalid};
 
 /// The statements of one `newmtl`; `None` for missing ones.
 #[derive(Debug, Default, Clone, PartialEq)]
-pub(super) struct Statements {
+pub(super) struct MtlMaterial {
     pub(super) ambient: Option<[f32; 3]>,
     pub(super) diffuse: Option<[f32; 3]>,
     pub(super) specular: Option<[f32; 3]>,
     pub(super) exponent: Option<f32>,
     /// Opacity: `d`, or 1 - `Tr`.
     pub(super) opacity: Option<f32>,
-    pub(super) colour_map: Option<String>,
+    pub(super) color_map: Option<String>,
     pub(super) alpha_map: Option<String>,
     /// The image of `norm`, `map_Bump`, `map_bump` or `bump`.
     pub(super) normal_map: Option<String>,
@@ -28,32 +28,32 @@ pub(super) struct Statements {
 ///
 /// # Errors
 /// `Invalid` with the line and the statement.
-pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, Statements>> {
+pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
     let mut all = BTreeMap::new();
-    let mut current: Option<(String, Statements)> = None;
+    let mut current: Option<(String, MtlMaterial)> = None;
     for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
         let Some(key) = words(line).next() else { continue };
         if key == b"newmtl" {
-            all.extend(current.replace((rest_of(line), Statements::default())));
+            all.extend(current.replace((rest_of(line), MtlMaterial::default())));
         } else if let Some((name, statements)) = &mut current {
             let place = || format!("line {}: {}", index + 1, String::from_utf8_lossy(key));
-            statements.read(key, line, name).map_err(|error| error.within(&place()))?;
+            statements.read(key, line, name).map_err(|error| error.prefix_field(&place()))?;
         }
     }
     all.extend(current);
     Ok(all)
 }
 
-impl Statements {
+impl MtlMaterial {
     fn read(&mut self, key: &[u8], line: &[u8], name: &str) -> Result<()> {
         match key.to_ascii_lowercase().as_slice() {
-            b"ka" => self.ambient = Some(colour(line)?),
-            b"kd" => self.diffuse = Some(colour(line)?),
-            b"ks" => self.specular = Some(colour(line)?),
+            b"ka" => self.ambient = Some(color(line)?),
+            b"kd" => self.diffuse = Some(color(line)?),
+            b"ks" => self.specular = Some(color(line)?),
             b"ns" => self.exponent = Some(last_number(line)?),
             b"d" => self.opacity = Some(last_number(line)?),
             b"tr" => self.opacity = Some(1.0 - last_number(line)?),
-            b"map_kd" => self.colour_map = self.image(line, name)?,
+            b"map_kd" => self.color_map = self.image(line, name)?,
             b"map_d" => self.alpha_map = self.image(line, name)?,
             b"norm" | b"map_bump" | b"bump" => self.normal_map = self.image(line, name)?,
             // Ambient maps repeat the color map. Illumination models and the other statements have no equivalent here.
@@ -100,10 +100,10 @@ fn next_word(text: &str) -> (&str, &str) {
 }
 
 /// Three numbers, or one for all three channels.
-fn colour(line: &[u8]) -> Result<[f32; 3]> {
+fn color(line: &[u8]) -> Result<[f32; 3]> {
     let found: Option<Vec<f32>> = words(line).skip(1).map(number).collect();
     match found.as_deref() {
-        Some([grey]) => Ok([*grey; 3]),
+        Some([gray]) => Ok([*gray; 3]),
         Some([red, green, blue]) => Ok([*red, *green, *blue]),
         _ => Err(invalid("colour", "one or three finite numbers", rest_of(line))),
     }
@@ -128,7 +128,7 @@ mod tests {
         assert_eq!(bark.ambient, Some([0.1, 0.2, 0.3]));
         assert_eq!(bark.diffuse, Some([0.5; 3]));
         assert_eq!((bark.exponent, bark.opacity), (Some(7.0), Some(0.75)));
-        assert_eq!(bark.colour_map.as_deref(), Some("my bark.png"));
+        assert_eq!(bark.color_map.as_deref(), Some("my bark.png"));
         assert_eq!(bark.normal_map.as_deref(), Some("maps/n.png"));
         assert_eq!(bark.remarks.len(), 3);
         assert_eq!((all["black"].diffuse, all["black"].opacity), (Some([0.0; 3]), Some(0.5)));

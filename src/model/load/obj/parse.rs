@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, HashMap};
 use crate::error::{Error, Result, invalid};
 
 /// Marks a missing texture coordinate or normal of a corner.
-pub(in crate::load) const NONE: u32 = u32::MAX;
+pub(in crate::load) const NO_INDEX: u32 = u32::MAX;
 
 /// One corner of a polygon, as indices into the lists of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -23,14 +23,14 @@ pub(in crate::load) struct Corner {
 pub(in crate::load) struct Face {
     first: usize,
     count: usize,
-    /// Index into [`Obj::materials`].
+    /// Index into [`ObjFile::materials`].
     pub(in crate::load) material: usize,
     line: usize,
 }
 
 /// The contents of an OBJ file. Texture coordinates have (0, 0) at the top left.
 #[derive(Debug, Default)]
-pub(in crate::load) struct Obj {
+pub(in crate::load) struct ObjFile {
     pub(in crate::load) positions: Vec<[f32; 3]>,
     pub(in crate::load) uvs: Vec<[f32; 2]>,
     pub(in crate::load) normals: Vec<[f32; 3]>,
@@ -44,7 +44,7 @@ pub(in crate::load) struct Obj {
     pub(in crate::load) remarks: Vec<String>,
 }
 
-impl Obj {
+impl ObjFile {
     /// Parses a whole file.
     ///
     /// # Errors
@@ -84,10 +84,10 @@ impl Obj {
         for (index, face) in self.faces.iter().enumerate() {
             for corner in self.corners_of(index) {
                 below(face.line, "v", corner.v, self.positions.len())?;
-                if corner.vt != NONE {
+                if corner.vt != NO_INDEX {
                     below(face.line, "vt", corner.vt, self.uvs.len())?;
                 }
-                if corner.vn != NONE {
+                if corner.vn != NO_INDEX {
                     below(face.line, "vn", corner.vn, self.normals.len())?;
                 }
             }
@@ -105,9 +105,9 @@ fn below(line: usize, list: &str, index: u32, count: usize) -> Result<()> {
 
 #[derive(Default)]
 struct Parser {
-    obj: Obj,
-    /// The name of the last `usemtl`, and its index in [`Obj::materials`] once a face uses it.
-    wanted: String,
+    obj: ObjFile,
+    /// The name of the last `usemtl`, and its index in [`ObjFile::materials`] once a face uses it.
+    current_material: String,
     material: Option<usize>,
     by_name: HashMap<String, usize>,
     ignored: BTreeMap<String, usize>,
@@ -126,7 +126,7 @@ impl Parser {
                 self.obj.uvs.push([u, 1.0 - v]);
             }
             b"f" => self.face(words, number)?,
-            b"usemtl" => (self.wanted, self.material) = (rest_of(line), None),
+            b"usemtl" => (self.current_material, self.material) = (rest_of(line), None),
             b"mtllib" => self.obj.libraries.push(rest_of(line)),
             // Groups and smoothing groups do not affect geometry: normals come from the file or are computed.
             b"o" | b"g" | b"s" => {}
@@ -139,12 +139,12 @@ impl Parser {
     fn number(&mut self) -> usize {
         let list = &mut self.obj.materials;
         let made = || {
-            list.push(self.wanted.clone());
+            list.push(self.current_material.clone());
             list.len() - 1
         };
         match self.material {
             Some(known) => known,
-            None => *self.material.insert(*self.by_name.entry(self.wanted.clone()).or_insert_with(made)),
+            None => *self.material.insert(*self.by_name.entry(self.current_material.clone()).or_insert_with(made)),
         }
     }
 
@@ -153,15 +153,15 @@ impl Parser {
         for word in words {
             let mut parts = word.split(|byte| *byte == b'/');
             let mut index = |list: &str, count: usize| match parts.next() {
-                None | Some(b"") => Ok(NONE),
+                None | Some(b"") => Ok(NO_INDEX),
                 Some(digits) => {
-                    resolve(digits, count).map_err(|error| error.within(&format!("line {line}: f: {list}")))
+                    resolve(digits, count).map_err(|error| error.prefix_field(&format!("line {line}: f: {list}")))
                 }
             };
             let v = index("v", self.obj.positions.len())?;
             let vt = index("vt", self.obj.uvs.len())?;
             let vn = index("vn", self.obj.normals.len())?;
-            if v == NONE || parts.next().is_some() {
+            if v == NO_INDEX || parts.next().is_some() {
                 let given = String::from_utf8_lossy(word).into_owned();
                 return Err(invalid(format!("line {line}: f"), "corners of the form v, v/vt, v//vn or v/vt/vn", given));
             }
@@ -176,7 +176,7 @@ impl Parser {
         Ok(())
     }
 
-    fn finish(mut self) -> Result<Obj> {
+    fn finish(mut self) -> Result<ObjFile> {
         self.obj.check()?;
         let remark = |(key, count): (&String, &usize)| format!("{count} statements '{key}' are not used");
         self.obj.remarks.extend(self.ignored.iter().take(16).map(remark));
@@ -230,7 +230,7 @@ fn resolve(digits: &[u8], count: usize) -> Result<u32> {
     let index: i64 = text.parse().map_err(|_| refuse("a whole number".into()))?;
     let from_zero =
         if index < 0 { i64::try_from(count).ok().and_then(|count| count.checked_add(index)) } else { Some(index - 1) };
-    let in_range = from_zero.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NONE);
+    let in_range = from_zero.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NO_INDEX);
     in_range.ok_or_else(|| refuse(format!("1 to {count} or -{count} to -1")))
 }
 
@@ -243,7 +243,7 @@ mod tests {
     #[test]
     fn negative_indices_count_back_from_the_last_line_so_far() {
         let text = format!("{TRIANGLE}vt 0.25 0.25\nvn 0 0 1\nf -3/-1/-1 -2/-1/-1 -1/-1/-1\nv 9 9 9\n");
-        let obj = Obj::parse(text.as_bytes()).expect("good");
+        let obj = ObjFile::parse(text.as_bytes()).expect("good");
         let found: Vec<_> = obj.corners_of(0).iter().map(|corner| (corner.v, corner.vt, corner.vn)).collect();
         assert_eq!(found, [(0, 0, 0), (1, 0, 0), (2, 0, 0)]);
         assert_eq!(obj.uvs, [[0.25, 0.75]], "v is flipped");
@@ -254,7 +254,7 @@ mod tests {
     fn comments_line_ends_continuations_and_names_with_blanks_are_read() {
         let text = "# head\r\nmtllib my file.mtl\r\nv 0 0 0 # first\r\nv 1 \\\r\n 0 0\r\nv 0 1 0 1 0 0\r\n\
                     usemtl dark bark\r\nf 1 2 \\\n 3\r\nl 1 2\r\nusemtl none\nusemtl light\nf 3 2 1 # back\n";
-        let obj = Obj::parse(text.as_bytes()).expect("good");
+        let obj = ObjFile::parse(text.as_bytes()).expect("good");
         assert_eq!(obj.libraries, ["my file.mtl"]);
         assert_eq!(obj.materials, ["dark bark", "light"]);
         assert_eq!(obj.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
@@ -284,7 +284,7 @@ mod tests {
             ("", "f: expected at least one face, given 0"),
         ] {
             let text = format!("{TRIANGLE}{statement}\n");
-            assert_eq!(Obj::parse(text.as_bytes()).expect_err(statement).to_string(), refusal);
+            assert_eq!(ObjFile::parse(text.as_bytes()).expect_err(statement).to_string(), refusal);
         }
     }
 
@@ -300,7 +300,7 @@ mod tests {
             b"mtllib",
             b"f -9223372036854775808 1 1",
         ] {
-            assert!(Obj::parse(text).is_err());
+            assert!(ObjFile::parse(text).is_err());
         }
     }
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Vector2, Vector3};
 
 /// The largest polygon that is triangulated by ear clipping, which takes cubic time. Larger ones are split into a fan.
-const MOST_EARS: usize = 256;
+const MAX_EAR_CLIPPING_CORNERS: usize = 256;
 
 /// Splits a polygon into triangles, as indices of `points`, with its winding; always two fewer than points.
 ///
@@ -16,38 +16,38 @@ pub(super) fn triangulate(points: &[[f32; 3]]) -> Vec<[usize; 3]> {
         return fan(points.len());
     }
     let points: Vec<_> = points.iter().map(|point| Vector3::from(*point).cast::<f64>()).collect();
-    let normal = newell(&points);
+    let normal = newell_normal(&points);
     let turns_along = |triangle: &[usize; 3]| {
         let [a, b, c] = triangle.map(|index| points[index]);
         (b - a).cross(&(c - a)).dot(&normal) > 0.0
     };
     let first = fan(points.len());
-    if first.iter().all(turns_along) || points.len() > MOST_EARS {
+    if first.iter().all(turns_along) || points.len() > MAX_EAR_CLIPPING_CORNERS {
         return first;
     }
     if points.len() == 4 {
         let other = vec![[1, 2, 3], [1, 3, 0]];
         return if other.iter().all(turns_along) { other } else { first };
     }
-    ears(&flattened(&points, normal))
+    ear_clip(&project_to_plane(&points, normal))
 }
 
 /// Twice the area vector; zero for a polygon without area.
-fn newell(points: &[Vector3<f64>]) -> Vector3<f64> {
+fn newell_normal(points: &[Vector3<f64>]) -> Vector3<f64> {
     // Relative to the first point, so that a small polygon far from the origin loses no precision.
     let from_first = |index: usize| points[index % points.len()] - points[0];
     (0..points.len()).map(|index| from_first(index).cross(&from_first(index + 1))).sum()
 }
 
 /// Projects the polygon along the dominant axis of its normal, counterclockwise.
-fn flattened(points: &[Vector3<f64>], normal: Vector3<f64>) -> Vec<Vector2<f64>> {
+fn project_to_plane(points: &[Vector3<f64>], normal: Vector3<f64>) -> Vec<Vector2<f64>> {
     let drop = normal.iamax();
     let (first, second) = ((drop + 1) % 3, (drop + 2) % 3);
     let sign = if normal[drop] < 0.0 { -1.0 } else { 1.0 };
     points.iter().map(|point| Vector2::new(point[first], sign * point[second])).collect()
 }
 
-fn ears(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
+fn ear_clip(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
     let mut left: Vec<usize> = (0..points.len()).collect();
     let mut triangles = Vec::with_capacity(points.len().saturating_sub(2));
     while left.len() > 3 {
@@ -56,7 +56,8 @@ fn ears(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
         let is_ear = |at: &usize| {
             let ear = around(*at);
             let corners = ear.map(|index| points[index]);
-            turn(corners) > 0.0 && !left.iter().any(|index| !ear.contains(index) && inside(points[*index], corners))
+            signed_area2(corners) > 0.0
+                && !left.iter().any(|index| !ear.contains(index) && contains_point(points[*index], corners))
         };
         // A self-intersecting polygon may have no ear; then any corner is cut, so that no face is lost.
         let at = (0..count).find(is_ear).unwrap_or(1);
@@ -67,12 +68,12 @@ fn ears(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
     triangles
 }
 
-fn turn([a, b, c]: [Vector2<f64>; 3]) -> f64 {
+fn signed_area2([a, b, c]: [Vector2<f64>; 3]) -> f64 {
     (b - a).perp(&(c - a))
 }
 
-fn inside(point: Vector2<f64>, [a, b, c]: [Vector2<f64>; 3]) -> bool {
-    turn([a, b, point]) >= 0.0 && turn([b, c, point]) >= 0.0 && turn([c, a, point]) >= 0.0
+fn contains_point(point: Vector2<f64>, [a, b, c]: [Vector2<f64>; 3]) -> bool {
+    signed_area2([a, b, point]) >= 0.0 && signed_area2([b, c, point]) >= 0.0 && signed_area2([c, a, point]) >= 0.0
 }
 
 #[cfg(test)]

@@ -2,19 +2,19 @@
 //! domain. Lengths are in meters, Z is up. Every domain can be moved independently; a `scene.toml` with
 //! `follows = "leaf"` keeps leaves attached to their shoots.
 
-mod assign;
+mod organs;
 mod structure;
 
 use std::collections::{BTreeMap, HashMap};
 
-use assign::{Member, members};
-use structure::{Structure, objects_of_faces};
+use organs::{Organ, assign_organs};
+use structure::{PlantStructure, parse_object_ids};
 
-use super::files::{Files, TEXT_BYTES};
-use super::obj::{self, Obj};
+use super::asset_dir::{AssetDir, MAX_TEXT_BYTES};
+use super::obj::{self, ObjFile};
 use crate::domain::{Attachment, Domain, Metadata, Modes, Shape, Transform};
 use crate::error::Result;
-use crate::scene::{Parts, UpAxis};
+use crate::scene::{SceneParts, UpAxis};
 
 /// Reads the plant `stem` in the folder `files`.
 ///
@@ -23,28 +23,30 @@ use crate::scene::{Parts, UpAxis};
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
-pub(super) fn read(files: &Files, stem: &str) -> Result<Parts> {
+pub(super) fn read(files: &AssetDir, stem: &str) -> Result<SceneParts> {
     let (json, ids) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
     let in_file = |name: &str| format!("file '{name}'");
     let obj = obj::parse_file(files, &format!("{stem}.obj"))?;
-    let structure = Structure::parse(&files.read(&json, TEXT_BYTES)?).map_err(|error| error.within(&in_file(&json)))?;
-    let objects = objects_of_faces(&files.read(&ids, TEXT_BYTES)?, obj.faces.len());
-    let objects = objects.map_err(|error| error.within(&in_file(&ids)))?;
-    let members = members(&structure, &points_of(&obj, &objects)).map_err(|error| error.within(&in_file(&json)))?;
-    let mut parts = Parts { up: UpAxis::Z, ..Parts::named(stem) };
+    let structure = PlantStructure::parse(&files.read(&json, MAX_TEXT_BYTES)?)
+        .map_err(|error| error.prefix_field(&in_file(&json)))?;
+    let objects = parse_object_ids(&files.read(&ids, MAX_TEXT_BYTES)?, obj.faces.len());
+    let objects = objects.map_err(|error| error.prefix_field(&in_file(&ids)))?;
+    let assign_organs =
+        assign_organs(&structure, &points_of(&obj, &objects)).map_err(|error| error.prefix_field(&in_file(&json)))?;
+    let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem) };
     obj::add_materials(&obj, files, &mut parts)?;
-    let mut faces: HashMap<Member, Vec<usize>> = HashMap::new();
+    let mut faces: HashMap<Organ, Vec<usize>> = HashMap::new();
     for (face, object) in objects.iter().enumerate() {
-        // Always `Some`: `members` received every object that has faces.
-        if let Some(member) = members.get(object) {
+        // Always `Some`: `assign_organs` received every object that has faces.
+        if let Some(member) = assign_organs.get(object) {
             faces.entry(*member).or_default().push(face);
         }
     }
-    Plant { obj: &obj, structure: &structure, faces, domain_of: HashMap::new(), parts }.grow()
+    PlantBuilder { obj: &obj, structure: &structure, faces, domain_of: HashMap::new(), parts }.build()
 }
 
 /// Positions of the corners of each object.
-fn points_of(obj: &Obj, objects: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
+fn points_of(obj: &ObjFile, objects: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
     let mut points: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
     for (face, object) in objects.iter().enumerate() {
         let corners = obj.corners_of(face).iter().map(|corner| obj.positions[corner.v as usize]);
@@ -53,57 +55,57 @@ fn points_of(obj: &Obj, objects: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
     points
 }
 
-struct Plant<'a> {
-    obj: &'a Obj,
-    structure: &'a Structure,
-    faces: HashMap<Member, Vec<usize>>,
-    domain_of: HashMap<Member, (usize, [f64; 3])>,
-    parts: Parts,
+struct PlantBuilder<'a> {
+    obj: &'a ObjFile,
+    structure: &'a PlantStructure,
+    faces: HashMap<Organ, Vec<usize>>,
+    domain_of: HashMap<Organ, (usize, [f64; 3])>,
+    parts: SceneParts,
 }
 
-impl Plant<'_> {
+impl PlantBuilder<'_> {
     /// Adds the shoots, parents first, then the leaves with a petiole, then the other leaflets, whose parents they are.
-    fn grow(mut self) -> Result<Parts> {
+    fn build(mut self) -> Result<SceneParts> {
         let structure = self.structure;
         for index in &structure.order {
             let shoot = &structure.shoots[*index];
-            let parent = structure.shoot(shoot.parent).map(Member::Shoot);
-            self.add(Member::Shoot(*index), format!("shoot {}", shoot.id), shoot.vertices[0], parent)?;
+            let parent = structure.shoot(shoot.parent).map(Organ::Shoot);
+            self.add(Organ::Shoot(*index), format!("shoot {}", shoot.id), shoot.vertices[0], parent)?;
         }
         let mut carriers = HashMap::new();
         for (index, leaf) in structure.leaves.iter().enumerate() {
             let Some(line) = &leaf.petiole_vertices else { continue };
-            carriers.entry((leaf.shoot, leaf.node, leaf.petiole)).or_insert(Member::Leaf(index));
-            let parent = structure.shoot(leaf.shoot).map(Member::Shoot);
-            self.add(Member::Leaf(index), format!("leaf {}", leaf.object_id), line[0], parent)?;
+            carriers.entry((leaf.shoot, leaf.node, leaf.petiole)).or_insert(Organ::Leaf(index));
+            let parent = structure.shoot(leaf.shoot).map(Organ::Shoot);
+            self.add(Organ::Leaf(index), format!("leaf {}", leaf.object_id), line[0], parent)?;
         }
         for (index, leaf) in structure.leaves.iter().enumerate() {
             if leaf.petiole_vertices.is_none() {
                 let carrier = carriers.get(&(leaf.shoot, leaf.node, leaf.petiole)).copied();
-                let parent = carrier.or_else(|| structure.shoot(leaf.shoot).map(Member::Shoot));
-                self.add(Member::Leaf(index), format!("leaf {}", leaf.object_id), leaf.base, parent)?;
+                let parent = carrier.or_else(|| structure.shoot(leaf.shoot).map(Organ::Shoot));
+                self.add(Organ::Leaf(index), format!("leaf {}", leaf.object_id), leaf.base, parent)?;
             }
         }
         Ok(self.parts)
     }
 
-    fn add(&mut self, member: Member, name: String, base: [f64; 3], parent: Option<Member>) -> Result<()> {
+    fn add(&mut self, member: Organ, name: String, base: [f64; 3], parent: Option<Organ>) -> Result<()> {
         let faces = self.faces.remove(&member).unwrap_or_default();
-        let piece = obj::part(self.obj, &faces, base).map_err(|error| error.within(&name))?;
+        let piece = obj::build_faces(self.obj, &faces, base).map_err(|error| error.prefix_field(&name))?;
         self.parts.shapes.push(Shape::new(piece.mesh, Modes::rigid())?);
         let attachment = parent.and_then(|parent| self.domain_of.get(&parent)).map(|(index, parent_base)| Attachment {
             parent: *index,
-            frame: moved([0, 1, 2].map(|axis| base[axis] - parent_base[axis])),
+            frame: translation_transform([0, 1, 2].map(|axis| base[axis] - parent_base[axis])),
             rows: Vec::new(),
         });
         self.domain_of.insert(member, (self.parts.domains.len(), base));
-        let kind = if matches!(member, Member::Shoot(_)) { "shoot" } else { "leaf" };
+        let kind = if matches!(member, Organ::Shoot(_)) { "shoot" } else { "leaf" };
         self.parts.domains.push(Domain {
             name,
             shape: self.parts.shapes.len() - 1,
             material: piece.material,
-            runs: piece.runs,
-            placement: moved(base),
+            material_ranges: piece.material_ranges,
+            placement: translation_transform(base),
             attachment,
             follows: None,
             rest_q: Vec::new(),
@@ -114,7 +116,7 @@ impl Plant<'_> {
     }
 }
 
-fn moved(translation: [f64; 3]) -> Transform {
+fn translation_transform(translation: [f64; 3]) -> Transform {
     Transform::from_parts(&nalgebra::Matrix3::identity(), &translation.into())
 }
 
@@ -135,12 +137,12 @@ mod tests {
         ]
     }"#;
 
-    fn plant(files: &[(&str, &str)]) -> Result<Parts> {
+    fn plant(files: &[(&str, &str)]) -> Result<SceneParts> {
         let folder = tempfile::tempdir().expect("a folder");
         for (name, text) in [("p.obj", OBJ), ("p_object_id.dat", IDS), ("p.structure.json", JSON)].iter().chain(files) {
             std::fs::write(folder.path().join(name), text).expect("written");
         }
-        read(&Files::anywhere(folder.path()), "p")
+        read(&AssetDir::unrestricted(folder.path()), "p")
     }
 
     #[test]
@@ -155,7 +157,7 @@ mod tests {
                     domain.name.as_str(),
                     triangles,
                     domain.attachment.as_ref().map(|attachment| attachment.parent),
-                    domain.runs.len(),
+                    domain.material_ranges.len(),
                 )
             })
             .collect();

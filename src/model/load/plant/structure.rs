@@ -26,7 +26,7 @@ pub(super) struct Leaf {
 }
 
 #[derive(serde::Deserialize)]
-struct Raw {
+struct StructureJson {
     objects: BTreeMap<String, String>,
     shoots: Vec<Shoot>,
     leaves: Vec<Leaf>,
@@ -34,7 +34,7 @@ struct Raw {
 
 /// A validated structure of a plant.
 #[derive(Debug)]
-pub(super) struct Structure {
+pub(super) struct PlantStructure {
     /// Kind of each object.
     pub(super) objects: BTreeMap<u64, String>,
     /// Shoots in file order.
@@ -45,14 +45,14 @@ pub(super) struct Structure {
     index_of: HashMap<i64, usize>,
 }
 
-impl Structure {
+impl PlantStructure {
     /// Parses and validates the JSON text.
     ///
     /// # Errors
     /// `Invalid` with the entry: invalid JSON, an unknown parent, a cycle, a number that exceeds f32, an empty line, or
     /// a leaf that is not an object or is duplicated.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
-        let raw: Raw =
+        let raw: StructureJson =
             serde_json::from_slice(bytes).map_err(|error| invalid("json", "objects, shoots and leaves", error))?;
         let number = |id: &str| id.parse().map_err(|_| invalid("objects", "whole numbers as names", id));
         let objects = raw.objects.into_iter().map(|(id, kind)| Ok((number(&id)?, kind))).collect::<Result<_>>()?;
@@ -60,7 +60,7 @@ impl Structure {
         if index_of.len() != raw.shoots.len() {
             return Err(invalid("shoots", "each id once", format!("{} ids of {}", index_of.len(), raw.shoots.len())));
         }
-        let order = parents_first(&raw.shoots, &index_of)?;
+        let order = topological_order(&raw.shoots, &index_of)?;
         let structure = Self { objects, shoots: raw.shoots, leaves: raw.leaves, order, index_of };
         structure.check_lines()?;
         structure.check_leaves()?;
@@ -107,7 +107,7 @@ impl Structure {
 }
 
 /// Indices of shoots by depth in the hierarchy, in file order within a depth.
-fn parents_first(shoots: &[Shoot], index_of: &HashMap<i64, usize>) -> Result<Vec<usize>> {
+fn topological_order(shoots: &[Shoot], index_of: &HashMap<i64, usize>) -> Result<Vec<usize>> {
     let mut depths: Vec<Option<usize>> = vec![None; shoots.len()];
     for start in 0..shoots.len() {
         // Walk up to an ancestor of known depth and back, so that each shoot is visited once.
@@ -141,7 +141,7 @@ fn parents_first(shoots: &[Shoot], index_of: &HashMap<i64, usize>) -> Result<Vec
 ///
 /// # Errors
 /// `Invalid` with the line, or if the number of lines is not the number of faces.
-pub(super) fn objects_of_faces(bytes: &[u8], faces: usize) -> Result<Vec<u64>> {
+pub(super) fn parse_object_ids(bytes: &[u8], faces: usize) -> Result<Vec<u64>> {
     let lines = bytes.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).enumerate();
     let ids: Vec<u64> = lines
         .filter(|(_, line)| !line.is_empty())
@@ -161,10 +161,10 @@ pub(super) fn objects_of_faces(bytes: &[u8], faces: usize) -> Result<Vec<u64>> {
 mod tests {
     use super::*;
 
-    fn parse(shoots: &str, leaves: &str) -> Result<Structure> {
+    fn parse(shoots: &str, leaves: &str) -> Result<PlantStructure> {
         let text =
             format!(r#"{{"objects": {{"1": "internode", "2": "leaf"}}, "shoots": [{shoots}], "leaves": [{leaves}]}}"#);
-        Structure::parse(text.as_bytes())
+        PlantStructure::parse(text.as_bytes())
     }
 
     fn shoot(id: i64, parent: i64) -> String {
@@ -197,15 +197,18 @@ mod tests {
             let refusal = parse(&shoots, &leaves).expect_err(start).to_string();
             assert!(refusal.starts_with(start), "{refusal}");
         }
-        assert!(Structure::parse("[".repeat(100_000).as_bytes()).is_err(), "deep nesting is no way to end the program");
+        assert!(
+            PlantStructure::parse("[".repeat(100_000).as_bytes()).is_err(),
+            "deep nesting is no way to end the program"
+        );
     }
 
     #[test]
     fn one_number_per_face() {
-        assert_eq!(objects_of_faces(b"1\n2\r\n 3 \n\n", 3).expect("good"), [1, 2, 3]);
-        let few = objects_of_faces(b"1\n", 2).expect_err("too few").to_string();
+        assert_eq!(parse_object_ids(b"1\n2\r\n 3 \n\n", 3).expect("good"), [1, 2, 3]);
+        let few = parse_object_ids(b"1\n", 2).expect_err("too few").to_string();
         assert_eq!(few, "lines: expected 2, one per face, given 1");
-        let odd = objects_of_faces(b"1\n-2\n", 2).expect_err("negative").to_string();
+        let odd = parse_object_ids(b"1\n-2\n", 2).expect_err("negative").to_string();
         assert_eq!(odd, "line 2: expected a whole number, given -2");
     }
 }

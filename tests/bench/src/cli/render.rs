@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use crate::render::loads::Kind;
-use crate::render::{self, Report, Request, variants};
+use crate::render::workloads::RenderWorkload;
+use crate::render::{self, RenderReport, RenderReportOptions, variants};
 use crate::thesis::PLANTS;
-use modalcast::cli::options::{Size, working};
-use modalcast::cli::{Outcome, say};
+use modalcast::cli::options::{ImageSize, with_spinner};
+use modalcast::cli::{Outcome, print_line};
 use modalcast_model::error::{Result, invalid};
 
 const LOADS: &str = "Loads:
@@ -45,10 +45,10 @@ pub(super) struct Args {
     /// Measure only this variant, or all variants with this prefix: "variance 512*"; repeatable.
     #[arg(long = "variant", value_name = "GLOB")]
     variants: Vec<String>,
-    /// Size of still pictures in pixels [default: 640x360]; moving pictures have a quarter of it on each side. With
+    /// ImageSize of still pictures in pixels [default: 640x360]; moving pictures have a quarter of it on each side. With
     /// --figures the size of single pictures [default: 640x480].
     #[arg(long)]
-    size: Option<Size>,
+    size: Option<ImageSize>,
     /// Frames per median, at least 20 [default: 100, 20 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
@@ -70,7 +70,7 @@ pub(super) struct Args {
 }
 
 /// Default sizes: of the report, and of the figures' pictures.
-const USUAL: [Size; 2] = [Size { width: 640, height: 360 }, Size { width: 640, height: 480 }];
+const USUAL: [ImageSize; 2] = [ImageSize { width: 640, height: 360 }, ImageSize { width: 640, height: 480 }];
 
 /// Upper limit of a picture's side in pixels, because the references trace 16 to 64 samples per pixel.
 const LARGEST: u32 = 4096;
@@ -86,44 +86,48 @@ pub(super) fn run(args: &Args) -> Outcome {
     if args.raster {
         return rasters(args, &request);
     }
-    let report = working("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
+    let report = with_spinner("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
     report.write(&args.out)?;
-    lines(&report).into_iter().for_each(say);
-    say(format!("written to {}", args.out.display()));
+    lines(&report).into_iter().for_each(print_line);
+    print_line(format!("written to {}", args.out.display()));
     Ok(report.passed())
 }
 
-fn rasters(args: &Args, request: &Request) -> Outcome {
-    let rasters = working("measuring", || render::rasters(request, |what| tracing::info!(what, "measuring")))?;
+fn rasters(args: &Args, request: &RenderReportOptions) -> Outcome {
+    let rasters = with_spinner("measuring", || render::rasters(request, |what| tracing::info!(what, "measuring")))?;
     rasters.write(&args.out)?;
-    rasters.rows.iter().for_each(|row| say(row.line()));
-    rasters.frames.iter().for_each(|row| say(row.line()));
-    say(format!("written to {}", args.out.display()));
+    rasters.rows.iter().for_each(|row| print_line(row.line()));
+    rasters.frames.iter().for_each(|row| print_line(row.line()));
+    print_line(format!("written to {}", args.out.display()));
     Ok(rasters.passed())
 }
 
 fn figures(args: &Args) -> Outcome {
     let request = render::figures::Request { size: size(args, USUAL[1])?, scenes: args.scenes.clone() };
     let hear = |what: &str| tracing::info!(what, "drawing");
-    let figures = working("drawing", || render::figures::figures(&request, hear))?;
+    let figures = with_spinner("drawing", || render::figures::figures(&request, hear))?;
     figures.write(&args.out)?;
     for figure in &figures.figures {
-        say(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.shows.join("; ")));
+        print_line(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.shows.join("; ")));
     }
-    say(format!("written to {}", args.out.display()));
+    print_line(format!("written to {}", args.out.display()));
     Ok(true)
 }
 
 fn timed(args: &Args) -> Outcome {
     let replays = args.replays.map_or(100, |replays| replays as usize);
-    let request = render::timed::Request { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
-    let timed = working("measuring", || render::timed::timed(&request, |what| tracing::info!(what, "timing")))?;
+    let request = render::frame_times::Request { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
+    let timed =
+        with_spinner("measuring", || render::frame_times::timed(&request, |what| tracing::info!(what, "timing")))?;
     timed.write(&args.out)?;
     for scene in &timed.scenes {
         let frame = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
-        say(format!("{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us", scene.name, scene.whole.median_us));
+        print_line(format!(
+            "{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us",
+            scene.name, scene.whole.median_us
+        ));
     }
-    say(format!("written to {}", args.out.display()));
+    print_line(format!("written to {}", args.out.display()));
     Ok(true)
 }
 
@@ -131,26 +135,26 @@ fn timed(args: &Args) -> Outcome {
 ///
 /// # Errors
 /// `Invalid` when a side is not in 1 to [`LARGEST`].
-fn size(args: &Args, usual: Size) -> Result<render::Size> {
-    let Size { width, height } = args.size.unwrap_or(usual);
+fn size(args: &Args, usual: ImageSize) -> Result<render::Size> {
+    let ImageSize { width, height } = args.size.unwrap_or(usual);
     match [width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
         true => Ok(render::Size { width, height }),
-        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), Size { width, height })),
+        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), ImageSize { width, height })),
     }
 }
 
-fn request(args: &Args) -> Result<Request> {
+fn request(args: &Args) -> Result<RenderReportOptions> {
     let (mut loads, mut plants) = (Vec::new(), Vec::new());
     for name in &args.loads {
         match plants_named(name) {
             Some(named) => plants.extend(named),
-            None => loads.push(Kind::named(name)?),
+            None => loads.push(RenderWorkload::named(name)?),
         }
     }
     if args.loads.is_empty() {
-        (loads, plants) = (Kind::all(args.quick), (0..PLANTS.len()).collect());
+        (loads, plants) = (RenderWorkload::all(args.quick), (0..PLANTS.len()).collect());
     }
-    let request = Request {
+    let request = RenderReportOptions {
         loads,
         plants,
         variants: args.variants.clone(),
@@ -176,7 +180,7 @@ fn plants_named(name: &str) -> Option<Vec<usize>> {
     (1..=PLANTS.len()).contains(&number).then(|| vec![number - 1])
 }
 
-fn lines(report: &Report) -> Vec<String> {
+fn lines(report: &RenderReport) -> Vec<String> {
     let head = ["frame us", "colour", "of aim", "light", "penumbra", "bleeding", "flicker", "passed"];
     let mut lines = vec![format!("{:<18}{:<40}{}", "load", "variant", head.map(|word| format!("{word:>10}")).concat())];
     for row in &report.rows {
@@ -184,8 +188,8 @@ fn lines(report: &Report) -> Vec<String> {
             |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
         let cells = [
             show(row.median_us(), 1),
-            show(Some(row.colour.mean), 3),
-            show(Some(row.colour_of_aim.mean), 3),
+            show(Some(row.color.mean), 3),
+            show(Some(row.color_of_reference.mean), 3),
             show(Some(row.light_of_aim.all.mean), 4),
             show(Some(row.light_of_aim.penumbra.mean), 4),
             show(row.light_of_aim.in_umbra, 4),
@@ -223,7 +227,7 @@ fn lines(report: &Report) -> Vec<String> {
             format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.beyond_us)
         }));
     }
-    lines.extend(report.raster.iter().map(render::Rastered::line));
+    lines.extend(report.raster.iter().map(render::RasterComparison::line));
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
     lines
 }
@@ -233,7 +237,7 @@ mod tests {
     use super::*;
 
     fn args() -> Args {
-        let size = Some(Size { width: 64, height: 48 });
+        let size = Some(ImageSize { width: 64, height: 48 });
         Args {
             out: PathBuf::from("out"),
             loads: vec![],
@@ -250,12 +254,12 @@ mod tests {
     #[test]
     fn defaults_to_all_loads_and_rejects_bad_names_and_sizes() {
         let all = request(&args()).expect("fits");
-        assert_eq!((all.loads.len(), all.plants.len(), all.replays), (Kind::all(true).len(), 12, 20));
+        assert_eq!((all.loads.len(), all.plants.len(), all.replays), (RenderWorkload::all(true).len(), 12, 20));
         let plants = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
         let plants = request(&plants).expect("fits");
         assert_eq!((plants.loads.len(), plants.plants.len(), plants.plants[0]), (1, 13, 2));
         let named = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
-        assert_eq!(request(&named).expect("fits").loads, [Kind::Square, Kind::Triangles(10)]);
+        assert_eq!(request(&named).expect("fits").loads, [RenderWorkload::Square, RenderWorkload::Triangles(10)]);
         // A quick run also includes the frame that the bare passes are compared with, if it is named.
         let variants = ["variance 4096, blur 1.5", "culling*"].map(String::from).to_vec();
         let named = request(&Args { variants, ..args() }).expect("fits").wanted();
@@ -266,8 +270,8 @@ mod tests {
             Args { loads: vec!["cube".into()], ..args() },
             Args { loads: vec!["plant-13".into()], ..args() },
             Args { variants: vec!["varience*".into()], ..args() },
-            Args { size: Some(Size { width: 0, height: 5 }), ..args() },
-            Args { size: Some(Size { width: 5, height: 5000 }), ..args() },
+            Args { size: Some(ImageSize { width: 0, height: 5 }), ..args() },
+            Args { size: Some(ImageSize { width: 5, height: 5000 }), ..args() },
         ] {
             assert!(request(&wrong).is_err(), "{wrong:?}");
         }

@@ -7,16 +7,16 @@ use std::sync::Arc;
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::trial::{Code, Compiled, KernelFacts, Trial};
-use super::turns::{Turns, Values};
+use super::input_sets::{InputAddresses, InputSets};
+use super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, download, room, upload};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
 use modalcast_compute::gpu::plan::storage_define;
-use modalcast_compute::storage::{Halves, QUAD, Tiles};
-use modalcast_model::error::{Error, Result, during, invalid};
-use modalcast_model::scene::{Scene, State, Storage};
+use modalcast_compute::storage::{QUAD, SplitCoordinates, TiledModes};
+use modalcast_model::error::{Error, Result, fault_in, invalid};
+use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-pub(super) const CODE: Code = Code {
+pub(super) const CODE: BenchmarkSource = BenchmarkSource {
     source: include_str!("../../kernels/batch_mma.cu"),
     functions: &["batch_mma"],
     variants: &[
@@ -61,13 +61,13 @@ unsafe impl DeviceRepr for BatchMmaArgs {}
 
 /// All domains of a scene with one shape, multiplied by tensor cores, for several steps.
 #[derive(Debug)]
-pub struct BatchMma {
+pub struct BatchMmaBenchmark {
     name: String,
-    compiled: Compiled,
+    compiled: CompiledKernel,
     words: CudaSlice<u8>,
     rest: CudaSlice<u8>,
     positions: CudaSlice<u8>,
-    turns: Turns,
+    turns: InputSets,
     /// Kernel arguments with null addresses; [`Self::args`] fills them in.
     args: BatchMmaArgs,
     vectors: usize,
@@ -75,30 +75,30 @@ pub struct BatchMma {
     bytes: Vec<(&'static str, u64)>,
 }
 
-impl BatchMma {
+impl BatchMmaBenchmark {
     /// Packs and uploads the shape and the values of each state. U is stored in the scene's 16-bit type.
     ///
     /// # Errors
     /// `Invalid` when the scene is not 1 to 32 domains of one shape, has followers, does not store U in 16 bits or
     /// requests compensated sums, or when there is no state; `Unavailable` when the device has no such tensor cores or
     /// NVRTC is missing; `Fault` when the device fails.
-    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State]) -> Result<Self> {
+    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState]) -> Result<Self> {
         check(scene)?;
         let storage = scene.deformation.storage;
-        if !matches!(storage, Storage::F16 | Storage::Bf16) {
+        if !matches!(storage, StorageType::F16 | StorageType::Bf16) {
             return Err(invalid("deform.storage", "f16 or bf16 for tensor cores", storage.name()));
         }
         check_device(device)?;
         let (vectors, define) = vectors_for(scene.domains.len());
         let defines: Vec<&str> = storage_define(storage).into_iter().chain(define).collect();
-        let tiles = Tiles::new(scene.shape_of(0), storage);
+        let tiles = TiledModes::new(scene.shape_of(0), storage);
         Ok(Self {
             name: format!("batch_mma{}_{}", scene.domains.len(), storage.name()),
-            compiled: Compiled::new(device, &CODE, &defines)?,
-            words: upload(device, tiles.planes())?,
+            compiled: CompiledKernel::new(device, &CODE, &defines)?,
+            words: upload(device, tiles.packed_words())?,
             rest: upload(device, tiles.rest())?,
-            positions: room(device, 12 * scene.layout.vertices as u64)?,
-            turns: Turns::new(device, scene, states, |state| {
+            positions: alloc_zeroed(device, 12 * scene.layout.vertices as u64)?,
+            turns: InputSets::new(device, scene, states, |state| {
                 let halves = halves(scene, state, &tiles);
                 [bytemuck::cast_vec(fragments(&halves, tiles.rank(), vectors)), placements(state, &halves, vectors)]
             })?,
@@ -109,7 +109,7 @@ impl BatchMma {
         })
     }
 
-    fn args(&self, device: &Device, values: Values) -> BatchMmaArgs {
+    fn args(&self, device: &Device, values: InputAddresses) -> BatchMmaArgs {
         BatchMmaArgs {
             words: address(device, &self.words),
             rest: address(device, &self.rest),
@@ -122,7 +122,7 @@ impl BatchMma {
     }
 }
 
-impl Trial for BatchMma {
+impl KernelBenchmark for BatchMmaBenchmark {
     fn name(&self) -> String {
         self.name.clone()
     }
@@ -139,7 +139,7 @@ impl Trial for BatchMma {
         // SAFETY: `BatchMmaArgs` is the kernel's only argument. Tiles and x0 are those of the scene's one shape, with
         // one block per tile. Halves, T and shrinks hold as many vectors as the kernel was compiled for, and halves
         // hold whole steps of modes. `positions` has room for the shape's vertices from each domain's first vertex on.
-        unsafe { launch.arg(&args).launch(config) }.map_err(during("batch_mma"))?;
+        unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("batch_mma"))?;
         Ok(())
     }
 
@@ -158,7 +158,7 @@ impl Trial for BatchMma {
         1
     }
 
-    fn kernels(&self) -> Vec<KernelFacts> {
+    fn kernels(&self) -> Vec<KernelAttributes> {
         vec![self.compiled.facts.clone()]
     }
 }
@@ -207,17 +207,17 @@ const fn vectors_for(domains: usize) -> (usize, Option<&'static str>) {
 }
 
 /// q of each domain, times the factors of the modes, split into pairs of 16-bit numbers.
-fn halves(scene: &Scene, state: &State, tiles: &Tiles) -> Vec<Halves> {
+fn halves(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> Vec<SplitCoordinates> {
     let own = |domain: usize| {
         let amounts = state.q_of(scene, domain).iter().zip(tiles.factors()).map(|(q, factor)| q * factor);
-        Halves::new(&amounts.collect::<Vec<_>>(), tiles.storage())
+        SplitCoordinates::new(&amounts.collect::<Vec<_>>(), tiles.storage())
     };
     (0..scene.domains.len()).map(own).collect()
 }
 
 /// The fragments of q as each lane reads them: [step][vectors / 8][lane][4] words; zeros where there is no domain or
 /// mode.
-fn fragments(halves: &[Halves], rank: usize, vectors: usize) -> Vec<u32> {
+fn fragments(halves: &[SplitCoordinates], rank: usize, vectors: usize) -> Vec<u32> {
     let mut words = Vec::with_capacity(rank.div_ceil(STEP) * vectors * 16);
     for (step, eight) in (0..rank.div_ceil(STEP)).flat_map(|step| (0..vectors / 8).map(move |eight| (step, eight))) {
         for lane in 0..32 {
@@ -234,10 +234,10 @@ fn fragments(halves: &[Halves], rank: usize, vectors: usize) -> Vec<u32> {
 }
 
 /// The transforms, then the scales that undo the scaling of q; zeros where there is no domain.
-fn placements(state: &State, halves: &[Halves], vectors: usize) -> Vec<f32> {
+fn placements(state: &SceneState, halves: &[SplitCoordinates], vectors: usize) -> Vec<f32> {
     let mut numbers: Vec<f32> = bytemuck::cast_slice(&state.transforms).to_vec();
     numbers.resize(12 * vectors, 0.0);
-    numbers.extend(halves.iter().map(Halves::shrink));
+    numbers.extend(halves.iter().map(SplitCoordinates::inverse_scale));
     numbers.resize(13 * vectors, 0.0);
     numbers
 }
@@ -257,7 +257,7 @@ fn args(scene: &Scene, chunks: usize) -> BatchMmaArgs {
 }
 
 /// The minimum of bytes that a launch moves. The few scales are not counted, because 16-bit storage needs none.
-fn bytes(scene: &Scene, tiles: &Tiles) -> Vec<(&'static str, u64)> {
+fn bytes(scene: &Scene, tiles: &TiledModes) -> Vec<(&'static str, u64)> {
     let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
     vec![
         ("U", tiles.bytes().len() as u64),
@@ -273,22 +273,22 @@ mod warp;
 
 #[cfg(test)]
 mod tests {
-    use super::super::trial::tests::compile_all;
-    use super::warp::{QUADS, Tables, staged, store, sums};
+    use super::super::kernel_benchmark::tests::compile_all;
+    use super::warp::{KernelInputs, QUADS, staged, store, sums};
     use super::*;
     use modalcast_compute::storage::TILE_QUADS;
-    use modalcast_compute::testing::{Noise, position_of, scene_and_state};
-    use modalcast_model::scene::Parts;
+    use modalcast_compute::testing::{TestRng, position_of, scene_and_state};
+    use modalcast_model::scene::SceneParts;
 
-    fn ensemble(vertices: usize, rank: usize, domains: usize, storage: Storage) -> (Arc<Scene>, State) {
+    fn ensemble(vertices: usize, rank: usize, domains: usize, storage: StorageType) -> (Arc<Scene>, SceneState) {
         let (one, _) = scene_and_state(&[(vertices, rank, 1)]);
-        let mut parts = Parts::named("ensemble");
+        let mut parts = SceneParts::named("ensemble");
         parts.shapes = vec![one.shapes[0].clone()];
         parts.materials = one.materials.clone();
         parts.domains = vec![one.domains[0].clone(); domains];
         parts.deformation.storage = storage;
         let scene = Scene::new(parts).expect("a scene");
-        let (mut random, mut state) = (Noise(domains as u64), State::rest(&scene));
+        let (mut random, mut state) = (TestRng(domains as u64), SceneState::rest(&scene));
         state.q.iter_mut().for_each(|coordinate| *coordinate = random.next());
         state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.next()));
         (scene, state)
@@ -310,7 +310,7 @@ mod tests {
     ];
 
     /// CPU twin of `batch_mma`, warp by warp, with fragments, staging buffer and stores; sums in f64.
-    fn twin_of_batch_mma(tables: &Tables, numbers: usize) -> Vec<f32> {
+    fn twin_of_batch_mma(tables: &KernelInputs, numbers: usize) -> Vec<f32> {
         let mut positions = vec![f32::NAN; numbers];
         let vertices = tables.args.vertices as usize;
         for (tile, warp) in (0..tables.tiles.count()).flat_map(|tile| (0..WARPS).map(move |warp| (tile, warp))) {
@@ -329,10 +329,10 @@ mod tests {
 
     #[test]
     fn writes_each_position_once_from_its_own_inputs() {
-        for storage in [Storage::F16, Storage::Bf16] {
+        for storage in [StorageType::F16, StorageType::Bf16] {
             for (vertices, rank, domains) in SIZES.into_iter().chain([(70, 31, 32), (33, 40, 17)]) {
                 let (scene, state) = ensemble(vertices, rank, domains, storage);
-                let tables = Tables::of(&scene, &state);
+                let tables = KernelInputs::of(&scene, &state);
                 let got = twin_of_batch_mma(&tables, 3 * scene.layout.vertices);
                 for (packed, got) in got.chunks_exact(3).enumerate() {
                     let (domain, vertex) = (packed / vertices, packed % vertices);
@@ -341,7 +341,7 @@ mod tests {
                     let near = |tolerance: f64| {
                         got.iter().zip(want).all(|(got, want)| (f64::from(*got) - want).abs() < tolerance)
                     };
-                    let tolerance = if storage == Storage::F16 { 4e-6 } else { 1e-4 };
+                    let tolerance = if storage == StorageType::F16 { 4e-6 } else { 1e-4 };
                     assert!(near(tolerance), "{storage:?} {vertices} {rank} {domains}: {got:?} not {want:?}");
                     let other = position_of(&scene, &state, (domain + 1) % domains, (vertex + 1) % vertices);
                     let alone = domains == 1 && vertices == 1;
@@ -353,10 +353,10 @@ mod tests {
     }
 
     /// x of a vertex in f64, with U as stored.
-    fn exactly(scene: &Scene, state: &State, tiles: &Tiles, (domain, vertex): (usize, usize)) -> [f64; 3] {
+    fn exactly(scene: &Scene, state: &SceneState, tiles: &TiledModes, (domain, vertex): (usize, usize)) -> [f64; 3] {
         let (rest, q) = (scene.shape_of(domain).mesh.rest()[vertex], state.q_of(scene, domain));
         let bent = [0, 1, 2].map(|axis| {
-            let terms = q.iter().enumerate().map(|(mode, q)| tiles.decoded(vertex, axis, mode) * f64::from(*q));
+            let terms = q.iter().enumerate().map(|(mode, q)| tiles.decode_entry(vertex, axis, mode) * f64::from(*q));
             f64::from(rest[axis]) + terms.sum::<f64>()
         });
         let rows = state.transforms[domain].0.map(f64::from);
@@ -367,7 +367,7 @@ mod tests {
     fn pads_to_compiled_vector_counts_and_rejects_over_32() {
         let vectors: Vec<usize> = [1, 8, 9, 16, 17, 32].map(|domains| vectors_for(domains).0).into();
         assert_eq!(vectors, [8, 8, 16, 16, 32, 32]);
-        let (scene, _) = ensemble(9, 2, 33, Storage::F16);
+        let (scene, _) = ensemble(9, 2, 33, StorageType::F16);
         assert!(check(&scene).expect_err("33 domains").to_string().contains("at most 32"));
     }
 

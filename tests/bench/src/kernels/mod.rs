@@ -1,13 +1,13 @@
-//! Benchmark kernels and their launchers; the server uses none of them. A `Trial` is one way to deform: its kernels are
+//! Benchmark kernels and their launchers; the server uses none of them. A `KernelBenchmark` is one way to deform: its kernels are
 //! timed without copies, and its positions are validated.
 //!
 //! | file | contents |
 //! |---|---|
-//! | `trial` | the `Trial` trait, and the driver's facts about kernels |
+//! | `kernel_benchmark` | the `KernelBenchmark` trait, and the driver's facts about kernels |
 //! | `turns` | inputs of several steps, uploaded before timing starts |
-//! | `measure` | timing by CUDA graphs and events |
-//! | `roof` | the best memory rates of the device, for comparison |
-//! | `ours` | the deformer's own kernels as a trial |
+//! | `timer` | timing by CUDA graphs and events |
+//! | `bandwidth` | the best memory rates of the device, for comparison |
+//! | `deformer_kernels` | the deformer's own kernels as a trial |
 //! | `batch_mma` | many vectors q of one U at once by tensor cores, with their own summation order and rounding |
 //! | `ingest` | host-to-device upload of a step's values |
 //! | `overlap` | steps with readback by the host, serial and overlapped |
@@ -15,27 +15,27 @@
 //! | `raster` | the CUDA rasterizer on its own positions and samples |
 //! | `thesis` | the kernels of the thesis |
 
+mod bandwidth;
 mod batch_mma;
 mod cublas;
-mod ingest;
-mod measure;
-mod ours;
+mod deformer_kernels;
+mod input_sets;
+mod kernel_benchmark;
 mod overlap;
 mod plain_update;
 mod raster;
-mod roof;
 mod thesis;
-mod trial;
-mod turns;
+mod timer;
+mod upload_time;
 
-pub use batch_mma::BatchMma;
-pub use cublas::{Cublas, Peer, cublas_version};
-pub use ingest::ingest;
-pub use measure::{Cache, Timing, empty_replay, gigabytes_per_second, time};
-pub use ours::{Extent, Ours};
+pub use bandwidth::{Roofs, roofs};
+pub use batch_mma::BatchMmaBenchmark;
+pub use cublas::{CublasBenchmark, CublasMethod, cublas_version};
+pub use deformer_kernels::{DeformerBenchmark, StepOutputs};
+pub use input_sets::Part;
+pub use kernel_benchmark::{KernelAttributes, KernelBenchmark};
 pub use overlap::{HostWrite, Overlap, host_writes, overlap};
-pub use raster::{Raster, RasterCounts, RasterMesh};
-pub use roof::{Roofs, roofs};
-pub use thesis::{Lanes, Split, Thesis, idle_in_warp, lanes};
-pub use trial::{KernelFacts, Trial};
-pub use turns::Part;
+pub use raster::{RasterBenchmark, RasterCounts, RasterMesh};
+pub use thesis::{KernelSplit, LaneCounts, ThesisBenchmark, count_lanes, idle_lanes_per_warp};
+pub use timer::{Cache, Timing, empty_replay, gigabytes_per_second, time};
+pub use upload_time::ingest;

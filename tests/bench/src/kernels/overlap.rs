@@ -13,16 +13,16 @@ use std::time::Instant;
 use cudarc::driver::PinnedHostSlice;
 use serde::Serialize;
 
-use super::measure::{Span, Timing};
+use super::timer::{EventPair, Timing};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::inputs::{Inputs, Listing, Packing, Writer};
+use modalcast_compute::gpu::inputs::{DirtyTileLayout, InputPacker, InputWriter, StepInputs};
 use modalcast_compute::gpu::layout::Header;
-use modalcast_compute::gpu::staging::{PARALLEL, copy_on_all_cores};
-use modalcast_compute::gpu::work::Coordinates;
-use modalcast_compute::gpu::{CudaDeformer, MOST_UNDER_WAY};
-use modalcast_model::deform::{Deformer as _, Surface, Wanted};
-use modalcast_model::error::{Result, during, invalid};
-use modalcast_model::scene::{Scene, State};
+use modalcast_compute::gpu::staging::{PARALLEL_THRESHOLD, parallel_copy};
+use modalcast_compute::gpu::work::CoordinateLayout;
+use modalcast_compute::gpu::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
+use modalcast_model::deform::{DeformedSurface, Deformer as _, VertexAttributes};
+use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// Rounds over all steps per method. The methods alternate; the median over the rounds is reported.
 const ROUNDS: usize = 5;
@@ -65,7 +65,7 @@ pub struct Overlap {
 ///
 /// # Errors
 /// `Invalid` without states or steps; errors of creating a deformer; `Fault` when the device fails.
-pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<Overlap> {
+pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[SceneState], steps: usize) -> Result<Overlap> {
     if states.is_empty() || steps == 0 {
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
     }
@@ -73,7 +73,7 @@ pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[State], steps
     let differing = differing(&mut deformer, states, steps)?;
     let mut times = [Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..ROUNDS {
-        for (way, times) in [serial, fetched, overlapped].iter().zip(&mut times) {
+        for (way, times) in [serial, pipelined, overlapped].iter().zip(&mut times) {
             let begin = Instant::now();
             way(&mut deformer, states, steps, &mut |_, surface| {
                 black_box(surface.positions.first());
@@ -85,8 +85,8 @@ pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[State], steps
     let [step_us, copy_out_us] = alone(&mut deformer, states, steps)?;
     let (bytes_in, [write_one_core_us, write_us]) = writes(device, scene, states, steps)?;
     let graph_us = graph(device, &deformer, steps)?;
-    let read = deformer.fetch(Wanted::VERTICES)?;
-    let surface = deformer.fetched(&read)?;
+    let read = deformer.readback(VertexAttributes::VERTICES)?;
+    let surface = deformer.wait_readback(&read)?;
     Ok(Overlap {
         steps,
         cores: rayon::current_num_threads(),
@@ -106,60 +106,60 @@ pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[State], steps
     })
 }
 
-type Read<'a> = &'a mut dyn FnMut(usize, &Surface);
+type Read<'a> = &'a mut dyn FnMut(usize, &DeformedSurface);
 
-fn serial(deformer: &mut CudaDeformer, states: &[State], steps: usize, read: Read<'_>) -> Result<()> {
+fn serial(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize, read: Read<'_>) -> Result<()> {
     for step in 0..steps {
         deformer.deform(&states[step % states.len()])?;
-        let fetch = deformer.fetch(Wanted::VERTICES)?;
-        read(step, &*deformer.fetched(&fetch)?);
+        let readback = deformer.readback(VertexAttributes::VERTICES)?;
+        read(step, &*deformer.wait_readback(&readback)?);
     }
     Ok(())
 }
 
-fn fetched(deformer: &mut CudaDeformer, states: &[State], steps: usize, read: Read<'_>) -> Result<()> {
+fn pipelined(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize, read: Read<'_>) -> Result<()> {
     let mut before = None;
     for step in 0..=steps {
         let next = match step < steps {
             true => {
                 deformer.deform(&states[step % states.len()])?;
-                Some(deformer.fetch(Wanted::VERTICES)?)
+                Some(deformer.readback(VertexAttributes::VERTICES)?)
             }
             false => None,
         };
-        if let Some(fetch) = std::mem::replace(&mut before, next) {
-            read(step - 1, &*deformer.fetched(&fetch)?);
+        if let Some(readback) = std::mem::replace(&mut before, next) {
+            read(step - 1, &*deformer.wait_readback(&readback)?);
         }
     }
     Ok(())
 }
 
-fn overlapped(deformer: &mut CudaDeformer, states: &[State], steps: usize, read: Read<'_>) -> Result<()> {
-    let mut fetches = VecDeque::new();
-    for step in 0..steps + MOST_UNDER_WAY {
-        let finished = step.checked_sub(MOST_UNDER_WAY);
+fn overlapped(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize, read: Read<'_>) -> Result<()> {
+    let mut readbacks = VecDeque::new();
+    for step in 0..steps + MAX_STEPS_IN_FLIGHT {
+        let finished = step.checked_sub(MAX_STEPS_IN_FLIGHT);
         if finished.is_some_and(|finished| finished < steps) {
             deformer.finish()?;
         }
         if step < steps {
             deformer.submit(&states[step % states.len()])?;
-            fetches.push_back(deformer.fetch(Wanted::VERTICES)?);
+            readbacks.push_back(deformer.readback(VertexAttributes::VERTICES)?);
         }
-        if let (Some(finished), true) = (finished, fetches.len() > MOST_UNDER_WAY || step >= steps)
-            && let Some(fetch) = fetches.pop_front()
+        if let (Some(finished), true) = (finished, readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps)
+            && let Some(readback) = readbacks.pop_front()
         {
-            read(finished, &*deformer.fetched(&fetch)?);
+            read(finished, &*deformer.wait_readback(&readback)?);
         }
     }
     Ok(())
 }
 
 /// Counts steps of the other two methods whose vertices differ from the serial ones.
-fn differing(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<usize> {
+fn differing(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<usize> {
     let mut want = Vec::new();
     serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
     let mut differing = 0;
-    for way in [fetched, overlapped] {
+    for way in [pipelined, overlapped] {
         let mut seen = 0;
         way(deformer, states, steps, &mut |step, surface| {
             seen += 1;
@@ -170,36 +170,37 @@ fn differing(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Res
     Ok(differing)
 }
 
-fn same_bits(one: &Surface, other: &Surface) -> bool {
+fn same_bits(one: &DeformedSurface, other: &DeformedSurface) -> bool {
     let same =
         |one: &[f32], other: &[f32]| bytemuck::cast_slice::<f32, u32>(one) == bytemuck::cast_slice::<f32, u32>(other);
     same(&one.positions, &other.positions) && same(&one.normals, &other.normals)
 }
 
 /// Median times of a step without readback, and of the readback alone.
-fn alone(deformer: &mut CudaDeformer, states: &[State], steps: usize) -> Result<[f64; 2]> {
+fn alone(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<[f64; 2]> {
     let [mut whole, mut out] = [Vec::new(), Vec::new()];
     for step in 0..steps {
         let begin = Instant::now();
         deformer.deform(&states[step % states.len()])?;
         whole.push(since(begin));
         let begin = Instant::now();
-        let fetch = deformer.fetch(Wanted::VERTICES)?;
-        deformer.fetched(&fetch)?;
+        let readback = deformer.readback(VertexAttributes::VERTICES)?;
+        deformer.wait_readback(&readback)?;
         out.push(since(begin));
     }
     Ok([whole, out].map(median))
 }
 
 /// Bytes of a step's values, and median times of writing them on one core and on all.
-fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -> Result<(u64, [f64; 2])> {
+fn writes(device: &Device, scene: &Arc<Scene>, states: &[SceneState], steps: usize) -> Result<(u64, [f64; 2])> {
     // Only the number of bytes matters here, so factors and tiles are empty.
-    let (coordinates, factors) = (Coordinates::new(scene), vec![Vec::new(); scene.shapes.len()]);
-    let packing = Packing { scene: Arc::clone(scene), coordinates, factors, listing: Listing::default() };
+    let (coordinates, factors) = (CoordinateLayout::new(scene), vec![Vec::new(); scene.shapes.len()]);
+    let packing =
+        InputPacker { scene: Arc::clone(scene), coordinates, factors, dirty_tile_layout: DirtyTileLayout::default() };
     let packing = Arc::new(packing);
-    let mut pinned = Inputs::new(device, &packing)?.pinned(device)?;
-    let words = pinned.as_mut_slice().map_err(during("write"))?;
-    let mut writer = Writer::new(&packing);
+    let mut staging = StepInputs::new(device, &packing)?.staging(device)?;
+    let words = staging.as_mut_slice().map_err(fault_in("write"))?;
+    let mut writer = InputWriter::new(&packing);
     let bytes = size_of_val(words) as u64;
     let mut run = move || {
         let mut write = |step: usize| {
@@ -210,7 +211,7 @@ fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -
         write(0);
         median((0..steps).map(&mut write).collect())
     };
-    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().map_err(during("write"))?;
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().map_err(fault_in("write"))?;
     Ok((bytes, [one.install(&mut run), run()]))
 }
 
@@ -218,7 +219,7 @@ fn writes(device: &Device, scene: &Arc<Scene>, states: &[State], steps: usize) -
 fn graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
     let mut times = Vec::with_capacity(steps);
     for _ in 0..steps {
-        let span = Span::new(device)?;
+        let span = EventPair::new(device)?;
         span.around(device, || deformer.replay())?;
         times.push(span.microseconds()?);
     }
@@ -250,9 +251,9 @@ pub struct HostWrite {
 pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
     const LARGEST: usize = 64 << 20;
     // SAFETY: the memory is only written here.
-    let pinned: std::result::Result<PinnedHostSlice<f32>, _> = unsafe { device.context().alloc_pinned(LARGEST / 4) };
-    let mut pinned = pinned.map_err(during("write"))?;
-    let to = pinned.as_mut_slice().map_err(during("write"))?;
+    let staging: std::result::Result<PinnedHostSlice<f32>, _> = unsafe { device.context().alloc_pinned(LARGEST / 4) };
+    let mut staging = staging.map_err(fault_in("write"))?;
+    let to = staging.as_mut_slice().map_err(fault_in("write"))?;
     let from = vec![1.0_f32; LARGEST / 4];
     let mut row = |bytes: usize| {
         let (to, from) = (&mut to[..bytes / 4], &from[..bytes / 4]);
@@ -267,8 +268,8 @@ pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
         Ok(HostWrite {
             bytes: bytes as u64,
             one_core_us: time(&|to, from| to.copy_from_slice(from))?,
-            all_cores_us: time(&copy_on_all_cores)?,
-            on_all_cores: bytes >= PARALLEL,
+            all_cores_us: time(&parallel_copy)?,
+            on_all_cores: bytes >= PARALLEL_THRESHOLD,
         })
     };
     (16..=26).map(|power| row(1 << power)).collect()

@@ -3,13 +3,13 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::trial::{Code, Compiled, KernelFacts};
+use super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, download, room, upload};
-use modalcast_model::error::{Result, during};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
+use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::Scene;
 
-pub(super) const CODE: Code = Code {
+pub(super) const CODE: BenchmarkSource = BenchmarkSource {
     source: include_str!("../../kernels/plain_update.cu"),
     functions: &["plain_update"],
     variants: &[&[], &["SINGLE"]],
@@ -23,7 +23,7 @@ const RIGID: u64 = u64::MAX;
 /// First float of a domain's u and its first packed vertex.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-struct PlainSlot {
+struct PlainDomain {
     first_u: u64,
     first: u32,
     reserved: u32,
@@ -43,7 +43,7 @@ struct PlainArgs {
     reserved: u32,
 }
 
-const _: () = assert!(size_of::<PlainSlot>() == 16, "PlainSlot differs from kernels/plain_update.cu");
+const _: () = assert!(size_of::<PlainDomain>() == 16, "PlainSlot differs from kernels/plain_update.cu");
 const _: () = assert!(size_of::<PlainArgs>() == 56, "PlainArgs differs from kernels/plain_update.cu");
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
@@ -52,7 +52,7 @@ unsafe impl DeviceRepr for PlainArgs {}
 /// The kernel with its inputs and outputs.
 #[derive(Debug)]
 pub(super) struct PlainUpdate {
-    compiled: Compiled,
+    compiled: CompiledKernel,
     slots: CudaSlice<u8>,
     domains: Option<CudaSlice<u8>>,
     rest: CudaSlice<u8>,
@@ -69,11 +69,11 @@ impl PlainUpdate {
         let defines: &[&str] = if single { &["SINGLE"] } else { &[] };
         let moving = scene.layout.slots.iter().filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64);
         Ok(Self {
-            compiled: Compiled::new(device, &CODE, defines)?,
+            compiled: CompiledKernel::new(device, &CODE, defines)?,
             slots: upload(device, &slots(scene, first_u))?,
             domains: (!single).then(|| upload(device, &domains(scene))).transpose()?,
             rest: upload(device, &rest(scene))?,
-            positions: room(device, 12 * vertices as u64)?,
+            positions: alloc_zeroed(device, 12 * vertices as u64)?,
             vertices,
             read: [48 * scene.domains.len() as u64, moving.sum()],
         })
@@ -95,7 +95,7 @@ impl PlainUpdate {
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         // SAFETY: `PlainArgs` is the kernel's only argument. Its tables belong to one scene, and the caller provides
         // three floats of u for each vertex of a domain that has a `first_u`.
-        unsafe { launch.arg(&args).launch(config) }.map_err(during("plain_update"))?;
+        unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("plain_update"))?;
         Ok(())
     }
 
@@ -118,13 +118,13 @@ impl PlainUpdate {
         ]
     }
 
-    pub(super) fn facts(&self) -> &KernelFacts {
+    pub(super) fn facts(&self) -> &KernelAttributes {
         &self.compiled.facts
     }
 }
 
-fn slots(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainSlot> {
-    let slot = |(slot, first_u): (&modalcast_model::scene::Slot, &Option<u64>)| PlainSlot {
+fn slots(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainDomain> {
+    let slot = |(slot, first_u): (&modalcast_model::scene::DomainLayout, &Option<u64>)| PlainDomain {
         first_u: first_u.unwrap_or(RIGID),
         first: slot.first_vertex as u32,
         reserved: 0,
@@ -144,12 +144,12 @@ fn rest(scene: &Scene) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::trial::tests::compile_all;
+    use super::super::kernel_benchmark::tests::compile_all;
     use super::*;
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
     /// CPU twin of `plain_update`, for one vertex.
-    fn twin_of_plain_update(tables: (&[PlainSlot], &[u32], &[f32]), t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
+    fn twin_of_plain_update(tables: (&[PlainDomain], &[u32], &[f32]), t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
         let (slots, domains, rest) = tables;
         let domain = domains[vertex] as usize;
         let slot = slots[domain];
@@ -190,7 +190,7 @@ mod tests {
         }
     }
 
-    fn got_of(scene: &Scene, state: &modalcast_model::scene::State, domain: usize, vertex: usize) -> [f32; 3] {
+    fn got_of(scene: &Scene, state: &modalcast_model::scene::SceneState, domain: usize, vertex: usize) -> [f32; 3] {
         position_of(scene, state, domain, vertex).map(|number| number as f32)
     }
 

@@ -3,13 +3,15 @@
 
 use cudarc::driver::CudaSlice;
 
-use super::trial::{KernelFacts, Trial};
+use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, download, room, upload};
-use modalcast_compute::gpu::raster::{Core, Functions, Pass, RasterForm, check, check_cut_outs};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
+use modalcast_compute::gpu::raster::{
+    RasterFunctions, RasterPass, RasterPipeline, RasterVariant, check, check_cut_outs,
+};
 use modalcast_model::error::Result;
 use modalcast_model::raster::CutOuts;
-use modalcast_model::scene::{Group, Window};
+use modalcast_model::scene::{DrawRange, Viewport};
 
 /// The mesh to draw.
 #[derive(Debug, Clone, Copy)]
@@ -18,7 +20,7 @@ pub struct RasterMesh<'a> {
     pub positions: &'a [f32],
     /// Vertex indices; a triangle's id is its index here.
     pub triangles: &'a [[u32; 3]],
-    pub groups: &'a [Group],
+    pub groups: &'a [DrawRange],
     pub cut_outs: Option<&'a CutOuts>,
 }
 
@@ -45,40 +47,43 @@ pub struct RasterCounts {
 
 /// A mesh and a window on the device, and the kernels that draw the mesh into the window.
 #[derive(Debug)]
-pub struct Raster {
-    form: RasterForm,
-    functions: Functions,
-    facts: Vec<KernelFacts>,
-    groups: Vec<Group>,
+pub struct RasterBenchmark {
+    variant: RasterVariant,
+    functions: RasterFunctions,
+    facts: Vec<KernelAttributes>,
+    groups: Vec<DrawRange>,
     positions: CudaSlice<u8>,
     target: CudaSlice<u8>,
-    core: Core,
-    window: Window,
+    core: RasterPipeline,
+    window: Viewport,
     bytes: Vec<(&'static str, u64)>,
 }
 
-impl Raster {
+impl RasterBenchmark {
     /// Compiles the kernels and uploads the mesh.
     ///
     /// # Errors
     /// `Invalid` when there are 2^24 triangles or more, a triangle refers to no vertex, or a group to no triangle;
     /// `Unavailable` when NVRTC is missing; `Fault` when the device fails.
-    pub fn new(device: &Device, mesh: RasterMesh<'_>, window: Window, form: RasterForm) -> Result<Self> {
+    pub fn new(device: &Device, mesh: RasterMesh<'_>, window: Viewport, variant: RasterVariant) -> Result<Self> {
         check(mesh.positions.len() as u64 / 3, mesh.triangles, mesh.groups)?;
         if let Some(cut_outs) = mesh.cut_outs {
             check_cut_outs(mesh.triangles.len(), cut_outs)?;
         }
-        let core = Core::new(device, mesh.triangles, mesh.cut_outs)?;
-        let functions = Functions::new(device, form, core.is_cut())?;
-        let facts = functions.named().map(|(name, function)| KernelFacts::of(name, function)).collect::<Result<_>>()?;
-        let (target, triangles) = (form.bytes(&window), size_of_val(mesh.triangles) as u64);
+        let core = RasterPipeline::new(device, mesh.triangles, mesh.cut_outs)?;
+        let functions = RasterFunctions::new(device, variant, core.has_cut_outs())?;
+        let facts = functions
+            .with_names()
+            .map(|(name, function)| KernelAttributes::of(name, function))
+            .collect::<Result<_>>()?;
+        let (target, triangles) = (variant.bytes(&window), size_of_val(mesh.triangles) as u64);
         Ok(Self {
-            form,
+            variant,
             functions,
             facts,
             groups: mesh.groups.to_vec(),
             positions: upload(device, mesh.positions)?,
-            target: room(device, target)?,
+            target: alloc_zeroed(device, target)?,
             core,
             window,
             bytes: vec![("samples", target), ("x", size_of_val(mesh.positions) as u64), ("triangles", triangles)],
@@ -91,7 +96,7 @@ impl Raster {
     /// # Errors
     /// `Fault` when the device fails.
     pub fn keys(&self, device: &Device) -> Result<Vec<u64>> {
-        let mut keys = vec![0; if self.form.depth_only { 0 } else { self.window.pixels() }];
+        let mut keys = vec![0; if self.variant.depth_only { 0 } else { self.window.pixel_count() }];
         // SAFETY: the buffer has a key for each sample unless the target is depth-only.
         unsafe { download(device, address(device, &self.target), &mut keys) }?;
         Ok(keys)
@@ -102,7 +107,7 @@ impl Raster {
     /// # Errors
     /// `Fault` when the device fails.
     pub fn depths(&self, device: &Device) -> Result<Vec<f32>> {
-        let mut depths = vec![0.0; if self.form.depth_only { self.window.pixels() } else { 0 }];
+        let mut depths = vec![0.0; if self.variant.depth_only { self.window.pixel_count() } else { 0 }];
         // SAFETY: the buffer has a depth for each sample when the target is depth-only.
         unsafe { download(device, address(device, &self.target), &mut depths) }?;
         Ok(depths)
@@ -118,10 +123,10 @@ impl Raster {
     }
 }
 
-impl Trial for Raster {
+impl KernelBenchmark for RasterBenchmark {
     fn name(&self) -> String {
         let [width, height] = self.window.size();
-        format!("raster {} {width}x{height}", if self.form.depth_only { "depth" } else { "ids" })
+        format!("raster {} {width}x{height}", if self.variant.depth_only { "depth" } else { "ids" })
     }
 
     fn turns(&self) -> usize {
@@ -129,7 +134,7 @@ impl Trial for Raster {
     }
 
     fn launch(&self, device: &Device, _: usize) -> Result<()> {
-        let pass = Pass {
+        let pass = RasterPass {
             functions: &self.functions,
             groups: &self.groups,
             window: &self.window,
@@ -147,7 +152,7 @@ impl Trial for Raster {
         self.core.launches(&self.groups)
     }
 
-    fn kernels(&self) -> Vec<KernelFacts> {
+    fn kernels(&self) -> Vec<KernelAttributes> {
         self.facts.clone()
     }
 }

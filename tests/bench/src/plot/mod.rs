@@ -8,13 +8,13 @@ pub(super) mod panel;
 
 use std::fmt::Write as _;
 
-use super::Report;
-use super::offers::is_partial;
-use super::table::Row;
-use super::timing::Cache;
+use super::DeformReport;
+use super::cuda_variants::is_partial;
+use super::table::DeformRow;
+use super::timing::CacheState;
 use modalcast_model::deform::Backend;
-use modalcast_model::error::{Result, during};
-use panel::{Look, Panel, Point};
+use modalcast_model::error::{Result, fault_in};
+use panel::{MarkerStyle, Panel, Point};
 
 /// Pixels of the PNG per unit of the SVG.
 const SCALE: f32 = 2.0;
@@ -27,13 +27,13 @@ pub(super) const HEAD: f64 = 94.0;
 pub(super) const LEGEND: f64 = 22.0;
 
 /// Colors that color-blind readers can distinguish, followed by a few more (Okabe and Ito; Tableau).
-pub(super) const COLOURS: [&str; 12] = [
+pub(super) const COLORS: [&str; 12] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d9a", "#8c564b", "#7f7f7f", "#a6a800",
     "#17becf", "#b2182b",
 ];
 
 /// Draws the plot as SVG.
-pub fn svg(report: &Report) -> String {
+pub fn svg(report: &DeformReport) -> String {
     let names = names(&report.rows);
     let loads: Vec<&str> = report.loads.iter().map(|load| load.name.as_str()).collect();
     let columns = match loads.len() {
@@ -86,26 +86,29 @@ pub fn png(svg: &str) -> Result<Vec<u8>> {
     let fonts = options.fontdb_mut();
     fonts.load_font_data(dejavu::sans::regular().to_vec());
     fonts.load_font_data(dejavu::sans::bold().to_vec());
-    let tree = resvg::usvg::Tree::from_str(svg, &options).map_err(during("plot"))?;
+    let tree = resvg::usvg::Tree::from_str(svg, &options).map_err(fault_in("plot"))?;
     let [width, height] = [tree.size().width(), tree.size().height()].map(|side| (side * SCALE).ceil() as u32);
-    let too_large = || during("plot")(format!("{width} x {height} pixels are too many"));
+    let too_large = || fault_in("plot")(format!("{width} x {height} pixels are too many"));
     let mut pixels = resvg::tiny_skia::Pixmap::new(width, height).ok_or_else(too_large)?;
     resvg::render(&tree, resvg::tiny_skia::Transform::from_scale(SCALE, SCALE), &mut pixels.as_mut());
     // The background is opaque, so premultiplied colors equal straight ones.
     let image = image::RgbaImage::from_raw(width, height, pixels.take()).ok_or_else(too_large)?;
     let mut bytes = std::io::Cursor::new(Vec::new());
-    image::DynamicImage::from(image).to_rgb8().write_to(&mut bytes, image::ImageFormat::Png).map_err(during("plot"))?;
+    image::DynamicImage::from(image)
+        .to_rgb8()
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .map_err(fault_in("plot"))?;
     Ok(bytes.into_inner())
 }
 
 /// Warm rows are filled. Variants that compute only a part of a step are excluded from the Pareto front.
-fn point(row: &Row) -> Option<Point<'_>> {
-    let warm = row.cache == Cache::Warm;
+fn point(row: &DeformRow) -> Option<Point<'_>> {
+    let warm = row.cache == CacheState::Warm;
     Some(Point { name: &row.name, at: row.point()?, filled: warm, rival: warm && !is_partial(&row.name) })
 }
 
 /// Each variant once with its backend, in the order of the rows.
-fn names(rows: &[Row]) -> Vec<(&str, Backend)> {
+fn names(rows: &[DeformRow]) -> Vec<(&str, Backend)> {
     let mut names: Vec<(&str, Backend)> = Vec::new();
     for row in rows {
         if !names.iter().any(|(name, _)| *name == row.name) {
@@ -115,10 +118,10 @@ fn names(rows: &[Row]) -> Vec<(&str, Backend)> {
     names
 }
 
-fn look(names: &[(&str, Backend)], name: &str) -> Look {
+fn look(names: &[(&str, Backend)], name: &str) -> MarkerStyle {
     let index = names.iter().position(|(own, _)| *own == name).unwrap_or(0);
     let backend = names.get(index).map_or(Backend::Cpu, |(_, backend)| *backend);
-    Look { colour: COLOURS[index % COLOURS.len()], backend, round: index / COLOURS.len() }
+    MarkerStyle { color: COLORS[index % COLORS.len()], backend, round: index / COLORS.len() }
 }
 
 /// The legend's SVG and its number of lines.
@@ -131,7 +134,7 @@ fn legend(names: &[(&str, Backend)], width: f64) -> (String, usize) {
             (x, line) = (MARGIN + 8.0, line + 1);
         }
         let y = MARGIN + HEAD + line as f64 * LEGEND;
-        panel::mark(&mut out, (x + 6.0, y - 4.0), look, &panel::filled(look.colour));
+        panel::mark(&mut out, (x + 6.0, y - 4.0), look, &panel::filled(look.color));
         text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
         x += wide + 10.0;
     }
@@ -171,20 +174,20 @@ mod tests {
     #[test]
     fn variant_has_the_same_color_in_every_panel() {
         let rows = [
-            row("a", "x", Cache::Warm, (1.0, 1.0)),
-            row("b", "y", Cache::Warm, (1.0, 1.0)),
-            row("b", "x", Cache::Cold, (1.0, 1.0)),
+            row("a", "x", CacheState::Warm, (1.0, 1.0)),
+            row("b", "y", CacheState::Warm, (1.0, 1.0)),
+            row("b", "x", CacheState::Cold, (1.0, 1.0)),
         ];
         let names = names(&rows);
         assert_eq!(names, [("x", Backend::Cpu), ("y", Backend::Cpu)]);
-        assert_ne!(look(&names, "x").colour, look(&names, "y").colour);
+        assert_ne!(look(&names, "x").color, look(&names, "y").color);
     }
 
     #[test]
     fn thirty_six_device_variants_have_distinct_marks() {
         let names: Vec<String> = (0..36).map(|index| index.to_string()).collect();
         let list: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
-        let looks: Vec<Look> = names.iter().map(|name| look(&list, name)).collect();
+        let looks: Vec<MarkerStyle> = names.iter().map(|name| look(&list, name)).collect();
         assert!((0..36).all(|one| (0..one).all(|other| looks[one] != looks[other])));
     }
 }

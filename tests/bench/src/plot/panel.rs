@@ -50,7 +50,7 @@ impl<'a> Panel<'a> {
         Self { corner, title, words, points, time, error }
     }
 
-    pub(crate) fn draw(&self, out: &mut String, look: impl Fn(&str) -> Look) {
+    pub(crate) fn draw(&self, out: &mut String, look: impl Fn(&str) -> MarkerStyle) {
         self.frame(out);
         let places: Vec<(f64, f64)> = self.points.iter().map(|point| self.place(point.at.0, point.at.1)).collect();
         let front = self.front();
@@ -74,7 +74,7 @@ impl<'a> Panel<'a> {
         for full in [false, true] {
             for (point, place) in self.points.iter().zip(&places).filter(|(point, _)| point.filled == full) {
                 let look = look(point.name);
-                let style = if full { filled(look.colour) } else { hollow(look.colour) };
+                let style = if full { filled(look.color) } else { hollow(look.color) };
                 mark(out, *place, look, &style);
             }
         }
@@ -136,7 +136,7 @@ impl<'a> Panel<'a> {
     }
 
     /// Labels the points of the front, and all filled points when there are few.
-    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], look: &impl Fn(&str) -> Look) {
+    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], look: &impl Fn(&str) -> MarkerStyle) {
         let mut taken: Vec<Area> = places.iter().map(|(x, y)| (x - 7.0, y - 7.0, 14.0, 14.0)).collect();
         let few = self.points.len() <= 8;
         let named = |at: &usize| front.contains(at) || (few && self.points[*at].filled);
@@ -144,7 +144,7 @@ impl<'a> Panel<'a> {
             let name = self.points[at].name;
             // A label without free space is omitted; the legend names its point too.
             if let Some(area) = self.room(places[at], width_of(name, LETTERS), &taken) {
-                let fill = look(name).colour;
+                let fill = look(name).color;
                 let style = format!(
                     "font-size=\"{LETTERS}\" fill=\"{fill}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
                 );
@@ -182,25 +182,25 @@ pub(crate) fn width_of(words: &str, size: f64) -> f64 {
     0.61 * size * words.chars().count() as f64
 }
 
-pub(crate) fn filled(colour: &str) -> String {
-    format!("fill=\"{colour}\" stroke=\"#ffffff\" stroke-width=\"0.8\"")
+pub(crate) fn filled(color: &str) -> String {
+    format!("fill=\"{color}\" stroke=\"#ffffff\" stroke-width=\"0.8\"")
 }
 
-fn hollow(colour: &str) -> String {
-    format!("fill=\"#fafafa\" stroke=\"{colour}\" stroke-width=\"1.8\"")
+fn hollow(color: &str) -> String {
+    format!("fill=\"#fafafa\" stroke=\"{color}\" stroke-width=\"1.8\"")
 }
 
 /// Color and shape of a mark, unique per variant of a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Look {
-    pub(crate) colour: &'static str,
+pub(crate) struct MarkerStyle {
+    pub(crate) color: &'static str,
     pub(crate) backend: Backend,
     /// Number of times that all colors were used before.
     pub(crate) round: usize,
 }
 
 /// Draws the mark of a variant at a point.
-pub(crate) fn mark(out: &mut String, (x, y): (f64, f64), look: Look, style: &str) {
+pub(crate) fn mark(out: &mut String, (x, y): (f64, f64), look: MarkerStyle, style: &str) {
     let shape = match (look.backend, look.round % 3) {
         (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {style}/>"),
         (Backend::Reference, _) => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {style}/>", y - 6.0),
@@ -231,7 +231,7 @@ mod tests {
         let panel = Panel::new((0.0, 0.0), "a", ["time", "error"], points);
         assert_eq!(panel.front(), [1, 2]);
         let mut out = String::new();
-        panel.draw(&mut out, |_| Look { colour: "#0072b2", backend: Backend::Cpu, round: 0 });
+        panel.draw(&mut out, |_| MarkerStyle { color: "#0072b2", backend: Backend::Cpu, round: 0 });
         for name in ["first", "second", "beaten"] {
             assert!(out.contains(&format!(">{name}</text>")), "{name}");
         }

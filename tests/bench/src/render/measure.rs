@@ -6,21 +6,21 @@ use std::time::Instant;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use super::bare::{self, Bare, Beside};
-use super::loads::{Kind, Stage};
-use super::metrics::{self, Flicker, Light, Spread};
+use super::harness::{HarnessScene, PassTime, RenderHarness, Size};
+use super::image_files::{self, ImageFile};
+use super::metrics::{self, ErrorDistribution, Flicker, LightErrors};
+use super::minimal_passes::{self, FrameBaseline, MinimalPasses};
 use super::packing::{Packing, packed};
-use super::patience::{PATIENCE, Patience};
-use super::picture::{Detail, Picture, Term, trace};
-use super::pictures::{self, File};
-use super::soup::Soup;
-use super::studio::{Pass, Set, Size, Studio};
-use super::variants::{Aim, Bounds, Method, Variant};
-use super::view::View;
-use super::{Entry, Request, Texels, meter};
+use super::ray_scene::RayScene;
+use super::reference_image::{ReferenceImage, SampleCounts, SunTerm, trace};
+use super::reference_view::View;
+use super::time_budget::{STEP_TIME_BUDGET, TimeBudget};
+use super::variants::{ErrorLimits, ReferenceKind, RenderVariant, ShadowVariant};
+use super::workloads::{AnimatedScene, RenderWorkload};
+use super::{RenderReportOptions, RenderWorkloadSummary, ShadowTexelSize, light_meter};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Camera, Culling, Look, Scene, Shadow};
-use modalcast_render::{Culled, Image, shadow_texel};
+use modalcast_model::scene::{Camera, Culling, RenderSettings, Scene, ShadowSettings};
+use modalcast_render::{FrameCullStats, FrameImage, shadow_texel_axes};
 
 /// Step of the motion that still pictures show.
 pub(super) const STILL: usize = 10;
@@ -31,17 +31,17 @@ const SMALLER: u32 = 4;
 
 /// Results of one variant on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Row {
+pub struct RenderRow {
     pub load: String,
     pub name: String,
-    pub method: Method,
-    pub shadow: Option<Shadow>,
+    pub method: ShadowVariant,
+    pub shadow: Option<ShadowSettings>,
     /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
     /// Culling of the variant's look.
     pub culling: Culling,
     /// Bounds on the error against the intended result.
-    pub bounds: Bounds,
+    pub bounds: ErrorLimits,
     /// Whether the variant is within its bounds.
     pub passed: bool,
     /// Whether the variant is included to show a failure. The report fails if it passes.
@@ -49,19 +49,21 @@ pub struct Row {
     /// Reasons why it failed.
     pub faults: Vec<String>,
     /// Color errors against one ray per sample to the sun, which is exact for a point light.
-    pub colour: Spread,
+    #[serde(rename = "colour")]
+    pub color: ErrorDistribution,
     /// Color errors against the intended result.
-    pub colour_of_aim: Spread,
+    #[serde(rename = "colour_of_aim")]
+    pub color_of_reference: ErrorDistribution,
     /// Sun visibility against the hard shadow.
-    pub light: Light,
+    pub light: LightErrors,
     /// Sun visibility against the intended result.
-    pub light_of_aim: Light,
+    pub light_of_aim: LightErrors,
     /// `None` when the variant failed or flicker was skipped.
-    pub flicker: Option<Spread>,
+    pub flicker: Option<ErrorDistribution>,
     /// Reason why a variant that passed has no flicker.
     pub no_flicker: Option<String>,
     /// Times per pass; "frame" is the sum without readback. Empty when the variant failed.
-    pub passes: Vec<Pass>,
+    pub passes: Vec<PassTime>,
     /// Device memory of the scene.
     pub bytes: u64,
     /// Part of `bytes` that the shadow takes.
@@ -71,10 +73,10 @@ pub struct Row {
     pub samples: u32,
     pub draws: usize,
     /// Culling counts of the last timed frame, where triangles are culled.
-    pub culled: Option<Culled>,
+    pub culled: Option<FrameCullStats>,
 }
 
-impl Row {
+impl RenderRow {
     /// Whether it passed or failed as stated.
     pub const fn as_stated(&self) -> bool {
         self.passed != self.to_fail
@@ -88,43 +90,43 @@ impl Row {
 
 /// References of a load's still picture.
 struct References {
-    hard: Picture,
+    hard: ReferenceImage,
     /// The intended result of each variant.
-    aims: Vec<Picture>,
-    texels: Option<Texels>,
+    aims: Vec<ReferenceImage>,
+    texels: Option<ShadowTexelSize>,
 }
 
 /// Data that all variants of a load share.
-struct Job<'a> {
-    request: &'a Request,
-    stage: Stage,
+struct WorkloadContext<'a> {
+    request: &'a RenderReportOptions,
+    stage: AnimatedScene,
     camera: Camera,
-    variants: Vec<Variant>,
+    variants: Vec<RenderVariant>,
     references: References,
     /// Light-meter image of the still picture without shadows.
-    bright: Image,
-    moving: Moving,
+    bright: FrameImage,
+    moving: MovingReferences,
 }
 
 /// References of the moving scene per step, unshadowed and with hard shadows; or the reason why there are none.
-type Moving = std::result::Result<Vec<[Picture; 2]>, String>;
+type MovingReferences = std::result::Result<Vec<[ReferenceImage; 2]>, String>;
 
 /// All results of one load.
-pub(super) struct Measured {
-    pub(super) entry: Entry,
-    pub(super) rows: Vec<Row>,
+pub(super) struct WorkloadResult {
+    pub(super) entry: RenderWorkloadSummary,
+    pub(super) rows: Vec<RenderRow>,
     /// `None` when there is no row to compare it with.
-    pub(super) bare: Option<Bare>,
-    pub(super) files: Vec<File>,
+    pub(super) bare: Option<MinimalPasses>,
+    pub(super) files: Vec<ImageFile>,
 }
 
 /// Measures every requested variant on one load.
 pub(super) fn load(
-    studio: &mut Studio,
-    request: &Request,
-    kind: Kind,
+    studio: &mut RenderHarness,
+    request: &RenderReportOptions,
+    kind: RenderWorkload,
     progress: &mut dyn FnMut(&str),
-) -> Result<Measured> {
+) -> Result<WorkloadResult> {
     let stage = kind.stage()?;
     let camera = stage.camera(request.size);
     let mut variants = request.wanted();
@@ -135,9 +137,9 @@ pub(super) fn load(
     let reference_ms = begin.elapsed().as_secs_f64() * 1e3;
     progress(&format!("{}: tracing the moving scene", stage.name));
     let moving = moving(studio, request, &stage)?;
-    let unlit = meter::relit(&stage.scene, Look { shadow: None, ..stage.scene.look })?;
-    let bright = frame(studio, &meter::meter(&unlit)?, &stage, request)?;
-    let job = Job { request, stage, camera, variants, references, bright, moving };
+    let unlit = light_meter::relit(&stage.scene, RenderSettings { shadow: None, ..stage.scene.look })?;
+    let bright = frame(studio, &light_meter::meter(&unlit)?, &stage, request)?;
+    let job = WorkloadContext { request, stage, camera, variants, references, bright, moving };
     let mut files = vec![job.reference_file("hard", &job.references.hard)?];
     files.push(job.light_file()?);
     let mut rows = Vec::new();
@@ -149,41 +151,41 @@ pub(super) fn load(
     }
     progress(&format!("{}: bare passes", job.stage.name));
     let bare = job.bare(studio, &rows)?;
-    Ok(Measured { entry: job.entry(reference_ms), rows, bare, files })
+    Ok(WorkloadResult { entry: job.entry(reference_ms), rows, bare, files })
 }
 
-fn detail(request: &Request) -> Detail {
-    if request.quick { Detail::QUICK } else { Detail::FULL }
+fn detail(request: &RenderReportOptions) -> SampleCounts {
+    if request.quick { SampleCounts::QUICK } else { SampleCounts::FULL }
 }
 
 fn references(
-    studio: &mut Studio,
-    request: &Request,
-    stage: &Stage,
+    studio: &mut RenderHarness,
+    request: &RenderReportOptions,
+    stage: &AnimatedScene,
     camera: Camera,
-    variants: &[Variant],
+    variants: &[RenderVariant],
 ) -> Result<References> {
     let mut set = studio.set(&stage.scene)?;
     studio.pose(&mut set, &stage.state(STILL))?;
     let shot = set.shot(camera, request.size);
-    let soup = Soup::new(&stage.scene, set.surface()?);
+    let ray_scene = RayScene::new(&stage.scene, set.surface()?);
     let view = View::new(set.scene(), &shot);
-    let mut terms = vec![Term::Hard];
+    let mut terms = vec![SunTerm::Hard];
     for variant in variants {
-        let scene = meter::relit(&stage.scene, variant.look(stage.scene.look))?;
-        terms.push(term(variant, shadow_texel(&scene, &shot)));
+        let scene = light_meter::relit(&stage.scene, variant.look(stage.scene.look))?;
+        terms.push(term(variant, shadow_texel_axes(&scene, &shot)));
     }
-    let mut pictures = trace(&soup, &view, &terms, detail(request));
-    studio.strike(set);
+    let mut pictures = trace(&ray_scene, &view, &terms, detail(request));
+    studio.unload(set);
     let aims = pictures.split_off(1);
-    Ok(References { hard: pictures.pop().unwrap_or_default(), aims, texels: Texels::of(&stage.scene, &shot) })
+    Ok(References { hard: pictures.pop().unwrap_or_default(), aims, texels: ShadowTexelSize::of(&stage.scene, &shot) })
 }
 
-fn term(variant: &Variant, texel: Option<[Vector3<f64>; 2]>) -> Term {
+fn term(variant: &RenderVariant, texel: Option<[Vector3<f64>; 2]>) -> SunTerm {
     match (variant.aim, texel) {
-        (Aim::Hard, _) => Term::Hard,
-        (Aim::Filtered { texels }, Some(texel)) => Term::Filtered(texel.map(|side| side * texels)),
-        _ => Term::Unshadowed,
+        (ReferenceKind::Hard, _) => SunTerm::Hard,
+        (ReferenceKind::Filtered { texels }, Some(texel)) => SunTerm::Filtered(texel.map(|side| side * texels)),
+        _ => SunTerm::Unshadowed,
     }
 }
 
@@ -193,46 +195,55 @@ fn small(size: Size) -> Size {
 }
 
 /// Traces the references of every step, with a quarter of a still picture's samples.
-fn moving(studio: &mut Studio, request: &Request, stage: &Stage) -> Result<Moving> {
+fn moving(
+    studio: &mut RenderHarness,
+    request: &RenderReportOptions,
+    stage: &AnimatedScene,
+) -> Result<MovingReferences> {
     let size = small(request.size);
     let camera = stage.camera(size);
     let mut set = studio.set(&stage.scene)?;
-    let (mut all, mut soup, mut too_long) = (Vec::new(), None::<Soup>, None);
-    let mut patience = Patience::new(PATIENCE, STEPS);
+    let (mut all, mut ray_scene, mut too_long) = (Vec::new(), None::<RayScene>, None);
+    let mut time_budget = TimeBudget::new(STEP_TIME_BUDGET, STEPS);
     for step in 0..STEPS {
         studio.pose(&mut set, &stage.state(step))?;
         let view = View::new(set.scene(), &set.shot(camera, size));
-        let own = match soup.take() {
-            Some(soup) => soup.moved(&stage.scene, set.surface()?),
-            None => Soup::new(&stage.scene, set.surface()?),
+        let own = match ray_scene.take() {
+            Some(ray_scene) => ray_scene.moved(&stage.scene, set.surface()?),
+            None => RayScene::new(&stage.scene, set.surface()?),
         };
-        let detail = Detail { taps: 1, ..Detail::QUICK };
-        if let Ok(pair) = trace(&own, &view, &[Term::Unshadowed, Term::Hard], detail).try_into() {
+        let detail = SampleCounts { taps: 1, ..SampleCounts::QUICK };
+        if let Ok(pair) = trace(&own, &view, &[SunTerm::Unshadowed, SunTerm::Hard], detail).try_into() {
             all.push(pair);
         }
-        soup = Some(own);
-        too_long = patience.tick("references");
+        ray_scene = Some(own);
+        too_long = time_budget.tick("references");
         if too_long.is_some() {
             break;
         }
     }
-    studio.strike(set);
+    studio.unload(set);
     Ok(too_long.map_or(Ok(all), Err))
 }
 
 /// Draws the still picture of a scene.
-fn frame(studio: &mut Studio, scene: &Arc<Scene>, stage: &Stage, request: &Request) -> Result<Image> {
+fn frame(
+    studio: &mut RenderHarness,
+    scene: &Arc<Scene>,
+    stage: &AnimatedScene,
+    request: &RenderReportOptions,
+) -> Result<FrameImage> {
     let mut set = studio.set(scene)?;
     studio.pose(&mut set, &stage.state(STILL))?;
     let image = studio.draw(&set, stage.camera(request.size), request.size);
-    studio.strike(set);
+    studio.unload(set);
     image
 }
 
-impl Job<'_> {
-    fn entry(&self, reference_ms: f64) -> Entry {
+impl WorkloadContext<'_> {
+    fn entry(&self, reference_ms: f64) -> RenderWorkloadSummary {
         let (layout, detail) = (&self.stage.scene.layout, detail(self.request));
-        Entry {
+        RenderWorkloadSummary {
             name: self.stage.name.clone(),
             vertices: layout.vertices,
             triangles: layout.triangles,
@@ -249,62 +260,62 @@ impl Job<'_> {
 
     /// Compares one variant's still picture and sun visibility with the references; if it passes, measures its times
     /// and flicker.
-    fn measure(&self, studio: &mut Studio, at: usize) -> Result<(Row, File)> {
+    fn measure(&self, studio: &mut RenderHarness, at: usize) -> Result<(RenderRow, ImageFile)> {
         let (variant, aim) = (&self.variants[at], &self.references.aims[at]);
-        let mut scene = meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+        let mut scene = light_meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
         if let Some(packing) = variant.packing {
             scene = packed(&scene, packing)?;
         }
-        let dark = frame(studio, &meter::meter(&scene)?, &self.stage, self.request)?;
-        let lit = meter::read(&dark.rgba, &self.bright.rgba);
+        let dark = frame(studio, &light_meter::meter(&scene)?, &self.stage, self.request)?;
+        let lit = light_meter::read(&dark.rgba, &self.bright.rgba);
         let mut set = studio.set(&scene)?;
         studio.pose(&mut set, &self.stage.state(STILL))?;
         let image = studio.draw(&set, self.camera, self.request.size)?;
-        let ran = studio.renderer.ran().clone();
+        let stats = studio.renderer.stats().clone();
         let mut row = self.compared(variant, (&image, &lit), aim);
-        (row.samples, row.draws) = (ran.samples, ran.draws);
+        (row.samples, row.draws) = (stats.samples, stats.draw_calls);
         let plan = set.buffers.plan();
         row.bytes = plan.bytes();
         let of = |begins: &[&str]| -> u64 {
             let own = plan.textures.iter().filter(|texture| begins.iter().any(|begin| texture.name.starts_with(begin)));
             own.map(|texture| texture.bytes).sum()
         };
-        (row.shadow_bytes, row.image_bytes) = (of(&["shadow"]), of(&["colour", "normal"]));
+        (row.shadow_bytes, row.image_bytes) = (of(&["shadow"]), of(&["color", "normal"]));
         if row.passed {
             row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
-            row.culled = studio.renderer.ran().culled;
+            row.culled = studio.renderer.stats().culled;
             match self.flicker(studio, &mut set, variant)? {
                 Ok(flicker) => row.flicker = Some(flicker),
                 Err(why) => row.no_flicker = Some(why),
             }
         }
-        studio.strike(set);
-        let file = pictures::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colours))?;
+        studio.unload(set);
+        let file = image_files::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colors))?;
         Ok((row, file))
     }
 
     /// Times the passes of the stripped scene, for comparison with frames that use the largest timed variance map with
     /// default settings.
-    fn bare(&self, studio: &mut Studio, rows: &[Row]) -> Result<Option<Bare>> {
-        let usual = |row: &Row| {
-            let own = row.shadow.filter(|own| Shadow { size: own.size, ..Shadow::default() } == *own);
+    fn bare(&self, studio: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
+        let usual = |row: &RenderRow| {
+            let own = row.shadow.filter(|own| ShadowSettings { size: own.size, ..ShadowSettings::default() } == *own);
             own.filter(|_| row.median_us().is_some())
         };
         let Some(shadow) = rows.iter().filter_map(usual).max_by_key(|own| own.size) else { return Ok(None) };
-        let scene = bare::stripped(&self.stage.scene, shadow.size)?;
+        let scene = minimal_passes::stripped(&self.stage.scene, shadow.size)?;
         let passes = self.timed(studio, &scene)?;
-        let ran = studio.renderer.ran().clone();
+        let stats = studio.renderer.stats().clone();
         let timing = |name: &str| passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
         let Some((depth, visibility)) = timing("shadow").zip(timing("visibility")) else { return Ok(None) };
-        if !bare::is_bare(&ran) {
+        if !minimal_passes::is_bare(&stats) {
             tracing::warn!(load = self.stage.name, "the stripped scene was not one draw a pass: no bare passes");
             return Ok(None);
         }
-        let own = Bare {
+        let own = MinimalPasses {
             load: self.stage.name.clone(),
             triangles: scene.layout.triangles,
             map: shadow.size,
-            samples: ran.samples,
+            samples: stats.samples,
             depth,
             visibility,
             unculled: self.beside(studio, rows, (shadow, Culling::None))?,
@@ -314,9 +325,14 @@ impl Job<'_> {
     }
 
     /// Time of a frame with this shadow map and culling: that of an existing row, or a new measurement.
-    fn beside(&self, studio: &mut Studio, rows: &[Row], (shadow, culling): (Shadow, Culling)) -> Result<Beside> {
+    fn beside(
+        &self,
+        studio: &mut RenderHarness,
+        rows: &[RenderRow],
+        (shadow, culling): (ShadowSettings, Culling),
+    ) -> Result<FrameBaseline> {
         // A row with the load's own look may not have culled anything.
-        let is = |row: &&Row| {
+        let is = |row: &&RenderRow| {
             let culls_so = row.culling == culling || culling == Culling::None && row.culled.is_none();
             row.shadow == Some(shadow) && culls_so
         };
@@ -324,32 +340,37 @@ impl Job<'_> {
         let (name, frame_us) = match found {
             Some(found) => found,
             None => {
-                let look = Look { shadow: Some(shadow), culling, ..self.stage.scene.look };
-                let passes = self.timed(studio, &meter::relit(&self.stage.scene, look)?)?;
+                let look = RenderSettings { shadow: Some(shadow), culling, ..self.stage.scene.look };
+                let passes = self.timed(studio, &light_meter::relit(&self.stage.scene, look)?)?;
                 let frame = passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
                 (format!("variance {}, blur {}", shadow.size, shadow.blur), frame)
             }
         };
         let way = if culling == Culling::None { "without culling" } else { "as the load culls" };
-        Ok(Beside { name: format!("{name}: {way}"), frame_us, beyond_us: 0.0 })
+        Ok(FrameBaseline { name: format!("{name}: {way}"), frame_us, beyond_us: 0.0 })
     }
 
     /// Times the passes of the still picture of a scene.
-    fn timed(&self, studio: &mut Studio, scene: &Arc<Scene>) -> Result<Vec<Pass>> {
+    fn timed(&self, studio: &mut RenderHarness, scene: &Arc<Scene>) -> Result<Vec<PassTime>> {
         let mut set = studio.set(scene)?;
         studio.pose(&mut set, &self.stage.state(STILL))?;
         let passes = studio.time(&set, self.camera, self.request.size, self.request.replays);
-        studio.strike(set);
+        studio.unload(set);
         passes
     }
 
-    fn compared(&self, variant: &Variant, (image, lit): (&Image, &[Option<f32>]), aim: &Picture) -> Row {
+    fn compared(
+        &self,
+        variant: &RenderVariant,
+        (image, lit): (&FrameImage, &[Option<f32>]),
+        aim: &ReferenceImage,
+    ) -> RenderRow {
         let hard = &self.references.hard;
-        let colour_of_aim = metrics::colours(&image.rgba, &aim.colours);
+        let color_of_reference = metrics::colors(&image.rgba, &aim.colors);
         let light_of_aim = metrics::light(lit, &aim.light);
         let bounds = variant.bounds(self.stage.kind);
-        let faults = faults(&colour_of_aim, &light_of_aim, &bounds);
-        Row {
+        let faults = faults(&color_of_reference, &light_of_aim, &bounds);
+        RenderRow {
             load: self.stage.name.clone(),
             name: variant.name.clone(),
             method: variant.method,
@@ -360,8 +381,8 @@ impl Job<'_> {
             passed: faults.is_empty(),
             to_fail: variant.is_to_fail(self.stage.kind),
             faults,
-            colour: metrics::colours(&image.rgba, &hard.colours),
-            colour_of_aim,
+            color: metrics::colors(&image.rgba, &hard.colors),
+            color_of_reference,
             light: metrics::light(lit, &hard.light),
             light_of_aim,
             flicker: None,
@@ -379,10 +400,10 @@ impl Job<'_> {
     /// The flicker of a variant, or the reason why it was skipped.
     fn flicker(
         &self,
-        studio: &mut Studio,
-        set: &mut Set,
-        variant: &Variant,
-    ) -> Result<std::result::Result<Spread, String>> {
+        studio: &mut RenderHarness,
+        set: &mut HarnessScene,
+        variant: &RenderVariant,
+    ) -> Result<std::result::Result<ErrorDistribution, String>> {
         let moving = match &self.moving {
             Ok(moving) => moving,
             Err(why) => return Ok(Err(why.clone())),
@@ -390,13 +411,13 @@ impl Job<'_> {
         let size = small(self.request.size);
         let camera = self.stage.camera(size);
         let mut flicker = Flicker::default();
-        let mut patience = Patience::new(PATIENCE, STEPS);
+        let mut time_budget = TimeBudget::new(STEP_TIME_BUDGET, STEPS);
         for (step, [unshadowed, hard]) in moving.iter().enumerate() {
             studio.pose(set, &self.stage.state(step))?;
             let image = studio.draw(set, camera, size)?;
-            let reference = if variant.aim == Aim::Unshadowed { unshadowed } else { hard };
-            flicker.push(&image.rgba, &reference.colours);
-            if let Some(why) = patience.tick("frames") {
+            let reference = if variant.aim == ReferenceKind::Unshadowed { unshadowed } else { hard };
+            flicker.push(&image.rgba, &reference.colors);
+            if let Some(why) = time_budget.tick("frames") {
                 return Ok(Err(why));
             }
         }
@@ -407,22 +428,22 @@ impl Job<'_> {
         format!("{}-{}", self.stage.name, what.replace(", ", "-").replace(' ', "-"))
     }
 
-    fn reference_file(&self, what: &str, picture: &Picture) -> Result<File> {
-        pictures::picture(&self.file_name(what), self.request.size, &picture.colours)
+    fn reference_file(&self, what: &str, picture: &ReferenceImage) -> Result<ImageFile> {
+        image_files::picture(&self.file_name(what), self.request.size, &picture.colors)
     }
 
     /// Sun visibility of the hard reference as a gray image; blue where it is undefined.
-    fn light_file(&self) -> Result<File> {
+    fn light_file(&self) -> Result<ImageFile> {
         let shade = |light: &Option<f32>| light.map_or([60.0, 70.0, 110.0], |light| [255.0 * light; 3]);
-        let colours: Vec<[f32; 3]> = self.references.hard.light.iter().map(shade).collect();
-        pictures::picture(&self.file_name("hard light"), self.request.size, &colours)
+        let colors: Vec<[f32; 3]> = self.references.hard.light.iter().map(shade).collect();
+        image_files::picture(&self.file_name("hard light"), self.request.size, &colors)
     }
 }
 
 /// Descriptions of the exceeded bounds.
-fn faults(colour: &Spread, light: &Light, bounds: &Bounds) -> Vec<String> {
+fn faults(color: &ErrorDistribution, light: &LightErrors, bounds: &ErrorLimits) -> Vec<String> {
     let found = [
-        ("mean error of colour", Some(colour.mean), bounds.mean_colour),
+        ("mean error of colour", Some(color.mean), bounds.mean_color),
         ("mean error of light", Some(light.all.mean), bounds.mean_light),
         ("mean light in the umbra", light.in_umbra, bounds.bleeding),
         ("mean light lost outside of shadows", light.lost, bounds.lost),
@@ -436,7 +457,7 @@ fn faults(colour: &Spread, light: &Light, bounds: &Bounds) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::variants::BOUNDS;
+    use super::super::variants::ERROR_LIMITS;
     use super::*;
 
     #[test]
@@ -444,14 +465,16 @@ mod tests {
         let shadow = |first: usize| -> Vec<Option<f32>> {
             (0..1000).map(|at| Some(if (first..first + 10).contains(&at) { 0.0 } else { 1.0 })).collect()
         };
-        let judged = |own: &[Option<f32>]| faults(&Spread::default(), &metrics::light(own, &shadow(100)), &BOUNDS);
+        let judged = |own: &[Option<f32>]| {
+            faults(&ErrorDistribution::default(), &metrics::light(own, &shadow(100)), &ERROR_LIMITS)
+        };
         assert_eq!(judged(&shadow(100)), Vec::<String>::new(), "control: the right one");
         assert_eq!(judged(&shadow(102)), Vec::<String>::new(), "a fifth of it beside its place is within the bound");
         for wrong in [shadow(200), vec![Some(1.0); 1000], shadow(105)] {
             assert!(judged(&wrong)[0].starts_with("mean light in the umbra"), "{:?}", judged(&wrong));
         }
         assert!(judged(&vec![Some(0.5); 1000]).iter().any(|fault| fault.starts_with("mean light lost")));
-        let loud = Spread { mean: f64::NAN, ..Spread::default() };
-        assert_eq!(faults(&loud, &Light::default(), &BOUNDS).len(), 1, "what is no number is a fault");
+        let loud = ErrorDistribution { mean: f64::NAN, ..ErrorDistribution::default() };
+        assert_eq!(faults(&loud, &LightErrors::default(), &ERROR_LIMITS).len(), 1, "what is no number is a fault");
     }
 }

@@ -11,14 +11,14 @@ const UMBRA: f32 = 1e-6;
 
 /// Mean, 99th percentile and maximum of a set of numbers; all 0 for an empty set.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Spread {
+pub struct ErrorDistribution {
     pub mean: f64,
     pub p99: f64,
     pub largest: f64,
     pub count: usize,
 }
 
-impl Spread {
+impl ErrorDistribution {
     fn of(mut values: Vec<f32>) -> Self {
         values.sort_by(f32::total_cmp);
         let count = values.len();
@@ -31,8 +31,8 @@ impl Spread {
 }
 
 /// Color errors over all pixels, of 255. `rendered` is RGBA, `reference` sRGB of 255.
-pub fn colours(rendered: &[u8], reference: &[[f32; 3]]) -> Spread {
-    Spread::of(differences(rendered, reference).collect())
+pub fn colors(rendered: &[u8], reference: &[[f32; 3]]) -> ErrorDistribution {
+    ErrorDistribution::of(differences(rendered, reference).collect())
 }
 
 /// The largest difference of the three channels, per pixel.
@@ -45,10 +45,10 @@ pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl It
 
 /// Errors of the sun visibility over the pixels where both pictures define it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Light {
-    pub all: Spread,
+pub struct LightErrors {
+    pub all: ErrorDistribution,
     /// Over the pixels in the reference's penumbra alone.
-    pub penumbra: Spread,
+    pub penumbra: ErrorDistribution,
     /// Light bleeding: mean sun visibility in the reference's umbra. `None` without such pixels.
     pub in_umbra: Option<f64>,
     pub umbra_pixels: usize,
@@ -59,7 +59,7 @@ pub struct Light {
 }
 
 /// Compares the sun visibility pixel by pixel; pixels where either is undefined are skipped.
-pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Light {
+pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> LightErrors {
     let pairs: Vec<(f32, f32)> = rendered.iter().zip(reference).filter_map(|(own, wanted)| own.zip(*wanted)).collect();
     let error = |(own, wanted): &(f32, f32)| (own - wanted).abs();
     let soft = |(_, wanted): &&(f32, f32)| (PENUMBRA..=1.0 - PENUMBRA).contains(wanted);
@@ -68,9 +68,9 @@ pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Light {
     let lost: Vec<f64> = whole.map(|pair| f64::from(pair.1 - pair.0)).collect();
     let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
     let bias = pairs.iter().map(|(own, wanted)| f64::from(own - wanted)).sum::<f64>();
-    Light {
-        all: Spread::of(pairs.iter().map(error).collect()),
-        penumbra: Spread::of(pairs.iter().filter(soft).map(error).collect()),
+    LightErrors {
+        all: ErrorDistribution::of(pairs.iter().map(error).collect()),
+        penumbra: ErrorDistribution::of(pairs.iter().filter(soft).map(error).collect()),
         in_umbra: mean(&umbra),
         umbra_pixels: umbra.len(),
         lost: mean(&lost),
@@ -101,8 +101,8 @@ impl Flicker {
     }
 
     /// The result over all pixels of all pairs of consecutive frames.
-    pub fn spread(self) -> Spread {
-        Spread::of(self.changes)
+    pub fn spread(self) -> ErrorDistribution {
+        ErrorDistribution::of(self.changes)
     }
 }
 
@@ -110,23 +110,23 @@ impl Flicker {
 mod tests {
     use super::*;
 
-    fn grey(levels: impl IntoIterator<Item = u8>) -> Vec<u8> {
+    fn gray(levels: impl IntoIterator<Item = u8>) -> Vec<u8> {
         levels.into_iter().flat_map(|level| [level, level, level, 255]).collect()
     }
 
     #[test]
     fn one_wrong_pixel_in_a_hundred_gives_known_errors() {
         let reference = vec![[100.0; 3]; 100];
-        assert_eq!(colours(&grey([100; 100]), &reference).largest, 0.0, "control: equal pictures");
-        let one = grey((0..100).map(|at| if at == 7 { 150 } else { 100 }));
-        let found = colours(&one, &reference);
+        assert_eq!(colors(&gray([100; 100]), &reference).largest, 0.0, "control: equal pictures");
+        let one = gray((0..100).map(|at| if at == 7 { 150 } else { 100 }));
+        let found = colors(&one, &reference);
         assert_eq!((found.mean, found.p99, found.largest, found.count), (0.5, 0.0, 50.0, 100));
-        let two = grey((0..100).map(|at| if at < 2 { 150 } else { 100 }));
-        assert_eq!(colours(&two, &reference).p99, 50.0, "two in a hundred reach the percentile");
-        let mut tinted = grey([100; 100]);
+        let two = gray((0..100).map(|at| if at < 2 { 150 } else { 100 }));
+        assert_eq!(colors(&two, &reference).p99, 50.0, "two in a hundred reach the percentile");
+        let mut tinted = gray([100; 100]);
         tinted[1] = 90;
-        assert_eq!(colours(&tinted, &reference).largest, 10.0, "one channel counts");
-        assert_eq!(colours(&[], &[]), Spread::default());
+        assert_eq!(colors(&tinted, &reference).largest, 10.0, "one channel counts");
+        assert_eq!(colors(&[], &[]), ErrorDistribution::default());
     }
 
     #[test]
@@ -163,7 +163,7 @@ mod tests {
     fn only_changes_without_the_reference_flicker() {
         let flicker = |rendered: &dyn Fn(usize) -> u8, reference: &dyn Fn(usize) -> f32| {
             let mut flicker = Flicker::default();
-            (0..60).for_each(|step| flicker.push(&grey([rendered(step); 4]), &[[reference(step); 3]; 4]));
+            (0..60).for_each(|step| flicker.push(&gray([rendered(step); 4]), &[[reference(step); 3]; 4]));
             flicker.spread()
         };
         let still = flicker(&|_| 90, &|_| 100.0);

@@ -6,7 +6,7 @@
 //! variant passes.
 //!
 //! - [`loads`], [`variants`]: the scenes, and the ways to draw them.
-//! - `soup`, `paint`, `texels`, `view`, `shade`, `pattern`, `picture`: the references. 64 samples per pixel, in f64
+//! - `ray_scene`, `paint`, `texels`, `view`, `shade`, `sample_pattern`, `picture`: the references. 64 samples per pixel, in f64
 //!   except for the boxes of the BVH. Opaque surfaces and cut-outs by their nearest point, transparent ones sorted by
 //!   depth along every sample. Shadows by one ray per sample to the sun, or by rays distributed over the blur's
 //!   footprint.
@@ -15,67 +15,67 @@
 //! - [`metrics`]: errors, light bleeding, flicker.
 //! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur by compute
 //!   and by fragment shaders.
-//! - `raster`: the bare passes by the CUDA rasterizer and by OpenGL; `paths`: whole frames with either.
+//! - `raster`: the bare passes by the CUDA rasterizer and by OpenGL; `frame_comparison`: whole frames with either.
 //! - [`packing`]: images in one array as in equation 3.13, against arrays by size.
 //! - [`plants`]: the plants of table 4.5, deformed and drawn.
 //! - [`timed`]: frame times of a scene of the user, for comparison with other programs.
 //! - [`figures`]: figures like those of the thesis, for viewing.
 
-mod bare;
-mod beside;
-mod blurs;
+mod blur_comparison;
+mod comparison_tables;
 pub mod figures;
-mod images;
-pub mod loads;
+mod frame_comparison;
+pub mod frame_times;
+mod harness;
+mod image_files;
+mod light_meter;
+mod markdown;
 mod measure;
-mod meter;
 pub mod metrics;
+mod minimal_passes;
 mod output;
 pub mod packing;
-mod page;
-mod paint;
-mod paths;
-mod patience;
-mod pattern;
-mod picture;
-mod pictures;
 pub mod plants;
 mod plot;
-mod raster;
+mod raster_comparison;
+mod ray_scene;
 mod readback;
+mod reference_image;
+mod reference_material;
+mod reference_texture;
+mod reference_view;
+mod sample_pattern;
 mod shade;
-mod soup;
-mod studio;
 #[cfg(test)]
 mod tests;
-mod texels;
-pub mod timed;
+mod texture_panels;
+mod time_budget;
 pub mod variants;
-mod view;
+pub mod workloads;
 
 use serde::Serialize;
 
-pub use self::bare::{Bare, Beside};
-pub use self::blurs::Blurs;
-use self::loads::Kind;
-pub use self::measure::Row;
-pub use self::pictures::File;
-use self::plants::Plant;
-pub use self::raster::{Rastered, Rasters, rasters};
-pub use self::readback::Readback;
-use self::studio::Studio;
-pub use self::studio::{Pass, Size};
-use self::variants::Variant;
-use super::machine::Provenance;
+pub use self::blur_comparison::BlurComparison;
+use self::harness::RenderHarness;
+pub use self::harness::{PassTime, Size};
+pub use self::image_files::ImageFile;
+pub use self::measure::RenderRow;
+pub use self::minimal_passes::{FrameBaseline, MinimalPasses};
+use self::plants::PlantResult;
+pub use self::raster_comparison::{RasterComparison, RasterReport, rasters};
+pub use self::readback::ReadbackRates;
+use self::variants::RenderVariant;
+use self::workloads::RenderWorkload;
+use super::provenance::Provenance;
 use super::wants;
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
-use modalcast_render::{Info, Shot, shadow_texel};
+use modalcast_render::{FrameParams, RendererInfo, shadow_texel_axes};
 
 /// Settings of a report.
 #[derive(Debug, Clone)]
-pub struct Request {
-    pub loads: Vec<Kind>,
+pub struct RenderReportOptions {
+    pub loads: Vec<RenderWorkload>,
     /// Plants of table 4.5 to deform and draw, as indices from 0.
     pub plants: Vec<usize>,
     /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
@@ -87,9 +87,9 @@ pub struct Request {
     pub replays: usize,
 }
 
-impl Request {
+impl RenderReportOptions {
     /// The variants to measure. A quick run has fewer, but includes every variant that is named in full.
-    pub fn wanted(&self) -> Vec<Variant> {
+    pub fn wanted(&self) -> Vec<RenderVariant> {
         let (few, mut all) = (variants::all(self.quick), variants::all(false));
         all.retain(|variant| {
             let is_named = self.variants.contains(&variant.name);
@@ -101,7 +101,7 @@ impl Request {
 
 /// Facts of one load in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Entry {
+pub struct RenderWorkloadSummary {
     pub name: String,
     pub vertices: usize,
     pub triangles: usize,
@@ -113,7 +113,7 @@ pub struct Entry {
     /// Time to trace all references of the still picture.
     pub reference_ms: f64,
     /// Texels of the shadow map of the load's own look; `None` without one.
-    pub texels: Option<Texels>,
+    pub texels: Option<ShadowTexelSize>,
     /// Steps over which flicker was measured.
     pub steps: usize,
     /// Size of the pictures of the moving scene.
@@ -126,54 +126,55 @@ pub struct Entry {
 /// which is fitted to the vertices' extent in light space; `by_corners`: of a map that is fitted to the corners of
 /// their bounds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Texels {
+pub struct ShadowTexelSize {
     pub size: u32,
     pub side: f64,
     pub by_corners: f64,
 }
 
-impl Texels {
-    fn of(scene: &Scene, shot: &Shot) -> Option<Self> {
-        let longer = |shot: &Shot| shadow_texel(scene, shot).map(|sides| sides[0].norm().max(sides[1].norm()));
-        let (side, by_corners) = (longer(shot)?, longer(&Shot { light: None, ..*shot })?);
+impl ShadowTexelSize {
+    fn of(scene: &Scene, shot: &FrameParams) -> Option<Self> {
+        let longer =
+            |shot: &FrameParams| shadow_texel_axes(scene, shot).map(|sides| sides[0].norm().max(sides[1].norm()));
+        let (side, by_corners) = (longer(shot)?, longer(&FrameParams { light: None, ..*shot })?);
         scene.look.shadow.map(|shadow| Self { size: shadow.size, side, by_corners })
     }
 }
 
 /// All results of one run.
 #[derive(Debug, Clone, Serialize)]
-pub struct Report {
+pub struct RenderReport {
     pub made: Provenance,
-    pub renderer: Info,
+    pub renderer: RendererInfo,
     pub size: Size,
     /// Error bounds against the intended result, for rows without tighter ones.
-    pub bounds: variants::Bounds,
-    pub loads: Vec<Entry>,
-    pub rows: Vec<Row>,
+    pub bounds: variants::ErrorLimits,
+    pub loads: Vec<RenderWorkloadSummary>,
+    pub rows: Vec<RenderRow>,
     /// One entry per load.
-    pub readback: Vec<Readback>,
+    pub readback: Vec<ReadbackRates>,
     /// Times of the bare passes on each load.
-    pub bare: Vec<Bare>,
+    pub bare: Vec<MinimalPasses>,
     /// The same passes by CUDA and by OpenGL, where there is a CUDA device.
-    pub raster: Vec<Rastered>,
+    pub raster: Vec<RasterComparison>,
     /// Times of the passes that compute the same moment map by compute and by fragment shaders.
-    pub blurs: Vec<Blurs>,
+    pub blurs: Vec<BlurComparison>,
     /// Plants of table 4.5, deformed and drawn.
-    pub plants: Vec<Plant>,
+    pub plants: Vec<PlantResult>,
     /// Unexpected results, as `load: variant: reason`: variants that failed, and variants that passed although they are
     /// stated to fail.
     pub failed: Vec<String>,
     /// Pictures for viewing.
     #[serde(skip)]
-    pub pictures: Vec<File>,
+    pub pictures: Vec<ImageFile>,
 }
 
 /// Measures everything that is requested; `progress` receives a description of each stage.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene.
-pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Report> {
-    let mut studio = Studio::open()?;
+pub fn render(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RenderReport> {
+    let mut studio = RenderHarness::open()?;
     let (mut loads, mut rows, mut bare, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut readback = Vec::new();
     for kind in &request.loads {
@@ -188,7 +189,7 @@ pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Repor
     }
     let device = plants::device();
     let raster = match &device {
-        Some(device) => raster::measure(&mut studio, device, request, &mut progress)?,
+        Some(device) => raster_comparison::measure(&mut studio, device, request, &mut progress)?,
         None => Vec::new(),
     };
     let mut plants = Vec::new();
@@ -196,20 +197,34 @@ pub fn render(request: &Request, mut progress: impl FnMut(&str)) -> Result<Repor
         progress(&format!("plant-{}", index + 1));
         plants.push(plants::measure(&mut studio, device.as_ref(), request, *index)?);
     }
-    let failed = rows.iter().filter(|row: &&Row| !row.as_stated()).map(why);
-    let failed = failed.chain(raster.iter().filter_map(Rastered::fault)).collect();
-    let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::BOUNDS);
-    let blurs = Blurs::of(&rows);
+    let failed = rows.iter().filter(|row: &&RenderRow| !row.as_stated()).map(why);
+    let failed = failed.chain(raster.iter().filter_map(RasterComparison::fault)).collect();
+    let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::ERROR_LIMITS);
+    let blurs = BlurComparison::of(&rows);
     let size = request.size;
-    Ok(Report { made, renderer, size, bounds, loads, rows, readback, bare, raster, blurs, plants, failed, pictures })
+    Ok(RenderReport {
+        made,
+        renderer,
+        size,
+        bounds,
+        loads,
+        rows,
+        readback,
+        bare,
+        raster,
+        blurs,
+        plants,
+        failed,
+        pictures,
+    })
 }
 
-fn why(row: &Row) -> String {
+fn why(row: &RenderRow) -> String {
     let why = if row.passed { "keeps bounds that it is stated to exceed".into() } else { row.faults.join("; ") };
     format!("{}: {}: {why}", row.load, row.name)
 }
 
-impl Report {
+impl RenderReport {
     /// Whether every variant passed or failed as stated.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use super::plants::Plant;
-use super::{Report, Row, page, plot};
+use super::plants::PlantResult;
+use super::{RenderReport, RenderRow, markdown, plot};
 use crate::plot::png;
 use crate::timing::Timing;
-use modalcast_model::error::{Result, during};
+use modalcast_model::error::{Result, fault_in};
 
 /// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`, or for times the name of the
 /// pass.
@@ -43,8 +43,8 @@ const COLUMNS: [(&str, &str); 55] = [
     ("samples", "/samples"),
     ("draws", "/draws"),
     ("culling", "/culling"),
-    ("listed", "/culled/camera/listed"),
-    ("hidden", "/culled/camera/hidden"),
+    ("listed", "/culled/camera/visible"),
+    ("hidden", "/culled/camera/occluded"),
     ("colour_mean", "/colour/mean"),
     ("colour_p99", "/colour/p99"),
     ("colour_largest", "/colour/largest"),
@@ -70,7 +70,7 @@ const COLUMNS: [(&str, &str); 55] = [
     ("faults", ""),
 ];
 
-impl Report {
+impl RenderReport {
     /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes; rasterizer and blur, both methods each),
     /// `plants.csv`, `report.md`, `report.svg`, `report.png` and `pictures/` into a folder, which is created.
     ///
@@ -78,38 +78,38 @@ impl Report {
     /// `Fault` when a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
         let pictures = folder.join("pictures");
-        std::fs::create_dir_all(&pictures).map_err(during("report"))?;
+        std::fs::create_dir_all(&pictures).map_err(fault_in("report"))?;
         let svg = plot::svg(self);
         let files = [
-            ("report.json", serde_json::to_vec_pretty(self).map_err(during("report"))?),
+            ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
             ("report.csv", csv(&self.rows)?),
             ("passes.csv", passes_csv(self)?),
             ("plants.csv", plants_csv(&self.plants)?),
-            ("report.md", page::markdown(self).into_bytes()),
+            ("report.md", markdown::markdown(self).into_bytes()),
             ("report.png", png(&svg)?),
             ("report.svg", svg.into_bytes()),
         ];
         for (name, bytes) in files {
-            std::fs::write(folder.join(name), bytes).map_err(during("report"))?;
+            std::fs::write(folder.join(name), bytes).map_err(fault_in("report"))?;
         }
         for file in &self.pictures {
-            std::fs::write(pictures.join(&file.name), &file.png).map_err(during("report"))?;
+            std::fs::write(pictures.join(&file.name), &file.png).map_err(fault_in("report"))?;
         }
         Ok(())
     }
 }
 
-fn csv(rows: &[Row]) -> Result<Vec<u8>> {
+fn csv(rows: &[RenderRow]) -> Result<Vec<u8>> {
     let mut lines = Vec::new();
     for row in rows {
-        let value = serde_json::to_value(row).map_err(during("report"))?;
+        let value = serde_json::to_value(row).map_err(fault_in("report"))?;
         lines.push(COLUMNS.map(|column| cell(row, &value, column)));
     }
     table(COLUMNS.map(|(name, _)| name.to_owned()), lines)
 }
 
 /// The CSV of bare passes, rasterizers and blurs: one line each, with the row that it is compared with.
-fn passes_csv(report: &Report) -> Result<Vec<u8>> {
+fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     let head =
         ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
     let mut lines = Vec::new();
@@ -154,12 +154,12 @@ fn passes_csv(report: &Report) -> Result<Vec<u8>> {
 }
 
 /// The CSV of plants, one per line: our figures and those of the thesis.
-fn plants_csv(plants: &[Plant]) -> Result<Vec<u8>> {
+fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let head =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
     let head = head.into_iter().chain(["render_ms", "t_vbr_ms", "frame_ms", "fps", "memory_mb", "o_vbr"]);
     let head = head.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
-    let line = |plant: &Plant| {
+    let line = |plant: &PlantResult| {
         let ms = |timing: Timing| (timing.median_us / 1e3).to_string();
         let printed = plant.thesis.drawn;
         let (backend, shared, full) = (plant.backend.name(), plant.shared, plant.full);
@@ -179,14 +179,14 @@ fn table<L: IntoIterator<Item = String>>(
     lines: impl IntoIterator<Item = L>,
 ) -> Result<Vec<u8>> {
     let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(head).map_err(during("report"))?;
+    writer.write_record(head).map_err(fault_in("report"))?;
     for line in lines {
-        writer.write_record(line).map_err(during("report"))?;
+        writer.write_record(line).map_err(fault_in("report"))?;
     }
-    writer.into_inner().map_err(during("report"))
+    writer.into_inner().map_err(fault_in("report"))
 }
 
-fn cell(row: &Row, value: &Value, (name, place): (&str, &str)) -> String {
+fn cell(row: &RenderRow, value: &Value, (name, place): (&str, &str)) -> String {
     if name == "faults" {
         return row.faults.join("; ");
     }
@@ -209,16 +209,16 @@ fn cell(row: &Row, value: &Value, (name, place): (&str, &str)) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::loads::Kind;
-    use crate::render::meter::relit;
-    use crate::render::studio::{Size, Studio};
-    use modalcast_model::scene::{Bloom, Culling, Look};
+    use crate::render::harness::{RenderHarness, Size};
+    use crate::render::light_meter::relit;
+    use crate::render::workloads::RenderWorkload;
+    use modalcast_model::scene::{Bloom, Culling, RenderSettings};
 
     #[test]
     fn every_pass_has_a_column_and_parts_add_up_to_draw() {
-        let stage = Kind::Triangles(2_000).stage().expect("built");
-        let look = Look { culling: Culling::Depth, bloom: Some(Bloom::default()), ..stage.scene.look };
-        let mut studio = Studio::open().expect("OpenGL");
+        let stage = RenderWorkload::Triangles(2_000).stage().expect("built");
+        let look = RenderSettings { culling: Culling::Occlusion, bloom: Some(Bloom::default()), ..stage.scene.look };
+        let mut studio = RenderHarness::open().expect("OpenGL");
         let mut set = studio.set(&relit(&stage.scene, look).expect("fits")).expect("loads");
         studio.pose(&mut set, &stage.state(0)).expect("poses");
         let size = Size { width: 64, height: 36 };

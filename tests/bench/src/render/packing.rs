@@ -19,7 +19,7 @@ use serde::Serialize;
 
 use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Texture};
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Parts, Scene};
+use modalcast_model::scene::{Scene, SceneParts};
 
 /// Packing of images in arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -45,12 +45,12 @@ pub(super) fn packed(scene: &Scene, packing: Packing) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-fn repeat(parts: &mut Parts, packing: Packing) -> Result<()> {
+fn repeat(parts: &mut SceneParts, packing: Packing) -> Result<()> {
     let largest = |side: fn(&Texture) -> u32| parts.textures.iter().map(side).max().unwrap_or(1);
     let size = [largest(Texture::width), largest(Texture::height)];
     let mut shapes = Vec::new();
     for domain in &mut parts.domains {
-        let image = parts.materials[domain.material].colour_texture.map(|image| &parts.textures[image]);
+        let image = parts.materials[domain.material].color_texture.map(|image| &parts.textures[image]);
         let scale = image.map_or([1.0; 2], |image| scale(image, size, packing));
         shapes.push(Shape::new(wrapped(&parts.shapes[domain.shape].mesh, scale)?, Modes::rigid())?);
         domain.shape = shapes.len() - 1;
@@ -109,11 +109,11 @@ fn wrapped(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::loads::Kind;
+    use crate::render::workloads::RenderWorkload;
 
     #[test]
     fn repeats_small_images_and_scales_uvs_by_equation_3_13() {
-        let scene = Kind::Images.stage().expect("built").scene;
+        let scene = RenderWorkload::Images.stage().expect("built").scene;
         let [printed, whole] =
             [Packing::Repeated, Packing::RepeatedWhole].map(|packing| packed(&scene, packing).expect("packed"));
         let small = scene.textures.iter().position(|image| (image.width(), image.height()) == (25, 15)).expect("there");
@@ -125,7 +125,7 @@ mod tests {
         }
         let largest = |scene: &Scene| {
             let domain =
-                scene.domains.iter().find(|domain| scene.materials[domain.material].colour_texture == Some(small));
+                scene.domains.iter().find(|domain| scene.materials[domain.material].color_texture == Some(small));
             let uvs = &scene.shapes[domain.expect("drawn").shape].mesh.corners().uvs;
             uvs.iter().fold([0.0_f32; 2], |most, uv| [most[0].max(uv[0]), most[1].max(uv[1])])
         };
@@ -140,7 +140,7 @@ mod tests {
         let mesh = |last: f32| {
             let rest = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
             let uvs = vec![[1.0, 0.0], [last, 0.0], [1.0, 1.0]];
-            Mesh::indexed(rest, vec![[0.0, 0.0, 1.0]; 3], uvs, vec![[0, 1, 2]]).expect("a mesh")
+            Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], uvs, vec![[0, 1, 2]]).expect("a mesh")
         };
         assert_eq!(wrapped(&mesh(2.0), [0.5; 2]).expect("stays inside").corners().uvs[1], [0.5, 0.0]);
         assert!(wrapped(&mesh(2.25), [0.5; 2]).is_err());

@@ -12,24 +12,24 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use super::studio::{Size, Studio};
-use super::{Request, meter};
-use crate::loads::{Kind, Load, Size as Scale};
-use crate::motion::Motion;
-use crate::thesis::{PLANTS, Species};
-use crate::timing::{FEWEST, Timing};
+use super::harness::{RenderHarness, Size};
+use super::{RenderReportOptions, light_meter};
+use crate::motion::WorkloadMotion;
+use crate::thesis::{PLANTS, ThesisPlant};
+use crate::timing::{MIN_REPETITIONS, Timing};
+use crate::workloads::{Size as Scale, Workload, WorkloadKind};
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, CudaDeformer, Device, GlBuffers, Role};
-use modalcast_model::deform::{Backend, Deformed, Deformer, Wanted};
-use modalcast_model::error::{Result, during};
-use modalcast_model::scene::{Camera, Look, Scene, Shadow, State};
-use modalcast_render::{SceneBuffers, Shot};
+use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, Device, GlVertexBuffers};
+use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
+use modalcast_model::error::{Result, fault_in};
+use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
+use modalcast_render::{FrameParams, SceneBuffers};
 
 /// Results of one plant, with the figures of the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Plant {
+pub struct PlantResult {
     pub load: String,
-    pub thesis: Species,
+    pub thesis: ThesisPlant,
     /// Whether the plant has the size of its row in table 4.5; only then are the figures comparable.
     pub full: bool,
     pub remarks: Vec<String>,
@@ -67,7 +67,7 @@ pub(super) fn device() -> Option<Arc<Device>> {
 }
 
 /// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
-struct Rig {
+struct PlantSetup {
     deformer: Box<dyn Deformer>,
     /// Device bytes of the deformer in addition to the buffers.
     bytes: u64,
@@ -76,26 +76,26 @@ struct Rig {
 
 /// Measures plant `index`.
 pub(super) fn measure(
-    studio: &mut Studio,
+    studio: &mut RenderHarness,
     device: Option<&Arc<Device>>,
-    request: &Request,
+    request: &RenderReportOptions,
     index: usize,
-) -> Result<Plant> {
+) -> Result<PlantResult> {
     let scale = if request.quick { Scale::Quick } else { Scale::Full };
-    let load = Kind::Plant(index).build(scale)?;
+    let load = WorkloadKind::Plant(index).build(scale)?;
     let map = if request.quick { MAPS.1 } else { MAPS.0 };
-    let shadow = Some(Shadow { size: map, ..Shadow::default() });
-    let scene = meter::relit(&load.scene, Look { shadow, ..load.scene.look })?;
-    let states = states(&Load { scene: Arc::clone(&scene), ..load.clone() });
+    let shadow = Some(ShadowSettings { size: map, ..ShadowSettings::default() });
+    let scene = light_meter::relit(&load.scene, RenderSettings { shadow, ..load.scene.look })?;
+    let states = states(&Workload { scene: Arc::clone(&scene), ..load.clone() });
     let mut rig = rig(studio, device, &scene)?;
     let times = times(studio, &mut rig, &scene, (request.size, request.replays), &states)?;
-    let Rig { deformer, bytes, buffers } = rig;
+    let PlantSetup { deformer, bytes, buffers } = rig;
     let (backend, shared) = (deformer.backend(), deformer.shares_buffers());
     let bytes = bytes + buffers.plan().bytes();
     drop(deformer);
     studio.renderer.unload(buffers);
     let [deform, upload, render, vbr, frame] = times;
-    Ok(Plant {
+    Ok(PlantResult {
         load: load.name,
         thesis: PLANTS[index],
         full: scale == Scale::Full,
@@ -116,70 +116,76 @@ pub(super) fn measure(
     })
 }
 
-fn states(load: &Load) -> Vec<State> {
-    let motion = Motion::new(load, None);
-    let state = |step: usize| State { step: step as u64 + 1, serial: step as u64 + 1, ..motion.step(step).state() };
+fn states(load: &Workload) -> Vec<SceneState> {
+    let motion = WorkloadMotion::new(load, None);
+    let state =
+        |step: usize| SceneState { step: step as u64 + 1, serial: step as u64 + 1, ..motion.step(step).state() };
     (0..STATES).map(state).collect()
 }
 
-fn rig(studio: &mut Studio, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<Rig> {
+fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<PlantSetup> {
     let buffers = studio.renderer.load(scene)?;
     let Some(device) = device else {
-        return Ok(Rig { deformer: Box::new(CpuDeformer::new(scene)), bytes: 0, buffers });
+        return Ok(PlantSetup { deformer: Box::new(CpuDeformer::new(scene)), bytes: 0, buffers });
     };
     let shared = buffers.shared;
-    let gl = GlBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents };
+    let gl = GlVertexBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents };
     let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
     let gl = (draws == Some(Some(device.ordinal()))).then_some(gl);
     let deformer = CudaDeformer::new(device, scene, gl)?;
-    Ok(Rig { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
+    Ok(PlantSetup { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
 }
 
 /// Bytes of a deformer's plan, without outputs in shared buffers.
-fn beside(plan: &gpu::Plan, shared: bool) -> u64 {
-    let outputs = [Role::Positions, Role::Normals, Role::Tangents].map(|role| plan.bytes(role));
+fn beside(plan: &gpu::DeformPlan, shared: bool) -> u64 {
+    let outputs = [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents].map(|role| plan.bytes(role));
     plan.total_bytes() - if shared { outputs.iter().sum() } else { 0 }
 }
 
 /// Times of deforming, uploading, rendering, their sum, and the whole frame.
 fn times(
-    studio: &mut Studio,
-    rig: &mut Rig,
+    studio: &mut RenderHarness,
+    rig: &mut PlantSetup,
     scene: &Arc<Scene>,
     (size, replays): (Size, usize),
-    states: &[State],
+    states: &[SceneState],
 ) -> Result<[Timing; 5]> {
-    let camera = Camera::framing(scene, size.width, size.height);
+    let camera = Camera::fit_to_scene(scene, size.width, size.height);
     let begin = Instant::now();
     let mut warm = 0;
     // Warm-up: the first frames compile and allocate, and clock rates rise.
-    while warm < 2 || (!studio.renderer.info().software && begin.elapsed() < super::studio::WARM_UP) {
+    while warm < 2 || (!studio.renderer.info().software && begin.elapsed() < super::harness::WARM_UP) {
         frame(studio, rig, (camera, size), &states[warm % states.len()])?;
         warm += 1;
     }
     let mut lists: [Vec<f64>; 5] = Default::default();
-    for replay in 0..replays.max(FEWEST) {
+    for replay in 0..replays.max(MIN_REPETITIONS) {
         let times = frame(studio, rig, (camera, size), &states[replay % states.len()])?;
         lists.iter_mut().zip(times).for_each(|(list, time)| list.push(time));
     }
-    let timing = |list: Vec<f64>| Timing::of(list).ok_or_else(|| during("plants")("no frame was drawn"));
+    let timing = |list: Vec<f64>| Timing::of(list).ok_or_else(|| fault_in("plants")("no frame was drawn"));
     let [deform, upload, render, vbr, frame] = lists;
     Ok([timing(deform)?, timing(upload)?, timing(render)?, timing(vbr)?, timing(frame)?])
 }
 
 /// One frame, microseconds, in the order of [`times`].
-fn frame(studio: &mut Studio, rig: &mut Rig, (camera, size): (Camera, Size), state: &State) -> Result<[f64; 5]> {
+fn frame(
+    studio: &mut RenderHarness,
+    rig: &mut PlantSetup,
+    (camera, size): (Camera, Size),
+    state: &SceneState,
+) -> Result<[f64; 5]> {
     let us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
     let whole = Instant::now();
-    let Deformed { bounds, light, .. } = rig.deformer.deform(state)?;
+    let DeformSummary { bounds, light, .. } = rig.deformer.deform(state)?;
     let deform = us(whole);
     let begin = Instant::now();
     let mut upload = 0.0;
     if !rig.deformer.shares_buffers() {
-        studio.renderer.upload(&rig.buffers, rig.deformer.read(Wanted::VERTICES)?)?;
+        studio.renderer.upload(&rig.buffers, rig.deformer.read(VertexAttributes::VERTICES)?)?;
         upload = us(begin);
     }
-    let shot = Shot { camera, width: size.width, height: size.height, bounds, light };
+    let shot = FrameParams { camera, width: size.width, height: size.height, bounds, light };
     let image = studio.renderer.draw(&rig.buffers, &shot)?;
     let frame = us(whole);
     let passes = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));
@@ -193,8 +199,8 @@ mod tests {
 
     #[test]
     fn deforms_and_draws_a_plant_with_consistent_times() {
-        let mut studio = Studio::open().expect("OpenGL");
-        let request = Request {
+        let mut studio = RenderHarness::open().expect("OpenGL");
+        let request = RenderReportOptions {
             loads: vec![],
             plants: vec![1],
             variants: vec![],
@@ -211,12 +217,12 @@ mod tests {
         assert!(plant.frame.median_us >= plant.vbr.median_us * 0.5 && plant.bytes > 0);
         assert!((plant.occupation - plant.vbr.median_us / plant.frame.median_us).abs() < 1e-12);
         assert!((plant.fps * plant.frame.median_us - 1e6).abs() < 1.0);
-        assert_eq!(plant.frame.replays, FEWEST);
+        assert_eq!(plant.frame.replays, MIN_REPETITIONS);
     }
 
     #[test]
     fn shared_output_buffers_count_once() {
-        let scene = Kind::Plant(0).build(Scale::Quick).expect("built").scene;
+        let scene = WorkloadKind::Plant(0).build(Scale::Quick).expect("built").scene;
         let plan = gpu::plan(&scene);
         let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
         assert_eq!(beside(&plan, false) - beside(&plan, true), outputs);

@@ -2,16 +2,16 @@
 
 use std::fmt::Write as _;
 
-use super::{Report, Row};
-use crate::plot::panel::{Look, Panel, Point, filled, mark, width_of};
-use crate::plot::{COLOURS, HEAD, LEGEND, MARGIN, PANEL, text};
+use super::{RenderReport, RenderRow};
+use crate::plot::panel::{MarkerStyle, Panel, Point, filled, mark, width_of};
+use crate::plot::{COLORS, HEAD, LEGEND, MARGIN, PANEL, text};
 use modalcast_model::deform::Backend;
 
 /// Panels per row.
 const COLUMNS: usize = 3;
 
 /// Draws the plot as SVG.
-pub(super) fn svg(report: &Report) -> String {
+pub(super) fn svg(report: &RenderReport) -> String {
     let mut names: Vec<&str> = Vec::new();
     for row in &report.rows {
         if !names.contains(&row.name.as_str()) {
@@ -40,7 +40,7 @@ pub(super) fn svg(report: &Report) -> String {
     out
 }
 
-fn head(out: &mut String, report: &Report) {
+fn head(out: &mut String, report: &RenderReport) {
     let title = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
     let small = "font-size=\"12\" fill=\"#555555\"";
     text(out, (MARGIN + 8.0, MARGIN + 18.0), title, "Rendering: error against run time");
@@ -59,22 +59,22 @@ fn head(out: &mut String, report: &Report) {
     }
 }
 
-fn samples(report: &Report) -> usize {
+fn samples(report: &RenderReport) -> usize {
     report.loads.iter().map(|load| load.samples).min().unwrap_or(0)
 }
 
-fn point(row: &Row) -> Option<Point<'_>> {
-    Some(Point { name: &row.name, at: (row.median_us()?, row.colour.mean), filled: true, rival: true })
+fn point(row: &RenderRow) -> Option<Point<'_>> {
+    Some(Point { name: &row.name, at: (row.median_us()?, row.color.mean), filled: true, rival: true })
 }
 
-fn look(names: &[&str], name: &str) -> Look {
+fn look(names: &[&str], name: &str) -> MarkerStyle {
     let index = names.iter().position(|own| *own == name).unwrap_or(0);
     // Circles first, then squares and triangles.
-    let (backend, round) = match index / COLOURS.len() {
+    let (backend, round) = match index / COLORS.len() {
         0 => (Backend::Cpu, 0),
         round => (Backend::Cuda, round - 1),
     };
-    Look { colour: COLOURS[index % COLOURS.len()], backend, round }
+    MarkerStyle { color: COLORS[index % COLORS.len()], backend, round }
 }
 
 /// The legend's SVG and its number of lines.
@@ -86,7 +86,7 @@ fn legend(names: &[&str], width: f64) -> (String, usize) {
             (x, line) = (MARGIN + 8.0, line + 1);
         }
         let (y, look) = (MARGIN + HEAD + line as f64 * LEGEND, look(names, name));
-        mark(&mut out, (x + 6.0, y - 4.0), look, &filled(look.colour));
+        mark(&mut out, (x + 6.0, y - 4.0), look, &filled(look.color));
         // Writing into a string cannot fail.
         let _ = writeln!(out);
         text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);

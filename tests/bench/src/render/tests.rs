@@ -4,25 +4,25 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
-use super::loads::{Kind, add, lying, quad};
-use super::meter;
+use super::harness::{RenderHarness, Size};
+use super::light_meter;
 use super::metrics;
-use super::picture::{Detail, Picture, Term, trace};
-use super::soup::{Ray, Soup};
-use super::studio::{Size, Studio};
-use super::texels::linear_from_srgb;
+use super::ray_scene::{Ray, RayScene};
+use super::reference_image::{ReferenceImage, SampleCounts, SunTerm, trace};
+use super::reference_texture::linear_from_srgb;
+use super::reference_view::View;
 use super::variants;
-use super::view::View;
-use super::{Request, render};
+use super::workloads::{RenderWorkload, add, lying, quad};
+use super::{RenderReportOptions, render};
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::deform::{Deformer as _, Surface};
+use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
-use modalcast_model::scene::{Bounds, Camera, Ground, Lens, Parts, Scene, State, View as Eye};
-use modalcast_render::Shot;
+use modalcast_model::scene::{Bounds, Camera, Ground, Lens, Scene, SceneParts, SceneState, View as Eye};
+use modalcast_render::FrameParams;
 
 /// An empty scene without sky and ground, with the sun behind the camera.
-fn bare() -> Parts {
-    let mut parts = Parts::named("test");
+fn bare() -> SceneParts {
+    let mut parts = SceneParts::named("test");
     (parts.look.shadow, parts.look.ground) = (None, None);
     (parts.look.zenith, parts.look.horizon) = ([0.0; 3], [0.0; 3]);
     (parts.look.sun, parts.look.sunlight, parts.look.skylight) = ([0.0, 0.0, 1.0], [0.5; 3], [0.25; 3]);
@@ -33,15 +33,15 @@ fn facing([left, bottom, right, top]: [f32; 4], z: f32) -> Mesh {
     quad([[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]], [0.0, 0.0, 1.0]).expect("a square")
 }
 
-fn surface(scene: &Arc<Scene>) -> (Surface, Bounds) {
+fn surface(scene: &Arc<Scene>) -> (DeformedSurface, Bounds) {
     let mut deformer = ReferenceDeformer::new(scene);
-    let bounds = deformer.deform(&State::rest(scene)).expect("deforms").bounds;
+    let bounds = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
     (deformer.surface().expect("there").clone(), bounds)
 }
 
 /// A shot with ten pixels per unit in the plane z = 0, or y = 0 when seen from above; the origin is in the center of
 /// `side` pixels.
-fn shot(bounds: Bounds, side: u32, above: bool) -> Shot {
+fn shot(bounds: Bounds, side: u32, above: bool) -> FrameParams {
     let middle = f64::from(side) / 2.0;
     let (eye, up) = if above { ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]) } else { ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]) };
     let camera = Camera {
@@ -50,18 +50,18 @@ fn shot(bounds: Bounds, side: u32, above: bool) -> Shot {
         near: 0.0,
         far: 0.0,
     };
-    Shot { camera, width: side, height: side, bounds, light: None }
+    FrameParams { camera, width: side, height: side, bounds, light: None }
 }
 
-fn pictures(parts: Parts, above: bool, terms: &[Term], side: u32) -> Vec<Picture> {
+fn pictures(parts: SceneParts, above: bool, terms: &[SunTerm], side: u32) -> Vec<ReferenceImage> {
     let scene = Scene::new(parts).expect("a good scene");
     let (surface, bounds) = surface(&scene);
     let view = View::new(&scene, &shot(bounds, side, above));
-    trace(&Soup::new(&scene, &surface), &view, terms, Detail::FULL)
+    trace(&RayScene::new(&scene, &surface), &view, terms, SampleCounts::FULL)
 }
 
-fn linear(picture: &Picture, at: usize) -> Vector3<f64> {
-    Vector3::from(picture.colours[at]).map(|level| linear_from_srgb(f64::from(level) / 255.0))
+fn linear(picture: &ReferenceImage, at: usize) -> Vector3<f64> {
+    Vector3::from(picture.colors[at]).map(|level| linear_from_srgb(f64::from(level) / 255.0))
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn pixels_are_as_bright_as_their_covered_area() {
     // 10.35 by 7.8 pixels; the left edge bisects a column of pixels.
     add(&mut parts, "square", facing([-0.55, -0.38, 0.485, 0.4], 0.0), white).expect("added");
     parts.look.skylight = [1.0; 3];
-    let picture = pictures(parts, false, &[Term::Unshadowed], 32).remove(0);
+    let picture = pictures(parts, false, &[SunTerm::Unshadowed], 32).remove(0);
     let area: f64 = (0..32 * 32).map(|at| linear(&picture, at).x).sum();
     assert!((area - 10.35 * 7.8).abs() < 0.25, "{area}");
     let half = linear(&picture, 16 * 32 + 10).x;
@@ -91,7 +91,7 @@ fn shades_one_pixel_by_equation_3_12() {
     };
     add(&mut parts, "square", facing([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("added");
     parts.look.sun = [3.0, 0.0, 4.0];
-    let picture = pictures(parts, false, &[Term::Unshadowed], 41).remove(0);
+    let picture = pictures(parts, false, &[SunTerm::Unshadowed], 41).remove(0);
     // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n.
     let cosine: f64 = 0.8;
     let wanted = [(0.2, 0.5, 0.3), (0.4, 0.25, 0.2), (0.6, 0.1, 0.1)]
@@ -109,7 +109,7 @@ fn back_face_is_visible_only_if_double_sided() {
         let turned = quad([[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0.0, 0.0, -1.0]);
         let material = Material { double_sided, ..Material::default() };
         add(&mut parts, "square", turned.expect("a square"), material).expect("added");
-        linear(&pictures(parts, false, &[Term::Unshadowed], 9).remove(0), 40).x
+        linear(&pictures(parts, false, &[SunTerm::Unshadowed], 9).remove(0), 40).x
     };
     assert!((shown(true) - 0.75).abs() < 1e-6 && shown(false) == 0.0);
 }
@@ -126,7 +126,7 @@ fn sorts_transparent_layers_in_any_order() {
         }
         let behind = Material { ambient: [0.0, 0.0, 1.0], diffuse: [0.0; 3], ..Material::default() };
         add(&mut parts, "behind", facing([-2.0, -2.0, 2.0, 2.0], -0.5), behind).expect("added");
-        linear(&pictures(parts, false, &[Term::Unshadowed], 9).remove(0), 40)
+        linear(&pictures(parts, false, &[SunTerm::Unshadowed], 9).remove(0), 40)
     };
     let red_first = shown([0.5, 0.0]);
     assert!((red_first - Vector3::new(0.5, 0.25, 0.25)).norm() < 1e-6, "{red_first}");
@@ -136,14 +136,14 @@ fn sorts_transparent_layers_in_any_order() {
 
 /// A ground seen from above with the edge of a shadow at `x = 0.3`. The caster is outside of the image; a peg keeps the
 /// ground at height 0.
-fn edge(caster: Material) -> Parts {
+fn edge(caster: Material) -> SceneParts {
     let mut parts = bare();
-    parts.look.ground = Some(Ground { colour: [1.0; 3] });
+    parts.look.ground = Some(Ground { color: [1.0; 3] });
     parts.look.sun = [3.0, 4.0, 0.0];
     // The sun comes from +x: a point at height 4 casts its shadow 3 units to the left.
     let rest = [[3.3, 4.0, 9.0], [9.0, 4.0, 9.0], [9.0, 4.0, -9.0], [3.3, 4.0, -9.0]];
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    let mesh = Mesh::indexed(rest.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
+    let mesh = Mesh::from_indexed(rest.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
     add(&mut parts, "caster", mesh.expect("a square"), caster).expect("added");
     add(&mut parts, "peg", lying(0.01, 0.0).expect("a square"), Material::default()).expect("added");
     parts
@@ -153,10 +153,10 @@ fn edge(caster: Material) -> Parts {
 fn hard_and_gaussian_shadow_edges_match_the_analytic_ones() {
     // Deviations of 0.4 in the plane perpendicular to the light: 0.4 / 0.8 on the ground along x.
     let across = [Vector3::new(4.0, -3.0, 0.0) / 5.0 * 0.4, Vector3::z() * 0.4];
-    let terms = [Term::Hard, Term::Filtered(across), Term::Unshadowed];
-    let [hard, soft, all]: [Picture; 3] =
+    let terms = [SunTerm::Hard, SunTerm::Filtered(across), SunTerm::Unshadowed];
+    let [hard, soft, all]: [ReferenceImage; 3] =
         pictures(edge(Material::default()), true, &terms, 40).try_into().expect("three");
-    let light = |picture: &Picture, column: usize| f64::from(picture.light[20 * 40 + column].expect("lit"));
+    let light = |picture: &ReferenceImage, column: usize| f64::from(picture.light[20 * 40 + column].expect("lit"));
     assert!((0..40).all(|column| light(&all, column) == 1.0));
     // The edge is at 20 + 10 x 0.3 = 23 pixels from the left.
     assert_eq!((light(&hard, 22), light(&hard, 23)), (1.0, 0.0));
@@ -182,9 +182,9 @@ fn erf(x: f64) -> f64 {
 #[test]
 fn cut_outs_and_glass_cast_from_their_alpha_threshold_on() {
     let dark = |alpha_mode: AlphaMode, alpha: f32, texel: u8| {
-        let mut parts = edge(Material { alpha_mode, alpha, colour_texture: Some(0), ..Material::default() });
+        let mut parts = edge(Material { alpha_mode, alpha, color_texture: Some(0), ..Material::default() });
         parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel]).expect("fits"));
-        let picture = pictures(parts, true, &[Term::Hard], 40).remove(0);
+        let picture = pictures(parts, true, &[SunTerm::Hard], 40).remove(0);
         picture.light[20 * 40 + 38].expect("enough light falls there") == 0.0
     };
     let mask = AlphaMode::Mask { cutoff: 0.5 };
@@ -194,45 +194,46 @@ fn cut_outs_and_glass_cast_from_their_alpha_threshold_on() {
 
 #[test]
 fn ray_queries_match_a_linear_search_at_any_position() {
-    let stage = Kind::Triangles(800).stage().expect("built");
+    let stage = RenderWorkload::Triangles(800).stage().expect("built");
     let (mut surface, _) = surface(&stage.scene);
     for shift in [0.0_f32, 2048.0] {
         surface.positions.iter_mut().for_each(|number| *number += shift);
-        let soup = Soup::new(&stage.scene, &surface);
+        let ray_scene = RayScene::new(&stage.scene, &surface);
         for seed in 0..400_u64 {
             let mut rng = fastrand::Rng::with_seed(seed);
             let mut any = || Vector3::from_fn(|_, _| 2.0 * rng.f64() - 1.0);
-            let (from, to) = (soup.centre + 40.0 * any(), soup.centre + soup.radius * any());
+            let (from, to) = (ray_scene.center + 40.0 * any(), ray_scene.center + ray_scene.radius * any());
             let ray = Ray { from, along: to - from };
-            let all = soup.every(&ray, (0.0, f64::INFINITY), |_| true);
-            let nearest = soup.nearest(&ray, (0.0, f64::INFINITY), |_| true);
-            let searched =
-                (0..soup.triangles.len()).filter_map(|at| soup.meet(at, &ray)).min_by(|a, b| a.t.total_cmp(&b.t));
+            let all = ray_scene.every(&ray, (0.0, f64::INFINITY), |_| true);
+            let nearest = ray_scene.nearest(&ray, (0.0, f64::INFINITY), |_| true);
+            let searched = (0..ray_scene.triangles.len())
+                .filter_map(|at| ray_scene.meet(at, &ray))
+                .min_by(|a, b| a.t.total_cmp(&b.t));
             assert_eq!(nearest.map(|hit| hit.t), searched.map(|hit| hit.t), "{seed}");
             assert_eq!(nearest.map(|hit| hit.t), all.last().map(|hit| hit.t), "{seed}");
-            assert_eq!(soup.is_dark(&ray, 0.0, None), searched.is_some(), "{seed}");
+            assert_eq!(ray_scene.is_dark(&ray, 0.0, None), searched.is_some(), "{seed}");
         }
     }
 }
 
 #[test]
 fn drawn_scene_matches_reference_unless_sun_moves() {
-    let stage = Kind::Square.stage().expect("built");
+    let stage = RenderWorkload::Square.stage().expect("built");
     let size = Size { width: 160, height: 90 };
     let variant = variants::all(true).remove(1);
-    let mut studio = Studio::open().expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)");
+    let mut studio = RenderHarness::open().expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)");
     let mut errors = |sun: [f32; 3]| {
-        let look = modalcast_model::scene::Look { sun, ..variant.look(stage.scene.look) };
-        let drawn = meter::relit(&stage.scene, look).expect("fits");
+        let look = modalcast_model::scene::RenderSettings { sun, ..variant.look(stage.scene.look) };
+        let drawn = light_meter::relit(&stage.scene, look).expect("fits");
         let mut set = studio.set(&drawn).expect("loads");
-        studio.pose(&mut set, &State::rest(&drawn)).expect("deforms");
-        let camera = Camera::framing(&drawn, size.width, size.height);
+        studio.pose(&mut set, &SceneState::rest(&drawn)).expect("deforms");
+        let camera = Camera::fit_to_scene(&drawn, size.width, size.height);
         let image = studio.draw(&set, camera, size).expect("draws");
         let view = View::new(&stage.scene, &set.shot(camera, size));
-        let soup = Soup::new(&stage.scene, set.surface().expect("there"));
-        let reference = trace(&soup, &view, &[Term::Hard], Detail::QUICK).remove(0);
-        studio.strike(set);
-        metrics::colours(&image.rgba, &reference.colours)
+        let ray_scene = RayScene::new(&stage.scene, set.surface().expect("there"));
+        let reference = trace(&ray_scene, &view, &[SunTerm::Hard], SampleCounts::QUICK).remove(0);
+        studio.unload(set);
+        metrics::colors(&image.rgba, &reference.colors)
     };
     let [x, y, z] = stage.scene.look.sun;
     let right = errors([x, y, z]);
@@ -243,9 +244,9 @@ fn drawn_scene_matches_reference_unless_sun_moves() {
 
 #[test]
 fn report_measures_wanted_variants_and_files_read_back() {
-    let request = Request {
+    let request = RenderReportOptions {
         plants: vec![],
-        loads: vec![Kind::Square],
+        loads: vec![RenderWorkload::Square],
         variants: vec!["none".into(), "variance 512, blur 4".into()],
         size: Size { width: 96, height: 54 },
         quick: true,
@@ -254,8 +255,11 @@ fn report_measures_wanted_variants_and_files_read_back() {
     let report = render(&request, |_| {}).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);
     let [none, soft] = &report.rows[..] else { panic!("two rows: {:?}", report.rows) };
-    assert!(none.colour.mean > 2.0 * soft.colour.mean, "a picture without shadows is far from one with them");
-    assert!(none.colour_of_aim.mean < 1.5 && none.light_of_aim.all.largest == 0.0, "but near to what it means to show");
+    assert!(none.color.mean > 2.0 * soft.color.mean, "a picture without shadows is far from one with them");
+    assert!(
+        none.color_of_reference.mean < 1.5 && none.light_of_aim.all.largest == 0.0,
+        "but near to what it means to show"
+    );
     assert!(soft.shadow_bytes == 20 * 512 * 512 && soft.bytes > none.bytes && none.shadow_bytes == 0);
     for row in &report.rows {
         assert!(row.median_us().expect("timed") > 0.0 && row.flicker.expect("looked at").count == 59 * 24 * 13);
@@ -279,9 +283,9 @@ fn report_measures_wanted_variants_and_files_read_back() {
 
 #[test]
 fn bare_passes_are_compared_with_a_frame_without_culling() {
-    let request = Request {
+    let request = RenderReportOptions {
         plants: vec![],
-        loads: vec![Kind::Triangles(800)],
+        loads: vec![RenderWorkload::Triangles(800)],
         variants: vec!["culling triangles".into()],
         size: Size { width: 48, height: 27 },
         quick: true,
@@ -296,7 +300,7 @@ fn bare_passes_are_compared_with_a_frame_without_culling() {
     for frame in [&bare.unculled, &bare.usual] {
         assert!((frame.frame_us - both - frame.beyond_us).abs() < 1e-6 && Some(frame.frame_us) != row.median_us());
     }
-    let request = Request { variants: vec!["culling none".into(), "culling triangles".into()], ..request };
+    let request = RenderReportOptions { variants: vec!["culling none".into(), "culling triangles".into()], ..request };
     let report = render(&request, |_| {}).expect("a report");
     assert_eq!(report.bare[0].unculled.name, "culling none: without culling", "its own row is taken");
     assert_eq!(Some(report.bare[0].unculled.frame_us), report.rows[0].median_us());
@@ -304,9 +308,9 @@ fn bare_passes_are_compared_with_a_frame_without_culling() {
 
 #[test]
 fn exact_transparency_is_closer_to_reference_than_two_pass() {
-    let request = Request {
+    let request = RenderReportOptions {
         plants: vec![],
-        loads: vec![Kind::Panes, Kind::Square],
+        loads: vec![RenderWorkload::Panes, RenderWorkload::Square],
         variants: vec!["exact transparency".into(), "two-pass transparency".into()],
         size: Size { width: 96, height: 54 },
         quick: true,
@@ -314,14 +318,14 @@ fn exact_transparency_is_closer_to_reference_than_two_pass() {
     };
     let report = render(&request, |_| {}).expect("a report");
     let [exact, passes] = &report.rows[..] else { panic!("two rows, of the panes: {:?}", report.rows) };
-    let [near, far] = [exact, passes].map(|row| row.colour_of_aim.mean);
+    let [near, far] = [exact, passes].map(|row| row.color_of_reference.mean);
     assert!(near < 1.0 && far > 3.0 * near, "{near} and {far} levels");
     assert!(report.passed(), "{:?}", report.failed);
 }
 
 #[test]
 fn refitted_bvh_gives_the_same_pictures_as_a_rebuilt_one() {
-    let stage = Kind::Triangles(2_000).stage().expect("built");
+    let stage = RenderWorkload::Triangles(2_000).stage().expect("built");
     let at = |step: usize| {
         let mut deformer = ReferenceDeformer::new(&stage.scene);
         let bounds = deformer.deform(&stage.state(step)).expect("deforms").bounds;
@@ -329,10 +333,12 @@ fn refitted_bvh_gives_the_same_pictures_as_a_rebuilt_one() {
     };
     let ((first, _), (later, bounds)) = (at(0), at(30));
     let size = Size { width: 48, height: 32 };
-    let view =
-        View::new(&stage.scene, &Shot { camera: stage.camera(size), width: 48, height: 32, bounds, light: None });
-    let traced = |soup: &Soup| trace(soup, &view, &[Term::Hard], Detail::QUICK);
-    let anew = traced(&Soup::new(&stage.scene, &later));
-    assert_eq!(traced(&Soup::new(&stage.scene, &first).moved(&stage.scene, &later)), anew);
-    assert_ne!(traced(&Soup::new(&stage.scene, &first)), anew, "control: the step before");
+    let view = View::new(
+        &stage.scene,
+        &FrameParams { camera: stage.camera(size), width: 48, height: 32, bounds, light: None },
+    );
+    let traced = |ray_scene: &RayScene| trace(ray_scene, &view, &[SunTerm::Hard], SampleCounts::QUICK);
+    let anew = traced(&RayScene::new(&stage.scene, &later));
+    assert_eq!(traced(&RayScene::new(&stage.scene, &first).moved(&stage.scene, &later)), anew);
+    assert_ne!(traced(&RayScene::new(&stage.scene, &first)), anew, "control: the step before");
 }

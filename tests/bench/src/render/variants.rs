@@ -4,14 +4,16 @@
 
 use serde::Serialize;
 
-use super::loads::Kind;
 use super::packing::Packing;
-use modalcast_model::scene::{Blurring, Culling, Fit, Look, Moments, Shadow, ShadowMethod, Transparency};
+use super::workloads::RenderWorkload;
+use modalcast_model::scene::{
+    BlurMethod, Culling, MomentFormat, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, Transparency,
+};
 
 /// Shadow technique.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Method {
+pub enum ShadowVariant {
     /// No shadows.
     None,
     /// Standard shadow map.
@@ -24,7 +26,7 @@ pub enum Method {
 
 /// Intended result of a variant: the reference that it is compared with.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Aim {
+pub enum ReferenceKind {
     /// No shadow at all.
     Unshadowed,
     /// Hard shadow edges, as of a point light.
@@ -35,9 +37,10 @@ pub enum Aim {
 
 /// Error bounds of a variant against its intended result.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Bounds {
+pub struct ErrorLimits {
     /// Mean color error of a pixel, of 255.
-    pub mean_colour: f64,
+    #[serde(rename = "mean_colour")]
+    pub mean_color: f64,
     /// Mean error of the sun visibility, of 1.
     pub mean_light: f64,
     /// Mean sun visibility inside the umbra (light bleeding), of 1.
@@ -48,23 +51,24 @@ pub struct Bounds {
 
 /// One way to draw a scene.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Variant {
+pub struct RenderVariant {
     /// Unique within a report.
     pub name: String,
-    pub method: Method,
-    pub shadow: Option<Shadow>,
+    pub method: ShadowVariant,
+    pub shadow: Option<ShadowSettings>,
     /// Transparency method, for variants that compare it; otherwise that of the load's look.
     pub transparency: Option<Transparency>,
     /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
     /// Culling, for variants that compare it. It does not change the picture.
     pub culling: Option<Culling>,
-    pub aim: Aim,
+    pub aim: ReferenceKind,
 }
 
 /// Twice the errors of small pictures with many leaves, where each leaf covers a pixel or two; all other errors are far
 /// below. A missing or displaced shadow exceeds the last two bounds, however small its part of the picture is.
-pub(super) const BOUNDS: Bounds = Bounds { mean_colour: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
+pub(super) const ERROR_LIMITS: ErrorLimits =
+    ErrorLimits { mean_color: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
 /// Bound on light bleeding of a filtered map where no two casters overlap: Chebyshev's bound is exact there, and only
 /// rounding remains.
 const EXACT: f64 = 0.01;
@@ -77,110 +81,112 @@ const NARROW: f64 = 0.4;
 const SIZES: [u32; 4] = [512, 1024, 2048, 4096];
 const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
 
-impl Variant {
+impl RenderVariant {
     /// The look of a scene as this variant draws it.
-    pub fn look(&self, look: Look) -> Look {
+    pub fn look(&self, look: RenderSettings) -> RenderSettings {
         let (transparency, culling) =
             (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
-        Look { shadow: self.shadow, transparency, culling, ..look }
+        RenderSettings { shadow: self.shadow, transparency, culling, ..look }
     }
 
     /// Whether a load has the features that the variant compares.
-    pub fn suits(&self, load: Kind) -> bool {
-        let is_large = matches!(load, Kind::Tree | Kind::Grove | Kind::Triangles(_));
-        let has_images = self.packing.is_some() == (load == Kind::Images);
-        has_images && (self.transparency.is_none() || load == Kind::Panes) && (self.culling.is_none() || is_large)
+    pub fn suits(&self, load: RenderWorkload) -> bool {
+        let is_large = matches!(load, RenderWorkload::Tree | RenderWorkload::Grove | RenderWorkload::Triangles(_));
+        let has_images = self.packing.is_some() == (load == RenderWorkload::Images);
+        has_images
+            && (self.transparency.is_none() || load == RenderWorkload::Panes)
+            && (self.culling.is_none() || is_large)
     }
 
     /// Error bounds on a load.
-    pub fn bounds(&self, load: Kind) -> Bounds {
+    pub fn bounds(&self, load: RenderWorkload) -> ErrorLimits {
         let bleeding = match (self.aim, load) {
-            (Aim::Filtered { .. }, Kind::Square | Kind::Shelf) => EXACT,
-            _ => BOUNDS.bleeding,
+            (ReferenceKind::Filtered { .. }, RenderWorkload::Square | RenderWorkload::Shelf) => EXACT,
+            _ => ERROR_LIMITS.bleeding,
         };
-        let mean_light = if load == Kind::Shelf { NARROW } else { BOUNDS.mean_light };
-        Bounds { bleeding, mean_light, ..BOUNDS }
+        let mean_light = if load == RenderWorkload::Shelf { NARROW } else { ERROR_LIMITS.mean_light };
+        ErrorLimits { bleeding, mean_light, ..ERROR_LIMITS }
     }
 
     /// Whether the variant is stated to exceed its bounds on a load: f16 second moments let light into a shadow near
     /// its caster.
-    pub fn is_to_fail(&self, load: Kind) -> bool {
-        load == Kind::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == Moments::F16)
+    pub fn is_to_fail(&self, load: RenderWorkload) -> bool {
+        load == RenderWorkload::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == MomentFormat::F16)
     }
 
     fn unshadowed() -> Self {
         Self {
             name: "none".into(),
-            method: Method::None,
+            method: ShadowVariant::None,
             shadow: None,
             transparency: None,
             packing: None,
             culling: None,
-            aim: Aim::Unshadowed,
+            aim: ReferenceKind::Unshadowed,
         }
     }
 
     /// One standard map. The intended result is the hard shadow, whatever the size of the texels.
     fn standard(size: u32) -> Self {
-        let shadow = Shadow { method: ShadowMethod::Standard, size, ..Shadow::default() };
+        let shadow = ShadowSettings { method: ShadowMethod::Standard, size, ..ShadowSettings::default() };
         Self {
             name: format!("standard {size}"),
-            method: Method::Standard,
+            method: ShadowVariant::Standard,
             shadow: Some(shadow),
             transparency: None,
             packing: None,
             culling: None,
-            aim: Aim::Hard,
+            aim: ReferenceKind::Hard,
         }
     }
 
     /// A map whose comparisons are weighted by a Gaussian of `blur` texels around the shaded point (PCF).
     fn filtered(size: u32, blur: f32) -> Self {
-        let shadow = Shadow { method: ShadowMethod::Filtered, size, blur, ..Shadow::default() };
-        Self::soft(format!("filtered {size}, blur {blur}"), Method::Filtered, shadow)
+        let shadow = ShadowSettings { method: ShadowMethod::PercentageCloser, size, blur, ..ShadowSettings::default() };
+        Self::soft(format!("filtered {size}, blur {blur}"), ShadowVariant::Filtered, shadow)
     }
 
     /// A variance map whose moments are blurred by a Gaussian of `blur` texels and then interpolated.
     fn variance(size: u32, blur: f32) -> Self {
-        let shadow = Shadow { size, blur, ..Shadow::default() };
-        Self::soft(format!("variance {size}, blur {blur}"), Method::Variance, shadow)
+        let shadow = ShadowSettings { size, blur, ..ShadowSettings::default() };
+        Self::soft(format!("variance {size}, blur {blur}"), ShadowVariant::Variance, shadow)
     }
 
     fn f16(size: u32) -> Self {
-        let shadow = Shadow { size, moments: Moments::F16, ..Shadow::default() };
-        Self::soft(format!("variance {size}, f16"), Method::Variance, shadow)
+        let shadow = ShadowSettings { size, moments: MomentFormat::F16, ..ShadowSettings::default() };
+        Self::soft(format!("variance {size}, f16"), ShadowVariant::Variance, shadow)
     }
 
     /// A variance map without light-bleeding reduction.
     fn uncut(size: u32, blur: f32) -> Self {
-        let shadow = Shadow { size, blur, bleeding: 0.0, ..Shadow::default() };
-        Self::soft(format!("variance {size}, blur {blur}, bleeding uncut"), Method::Variance, shadow)
+        let shadow = ShadowSettings { size, blur, bleeding: 0.0, ..ShadowSettings::default() };
+        Self::soft(format!("variance {size}, blur {blur}, bleeding uncut"), ShadowVariant::Variance, shadow)
     }
 
     /// A map that is fitted to the corners of the bounding box, as in the thesis.
     fn cornered(size: u32) -> Self {
-        let shadow = Shadow { size, fit: Fit::Corners, ..Shadow::default() };
-        Self::soft(format!("variance {size}, fitted to corners"), Method::Variance, shadow)
+        let shadow = ShadowSettings { size, fit: ShadowFit::Corners, ..ShadowSettings::default() };
+        Self::soft(format!("variance {size}, fitted to corners"), ShadowVariant::Variance, shadow)
     }
 
     /// The same picture with the blur in other passes: a baseline for times.
-    fn blurred((size, blur): (u32, f32), (name, blurring): (&str, Blurring)) -> Self {
-        let shadow = Shadow { size, blur, blurring, ..Shadow::default() };
-        Self::soft(format!("variance {size}, blur {blur}, {name}"), Method::Variance, shadow)
+    fn blurred((size, blur): (u32, f32), (name, blur_method): (&str, BlurMethod)) -> Self {
+        let shadow = ShadowSettings { size, blur, blur_method, ..ShadowSettings::default() };
+        Self::soft(format!("variance {size}, blur {blur}, {name}"), ShadowVariant::Variance, shadow)
     }
 
     /// Cascaded maps, sharper near the camera. The intended result is the hard shadow.
     fn split(size: u32, splits: u32) -> Self {
-        let shadow = Shadow { size, splits, ..Shadow::default() };
+        let shadow = ShadowSettings { size, splits, ..ShadowSettings::default() };
         let name = format!("variance {size}, {splits} splits");
         Self {
             name,
-            method: Method::Variance,
+            method: ShadowVariant::Variance,
             shadow: Some(shadow),
             transparency: None,
             packing: None,
             culling: None,
-            aim: Aim::Hard,
+            aim: ReferenceKind::Hard,
         }
     }
 
@@ -199,64 +205,65 @@ impl Variant {
         Self { name: format!("culling {name}"), culling: Some(culling), ..Self::variance(2048, BLURS[1]) }
     }
 
-    fn soft(name: String, method: Method, shadow: Shadow) -> Self {
-        let aim = Aim::Filtered { texels: shadow.deviation() };
+    fn soft(name: String, method: ShadowVariant, shadow: ShadowSettings) -> Self {
+        let aim = ReferenceKind::Filtered { texels: shadow.filter_deviation() };
         Self { name, method, shadow: Some(shadow), transparency: None, packing: None, culling: None, aim }
     }
 }
 
 /// All variants, or the few of a quick run.
-pub fn all(quick: bool) -> Vec<Variant> {
+pub fn all(quick: bool) -> Vec<RenderVariant> {
     if quick {
         return few();
     }
-    let mut all = vec![Variant::unshadowed()];
+    let mut all = vec![RenderVariant::unshadowed()];
     for size in SIZES {
-        all.push(Variant::standard(size));
-        all.extend(BLURS[1..].iter().map(|blur| Variant::filtered(size, *blur)));
-        all.extend(BLURS.iter().map(|blur| Variant::variance(size, *blur)));
+        all.push(RenderVariant::standard(size));
+        all.extend(BLURS[1..].iter().map(|blur| RenderVariant::filtered(size, *blur)));
+        all.extend(BLURS.iter().map(|blur| RenderVariant::variance(size, *blur)));
     }
-    all.extend([2048, 4096].map(Variant::f16));
-    all.extend(BLURS[1..].iter().map(|blur| Variant::uncut(1024, *blur)));
-    all.extend((2..=4).map(|splits| Variant::split(1024, splits)));
-    all.push(Variant::cornered(2048));
-    let passes = [("tiles", Blurring::Tiles), ("rows", Blurring::Rows), ("fragments", Blurring::Fragments)];
+    all.extend([2048, 4096].map(RenderVariant::f16));
+    all.extend(BLURS[1..].iter().map(|blur| RenderVariant::uncut(1024, *blur)));
+    all.extend((2..=4).map(|splits| RenderVariant::split(1024, splits)));
+    all.push(RenderVariant::cornered(2048));
+    let passes = [("tiles", BlurMethod::Tiles), ("rows", BlurMethod::Rows), ("fragments", BlurMethod::Fragments)];
     // Blurs of 25 taps per direction, and of 15.
     for map in [(1024, 4.0), (4096, 4.0), (4096, 2.3)] {
-        all.extend(passes.map(|pass| Variant::blurred(map, pass)));
+        all.extend(passes.map(|pass| RenderVariant::blurred(map, pass)));
     }
-    all.push(Variant::blended("exact transparency", Transparency::Exact));
-    all.push(Variant::blended("two-pass transparency", Transparency::TwoPass));
+    all.push(RenderVariant::blended("exact transparency", Transparency::OrderIndependent));
+    all.push(RenderVariant::blended("two-pass transparency", Transparency::TwoPass));
     all.extend(packings());
     all.extend(cullings());
     all
 }
 
-fn packings() -> [Variant; 3] {
+fn packings() -> [RenderVariant; 3] {
     [
-        Variant::packed("images by size", Packing::Classes),
-        Variant::packed("images repeat-filled", Packing::Repeated),
-        Variant::packed("images repeat-filled, whole", Packing::RepeatedWhole),
+        RenderVariant::packed("images by size", Packing::Classes),
+        RenderVariant::packed("images repeat-filled", Packing::Repeated),
+        RenderVariant::packed("images repeat-filled, whole", Packing::RepeatedWhole),
     ]
 }
 
-fn cullings() -> [Variant; 3] {
-    [("none", Culling::None), ("triangles", Culling::Triangles), ("depth", Culling::Depth)].map(Variant::culled)
+fn cullings() -> [RenderVariant; 3] {
+    [("none", Culling::None), ("triangles", Culling::Triangles), ("depth", Culling::Occlusion)]
+        .map(RenderVariant::culled)
 }
 
-fn few() -> Vec<Variant> {
+fn few() -> Vec<RenderVariant> {
     let mut few = vec![
-        Variant::unshadowed(),
-        Variant::variance(512, BLURS[1]),
-        Variant::variance(512, BLURS[2]),
-        Variant::variance(2048, BLURS[1]),
-        Variant::standard(1024),
-        Variant::filtered(1024, BLURS[1]),
-        Variant::f16(2048),
-        Variant::split(1024, 3),
-        Variant::cornered(2048),
-        Variant::blended("exact transparency", Transparency::Exact),
-        Variant::blended("two-pass transparency", Transparency::TwoPass),
+        RenderVariant::unshadowed(),
+        RenderVariant::variance(512, BLURS[1]),
+        RenderVariant::variance(512, BLURS[2]),
+        RenderVariant::variance(2048, BLURS[1]),
+        RenderVariant::standard(1024),
+        RenderVariant::filtered(1024, BLURS[1]),
+        RenderVariant::f16(2048),
+        RenderVariant::split(1024, 3),
+        RenderVariant::cornered(2048),
+        RenderVariant::blended("exact transparency", Transparency::OrderIndependent),
+        RenderVariant::blended("two-pass transparency", Transparency::TwoPass),
     ];
     few.extend(packings());
     few.extend(cullings());
@@ -274,32 +281,36 @@ mod tests {
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
             assert_eq!((names.len(), all.len()), if quick { (17, 17) } else { (50, 50) });
             for variant in &all {
-                let look = variant.look(Look::default());
+                let look = variant.look(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
                 let culling = variant.culling.unwrap_or_default();
-                let plain = Look { shadow: None, transparency, culling, ..Look::default() };
-                assert_eq!(Look { shadow: None, ..look }, plain);
+                let plain = RenderSettings { shadow: None, transparency, culling, ..RenderSettings::default() };
+                assert_eq!(RenderSettings { shadow: None, ..look }, plain);
                 let (blends, packs) = (variant.transparency.is_some(), variant.packing.is_some());
-                let suits = [Kind::Panes, Kind::Tree, Kind::Images].map(|load| variant.suits(load));
+                let suits = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
+                    .map(|load| variant.suits(load));
                 let culls = variant.culling.is_some();
                 assert_eq!(suits, [!packs && !culls, !packs && !blends, packs], "{}", variant.name);
-                assert_eq!(look.shadow.is_none(), variant.aim == Aim::Unshadowed);
+                assert_eq!(look.shadow.is_none(), variant.aim == ReferenceKind::Unshadowed);
             }
         }
     }
     #[test]
     fn only_f16_on_the_shelf_is_stated_to_fail() {
         for variant in all(false) {
-            let loads: Vec<Kind> = Kind::all(false).into_iter().filter(|load| variant.is_to_fail(*load)).collect();
-            let wanted: &[Kind] = if variant.name.contains("f16") { &[Kind::Shelf] } else { &[] };
+            let loads: Vec<RenderWorkload> =
+                RenderWorkload::all(false).into_iter().filter(|load| variant.is_to_fail(*load)).collect();
+            let wanted: &[RenderWorkload] = if variant.name.contains("f16") { &[RenderWorkload::Shelf] } else { &[] };
             assert_eq!(loads, wanted, "{}", variant.name);
         }
     }
 
     #[test]
     fn only_filtered_maps_get_the_exact_bleeding_bound() {
-        let soft = Variant::variance(512, 1.5);
-        assert!(soft.bounds(Kind::Square).bleeding < 0.02 && soft.bounds(Kind::Tree) == BOUNDS);
-        assert_eq!(Variant::standard(512).bounds(Kind::Square), BOUNDS);
+        let soft = RenderVariant::variance(512, 1.5);
+        assert!(
+            soft.bounds(RenderWorkload::Square).bleeding < 0.02 && soft.bounds(RenderWorkload::Tree) == ERROR_LIMITS
+        );
+        assert_eq!(RenderVariant::standard(512).bounds(RenderWorkload::Square), ERROR_LIMITS);
     }
 }

@@ -2,27 +2,33 @@
 
 use std::sync::Arc;
 
-use modalcast_bench::kernels::{BatchMma, Cache, Extent, Ours, Trial, gigabytes_per_second, time};
-use modalcast_compute::gpu::{Device, Launch};
-use modalcast_compute::storage::bound::{Reaches, Step};
-use modalcast_compute::storage::{Products, QUAD, TILE_QUADS, Tiles};
-use modalcast_model::scene::{Batches, Deformation, Scene, State, Storage};
+use modalcast_bench::kernels::{
+    BatchMmaBenchmark, Cache, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time,
+};
+use modalcast_compute::gpu::{Device, KernelKind};
+use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
+use modalcast_compute::storage::{QUAD, TILE_QUADS, TensorCoreError, TiledModes};
+use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneState, StorageType};
 
+use crate::accuracy::same_bits;
 use crate::ensembles::{ensemble, made, states, stored};
-use crate::judge::same_bits;
 use crate::scenes;
 
 /// Largest quotient of a vertex's error and the bound of its tile. The bound covers U in 16 bits, q as pairs of 16-bit
 /// numbers, and the tensor cores' own sums.
-fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
+fn of_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
-    let tiles = Tiles::new(shape, storage);
-    let (reaches, products) = (Reaches::new(shape, &tiles), Products::of(storage, tiles.rank()));
+    let tiles = TiledModes::new(shape, storage);
+    let (reaches, products) = (ShapeErrorModel::new(shape, &tiles), TensorCoreError::of(storage, tiles.rank()));
     let vertices = shape.mesh.rest().len();
     let want = modalcast_compute::reference::deform(scene, state);
     let share = |(packed, got): (usize, &[f32; 3])| {
         let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));
-        let step = Step { q: state.q_of(scene, domain), transform: state.composed(scene, domain), compensated: false };
+        let step = ErrorBoundInput {
+            q: state.q_of(scene, domain),
+            transform: state.composed_transform(scene, domain),
+            compensated: false,
+        };
         let bound = reaches.tile(tile, &step).total() + reaches.products(tile, &step, products);
         let square = |axis: usize| (f64::from(got[axis]) - want[packed][axis]).powi(2);
         let error = (0..3).map(square).sum::<f64>().sqrt();
@@ -35,7 +41,7 @@ fn of_bound(scene: &Scene, state: &State, positions: &[f32]) -> f64 {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_tensor_core_batches_stay_within_their_bound() {
     let device = Device::open(0).expect("a CUDA device");
-    for storage in [Storage::F16, Storage::Bf16] {
+    for storage in [StorageType::F16, StorageType::Bf16] {
         for (vertices, rank, count) in [
             (1, 3, 1),
             (33, 0, 2),
@@ -49,7 +55,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
         ] {
             let scene = made(ensemble((vertices, rank, count), stored(storage)));
             let states = states(&scene);
-            let batch = BatchMma::new(&device, &scene, &states).expect("a trial");
+            let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("a trial");
             let name = format!("{} n {vertices} r {rank}", batch.name());
             for (turn, state) in states.iter().enumerate() {
                 batch.launch(&device, turn).expect("launches");
@@ -66,36 +72,37 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
             }
         }
     }
-    let refused = |scene: &Arc<Scene>| BatchMma::new(&device, scene, &states(scene)).expect_err("refused");
-    assert!(refused(&made(ensemble((9, 2, 2), stored(Storage::F32)))).to_string().contains("f16 or bf16"));
-    assert!(refused(&made(ensemble((9, 2, 33), stored(Storage::F16)))).to_string().contains("at most 32"));
+    let refused = |scene: &Arc<Scene>| BatchMmaBenchmark::new(&device, scene, &states(scene)).expect_err("refused");
+    assert!(refused(&made(ensemble((9, 2, 2), stored(StorageType::F32)))).to_string().contains("f16 or bf16"));
+    assert!(refused(&made(ensemble((9, 2, 33), stored(StorageType::F16)))).to_string().contains("at most 32"));
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     let device = Device::open(0).expect("a CUDA device");
-    let measure = |trial: &dyn Trial| {
+    let measure = |trial: &dyn KernelBenchmark| {
         let us = time(&device, trial, Cache::Warm, 200).expect("times").median_us;
         let bytes: u64 = trial.bytes().iter().map(|(_, bytes)| bytes).sum();
         let rate = gigabytes_per_second(bytes, us);
         eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", trial.name(), trial.kernels());
         us
     };
-    for storage in Storage::ALL {
-        let batched = Deformation { batches: Batches::Always, ..stored(storage) };
+    for storage in StorageType::ALL {
+        let batched = DeformationSettings { batches: BatchPolicy::Always, ..stored(storage) };
         let scene = made(ensemble((1_500_000, 32, 1), batched));
         let state = scenes::state(&scene, 1);
-        let one = measure(&Ours::new(&device, &scene, &[state], Extent::Positions).expect("a trial"));
+        let one = measure(&DeformerBenchmark::new(&device, &scene, &[state], StepOutputs::Positions).expect("a trial"));
         let scene = made(ensemble((1_500_000, 32, 16), batched));
         let state = scenes::state(&scene, 1);
-        let sixteen = Ours::new(&device, &scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
+        let sixteen = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), StepOutputs::Positions)
+            .expect("a trial");
         assert_eq!(sixteen.kernels()[0].name, "batch");
         let sixteen = measure(&sixteen);
         eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
         assert!(sixteen < 8.0 * one, "{storage:?} {one} {sixteen}");
-        if matches!(storage, Storage::F16 | Storage::Bf16) {
-            let products = measure(&BatchMma::new(&device, &scene, &[state]).expect("a trial"));
+        if matches!(storage, StorageType::F16 | StorageType::Bf16) {
+            let products = measure(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("a trial"));
             eprintln!("{} by tensor cores: {:.2} times as long as one", storage.name(), products / one);
             assert!(products < 8.0 * one, "{storage:?} {one} {products}");
         }
@@ -112,16 +119,21 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
             if vertices * count * rank > 1 << 29 {
                 continue;
             }
-            let of =
-                |batches| made(ensemble((vertices, rank, count), Deformation { batches, ..Deformation::default() }));
-            let [together, apart, chosen] = [Batches::Always, Batches::Never, Batches::Auto].map(of);
+            let of = |batches| {
+                made(ensemble(
+                    (vertices, rank, count),
+                    DeformationSettings { batches, ..DeformationSettings::default() },
+                ))
+            };
+            let [together, apart, chosen] = [BatchPolicy::Always, BatchPolicy::Never, BatchPolicy::Auto].map(of);
             let state = scenes::state(&together, 1);
             let measured = |scene: &Arc<Scene>| {
-                let ours = Ours::new(&device, scene, std::slice::from_ref(&state), Extent::Positions).expect("a trial");
+                let ours = DeformerBenchmark::new(&device, scene, std::slice::from_ref(&state), StepOutputs::Positions)
+                    .expect("a trial");
                 time(&device, &ours, Cache::Warm, 100).expect("times").median_us
             };
             let [batch, alone] = [&together, &apart].map(measured);
-            let chooses = modalcast_compute::gpu::plan(&chosen).kernel(Launch::Batch).is_some();
+            let chooses = modalcast_compute::gpu::plan(&chosen).kernel(KernelKind::Batch).is_some();
             eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
             let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
             if own > 1.5 * other + 2.0 {

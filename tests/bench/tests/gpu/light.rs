@@ -1,6 +1,6 @@
 //! Cost of computing light-space bounds in a step.
 
-use modalcast_bench::kernels::{Cache, Extent, Ours, Trial, time};
+use modalcast_bench::kernels::{Cache, DeformerBenchmark, KernelBenchmark, StepOutputs, time};
 use modalcast_compute::gpu::Device;
 use modalcast_model::scene::Scene;
 
@@ -14,7 +14,8 @@ fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64
         parts.domains = vec![scenes::domain(0, 0); instances];
         parts.look.shadow = parts.look.shadow.filter(|_| is_lit);
         let scene = Scene::new(parts).expect("a scene");
-        let trial = Ours::new(&device, &scene, &[scenes::state(&scene, 1)], Extent::Whole).expect("a trial");
+        let trial =
+            DeformerBenchmark::new(&device, &scene, &[scenes::state(&scene, 1)], StepOutputs::Whole).expect("a trial");
         trial.kernels().iter().for_each(|facts| eprintln!("{name}, shadow {is_lit}: {facts:?}"));
         time(&device, &trial, Cache::Warm, 300).expect("times").median_us
     });

@@ -1,14 +1,15 @@
 //! GPU tests of the benchmarks. Tests that need a device are ignored by default; run them with `--include-ignored
 //! --test-threads=1`. The binary does not need the build tree.
 
+#[expect(dead_code, reason = "shared with the tests of the deformer")]
+#[path = "../../../gpu/accuracy.rs"]
+mod accuracy;
 mod batch;
+mod benchmarks;
 #[path = "../../../both/cut_outs.rs"]
 mod cut_outs;
 #[path = "../../../gpu/ensembles.rs"]
 mod ensembles;
-#[expect(dead_code, reason = "shared with the tests of the deformer")]
-#[path = "../../../gpu/judge.rs"]
-mod judge;
 mod light;
 mod overlap;
 mod raster;
@@ -18,4 +19,3 @@ mod report;
 mod scenes;
 #[path = "../../../both/soups.rs"]
 mod soups;
-mod trials;

@@ -2,7 +2,7 @@
 
 use modalcast_bench::kernels::{host_writes, overlap};
 use modalcast_compute::gpu::Device;
-use modalcast_model::scene::State;
+use modalcast_model::scene::SceneState;
 
 use crate::scenes;
 
@@ -11,7 +11,7 @@ use crate::scenes;
 fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
     let device = Device::open(0).expect("a CUDA device");
     let scene = scenes::scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
-    let states: Vec<State> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();
+    let states: Vec<SceneState> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();
     let found = overlap(&device, &scene, &states, 50).expect("measures");
     eprintln!("{found:#?}");
     assert_eq!(found.differing, 0);

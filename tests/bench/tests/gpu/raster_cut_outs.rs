@@ -1,8 +1,8 @@
 //! Cut-outs on the device against the definition, on every path: bit-identical where filtering has no effect, and
 //! identical away from the alpha threshold where it has.
 
-use modalcast_bench::kernels::{Raster, RasterMesh, Trial as _};
-use modalcast_compute::gpu::{Device, RasterForm, Spread};
+use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterMesh};
+use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 
 use crate::cut_outs::{Holes, floor, image, plain_holes, sheet};
 use crate::scenes::Random;
@@ -12,24 +12,24 @@ use crate::scenes::Random;
 /// assumed here to be accurate to a sixteenth of a level, where levels differ by at most one half.
 const TOLERANCE: f32 = 1.0 / 16.0;
 
-const SPREADS: [Spread; 3] = [Spread::BySize, Spread::Warps, Spread::Tiles];
+const SPREADS: [RasterGranularity; 3] = [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles];
 
-fn launched(device: &Device, holes: &Holes, form: RasterForm) -> Raster {
+fn launched(device: &Device, holes: &Holes, form: RasterVariant) -> RasterBenchmark {
     let soup = &holes.soup;
     let (positions, triangles, groups) = (&soup.positions, &soup.triangles, &soup.groups);
     let mesh = RasterMesh { positions, triangles, groups, cut_outs: Some(&holes.cut_outs) };
-    let raster = Raster::new(device, mesh, soup.window, form).expect("a raster");
+    let raster = RasterBenchmark::new(device, mesh, soup.window, form).expect("a raster");
     (0..2).for_each(|_| raster.launch(device, 0).expect("launches"));
     raster
 }
 
-fn keys(device: &Device, holes: &Holes, spread: Spread) -> Vec<u64> {
-    let form = RasterForm { spread, ..RasterForm::default() };
+fn keys(device: &Device, holes: &Holes, granularity: RasterGranularity) -> Vec<u64> {
+    let form = RasterVariant { granularity, ..RasterVariant::default() };
     launched(device, holes, form).keys(device).expect("keys")
 }
 
 fn depths(device: &Device, holes: &Holes) -> Vec<u32> {
-    let form = RasterForm { depth_only: true, ..RasterForm::default() };
+    let form = RasterVariant { depth_only: true, ..RasterVariant::default() };
     launched(device, holes, form).depths(device).expect("depths").into_iter().map(f32::to_bits).collect()
 }
 
@@ -39,10 +39,10 @@ fn gpu_uniform_images_match_the_definition_bitwise() {
     let device = Device::open(0).expect("a CUDA device");
     for holes in plain_holes() {
         let want = holes.drawn();
-        for spread in SPREADS {
-            let got = keys(&device, &holes, spread);
+        for granularity in SPREADS {
+            let got = keys(&device, &holes, granularity);
             let wrong = got.iter().zip(&want.keys).filter(|(got, want)| got != want).count();
-            assert_eq!(wrong, 0, "{} by {spread:?}: of {} samples", holes.soup.name, got.len());
+            assert_eq!(wrong, 0, "{} by {granularity:?}: of {} samples", holes.soup.name, got.len());
         }
         let bits: Vec<u32> = want.depths().into_iter().map(f32::to_bits).collect();
         assert!(depths(&device, &holes) == bits, "{}: depth alone", holes.soup.name);
@@ -56,11 +56,11 @@ fn gpu_sheet_samples_its_image_and_mip_level_exactly() {
     let mut random = Random(3);
     let own = image(64, 64, |_, _, _| if random.number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
-        for spread in SPREADS {
+        for granularity in SPREADS {
             let holes = sheet(64 >> level, own.clone());
-            let got: Vec<bool> = keys(&device, &holes, spread).iter().map(|key| *key != u64::MAX).collect();
+            let got: Vec<bool> = keys(&device, &holes, granularity).iter().map(|key| *key != u64::MAX).collect();
             let want: Vec<bool> = own.levels[level].iter().map(|texel| *texel == 255).collect();
-            assert!(got == want, "level {level} by {spread:?}");
+            assert!(got == want, "level {level} by {granularity:?}");
             assert!(got.iter().rev().ne(&want), "the judge can fail");
         }
     }
@@ -78,15 +78,15 @@ fn beyond_doubt(holes: &Holes, got: &[u64]) -> (usize, usize) {
 fn gpu_perspective_floor_matches_the_definition() {
     let device = Device::open(0).expect("a CUDA device");
     let mut holes = floor(1);
-    let got = keys(&device, &holes, Spread::BySize);
+    let got = keys(&device, &holes, RasterGranularity::BySize);
     let (wrong, doubtful) = beyond_doubt(&holes, &got);
     eprintln!("a floor: {wrong} of {} samples differ, {doubtful} are in doubt", got.len());
     assert_eq!(wrong, 0, "{doubtful} of {} in doubt", got.len());
     assert!(doubtful < got.len() / 8, "{doubtful} of {} in doubt", got.len());
     // Controls: another threshold, and texture coordinates that are off by a tenth.
-    holes.cut_outs.table[0].least += 4.0 * TOLERANCE;
+    holes.cut_outs.materials[0].cutoff += 4.0 * TOLERANCE;
     assert!(beyond_doubt(&holes, &got).0 > 100);
-    holes.cut_outs.table[0].least -= 4.0 * TOLERANCE;
+    holes.cut_outs.materials[0].cutoff -= 4.0 * TOLERANCE;
     holes.cut_outs.uvs.as_flattened_mut().iter_mut().for_each(|uv| uv[0] += 0.1);
     assert!(beyond_doubt(&holes, &got).0 > 100);
 }
@@ -95,11 +95,16 @@ fn gpu_perspective_floor_matches_the_definition() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_split_floor_matches_the_definition_on_every_path() {
     let device = Device::open(0).expect("a CUDA device");
-    for (cuts, spread) in [(60_u32, Spread::BySize), (12, Spread::BySize), (12, Spread::Warps), (12, Spread::Tiles)] {
+    for (cuts, granularity) in [
+        (60_u32, RasterGranularity::BySize),
+        (12, RasterGranularity::BySize),
+        (12, RasterGranularity::Warps),
+        (12, RasterGranularity::Tiles),
+    ] {
         let holes = floor(cuts);
-        let got = keys(&device, &holes, spread);
+        let got = keys(&device, &holes, granularity);
         let (wrong, doubtful) = beyond_doubt(&holes, &got);
-        assert_eq!(wrong, 0, "{cuts} by {spread:?}, {doubtful} of {} in doubt", got.len());
+        assert_eq!(wrong, 0, "{cuts} by {granularity:?}, {doubtful} of {} in doubt", got.len());
         assert!(doubtful < got.len() / 8, "{doubtful} of {} in doubt", got.len());
     }
 }
@@ -116,7 +121,7 @@ fn gpu_anisotropic_filtering_keeps_more_of_far_stripes() {
         _ => 90,
     });
     let floor_samples = |holes: &Holes| {
-        let got = keys(&device, holes, Spread::BySize);
+        let got = keys(&device, holes, RasterGranularity::BySize);
         got.iter().filter(|key| **key != u64::MAX && **key as u32 >= 2).count()
     };
     let alike = floor_samples(&holes);

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use modalcast_client::{Camera, Delivery, Format, Lens, Output, Picture, View};
+use modalcast_client::{Camera, Delivery, FrameFormat, Lens, Output, Picture, View};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -21,7 +21,7 @@ Exit codes: 0 done; 1 the server refused; 2 bad command line; 3 no connection, o
 /// Saves frames or vertices of a modalcast server.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
-pub(crate) struct Arguments {
+pub(crate) struct Cli {
     /// URL of the server.
     #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
@@ -76,7 +76,7 @@ pub(crate) struct PictureOptions {
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = size)]
     size: (u32, u32),
     /// What the picture shows: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map with legend.
-    #[arg(long, value_enum, default_value = "colour")]
+    #[arg(long, value_enum, default_value = "color")]
     output: OutputOption,
     /// Column of U for `--output mode-shape`.
     #[arg(long, default_value_t = 0)]
@@ -109,7 +109,7 @@ pub(crate) enum FormatOption {
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum OutputOption {
-    Colour,
+    Color,
     Depth,
     Domains,
     Normals,
@@ -122,12 +122,12 @@ impl PictureOptions {
         let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
         let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
         let format = match self.format {
-            FormatOption::Png => Format::Png,
-            FormatOption::Raw => Format::Rgba,
+            FormatOption::Png => FrameFormat::Png,
+            FormatOption::Raw => FrameFormat::Rgba,
         };
         let (mode, largest) = (self.mode, self.largest);
         let output = match self.output {
-            OutputOption::Colour => Output::Colour,
+            OutputOption::Color => Output::Color,
             OutputOption::Depth => Output::Depth,
             OutputOption::Domains => Output::Domains,
             OutputOption::Normals => Output::Normals,
@@ -255,7 +255,7 @@ mod tests {
     #[test]
     fn command_line_is_valid() {
         use clap::CommandFactory as _;
-        Arguments::command().debug_assert();
+        Cli::command().debug_assert();
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use modalcast_client::{Client, Error, Format, Frame, FrameRequest, FramesRequest, Result};
+use modalcast_client::{Client, Error, Frame, FrameFormat, FrameRequest, FrameStreamRequest, Result};
 
 use crate::cli::{FrameOptions, FramesOptions, StepOptions};
 use crate::output::{Summary, bar, scene};
@@ -11,20 +11,20 @@ use crate::output::{Summary, bar, scene};
 pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
     std::fs::create_dir_all(&options.out).map_err(|fault| Error::file(&options.out, fault))?;
-    let request = FramesRequest {
+    let request = FrameStreamRequest {
         scene: name,
         picture: options.picture.picture(),
         delivery: options.delivery.into(),
         frames: options.count,
     };
-    let mut frames = client.frames(&request).await?;
+    let mut frames = client.stream_frames(&request).await?;
     println!("ready");
-    let patience = Duration::from_secs_f64(options.timeout);
+    let timeout = Duration::from_secs_f64(options.timeout);
     let (mut summary, bar) = (Summary::new(), bar(options.count, "frames"));
     for index in 0..options.count {
-        let late = Error::Deadline { what: "the next frame", ms: patience.as_millis() as u64 };
-        let next = tokio::time::timeout(patience, frames.next()).await.map_err(|_| late)?;
-        let frame = next.unwrap_or(Err(Error::Ended { what: "the last frame" }))?;
+        let late = Error::Deadline { what: "the next frame", ms: timeout.as_millis() as u64 };
+        let next = tokio::time::timeout(timeout, frames.next()).await.map_err(|_| late)?;
+        let frame = next.unwrap_or(Err(Error::StreamEnded { what: "the last frame" }))?;
         write(&options.out.join(format!("frame_{index:05}.{}", extension(frame.format))), &frame)?;
         summary.add((frame.step.run, frame.step.number), frame.bytes.len() as u64, frame.skipped, &frame.stages);
         bar.inc(1);
@@ -36,11 +36,11 @@ pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool)
 
 pub(crate) async fn single(client: &Client, options: &FrameOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
-    let mut request = FrameRequest::of(&name).within_ms(options.step.deadline_ms);
+    let mut request = FrameRequest::new(&name).deadline_ms(options.step.deadline_ms);
     request.picture = options.picture.picture();
     let StepOptions { step, min_step, .. } = options.step;
-    request = step.map_or(request.clone(), |step| request.exactly(step));
-    request = min_step.map_or(request.clone(), |step| request.at_least(step));
+    request = step.map_or(request.clone(), |step| request.exact_step(step));
+    request = min_step.map_or(request.clone(), |step| request.minimum_step(step));
     let mut summary = Summary::new();
     let frame = client.frame(&request).await?;
     write(&options.out, &frame)?;
@@ -53,12 +53,12 @@ fn write(path: &Path, frame: &Frame) -> Result<()> {
     std::fs::write(path, &frame.bytes).map_err(|fault| Error::file(path, fault))
 }
 
-const fn extension(format: Format) -> &'static str {
+const fn extension(format: FrameFormat) -> &'static str {
     match format {
-        Format::Png => "png",
-        Format::Rgba => "rgba",
-        Format::F32 => "f32",
-        Format::U32 => "u32",
-        Format::F32x3 => "f32x3",
+        FrameFormat::Png => "png",
+        FrameFormat::Rgba => "rgba",
+        FrameFormat::F32 => "f32",
+        FrameFormat::U32 => "u32",
+        FrameFormat::F32x3 => "f32x3",
     }
 }

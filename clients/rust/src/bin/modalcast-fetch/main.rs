@@ -12,10 +12,10 @@ use std::time::Duration;
 use clap::Parser as _;
 use modalcast_client::{Client, Error, Result};
 
-use cli::{Arguments, Command};
+use cli::{Cli, Command};
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = Cli::parse();
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(fault) => {
@@ -35,15 +35,15 @@ fn main() -> ExitCode {
 /// The documented exit code of an error.
 const fn code(error: &Error) -> u8 {
     match error {
-        Error::Connect { .. } | Error::Refused { code: modalcast_client::Code::Unavailable, .. } => 3,
-        Error::Refused { .. } | Error::Rejected(_) | Error::Step { .. } => 1,
+        Error::Connect { .. } | Error::Status { code: modalcast_client::Code::Unavailable, .. } => 3,
+        Error::Status { .. } | Error::Rejected(_) | Error::Step { .. } => 1,
         Error::File { .. } => 4,
-        Error::Malformed { .. } | Error::Ended { .. } | Error::Deadline { .. } => 5,
+        Error::Malformed { .. } | Error::StreamEnded { .. } | Error::Deadline { .. } => 5,
     }
 }
 
-async fn run(arguments: &Arguments) -> Result<()> {
-    let client = Client::connect_within(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
+async fn run(arguments: &Cli) -> Result<()> {
+    let client = Client::connect_with_retry(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
     let json = arguments.json;
     match &arguments.command {
         Command::Frames(options) => frames::stream(&client, options, json).await,

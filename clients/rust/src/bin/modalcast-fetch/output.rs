@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::{Client, Result, SceneInfo, Stages};
+use modalcast_client::{Client, Result, SceneInfo, StageTimes};
 use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
@@ -35,7 +35,7 @@ impl Summary {
     }
 
     /// Counts one reply.
-    pub(crate) fn add(&mut self, step: (u64, u64), bytes: u64, skipped: u64, stages: &Stages) {
+    pub(crate) fn add(&mut self, step: (u64, u64), bytes: u64, skipped: u64, stages: &StageTimes) {
         let now = Instant::now();
         self.replies = Some((self.replies.map_or(now, |(first, _)| first), now));
         self.runs.push(step.0);

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use modalcast_client::npy::Writer;
-use modalcast_client::{Client, Error, Readings, Result, VertexRequest, VertexSet, VertexStreamRequest};
+use modalcast_client::{Client, Error, ReadbackOptions, Result, VertexRequest, VertexSet, VertexStreamRequest};
 
 use crate::cli::VerticesOptions;
 use crate::output::{Summary, bar, scene};
@@ -20,12 +20,12 @@ pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool
 }
 
 async fn single(client: &Client, options: &VerticesOptions, scene: &str) -> Result<VertexSet> {
-    let mut request = VertexRequest::of(scene).within_ms(options.step.deadline_ms);
+    let mut request = VertexRequest::new(scene).deadline_ms(options.step.deadline_ms);
     request.domains = options.domains.clone();
     request.positions_only = options.normals.is_none();
-    request.readings = readings(options);
-    request = options.step.step.map_or(request.clone(), |step| request.exactly(step));
-    request = options.step.min_step.map_or(request.clone(), |step| request.at_least(step));
+    request.readback = readback(options);
+    request = options.step.step.map_or(request.clone(), |step| request.exact_step(step));
+    request = options.step.min_step.map_or(request.clone(), |step| request.minimum_step(step));
     client.vertices(&request).await
 }
 
@@ -35,27 +35,27 @@ async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>)
         scene: scene.to_owned(),
         domains: options.domains.clone(),
         positions_only: options.normals.is_none(),
-        readings: readings(options),
+        readback: readback(options),
         delivery: options.delivery.into(),
         steps: count,
     };
-    let mut sets = client.vertex_sets(&request).await?;
+    let mut sets = client.stream_vertices(&request).await?;
     println!("ready");
-    let patience = Duration::from_secs_f64(options.timeout);
+    let timeout = Duration::from_secs_f64(options.timeout);
     let bar = bar(count, "steps");
     for _ in 0..count {
-        let late = Error::Deadline { what: "the next step", ms: patience.as_millis() as u64 };
-        let next = tokio::time::timeout(patience, sets.next()).await.map_err(|_| late)?;
-        files.add(&next.unwrap_or(Err(Error::Ended { what: "the last step" }))?)?;
+        let late = Error::Deadline { what: "the next step", ms: timeout.as_millis() as u64 };
+        let next = tokio::time::timeout(timeout, sets.next()).await.map_err(|_| late)?;
+        files.add(&next.unwrap_or(Err(Error::StreamEnded { what: "the last step" }))?)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
     Ok(())
 }
 
-fn readings(options: &VerticesOptions) -> Readings {
+fn readback(options: &VerticesOptions) -> ReadbackOptions {
     let (displacements, boxes) = (options.displacements.is_some(), options.boxes.is_some());
-    Readings { displacements, boxes, alone: false }
+    ReadbackOptions { displacements, boxes, without_vertices: false }
 }
 
 /// The file of one array, the shape of its rows, and the row of one step.

@@ -1,14 +1,14 @@
 //! Tests of the glTF reader with small generated models.
 
-mod hostile;
-mod looks;
+mod malformed;
+mod materials;
 mod real;
 
 use serde_json::{Value, json};
 
 use crate::error::Result;
-use crate::load::files::Files;
-use crate::scene::{Parts, Scene};
+use crate::load::asset_dir::AssetDir;
+use crate::scene::{Scene, SceneParts};
 
 const U8: u64 = 5121;
 const U16: u64 = 5123;
@@ -87,11 +87,11 @@ impl Model {
         glb
     }
 
-    fn read(&self) -> Result<Parts> {
-        super::parse(&Files::anywhere(&std::env::temp_dir()), "model", &self.glb())
+    fn read(&self) -> Result<SceneParts> {
+        super::parse(&AssetDir::unrestricted(&std::env::temp_dir()), "model", &self.glb())
     }
 
-    fn parts(&self) -> Parts {
+    fn parts(&self) -> SceneParts {
         self.read().expect("a sound model")
     }
 }
@@ -193,7 +193,7 @@ fn nodes_are_placed_by_the_product_of_their_matrices_and_hang_on_the_nearest_mes
     let attachment = parts.domains[1].attachment.as_ref().expect("hangs on root");
     assert_eq!((attachment.parent, attachment.rows.len()), (0, 0));
     close(&attachment.frame.0, &[0.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
-    let composed = parts.domains[0].placement.then(attachment.frame);
+    let composed = parts.domains[0].placement.compose(attachment.frame);
     close(&composed.0, &parts.domains[1].placement.0);
     assert!(parts.domains[0].attachment.is_none() && parts.domains[2].attachment.is_none());
     Scene::new(parts).expect("a scene");
@@ -277,7 +277,7 @@ fn a_gltf_reads_data_uris_and_files_beside_it_and_not_those_of_another_folder() 
     std::fs::create_dir(folder.path().join("sub")).expect("made");
     std::fs::write(folder.path().join("sub/my buffer.bin"), &model.bin).expect("written");
     std::fs::write(folder.path().join("secret.bin"), &model.bin).expect("written");
-    let files = Files::anywhere(folder.path());
+    let files = AssetDir::unrestricted(folder.path());
     let mut read = |uri: String| {
         model.json["buffers"][0]["uri"] = uri.into();
         std::fs::write(folder.path().join("sub/model.gltf"), model.json.to_string()).expect("written");

@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use crate::domain::{AlphaMode, Texture};
-use crate::load::files::Files;
-use crate::scene::{Parts, Scene};
+use crate::load::asset_dir::AssetDir;
+use crate::scene::{Scene, SceneParts};
 
-fn read(path: &str) -> Parts {
+fn read(path: &str) -> SceneParts {
     let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let data = std::env::var_os("MODALCAST_DATA").map_or(here, PathBuf::from);
-    super::super::read(&Files::anywhere(&data), path).expect("the real input")
+    super::super::read(&AssetDir::unrestricted(&data), path).expect("the real input")
 }
 
 #[test]
@@ -57,7 +57,7 @@ fn real_ferns_are_four_masked_plants_with_a_normal_map() {
     assert_eq!(material.alpha_mode, AlphaMode::Mask { cutoff: 0.5 });
     assert!(material.double_sided);
     let side = |texture: Option<usize>| texture.map(|index| &parts.textures[index]).map(Texture::width);
-    assert_eq!((side(material.colour_texture), side(material.normal_texture)), (Some(2048), Some(2048)));
+    assert_eq!((side(material.color_texture), side(material.normal_texture)), (Some(2048), Some(2048)));
     assert_eq!(parts.textures[0].name, "fern_02_diff-fern_02_alpha");
     assert_eq!(parts.textures.len(), 2);
     let scene = Scene::new(parts).expect("a scene");

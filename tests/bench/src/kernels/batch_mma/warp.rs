@@ -1,25 +1,25 @@
 //! CPU twin of one warp of `kernels/batch_mma.cu` in lockstep: fragments, staging buffer and stores. Sums are f64.
 
 use super::{BatchMmaArgs, STEP, args, fragments, halves, placements, vectors_for};
-use modalcast_compute::storage::{Plane, Tiles};
+use modalcast_compute::storage::{PackedWord, TiledModes};
 use modalcast_compute::testing::transformed_axis;
-use modalcast_model::scene::{Scene, State, Storage};
+use modalcast_model::scene::{Scene, SceneState, StorageType};
 
 pub(super) const QUADS: usize = 8;
 const STRIDE: usize = 3 * QUADS + 2;
 
 /// The kernel's inputs.
-pub(super) struct Tables {
-    pub tiles: Tiles,
+pub(super) struct KernelInputs {
+    pub tiles: TiledModes,
     pub args: BatchMmaArgs,
     fragments: Vec<u32>,
     placements: Vec<f32>,
     pub vectors: usize,
 }
 
-impl Tables {
-    pub(super) fn of(scene: &Scene, state: &State) -> Self {
-        let tiles = Tiles::new(scene.shape_of(0), scene.deformation.storage);
+impl KernelInputs {
+    pub(super) fn of(scene: &Scene, state: &SceneState) -> Self {
+        let tiles = TiledModes::new(scene.shape_of(0), scene.deformation.storage);
         let (vectors, halves) = (vectors_for(scene.domains.len()).0, halves(scene, state, &tiles));
         Self {
             args: args(scene, tiles.chunks()),
@@ -32,7 +32,7 @@ impl Tables {
 
     fn number(&self, bits: u32) -> f64 {
         match self.tiles.storage() {
-            Storage::F16 => half::f16::from_bits(bits as u16).to_f64(),
+            StorageType::F16 => half::f16::from_bits(bits as u16).to_f64(),
             _ => half::bf16::from_bits(bits as u16).to_f64(),
         }
     }
@@ -40,7 +40,7 @@ impl Tables {
 
 /// A product of fragments as the PTX instruction set defines m16n8k16: rows g and g + 8 of A and columns 2 t and 2 t +
 /// 1 of D belong to lane 4 g + t.
-fn multiply(tables: &Tables, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
+fn multiply(tables: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
     let half = |word: u32, index: usize| tables.number(word >> (16 * (index % 2)) & 0xffff);
     let at = |row: usize, k: usize| half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
     let from = |k: usize, column: usize| half(b[4 * column + k % 8 / 2][k / 8], k);
@@ -53,10 +53,11 @@ fn multiply(tables: &Tables, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f
 }
 
 /// The twelve words of a lane's chunk; zeros beyond the last chunk.
-fn load(tables: &Tables, (first, width, quad): (usize, usize, usize), chunk: usize) -> [u32; 12] {
+fn load(tables: &KernelInputs, (first, width, quad): (usize, usize, usize), chunk: usize) -> [u32; 12] {
     let mut words = [0; 12];
     if chunk < tables.args.chunks as usize {
-        let plane = |plane: usize| -> Plane { tables.tiles.planes()[first + (3 * chunk + plane) * width + quad] };
+        let plane =
+            |plane: usize| -> PackedWord { tables.tiles.packed_words()[first + (3 * chunk + plane) * width + quad] };
         let bytes: Vec<u8> = (0..3).flat_map(|index| plane(index).0).collect();
         words = std::array::from_fn(|word| bytemuck::pod_read_unaligned(&bytes[4 * word..4 * word + 4]));
     }
@@ -64,13 +65,13 @@ fn load(tables: &Tables, (first, width, quad): (usize, usize, usize), chunk: usi
 }
 
 /// Accumulators: [row][eight of domains][lane][4].
-pub(super) type Sums = Vec<Vec<[[f64; 4]; 32]>>;
+pub(super) type AccumulatorFragments = Vec<Vec<[[f64; 4]; 32]>>;
 
-pub(super) fn sums(tables: &Tables, tile: usize, warp: usize) -> Sums {
+pub(super) fn sums(tables: &KernelInputs, tile: usize, warp: usize) -> AccumulatorFragments {
     let width = tables.tiles.tile(tile).quads;
-    let first = tables.tiles.tile(tile).first_plane;
+    let first = tables.tiles.tile(tile).first_packed_word;
     let eights = tables.vectors / 8;
-    let mut sums: Sums = vec![vec![[[0.0; 4]; 32]; eights]; 6];
+    let mut sums: AccumulatorFragments = vec![vec![[[0.0; 4]; 32]; eights]; 6];
     for step in 0..tables.tiles.rank().div_ceil(STEP) {
         let chunks: Vec<[[u32; 12]; 2]> = (0..32)
             .map(|lane| {
@@ -97,7 +98,12 @@ pub(super) fn sums(tables: &Tables, tile: usize, warp: usize) -> Sums {
     sums
 }
 
-pub(super) fn staged(tables: &Tables, sums: &Sums, (tile, warp): (usize, usize), pass: usize) -> Vec<[f32; 4]> {
+pub(super) fn staged(
+    tables: &KernelInputs,
+    sums: &AccumulatorFragments,
+    (tile, warp): (usize, usize),
+    pass: usize,
+) -> Vec<[f32; 4]> {
     let mut staged = vec![[f32::NAN; 4]; 4 * STRIDE];
     let place = tables.tiles.tile(tile);
     for (quad, pair) in (0..QUADS).flat_map(|quad| (0..4).map(move |pair| (quad, pair))) {
@@ -123,7 +129,7 @@ pub(super) fn staged(tables: &Tables, sums: &Sums, (tile, warp): (usize, usize),
 }
 
 pub(super) fn store(
-    tables: &Tables,
+    tables: &KernelInputs,
     staged: &[[f32; 4]],
     (first, own, pass): (usize, usize, usize),
     positions: &mut [f32],

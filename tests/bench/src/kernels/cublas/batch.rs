@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::library::Product;
+use super::library::GemmCall;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// Ways to compute u = U q with cuBLAS.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Peer {
+pub enum CublasMethod {
     /// One domain, `sgemv`, U column-major.
     SgemvColumns,
     /// One domain, `sgemv`, U row-major.
@@ -30,7 +30,7 @@ pub enum Peer {
     Instances,
 }
 
-impl Peer {
+impl CublasMethod {
     /// All variants.
     pub const ALL: [Self; 8] = [
         Self::SgemvColumns,
@@ -75,8 +75,8 @@ impl Peer {
 
 /// Products of one kind and their domains.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Batch {
-    pub product: Product,
+pub(super) struct GemmBatch {
+    pub product: GemmCall,
     pub domains: Vec<usize>,
     /// Offsets of U, q and u, in floats.
     pub first: [u64; 3],
@@ -84,16 +84,16 @@ pub(super) struct Batch {
 
 /// All products of a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Batches {
-    pub list: Vec<Batch>,
+pub(super) struct GemmBatches {
+    pub list: Vec<GemmBatch>,
     /// Total floats of U, q and u.
     pub floats: [u64; 3],
 }
 
-impl Batches {
+impl GemmBatches {
     /// # Errors
     /// `Invalid` when `peer` does not support the scene, or the scene is too large for the library's 32-bit integers.
-    pub(super) fn of(scene: &Scene, peer: Peer) -> Result<Self> {
+    pub(super) fn of(scene: &Scene, peer: CublasMethod) -> Result<Self> {
         check(scene, peer)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
         for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
@@ -102,14 +102,14 @@ impl Batches {
         let (mut list, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
         for domains in groups.into_values() {
             let product = product(scene, peer, &domains)?;
-            let matrices = if peer == Peer::Instances { 1 } else { domains.len() as u64 };
+            let matrices = if peer == CublasMethod::Instances { 1 } else { domains.len() as u64 };
             let sizes = [matrices, domains.len() as u64, domains.len() as u64];
             let first = floats;
             for ((total, stride), count) in floats.iter_mut().zip(product.strides).zip(sizes) {
                 // Batches are aligned to float4.
                 *total = (*total + stride.unsigned_abs() * count).next_multiple_of(4);
             }
-            list.push(Batch { product, domains, first });
+            list.push(GemmBatch { product, domains, first });
         }
         Ok(Self { list, floats })
     }
@@ -126,7 +126,7 @@ impl Batches {
     }
 
     /// The coordinates of all domains, padded with zeros.
-    pub(super) fn pack_q(&self, scene: &Scene, state: &State) -> Vec<f32> {
+    pub(super) fn pack_q(&self, scene: &Scene, state: &SceneState) -> Vec<f32> {
         let mut packed = vec![0.0; self.floats[1] as usize];
         for batch in &self.list {
             for (index, domain) in batch.domains.iter().enumerate() {
@@ -138,7 +138,7 @@ impl Batches {
     }
 }
 
-impl Batch {
+impl GemmBatch {
     /// Offset in floats of U (`of` 0), q (1) or u (2) of the domain at `index` of this batch.
     pub(super) fn place(&self, index: usize, of: usize) -> u64 {
         self.first[of] + self.product.strides[of].unsigned_abs() * index as u64
@@ -161,7 +161,7 @@ impl Batch {
 }
 
 /// The product of a batch, sized by its largest domain.
-fn product(scene: &Scene, peer: Peer, domains: &[usize]) -> Result<Product> {
+fn product(scene: &Scene, peer: CublasMethod, domains: &[usize]) -> Result<GemmCall> {
     let int = |number: usize| {
         i32::try_from(number).map_err(|_| invalid("scene.size", format!("at most {} for cuBLAS", i32::MAX), number))
     };
@@ -169,10 +169,10 @@ fn product(scene: &Scene, peer: Peer, domains: &[usize]) -> Result<Product> {
     let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
     let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
     // The library is fastest with columns aligned to 16 bytes; row-major storage has no gaps.
-    let lead = if peer == Peer::SgemvRows { rows } else { rows.next_multiple_of(4) };
-    let (columns, count) = if peer == Peer::Instances { (domains.len(), 1) } else { (1, domains.len()) };
+    let lead = if peer == CublasMethod::SgemvRows { rows } else { rows.next_multiple_of(4) };
+    let (columns, count) = if peer == CublasMethod::Instances { (domains.len(), 1) } else { (1, domains.len()) };
     let strides = [lead as i64 * rank as i64, rank as i64, lead as i64];
-    Ok(Product {
+    Ok(GemmCall {
         rows: int(rows)?,
         inner: int(rank)?,
         columns: int(columns)?,
@@ -182,16 +182,16 @@ fn product(scene: &Scene, peer: Peer, domains: &[usize]) -> Result<Product> {
     })
 }
 
-fn check(scene: &Scene, peer: Peer) -> Result<()> {
+fn check(scene: &Scene, peer: CublasMethod) -> Result<()> {
     let domains = scene.domains.len();
     if !scene.needs.modes {
         return Err(invalid("modes", format!("some, for {}", peer.name()), 0));
     }
     match peer {
-        Peer::SgemvColumns | Peer::SgemvRows if domains != 1 => {
+        CublasMethod::SgemvColumns | CublasMethod::SgemvRows if domains != 1 => {
             Err(invalid("scene.domains", format!("1 for {}", peer.name()), domains))
         }
-        Peer::Instances if scene.domains.iter().any(|domain| domain.shape != scene.domains[0].shape) => {
+        CublasMethod::Instances if scene.domains.iter().any(|domain| domain.shape != scene.domains[0].shape) => {
             Err(invalid("scene.domains", "instances of one shape for cublas_instances", "several shapes"))
         }
         _ => Ok(()),
@@ -204,8 +204,8 @@ mod tests {
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
     /// Emulates cuBLAS on a batch: C = A B for strided column-major matrices.
-    fn multiply(batch: &Batch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
-        let Product { rows, inner, columns, lead, count, strides } = batch.product;
+    fn multiply(batch: &GemmBatch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
+        let GemmCall { rows, inner, columns, lead, count, strides } = batch.product;
         let at = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
         for index in 0..count {
             let [a0, b0, c0] = [0, 1, 2].map(|of| at(batch.first[of], strides[of], index));
@@ -222,12 +222,12 @@ mod tests {
         }
     }
 
-    fn check_peer(scene: &Scene, state: &State, peer: Peer) -> Batches {
-        let batches = Batches::of(scene, peer).expect("batches");
-        let by_rows = peer == Peer::SgemvRows;
+    fn check_peer(scene: &Scene, state: &SceneState, peer: CublasMethod) -> GemmBatches {
+        let batches = GemmBatches::of(scene, peer).expect("batches");
+        let by_rows = peer == CublasMethod::SgemvRows;
         let mut matrices = vec![0.0; batches.floats[0] as usize];
         for batch in &batches.list {
-            let stored = if peer == Peer::Instances { 1 } else { batch.domains.len() };
+            let stored = if peer == CublasMethod::Instances { 1 } else { batch.domains.len() };
             for (index, domain) in batch.domains.iter().enumerate().take(stored) {
                 let matrix = batch.matrix(scene, *domain, by_rows);
                 matrices[batch.place(index, 0) as usize..][..matrix.len()].copy_from_slice(&matrix);
@@ -256,13 +256,14 @@ mod tests {
         let (many, state) = scene_and_state(&shapes);
         let deformable = shapes.iter().filter(|(_, rank, _)| *rank > 0);
         let needed: u64 = deformable.clone().map(|(vertices, rank, _)| (3 * vertices * rank) as u64).sum();
-        let stored = |peer: Peer| check_peer(&many, &state, peer).floats[0];
-        let (padded, bucketed, grouped) = (stored(Peer::Padded), stored(Peer::Bucketed), stored(Peer::Grouped));
+        let stored = |peer: CublasMethod| check_peer(&many, &state, peer).floats[0];
+        let (padded, bucketed, grouped) =
+            (stored(CublasMethod::Padded), stored(CublasMethod::Bucketed), stored(CublasMethod::Grouped));
         assert!(needed <= grouped && grouped < bucketed && bucketed < padded, "{grouped} {bucketed} {padded}");
-        assert_eq!(check_peer(&many, &state, Peer::Padded).list.len(), 1);
-        assert_eq!(check_peer(&many, &state, Peer::Grouped).list.len(), deformable.count(), "all differ here");
+        assert_eq!(check_peer(&many, &state, CublasMethod::Padded).list.len(), 1);
+        assert_eq!(check_peer(&many, &state, CublasMethod::Grouped).list.len(), deformable.count(), "all differ here");
         let (one, state) = scene_and_state(&[(23, 10, 1)]);
-        for peer in Peer::ALL {
+        for peer in CublasMethod::ALL {
             let batches = check_peer(&one, &state, peer);
             assert_eq!(batches.list.len(), 1, "{}", peer.name());
         }
@@ -270,16 +271,16 @@ mod tests {
 
     #[test]
     fn instances_share_one_matrix_with_a_column_each() {
-        use modalcast_model::scene::Parts;
+        use modalcast_model::scene::SceneParts;
         let (one, _) = scene_and_state(&[(23, 10, 1)]);
-        let mut parts = Parts::named("instances");
+        let mut parts = SceneParts::named("instances");
         parts.shapes = one.shapes.clone();
         parts.materials = one.materials.clone();
         parts.domains = vec![one.domains[0].clone(); 16];
         let instances = Scene::new(parts).expect("a scene");
-        let mut state = State::rest(&instances);
+        let mut state = SceneState::rest(&instances);
         state.q.iter_mut().enumerate().for_each(|(index, q)| *q = (index as f32).sin());
-        let batches = check_peer(&instances, &state, Peer::Instances);
+        let batches = check_peer(&instances, &state, CublasMethod::Instances);
         assert_eq!(batches.floats, [72 * 10, 160, 72 * 16]);
         assert_eq!((batches.list[0].product.columns, batches.list[0].product.count), (16, 1));
     }
@@ -287,13 +288,13 @@ mod tests {
     #[test]
     fn rejects_unsupported_scenes_by_name() {
         let (two, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
-        for peer in [Peer::SgemvColumns, Peer::SgemvRows, Peer::Instances] {
-            let refusal = Batches::of(&two, peer).expect_err("two shapes").to_string();
+        for peer in [CublasMethod::SgemvColumns, CublasMethod::SgemvRows, CublasMethod::Instances] {
+            let refusal = GemmBatches::of(&two, peer).expect_err("two shapes").to_string();
             assert!(refusal.starts_with("scene.domains") && refusal.contains(peer.name()), "{refusal}");
         }
         let (rigid, _) = scene_and_state(&[(5, 0, 1)]);
-        for peer in Peer::ALL {
-            assert!(Batches::of(&rigid, peer).expect_err("no modes").to_string().starts_with("modes"));
+        for peer in CublasMethod::ALL {
+            assert!(GemmBatches::of(&rigid, peer).expect_err("no modes").to_string().starts_with("modes"));
         }
     }
 }

@@ -8,8 +8,8 @@ use cudarc::driver::CudaSlice;
 use libloading::Library;
 
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, room};
-use modalcast_model::error::{Error, Result, during};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// Remedy in the error message when cuBLAS is missing.
 const REMEDY: &str = "Install the PyPI wheel nvidia-cublas==13.* and set MODALCAST_CUBLAS to the path of its \
@@ -23,7 +23,7 @@ type Handle = *mut c_void;
 /// The used functions, in the types of cublas_v2.h; device pointers are `u64` addresses. Old versions lack the two
 /// optional ones.
 #[allow(clippy::type_complexity, reason = "the types are those of a C header")]
-struct Functions {
+struct CublasFunctions {
     property: unsafe extern "C" fn(c_int, *mut c_int) -> c_int,
     status: unsafe extern "C" fn(c_int) -> *const c_char,
     create: unsafe extern "C" fn(*mut Handle) -> c_int,
@@ -127,9 +127,9 @@ const NO_TRANSPOSE: c_int = 0;
 const TRANSPOSE: c_int = 1;
 
 /// The cuBLAS functions of this process, loaded at the first call.
-fn functions() -> Result<&'static Functions> {
-    static LOADED: OnceLock<Result<Functions>> = OnceLock::new();
-    LOADED.get_or_init(|| Functions::find(&candidates())).as_ref().map_err(Clone::clone)
+fn functions() -> Result<&'static CublasFunctions> {
+    static LOADED: OnceLock<Result<CublasFunctions>> = OnceLock::new();
+    LOADED.get_or_init(|| CublasFunctions::find(&candidates())).as_ref().map_err(Clone::clone)
 }
 
 /// Version of cuBLAS: major, minor, patch.
@@ -160,7 +160,7 @@ fn candidates() -> Vec<PathBuf> {
     names.iter().map(PathBuf::from).chain(names.iter().map(|name| toolkit.join(name))).collect()
 }
 
-impl Functions {
+impl CublasFunctions {
     fn find(candidates: &[PathBuf]) -> Result<Self> {
         let mut reasons = Vec::new();
         for candidate in candidates {
@@ -204,14 +204,14 @@ impl Functions {
         }
         // SAFETY: cuBLAS returns a NUL-terminated string of static lifetime for any code.
         let text = unsafe { CStr::from_ptr((self.status)(code)) }.to_string_lossy().into_owned();
-        Err(during("cublas")(text))
+        Err(fault_in("cublas")(text))
     }
 }
 
 /// C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. `count` such products lie at
 /// regular strides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Product {
+pub(super) struct GemmCall {
     pub rows: i32,
     pub inner: i32,
     pub columns: i32,
@@ -224,20 +224,20 @@ pub(super) struct Product {
 
 /// Arguments of a grouped product: one entry per group on the host, and device arrays with one pointer per problem.
 #[derive(Debug)]
-pub(super) struct Grouped<'a> {
-    pub groups: &'a [Product],
+pub(super) struct GroupedGemm<'a> {
+    pub groups: &'a [GemmCall],
     /// Device arrays of pointers to A, B and C.
     pub pointers: [u64; 3],
 }
 
 /// A cuBLAS handle on the device's stream.
-pub(super) struct Blas {
-    functions: &'static Functions,
+pub(super) struct CublasHandle {
+    functions: &'static CublasFunctions,
     handle: Handle,
     _workspace: CudaSlice<u8>,
 }
 
-impl std::fmt::Debug for Blas {
+impl std::fmt::Debug for CublasHandle {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.debug_struct("Blas").finish_non_exhaustive()
     }
@@ -246,13 +246,13 @@ impl std::fmt::Debug for Blas {
 const ONE: f32 = 1.0;
 const ZERO: f32 = 0.0;
 
-impl Blas {
+impl CublasHandle {
     /// # Errors
     /// `Unavailable` when cuBLAS is missing or does not start; `Fault` when the device fails.
     pub(super) fn new(device: &Device) -> Result<Self> {
         let functions = functions()?;
-        device.context().bind_to_thread().map_err(during("device"))?;
-        let workspace = room(device, WORKSPACE)?;
+        device.context().bind_to_thread().map_err(fault_in("device"))?;
+        let workspace = alloc_zeroed(device, WORKSPACE)?;
         let mut handle = std::ptr::null_mut();
         // SAFETY: `handle` is a live pointer, and the device's context is current.
         functions.check(unsafe { (functions.create)(&mut handle) }).map_err(|error| unavailable(error.to_string()))?;
@@ -271,8 +271,8 @@ impl Blas {
     pub(super) fn check_has(&self, grouped: bool, vectors: bool) -> Result<()> {
         let missing = |name: &str| Err(unavailable(format!("this version has no {name}")));
         match self.functions {
-            Functions { sgemm_grouped: None, .. } if grouped => missing("cublasSgemmGroupedBatched"),
-            Functions { sgemv_strided: None, .. } if vectors => missing("cublasSgemvStridedBatched"),
+            CublasFunctions { sgemm_grouped: None, .. } if grouped => missing("cublasSgemmGroupedBatched"),
+            CublasFunctions { sgemv_strided: None, .. } if vectors => missing("cublasSgemvStridedBatched"),
             _ => Ok(()),
         }
     }
@@ -281,7 +281,7 @@ impl Blas {
     ///
     /// # Safety
     /// The addresses are device addresses of matrices with the sizes in `of`; its `columns` and `count` are 1.
-    pub(super) unsafe fn gemv(&self, of: Product, by_rows: bool, [a, x, y]: [u64; 3]) -> Result<()> {
+    pub(super) unsafe fn gemv(&self, of: GemmCall, by_rows: bool, [a, x, y]: [u64; 3]) -> Result<()> {
         let (transpose, rows, columns, lead) = match by_rows {
             // A row-major matrix is the transpose of a column-major one.
             true => (TRANSPOSE, of.inner, of.rows, of.inner),
@@ -297,8 +297,8 @@ impl Blas {
     ///
     /// # Safety
     /// The addresses are device addresses of matrices with the sizes in `of`; its `count` is 1.
-    pub(super) unsafe fn gemm(&self, of: Product, [a, b, c]: [u64; 3]) -> Result<()> {
-        let Product { rows, inner, columns, lead, .. } = of;
+    pub(super) unsafe fn gemm(&self, of: GemmCall, [a, b, c]: [u64; 3]) -> Result<()> {
+        let GemmCall { rows, inner, columns, lead, .. } = of;
         let (handle, no) = (self.handle, NO_TRANSPOSE);
         // SAFETY: the handle is live; the caller vouches for the matrices.
         self.functions.check(unsafe {
@@ -310,8 +310,8 @@ impl Blas {
     ///
     /// # Safety
     /// The addresses are those of `count` matrices as `of` says; with `as_vectors`, its `columns` is 1.
-    pub(super) unsafe fn strided(&self, of: Product, as_vectors: bool, [a, b, c]: [u64; 3]) -> Result<()> {
-        let Product { rows, inner, columns, lead, count, strides: [to_a, to_b, to_c] } = of;
+    pub(super) unsafe fn strided(&self, of: GemmCall, as_vectors: bool, [a, b, c]: [u64; 3]) -> Result<()> {
+        let GemmCall { rows, inner, columns, lead, count, strides: [to_a, to_b, to_c] } = of;
         let (handle, no) = (self.handle, NO_TRANSPOSE);
         let code = match self.functions.sgemv_strided.filter(|_| as_vectors) {
             // SAFETY: the handle is live; the caller vouches for the matrices.
@@ -333,11 +333,11 @@ impl Blas {
     ///
     /// # Safety
     /// The device arrays hold the device address of a matrix for each problem, in the order of the groups.
-    pub(super) unsafe fn grouped(&self, of: &Grouped) -> Result<()> {
+    pub(super) unsafe fn grouped(&self, of: &GroupedGemm) -> Result<()> {
         let Some(grouped) = self.functions.sgemm_grouped else {
             return self.check_has(true, false);
         };
-        let list = |of_group: fn(&Product) -> c_int| of.groups.iter().map(of_group).collect::<Vec<c_int>>();
+        let list = |of_group: fn(&GemmCall) -> c_int| of.groups.iter().map(of_group).collect::<Vec<c_int>>();
         let (rows, columns, inner) = (list(|group| group.rows), list(|group| group.columns), list(|group| group.inner));
         let (lead, counts, no) = (list(|group| group.lead), list(|group| group.count), list(|_| NO_TRANSPOSE));
         let (ones, zeros) = (vec![ONE; of.groups.len()], vec![ZERO; of.groups.len()]);
@@ -366,7 +366,7 @@ impl Blas {
     }
 }
 
-impl Drop for Blas {
+impl Drop for CublasHandle {
     fn drop(&mut self) {
         // SAFETY: the handle came from `create` and is destroyed once; destroying waits for its work. A failure here
         // cannot be handled, so its code is ignored.
@@ -384,7 +384,7 @@ mod tests {
         let broken = folder.path().join("libcublas.so.13");
         std::fs::write(&broken, b"no library").expect("a file");
         for path in [folder.path().join("nowhere.so"), broken] {
-            let refusal = Functions::find(std::slice::from_ref(&path)).err().expect("refused");
+            let refusal = CublasFunctions::find(std::slice::from_ref(&path)).err().expect("refused");
             assert!(matches!(refusal, Error::Unavailable { what: "cuBLAS", .. }), "{refusal}");
             let text = refusal.to_string();
             assert!(text.contains(&path.display().to_string()) && text.contains("nvidia-cublas"), "{text}");

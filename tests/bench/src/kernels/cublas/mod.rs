@@ -4,90 +4,96 @@
 mod batch;
 mod library;
 
-pub use batch::Peer;
+pub use batch::CublasMethod;
 pub use library::cublas_version;
 
 use std::sync::Arc;
 
 use cudarc::driver::CudaSlice;
 
+use super::input_sets::{InputSets, Part};
+use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use super::plain_update::PlainUpdate;
-use super::trial::{KernelFacts, Trial};
-use super::turns::{Part, Turns};
-use batch::Batches;
-use library::{Blas, Grouped, Product};
+use batch::GemmBatches;
+use library::{CublasHandle, GemmCall, GroupedGemm};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, download, room, upload};
-use modalcast_model::error::{Error, Result, during};
-use modalcast_model::scene::{Scene, State};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
+use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// cuBLAS for a scene, with the inputs of several steps.
 #[derive(Debug)]
-pub struct Cublas {
+pub struct CublasBenchmark {
     // Declared first and therefore dropped first: dropping it waits for its work on the buffers below.
-    blas: Blas,
-    peer: Peer,
+    blas: CublasHandle,
+    peer: CublasMethod,
     part: Part,
-    batches: Batches,
+    batches: GemmBatches,
     u_matrices: CudaSlice<u8>,
     u: CudaSlice<u8>,
     update: Option<PlainUpdate>,
     /// First float of each domain's u; `None` for domains without modes.
     places: Vec<Option<u64>>,
-    turns: Turns,
-    pointers: Option<Pointers>,
+    turns: InputSets,
+    pointers: Option<PointerArrays>,
 }
 
 /// Device arrays with one pointer per problem: to U, to u, and to q for each turn.
 #[derive(Debug)]
-struct Pointers {
+struct PointerArrays {
     matrices: CudaSlice<u8>,
     outputs: CudaSlice<u8>,
     q: CudaSlice<u8>,
     problems: u64,
 }
 
-impl Cublas {
+impl CublasBenchmark {
     /// Packs a scene for one kind of product.
     ///
     /// # Errors
     /// `Invalid` when `peer` does not support the scene, or there is no state; `Unavailable` when cuBLAS is missing or
     /// too old, or the device has too little memory; `Fault` when the device fails.
-    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[State], (peer, part): (Peer, Part)) -> Result<Self> {
-        let batches = Batches::of(scene, peer)?;
+    pub fn new(
+        device: &Device,
+        scene: &Arc<Scene>,
+        states: &[SceneState],
+        (peer, part): (CublasMethod, Part),
+    ) -> Result<Self> {
+        let batches = GemmBatches::of(scene, peer)?;
         check_memory(device, &batches)?;
-        let blas = Blas::new(device)?;
-        blas.check_has(peer == Peer::Grouped, peer.as_vectors())?;
+        let blas = CublasHandle::new(device)?;
+        blas.check_has(peer == CublasMethod::Grouped, peer.as_vectors())?;
         let places = batches.places_of_u(scene.domains.len());
         let u_matrices = upload_matrices(device, scene, &batches, peer)?;
-        let u = room(device, 4 * batches.floats[2])?;
-        let transforms = |state: &State| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
-        let turns = Turns::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
-        let pointers = (peer == Peer::Grouped).then(|| Pointers::new(device, &batches, [&u_matrices, &u], &turns));
+        let u = alloc_zeroed(device, 4 * batches.floats[2])?;
+        let transforms = |state: &SceneState| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
+        let turns = InputSets::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
+        let pointers =
+            (peer == CublasMethod::Grouped).then(|| PointerArrays::new(device, &batches, [&u_matrices, &u], &turns));
         let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &places)).transpose()?;
         Ok(Self { blas, peer, part, pointers: pointers.transpose()?, batches, u_matrices, u, update, places, turns })
     }
 
     fn multiply(&self, device: &Device, q: u64, turn: usize) -> Result<()> {
         if let Some(pointers) = &self.pointers {
-            let groups: Vec<Product> = self.batches.list.iter().map(|batch| batch.product).collect();
+            let groups: Vec<GemmCall> = self.batches.list.iter().map(|batch| batch.product).collect();
             let q = address(device, &pointers.q) + 8 * pointers.problems * (turn % self.turns.count()) as u64;
             let pointers = [address(device, &pointers.matrices), q, address(device, &pointers.outputs)];
             // SAFETY: the arrays have a pointer for each problem, in the order of the groups, each to memory of the
-            // size that `Batches` planned.
-            return unsafe { self.blas.grouped(&Grouped { groups: &groups, pointers }) };
+            // size that `GemmBatches` planned.
+            return unsafe { self.blas.grouped(&GroupedGemm { groups: &groups, pointers }) };
         }
         let bases = [address(device, &self.u_matrices), q, address(device, &self.u)];
         for batch in &self.batches.list {
             let at: [u64; 3] = std::array::from_fn(|of| bases[of] + 4 * batch.first[of]);
-            // SAFETY: the three buffers have the sizes that `Batches` planned, and this batch lies inside them. The
+            // SAFETY: the three buffers have the sizes that `GemmBatches` planned, and this batch lies inside them. The
             // products of the first three kinds have a `count` of 1, and those of the first two have one column.
             unsafe {
                 match self.peer {
-                    Peer::SgemvColumns | Peer::SgemvRows => {
-                        self.blas.gemv(batch.product, self.peer == Peer::SgemvRows, at)?;
+                    CublasMethod::SgemvColumns | CublasMethod::SgemvRows => {
+                        self.blas.gemv(batch.product, self.peer == CublasMethod::SgemvRows, at)?;
                     }
-                    Peer::Instances => self.blas.gemm(batch.product, at)?,
+                    CublasMethod::Instances => self.blas.gemm(batch.product, at)?,
                     _ => self.blas.strided(batch.product, self.peer.as_vectors(), at)?,
                 }
             }
@@ -96,7 +102,7 @@ impl Cublas {
     }
 }
 
-impl Trial for Cublas {
+impl KernelBenchmark for CublasBenchmark {
     fn name(&self) -> String {
         self.part.named(self.peer.name())
     }
@@ -142,13 +148,18 @@ impl Trial for Cublas {
     }
 
     /// Facts about the update alone, because the library's kernels are not accessible.
-    fn kernels(&self) -> Vec<KernelFacts> {
+    fn kernels(&self) -> Vec<KernelAttributes> {
         self.update.iter().map(|update| update.facts().clone()).collect()
     }
 }
 
-impl Pointers {
-    fn new(device: &Device, batches: &Batches, [matrices, u]: [&CudaSlice<u8>; 2], turns: &Turns) -> Result<Self> {
+impl PointerArrays {
+    fn new(
+        device: &Device,
+        batches: &GemmBatches,
+        [matrices, u]: [&CudaSlice<u8>; 2],
+        turns: &InputSets,
+    ) -> Result<Self> {
         let problems =
             || batches.list.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
         let list = |base: u64, of: usize| problems().map(move |(batch, index)| base + 4 * batch.place(index, of));
@@ -162,16 +173,16 @@ impl Pointers {
     }
 }
 
-fn upload_matrices(device: &Device, scene: &Scene, batches: &Batches, peer: Peer) -> Result<CudaSlice<u8>> {
-    let mut buffer = room(device, 4 * batches.floats[0])?;
+fn upload_matrices(device: &Device, scene: &Scene, batches: &GemmBatches, peer: CublasMethod) -> Result<CudaSlice<u8>> {
+    let mut buffer = alloc_zeroed(device, 4 * batches.floats[0])?;
     for batch in &batches.list {
-        let stored = if peer == Peer::Instances { 1 } else { batch.domains.len() };
+        let stored = if peer == CublasMethod::Instances { 1 } else { batch.domains.len() };
         for (index, domain) in batch.domains.iter().enumerate().take(stored) {
-            let matrix = batch.matrix(scene, *domain, peer == Peer::SgemvRows);
+            let matrix = batch.matrix(scene, *domain, peer == CublasMethod::SgemvRows);
             let begin = 4 * batch.place(index, 0) as usize;
             let mut part = buffer.slice_mut(begin..begin + size_of_val(matrix.as_slice()));
             let bytes = bytemuck::cast_slice::<f32, u8>(&matrix);
-            device.stream().memcpy_htod(bytes, &mut part).map_err(during("upload"))?;
+            device.stream().memcpy_htod(bytes, &mut part).map_err(fault_in("upload"))?;
         }
     }
     Ok(buffer)
@@ -181,7 +192,7 @@ fn upload_matrices(device: &Device, scene: &Scene, batches: &Batches, peer: Peer
 ///
 /// # Errors
 /// `Unavailable` when they do not fit.
-fn check_memory(device: &Device, batches: &Batches) -> Result<()> {
+fn check_memory(device: &Device, batches: &GemmBatches) -> Result<()> {
     let (free, _) = device.memory()?;
     let bytes: u64 = batches.floats.iter().map(|floats| 4 * floats).sum();
     if bytes <= free as u64 {

@@ -7,7 +7,7 @@
 
 use serde::Serialize;
 
-use modalcast_model::scene::{Scene, State};
+use modalcast_model::scene::{Scene, SceneState};
 
 /// Lanes per warp, and threads per block.
 pub(super) const WARP: usize = 32;
@@ -22,7 +22,7 @@ pub(super) const IDLE: u32 = u32::MAX;
 /// Number of kernels over which the domains are distributed by n_vr (figures 3.5 and 3.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Split {
+pub enum KernelSplit {
     /// All with w_g = 8.
     One,
     /// n_vr of 3, 5 and 6 with w_g = 6, the others with 8: the fastest in the text.
@@ -31,7 +31,7 @@ pub enum Split {
     Four,
 }
 
-impl Split {
+impl KernelSplit {
     /// All variants.
     pub const ALL: [Self; 3] = [Self::One, Self::Two, Self::Four];
 
@@ -75,13 +75,13 @@ const fn reshaped_rows(rows: usize, width: usize, fours: usize) -> usize {
 }
 
 /// Idle lanes of a full warp, for groups of `width` lanes on rows of `fours` float4.
-pub const fn idle_in_warp(width: usize, fours: usize) -> usize {
+pub const fn idle_lanes_per_warp(width: usize, fours: usize) -> usize {
     WARP - groups_of_warp(width) * rows_of_group(width, fours) * fours
 }
 
 /// Lanes that one kernel launches, and the number of idle ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct Lanes {
+pub struct LaneCounts {
     /// w_g.
     pub width: usize,
     pub all: u64,
@@ -89,7 +89,7 @@ pub struct Lanes {
 }
 
 /// The lanes of each kernel of a split, computed from sizes alone.
-pub fn lanes(scene: &Scene, split: Split) -> Vec<Lanes> {
+pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     let of_width = |width: &usize| {
         let (mut groups, mut busy) = (0, 0);
         for slot in scene.layout.slots.iter().filter(|slot| is_of_width(split, *width, slot.rank)) {
@@ -97,19 +97,19 @@ pub fn lanes(scene: &Scene, split: Split) -> Vec<Lanes> {
             busy += (3 * slot.vertices * fours(slot.rank)) as u64;
         }
         let all = (groups.div_ceil(groups_of_warp(*width)) * WARP).next_multiple_of(BLOCK) as u64;
-        Lanes { width: *width, all, idle: all - busy }
+        LaneCounts { width: *width, all, idle: all - busy }
     };
-    split.widths().iter().map(of_width).filter(|lanes| lanes.all > 0).collect()
+    split.widths().iter().map(of_width).filter(|count_lanes| count_lanes.all > 0).collect()
 }
 
-const fn is_of_width(split: Split, width: usize, rank: usize) -> bool {
+const fn is_of_width(split: KernelSplit, width: usize, rank: usize) -> bool {
     rank > 0 && split.width_of(fours(rank)) == width
 }
 
 /// First vertex of each domain's u, `None` without modes, and the total of vertices with a u.
 pub(super) fn places_of_u(scene: &Scene) -> (Vec<Option<u32>>, usize) {
     let mut total = 0;
-    let place = |slot: &modalcast_model::scene::Slot| {
+    let place = |slot: &modalcast_model::scene::DomainLayout| {
         let first = total;
         total += if slot.rank > 0 { slot.vertices } else { 0 };
         (slot.rank > 0).then_some(first as u32)
@@ -119,7 +119,7 @@ pub(super) fn places_of_u(scene: &Scene) -> (Vec<Option<u32>>, usize) {
 }
 
 /// q'': the coordinates of each domain, padded to whole float4.
-pub(super) fn packed_q(scene: &Scene, state: &State) -> Vec<f32> {
+pub(super) fn packed_q(scene: &Scene, state: &SceneState) -> Vec<f32> {
     let mut packed = Vec::with_capacity(scene.layout.coordinates + 3 * scene.domains.len());
     for domain in 0..scene.domains.len() {
         packed.extend_from_slice(state.q_of(scene, domain));
@@ -139,7 +139,7 @@ pub(super) fn entry(scene: &Scene, domain: usize, row: usize, k: usize) -> [f32;
 
 /// Inputs of one kernel: a float4 of U'' and the metadata of each lane.
 #[derive(Debug)]
-pub(super) struct Packed {
+pub(super) struct PackedGroups {
     pub width: usize,
     pub entries: Vec<[f32; 4]>,
     /// Per lane: output index in u (floats) or [`IDLE`], input index in q (float4), n_vr, unused.
@@ -147,9 +147,9 @@ pub(super) struct Packed {
 }
 
 /// Packs all domains whose groups are `width` lanes wide.
-pub(super) fn pack(scene: &Scene, split: Split, width: usize) -> Packed {
+pub(super) fn pack(scene: &Scene, split: KernelSplit, width: usize) -> PackedGroups {
     let (places, _) = places_of_u(scene);
-    let mut packed = Packed { width, entries: Vec::new(), meta: Vec::new() };
+    let mut packed = PackedGroups { width, entries: Vec::new(), meta: Vec::new() };
     let mut first_q = 0;
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
         let wide = fours(slot.rank);
@@ -177,7 +177,7 @@ pub(super) fn pack(scene: &Scene, split: Split, width: usize) -> Packed {
     packed
 }
 
-impl Packed {
+impl PackedGroups {
     fn push(&mut self, lane: Option<([f32; 4], [u32; 4])>) {
         let (entry, meta) = lane.unwrap_or(([0.0; 4], [IDLE, 0, 1, 0]));
         self.entries.push(entry);
@@ -204,19 +204,19 @@ mod tests {
 
     #[test]
     fn only_four_kernels_leave_no_idle_lane_in_groups() {
-        let idle_in_group = |split: Split, fours: usize| split.width_of(fours) % fours;
+        let idle_in_group = |split: KernelSplit, fours: usize| split.width_of(fours) % fours;
         for fours in 1..=8 {
-            assert_eq!(idle_in_group(Split::Four, fours), 0, "n_vr {fours}");
+            assert_eq!(idle_in_group(KernelSplit::Four, fours), 0, "n_vr {fours}");
         }
-        let idle = |split: Split| (1..=8).filter(|fours| idle_in_group(split, *fours) > 0).collect::<Vec<_>>();
-        assert_eq!(idle(Split::Two), [5, 7]);
-        assert_eq!(idle(Split::One), [3, 5, 6, 7]);
+        let idle = |split: KernelSplit| (1..=8).filter(|fours| idle_in_group(split, *fours) > 0).collect::<Vec<_>>();
+        assert_eq!(idle(KernelSplit::Two), [5, 7]);
+        assert_eq!(idle(KernelSplit::One), [3, 5, 6, 7]);
         // Lanes outside of groups count as idle too: with w_g = 6 two per warp, as the text says of widths that do not
         // divide 32.
-        assert_eq!([1, 2, 4, 8].map(|fours| idle_in_warp(8, fours)), [0; 4]);
-        assert_eq!([3, 6].map(|fours| idle_in_warp(6, fours)), [2, 2]);
-        assert_eq!([idle_in_warp(6, 5), idle_in_warp(8, 5), idle_in_warp(5, 5)], [7, 12, 2]);
-        assert_eq!([idle_in_warp(8, 7), idle_in_warp(7, 7), idle_in_warp(8, 3)], [4, 4, 8]);
+        assert_eq!([1, 2, 4, 8].map(|fours| idle_lanes_per_warp(8, fours)), [0; 4]);
+        assert_eq!([3, 6].map(|fours| idle_lanes_per_warp(6, fours)), [2, 2]);
+        assert_eq!([idle_lanes_per_warp(6, 5), idle_lanes_per_warp(8, 5), idle_lanes_per_warp(5, 5)], [7, 12, 2]);
+        assert_eq!([idle_lanes_per_warp(8, 7), idle_lanes_per_warp(7, 7), idle_lanes_per_warp(8, 3)], [4, 4, 8]);
     }
 
     #[test]
@@ -233,7 +233,7 @@ mod tests {
         assert_eq!(reshaped_rows(12, 8, 1), 2);
         let mut dropped = 0;
         for (vertices, wide) in (1..50).flat_map(|vertices| (1..=8).map(move |wide| (vertices, wide))) {
-            for split in Split::ALL {
+            for split in KernelSplit::ALL {
                 let (rows, width) = (3 * vertices, split.width_of(wide));
                 let parts = rows_of_group(width, wide);
                 assert_eq!(covered(rows, reshaped_rows(rows, width, wide), parts), rows);
@@ -247,20 +247,23 @@ mod tests {
     fn lane_counts_match_the_packing() {
         let shapes: Vec<_> = (0..40).map(|index| (1 + index * 7 % 50, index % 33, 1)).collect();
         let (scene, _) = scene_and_state(&shapes);
-        for split in Split::ALL {
-            let counted = lanes(&scene, split);
+        for split in KernelSplit::ALL {
+            let counted = count_lanes(&scene, split);
             assert_eq!(counted.len(), split.widths().len());
-            for lanes in counted {
-                let packed = pack(&scene, split, lanes.width);
-                assert_eq!((packed.meta.len() as u64, packed.busy()), (lanes.all, lanes.all - lanes.idle));
+            for count_lanes in counted {
+                let packed = pack(&scene, split, count_lanes.width);
+                assert_eq!(
+                    (packed.meta.len() as u64, packed.busy()),
+                    (count_lanes.all, count_lanes.all - count_lanes.idle)
+                );
                 assert_eq!(packed.meta.len(), packed.entries.len());
             }
         }
-        let share = |split: Split| {
-            let all = lanes(&scene, split);
-            all.iter().map(|lanes| lanes.idle).sum::<u64>() as f64
-                / all.iter().map(|lanes| lanes.all).sum::<u64>() as f64
+        let share = |split: KernelSplit| {
+            let all = count_lanes(&scene, split);
+            all.iter().map(|count_lanes| count_lanes.idle).sum::<u64>() as f64
+                / all.iter().map(|count_lanes| count_lanes.all).sum::<u64>() as f64
         };
-        assert!(share(Split::Two) < share(Split::One), "two kernels leave fewer lanes idle than one");
+        assert!(share(KernelSplit::Two) < share(KernelSplit::One), "two kernels leave fewer lanes idle than one");
     }
 }

@@ -14,66 +14,71 @@ mod thesis_multi;
 mod thesis_single;
 mod thesis_update;
 
-pub use group::{Lanes, Split, idle_in_warp, lanes};
+pub use group::{KernelSplit, LaneCounts, count_lanes, idle_lanes_per_warp};
 
 use std::sync::Arc;
 
 use cudarc::driver::CudaSlice;
 
-use super::trial::{KernelFacts, Trial};
-use super::turns::{Part, Turns};
+use super::input_sets::{InputSets, Part};
+use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use group::{packed_q, places_of_u};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, download, room};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download};
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Scene, State};
-use thesis_multi::Multi;
-use thesis_single::Single;
-use thesis_update::{Update, matrices};
+use modalcast_model::scene::{Scene, SceneState};
+use thesis_multi::MultiDomainKernel;
+use thesis_single::SingleDomainKernel;
+use thesis_update::{UpdateKernel, matrices};
 
 /// The kernels that compute u.
 #[derive(Debug)]
-enum Uq {
-    Single(Single),
-    Multi(Multi),
+enum UqKernel {
+    Single(SingleDomainKernel),
+    Multi(MultiDomainKernel),
 }
 
 /// The kernels of the thesis for a scene, with the inputs of several steps.
 #[derive(Debug)]
-pub struct Thesis {
+pub struct ThesisBenchmark {
     name: String,
-    uq: Uq,
-    update: Option<Update>,
+    uq: UqKernel,
+    update: Option<UpdateKernel>,
     u: CudaSlice<u8>,
     /// First vertex of each domain's u (`None` without modes), and the number of vertices that have a u.
     places: (Vec<Option<u32>>, usize),
-    turns: Turns,
+    turns: InputSets,
     vertices: usize,
     /// Bytes of the packed q per step.
     q_bytes: u64,
 }
 
-impl Thesis {
+impl ThesisBenchmark {
     /// The single-domain kernel, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
     /// `Invalid` when the scene is not one domain with modes, or there is no state; `Unavailable` when NVRTC is
     /// missing; `Fault` when the device fails.
-    pub fn single(device: &Device, scene: &Arc<Scene>, states: &[State], part: Part) -> Result<Self> {
-        let uq = Uq::Single(Single::new(device, scene)?);
+    pub fn single(device: &Device, scene: &Arc<Scene>, states: &[SceneState], part: Part) -> Result<Self> {
+        let uq = UqKernel::Single(SingleDomainKernel::new(device, scene)?);
         Self::new(device, scene, states, (part.named("thesis_single"), uq, part))
     }
 
     /// The grouped kernels, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when a domain has more than 32 modes, [`Part::Uq`] is requested and no domain has modes, or there is
+    /// `Invalid` when a domain has more than 32 modes, [`Part::UqKernel`] is requested and no domain has modes, or there is
     /// no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
-    pub fn multi(device: &Device, scene: &Arc<Scene>, states: &[State], (split, part): (Split, Part)) -> Result<Self> {
+    pub fn multi(
+        device: &Device,
+        scene: &Arc<Scene>,
+        states: &[SceneState],
+        (split, part): (KernelSplit, Part),
+    ) -> Result<Self> {
         if part == Part::Uq && !scene.needs.modes {
             return Err(invalid("modes", "some, for u = U q alone", 0));
         }
-        let uq = Uq::Multi(Multi::new(device, scene, split)?);
+        let uq = UqKernel::Multi(MultiDomainKernel::new(device, scene, split)?);
         let name = part.named(&format!("thesis_multi_{}", split.widths().len()));
         Self::new(device, scene, states, (name, uq, part))
     }
@@ -81,25 +86,25 @@ impl Thesis {
     fn new(
         device: &Device,
         scene: &Arc<Scene>,
-        states: &[State],
-        (name, uq, part): (String, Uq, Part),
+        states: &[SceneState],
+        (name, uq, part): (String, UqKernel, Part),
     ) -> Result<Self> {
         let places = places_of_u(scene);
-        let update = (part == Part::Whole).then(|| Update::new(device, scene)).transpose()?;
+        let update = (part == Part::Whole).then(|| UpdateKernel::new(device, scene)).transpose()?;
         Ok(Self {
             name,
             uq,
             update,
-            u: room(device, 16 * places.1 as u64)?,
+            u: alloc_zeroed(device, 16 * places.1 as u64)?,
             places,
-            turns: Turns::new(device, scene, states, |state| [packed_q(scene, state), matrices(scene, state)])?,
+            turns: InputSets::new(device, scene, states, |state| [packed_q(scene, state), matrices(scene, state)])?,
             vertices: scene.layout.vertices,
             q_bytes: scene.layout.slots.iter().map(|slot| 4 * slot.rank.next_multiple_of(4) as u64).sum(),
         })
     }
 }
 
-impl Trial for Thesis {
+impl KernelBenchmark for ThesisBenchmark {
     fn name(&self) -> String {
         self.name.clone()
     }
@@ -111,8 +116,8 @@ impl Trial for Thesis {
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
         let (values, u) = (self.turns.start(device, turn), address(device, &self.u));
         match &self.uq {
-            Uq::Single(single) => single.launch(device, values.q, u)?,
-            Uq::Multi(multi) => multi.launch(device, values.q, u)?,
+            UqKernel::Single(single) => single.launch(device, values.q, u)?,
+            UqKernel::Multi(multi) => multi.launch(device, values.q, u)?,
         }
         self.update.as_ref().map_or(Ok(()), |update| update.launch(device, values.transforms, u))
     }
@@ -134,25 +139,25 @@ impl Trial for Thesis {
 
     fn bytes(&self) -> Vec<(&'static str, u64)> {
         let mut bytes = match &self.uq {
-            Uq::Single(single) => single.bytes(),
-            Uq::Multi(multi) => multi.bytes(self.q_bytes),
+            UqKernel::Single(single) => single.bytes(),
+            UqKernel::Multi(multi) => multi.bytes(self.q_bytes),
         };
-        bytes.extend(self.update.iter().flat_map(Update::bytes));
+        bytes.extend(self.update.iter().flat_map(UpdateKernel::bytes));
         bytes
     }
 
     fn launches(&self) -> usize {
         let uq = match &self.uq {
-            Uq::Single(_) => 1,
-            Uq::Multi(multi) => multi.launches(),
+            UqKernel::Single(_) => 1,
+            UqKernel::Multi(multi) => multi.launches(),
         };
         uq + usize::from(self.update.is_some())
     }
 
-    fn kernels(&self) -> Vec<KernelFacts> {
+    fn kernels(&self) -> Vec<KernelAttributes> {
         let mut facts = match &self.uq {
-            Uq::Single(single) => vec![single.facts().clone()],
-            Uq::Multi(multi) => multi.facts(),
+            UqKernel::Single(single) => vec![single.facts().clone()],
+            UqKernel::Multi(multi) => multi.facts(),
         };
         facts.extend(self.update.iter().map(|update| update.facts().clone()));
         facts

@@ -4,14 +4,14 @@
 
 use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
 
-use super::super::trial::{Code, Compiled, KernelFacts};
-use super::group::{BLOCK, LARGEST_RANK, Split, pack};
+use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
+use super::group::{BLOCK, KernelSplit, LARGEST_RANK, pack};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::memory::{address, upload};
-use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::Scene;
 
-pub(super) const CODE: Code = Code {
+pub(super) const CODE: BenchmarkSource = BenchmarkSource {
     source: include_str!("../../../kernels/thesis_multi.cu"),
     functions: &["thesis_multi"],
     variants: &[&["WIDTH=5"], &["WIDTH=6"], &["WIDTH=7"], &["WIDTH=8"]],
@@ -19,8 +19,8 @@ pub(super) const CODE: Code = Code {
 
 /// The kernel of one group width and its inputs.
 #[derive(Debug)]
-struct Kernel {
-    compiled: Compiled,
+struct GroupKernel {
+    compiled: CompiledKernel,
     entries: CudaSlice<u8>,
     meta: CudaSlice<u8>,
     lanes: usize,
@@ -29,16 +29,16 @@ struct Kernel {
 
 /// The kernels of a split.
 #[derive(Debug)]
-pub(super) struct Multi {
-    kernels: Vec<Kernel>,
+pub(super) struct MultiDomainKernel {
+    kernels: Vec<GroupKernel>,
     /// Rows of U of all domains.
     rows: u64,
 }
 
-impl Multi {
+impl MultiDomainKernel {
     /// # Errors
     /// `Invalid` when a domain has more modes than a group holds.
-    pub(super) fn new(device: &Device, scene: &Scene, split: Split) -> Result<Self> {
+    pub(super) fn new(device: &Device, scene: &Scene, split: KernelSplit) -> Result<Self> {
         let slots = &scene.layout.slots;
         if let Some(domain) = slots.iter().position(|slot| slot.rank > LARGEST_RANK) {
             let field = format!("domain {domain}: modes");
@@ -52,8 +52,8 @@ impl Multi {
                 continue;
             }
             let define = format!("WIDTH={width}");
-            kernels.push(Kernel {
-                compiled: Compiled::new(device, &CODE, &[&define])?,
+            kernels.push(GroupKernel {
+                compiled: CompiledKernel::new(device, &CODE, &[&define])?,
                 entries: upload(device, &packed.entries)?,
                 meta: upload(device, &packed.meta)?,
                 lanes: packed.meta.len(),
@@ -74,7 +74,7 @@ impl Multi {
             // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread
             // of the whole blocks. The indices in the metadata are inside of `u` and `q`, because `pack` made all of
             // them from one scene.
-            unsafe { launch.launch(config) }.map_err(during("thesis_multi"))?;
+            unsafe { launch.launch(config) }.map_err(fault_in("thesis_multi"))?;
         }
         Ok(())
     }
@@ -95,20 +95,20 @@ impl Multi {
         ]
     }
 
-    pub(super) fn facts(&self) -> Vec<KernelFacts> {
+    pub(super) fn facts(&self) -> Vec<KernelAttributes> {
         self.kernels.iter().map(|kernel| kernel.compiled.facts.clone()).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::trial::tests::compile_all;
-    use super::super::group::{IDLE, Packed, WARP, packed_q, places_of_u};
+    use super::super::super::kernel_benchmark::tests::compile_all;
+    use super::super::group::{IDLE, PackedGroups, WARP, packed_q, places_of_u};
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
     /// CPU twin of `thesis_multi`, thread by thread; counts the writes to each number of u.
-    fn twin_of_thesis_multi(packed: &Packed, q: &[f32], u: &mut [f32], written: &mut [usize]) {
+    fn twin_of_thesis_multi(packed: &PackedGroups, q: &[f32], u: &mut [f32], written: &mut [usize]) {
         for first in (0..packed.meta.len()).step_by(WARP) {
             let busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
             let mut sub_sums = [0.0_f32; WARP];
@@ -132,7 +132,7 @@ mod tests {
         let (scene, state) = scene_and_state(&shapes);
         let (places, vertices) = places_of_u(&scene);
         let q = packed_q(&scene, &state);
-        for split in Split::ALL {
+        for split in KernelSplit::ALL {
             let (mut u, mut written) = (vec![f32::NAN; 4 * vertices], vec![0; 4 * vertices]);
             for width in split.widths() {
                 twin_of_thesis_multi(&pack(&scene, split, *width), &q, &mut u, &mut written);

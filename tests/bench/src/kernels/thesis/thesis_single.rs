@@ -2,19 +2,22 @@
 
 use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
 
-use super::super::trial::{Code, Compiled, KernelFacts};
+use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use super::group::{BLOCK, WARP, entry, fours};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::memory::{address, upload};
-use modalcast_model::error::{Result, during, invalid};
+use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::Scene;
 
-pub(super) const CODE: Code =
-    Code { source: include_str!("../../../kernels/thesis_single.cu"), functions: &["thesis_single"], variants: &[&[]] };
+pub(super) const CODE: BenchmarkSource = BenchmarkSource {
+    source: include_str!("../../../kernels/thesis_single.cu"),
+    functions: &["thesis_single"],
+    variants: &[&[]],
+};
 
 /// Layout of rows of U in lines of 32 float4 (figure 3.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Lines {
+struct RowLines {
     /// Rows of U, 3n.
     rows: usize,
     rank: usize,
@@ -26,7 +29,7 @@ struct Lines {
     lines: usize,
 }
 
-impl Lines {
+impl RowLines {
     fn of(vertices: usize, rank: usize) -> Self {
         let (rows, width) = (3 * vertices, fours(rank).min(WARP));
         Self { rows, rank, width, passes: fours(rank).div_ceil(WARP), lines: rows.div_ceil(WARP / width) }
@@ -49,13 +52,13 @@ impl Lines {
 
 /// The kernel and the uploaded lines of U.
 #[derive(Debug)]
-pub(super) struct Single {
-    compiled: Compiled,
+pub(super) struct SingleDomainKernel {
+    compiled: CompiledKernel,
     buffer: CudaSlice<u8>,
-    lines: Lines,
+    lines: RowLines,
 }
 
-impl Single {
+impl SingleDomainKernel {
     /// # Errors
     /// `Invalid` when the scene is not one domain with modes.
     pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
@@ -65,8 +68,8 @@ impl Single {
         if slot.rank == 0 {
             return Err(invalid("modes", "at least 1 for the single-domain kernel", 0));
         }
-        let lines = Lines::of(slot.vertices, slot.rank);
-        let compiled = Compiled::new(device, &CODE, &[])?;
+        let lines = RowLines::of(slot.vertices, slot.rank);
+        let compiled = CompiledKernel::new(device, &CODE, &[])?;
         Ok(Self { compiled, buffer: upload(device, &lines.pack(scene))?, lines })
     }
 
@@ -78,7 +81,7 @@ impl Single {
         launch.arg(&lines).arg(&q).arg(&u).arg(&rank).arg(&rows);
         // SAFETY: these are the kernel's arguments. `buffer` has every line of `lines`, `q` as many floats as the rank
         // of the scene's only domain, and `u` a float4 per vertex; warps beyond the last row access none of them.
-        unsafe { launch.launch(config) }.map_err(during("thesis_single"))?;
+        unsafe { launch.launch(config) }.map_err(fault_in("thesis_single"))?;
         Ok(())
     }
 
@@ -91,14 +94,14 @@ impl Single {
         ]
     }
 
-    pub(super) fn facts(&self) -> &KernelFacts {
+    pub(super) fn facts(&self) -> &KernelAttributes {
         &self.compiled.facts
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::trial::tests::compile_all;
+    use super::super::super::kernel_benchmark::tests::compile_all;
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
@@ -139,7 +142,7 @@ mod tests {
     fn twin_sums_every_row_for_any_rank() {
         for rank in [1, 3, 4, 5, 9, 10, 20, 30, 31, 32, 33, 127, 128, 129, 300, 512] {
             let (scene, state) = scene_and_state(&[(23, rank, 1)]);
-            let lines = Lines::of(23, rank).pack(&scene);
+            let lines = RowLines::of(23, rank).pack(&scene);
             let largest = |q: &[f32]| {
                 let u = twin_of_thesis_single(&lines, q, 69);
                 let error = |row: usize| {
@@ -172,11 +175,11 @@ mod tests {
     #[test]
     fn line_holds_whole_rows_and_is_128_byte_aligned() {
         // r = 30 of figure 3.2: eight lanes per row, four rows per warp.
-        let lines = Lines::of(4, 30);
+        let lines = RowLines::of(4, 30);
         assert_eq!((lines.width, lines.passes, lines.lines), (8, 1, 3));
         assert_eq!(WARP * size_of::<[f32; 4]>() % 128, 0);
-        assert_eq!(Lines::of(4, 10), Lines { rows: 12, rank: 10, width: 3, passes: 1, lines: 2 });
-        assert_eq!(Lines::of(1, 512), Lines { rows: 3, rank: 512, width: 32, passes: 4, lines: 3 });
+        assert_eq!(RowLines::of(4, 10), RowLines { rows: 12, rank: 10, width: 3, passes: 1, lines: 2 });
+        assert_eq!(RowLines::of(1, 512), RowLines { rows: 3, rank: 512, width: 32, passes: 4, lines: 3 });
     }
 
     #[test]

@@ -3,14 +3,14 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::super::trial::{Code, Compiled, KernelFacts};
+use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use super::group::{BLOCK, places_of_u};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, download, room, upload};
-use modalcast_model::error::{Result, during};
-use modalcast_model::scene::{Scene, State};
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
+use modalcast_model::error::{Result, fault_in};
+use modalcast_model::scene::{Scene, SceneState};
 
-pub(super) const CODE: Code = Code {
+pub(super) const CODE: BenchmarkSource = BenchmarkSource {
     source: include_str!("../../../kernels/thesis_update.cu"),
     functions: &["thesis_update"],
     variants: &[&[], &["TANGENTS"]],
@@ -52,7 +52,7 @@ unsafe impl DeviceRepr for UpdateArgs {}
 
 /// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
-struct Unfolded {
+struct UnfoldedTriangles {
     warps: Vec<[u32; 4]>,
     /// Index of the vertex in u, or [`RIGID`].
     sources: Vec<u32>,
@@ -63,7 +63,7 @@ struct Unfolded {
     tangents: Vec<[f32; 4]>,
 }
 
-impl Unfolded {
+impl UnfoldedTriangles {
     /// Unfolds all triangles. A domain with fewer than three triangles repeats its last one.
     fn of(scene: &Scene) -> Self {
         let (places, _) = places_of_u(scene);
@@ -105,15 +105,15 @@ const fn four([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
 }
 
 /// T of every domain as a 4x4 row-major matrix.
-pub(super) fn matrices(scene: &Scene, state: &State) -> Vec<f32> {
+pub(super) fn matrices(scene: &Scene, state: &SceneState) -> Vec<f32> {
     let transforms = state.world_transforms(scene);
     transforms.iter().flat_map(|transform| transform.0.into_iter().chain([0.0, 0.0, 0.0, 1.0])).collect()
 }
 
 /// The kernel with its inputs and outputs.
 #[derive(Debug)]
-pub(super) struct Update {
-    compiled: Compiled,
+pub(super) struct UpdateKernel {
+    compiled: CompiledKernel,
     /// Warps, sources, rest positions, normals and tangents.
     tables: [CudaSlice<u8>; 5],
     /// Positions, normals and tangents.
@@ -124,13 +124,13 @@ pub(super) struct Update {
     read: [u64; 2],
 }
 
-impl Update {
+impl UpdateKernel {
     pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
-        let unfolded = Unfolded::of(scene);
+        let unfolded = UnfoldedTriangles::of(scene);
         let (tangents, bytes) = (scene.needs.normal_maps, 16 * unfolded.targets.len() as u64);
         let defines: &[&str] = if tangents { &["TANGENTS"] } else { &[] };
         Ok(Self {
-            compiled: Compiled::new(device, &CODE, defines)?,
+            compiled: CompiledKernel::new(device, &CODE, defines)?,
             tables: [
                 upload(device, &unfolded.warps)?,
                 upload(device, &unfolded.sources)?,
@@ -138,7 +138,11 @@ impl Update {
                 upload(device, &unfolded.normals)?,
                 upload(device, &unfolded.tangents)?,
             ],
-            outputs: [room(device, bytes)?, room(device, bytes)?, room(device, if tangents { bytes } else { 0 })?],
+            outputs: [
+                alloc_zeroed(device, bytes)?,
+                alloc_zeroed(device, bytes)?,
+                alloc_zeroed(device, if tangents { bytes } else { 0 })?,
+            ],
             targets: unfolded.targets,
             tangents,
             read: [64 * scene.domains.len() as u64, 16 * places_of_u(scene).1 as u64],
@@ -168,9 +172,9 @@ impl Update {
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         // SAFETY: `UpdateArgs` is the kernel's only argument. Its tables belong to one scene, as built by
-        // `Unfolded::of`: sources are inside of `u`, domains inside of `transforms`, and the outputs have a float4 for
+        // `UnfoldedTriangles::of`: sources are inside of `u`, domains inside of `transforms`, and the outputs have a float4 for
         // every vertex.
-        unsafe { launch.arg(&args).launch(config) }.map_err(during("thesis_update"))?;
+        unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("thesis_update"))?;
         Ok(())
     }
 
@@ -195,7 +199,7 @@ impl Update {
         ]
     }
 
-    pub(super) fn facts(&self) -> &KernelFacts {
+    pub(super) fn facts(&self) -> &KernelAttributes {
         &self.compiled.facts
     }
 }
@@ -210,12 +214,12 @@ fn fold(unfolded: &[[f32; 4]], targets: &[u32], vertices: usize) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::trial::tests::compile_all;
+    use super::super::super::kernel_benchmark::tests::compile_all;
     use super::*;
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
     /// CPU twin of `thesis_update` for positions, thread by thread.
-    fn twin_of_thesis_update(unfolded: &Unfolded, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
+    fn twin_of_thesis_update(unfolded: &UnfoldedTriangles, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
         let count = unfolded.targets.len();
         let mut positions = vec![[f32::NAN; 4]; count];
         for thread in 0..count.div_ceil(OF_BLOCK) * BLOCK {
@@ -240,7 +244,7 @@ mod tests {
         // three.
         let shapes = [(5, 2, 1), (9, 0, 2), (40, 7, 30), (4, 0, 1), (6, 3, 2), (3, 1, 5)];
         let (scene, state) = scene_and_state(&shapes);
-        let unfolded = Unfolded::of(&scene);
+        let unfolded = UnfoldedTriangles::of(&scene);
         assert_eq!(unfolded.targets.len(), 3 * (3 + 3 + 30 + 3 + 3 + 5));
         let (places, vertices) = places_of_u(&scene);
         let mut u = vec![[0.0_f32; 4]; vertices];
@@ -269,7 +273,7 @@ mod tests {
     #[test]
     fn three_triangles_per_domain_fit_two_matrices_per_warp() {
         let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
-        let unfolded = Unfolded::of(&scene);
+        let unfolded = UnfoldedTriangles::of(&scene);
         let domain = |vertex: usize| unfolded.targets[vertex] / 3;
         for (index, [first, second, split, _]) in unfolded.warps.iter().enumerate().take(450 / OF_WARP) {
             for vertex in 0..OF_WARP {

@@ -4,11 +4,11 @@ use nalgebra::{Matrix4, Rotation3, Vector3};
 
 use modalcast_model::domain::{Texture, Transform};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Look, Parts};
+use modalcast_model::scene::{RenderSettings, SceneParts};
 
 /// Placement of one plant: to the right, towards the viewer, rotation about its trunk in radians, and scale.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Stand {
+pub(super) struct PlantInstance {
     /// Index of the species.
     pub(super) species: usize,
     pub(super) right: f64,
@@ -18,8 +18,8 @@ pub(super) struct Stand {
 }
 
 /// Combines plants of Y-up species into one scene with this look.
-pub(super) fn plant(name: &str, species: &[&Parts], stands: &[Stand], look: Look) -> Parts {
-    let mut forest = Parts { look, ..Parts::named(name) };
+pub(super) fn plant(name: &str, species: &[&SceneParts], stands: &[PlantInstance], look: RenderSettings) -> SceneParts {
+    let mut forest = SceneParts { look, ..SceneParts::named(name) };
     let firsts: Vec<[usize; 2]> = species.iter().map(|species| bring(&mut forest, species)).collect();
     for (number, stand) in stands.iter().enumerate() {
         let [shape, material] = firsts[stand.species];
@@ -32,7 +32,7 @@ pub(super) fn plant(name: &str, species: &[&Parts], stands: &[Stand], look: Look
             own.name = format!("{} of plant {number}", domain.name);
             own.shape += shape;
             own.material += material;
-            own.runs.iter_mut().for_each(|run| run.material += material);
+            own.material_ranges.iter_mut().for_each(|run| run.material += material);
             own.placement = Transform::from_matrix(&(place * domain.placement.to_matrix()));
             if let Some(attachment) = &mut own.attachment {
                 attachment.parent += first;
@@ -45,13 +45,13 @@ pub(super) fn plant(name: &str, species: &[&Parts], stands: &[Stand], look: Look
 }
 
 /// Adds the shared data of a species and returns the indices of its first shape and material.
-fn bring(forest: &mut Parts, species: &Parts) -> [usize; 2] {
+fn bring(forest: &mut SceneParts, species: &SceneParts) -> [usize; 2] {
     let [shape, material, texture] = [forest.shapes.len(), forest.materials.len(), forest.textures.len()];
     forest.shapes.extend_from_slice(&species.shapes);
     forest.textures.extend_from_slice(&species.textures);
     for own in &species.materials {
         let mut own = own.clone();
-        own.colour_texture = own.colour_texture.map(|index| index + texture);
+        own.color_texture = own.color_texture.map(|index| index + texture);
         own.normal_texture = own.normal_texture.map(|index| index + texture);
         forest.materials.push(own);
     }
@@ -62,13 +62,13 @@ fn bring(forest: &mut Parts, species: &Parts) -> [usize; 2] {
 ///
 /// # Errors
 /// Only those that the tree's own images would cause.
-pub(super) fn in_blossom(tree: &Parts) -> Result<Parts> {
-    let mut parts = Parts { name: "peach tree".into(), ..Parts::named("peach tree") };
+pub(super) fn in_blossom(tree: &SceneParts) -> Result<SceneParts> {
+    let mut parts = SceneParts { name: "peach tree".into(), ..SceneParts::named("peach tree") };
     bring(&mut parts, tree);
     parts.domains.clone_from(&tree.domains);
     for (name, tint) in [("leaf", [1.25, 1.12, 0.75]), ("light leaf", [1.85, 1.02, 2.9])] {
         let leaf = parts.materials.iter().find(|material| material.name == name);
-        let Some(index) = leaf.and_then(|leaf| leaf.colour_texture) else { continue };
+        let Some(index) = leaf.and_then(|leaf| leaf.color_texture) else { continue };
         parts.textures[index] = tinted(&parts.textures[index], tint)?;
     }
     Ok(parts)
@@ -95,7 +95,7 @@ mod tests {
         let tree = load::open("tree").expect("built").parts();
         let blossom = in_blossom(&tree).expect("tinted");
         assert_ne!(blossom.textures, tree.textures);
-        let stand = |species: usize, right: f64| Stand { species, right, near: 0.0, turn: 1.0, scale: 0.5 };
+        let stand = |species: usize, right: f64| PlantInstance { species, right, near: 0.0, turn: 1.0, scale: 0.5 };
         let stands = [stand(0, -5.0), stand(1, 0.0), stand(1, 5.0)];
         let forest = plant("three", &[&tree, &blossom], &stands, tree.look);
         let count = tree.domains.len();

@@ -19,11 +19,11 @@ struct Needle {
     light: f32,
 }
 
-/// Draws the texture; `colour`: sRGB, 0 to 255, of a needle of brightness 1.
+/// Draws the texture; `color`: sRGB, 0 to 255, of a needle of brightness 1.
 ///
 /// # Errors
 /// None in practice: its size is a constant.
-pub(super) fn texture(colour: [f32; 3], seed: u64) -> Result<Texture> {
+pub(super) fn texture(color: [f32; 3], seed: u64) -> Result<Texture> {
     let needles = needles(&mut Rng::with_seed(seed));
     let pixel = |at: usize| {
         let place = [(at % WIDE) as f32 + 0.5, (at / WIDE) as f32 + 0.5];
@@ -39,7 +39,7 @@ pub(super) fn texture(colour: [f32; 3], seed: u64) -> Result<Texture> {
         let [r, g, b] = if twig > best.0 && place[0] < 0.92 * WIDE as f32 {
             [96.0, 78.0, 58.0]
         } else {
-            colour.map(|channel| channel * best.1)
+            color.map(|channel| channel * best.1)
         };
         let alpha = 255.0 * if place[0] < 0.92 * WIDE as f32 { best.0.max(twig) } else { best.0 };
         [r, g, b, alpha].map(|channel| channel.clamp(0.0, 255.0) as u8)

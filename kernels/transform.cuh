@@ -1,0 +1,94 @@
+// T of a domain: its own or, with FOLLOWERS, that of its transform root times a constant frame. CPU twin:
+// src/model/domain/composed_transform.rs, bit by bit: it defines the order of operations.
+#pragma once
+#include "layout.cuh"
+
+// The three rows of a transform.
+struct Affine {
+    float4 a, b, c;
+};
+
+// Tables from which T is composed.
+struct Transforms {
+    const float4* rows; // [movers][3]
+#ifdef FOLLOWERS
+    const TransformLink* transform_links;
+    const float4* frames; // [followers][3]
+#endif
+};
+
+template <typename Args>
+__device__ __forceinline__ Transforms transforms_of(const Args& args) {
+#ifdef FOLLOWERS
+    return {args.transforms, args.transform_links, args.frames};
+#else
+    return {args.transforms};
+#endif
+}
+
+__device__ __forceinline__ Affine load_affine(const float4* list, unsigned index) {
+    const float4* rows = list + 3 * (size_t)index;
+    return {__ldg(rows), __ldg(rows + 1), __ldg(rows + 2)};
+}
+
+#ifdef FOLLOWERS
+__device__ __forceinline__ TransformLink load_transform_link(const Transforms& transforms, unsigned domain) {
+    const uint2 own = __ldg((const uint2*)(transforms.transform_links + domain));
+    return {own.x, own.y};
+}
+
+// A row of T times a column of F.
+__device__ __forceinline__ float dot_row_column(const float4& t, float x, float y, float z) {
+    return fmaf(t.x, x, fmaf(t.y, y, __fmul_rn(t.z, z)));
+}
+
+__device__ __forceinline__ float4 compose_row(const float4& t, const Affine& f) {
+    return make_float4(dot_row_column(t, f.a.x, f.b.x, f.c.x), dot_row_column(t, f.a.y, f.b.y, f.c.y),
+                       dot_row_column(t, f.a.z, f.b.z, f.c.z), fmaf(t.x, f.a.w, fmaf(t.y, f.b.w, fmaf(t.z, f.c.w, t.w))));
+}
+#endif
+
+__device__ __forceinline__ Affine load_transform(const Transforms& transforms, unsigned domain) {
+#ifdef FOLLOWERS
+    const TransformLink own = load_transform_link(transforms, domain);
+    const Affine t = load_affine(transforms.rows, own.root);
+    if (own.frame == NO_FRAME) {
+        return t;
+    }
+    const Affine f = load_affine(transforms.frames, own.frame);
+    return {compose_row(t.a, f), compose_row(t.b, f), compose_row(t.c, f)};
+#else
+    return load_affine(transforms.rows, domain);
+#endif
+}
+
+// A row of T times a point.
+__device__ __forceinline__ float transform_row(const float4& row, float x, float y, float z) {
+    return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
+}
+
+__device__ __forceinline__ void transform_point_f64(const float4* rows, const double (&point)[3], double (&world)[3]) {
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        const float4 row = rows[axis];
+        world[axis] = row.x * point[0] + row.y * point[1] + row.z * point[2] + row.w;
+    }
+}
+
+// T of a domain times a point in f64, rounded once.
+__device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& transforms, unsigned domain, double (&point)[3]) {
+    double world[3];
+#ifdef FOLLOWERS
+    // Apply both transforms in sequence: their product may overflow f32.
+    const TransformLink own = load_transform_link(transforms, domain);
+    if (own.frame != NO_FRAME) {
+        transform_point_f64(transforms.frames + 3 * (size_t)own.frame, point, world);
+        point[0] = world[0];
+        point[1] = world[1];
+        point[2] = world[2];
+    }
+    transform_point_f64(transforms.rows + 3 * (size_t)own.root, point, world);
+#else
+    transform_point_f64(transforms.rows + 3 * (size_t)domain, point, world);
+#endif
+    return make_float3((float)world[0], (float)world[1], (float)world[2]);
+}

@@ -1,0 +1,13 @@
+// Index of a fragment's triangle in the draw order. A draw call begins at `first_triangle`; a draw call of a culled
+// list passes the complement of the list's first entry instead.
+layout(location = 0) uniform int first_triangle;
+#ifdef CULLED
+layout(binding = 25) uniform usamplerBuffer triangle_ids;
+
+int current_triangle() {
+    if (first_triangle >= 0) return first_triangle + gl_PrimitiveID;
+    return int(texelFetch(triangle_ids, ~first_triangle + gl_PrimitiveID).x);
+}
+#else
+int current_triangle() { return first_triangle + gl_PrimitiveID; }
+#endif

@@ -1,0 +1,12 @@
+// One direction of the Gaussian blur as in the thesis, with one fragment per texel: the baseline of the report.
+layout(location = 0) out vec4 blurred;
+
+void main() {
+    vec2 sums[TEXELS_PER_INVOCATION];
+#ifdef FROM_DEPTH
+    blur(ivec2(gl_FragCoord.xy), ivec2(1, 0), int(frame.shadow.w), sums);
+#else
+    blur(ivec2(gl_FragCoord.xy), ivec2(0, 1), int(frame.shadow.w), sums);
+#endif
+    blurred = vec4(sums[0], 0.0, 0.0);
+}

@@ -1,0 +1,302 @@
+//! Compares the results of a demo with the f64 reference and with the demo's acceptance criteria.
+
+use serde_json::{Value, json};
+
+use super::DemoRun;
+use modalcast_compute::reference;
+use modalcast_model::domain::Transform;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{Scene, SceneState};
+
+/// Tolerance for the error of received vertices, as a fraction of the scene's diagonal.
+const LARGEST_ERROR: f64 = 1e-5;
+
+/// Tolerance for the gap of a joint, as a fraction of the scene's diagonal.
+const LARGEST_GAP: f64 = 1e-3;
+
+pub(super) struct Evaluation {
+    backend: String,
+    renderer: String,
+    steps: usize,
+    steps_per_second: f64,
+    stages: Vec<(String, f64)>,
+    /// Largest distance to the reference, in scene units and as a fraction of the diagonal.
+    error: f64,
+    relative_error: f64,
+    /// Largest distance from the rest position, in scene units and as a fraction of the diagonal.
+    displacement: f64,
+    relative_displacement: f64,
+    /// Largest distance from the rest position in the top tenth of the scene, as a fraction of the scene's height.
+    sway: f64,
+    /// Largest distance of a child's origin from the displaced center of the ring that carries it, as a fraction of the
+    /// diagonal; `None` without joints.
+    joint_gap: Option<f64>,
+    least: MinimumMotion,
+    frames: usize,
+    frames_wanted: usize,
+}
+
+impl Evaluation {
+    /// Compares every received vertex of every step with the reference.
+    ///
+    /// # Errors
+    /// `Invalid` when the recorded arrays have different step or vertex counts.
+    pub(super) fn of(scene: &Scene, ran: &DemoRun, wanted: u32) -> Result<Self> {
+        let steps = ran.vertices.shape()[0];
+        if ran.q.shape()[0] != steps
+            || ran.transforms.shape()[0] != steps
+            || ran.vertices.shape()[1] != scene.layout.vertices
+        {
+            let given = format!("{:?}, {:?}, {:?}", ran.q.shape(), ran.transforms.shape(), ran.vertices.shape());
+            return Err(invalid("demo", "as many steps of q, transforms and vertices as frames", given));
+        }
+        let rest = reference::deform(scene, &SceneState::rest(scene));
+        let crown = TopRegion::of(scene, &rest);
+        let joints = Joint::all(scene, &rest);
+        let (mut error, mut displacement, mut sway, mut gap) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
+        for step in 0..steps {
+            let state = state(scene, ran, step);
+            let want = reference::deform(scene, &state);
+            let got = ran.vertices.index_axis(ndarray::Axis(0), step);
+            gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(&got, &state)));
+            for (vertex, got) in got.outer_iter().enumerate() {
+                let got = [got[0], got[1], got[2]].map(f64::from);
+                error = max_error(error, distance(got, want[vertex]));
+                let moved = distance(got, rest[vertex]);
+                displacement = max_error(displacement, moved);
+                if crown.holds(rest[vertex]) {
+                    sway = max_error(sway, moved);
+                }
+            }
+        }
+        let diagonal = scene.rest_bounds.diagonal();
+        Ok(Self {
+            backend: text(&ran.server, "backend"),
+            renderer: text(&ran.server, "renderer"),
+            steps,
+            steps_per_second: ran.sim["steps_per_second"].as_f64().unwrap_or(f64::NAN),
+            stages: stages(&ran.frames),
+            error,
+            relative_error: error / diagonal,
+            displacement,
+            relative_displacement: displacement / diagonal,
+            sway: sway / crown.height,
+            joint_gap: (!joints.is_empty()).then_some(gap / diagonal),
+            least: MinimumMotion::of(scene),
+            frames: ran.frames_on_disk,
+            frames_wanted: wanted as usize,
+        })
+    }
+
+    /// The acceptance criteria that are not met.
+    pub(super) fn failed_checks(&self) -> Vec<String> {
+        let promises = [
+            (self.relative_error <= LARGEST_ERROR, format!("vertices within {LARGEST_ERROR:.0e} of the diagonal")),
+            (self.joint_gap.is_none_or(|gap| gap <= LARGEST_GAP), format!("joints within {LARGEST_GAP:.0e}")),
+            (self.frames == self.frames_wanted, format!("{} frames", self.frames_wanted)),
+            (self.sway >= self.least.sway, format!("a sway of {} % of the height", 100.0 * self.least.sway)),
+            (
+                self.relative_displacement >= self.least.displacement,
+                format!("a displacement of {} % of the diagonal", 100.0 * self.least.displacement),
+            ),
+        ];
+        promises.into_iter().filter_map(|(kept, promise)| (!kept).then_some(promise)).collect()
+    }
+
+    pub(super) fn table(&self) -> Vec<String> {
+        let mut rows = vec![
+            ("backend".into(), self.backend.clone()),
+            ("renderer".into(), self.renderer.clone()),
+            ("steps".into(), format!("{} at {:.1} steps/s", self.steps, self.steps_per_second)),
+        ];
+        rows.extend(self.stages.iter().map(|(stage, ms)| (format!("  {stage}"), format!("{ms:.2} ms"))));
+        let share = 100.0 * self.relative_displacement;
+        rows.extend([
+            (
+                "error against f64".into(),
+                format!("{:.2e} units, {:.1e} of the diagonal", self.error, self.relative_error),
+            ),
+            ("largest displacement".into(), format!("{:.3} units, {share:.1} % of the diagonal", self.displacement)),
+            ("sway at the top".into(), format!("{:.1} % of the height", 100.0 * self.sway)),
+        ]);
+        rows.extend(self.joint_gap.map(|gap| ("largest joint gap".into(), format!("{gap:.1e} of the diagonal"))));
+        rows.push(("frames written".into(), format!("{} of {}", self.frames, self.frames_wanted)));
+        rows.extend(self.failed_checks().into_iter().map(|promise| ("NOT KEPT".into(), promise)));
+        rows.into_iter().map(|(name, value): (String, String)| format!("{name:<22}{value}")).collect()
+    }
+
+    pub(super) fn json(&self) -> Value {
+        let stages: serde_json::Map<String, Value> =
+            self.stages.iter().map(|(stage, ms)| (stage.clone(), json!(ms))).collect();
+        json!({
+            "backend": self.backend,
+            "renderer": self.renderer,
+            "steps": self.steps,
+            "steps_per_second": self.steps_per_second,
+            "stage_ms_median": stages,
+            "error_units": self.error,
+            "error_of_diagonal": self.relative_error,
+            "displacement_of_diagonal": self.relative_displacement,
+            "sway_of_height": self.sway,
+            "joint_gap_of_diagonal": self.joint_gap,
+            "frames": self.frames,
+            "broken": self.failed_checks(),
+        })
+    }
+}
+
+/// The top tenth of a scene along its up axis.
+struct TopRegion {
+    axis: usize,
+    from: f64,
+    height: f64,
+}
+
+impl TopRegion {
+    fn of(scene: &Scene, rest: &[[f64; 3]]) -> Self {
+        let axis = scene.up.index();
+        let heights = || rest.iter().map(|point| point[axis]);
+        let (low, high) = (heights().fold(f64::INFINITY, f64::min), heights().fold(f64::NEG_INFINITY, f64::max));
+        Self { axis, from: high - 0.1 * (high - low), height: (high - low).max(f64::MIN_POSITIVE) }
+    }
+
+    fn holds(&self, point: [f64; 3]) -> bool {
+        point[self.axis] >= self.from
+    }
+}
+
+/// Minimum motion that a demo must show, as fractions of the diagonal and the height.
+struct MinimumMotion {
+    displacement: f64,
+    sway: f64,
+}
+
+impl MinimumMotion {
+    /// 2 % of the diagonal for a scene with modes, 0.01 % for a rigid one. A scene with modes and attached domains must
+    /// also sway by 3 % of its height.
+    fn of(scene: &Scene) -> Self {
+        let jointed = scene.needs.modes && scene.domains.iter().any(|domain| domain.attachment.is_some());
+        Self { displacement: if scene.needs.modes { 0.02 } else { 1e-4 }, sway: if jointed { 0.03 } else { 0.0 } }
+    }
+}
+
+/// A child domain and the ring of parent vertices that carries it.
+struct Joint {
+    /// Index of the child's transform.
+    root: usize,
+    /// Vertices of the ring in the packed positions.
+    ring: Vec<usize>,
+}
+
+impl Joint {
+    /// The joints whose rest frame is at the center of their ring, so that the ring determines the expected position.
+    fn all(scene: &Scene, rest: &[[f64; 3]]) -> Vec<Self> {
+        let state = SceneState::rest(scene);
+        let diagonal = scene.rest_bounds.diagonal();
+        let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
+            let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
+            let root = scene.movers.frame_of(child).is_none().then(|| scene.movers.of(child))?;
+            let first = scene.layout.slots[attachment.parent].first_vertex;
+            let joint = Self { root, ring: attachment.rows.iter().map(|row| first + *row as usize).collect() };
+            let center = center(joint.ring.iter().map(|vertex| rest[*vertex]));
+            (distance(center, joint.origin(&state)) <= 1e-5 * diagonal).then_some(joint)
+        };
+        scene.domains.iter().enumerate().filter_map(joint).collect()
+    }
+
+    fn origin(&self, state: &SceneState) -> [f64; 3] {
+        state.transforms[self.root].translation().into()
+    }
+
+    /// Distance in scene units of the child's origin, as sent, from the center of the ring, as received.
+    fn gap(&self, got: &ndarray::ArrayView2<'_, f32>, state: &SceneState) -> f64 {
+        let ring = self.ring.iter().map(|vertex| [0, 1, 2].map(|axis| f64::from(got[[*vertex, axis]])));
+        distance(center(ring), self.origin(state))
+    }
+}
+
+fn center(points: impl ExactSizeIterator<Item = [f64; 3]>) -> [f64; 3] {
+    let count = points.len() as f64;
+    let sum = points.fold([0.0; 3], |sum, point| [0, 1, 2].map(|axis| sum[axis] + point[axis]));
+    sum.map(|number| number / count)
+}
+
+/// The state that the physics process sent at one step.
+fn state(scene: &Scene, ran: &DemoRun, step: usize) -> SceneState {
+    let mut state = SceneState::rest(scene);
+    state.q = ran.q.index_axis(ndarray::Axis(0), step).to_vec();
+    for (transform, sent) in
+        state.transforms.iter_mut().zip(ran.transforms.index_axis(ndarray::Axis(0), step).outer_iter())
+    {
+        *transform = Transform(std::array::from_fn(|entry| sent[entry]));
+    }
+    state
+}
+
+fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+/// The larger of two values; a NaN `b` counts as infinity.
+fn max_error(a: f64, b: f64) -> f64 {
+    if b.is_nan() { f64::INFINITY } else { a.max(b) }
+}
+
+fn text(value: &Value, key: &str) -> String {
+    value[key].as_str().unwrap_or("unknown").to_owned()
+}
+
+/// Median milliseconds per stage, as reported by the receiving client.
+fn stages(frames: &Value) -> Vec<(String, f64)> {
+    let object = frames["stages_ms"].as_object();
+    object
+        .map(|all| all.iter().filter_map(|(name, ms)| Some((name.clone(), ms.as_f64()?))).collect())
+        .unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_distance_that_is_not_a_number_is_the_worst() {
+        assert_eq!(max_error(1.0, f64::NAN), f64::INFINITY);
+        assert_eq!(max_error(f64::INFINITY, 1.0), f64::INFINITY);
+        assert_eq!(max_error(1.0, 2.0), 2.0);
+    }
+
+    /// Results with two steps of a scene at rest, as correct processes would record them.
+    fn at_rest(scene: &Scene) -> DemoRun {
+        let (domains, vertices) = (scene.domains.len(), scene.layout.vertices);
+        let state = SceneState::rest(scene);
+        let rest = reference::deform(scene, &state);
+        DemoRun {
+            frames: json!({}),
+            sim: json!({}),
+            server: json!({}),
+            q: ndarray::Array2::zeros((2, scene.layout.coordinates)),
+            transforms: ndarray::Array3::from_shape_fn((2, domains, 12), |(_, domain, at)| {
+                state.transforms[domain].0[at]
+            }),
+            vertices: ndarray::Array3::from_shape_fn((2, vertices, 3), |(_, vertex, axis)| rest[vertex][axis] as f32),
+            frames_on_disk: 2,
+        }
+    }
+
+    #[test]
+    fn every_broken_promise_is_named_and_kept_ones_are_not() {
+        let scene = modalcast_model::load::open("tree").expect("the tree");
+        let failed_checks = |spoil: &dyn Fn(&mut DemoRun)| {
+            let mut ran = at_rest(&scene);
+            spoil(&mut ran);
+            Evaluation::of(&scene, &ran, 2).expect("as many steps").failed_checks().join("; ")
+        };
+        let still = failed_checks(&|_| {});
+        assert_eq!(still, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
+        assert!(failed_checks(&|ran| ran.frames_on_disk = 1).contains("2 frames"));
+        assert!(failed_checks(&|ran| ran.vertices[[1, 77, 0]] += 0.01).contains("vertices within"));
+        assert!(failed_checks(&|ran| ran.vertices[[1, 77, 0]] = f32::NAN).contains("vertices within"));
+        let child = scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("a child");
+        assert!(failed_checks(&|ran| ran.transforms[[1, child, 3]] += 0.1).contains("joints within"));
+    }
+}

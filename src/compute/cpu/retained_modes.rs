@@ -1,0 +1,78 @@
+//! The modes that each domain sums in a step, in scenes with a truncation budget.
+
+use rayon::prelude::*;
+
+use super::changes::ChangeTracker;
+use super::sum::ModeSelection;
+use crate::storage::{Truncation, TruncationInput, bound, max_row_norms, modes_per_chunk};
+use modalcast_model::scene::{Scene, SceneState};
+
+/// The kept modes of all domains.
+#[derive(Debug)]
+pub(super) struct RetainedModes {
+    /// Error budget, scene units.
+    budget: f64,
+    /// Per shape.
+    max_row_norms: Vec<Vec<f64>>,
+    domains: Vec<DomainModes>,
+}
+
+#[derive(Debug)]
+struct DomainModes {
+    truncation: Truncation,
+    q: Vec<f32>,
+    chunks: Vec<u16>,
+}
+
+impl RetainedModes {
+    /// Starts without truncated modes. `None` for a scene without a budget.
+    pub(super) fn new(scene: &Scene) -> Option<Self> {
+        let meters = scene.deformation.truncation.filter(|_| scene.needs.truncation)?;
+        let list = |domain| {
+            let rank = scene.rank_of(domain);
+            DomainModes { truncation: Truncation::new(rank), q: vec![0.0; rank], chunks: Vec::with_capacity(rank) }
+        };
+        Some(Self {
+            budget: meters / scene.unit,
+            max_row_norms: scene.shapes.par_iter().map(|shape| max_row_norms(&shape.modes)).collect(),
+            domains: (0..scene.domains.len()).map(list).collect(),
+        })
+    }
+
+    /// Updates the domains that changed.
+    pub(super) fn update(&mut self, scene: &Scene, state: &SceneState, changes: &ChangeTracker) {
+        let per_chunk = modes_per_chunk(scene.deformation.storage) as u16;
+        let Self { budget, max_row_norms, domains } = self;
+        let decide = |(domain, list): (usize, &mut DomainModes)| {
+            if list.q.is_empty() || !changes.is_changed(domain) {
+                return;
+            }
+            let q = state.q_of(scene, domain);
+            let max_row_norms = &max_row_norms[scene.domains[domain].shape];
+            list.truncation.update(
+                TruncationInput { q, max_row_norms, norm: bound::norm(&state.composed_transform(scene, domain)) },
+                *budget,
+            );
+            list.q.fill(0.0);
+            list.chunks.clear();
+            for mode in list.truncation.retained() {
+                list.q[usize::from(*mode)] = q[usize::from(*mode)];
+                if list.chunks.last() != Some(&(mode / per_chunk)) {
+                    list.chunks.push(mode / per_chunk);
+                }
+            }
+        };
+        domains.par_iter_mut().enumerate().with_min_len(64).for_each(decide);
+    }
+
+    /// The modes that a domain sums.
+    pub(super) fn of(&self, domain: usize) -> ModeSelection<'_> {
+        let list = &self.domains[domain];
+        ModeSelection { q: &list.q, chunks: &list.chunks }
+    }
+
+    /// The truncation of a domain.
+    pub(super) fn truncation(&self, domain: usize) -> &Truncation {
+        &self.domains[domain].truncation
+    }
+}

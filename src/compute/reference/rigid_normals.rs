@@ -1,0 +1,53 @@
+//! Rigid normals by the inverse transpose of A, tangents by A, both of unit length. Twin of `kernels/rigid_normals.cuh`.
+
+use nalgebra::{Matrix3, Vector3};
+
+use modalcast_model::scene::{Scene, SceneState};
+
+/// World unit normals, one per corner. If A is singular, the cofactors still give the direction, and a normal that they
+/// map to zero becomes +Z.
+pub fn rigid_normals(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
+    let mut normals = Vec::with_capacity(scene.layout.corners);
+    for domain in 0..scene.domains.len() {
+        let linear = state.composed_transform(scene, domain).linear();
+        // The inverse transpose is the cofactor matrix over the determinant; only the determinant's sign survives
+        // normalization.
+        let turn = cofactors(&linear) * linear.determinant().signum();
+        for normal in &scene.shape_of(domain).mesh.corners().normals {
+            normals.push(unit(turn * Vector3::from(*normal).cast::<f64>()).into());
+        }
+    }
+    normals
+}
+
+/// World unit tangents and bitangent signs, one per corner; empty when the scene has no normal map. A shape without
+/// tangents gives zeros. A mirroring A flips the sign.
+pub fn rigid_tangents(scene: &Scene, state: &SceneState) -> Vec<[f64; 4]> {
+    if !scene.needs.normal_maps {
+        return Vec::new();
+    }
+    let mut tangents = Vec::with_capacity(scene.layout.corners);
+    for domain in 0..scene.domains.len() {
+        let shape = scene.shape_of(domain);
+        let linear = state.composed_transform(scene, domain).linear();
+        let hand = linear.determinant().signum();
+        for corner in 0..shape.mesh.corners().vertices.len() {
+            let Some([x, y, z, sign]) = shape.tangents().get(corner) else {
+                tangents.push([0.0; 4]);
+                continue;
+            };
+            let tangent = unit(linear * Vector3::new(*x, *y, *z).cast::<f64>());
+            tangents.push([tangent.x, tangent.y, tangent.z, f64::from(*sign) * hand]);
+        }
+    }
+    tangents
+}
+
+pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
+    let [a, b, c] = [0, 1, 2].map(|row| linear.row(row).transpose());
+    Matrix3::from_rows(&[b.cross(&c).transpose(), c.cross(&a).transpose(), a.cross(&b).transpose()])
+}
+
+fn unit(vector: Vector3<f64>) -> Vector3<f64> {
+    vector.try_normalize(1e-300).unwrap_or_else(Vector3::z)
+}

@@ -1,0 +1,157 @@
+//! Coordinates for tensor cores with U in 16 bits: each coordinate is split into two numbers of U's type.
+//!
+//! A number x becomes h = round(x) and l = round(x - h). For a type with p significant bits, |x - h| <= 2^-p |x|.
+//! Unless l is denormal, |x - h - l| <= 2^-2p |x|: 2^-22 with f16, 2^-16 with bf16. All coordinates of a domain are
+//! first multiplied by one power of two, so that the largest lies in [2^13, 2^14). Then nothing overflows f16, and the
+//! loss in its denormals is at most 2^-25, 2^-38 of the largest.
+
+use half::{bf16, f16};
+
+use modalcast_model::scene::StorageType;
+
+/// Exponent of the power of two at or below the largest coordinate, after scaling.
+const TOP_EXPONENT: i32 = 13;
+/// Largest coordinates below 2^-113 are scaled as if they were 2^-113, so that the inverse scaling is at least 2^-126.
+const MIN_EXPONENT: i32 = -113;
+
+/// The split coordinates of one domain.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SplitCoordinates {
+    storage: StorageType,
+    pairs: Vec<[u16; 2]>,
+    /// Exponent of the inverse scaling: sums are multiplied by 2 to this power.
+    exponent: i32,
+}
+
+impl SplitCoordinates {
+    /// Splits finite coordinates, already multiplied by the factors of their modes, for U in `F16`; for any other
+    /// storage, in `Bf16`.
+    pub fn new(amounts: &[f32], storage: StorageType) -> Self {
+        let largest = amounts.iter().fold(0.0, |largest: f32, amount| largest.max(amount.abs()));
+        let exponent = exponent_of(largest).max(MIN_EXPONENT) - TOP_EXPONENT;
+        let grow = f64::from(-exponent).exp2();
+        let pair = |amount: &f32| {
+            let scaled = f64::from(*amount) * grow;
+            let high = rounded(scaled, storage);
+            [high, rounded(scaled - value(high, storage), storage)]
+        };
+        Self { storage, pairs: amounts.iter().map(pair).collect(), exponent }
+    }
+
+    /// Bits of both numbers of a mode, the larger one first.
+    pub fn pair(&self, mode: usize) -> [u16; 2] {
+        self.pairs[mode]
+    }
+
+    /// Factor of the inverse scaling, by which sums are multiplied: a power of two that f32 can represent.
+    pub fn inverse_scale(&self) -> f32 {
+        f64::from(self.exponent).exp2() as f32
+    }
+
+    /// The value that both numbers of a mode represent.
+    pub fn decode_coordinate(&self, mode: usize) -> f64 {
+        let [high, low] = self.pairs[mode];
+        (value(high, self.storage) + value(low, self.storage)) * f64::from(self.exponent).exp2()
+    }
+}
+
+/// Relative error bounds of products by tensor cores, in addition to the storage error of U.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TensorCoreError {
+    /// Relative to each coordinate.
+    pub coordinate: f64,
+    /// For each coordinate, relative to the largest coordinate of the domain.
+    pub floor: f64,
+    /// Relative to the sum of the magnitudes of all terms.
+    pub sum: f64,
+}
+
+/// 2^-23: the relative loss of truncating an addend that is aligned to the exponent of the largest.
+const TRUNCATION_ERROR: f64 = 1.0 / (1 << 23) as f64;
+/// Modes per product.
+const MMA_MODES: usize = 16;
+/// Truncations of a product of 16 terms, computed at once or in two halves: of each term and of the previous sum, and
+/// of the result.
+const TRUNCATIONS: f64 = 20.0;
+
+impl TensorCoreError {
+    /// Bounds for `rank` modes in this storage type.
+    ///
+    /// A tensor core multiplies exactly, aligns all terms and the previous sum to the largest of them, and truncates
+    /// (Fasi, Higham, Mikaitis, Pranesh, Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 7:e330,
+    /// 2021). A product therefore loses at most `TRUNCATIONS` units of the sum of all magnitudes, and there are two
+    /// products for every 16 modes.
+    pub fn of(storage: StorageType, rank: usize) -> Self {
+        let coordinate = f64::from(if storage == StorageType::F16 { -22_i8 } else { -16 }).exp2();
+        let sum = 2.0 * rank.div_ceil(MMA_MODES) as f64 * TRUNCATIONS * TRUNCATION_ERROR;
+        // The magnitudes are those of rounded coordinates, so their errors compound slightly.
+        Self { coordinate, floor: f64::from(-25 - TOP_EXPONENT).exp2(), sum: sum * (1.0 + 2.0 * sum + 1e-4) }
+    }
+
+    /// Lower limit of the largest coordinate in the `floor` bound.
+    pub(super) fn least() -> f64 {
+        f64::from(MIN_EXPONENT).exp2()
+    }
+}
+
+/// Exponent of the power of two at or below a number; for zero, that of the smallest f32.
+fn exponent_of(number: f32) -> i32 {
+    let bits = f64::from(number).to_bits();
+    if number == 0.0 { -149 } else { (bits >> 52) as i32 - 1023 }
+}
+
+fn rounded(number: f64, storage: StorageType) -> u16 {
+    if storage == StorageType::F16 { f16::from_f64(number).to_bits() } else { bf16::from_f64(number).to_bits() }
+}
+
+fn value(bits: u16, storage: StorageType) -> f64 {
+    if storage == StorageType::F16 { f16::from_bits(bits).to_f64() } else { bf16::from_bits(bits).to_f64() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::TestRng;
+
+    #[test]
+    fn two_halves_keep_what_they_promise_at_every_size_and_one_half_does_not() {
+        let mut noise = TestRng(3);
+        for storage in [StorageType::F16, StorageType::Bf16] {
+            let TensorCoreError { coordinate, floor, .. } = TensorCoreError::of(storage, 32);
+            for power in [-149, -126, -60, -14, 0, 30, 127] {
+                let scale = f64::from(power).exp2();
+                let spread = |at: i32| (f64::from(noise.next()) * scale * f64::from(-at).exp2()) as f32;
+                let amounts: Vec<f32> = (0..32).map(spread).collect();
+                let halves = SplitCoordinates::new(&amounts, storage);
+                let largest = amounts.iter().fold(0.0, |most: f32, amount| most.max(amount.abs()));
+                let most = f64::from(largest).max(TensorCoreError::least());
+                let mut one_half = false;
+                for (mode, amount) in amounts.iter().map(|amount| f64::from(*amount)).enumerate() {
+                    let allowed = coordinate * amount.abs() + floor * most;
+                    assert!((halves.decode_coordinate(mode) - amount).abs() <= allowed, "{storage:?} {power} {mode}");
+                    let high = value(halves.pair(mode)[0], storage) * f64::from(halves.inverse_scale());
+                    one_half |= (high - amount).abs() > allowed;
+                }
+                assert!(one_half || power < -120, "{storage:?} {power}: the judge can fail");
+                assert!(halves.inverse_scale() > 0.0 && halves.inverse_scale().is_finite());
+            }
+        }
+    }
+
+    #[test]
+    fn zeros_and_the_extremes_of_f32_stay_finite_and_keep_their_signs() {
+        let zeros = SplitCoordinates::new(&[0.0, -0.0], StorageType::F16);
+        assert_eq!((zeros.decode_coordinate(0), zeros.decode_coordinate(1)), (0.0, 0.0));
+        let wide = SplitCoordinates::new(&[f32::MAX, -f32::MAX, f32::MIN_POSITIVE, 1e-45], StorageType::F16);
+        assert!(
+            (wide.decode_coordinate(0) / f64::from(f32::MAX) - 1.0).abs() < 3e-7
+                && wide.decode_coordinate(1) == -wide.decode_coordinate(0)
+        );
+        assert_eq!(
+            (wide.decode_coordinate(2), wide.decode_coordinate(3)),
+            (0.0, 0.0),
+            "2^-253 of the largest is nothing"
+        );
+        assert_eq!(SplitCoordinates::new(&[3.0], StorageType::F16).decode_coordinate(0), 3.0);
+    }
+}

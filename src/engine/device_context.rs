@@ -1,0 +1,311 @@
+//! Device context: owns the deformation backend and the optional renderer, and loads scenes onto both ([`LoadedScene`]).
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::loaded_scene::LoadedScene;
+use super::subscriber::FrameOutput;
+use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::frame::Legend;
+use crate::telemetry::{Stage, ms_since};
+use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::gpu::{self, CudaDeformer, CudaRasterizer, GlVertexBuffers};
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Backend, Deformer};
+use modalcast_model::error::{Error, Result};
+use modalcast_model::raster::{RasterGeometry, Rasterizer};
+use modalcast_model::scene::{Camera, PixelRect, RasterPolicy, Scene};
+use modalcast_render::{
+    Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PendingFrame, PendingPick, PickHit, Renderer,
+    SceneBuffers,
+};
+
+/// Description of the deformation backend and the renderer in use.
+#[derive(Debug, Clone)]
+pub struct EngineInfo {
+    pub backend: Backend,
+    /// The name of the CUDA device, or the reason why none is in use.
+    pub device: String,
+    /// The renderer, or the reason why there is none.
+    pub renderer: Result<modalcast_render::RendererInfo>,
+}
+
+/// A frame in flight.
+#[derive(Debug)]
+pub struct PendingDraw {
+    ticket: PendingFrame,
+    /// Milliseconds spent on uploading vertices to the renderer; `None` if no upload was needed.
+    upload_ms: Option<f64>,
+}
+
+impl PendingDraw {
+    /// Waits for at most `limit`; returns whether [`DeviceContext::finish_draw`] would now return without waiting.
+    pub fn is_ready_within(&self, limit: Duration) -> bool {
+        self.ticket.is_ready_within(limit)
+    }
+}
+
+/// Owns the CUDA device and the renderer. Must remain on the thread that created it: the device thread of the server,
+/// or the main thread of `modalcast render`.
+#[derive(Debug)]
+pub struct DeviceContext {
+    // Field order is drop order: the OpenGL context is dropped before the CUDA context that maps its buffers. Scenes
+    // must be freed by `unload_scene` before either is dropped.
+    renderer: Result<Renderer>,
+    device: Option<Arc<gpu::Device>>,
+    info: EngineInfo,
+}
+
+impl DeviceContext {
+    /// Opens the configured backend and renderer.
+    ///
+    /// # Errors
+    /// `Unavailable` when CUDA is requested by name and cannot be opened. A missing renderer is an error only once a
+    /// frame is requested.
+    pub fn open(config: &Config) -> Result<Self> {
+        let (backend, device, note) = open_backend(config)?;
+        let renderer = open_renderer(config, device.is_some());
+        let info = EngineInfo {
+            backend,
+            device: note,
+            renderer: renderer.as_ref().map(|renderer| renderer.info().clone()).map_err(Clone::clone),
+        };
+        Ok(Self { renderer, device, info })
+    }
+
+    /// The backend in use.
+    pub const fn backend(&self) -> Backend {
+        self.info.backend
+    }
+
+    /// The backend and the renderer.
+    pub const fn info(&self) -> &EngineInfo {
+        &self.info
+    }
+
+    /// Statistics of the passes that the last frame executed; `None` without a renderer.
+    pub fn stats(&self) -> Option<&modalcast_render::FrameStats> {
+        self.renderer.as_ref().ok().map(Renderer::stats)
+    }
+
+    /// Loads a scene and deforms it to the rest state. Creates OpenGL buffers here only if the deformer or a CUDA
+    /// rasterizer uses them; otherwise the first frame creates them.
+    ///
+    /// # Errors
+    /// `Fault` of the device; `Invalid` when the rest state overflows.
+    pub fn load_scene(&mut self, scene: &Arc<Scene>) -> Result<LoadedScene> {
+        let mut buffers = None;
+        let deformer: Box<dyn Deformer> = match (self.device.clone(), self.info.backend) {
+            (Some(device), Backend::Cuda) => {
+                buffers = self.shareable_buffers(scene)?;
+                let gl = buffers.as_ref().map(gl_buffers);
+                match CudaDeformer::new(&device, scene, gl) {
+                    Ok(deformer) => Box::new(deformer),
+                    Err(error) => {
+                        self.unload(buffers);
+                        return Err(error);
+                    }
+                }
+            }
+            (_, Backend::Reference) => Box::new(ReferenceDeformer::new(scene)),
+            _ => Box::new(CpuDeformer::new(scene)),
+        };
+        let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
+        let ready = loaded_scene.rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene));
+        match ready {
+            Ok(()) => Ok(loaded_scene),
+            Err(error) => {
+                self.unload_scene(loaded_scene);
+                Err(error)
+            }
+        }
+    }
+
+    /// Creates the compute (CUDA) rasterizer of a scene if its look requests one, and, for [`RasterPolicy::Fastest`],
+    /// measures both rasterizers and selects the faster one per pass. If the compute rasterizer cannot be created,
+    /// OpenGL draws and the reason is logged.
+    ///
+    /// # Errors
+    /// The errors of drawing the measured frames.
+    fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene) -> Result<()> {
+        let scene = Arc::clone(loaded_scene.scene());
+        let (wanted, Some(device), Ok(renderer)) = (scene.look.raster, &self.device, &mut self.renderer) else {
+            return Ok(());
+        };
+        if wanted == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
+            return Ok(());
+        }
+        let make = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
+        if let Err(error) = loaded_scene.attach_rasterizer(renderer, make) {
+            tracing::warn!(%error, "OpenGL draws: its buffers have no rasteriser in CUDA");
+            return Ok(());
+        }
+        if wanted == RasterPolicy::Fastest { loaded_scene.select_raster_backends(renderer) } else { Ok(()) }
+    }
+
+    /// Frees a loaded scene.
+    pub fn unload_scene(&mut self, loaded_scene: LoadedScene) {
+        let buffers = loaded_scene.into_buffers();
+        self.unload(buffers);
+    }
+
+    /// Draws the vertices of the last deformation; `width` and `height` are in pixels. The image's passes include
+    /// "upload" if the vertices had to be uploaded.
+    ///
+    /// # Errors
+    /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
+    pub fn draw(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        width: u32,
+        height: u32,
+    ) -> Result<FrameImage> {
+        let drawing = self.begin_draw(loaded_scene, camera, width, height)?;
+        self.finish_draw(drawing).map(MappedPixels::into_image)
+    }
+
+    /// Submits a frame of the last deformation without waiting for the device. The scene may be deformed again while
+    /// the frame is in flight.
+    ///
+    /// # Errors
+    /// As [`Self::draw`]; `Busy` when every ring slot is in flight.
+    pub fn begin_draw(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        width: u32,
+        height: u32,
+    ) -> Result<PendingDraw> {
+        let camera = camera.validated()?;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let begin = Instant::now();
+        let filled = loaded_scene.fill_buffers(renderer, &camera)?;
+        let upload_ms = filled.uploaded.then(|| ms_since(begin));
+        let shot = filled.shot(camera, [width, height]);
+        Ok(PendingDraw { ticket: renderer.submit(loaded_scene.buffers()?, &shot)?, upload_ms })
+    }
+
+    /// Waits for a frame. Any thread may then copy its pixels.
+    ///
+    /// # Errors
+    /// `Fault` when the device does not finish.
+    pub fn finish_draw(&mut self, drawing: PendingDraw) -> Result<MappedPixels> {
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let pixels = renderer.map_pixels(drawing.ticket)?;
+        Ok(match drawing.upload_ms {
+            Some(ms) => pixels.with_stage(Stage::Upload.name(), ms),
+            None => pixels,
+        })
+    }
+
+    /// Renders an AOV: depth, domains, normals or the values of a color map, and the legend of a color map. `size` is
+    /// in pixels. For color frames use [`Self::draw`].
+    ///
+    /// # Errors
+    /// As [`Self::draw`].
+    pub fn render_aov(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        size: [u32; 2],
+        frame_output: FrameOutput,
+    ) -> Result<(AovImage, Option<Legend>)> {
+        let camera = camera.validated()?;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let shot = loaded_scene.fill_buffers(renderer, &camera)?.shot(camera, size);
+        let legend = loaded_scene.upload_scalar_field(renderer, frame_output)?;
+        let field = match (frame_output, &legend) {
+            (_, Some(legend)) => Aov::Values { largest: legend.largest as f32 },
+            (FrameOutput::Depth, _) => Aov::Depth,
+            (FrameOutput::Normals, _) => Aov::Normals,
+            _ => Aov::Domains,
+        };
+        let survey = renderer.render_aov(loaded_scene.buffers()?, &shot, field)?;
+        Ok((survey, legend))
+    }
+
+    /// Submits a pick in a rectangle of a picture of `size` pixels without waiting for the device.
+    ///
+    /// # Errors
+    /// As [`Self::draw`].
+    pub fn begin_pick(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        size: [u32; 2],
+        rectangle: PixelRect,
+    ) -> Result<PendingPick> {
+        let camera = camera.validated()?;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        let shot = loaded_scene.fill_buffers(renderer, &camera)?.shot(camera, size);
+        renderer.begin_pick(loaded_scene.buffers()?, &shot, rectangle)
+    }
+
+    /// Waits for a pick; returns the hits row by row.
+    ///
+    /// # Errors
+    /// `Fault` when the device does not finish.
+    pub fn finish_pick(&mut self, pick: PendingPick) -> Result<Vec<PickHit>> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.finish_pick(pick)
+    }
+
+    /// Buffers that CUDA can map; `None` unless the renderer runs on a CUDA device.
+    fn shareable_buffers(&mut self, scene: &Arc<Scene>) -> Result<Option<SceneBuffers>> {
+        match &mut self.renderer {
+            Ok(renderer) if renderer.info().cuda_device.is_some() => renderer.load(scene).map(Some),
+            _ => Ok(None),
+        }
+    }
+
+    fn unload(&mut self, buffers: Option<SceneBuffers>) {
+        if let (Some(buffers), Ok(renderer)) = (buffers, &mut self.renderer) {
+            renderer.unload(buffers);
+        }
+    }
+}
+
+fn gl_buffers(buffers: &SceneBuffers) -> GlVertexBuffers {
+    let shared = buffers.shared;
+    GlVertexBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents }
+}
+
+fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
+    match config.backend {
+        BackendChoice::Cpu => Ok((Backend::Cpu, None, "not asked for".into())),
+        BackendChoice::Reference => Ok((Backend::Reference, None, "not asked for".into())),
+        BackendChoice::Cuda => open_cuda(config),
+        BackendChoice::Auto => open_cuda(config).or_else(|error| Ok((Backend::Cpu, None, error.to_string()))),
+    }
+}
+
+/// Opens the CUDA device; fails if no NVRTC version fits it, since it could not compile the kernels.
+fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
+    let device = gpu::Device::open(config.cuda_device)?;
+    device.check_compiler()?;
+    let name = device.name().to_owned();
+    Ok((Backend::Cuda, Some(device), name))
+}
+
+fn open_renderer(config: &Config, cuda: bool) -> Result<Renderer> {
+    let refusal = |reason: &str, remedy: &str| Error::Unavailable {
+        what: "renderer",
+        reason: reason.into(),
+        remedy: remedy.into(),
+    };
+    let renderer = match config.renderer {
+        RendererChoice::Off => return Err(refusal("it was switched off", "Start the server with a renderer")),
+        RendererChoice::Software => Renderer::open(DevicePreference::Software),
+        RendererChoice::Auto if cuda => {
+            let ordinal = i32::try_from(config.cuda_device).unwrap_or(i32::MAX);
+            // A driver without EGL can still deform; another renderer then draws the frames.
+            Renderer::open(DevicePreference::Cuda(ordinal)).or_else(|_| Renderer::open(DevicePreference::Any))
+        }
+        RendererChoice::Auto => Renderer::open(DevicePreference::Any),
+    }?;
+    if renderer.info().software && !config.allow_software {
+        let reason = format!("only {} is there and software renderers are not allowed", renderer.info().renderer);
+        return Err(refusal(&reason, "Install the GPU's EGL driver or allow software"));
+    }
+    Ok(renderer)
+}

@@ -1,0 +1,154 @@
+//! Handle to the device thread, which receives commands (`command`) from a bounded queue, owns the device context and
+//! every loaded scene (`device_loop`), and answers each command at most once. Vertices, picks and frames are answered
+//! asynchronously: their readback overlaps with the commands after them.
+
+use std::sync::Arc;
+
+use tokio::sync::mpsc::error::TrySendError;
+use tokio::sync::{mpsc, oneshot};
+
+use super::command::{Command, Reply, SceneId, TimedVertices};
+use super::device_context::{DeviceContext, EngineInfo};
+use super::device_loop::{DeviceLoop, run_device_loop};
+use super::subscriber::FrameOutput;
+use crate::config::Config;
+use crate::frame::Legend;
+use modalcast_model::deform::{DeformSummary, VertexAttributes};
+use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::scene::{Camera, PixelRect, Scene, SceneState};
+use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
+
+/// Sends commands to the device thread. The thread ends when the last clone is dropped.
+#[derive(Debug, Clone)]
+pub(super) struct DeviceHandle {
+    commands: mpsc::Sender<Command>,
+    limit: usize,
+}
+
+impl DeviceHandle {
+    /// Starts the thread and waits until it has opened its devices.
+    ///
+    /// # Errors
+    /// `Unavailable` when the requested backend cannot be opened, `Fault` when a thread cannot be started.
+    pub(super) async fn start(config: &Arc<Config>) -> Result<(Self, EngineInfo, std::thread::JoinHandle<()>)> {
+        // A scene queues at most FRAMES_UNDER_WAY frames, one copy and the next step, and an opening queues one command
+        // more. The queue is therefore full only when scenes are opened faster than the limit on open scenes allows.
+        let limit = (3 + MAX_FRAMES_IN_FLIGHT) * config.open_scenes + 8;
+        let (commands, inbox) = mpsc::channel(limit);
+        let (info_sender, info_receiver) = oneshot::channel();
+        let config = Arc::clone(config);
+        let thread = std::thread::Builder::new()
+            .name("device".into())
+            .spawn(move || match DeviceContext::open(&config).and_then(DeviceLoop::new) {
+                Ok(device_loop) => {
+                    info_sender.send(Ok(device_loop.info().clone())).ok(); // Fails if the caller has gone; the queue is closed then.
+                    run_device_loop(device_loop, inbox);
+                }
+                Err(error) => {
+                    info_sender.send(Err(error)).ok(); // As above.
+                }
+            })
+            .map_err(fault_in("device thread"))?;
+        let info = info_receiver.await.map_err(|_| gone())??;
+        Ok((Self { commands, limit }, info, thread))
+    }
+
+    /// A handle for tests that play the device thread, and the receiver of its commands.
+    #[cfg(test)]
+    pub(super) fn mock() -> (Self, mpsc::Receiver<Command>) {
+        let (commands, inbox) = mpsc::channel(16);
+        (Self { commands, limit: 16 }, inbox)
+    }
+
+    pub(super) async fn load_scene(&self, id: SceneId, scene: &Arc<Scene>) -> Result<()> {
+        let scene = Arc::clone(scene);
+        self.call(|reply| Command::LoadScene { id, scene, reply }).await
+    }
+
+    /// Starts deforming a scene to a state.
+    pub(super) fn deform(&self, id: SceneId, state: &Arc<SceneState>) -> PendingReply<DeformSummary> {
+        let state = Arc::clone(state);
+        self.submit(|reply| Command::Deform { id, state, reply })
+    }
+
+    /// Starts drawing the last deformation. Later commands do not affect the frame.
+    pub(super) fn begin_draw(&self, id: SceneId, camera: Camera, size: (u32, u32)) -> PendingReply<FrameImage> {
+        self.submit(|reply| Command::Draw { id, camera, size, reply })
+    }
+
+    pub(super) async fn render_aov(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        size: [u32; 2],
+        frame_output: FrameOutput,
+    ) -> Result<(AovImage, Option<Legend>)> {
+        self.call(|reply| Command::RenderAov { id, camera, size, frame_output, reply }).await
+    }
+
+    pub(super) async fn pick(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        picture: [u32; 2],
+        rectangle: PixelRect,
+    ) -> Result<Vec<PickHit>> {
+        self.call(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
+    }
+
+    /// Starts copying the wanted attributes of the last deformation. Later commands do not affect the copy.
+    pub(super) fn read_vertices(&self, id: SceneId, wanted: VertexAttributes) -> PendingReply<TimedVertices> {
+        self.submit(|reply| Command::ReadVertices { id, wanted, reply })
+    }
+
+    /// Waits for queue capacity, so that a scene never remains on the device because the queue was full.
+    pub(super) async fn unload_scene(&self, id: SceneId) -> Result<()> {
+        let (reply, answer) = oneshot::channel();
+        self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| gone())?;
+        answer.await.map_err(|_| gone())?
+    }
+
+    /// Ends the thread after the commands already queued. Blocks until the queue has capacity, so it must not be called
+    /// on a runtime thread.
+    pub(super) fn quit(&self) {
+        // A closed queue means that the thread has ended.
+        self.commands.blocking_send(Command::Quit).ok();
+    }
+
+    async fn call<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
+        self.submit(make).wait().await
+    }
+
+    /// Sends a command; the caller awaits the answer later.
+    fn submit<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> PendingReply<T> {
+        let (reply, answer) = oneshot::channel();
+        PendingReply(match self.commands.try_send(make(reply)) {
+            Ok(()) => Ok(answer),
+            Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "device", limit: self.limit }),
+            Err(TrySendError::Closed(_)) => Err(gone()),
+        })
+    }
+}
+
+/// The pending answer to a command that was sent to the device thread.
+#[derive(Debug)]
+pub(super) struct PendingReply<T>(Result<oneshot::Receiver<Result<T>>>);
+
+impl<T> PendingReply<T> {
+    pub(super) async fn wait(mut self) -> Result<T> {
+        self.recv().await
+    }
+
+    /// As [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
+    pub(super) async fn recv(&mut self) -> Result<T> {
+        match &mut self.0 {
+            Ok(answer) => answer.await.map_err(|_| gone())?,
+            Err(error) => Err(error.clone()),
+        }
+    }
+}
+
+/// The error for a dropped reply channel: the command panicked or the thread has ended.
+fn gone() -> Error {
+    fault_in("device")("the device thread gave no answer")
+}

@@ -1,0 +1,309 @@
+//! A scene loaded on the device thread: its deformer, its OpenGL buffers (created on first use), and the last valid
+//! state.
+
+use std::sync::Arc;
+
+use super::scalar_field;
+use super::subscriber::FrameOutput;
+use crate::frame::Legend;
+use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
+use modalcast_model::error::{Error, Result, fault_in, invalid};
+use modalcast_model::raster::{RasterGeometry, Rasterizer};
+use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene, SceneState, snap_to_origin_grid};
+use modalcast_render::{FrameParams, Renderer, SceneBuffers};
+
+/// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
+/// shaders.
+const MAX_COORDINATE: f64 = 1e18;
+
+/// Size in pixels of the frames that are measured to choose between the rasterizers.
+const BENCHMARK_SIZE: [u32; 2] = [1920, 1080];
+
+/// Description of the content of the buffers, in the coordinate frame that the camera needs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BufferContents {
+    bounds: Bounds,
+    /// `None` in a camera-relative frame, because the deformer computed them in the frames of the domains' cells.
+    light: Option<LightSpaceBox>,
+    /// Whether vertices were uploaded.
+    pub(super) uploaded: bool,
+}
+
+impl BufferContents {
+    /// The parameters of a frame of these buffers; the size is in pixels.
+    pub(super) const fn shot(&self, camera: Camera, [width, height]: [u32; 2]) -> FrameParams {
+        FrameParams { camera, width, height, bounds: self.bounds, light: self.light }
+    }
+}
+
+/// A scene that can be deformed and drawn.
+pub struct LoadedScene {
+    scene: Arc<Scene>,
+    deformer: Box<dyn Deformer>,
+    buffers: Option<SceneBuffers>,
+    /// Whether the buffers hold the vertices of the last deformation.
+    filled: bool,
+    bounds: Bounds,
+    /// Bounds of the same vertices in light space; only if the scene has a shadow.
+    light: Option<LightSpaceBox>,
+    /// The state that the deformer's output shows.
+    current_state: Arc<SceneState>,
+    /// Number of deformations, including rejected states and the deformations that undo them, since each one changes
+    /// the content of the buffers.
+    generation: u64,
+    /// The color map whose values are in the buffers.
+    cached_color_map: Option<(FrameOutput, Legend)>,
+}
+
+impl LoadedScene {
+    /// A scene without output. [`Self::rest`] must be called before any other method.
+    pub(super) fn new(scene: &Arc<Scene>, deformer: Box<dyn Deformer>, buffers: Option<SceneBuffers>) -> Self {
+        let current_state = Arc::new(SceneState::rest(scene));
+        Self {
+            scene: Arc::clone(scene),
+            deformer,
+            buffers,
+            filled: false,
+            bounds: scene.rest_bounds,
+            light: None,
+            current_state,
+            generation: 0,
+            cached_color_map: None,
+        }
+    }
+
+    /// Deforms the rest state.
+    pub(super) fn rest(&mut self) -> Result<()> {
+        let deformed = self.run(&Arc::clone(&self.current_state))?;
+        if !is_in_range(&deformed.bounds) {
+            return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
+        }
+        (self.bounds, self.light) = (deformed.bounds, deformed.light);
+        Ok(())
+    }
+
+    /// The scene.
+    pub const fn scene(&self) -> &Arc<Scene> {
+        &self.scene
+    }
+
+    /// Bounds of the last deformation in scene units, each domain relative to its cell. Always finite.
+    pub const fn bounds(&self) -> Bounds {
+        self.bounds
+    }
+
+    /// Deforms the scene to a state. If a vertex is not finite or beyond 1e18 units, the state is rejected and the
+    /// previous state is deformed again, so that no reader sees the rejected one.
+    ///
+    /// # Errors
+    /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
+    pub fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
+        self.deform_shared(&Arc::new(state.clone()))
+    }
+
+    /// [`Self::deform`] of a shared state, without a copy.
+    pub(super) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
+        self.filled = false;
+        let deformed = match self.run(state) {
+            Ok(deformed) => deformed,
+            Err(error) => {
+                // The output may be partially written, so restore it. If that fails too, the first error says more.
+                self.run(&Arc::clone(&self.current_state)).ok();
+                return Err(error);
+            }
+        };
+        if is_in_range(&deformed.bounds) {
+            (self.bounds, self.light) = (deformed.bounds, deformed.light);
+            self.current_state = Arc::clone(state);
+            return Ok(deformed);
+        }
+        let refusal = self.overflow_error(state)?;
+        self.run(&Arc::clone(&self.current_state))?;
+        Err(refusal)
+    }
+
+    fn run(&mut self, state: &SceneState) -> Result<DeformSummary> {
+        self.generation += 1;
+        self.deformer.deform(state)
+    }
+
+    /// The vertices of the last deformation, in host memory.
+    ///
+    /// # Errors
+    /// `Fault` when copying from the device failed.
+    pub fn surface(&mut self) -> Result<&DeformedSurface> {
+        self.deformer.surface()
+    }
+
+    /// Creates the buffers on first use and fills them with the last deformation. If the domains have different cells,
+    /// the positions are rebased to the cell nearest the camera.
+    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<BufferContents> {
+        let uploaded = self.fill_shared(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        let rebased = match &self.current_state.origins {
+            Some(origins) if !origins.is_uniform() => Arc::clone(origins),
+            // All domains share one origin, so the deformer's output is drawn unchanged.
+            origins => {
+                buffers.set_origin(origins.as_ref().map_or([0.0; 3], |origins| origins.shared()));
+                buffers.set_step(self.generation);
+                return Ok(BufferContents { bounds: self.bounds, light: self.light, uploaded });
+            }
+        };
+        let view = snap_to_origin_grid(camera.eye().into());
+        let positions = &self.deformer.read(VertexAttributes::VERTICES)?.positions;
+        let (positions, bounds) = rebased.rebase_positions(view, &self.scene, positions);
+        renderer.upload_rebased(buffers, &positions, view)?;
+        Ok(BufferContents { bounds, light: None, uploaded: true })
+    }
+
+    /// Starts copying the wanted attributes of the last deformation to host memory. The copy overlaps with the next
+    /// deformation.
+    pub(super) fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
+        self.deformer.readback(wanted)
+    }
+
+    /// Waits until the copy is complete.
+    pub(super) fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
+        self.deformer.wait_readback(readback)
+    }
+
+    /// Uploads the values of a color map into the buffers, which must be filled, and returns the legend; `None` if
+    /// `frame_output` is not a color map. A mode shape does not depend on the state, so it is not recomputed while its
+    /// values are in the buffers.
+    pub(super) fn upload_scalar_field(
+        &mut self,
+        renderer: &mut Renderer,
+        frame_output: FrameOutput,
+    ) -> Result<Option<Legend>> {
+        let fixed = matches!(frame_output, FrameOutput::ModeShape { .. });
+        if let Some((_, legend)) = self.cached_color_map.as_ref().filter(|(held, _)| fixed && *held == frame_output) {
+            return Ok(Some(legend.clone()));
+        }
+        let scalar_field = match frame_output {
+            FrameOutput::ModeShape { mode, .. } => scalar_field::mode_shape_magnitudes(&self.scene, mode as usize),
+            FrameOutput::Displacement { .. } => scalar_field::displacement_magnitudes(
+                &self.scene,
+                &self.current_state,
+                self.deformer.read(VertexAttributes::VERTICES)?,
+            ),
+            FrameOutput::Color | FrameOutput::Depth | FrameOutput::Domains | FrameOutput::Normals => return Ok(None),
+        };
+        let legend = scalar_field::fit_legend(&self.scene, frame_output, &scalar_field);
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        self.cached_color_map = None;
+        renderer.upload_vertex_values(buffers, &scalar_field)?;
+        self.cached_color_map = Some((frame_output, legend.clone()));
+        Ok(Some(legend))
+    }
+
+    /// Creates the buffers on first use and uploads the vertices unless the deformer writes the buffers itself. Returns
+    /// whether vertices were uploaded.
+    fn fill_shared(&mut self, renderer: &mut Renderer) -> Result<bool> {
+        let shares = self.deformer.shares_buffers();
+        let buffers = match self.buffers.take() {
+            Some(buffers) => buffers,
+            None => renderer.load(&self.scene)?,
+        };
+        let buffers = self.buffers.insert(buffers);
+        if self.filled || shares {
+            return Ok(false);
+        }
+        renderer.upload(buffers, self.deformer.read(VertexAttributes::VERTICES)?)?;
+        self.filled = true;
+        Ok(true)
+    }
+
+    /// Adds a compute rasterizer to the scene's buffers, next to OpenGL.
+    pub(super) fn attach_rasterizer(
+        &mut self,
+        renderer: &mut Renderer,
+        make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+    ) -> Result<()> {
+        self.fill_shared(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        renderer.attach_rasterizer(buffers, make)
+    }
+
+    /// Measures both rasterizers on frames of [`BENCHMARK_SIZE`] pixels of the current state and selects the faster one per
+    /// pass.
+    pub(super) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {
+        let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE[0], BENCHMARK_SIZE[1]);
+        let filled = self.fill_buffers(renderer, &camera)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        renderer.select_raster_backends(buffers, &filled.shot(camera, BENCHMARK_SIZE)).map(drop)
+    }
+
+    pub(super) fn buffers(&self) -> Result<&SceneBuffers> {
+        self.buffers.as_ref().ok_or_else(no_buffers)
+    }
+
+    /// Drops the deformer first, because it may have the buffers registered with CUDA.
+    pub(super) fn into_buffers(self) -> Option<SceneBuffers> {
+        drop(self.deformer);
+        self.buffers
+    }
+
+    /// The error that names the domain of the first vertex out of range.
+    fn overflow_error(&mut self, state: &SceneState) -> Result<Error> {
+        let scene = Arc::clone(&self.scene);
+        let surface = self.deformer.read(VertexAttributes {
+            positions: true,
+            displacements: true,
+            ..VertexAttributes::default()
+        })?;
+        let is_far = |number: &f32| number.is_nan() || f64::from(*number).abs() > MAX_COORDINATE;
+        let far = surface.positions.iter().position(is_far);
+        // A displacement may be out of range although its position is not.
+        let at = far.or_else(|| surface.displacements.iter().position(|number| !number.is_finite())).unwrap_or(0);
+        let domain = scene.layout.slots.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
+        let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));
+        let given = format!("vertex {} out of range, largest |q| {largest:e}", at / 3);
+        let field = format!("step.q of domain '{}'", scene.domains[domain].name);
+        Ok(invalid(field, format!("q and transform that keep every vertex within {MAX_COORDINATE:e}"), given))
+    }
+}
+
+fn no_buffers() -> Error {
+    fault_in("draw")("the scene has no buffers")
+}
+
+fn is_in_range(bounds: &Bounds) -> bool {
+    bounds.min.iter().chain(&bounds.max).all(|number| number.abs() <= MAX_COORDINATE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing;
+    use super::*;
+    use modalcast_compute::reference::ReferenceDeformer;
+
+    fn loaded_scene() -> LoadedScene {
+        let scene = testing::two_strips();
+        let deformer = Box::new(ReferenceDeformer::new(&scene));
+        let mut loaded_scene = LoadedScene::new(&scene, deformer, None);
+        loaded_scene.rest().expect("a scene at rest");
+        loaded_scene
+    }
+
+    #[test]
+    fn an_overflowing_step_is_refused_by_name_and_the_previous_vertices_stay() {
+        let mut loaded_scene = loaded_scene();
+        let scene = Arc::clone(loaded_scene.scene());
+        let mut good = SceneState::rest(&scene);
+        good.q[0] = 0.25;
+        loaded_scene.deform(&good).expect("a good step");
+        let before = loaded_scene.surface().expect("vertices").clone();
+        let light = loaded_scene.light;
+        assert!(light.is_some_and(|light| light.is_valid()));
+        let last = scene.layout.slots[1].first_q;
+        for amount in [f32::MAX, 1e30] {
+            let mut bad = good.clone();
+            bad.q[last] = amount;
+            let refusal = loaded_scene.deform(&bad).expect_err("overflows").to_string();
+            assert!(refusal.starts_with("step.q of domain 'right'"), "{refusal}");
+            assert_eq!(loaded_scene.surface().expect("vertices"), &before);
+            assert!(loaded_scene.bounds().is_finite() && loaded_scene.light == light);
+        }
+        assert_ne!(before, DeformedSurface::default());
+    }
+}

@@ -1,0 +1,58 @@
+//! The result of a pick, with the data that a client needs to apply a force at the point: the rows of U and the linear
+//! part A of the transform.
+
+use std::sync::Arc;
+
+use super::blocking::run_blocking;
+use super::subscriber::{OutputBody, StepId, StepOutput};
+use crate::telemetry::StageTimes;
+use modalcast_model::error::{Result, fault_in};
+use modalcast_model::scene::{Scene, SceneState};
+use modalcast_render::PickHit;
+
+/// One hit of a pick.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModalHit {
+    /// Lengths are in scene units.
+    pub hit: PickHit,
+    /// A, the linear part of `world_from_domain` at the step, row-major.
+    pub linear: [f32; 9],
+    /// The 3 x r block of U at the point, row-major. A force f at the point (world axes) acts on the coordinates as
+    /// f_q = U^T A^T f.
+    pub modes: Vec<f32>,
+}
+
+/// All hits of a pick in one step.
+#[derive(Debug, Clone)]
+pub struct PickResult {
+    pub step: StepId,
+    pub stages: StageTimes,
+    pub hits: Vec<ModalHit>,
+}
+
+/// Adds the linear parts of the domains' transforms to hits. [`resolve_picks`] adds the modes outside the scene's task.
+pub(super) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
+    let one = |hit: PickHit| {
+        let rows = state.transform_of(scene, hit.domain).0;
+        let linear = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(|entry: usize| rows[entry]);
+        ModalHit { hit, linear, modes: Vec::new() }
+    };
+    hits.into_iter().map(one).collect()
+}
+
+/// Adds the block of U to every hit if `with_modes` is true.
+///
+/// # Errors
+/// `Fault` when `output` is not a pick.
+pub async fn resolve_picks(output: StepOutput, scene: &Arc<Scene>, with_modes: bool) -> Result<PickResult> {
+    let OutputBody::Pick(mut hits) = output.body else { return Err(fault_in("pick")("a picture is no pick")) };
+    let scene = Arc::clone(scene);
+    let work = move || {
+        for picked in hits.iter_mut().filter(|_| with_modes) {
+            let shape = &scene.shapes[scene.domains[picked.hit.domain].shape];
+            picked.modes = shape.modes.block_at_point(picked.hit.vertices, picked.hit.barycentrics);
+        }
+        Ok(hits)
+    };
+    Ok(PickResult { step: output.step, stages: output.stages, hits: run_blocking("pick", work).await? })
+}

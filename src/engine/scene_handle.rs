@@ -1,0 +1,196 @@
+//! Handle to one open scene: its immutable description and a sender to the bounded mailbox of its task.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use tokio::sync::mpsc::error::TrySendError;
+use tokio::sync::{Notify, mpsc, oneshot, watch};
+
+use super::command::SceneId;
+use super::scene_actor::{ActorParams, Message, SceneActor, SceneServices, StepRequest, StepSelector};
+use super::scene_catalog::SceneProvenance;
+use super::step_queue::{Policy, QueuedStep, StepReport, WriterLease};
+use super::subscriber::{Delivery, OutputSpec, StepId, StepOutput, Subscription};
+use crate::telemetry::ms_since;
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::scene::{RawStepUpdate, Scene, SceneState, StepUpdate};
+
+/// Capacity of a scene's mailbox in messages.
+const MAILBOX_CAPACITY: usize = 128;
+
+/// Handle to an open scene.
+#[derive(Debug)]
+pub struct SceneHandle {
+    pub name: String,
+    pub provenance: SceneProvenance,
+    pub scene: Arc<Scene>,
+    /// The reason why no frame can be drawn; `None` if frames can be drawn.
+    frames_unavailable: Option<Error>,
+    max_window: u32,
+    mailbox: mpsc::Sender<Message>,
+    last_step: watch::Receiver<Option<StepId>>,
+    wake: Arc<Notify>,
+    closing: AtomicBool,
+}
+
+/// Arguments of [`SceneHandle::open`].
+pub(super) struct OpenParams {
+    pub name: String,
+    pub provenance: SceneProvenance,
+    pub scene: Arc<Scene>,
+    pub id: SceneId,
+    /// The state restored from a checkpoint, if there is one.
+    pub state: Option<SceneState>,
+    pub frames_unavailable: Option<Error>,
+}
+
+impl SceneHandle {
+    /// Loads a scene onto the device, restores its state and starts its task. An unusable restored state is logged and
+    /// replaced by the rest state.
+    ///
+    /// # Errors
+    /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
+    pub(super) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
+        let OpenParams { name, provenance, scene, id, state, frames_unavailable } = params;
+        services.device_handle.load_scene(id, &scene).await?;
+        let state = match state.map(Arc::new) {
+            Some(state) => match services.device_handle.deform(id, &state).wait().await {
+                Ok(_) => state,
+                Err(error) => {
+                    tracing::warn!(scene = name, %error, "the kept step is not usable; the scene begins at rest");
+                    Arc::new(SceneState::rest(&scene))
+                }
+            },
+            None => Arc::new(SceneState::rest(&scene)),
+        };
+        let wake = Arc::new(Notify::new());
+        let max_window = services.config.max_window;
+        let params = ActorParams { name: name.clone(), id, scene: Arc::clone(&scene), state, wake: Arc::clone(&wake) };
+        let (scene_actor, last_step) = SceneActor::new(params, services);
+        let (mailbox, inbox) = mpsc::channel(MAILBOX_CAPACITY);
+        tokio::spawn(scene_actor.run_until_stopped(inbox));
+        let closing = AtomicBool::new(false);
+        Ok(Self { name, provenance, scene, frames_unavailable, max_window, mailbox, last_step, wake, closing })
+    }
+
+    /// The last completed step, if there is one.
+    pub fn last_step(&self) -> Option<StepId> {
+        *self.last_step.borrow()
+    }
+
+    /// Acquires the writer lease. The window is clamped to 1 through the configured limit.
+    ///
+    /// # Errors
+    /// `Taken` naming the current writer and how long it has held the lease; `NotFound` when the scene is closed;
+    /// `Busy` when the mailbox is full.
+    pub async fn drive(&self, peer: String, policy: Policy, window: u32) -> Result<WriterSession> {
+        let window = window.clamp(1, self.max_window);
+        let (lease, run) = self.call(|reply| Message::AcquireWriter { peer, policy, window, reply }).await?;
+        tracing::info!(scene = self.name, run, ?policy, "driven by a new writer");
+        Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, policy, last: None })
+    }
+
+    /// Subscribes to the scene's steps. The subscription is active when this returns.
+    ///
+    /// # Errors
+    /// `Unavailable` when frames are requested and there is no renderer; `Busy` when there are too many subscribers or
+    /// the mailbox is full; `NotFound` when the scene is closed.
+    pub async fn subscribe(&self, spec: OutputSpec, delivery: Delivery) -> Result<Subscription> {
+        self.check_spec(&spec)?;
+        let (subscriber, subscription) = Subscription::new(spec, delivery, Arc::clone(&self.wake));
+        self.call(|reply| Message::Subscribe { subscriber, reply }).await?;
+        Ok(subscription)
+    }
+
+    /// Waits for a step and returns a result of it. Dropping the future cancels the request before it is drawn.
+    ///
+    /// # Errors
+    /// `Gone` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when too many requests
+    /// wait; `NotFound` when the scene is closed.
+    pub async fn request_output(&self, selector: StepSelector, spec: OutputSpec) -> Result<StepOutput> {
+        self.check_spec(&spec)?;
+        self.call(|reply| Message::Request(StepRequest { selector, spec, reply })).await
+    }
+
+    /// Ends every stream of the scene with `error` and frees the scene. Returns after the scene is freed.
+    pub(super) async fn stop(&self, error: Error) {
+        self.closing.store(true, Ordering::Release);
+        let (done, stopped) = oneshot::channel();
+        // A closed mailbox means that the scene's task has already ended.
+        if self.mailbox.send(Message::Stop { error, done }).await.is_ok() {
+            stopped.await.ok();
+        }
+    }
+
+    /// Whether [`Self::stop`] was called.
+    pub(super) fn is_closing(&self) -> bool {
+        self.closing.load(Ordering::Acquire)
+    }
+
+    fn check_spec(&self, spec: &OutputSpec) -> Result<()> {
+        match (spec, &self.frames_unavailable) {
+            (OutputSpec::Frame { .. } | OutputSpec::Pick { .. }, Some(error)) => Err(error.clone()),
+            _ => Ok(()),
+        }
+    }
+
+    async fn call<T>(&self, make: impl FnOnce(oneshot::Sender<Result<T>>) -> Message) -> Result<T> {
+        let gone = || Error::NotFound { what: "scene", given: format!("'{}', which was closed", self.name) };
+        let (reply, answer) = oneshot::channel();
+        match self.mailbox.try_send(make(reply)) {
+            Ok(()) => answer.await.map_err(|_| gone())?,
+            Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "requests to the scene", limit: MAILBOX_CAPACITY }),
+            Err(TrySendError::Closed(_)) => Err(gone()),
+        }
+    }
+}
+
+/// The writer's handle to a scene. Dropping it releases the writer lease.
+#[derive(Debug)]
+pub struct WriterSession {
+    lease: WriterLease,
+    scene: Arc<Scene>,
+    /// Number of this writer among the scene's writers, from 1.
+    pub run: u64,
+    /// Steps that may be unacknowledged at a time.
+    pub window: u32,
+    pub policy: Policy,
+    last: Option<u64>,
+}
+
+impl WriterSession {
+    /// Checks and queues a step. A rejected step has no effect.
+    ///
+    /// # Errors
+    /// `Invalid` with field, expected and given for a malformed step or one beyond the window; or the error with which
+    /// the server ended the stream.
+    pub fn step(&mut self, raw: &RawStepUpdate) -> Result<()> {
+        let begin = Instant::now();
+        if let Some(last) = self.last.filter(|last| raw.number <= *last) {
+            return Err(invalid("step.number", format!("a number above {last}"), raw.number));
+        }
+        let update = StepUpdate::parse(&self.scene, raw)?;
+        self.lease.0.push(QueuedStep::new(update, ms_since(begin)))?;
+        self.last = Some(raw.number);
+        Ok(())
+    }
+
+    /// Waits for the next report. Cancel-safe.
+    ///
+    /// # Errors
+    /// The error with which the server ended the stream, after all reports.
+    pub async fn next_report(&self) -> Result<StepReport> {
+        self.lease.0.next_report().await
+    }
+
+    /// Whether every accepted step is reported and every report is taken.
+    pub fn is_drained(&self) -> bool {
+        self.lease.0.is_drained()
+    }
+
+    /// Whether the server has ended the stream.
+    pub fn is_ended(&self) -> bool {
+        self.lease.0.is_closed()
+    }
+}

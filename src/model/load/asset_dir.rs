@@ -1,0 +1,217 @@
+//! File access of the loaders: which paths they may read, and how many bytes.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Component, Path, PathBuf};
+
+use crate::error::{Result, invalid};
+
+/// The largest mesh or matrix file in bytes.
+pub(super) const MAX_MODEL_BYTES: u64 = 2 << 30;
+/// The largest image file in bytes.
+pub(super) const MAX_IMAGE_BYTES: u64 = 256 << 20;
+/// The largest text description in bytes.
+pub(super) const MAX_TEXT_BYTES: u64 = 64 << 20;
+
+/// The largest number of directory entries that are read.
+const MAX_ENTRIES: usize = 10_000;
+
+/// A folder whose files a loader may read. With `root`, every path must stay inside that root after symbolic links
+/// are resolved. Without, any path is allowed.
+#[derive(Debug, Clone)]
+pub(super) struct AssetDir {
+    base: PathBuf,
+    root: Option<PathBuf>,
+}
+
+/// The kind of an existing path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum EntryKind {
+    File,
+    Directory,
+}
+
+impl AssetDir {
+    /// Allows paths relative to `base` and absolute ones, without confinement.
+    pub(super) fn unrestricted(base: &Path) -> Self {
+        Self { base: base.to_path_buf(), root: None }
+    }
+
+    /// Allows only paths relative to `root` that stay inside it. `root` must be canonical.
+    pub(super) fn confined_to(root: &Path) -> Self {
+        Self { base: root.to_path_buf(), root: Some(root.to_path_buf()) }
+    }
+
+    /// The folder `relative`, with the same confinement.
+    ///
+    /// # Errors
+    /// As for [`Self::resolve`].
+    pub(super) fn within(&self, relative: &str) -> Result<Self> {
+        Ok(Self { base: self.resolve(relative)?, root: self.root.clone() })
+    }
+
+    /// The last component of the resolved path, or `scene` if there is none.
+    pub(super) fn resolved_name(&self, relative: &str) -> String {
+        let path = self.resolve(relative).ok();
+        let name = path.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
+        name.unwrap_or("scene").to_owned()
+    }
+
+    /// Reads a regular file of at most `limit` bytes.
+    ///
+    /// # Errors
+    /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable.
+    /// The error names the path as it was given, never the resolved path.
+    pub(super) fn read(&self, relative: &str, limit: u64) -> Result<Vec<u8>> {
+        let path = self.resolve(relative)?;
+        let refuse = |given: &dyn std::fmt::Display| invalid(field(relative), "a readable file", given);
+        // Check the type before opening, because opening a pipe or a device may block, and reading it may never end.
+        let about = path.metadata().map_err(|error| refuse(&error.kind()))?;
+        if !about.is_file() {
+            return Err(refuse(&"something that is no regular file"));
+        }
+        let too_large = |size: u64| invalid(field(relative), format!("at most {limit} bytes"), size);
+        if about.len() > limit {
+            return Err(too_large(about.len()));
+        }
+        let mut bytes = Vec::new();
+        let file = File::open(&path).map_err(|error| refuse(&error.kind()))?;
+        file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| refuse(&error.kind()))?;
+        // The file may have grown after its size was read.
+        if bytes.len() as u64 > limit {
+            return Err(too_large(bytes.len() as u64));
+        }
+        Ok(bytes)
+    }
+
+    /// The kind of the path, or `None` if it does not exist.
+    ///
+    /// # Errors
+    /// `Invalid` for a path that leaves the root.
+    pub(super) fn kind(&self, relative: &str) -> Result<Option<EntryKind>> {
+        let path = self.join(relative)?;
+        if !path.exists() {
+            return Ok(None);
+        }
+        let path = self.resolve(relative)?;
+        Ok(match () {
+            () if path.is_dir() => Some(EntryKind::Directory),
+            () if path.is_file() => Some(EntryKind::File),
+            () => None,
+        })
+    }
+
+    /// Names and kinds of the folder's direct entries, sorted. Reads at most [`MAX_ENTRIES`] entries.
+    pub(super) fn entries(&self) -> Vec<(String, EntryKind)> {
+        let Ok(listing) = std::fs::read_dir(&self.base) else { return Vec::new() };
+        let names = listing.take(MAX_ENTRIES).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        let mut entries: Vec<_> =
+            names.filter_map(|name| self.kind(&name).ok().flatten().map(|kind| (name, kind))).collect();
+        entries.sort_by(|a, b| a.0.cmp(&b.0));
+        entries
+    }
+
+    /// The canonical path of `relative`.
+    ///
+    /// # Errors
+    /// `Invalid` if the path leaves the root or does not exist.
+    pub(super) fn resolve(&self, relative: &str) -> Result<PathBuf> {
+        let path = self.join(relative)?;
+        let missing = |error: std::io::Error| invalid(field(relative), "a file that is there", error.kind());
+        let canonical = path.canonicalize().map_err(missing)?;
+        match &self.root {
+            Some(root) if !canonical.starts_with(root) => Err(outside(relative)),
+            _ => Ok(canonical),
+        }
+    }
+
+    /// Joins the path lexically, so that an error reveals nothing about files outside the root.
+    fn join(&self, relative: &str) -> Result<PathBuf> {
+        if relative.is_empty() || relative.contains('\0') {
+            return Err(invalid(field(relative), "a path", format!("{relative:?}")));
+        }
+        let Some(root) = &self.root else { return Ok(self.base.join(relative)) };
+        let mut path = self.base.clone();
+        for component in Path::new(relative).components() {
+            match component {
+                Component::Normal(name) => path.push(name),
+                Component::CurDir => {}
+                Component::ParentDir => {
+                    path.pop();
+                    if !path.starts_with(root) {
+                        return Err(outside(relative));
+                    }
+                }
+                Component::RootDir | Component::Prefix(_) => return Err(outside(relative)),
+            }
+        }
+        Ok(path)
+    }
+}
+
+/// The folder of a relative path; `.` if it has none.
+pub(super) fn parent_of(path: &str) -> &str {
+    match path.rsplit_once('/') {
+        Some(("", _)) => "/",
+        Some((folder, _)) => folder,
+        None => ".",
+    }
+}
+
+/// The last component of a relative path.
+pub(super) fn file_name_of(path: &str) -> &str {
+    path.rsplit_once('/').map_or(path, |(_, name)| name)
+}
+
+fn field(relative: &str) -> String {
+    format!("file '{relative}'")
+}
+
+fn outside(relative: &str) -> crate::error::Error {
+    invalid(field(relative), "a path inside the repository", "one that leaves it")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_confined_reader_refuses_each_way_out_and_tells_nothing_of_what_is_there() {
+        let outer = tempfile::tempdir().expect("a folder");
+        let root = outer.path().join("root");
+        std::fs::create_dir_all(root.join("sub")).expect("made");
+        std::fs::write(outer.path().join("secret.txt"), "secret").expect("written");
+        std::fs::write(root.join("inside.txt"), "inside").expect("written");
+        std::os::unix::fs::symlink(outer.path().join("secret.txt"), root.join("link.txt")).expect("linked");
+        std::os::unix::fs::symlink(outer.path(), root.join("folder")).expect("linked");
+        let files = AssetDir::confined_to(&root.canonicalize().expect("there")).within("sub").expect("there");
+        assert_eq!(files.read("../inside.txt", 6).expect("inside"), b"inside");
+        let secret = outer.path().join("secret.txt");
+        for path in ["../../secret.txt", "../link.txt", "../folder/secret.txt", secret.to_str().expect("utf-8")] {
+            let refusal = files.read(path, 100).expect_err(path).to_string();
+            let expected = format!("file '{path}': expected a path inside the repository, given one that leaves it");
+            assert_eq!(refusal, expected);
+        }
+        let absent = files.read("../../absent.txt", 100).expect_err("absent").to_string();
+        assert!(absent.ends_with("expected a path inside the repository, given one that leaves it"), "{absent}");
+        assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("unconfined"), b"secret");
+    }
+
+    #[test]
+    fn files_over_the_limit_missing_files_and_folders_are_refused_by_the_path_as_given() {
+        let root = tempfile::tempdir().expect("a folder");
+        std::fs::write(root.path().join("a.bin"), [0; 5]).expect("written");
+        std::fs::create_dir(root.path().join("d")).expect("made");
+        let files = AssetDir::unrestricted(root.path());
+        for (path, refusal) in [
+            ("a.bin", "file 'a.bin': expected at most 4 bytes, given 5"),
+            ("b.bin", "file 'b.bin': expected a file that is there, given entity not found"),
+            ("d", "file 'd': expected a readable file, given something that is no regular file"),
+            ("", "file '': expected a path, given \"\""),
+            ("a\0b", "file 'a\0b': expected a path, given \"a\\0b\""),
+        ] {
+            assert_eq!(files.read(path, 4).expect_err(path).to_string(), refusal);
+        }
+        assert_eq!(files.read("a.bin", 5).expect("fits").len(), 5);
+    }
+}

@@ -1,0 +1,51 @@
+//! Messages about features of a model that the loader does not support, without duplicates.
+
+/// The largest number of stored remarks, so that a hostile file cannot flood the log.
+const MAX_WARNINGS: usize = 64;
+
+/// Remarks in order of occurrence.
+#[derive(Debug, Default)]
+pub(super) struct ImportWarnings {
+    messages: Vec<String>,
+    suppressed: usize,
+}
+
+impl ImportWarnings {
+    /// Adds a remark unless it already exists.
+    pub(super) fn add(&mut self, remark: String) {
+        let remark = sanitize(&remark, 240);
+        match self.messages.contains(&remark) {
+            true => {}
+            false if self.messages.len() < MAX_WARNINGS => self.messages.push(remark),
+            false => self.suppressed += 1,
+        }
+    }
+
+    /// All remarks, and the number of remarks that exceeded the limit.
+    pub(super) fn into_list(mut self) -> Vec<String> {
+        if self.suppressed > 0 {
+            self.messages.push(format!("and {} more remarks", self.suppressed));
+        }
+        self.messages
+    }
+}
+
+/// Sanitizes text from a file for display: no control characters, at most `most` characters.
+pub(super) fn sanitize(text: &str, most: usize) -> String {
+    text.chars().filter(|letter| !letter.is_control()).take(most).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_remark_is_made_once_and_a_flood_is_cut_and_counted() {
+        let mut remarks = ImportWarnings::default();
+        (0..3).for_each(|_| remarks.add("same\u{1b}[31m".into()));
+        (0..100).for_each(|index| remarks.add(format!("other {index}")));
+        let list = remarks.into_list();
+        assert_eq!((list.len(), list[0].as_str()), (MAX_WARNINGS + 1, "same[31m"));
+        assert_eq!(list[MAX_WARNINGS], "and 37 more remarks");
+    }
+}

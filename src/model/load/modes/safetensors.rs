@@ -1,0 +1,114 @@
+//! Parser of safetensors files: the tensor `U`, or the only one, as row-major f64, f32, f16 or bf16.
+
+use safetensors::{Dtype, SafeTensors};
+
+use crate::domain::Modes;
+use crate::error::{Result, invalid};
+
+/// Parses U.
+///
+/// # Errors
+/// `Invalid` if the bytes are not such a file, contain no such tensor, or it has an unsupported type or shape.
+pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
+    let safetensors =
+        SafeTensors::deserialize(bytes).map_err(|error| invalid("header", "a safetensors file", error))?;
+    let names = safetensors.names();
+    let name = match names[..] {
+        [only] => only,
+        _ => "U",
+    };
+    let missing = |_| {
+        let given = names.iter().take(16).copied().collect::<Vec<_>>().join(", ");
+        invalid("tensor", "one tensor, or one named U", format!("{} ({given})", names.len()))
+    };
+    let tensor = safetensors.tensor(name).map_err(missing)?;
+    let [rows, rank] = *tensor.shape() else {
+        return Err(invalid(format!("tensor '{name}': shape"), "3n x r", format!("{:?}", tensor.shape())));
+    };
+    let body = tensor.data();
+    let entries = match tensor.dtype() {
+        Dtype::F64 => super::vega::read_f64_le_as_f32(body),
+        Dtype::F32 => super::vega::read_f32_le(body),
+        Dtype::F16 => body.as_chunks().0.iter().map(|half| f16_to_f32(u16::from_le_bytes(*half))).collect(),
+        // bf16 is the upper half of an f32.
+        Dtype::BF16 => {
+            let wide = |half: &[u8; 2]| f32::from_bits(u32::from(u16::from_le_bytes(*half)) << 16);
+            body.as_chunks().0.iter().map(wide).collect()
+        }
+        other => return Err(invalid(format!("tensor '{name}': type"), "F64, F32, F16 or BF16", format!("{other:?}"))),
+    };
+    Modes::from_rows(rows, rank, &entries)
+}
+
+/// IEEE 754 binary16 to f32, exact.
+fn f16_to_f32(half: u16) -> f32 {
+    let sign = if half & 0x8000 == 0 { 1.0 } else { -1.0 };
+    let (exponent, fraction) = (i32::from(half >> 10 & 0x1f), f32::from(half & 0x3ff));
+    let size = match exponent {
+        0 => fraction * 2f32.powi(-24),
+        31 if fraction == 0.0 => f32::INFINITY,
+        31 => f32::NAN,
+        _ => (1024.0 + fraction) * 2f32.powi(exponent - 25),
+    };
+    sign * size
+}
+
+#[cfg(test)]
+mod tests {
+    use safetensors::tensor::TensorView;
+
+    use super::*;
+
+    fn file(safetensors: &[(&str, Dtype, Vec<usize>, &[u8])]) -> Vec<u8> {
+        let view = |(name, dtype, shape, data): &(&str, Dtype, Vec<usize>, &'static [u8])| {
+            (name.to_string(), TensorView::new(*dtype, shape.clone(), data).expect("a view"))
+        };
+        let safetensors: Vec<(&str, Dtype, Vec<usize>, &'static [u8])> = safetensors
+            .iter()
+            .map(|(name, dtype, shape, data)| (*name, *dtype, shape.clone(), &*data.to_vec().leak()))
+            .collect();
+        safetensors::serialize(safetensors.iter().map(view), None).expect("serialised")
+    }
+
+    #[test]
+    fn all_four_types_give_the_same_column() {
+        let f64s: Vec<u8> = [1.0f64, -0.5, 2.0].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        let f32s: Vec<u8> = [1.0f32, -0.5, 2.0].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        let halves: Vec<u8> = [0x3c00u16, 0xb800, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        let brains: Vec<u8> = [0x3f80u16, 0xbf00, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        for (dtype, body) in [(Dtype::F64, f64s), (Dtype::F32, f32s), (Dtype::F16, halves), (Dtype::BF16, brains)] {
+            let modes = parse(&file(&[("anything", dtype, vec![3, 1], &body)])).expect("good");
+            assert_eq!(modes.column(0), [1.0, -0.5, 2.0], "{dtype:?}");
+        }
+    }
+
+    #[test]
+    fn halves_are_exact_at_the_ends_of_their_range() {
+        assert_eq!(f16_to_f32(1), 2f32.powi(-24));
+        assert_eq!(f16_to_f32(0x0400), 2f32.powi(-14));
+        assert_eq!(f16_to_f32(0x7bff), 65504.0);
+        assert!(f16_to_f32(0xfc00) == f32::NEG_INFINITY && f16_to_f32(0x7e00).is_nan());
+    }
+
+    #[test]
+    fn other_types_shapes_names_and_broken_headers_are_refused() {
+        let zeros = [0; 12];
+        let two = [("U", Dtype::F32, vec![3, 1], &zeros[..]), ("V", Dtype::F32, vec![3, 1], &zeros[..])];
+        assert!(parse(&file(&two)).is_ok(), "U is chosen by name");
+        for (bytes, start) in [
+            (
+                file(&[("a", Dtype::F32, vec![3, 1], &zeros[..]), two[1].clone()]),
+                "tensor: expected one tensor, or one named U",
+            ),
+            (file(&[("U", Dtype::I32, vec![3, 1], &zeros[..])]), "tensor 'U': type"),
+            (file(&[("U", Dtype::F32, vec![3], &zeros[..])]), "tensor 'U': shape"),
+            (file(&[("U", Dtype::F32, vec![1, 3], &zeros[..])]), "modes.rows"),
+            (vec![255; 64], "header: expected a safetensors file"),
+            (b"\x02\0\0\0\0\0\0\0{}".to_vec(), "tensor: expected one tensor"),
+            (vec![], "header: expected a safetensors file"),
+        ] {
+            let refusal = parse(&bytes).expect_err(start).to_string();
+            assert!(refusal.starts_with(start), "{refusal}");
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! Inputs of a rasterizer besides the mesh: the window and groups of triangles.
+
+use nalgebra::Matrix4;
+
+use crate::error::{Result, invalid};
+
+/// The largest width and height of a window in pixels.
+pub const MAX_VIEWPORT_SIDE: u32 = 16384;
+
+/// An image size and the projection of positions into it. Rows are counted from the top.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Viewport {
+    clip: [f32; 16],
+    width: u32,
+    height: u32,
+}
+
+impl Viewport {
+    /// A window of `width` x `height` pixels. `clip_from_positions` maps positions to OpenGL's clip space and is
+    /// rounded to f32. A triangle with a vertex that is not finite in clip space is dropped.
+    ///
+    /// # Errors
+    /// `Invalid` if a side is not 1 to [`MAX_VIEWPORT_SIDE`] pixels.
+    pub fn new(clip_from_positions: &Matrix4<f64>, width: u32, height: u32) -> Result<Self> {
+        for (name, side) in [("width", width), ("height", height)] {
+            if !(1..=MAX_VIEWPORT_SIDE).contains(&side) {
+                return Err(invalid(name, format!("1 to {MAX_VIEWPORT_SIDE} pixels"), side));
+            }
+        }
+        let clip = std::array::from_fn(|at| clip_from_positions[(at / 4, at % 4)] as f32);
+        Ok(Self { clip, width, height })
+    }
+
+    /// `clip_from_positions`, row-major.
+    pub const fn clip(&self) -> &[f32; 16] {
+        &self.clip
+    }
+
+    /// Width and height in pixels.
+    pub const fn size(&self) -> [u32; 2] {
+        [self.width, self.height]
+    }
+
+    /// Number of pixels.
+    pub const fn pixel_count(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Half the width and height in pixels.
+    pub fn half(&self) -> [f32; 2] {
+        self.size().map(|side| 0.5 * side as f32)
+    }
+
+    /// The guard band: |x| and |y| in normalized device coordinates beyond which triangles are clipped. It ends 16384
+    /// pixels from the center, where f32 still resolves more than 1/256 pixel.
+    pub fn guard(&self) -> [f32; 2] {
+        self.half().map(|half| MAX_VIEWPORT_SIDE as f32 / half)
+    }
+}
+
+/// Which faces of triangles are drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum CullMode {
+    #[default]
+    None,
+    /// Front faces: triangles whose corners appear counterclockwise.
+    Back,
+}
+
+/// A contiguous range of triangles that are drawn alike.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DrawRange {
+    pub first: u32,
+    pub triangles: u32,
+    pub faces: CullMode,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn windows_have_pixels_and_not_too_many() {
+        let of = |width, height| Viewport::new(&Matrix4::identity(), width, height);
+        assert!(of(0, 1).is_err() && of(1, 0).is_err() && of(MAX_VIEWPORT_SIDE + 1, 1).is_err());
+        let largest = of(MAX_VIEWPORT_SIDE, 1).expect("a window");
+        assert_eq!((largest.guard()[0], largest.half()), (2.0, [8192.0, 0.5]));
+    }
+}

@@ -1,0 +1,230 @@
+//! The look of a scene: one directional light (the sun) and its shadow, ground, sky, and how triangles are rasterized
+//! and blended.
+
+use nalgebra::Vector3;
+
+use super::shadow::ShadowSettings;
+use super::{Antialiasing, Bloom, ToneMapping};
+use crate::error::{Result, invalid};
+
+/// The axis that points up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UpAxis {
+    X,
+    #[default]
+    Y,
+    Z,
+}
+
+impl UpAxis {
+    /// Index of the axis: 0 to 2.
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// The up direction as a unit vector.
+    pub fn vector(self) -> Vector3<f64> {
+        Vector3::ith(self.index(), 1.0)
+    }
+
+    /// The rotation from Y-up coordinates to this up axis.
+    pub fn rotation_from_y_up(self) -> nalgebra::Rotation3<f64> {
+        let identity = nalgebra::Rotation3::identity();
+        nalgebra::Rotation3::rotation_between(&Vector3::y(), &self.vector()).unwrap_or(identity)
+    }
+}
+
+/// A plane at the lowest rest position along the up axis. It receives shadows and casts none.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Ground {
+    #[serde(rename = "colour")]
+    pub color: [f32; 3],
+}
+
+impl Default for Ground {
+    fn default() -> Self {
+        Self { color: [0.40, 0.41, 0.36] }
+    }
+}
+
+/// The largest number of blended fragments per frame. They share one buffer, 8 bytes per fragment, and a buffer must
+/// stay below 2 GiB.
+pub const MAX_FRAGMENTS: u32 = (1 << 28) - 1;
+
+/// How blended triangles are composited over opaque ones and over each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Transparency {
+    /// The two-pass method of the thesis (chapter 3.3). The first pass draws fragments whose alpha reaches
+    /// [`RenderSettings::opaque_alpha`], with depth writes; the second blends the others over them without depth writes. Blended
+    /// triangles are drawn in index-buffer order: one-sided before two-sided, then by domain, then by triangle.
+    TwoPass,
+    /// Order-independent transparency: per pixel, a list of all blended fragments, sorted by depth. Depths are compared
+    /// at the pixel center; of equal depths, the later triangle in the index buffer is in front.
+    #[default]
+    #[serde(rename = "exact")]
+    OrderIndependent,
+}
+
+/// Which triangles are culled before rasterization. The image is bit-identical in all modes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Culling {
+    /// Selected by the number of triangles and by the device.
+    #[default]
+    #[serde(rename = "fitting")]
+    Auto,
+    /// No culling: no culling pass is compiled, allocated or run.
+    None,
+    /// Triangles outside the view, back faces of one-sided materials, and triangles that cover no sample. Applies to
+    /// shadow maps too.
+    Triangles,
+    /// As `Triangles`, plus triangles that are occluded by the triangles visible in the last frame. On software OpenGL
+    /// implementations, hidden triangles are kept if cut-outs have textures and the frame is multisampled, because
+    /// there their absence would change where textures are sampled.
+    #[serde(rename = "depth")]
+    Occlusion,
+}
+
+/// Which rasterizer draws the shadow map's depth pass and the camera's pass.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RasterPolicy {
+    /// OpenGL's rasterizer, the reference.
+    #[default]
+    OpenGl,
+    /// The compute rasterizer in CUDA, where it is supported: on a CUDA device that also draws, for variance shadow
+    /// maps without splits, and for frames with one sample per pixel and no blended triangles. OpenGL draws everything
+    /// else, and each frame reports which rasterizer drew it. The visible triangle of a sample may differ only where
+    /// depths tie, within 1/256 pixel of an edge, and at the border of textured cut-outs.
+    Cuda,
+    /// For each pass the faster of both, measured when the scene is loaded.
+    Fastest,
+}
+
+/// Light, shadow, ground, sky and rasterization settings. Colors are linear.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RenderSettings {
+    /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
+    pub sun: [f32; 3],
+    /// Color times intensity of the sun.
+    pub sunlight: [f32; 3],
+    /// Color times intensity of the ambient light.
+    pub skylight: [f32; 3],
+    /// Sky colors at the zenith and at the horizon.
+    pub zenith: [f32; 3],
+    pub horizon: [f32; 3],
+    pub shadow: Option<ShadowSettings>,
+    pub ground: Option<Ground>,
+    /// Samples per pixel for multisampling, 1 or 4.
+    pub samples: u32,
+    /// The antialiasing method: multisampling with `samples`, or a method with one sample per pixel.
+    pub antialias: Antialiasing,
+    pub bloom: Option<Bloom>,
+    pub tone: ToneMapping,
+    /// Multiplier of all light before bloom and tone mapping, above 0.
+    pub exposure: f32,
+    /// Whether 8-bit output is dithered with a fixed pattern of 8 x 8 pixels against banding in slow gradients. A pixel
+    /// changes by at most one level, and a value exactly on a level does not change.
+    pub dither: bool,
+    /// How blended triangles are composited.
+    pub transparency: Transparency,
+    /// [`Transparency::TwoPass`] only: the alpha from which a blended fragment counts as opaque, above 0. Above 1, none
+    /// does.
+    pub opaque_alpha: f32,
+    /// [`Transparency::OrderIndependent`] only: capacity of the fragment buffer, 1 to 2^28 - 1. By default eight fragments per
+    /// pixel and at least 2^20, limited by the largest buffer of the device. If a frame has more fragments, every pixel
+    /// keeps the same number of nearest ones, the largest that fits.
+    pub fragments: Option<u32>,
+    /// Which triangles are culled.
+    pub culling: Culling,
+    /// Which rasterizer draws.
+    pub raster: RasterPolicy,
+}
+
+impl Default for RenderSettings {
+    fn default() -> Self {
+        Self {
+            sun: [0.45, 0.80, 0.55],
+            // Ambient and sun together stay about at 1, so that white surfaces keep some shape.
+            sunlight: [0.82, 0.77, 0.69],
+            skylight: [0.25, 0.28, 0.33],
+            zenith: [0.16, 0.36, 0.72],
+            horizon: [0.72, 0.82, 0.90],
+            shadow: Some(ShadowSettings::default()),
+            ground: Some(Ground::default()),
+            samples: 4,
+            antialias: Antialiasing::Msaa,
+            bloom: None,
+            tone: ToneMapping::None,
+            exposure: 1.0,
+            dither: false,
+            transparency: Transparency::default(),
+            opaque_alpha: 0.95,
+            fragments: None,
+            culling: Culling::default(),
+            raster: RasterPolicy::default(),
+        }
+    }
+}
+
+impl RenderSettings {
+    /// Unit vector from the scene towards the sun (v_l of the thesis).
+    pub fn to_sun(&self, up: UpAxis) -> Vector3<f64> {
+        let sun = Vector3::from(self.sun).cast::<f64>();
+        up.rotation_from_y_up() * sun.try_normalize(1e-12).unwrap_or_else(Vector3::y)
+    }
+
+    pub(super) fn check(&self) -> Result<()> {
+        let colors = [self.sun, self.sunlight, self.skylight, self.zenith, self.horizon];
+        if !colors.as_flattened().iter().all(|number| number.is_finite()) {
+            return Err(invalid("look", "finite numbers", format!("{self:?}")));
+        }
+        if ![1, 4].contains(&self.samples) {
+            return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
+        }
+        if !(self.opaque_alpha > 0.0 && self.opaque_alpha.is_finite()) {
+            return Err(invalid("look.opaque_alpha", "a number above 0", self.opaque_alpha));
+        }
+        if self.fragments.is_some_and(|fragments| !(1..=MAX_FRAGMENTS).contains(&fragments)) {
+            return Err(invalid("look.fragments", format!("1 to {MAX_FRAGMENTS}"), format!("{:?}", self.fragments)));
+        }
+        self.check_post()?;
+        self.shadow.map_or(Ok(()), |shadow| shadow.check())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_that_are_neither_one_nor_four_are_refused() {
+        for samples in [1, 4] {
+            RenderSettings { samples, ..RenderSettings::default() }.check().expect("good");
+        }
+        for samples in [0, 2, 8, u32::MAX] {
+            let refusal =
+                RenderSettings { samples, ..RenderSettings::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
+        }
+    }
+
+    #[test]
+    fn a_threshold_of_nothing_and_a_budget_of_nothing_or_beyond_a_buffer_are_refused() {
+        for opaque_alpha in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            let refusal =
+                RenderSettings { opaque_alpha, ..RenderSettings::default() }.check().expect_err("refused").to_string();
+            assert_eq!(refusal, format!("look.opaque_alpha: expected a number above 0, given {opaque_alpha}"));
+        }
+        for fragments in [0, MAX_FRAGMENTS + 1, u32::MAX] {
+            RenderSettings { fragments: Some(fragments), ..RenderSettings::default() }.check().expect_err("refused");
+        }
+        for fragments in [None, Some(1), Some(MAX_FRAGMENTS)] {
+            RenderSettings { fragments, opaque_alpha: 2.0, ..RenderSettings::default() }.check().expect("good");
+        }
+    }
+}

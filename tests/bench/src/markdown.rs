@@ -1,0 +1,107 @@
+//! Formats a report as Markdown tables (`report.md`).
+
+use super::table::DeformRow;
+use super::thesis_comparison::{dash, line, rule};
+use super::{DeformReport, WorkloadSummary};
+use crate::kernels::Overlap;
+
+/// The whole page.
+pub(super) fn markdown(report: &DeformReport) -> String {
+    let mut text = format!("# Error against run time\n\n{}\n", report.made.line());
+    let commit = report.made.commit.as_deref().unwrap_or("unknown");
+    text.push_str(&format!("\nCommit {commit}; {} random states per load.\n", report.seeds));
+    for remark in &report.remarks {
+        text.push_str(&format!("\n{remark}\n"));
+    }
+    if !report.missing.is_empty() {
+        text.push_str(&format!("\nNot measured yet: {}.\n", report.missing.join(", ")));
+    }
+    let verdict = match report.failed.is_empty() {
+        true => "\nEvery variant stays within its a-priori bound.\n".to_owned(),
+        false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
+    };
+    text.push_str(&verdict);
+    for load in &report.loads {
+        text.push_str(&section(load, report.rows.iter().filter(|row| row.load == load.name)));
+    }
+    text.push('\n');
+    text.push_str(&report.thesis.markdown());
+    text
+}
+
+const HEAD: [&str; 13] = [
+    "variant",
+    "cache",
+    "median us",
+    "quartiles us",
+    "bytes",
+    "GB/s",
+    "of copy",
+    "of read",
+    "largest error m",
+    "of diagonal",
+    "px",
+    "of bound",
+    "passed",
+];
+
+fn section<'a>(load: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
+    let WorkloadSummary {
+        name, vertices, corners, triangles, domains, coordinates, condition, steps, recorded, ..
+    } = load;
+    let trajectory = if *recorded { "recorded" } else { "made-up" };
+    let mut text = format!(
+        "\n## {name}\n\n{vertices} vertices, {corners} corners, {triangles} triangles, {domains} domains, \
+         {coordinates} coordinates; {steps} {trajectory} steps; sum \\|U q\\| / \\|u\\|: median {:.3e}, largest {:.3e}.\n",
+        condition.median, condition.largest
+    );
+    if !load.remarks.is_empty() {
+        text.push_str(&format!("\n- {}\n", load.remarks.join("\n- ")));
+    }
+    text.push('\n');
+    text.push_str(&line(HEAD.map(String::from)));
+    text.push_str(&rule(HEAD.len()));
+    rows.for_each(|row| text.push_str(&line(cells(row))));
+    if let Some(overlap) = &load.overlap {
+        text.push_str(&overlapped(overlap));
+    }
+    text
+}
+
+/// The paragraph on the cost of reading every step back, serial and overlapped.
+fn overlapped(overlap: &Overlap) -> String {
+    let Overlap { write_one_core_us: one, write_us: all, cores, graph_us, copy_out_us, step_us, .. } = overlap;
+    let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
+    format!(
+        "\nThe host reads every step, microseconds a step: {serial_us:.1} one after the other, {fetched_us:.1} with the \
+         way out beside the next step, {overlapped_us:.1} with two steps under way, {gain:.2} times as fast; \
+         {ideal_us:.1} would be the longest part alone. Parts: writing {all:.1} on {cores} cores ({one:.1} on one), copy \
+         in and kernels {graph_us:.1}, way out {copy_out_us:.1}; a step that nobody reads {step_us:.1}. Steps that \
+         differ in a bit: {differing}.\n"
+    )
+}
+
+fn cells(row: &DeformRow) -> [String; 13] {
+    let number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.3}"));
+    let small = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.2e}"));
+    let errors = row.found.as_ref().map(|found| found.errors);
+    [
+        row.name.clone(),
+        row.cache.name().into(),
+        number(row.timing.map(|timing| timing.median_us)),
+        row.timing.map_or_else(dash, |timing| format!("{:.3} to {:.3}", timing.q1_us, timing.q3_us)),
+        row.bytes.to_string(),
+        number(row.gbs),
+        number(row.of_copy),
+        number(row.of_read),
+        small(errors.map(|errors| errors.meters.largest)),
+        small(errors.map(|errors| errors.of_diagonal.largest)),
+        small(errors.and_then(|errors| Some(errors.pixels?.largest))),
+        number(errors.map(|errors| errors.of_bound)),
+        match (row.passed, row.left_out) {
+            (true, _) => "yes".into(),
+            (false, true) => format!("left out: {}", row.faults.join("; ")),
+            (false, false) => format!("no: {}", row.faults.join("; ")),
+        },
+    ]
+}

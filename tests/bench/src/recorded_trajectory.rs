@@ -1,0 +1,177 @@
+//! Recorded trajectories: modal coordinates over time, and optionally transforms.
+
+use std::path::Path;
+
+use super::motion::ExactState;
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::load::parse_numpy;
+use modalcast_model::scene::Scene;
+
+/// A recorded trajectory of one scene.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordedTrajectory {
+    /// Packed coordinates of each step.
+    q: Vec<Vec<f64>>,
+    /// `world_from_domain` of each mover per step, 12 numbers each. Empty if all domains stay at their placements.
+    transforms: Vec<Vec<f64>>,
+}
+
+impl RecordedTrajectory {
+    /// Reads a `.csv` file with a header and the columns time, q0, q1, ..., or a folder with `q.npy` (steps x
+    /// coordinates) and, if the domains move, `transforms.npy` (steps x movers x 12), as `modalcast-sim` writes it.
+    /// Movers are the domains with a transform of their own.
+    ///
+    /// # Errors
+    /// `NotFound`, or `Invalid` when the numbers do not fit the scene.
+    pub fn read(path: &Path, scene: &Scene) -> Result<Self> {
+        let name = path.display().to_string();
+        let record = match path.is_dir() {
+            true => Self {
+                q: table(&path.join("q.npy"))?,
+                transforms: match path.join("transforms.npy") {
+                    file if file.exists() => table(&file)?,
+                    _ => Vec::new(),
+                },
+            },
+            false => Self { q: columns(path)?, transforms: Vec::new() },
+        };
+        record.validated(scene).map_err(|error| error.prefix_field(&name))
+    }
+
+    /// The recording next to a scene: the only file in its folder that ends in `.q.csv`. `None` when there is no such
+    /// file or several.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn beside(source: &str, scene: &Scene) -> Result<Option<Self>> {
+        let path = Path::new(source);
+        let folder = if path.is_dir() { path } else { path.parent().unwrap_or(path) };
+        let Ok(entries) = std::fs::read_dir(folder) else { return Ok(None) };
+        let is_record = |path: &std::path::PathBuf| path.to_string_lossy().ends_with(".q.csv");
+        let mut found: Vec<_> = entries.flatten().map(|entry| entry.path()).filter(is_record).collect();
+        match (found.pop(), found.is_empty()) {
+            (Some(only), true) if path.exists() => Self::read(&only, scene).map(Some),
+            _ => Ok(None),
+        }
+    }
+
+    fn validated(self, scene: &Scene) -> Result<Self> {
+        let fits = |field: &str, list: &[Vec<f64>], length: usize| match list.iter().position(|row| row.len() != length)
+        {
+            None => Ok(()),
+            Some(at) => Err(invalid(format!("{field}[{at}]"), format!("{length} numbers"), list[at].len())),
+        };
+        if self.q.is_empty() {
+            return Err(invalid("steps", "at least one", 0));
+        }
+        fits("q", &self.q, scene.layout.coordinates)?;
+        fits("transforms", &self.transforms, 12 * scene.movers.count())?;
+        if !self.transforms.is_empty() && self.transforms.len() != self.q.len() {
+            return Err(invalid("transforms", format!("{} steps", self.q.len()), self.transforms.len()));
+        }
+        match self.q.iter().chain(&self.transforms).flatten().find(|number| !number.is_finite()) {
+            Some(number) => Err(invalid("entries", "finite numbers", number)),
+            None => Ok(self),
+        }
+    }
+
+    pub(super) fn steps(&self) -> usize {
+        self.q.len()
+    }
+
+    pub(super) fn step(&self, scene: &Scene, step: usize) -> ExactState {
+        let placement = |domain: u32| scene.domains[domain as usize].placement.0.map(f64::from);
+        let still = || scene.movers.domains().map(placement).collect();
+        let moved = |row: &Vec<f64>| row.as_chunks().0.to_vec();
+        ExactState { q: self.q[step].clone(), transforms: self.transforms.get(step).map_or_else(still, moved) }
+    }
+}
+
+/// The rows of a `.npy` array of at least two dimensions; all but the first dimension are flattened.
+fn table(path: &Path) -> Result<Vec<Vec<f64>>> {
+    let missing =
+        |error: std::io::Error| Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) };
+    let array = parse_numpy(&std::fs::read(path).map_err(missing)?)?;
+    if array.shape.len() < 2 || array.fortran_order {
+        let given = format!("{:?}, fortran {}", array.shape, array.fortran_order);
+        return Err(invalid(path.display().to_string(), "steps x numbers in C order", given));
+    }
+    let width = array.shape[1..].iter().product::<usize>().max(1);
+    let row = |row: &[f32]| row.iter().map(|number| f64::from(*number)).collect();
+    Ok(array.entries.chunks_exact(width).map(row).collect())
+}
+
+/// All columns except the first of a CSV file with a header.
+fn columns(path: &Path) -> Result<Vec<Vec<f64>>> {
+    let refuse = |error: csv::Error| match error.is_io_error() {
+        true => Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) },
+        false => invalid(path.display().to_string(), "rows of time,q0,q1,...", error),
+    };
+    let mut reader = csv::Reader::from_path(path).map_err(refuse)?;
+    let row = |row: Result<Vec<f64>, csv::Error>| row.map(|row| row[1.min(row.len())..].to_vec()).map_err(refuse);
+    reader.deserialize().map(row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::workloads::{Size, WorkloadKind};
+
+    fn scene() -> std::sync::Arc<Scene> {
+        WorkloadKind::Single { power: 6, rank: 2 }.build(Size::Full).expect("built").scene
+    }
+
+    fn read(text: &str) -> Result<RecordedTrajectory> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("x.q.csv");
+        std::fs::write(&path, text).expect("written");
+        let beside = RecordedTrajectory::beside(folder.path().to_str().expect("UTF-8"), &scene());
+        let read = RecordedTrajectory::read(&path, &scene());
+        assert_eq!(beside, read.clone().map(Some));
+        read
+    }
+
+    #[test]
+    fn columns_after_time_are_coordinates() {
+        let record = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a record");
+        assert_eq!(record.steps(), 2);
+        assert_eq!(record.step(&scene(), 1).q, [3.0, 4.0]);
+        assert_eq!(record.step(&scene(), 1).transforms[0][0], 1.0, "at its placement");
+    }
+
+    #[test]
+    fn rejects_bad_records_with_the_reason() {
+        for (text, part) in [
+            ("time,q0\n0,1\n", "q[0]: expected 2 numbers, given 1"),
+            ("time,q0,q1\n", "steps: expected at least one"),
+            ("time,q0,q1\n0,1,x\n", "expected rows of time,q0,q1"),
+            ("time,q0,q1\n0,1,inf\n", "expected finite numbers"),
+        ] {
+            let refusal = read(text).expect_err(part).to_string();
+            assert!(refusal.contains(part), "{refusal}");
+        }
+        assert!(matches!(RecordedTrajectory::read(Path::new("absent.csv"), &scene()), Err(Error::NotFound { .. })));
+        assert_eq!(RecordedTrajectory::beside("tree", &scene()), Ok(None));
+    }
+
+    #[test]
+    fn reads_transforms_from_a_folder_of_arrays() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let write = |name: &str, shape: &str, numbers: &[f32]| {
+            let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+            header.push_str(&" ".repeat(63 - (header.len() + 10) % 64));
+            header.push('\n');
+            let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+            bytes.extend((header.len() as u16).to_le_bytes());
+            bytes.extend(header.as_bytes());
+            bytes.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
+            std::fs::write(folder.path().join(name), bytes).expect("written");
+        };
+        write("q.npy", "(2, 2)", &[1.0, 2.0, 3.0, 4.0]);
+        let numbers: Vec<f32> = (0..24).map(|number| number as f32).collect();
+        write("transforms.npy", "(2, 1, 12)", &numbers);
+        let record = RecordedTrajectory::read(folder.path(), &scene()).expect("a record");
+        let step = record.step(&scene(), 1);
+        assert_eq!((step.q, step.transforms[0][0]), (vec![3.0, 4.0], 12.0));
+    }
+}

@@ -1,0 +1,112 @@
+//! Compares the time to compute the same blurred moment map in compute shaders and, as in the thesis, in fragment
+//! shaders.
+
+use serde::Serialize;
+
+use super::RenderRow;
+use modalcast_model::scene::{BlurMethod, ShadowSettings};
+
+/// Times of one map by both methods.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BlurComparison {
+    pub load: String,
+    /// Side of the map, texels.
+    pub size: u32,
+    /// Taps of the blur per direction.
+    pub taps: u32,
+    /// Medians, microseconds: the fastest compute method, and fragments.
+    pub compute_us: f64,
+    pub fragments_us: f64,
+    pub ratio: f64,
+}
+
+/// Required speedup of compute over fragments at 4096 texels per side on an H200, and the time limit of compute in
+/// microseconds.
+pub(super) const TIMES_AS_FAST: f64 = 40.0;
+pub(super) const MOST_US: f64 = 200.0;
+
+impl BlurComparison {
+    /// Every map that was timed with both methods.
+    pub(super) fn of(rows: &[RenderRow]) -> Vec<Self> {
+        let by =
+            |row: &RenderRow, wanted: fn(BlurMethod) -> bool| row.shadow.filter(|shadow| wanted(shadow.blur_method));
+        let fragments = rows.iter().filter_map(|row| Some((row, by(row, |way| way == BlurMethod::Fragments)?)));
+        let comparison_tables = |(row, shadow): (&RenderRow, ShadowSettings)| {
+            let same = |other: &&RenderRow| {
+                let own = by(other, |way| way != BlurMethod::Fragments);
+                other.load == row.load
+                    && own.map(|own| ShadowSettings { blur_method: shadow.blur_method, ..own }) == Some(shadow)
+            };
+            let compute_us = rows.iter().filter(same).filter_map(blur_us).min_by(f64::total_cmp)?;
+            let fragments_us = blur_us(row)?;
+            let ratio = fragments_us / compute_us;
+            let taps = 2 * shadow.reach() + 1;
+            Some(Self { load: row.load.clone(), size: shadow.size, taps, compute_us, fragments_us, ratio })
+        };
+        fragments.filter_map(comparison_tables).collect()
+    }
+}
+
+fn blur_us(row: &RenderRow) -> Option<f64> {
+    row.passes.iter().find(|pass| pass.name == "blur").map(|pass| pass.timing.median_us)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::PassTime;
+    use crate::render::metrics::{ErrorDistribution, LightErrors};
+    use crate::render::variants::{ERROR_LIMITS, ShadowVariant};
+    use crate::timing::Timing;
+    use modalcast_model::scene::Culling;
+
+    fn row(load: &str, shadow: ShadowSettings, us: f64) -> RenderRow {
+        let timing = Timing::of(vec![us]).expect("one");
+        RenderRow {
+            load: load.into(),
+            name: String::new(),
+            method: ShadowVariant::Variance,
+            shadow: Some(shadow),
+            packing: None,
+            culling: Culling::default(),
+            bounds: ERROR_LIMITS,
+            passed: true,
+            to_fail: false,
+            faults: Vec::new(),
+            color: ErrorDistribution::default(),
+            color_of_reference: ErrorDistribution::default(),
+            light: LightErrors::default(),
+            light_of_aim: LightErrors::default(),
+            flicker: None,
+            no_flicker: None,
+            passes: vec![PassTime { name: "blur", timing }],
+            bytes: 0,
+            shadow_bytes: 0,
+            image_bytes: 0,
+            samples: 4,
+            draws: 1,
+            culled: None,
+        }
+    }
+
+    #[test]
+    fn compares_fragments_with_fastest_compute_of_same_map() {
+        let map = |size: u32, blur_method: BlurMethod| ShadowSettings {
+            size,
+            blur: 2.3,
+            blur_method,
+            ..ShadowSettings::default()
+        };
+        let rows = [
+            row("a", map(4096, BlurMethod::Tiles), 200.0),
+            row("a", map(4096, BlurMethod::Rows), 400.0),
+            row("a", map(4096, BlurMethod::Fragments), 9000.0),
+            row("a", map(1024, BlurMethod::Tiles), 1.0),
+            row("b", map(4096, BlurMethod::Tiles), 1.0),
+            row("b", map(1024, BlurMethod::Fragments), 50.0),
+        ];
+        let [only] = &BlurComparison::of(&rows)[..] else { panic!("one map was made both ways") };
+        assert_eq!((only.load.as_str(), only.size, only.taps), ("a", 4096, 15));
+        assert_eq!((only.compute_us, only.fragments_us, only.ratio), (200.0, 9000.0, 45.0));
+    }
+}

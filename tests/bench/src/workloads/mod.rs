@@ -1,0 +1,209 @@
+//! Synthetic scenes of known sizes, identical on every machine: seeded, and fast to build even with millions of
+//! vertices.
+//!
+//! | name | contents |
+//! |---|---|
+//! | `single-P-R` | one domain of 2^P vertices and R modes, positions only (table 4.4 of the thesis) |
+//! | `a`, `a-positions` | one domain of 1.5 M vertices, r = 32, with normals and tangents, or without |
+//! | `b` | 1,000 domains of 1,500 vertices, r mixed 0 to 64, about 17 on average |
+//! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
+//! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
+//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q per U; compare `single-18-32` |
+//! | `plant-1` to `plant-12` | the plants of table 4.5 |
+//! | `plant-1-follows` to `plant-12-follows` | the same, leaves follow branches: T for branches alone |
+//!
+//! `single`, `plants` and `follows` name whole groups. `all` names everything except that of the last group it includes
+//! only the plant with the most domains.
+
+mod build;
+mod plant;
+
+use std::sync::Arc;
+
+use super::thesis::{PLANTS, POWERS, RANKS};
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneParts};
+
+/// Size of a load.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Size {
+    Full,
+    /// A fraction of the vertices or domains, for machines without a GPU; the load's remarks state it.
+    Quick,
+}
+
+/// Identifies a synthetic scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WorkloadKind {
+    /// 2^power vertices, `rank` modes.
+    Single {
+        power: u32,
+        rank: usize,
+    },
+    OneDomain {
+        dressed: bool,
+    },
+    ManyDomains,
+    TinyDomains,
+    Cancelling,
+    Batch,
+    /// Index into the thesis's plants.
+    Plant(usize),
+    /// The same plant with leaves that follow its branches.
+    Follows(usize),
+}
+
+/// A scene to measure.
+#[derive(Debug, Clone)]
+pub struct Workload {
+    pub name: String,
+    pub scene: Arc<Scene>,
+    /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
+    pub paired: bool,
+    /// Index of the thesis's plant, if it is one.
+    pub species: Option<usize>,
+    /// Deviations from the size that the name states.
+    pub remarks: Vec<String>,
+}
+
+impl WorkloadKind {
+    /// Every load, in the order of the report.
+    pub fn all() -> Vec<Self> {
+        let mut kinds = Self::singles();
+        kinds.extend([
+            Self::OneDomain { dressed: false },
+            Self::OneDomain { dressed: true },
+            Self::ManyDomains,
+            Self::TinyDomains,
+            Self::Cancelling,
+            Self::Batch,
+        ]);
+        kinds.extend((0..PLANTS.len()).map(Self::Plant));
+        let largest = (0..PLANTS.len()).max_by_key(|index| PLANTS[*index].domains);
+        kinds.extend(largest.map(Self::Follows));
+        kinds
+    }
+
+    fn singles() -> Vec<Self> {
+        RANKS.iter().flat_map(|rank| POWERS.map(|power| Self::Single { power, rank: *rank })).collect()
+    }
+
+    /// The loads that a name on the command line selects.
+    ///
+    /// # Errors
+    /// `Invalid` when there is no such load.
+    pub fn parse(name: &str) -> Result<Vec<Self>> {
+        let number = |text: &str| text.parse::<usize>().ok();
+        let plant =
+            |index: &str| number(index).filter(|index| (1..=PLANTS.len()).contains(index)).map(|index| index - 1);
+        let found = match name.split('-').collect::<Vec<_>>()[..] {
+            ["all"] => Some(Self::all()),
+            ["single"] => Some(Self::singles()),
+            ["single", power, rank] => {
+                let power = number(power).filter(|power| (2..=22).contains(power));
+                let rank = number(rank).filter(|rank| (0..=modalcast_model::domain::MAX_RANK).contains(rank));
+                power.zip(rank).map(|(power, rank)| vec![Self::Single { power: power as u32, rank }])
+            }
+            ["a"] => Some(vec![Self::OneDomain { dressed: true }]),
+            ["a", "positions"] => Some(vec![Self::OneDomain { dressed: false }]),
+            ["b"] => Some(vec![Self::ManyDomains]),
+            ["c"] => Some(vec![Self::TinyDomains]),
+            ["cancel"] => Some(vec![Self::Cancelling]),
+            ["batch"] => Some(vec![Self::Batch]),
+            ["plants"] => Some((0..PLANTS.len()).map(Self::Plant).collect()),
+            ["follows"] => Some((0..PLANTS.len()).map(Self::Follows).collect()),
+            ["plant", index] => plant(index).map(|index| vec![Self::Plant(index)]),
+            ["plant", index, "follows"] => plant(index).map(|index| vec![Self::Follows(index)]),
+            _ => None,
+        };
+        let expected = "single-P-R (2^P vertices, P 2 to 22, R modes), a, a-positions, b, c, cancel, batch, plant-1 to \
+                        plant-12, each also with -follows, or one of the groups single, plants, follows, all";
+        found.ok_or_else(|| invalid("load", expected, name))
+    }
+
+    /// The name that [`Self::parse`] takes.
+    pub fn name(self) -> String {
+        match self {
+            Self::Single { power, rank } => format!("single-{power}-{rank}"),
+            Self::OneDomain { dressed: true } => "a".into(),
+            Self::OneDomain { dressed: false } => "a-positions".into(),
+            Self::ManyDomains => "b".into(),
+            Self::TinyDomains => "c".into(),
+            Self::Cancelling => "cancel".into(),
+            Self::Batch => "batch".into(),
+            Self::Plant(index) => format!("plant-{}", index + 1),
+            Self::Follows(index) => format!("plant-{}-follows", index + 1),
+        }
+    }
+
+    /// Builds the scene.
+    ///
+    /// # Errors
+    /// Errors of [`Scene::new`]; none are expected for these sizes.
+    pub fn build(self, size: Size) -> Result<Workload> {
+        build::build(self, size)
+    }
+}
+
+/// The scene with another deformation.
+///
+/// # Errors
+/// `Invalid` when the deformation's options contradict each other.
+pub fn with_deformation(scene: &Scene, deformation: DeformationSettings) -> Result<Arc<Scene>> {
+    Scene::new(SceneParts { deformation, ..scene.parts() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use modalcast_model::scene::StorageType;
+
+    #[test]
+    fn finds_every_load_by_name_and_rejects_others() {
+        for kind in WorkloadKind::all() {
+            assert_eq!(WorkloadKind::parse(&kind.name()), Ok(vec![kind]));
+        }
+        assert_eq!(WorkloadKind::parse("plants").map(|list| list.len()), Ok(12));
+        assert_eq!(WorkloadKind::parse("follows").map(|list| list.len()), Ok(12));
+        assert_eq!(WorkloadKind::parse("single").map(|list| list.len()), Ok(15));
+        for wrong in [
+            "",
+            "d",
+            "plant-0",
+            "plant-13",
+            "single-23-10",
+            "single-14",
+            "single-14-513",
+            "a-b",
+            "b-",
+            "plant-13-follows",
+            "plant-1-",
+            "b-follows",
+        ] {
+            assert!(WorkloadKind::parse(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn building_a_load_is_deterministic() {
+        let [one, two] = [0, 1].map(|_| WorkloadKind::ManyDomains.build(Size::Quick).expect("built").scene);
+        assert_eq!(one.shapes[7].modes, two.shapes[7].modes);
+        assert_eq!(one.shapes[7].mesh, two.shapes[7].mesh);
+        assert_ne!(one.shapes[7].mesh, one.shapes[8].mesh);
+    }
+
+    #[test]
+    fn restates_a_scene_with_another_storage_type() {
+        let scene = WorkloadKind::OneDomain { dressed: true }.build(Size::Quick).expect("built").scene;
+        let other = with_deformation(
+            &scene,
+            DeformationSettings { storage: StorageType::Int8, ..DeformationSettings::default() },
+        )
+        .expect("fits");
+        assert_eq!((other.deformation.storage, &other.layout), (StorageType::Int8, &scene.layout));
+        assert!(
+            with_deformation(&scene, DeformationSettings { truncation: Some(-1.0), ..DeformationSettings::default() })
+                .is_err()
+        );
+    }
+}
