@@ -169,7 +169,7 @@ fn forbidden_uses_are_detected() {
 /// This holds for kernels that only the benchmarks launch and for kernels that compute the result of another kernel in
 /// a different way.
 fn is_walked_in_tests(name: &str) -> bool {
-    name.starts_with("thesis_") || ["roof", "plain_update", "batch", "batch_mma"].contains(&name)
+    name.starts_with("thesis_") || ["bandwidth", "plain_update", "batch", "batch_mma"].contains(&name)
 }
 
 /// Kernels whose CPU twin is a method of a model or reference type, instead of a file with the name of the kernel.
