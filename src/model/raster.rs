@@ -68,7 +68,7 @@ pub type DrawTarget<'a> = (&'a Viewport, GlBuffer);
 /// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
 /// host. The implementation may keep the position buffer and the target buffers registered. The caller must therefore
 /// delete the position buffer only after it drops the rasterizer, and a target only after
-/// [`release_target`](Rasteriser::forget).
+/// `release_target`.
 pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.

@@ -186,7 +186,7 @@ impl InputWriter {
         Self { packing: Arc::clone(packing), truncation }
     }
 
-    /// Writes a full step; `to` has [`InputSizes::total`] bytes.
+    /// Writes a full step; `to` has `InputSizes::total` bytes.
     pub fn write(&mut self, to: &mut [f32], header: &Header, state: &SceneState) {
         let mut to = SliceWriter::new(to);
         to.put(std::slice::from_ref(header));

@@ -1,7 +1,7 @@
 //! The CUDA backend: one launcher module per kernel, with the name of the kernel.
 //!
 //! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the device that is present, with only the
-//! features that the scene needs ([`plan`]), and a disk cache keeps the machine code. A step is one CUDA graph: a
+//! features that the scene needs ([`plan()`]), and a disk cache keeps the machine code. A step is one CUDA graph: a
 //! host-to-device copy, at most four kernel launches for any number of domains, and a readback of the bounds. The
 //! kernels write directly into OpenGL's buffers when the driver shares them.
 //!

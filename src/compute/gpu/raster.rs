@@ -8,10 +8,10 @@
 //!
 //! | file | content |
 //! |---|---|
-//! | [`variant`] | the variants of the kernels |
+//! | `variant` | the variants of the kernels |
 //! | [`check`] | validation of meshes |
-//! | [`mod@cut_out`] | texture coordinates, surfaces and images of cut-outs |
-//! | [`cuda_rasterizer`] | positions and samples in OpenGL's buffers |
+//! | `cut_out` | texture coordinates, surfaces and images of cut-outs |
+//! | `cuda_rasterizer` | positions and samples in OpenGL's buffers |
 
 mod check;
 mod cuda_rasterizer;

@@ -68,7 +68,7 @@ impl ErrorBound {
 pub struct ErrorBoundInput<'a> {
     /// Coordinates of the domain; zero for truncated modes.
     pub q: &'a [f32],
-    /// As returned by [`modalcast_model::scene::SceneState::composed`].
+    /// As returned by `modalcast_model::scene::SceneState::composed`.
     pub transform: ComposedTransform,
     pub compensated: bool,
 }

@@ -4,10 +4,10 @@
 //! Validation comes before timing: a variant whose error exceeds its a-priori bound at any vertex of any state is not
 //! timed. The report names the variant and fails.
 //!
-//! - [`loads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms; [`record`]: recorded
+//! - [`workloads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms; [`recorded_trajectory`]: recorded
 //!   trajectories.
-//! - [`exact`], [`ingredients`] and `double_double`: reference positions in f64 with single terms of the error model
-//!   exchanged, and a-priori bounds. [`errors`] and [`sources`] measure variants against them.
+//! - [`exact_positions`], [`error_model`] and `double_double`: reference positions in f64 with single terms of the error model
+//!   exchanged, and a-priori bounds. [`errors`] and [`error_sources`] measure variants against them.
 //! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and a
 //!   [`bench::BenchTarget`] offers it.
 //! - [`table`], [`thesis_comparison`], [`plot`]: the output.

@@ -2,10 +2,10 @@
 //!
 //! A tile computes vertices, or corners, or both where corner i of a shape is its vertex i.
 //!
-//! A shape of more than [`MAX_SHARED_QUADS`] quads, or one with modes that several domains share, is cut into tiles of its own,
+//! A shape of more than `MAX_SHARED_QUADS` quads, or one with modes that several domains share, is cut into tiles of its own,
 //! and its U is stored once. The quads of smaller domains with the same number of chunks fill tiles together (mixed
 //! tiles), so that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first, because a long tile that
-//! begins last would delay the end of the step. Vertices of domains that [`batches`] puts into groups have tiles too,
+//! begins last would delay the end of the step. Vertices of domains that `batches` puts into groups have tiles too,
 //! after all others: a full step leaves them to `batch`, and the tile list of a partial step refers to them.
 
 pub(super) mod batches;

@@ -11,7 +11,7 @@
 //! | `batch_mma` | many vectors q of one U at once by tensor cores, with their own summation order and rounding |
 //! | `ingest` | host-to-device upload of a step's values |
 //! | `overlap` | steps with readback by the host, serial and overlapped |
-//! | `cublas`, [`plain_update`] | products by cuBLAS, and the vertex update that follows them |
+//! | `cublas`, `plain_update` | products by cuBLAS, and the vertex update that follows them |
 //! | `raster` | the CUDA rasterizer on its own positions and samples |
 //! | `thesis` | the kernels of the thesis |
 

@@ -5,7 +5,7 @@
 //! timed. The report names it and fails. Some variants are included to show a failure; the report also fails if such a
 //! variant passes.
 //!
-//! - [`loads`], [`variants`]: the scenes, and the ways to draw them.
+//! - [`workloads`], [`variants`]: the scenes, and the ways to draw them.
 //! - `ray_scene`, `paint`, `texels`, `view`, `shade`, `sample_pattern`, `picture`: the references. 64 samples per pixel, in f64
 //!   except for the boxes of the BVH. Opaque surfaces and cut-outs by their nearest point, transparent ones sorted by
 //!   depth along every sample. Shadows by one ray per sample to the sun, or by rays distributed over the blur's
@@ -18,7 +18,7 @@
 //! - `raster`: the bare passes by the CUDA rasterizer and by OpenGL; `frame_comparison`: whole frames with either.
 //! - [`packing`]: images in one array as in equation 3.13, against arrays by size.
 //! - [`plants`]: the plants of table 4.5, deformed and drawn.
-//! - [`timed`]: frame times of a scene of the user, for comparison with other programs.
+//! - [`frame_times`]: frame times of a scene of the user, for comparison with other programs.
 //! - [`figures`]: figures like those of the thesis, for viewing.
 
 mod blur_comparison;

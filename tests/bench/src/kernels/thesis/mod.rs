@@ -67,7 +67,7 @@ impl ThesisBenchmark {
     /// The grouped kernels, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when a domain has more than 32 modes, [`Part::UqKernel`] is requested and no domain has modes, or there is
+    /// `Invalid` when a domain has more than 32 modes, `Part::UqKernel` is requested and no domain has modes, or there is
     /// no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn multi(
         device: &Device,
