@@ -96,11 +96,11 @@ impl FrameEncoder {
                     _ => (frame.rgba.clone(), None),
                 }
             }
-            OutputBody::Aov(survey, Some(legend)) => {
-                let map = move || color_map(&survey, &legend, format);
+            OutputBody::Aov(image, Some(legend)) => {
+                let map = move || color_map(&image, &legend, format);
                 self.run(map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
             }
-            OutputBody::Aov(survey, None) => (survey.bytes.into(), None),
+            OutputBody::Aov(image, None) => (image.bytes.into(), None),
             OutputBody::Vertices(_) | OutputBody::Pick(_) => return Err(fault_in("encode")("it is not a picture")),
         };
         stages.extend(ms.map(|ms| (Stage::Encode, ms)));
@@ -130,9 +130,9 @@ impl FrameEncoder {
     }
 }
 
-fn color_map(survey: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
-    let size = [survey.width, survey.height];
-    let rgba = frame::color_map(&survey.bytes, survey.samples, size, legend)?;
+fn color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
+    let size = [image.width, image.height];
+    let rgba = frame::color_map(&image.bytes, image.samples, size, legend)?;
     if format == FrameFormat::Png { frame::encode_png(size[0], size[1], &rgba) } else { Ok(rgba) }
 }
 

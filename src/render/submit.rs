@@ -252,7 +252,7 @@ impl Renderer {
 /// Whether the ground must be rasterized.
 fn draws_ground(buffers: &SceneBuffers, shot: &FrameParams) -> bool {
     let scene = &buffers.scene;
-    // The bounds of a rebased scene leave out what is far away.
+    // The bounds of a rebased scene exclude distant domains.
     let is_last = buffers.rebased.is_none() && frame_uniforms::ground_is_behind_scene(scene, shot, buffers.origin);
     scene.look.ground.is_some() && frame_uniforms::camera_is_above_ground(scene, shot) && !is_last
 }

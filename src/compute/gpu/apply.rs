@@ -54,9 +54,9 @@ pub(super) fn max_change_entries(scene: &Scene) -> usize {
     max_changed_domains(scene).min(scene.domains.len() - silent)
 }
 
-/// Whether a step never has to send a change of this domain. Such a domain follows another domain's transform, has no
-/// coordinates, and nobody reads its stamp, as exact normals and boxes would. Its tiles are computed again all the
-/// same.
+/// Whether a step never has to send a change of this domain: the domain follows another domain's transform, has no
+/// coordinates, and the scene keeps neither exact normals nor boxes, which read the step of its last change. Its tiles
+/// are recomputed nevertheless.
 fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
     let needs = scene.needs;
     needs.followers

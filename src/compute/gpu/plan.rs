@@ -160,7 +160,7 @@ pub struct BufferDescriptor {
 pub struct OmittedFeature {
     /// The flag of [`modalcast_model::scene::SceneFeatures`] that is off, or "batches".
     pub feature: &'static str,
-    /// What is not compiled, computed or stored.
+    /// Features that are not compiled, computed or stored.
     pub what: &'static str,
     /// Device bytes saved, as far as they are known: the length of rings is unknown until they are built.
     pub bytes: u64,

@@ -11,7 +11,7 @@ use modalcast_compute::gpu;
 pub struct Provenance {
     pub cpu: String,
     pub threads: usize,
-    /// CUDA devices with their memory, driver, CUDA and NVRTC versions, and descriptions of what is missing.
+    /// CUDA devices with their memory, driver, CUDA and NVRTC versions, and the reason for each missing component.
     pub cuda: gpu::Probe,
     pub version: &'static str,
     /// `MODALCAST_COMMIT`, otherwise git's HEAD in the current folder.

@@ -93,7 +93,7 @@ impl AlphaTexture {
     fn new(device: &Device, image: &AlphaImage, anisotropy: f32) -> Result<Self> {
         let fail = fault_in("texture");
         let array = create(image).map_err(&fail)?;
-        // From here on, dropping `own` destroys what was created.
+        // From here on, dropping `own` destroys the objects created so far.
         let mut own = Self { texture: 0, array, context: Arc::clone(device.context()) };
         for (level, texels) in image.levels.iter().enumerate() {
             own.fill(device, level as u32, (size_of_level(image, level), texels)).map_err(&fail)?;

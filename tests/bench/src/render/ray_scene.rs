@@ -263,7 +263,7 @@ impl RayScene {
             }
     }
 
-    /// Whether a hit is blended over what is behind it.
+    /// Whether a hit is blended over the surfaces behind it.
     pub(super) fn is_blended(&self, hit: &Hit) -> bool {
         let paint = self.paint(hit);
         paint.kind == AlphaKind::Blend && (hit.front || paint.double_sided)
