@@ -79,7 +79,7 @@ fn exit_code(error: &Error) -> u8 {
         Error::Invalid { .. } => 3,
         Error::NotFound { .. } | Error::Gone { .. } => 4,
         Error::Taken { .. } | Error::Busy { .. } | Error::Unavailable { .. } => 5,
-        Error::Deadline { .. } | Error::Fault { .. } => 6,
+        Error::Deadline { .. } | Error::Fault { .. } | Error::DeviceLost { .. } => 6,
     }
 }
 

@@ -28,6 +28,10 @@ pub enum Error {
     /// An internal error, or a failure of the device or a library.
     #[error("{stage} failed: {reason}")]
     Fault { stage: &'static str, reason: String },
+    /// The device context is lost with all its memory, for example after an illegal access by a kernel. Every later call
+    /// to that device fails as well, so only the operator can act: by a restart of the server.
+    #[error("{stage} failed: the device is lost ({reason}). Restart the server")]
+    DeviceLost { stage: &'static str, reason: String },
 }
 
 /// `Result` with [`Error`] as its default error type.

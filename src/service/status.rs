@@ -29,6 +29,7 @@ pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
         Error::Deadline { what, ms } => (what, format!("within {ms} ms"), "later".into()),
         Error::Unavailable { what, reason, remedy } => (what.into(), remedy, reason),
         Error::Fault { stage, reason } => (stage.into(), "success".into(), reason),
+        Error::DeviceLost { stage, reason } => (stage.into(), "a restart of the server".into(), reason),
     };
     Rejection { step, field: truncate(field), expected: truncate(expected), given: truncate(given) }
 }
@@ -42,7 +43,7 @@ pub(super) fn status(error: Error) -> Status {
         Error::Gone { .. } => Code::FailedPrecondition,
         Error::Busy { .. } => Code::ResourceExhausted,
         Error::Deadline { .. } => Code::DeadlineExceeded,
-        Error::Unavailable { .. } => Code::Unavailable,
+        Error::Unavailable { .. } | Error::DeviceLost { .. } => Code::Unavailable,
         Error::Fault { .. } => Code::Internal,
     };
     let details = rejection(None, &error);
